@@ -1,0 +1,62 @@
+"""Joints with one coordinate: revolute, continuous, prismatic."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..expressions.expression import Expression
+from ..model.body import Pose, Vector3
+from ..spatial import normalised, rotation_x, rotation_y, rotation_z, snapped, translation
+from .joint import AxisJoint
+
+
+@dataclass(frozen=True, kw_only=True)
+class Revolute(AxisJoint):
+    """A hinge: parent_T_child = origin · rotation(axis, q), q in [rad]."""
+
+    def motion(self, q: Expression) -> tuple[Pose | Expression, ...]:
+        """Return joint_T_child as factors."""
+        return rotation_factors(self.axis, q)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Continuous(Revolute):
+    """A hinge without end stops, q in [rad]; usually without position limits."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Prismatic(AxisJoint):
+    """A slider: parent_T_child = origin · translation(axis · q), q in [m]."""
+
+    def motion(self, q: Expression) -> tuple[Pose | Expression, ...]:
+        """Return joint_T_child as factors."""
+        x, y, z = unit_axis(self.axis)
+        return (translation(x * q, y * q, z * q),)
+
+
+def unit_axis(axis: Vector3) -> tuple[float, float, float]:
+    """Return the axis at length one."""
+    numbers = normalised(axis)
+    assert numbers is not None  # joints check their axis when they are made
+    x, y, z = numbers.tolist()
+    return x, y, z
+
+
+def rotation_factors(axis: Vector3, q: Expression) -> tuple[Pose | Expression, ...]:
+    """Return the rotation about any axis as constants around one about x, y or z.
+
+    Such factors keep the Jacobian constant in q and the chain short: A · rotation_z(q) · Aᵀ with A's last column the axis.
+    """
+    x, y, z = unit_axis(axis)
+    for component, rotation in ((x, rotation_x), (y, rotation_y), (z, rotation_z)):
+        if abs(component) == 1.0:
+            return (rotation(q if component > 0 else -q),)
+    turn = np.eye(4)
+    a = np.array([x, y, z])
+    helper = np.eye(3)[np.argmin(np.abs(a))]
+    first = np.cross(helper, a)
+    first /= np.linalg.norm(first)
+    turn[:3, :3] = snapped(np.column_stack([first, np.cross(a, first), a]))
+    return Pose.of(turn), rotation_z(q), Pose.of(turn.T)

@@ -1,0 +1,84 @@
+"""Every error the library raises on purpose.
+
+All of them derive from :class:`KineverseError`, so one ``except`` catches whatever Kineverse has to say; each
+also derives from the built-in error a Python programmer would expect (``KeyError``, ``ValueError`` ...).
+A message says what was wrong, where, what was available and what to do.
+"""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterable
+
+
+class KineverseError(Exception):
+    """Base of all errors of this package."""
+
+    def __str__(self) -> str:
+        # KeyError prints the repr of its argument; a message for people is printed as it is.
+        return str(self.args[0]) if len(self.args) == 1 else super().__str__()
+
+
+class UnknownNameError(KineverseError, KeyError):
+    """A frame, symbol, constraint, tag or model of that name does not exist."""
+
+
+class NameTakenError(KineverseError, ValueError):
+    """The name is in use already; names, tags and constraints are unique."""
+
+
+class ShapeError(KineverseError, ValueError):
+    """Operands, arrays or matrices have shapes that do not fit."""
+
+
+class ValueRejectedError(KineverseError, ValueError):
+    """A number is not acceptable here: NaN, an empty range, a zero axis ..."""
+
+
+class ExpressionError(KineverseError, TypeError):
+    """An expression is used in a way that has no meaning (such as ``if expression:``)."""
+
+
+class CompileError(KineverseError, RuntimeError):
+    """Expressions could not be turned into a function."""
+
+
+class ModelError(KineverseError, ValueError):
+    """The model would not be consistent: cyclic frames, cyclic rates, rows that end nowhere."""
+
+
+class EditError(KineverseError, RuntimeError):
+    """An edit was refused, and the model is what it was before."""
+
+
+class FormatError(KineverseError, ValueError):
+    """A file or document cannot be read as what it claims to be."""
+
+
+class MissingExtraError(KineverseError, ImportError):
+    """An optional dependency is not installed; the message names the extra that brings it."""
+
+
+def suggest(name: str, available: Iterable[str], what: str = "name", limit: int = 12) -> str:
+    """Return the half of an error message that lists close matches, or what there is.
+
+    Parameters
+    ----------
+    name
+        What was asked for.
+    available
+        What could have been asked for.
+    what
+        The noun used for the listed things.
+    limit
+        At most so many names are listed.
+    """
+    names = sorted(set(available))
+    if not names:
+        return f"There is no {what} at all."
+    close = difflib.get_close_matches(name, names, n=4, cutoff=0.6) if len(names) <= 20_000 else []
+    close += [n for n in names if n.rsplit("/", 1)[-1] == name and n not in close][: limit - len(close)]
+    if close:
+        return f"Did you mean {' or '.join(repr(n) for n in close)}?"
+    more = f" and {len(names) - limit} more" if len(names) > limit else ""
+    return f"Available: {', '.join(names[:limit])}{more}."

@@ -1,0 +1,599 @@
+"""The one type of layer 1: arrays of symbolic expressions that know their gradient.
+
+An :class:`Expression` behaves like a numpy array of fixed shape. CasADi's ``SX`` does the algebra inside. What
+CasADi cannot say, such as gradients that differ from the partial derivatives, lives in opaque nodes
+(:mod:`kineverse.expressions.node`) that stand in the ``SX`` graph as symbols of their own until the expression
+is lowered to numbers.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from typing import TYPE_CHECKING, Any, TypeAlias
+
+import casadi as ca
+import numpy as np
+import numpy.typing as npt
+
+from ..errors import ExpressionError, ShapeError, ValueRejectedError
+from . import layout
+from .layout import SX, Shape
+
+if TYPE_CHECKING:
+    from ..symbols import Symbol
+    from .node import Node
+
+ExpressionLike: TypeAlias = "Expression | float | int | npt.ArrayLike | Sequence[Any]"
+
+NO_NODES: frozenset[Node] = frozenset()
+
+# Symbols by the hash of their SX element. Strong on purpose: CasADi reuses the addresses (and so the hashes) of
+# freed elements, and a symbol is a name, of which there are finitely many.
+SYMBOLS: dict[int, Symbol] = {}
+
+
+class Expression:
+    """An immutable array of symbolic expressions.
+
+    Arithmetic, slicing and numpy's functions work as on arrays. Three things differ, each on purpose:
+    ``==`` and ``hash`` compare structure and give a plain ``bool``; ``<``, ``>``, ``&``, ``|`` and ``~`` build
+    continuous logic (:mod:`kineverse.logic`); and :meth:`gradient` is a mapping from derivative symbols to
+    expressions that may be overridden (:meth:`augment`).
+    """
+
+    __slots__ = ("__weakref__", "_gradients", "_key", "_leaves", "_lowered", "_nodes", "_shape", "_sx")
+    __array_priority__ = 1000.0
+
+    _sx: SX
+    _shape: Shape
+    _nodes: frozenset[Node]
+
+    def __init__(self, value: ExpressionLike) -> None:
+        source = as_expression(value)
+        self._set(source._sx, source._shape, source._nodes)
+
+    def _set(self, sx: SX, shape: Shape, nodes: frozenset[Node]) -> None:
+        self._sx = sx
+        self._shape = shape
+        self._nodes = nodes
+        self._leaves: tuple[tuple[Symbol, ...], tuple[Node, ...]] | None = None
+        self._gradients: dict[bool, Any] = {}
+        self._key: bytes | None = None
+        self._lowered: Any = None
+
+    # -- what it is ----------------------------------------------------------------------------------------
+
+    @property
+    def shape(self) -> Shape:
+        """The shape, as numpy has it; ``()`` for a scalar."""
+        return self._shape
+
+    @property
+    def ndim(self) -> int:
+        """The number of dimensions."""
+        return len(self._shape)
+
+    @property
+    def size(self) -> int:
+        """The number of elements."""
+        return math.prod(self._shape)
+
+    @property
+    def casadi(self) -> SX:
+        """CasADi's ``SX`` of the values, nodes lowered: (n, m) as stored, see :mod:`.layout`."""
+        from .lowering import lowered
+
+        return lowered(self)
+
+    @property
+    def symbols(self) -> tuple[Symbol, ...]:
+        """The free symbols V(e) of the values, sorted by path and order (2022 paper, III-A)."""
+        from .leaves import free_symbols
+
+        return free_symbols(self)
+
+    @property
+    def is_constant(self) -> bool:
+        """Whether the value depends on no symbol and the gradient is empty."""
+        if not self._nodes:
+            return bool(self._sx.is_constant())
+        return not self.symbols and not self.gradient()
+
+    @property
+    def T(self) -> Expression:
+        """The transpose."""
+        return self.transpose()
+
+    def __len__(self) -> int:
+        if not self._shape:
+            raise ExpressionError("len() of a scalar expression.")
+        return self._shape[0]
+
+    def __iter__(self) -> Iterator[Expression]:
+        if not self._shape:
+            raise ExpressionError("A scalar expression cannot be iterated over.")
+        return (self[i] for i in range(self._shape[0]))
+
+    def __getitem__(self, key: Any) -> Expression:
+        if isinstance(key, Expression) or (
+            isinstance(key, tuple) and any(isinstance(k, Expression) for k in key)
+        ):
+            raise ExpressionError("An index must be a number or a slice; use where(condition, a, b) to select.")
+        if type(key) is tuple and len(key) == 2 and type(key[0]) is int and type(key[1]) is int:
+            if len(self._shape) == 2 and 0 <= key[0] < self._shape[0] and 0 <= key[1] < self._shape[1]:
+                return make(self._sx[key[0], key[1]], (), self._nodes)
+        try:
+            index = layout.indices(self._shape)[key]
+        except IndexError as error:
+            raise ShapeError(f"{error} (the expression has shape {self._shape}).") from None
+        return self._rearranged(np.asarray(index))
+
+    def __setitem__(self, key: Any, value: Any) -> None:
+        raise ExpressionError(
+            "Expressions are immutable; build a new one, for example with kv.array([[a, b], [c, d]]) "
+            "or numpy.concatenate."
+        )
+
+    def _rearranged(self, index: layout.Indices) -> Expression:
+        return make(layout.gather(self._sx, self._shape, index), index.shape, self._nodes)
+
+    # -- rearranging ---------------------------------------------------------------------------------------
+
+    def reshape(self, *shape: Any) -> Expression:
+        """Return the same elements, in C order, in another shape; one length may be -1."""
+        wanted = shape[0] if len(shape) == 1 and not isinstance(shape[0], (int, np.integer)) else shape
+        try:
+            return self._rearranged(layout.indices(self._shape).reshape(wanted))
+        except ValueError:
+            raise ShapeError(f"An expression of shape {self._shape} cannot be reshaped to {wanted}.") from None
+
+    def ravel(self) -> Expression:
+        """Return the elements in C order, shape (size,)."""
+        return self.reshape(-1)
+
+    flatten = ravel
+
+    def transpose(self, *axes: Any) -> Expression:
+        """Return the array with its axes permuted; reversed if none are given."""
+        if len(self._shape) == 2 and not axes:
+            return make(self._sx.T, self._shape[::-1], self._nodes)
+        return self._rearranged(layout.indices(self._shape).transpose(*axes))
+
+    def sum(self, axis: int | None = None) -> Expression:
+        """Return the sum over all elements or along one axis."""
+        return np.sum(self, axis=axis)  # type: ignore[call-overload, no-any-return]
+
+    def dot(self, other: ExpressionLike) -> Expression:
+        """Return the matrix product, as ``@``."""
+        return self @ other
+
+    # -- arithmetic ----------------------------------------------------------------------------------------
+
+    def __add__(self, other: ExpressionLike) -> Expression:
+        return binary(ca.OP_ADD, self, other)
+
+    def __radd__(self, other: ExpressionLike) -> Expression:
+        return binary(ca.OP_ADD, other, self)
+
+    def __sub__(self, other: ExpressionLike) -> Expression:
+        return binary(ca.OP_SUB, self, other)
+
+    def __rsub__(self, other: ExpressionLike) -> Expression:
+        return binary(ca.OP_SUB, other, self)
+
+    def __mul__(self, other: ExpressionLike) -> Expression:
+        return binary(ca.OP_MUL, self, other)
+
+    def __rmul__(self, other: ExpressionLike) -> Expression:
+        return binary(ca.OP_MUL, other, self)
+
+    def __truediv__(self, other: ExpressionLike) -> Expression:
+        return binary(ca.OP_DIV, self, other)
+
+    def __rtruediv__(self, other: ExpressionLike) -> Expression:
+        return binary(ca.OP_DIV, other, self)
+
+    def __pow__(self, other: ExpressionLike) -> Expression:
+        return binary(ca.OP_POW, self, other)
+
+    def __rpow__(self, other: ExpressionLike) -> Expression:
+        return binary(ca.OP_POW, other, self)
+
+    def __mod__(self, other: ExpressionLike) -> Expression:
+        return self - floor_divide(self, other) * as_expression(other)
+
+    def __rmod__(self, other: ExpressionLike) -> Expression:
+        return as_expression(other) % self
+
+    def __floordiv__(self, other: ExpressionLike) -> Expression:
+        return floor_divide(self, other)
+
+    def __rfloordiv__(self, other: ExpressionLike) -> Expression:
+        return floor_divide(other, self)
+
+    def __neg__(self) -> Expression:
+        return unary(ca.OP_NEG, self)
+
+    def __pos__(self) -> Expression:
+        return self
+
+    def __abs__(self) -> Expression:
+        return unary(ca.OP_FABS, self)
+
+    def __matmul__(self, other: ExpressionLike) -> Expression:
+        return matmul(self, other)
+
+    def __rmatmul__(self, other: ExpressionLike) -> Expression:
+        return matmul(other, self)
+
+    # -- logic (kineverse.logic says what it means) --------------------------------------------------------
+
+    def __lt__(self, other: ExpressionLike) -> Expression:
+        from ..logic import less
+
+        return less(self, other)
+
+    def __gt__(self, other: ExpressionLike) -> Expression:
+        from ..logic import less
+
+        return less(other, self)
+
+    __le__ = __lt__
+    __ge__ = __gt__
+
+    def __and__(self, other: ExpressionLike) -> Expression:
+        from ..logic import logic_and
+
+        return logic_and(self, other)
+
+    def __rand__(self, other: ExpressionLike) -> Expression:
+        from ..logic import logic_and
+
+        return logic_and(other, self)
+
+    def __or__(self, other: ExpressionLike) -> Expression:
+        from ..logic import logic_or
+
+        return logic_or(self, other)
+
+    def __ror__(self, other: ExpressionLike) -> Expression:
+        from ..logic import logic_or
+
+        return logic_or(other, self)
+
+    def __invert__(self) -> Expression:
+        from ..logic import logic_not
+
+        return logic_not(self)
+
+    def __bool__(self) -> bool:
+        raise ExpressionError(
+            "An expression has no truth value. Write (0.4 < b) & (b < 0.6) for 0.4 < b < 0.6, a & b for "
+            "'a and b', ~a for 'not a', and kv.where(condition, a, b) for 'a if condition else b'."
+        )
+
+    # -- gradients -----------------------------------------------------------------------------------------
+
+    def gradient(self, heuristic: bool = True) -> Mapping[Symbol, Expression]:
+        """Return D(e): a mapping from derivative symbols to expressions of this shape.
+
+        The augmented gradient of the papers (2022, Eqs. 5-8): where nothing was augmented, the entry of ``ȧ`` is
+        ∂e/∂a. Entries that are structurally zero are left out.
+
+        Parameters
+        ----------
+        heuristic
+            Whether logic and ``augment(..., heuristic=True)`` contribute their trends. ``False`` takes a logic
+            node as locally constant and such an augmentation as absent: only facts remain.
+        """
+        from .gradient import gradient
+
+        return gradient(self, heuristic)
+
+    def jacobian(self, symbols: Sequence[Symbol], heuristic: bool = True) -> Expression:
+        """Return the derivatives by ``symbols``, shape ``e.shape + (n,)``.
+
+        The column of ``x`` is ``D(e)[x.derivative()]``, zero where that has no entry.
+
+        Raises
+        ------
+        ExpressionError
+            If something else than symbols is given, or a parameter, which has no derivative.
+        """
+        from .gradient import jacobian
+
+        return jacobian(self, symbols, heuristic)
+
+    def partial(self, symbols: Sequence[Symbol]) -> Expression:
+        """Return the plain partial derivatives of the value, shape ``e.shape + (n,)``.
+
+        Augmentations are ignored and parameters are symbols like any other. A filter's transition matrix is one
+        of these.
+        """
+        from .gradient import partial
+
+        return partial(self, symbols)
+
+    def augment(self, gradient: Mapping[Symbol, ExpressionLike], heuristic: bool = False) -> Expression:
+        """Return the same value whose gradient has these entries overridden or added, the others kept.
+
+        Parameters
+        ----------
+        gradient
+            From derivative symbols (order at least 1; they need not be derivatives of symbols in here, such as
+            the speeds of wheels) to expressions that fit this shape.
+        heuristic
+            Marks the entries as directions to try rather than rates (see :meth:`gradient`).
+        """
+        from .node import augment
+
+        return augment(self, gradient, replace=False, heuristic=heuristic)
+
+    def with_gradient(self, gradient: Mapping[Symbol, ExpressionLike]) -> Expression:
+        """Return the same value with exactly this gradient."""
+        from .node import augment
+
+        return augment(self, gradient, replace=True, heuristic=False)
+
+    # -- substitution and values ---------------------------------------------------------------------------
+
+    def substitute(self, values: Mapping[Symbol, ExpressionLike]) -> Expression:
+        """Return e∘S: symbols replaced by expressions or numbers, gradients by the chain rule.
+
+        ``D(e∘S)[w] = Σ_a (D(e)[ȧ]∘S)·D(S(a))[w]`` plus the entries of D(e) that belong to no replaced symbol.
+        """
+        from .substitution import substitute
+
+        return substitute(self, values)
+
+    def __call__(self, values: Mapping[Any, Any] | None = None, /, **by_name: float) -> npt.NDArray[Any]:
+        """Return the value at numbers, as a fresh numpy array (a numpy scalar for a scalar).
+
+        Parameters
+        ----------
+        values
+            A mapping from symbols or their names to numbers, or a :class:`~kineverse.State`, which may know
+            more symbols than there are here. Parameters that are not given have their own values.
+
+        Raises
+        ------
+        UnknownNameError
+            Listing what is missing or not known.
+        """
+        from .evaluation import evaluate
+
+        return evaluate(self, {**(values or {}), **by_name} if by_name else (values or {}))
+
+    def __float__(self) -> float:
+        if self._shape or self.symbols:
+            raise ExpressionError(
+                f"float() needs a constant scalar; this has shape {self._shape} and the symbols "
+                f"{', '.join(map(str, self.symbols[:6]))}. Call it with values: e({{name: number}})."
+            )
+        return float(self())
+
+    # -- identity ------------------------------------------------------------------------------------------
+
+    @property
+    def key(self) -> bytes:
+        """A digest of shape and structure, the same in every process."""
+        from .structure import structural_key
+
+        return structural_key(self)
+
+    def __eq__(self, other: object) -> bool:
+        if self is other:
+            return True
+        if not isinstance(other, Expression):
+            try:
+                other = as_expression(other)  # type: ignore[arg-type]
+            except (ExpressionError, ValueRejectedError, ShapeError):
+                return NotImplemented
+        return self._shape == other._shape and self.key == other.key
+
+    def __hash__(self) -> int:
+        return hash(self.key)
+
+    def __reduce__(self) -> Any:
+        from .structure import pack, unpack
+
+        return unpack, pack(self)
+
+    def __copy__(self) -> Expression:
+        return self
+
+    def __deepcopy__(self, memo: Any) -> Expression:
+        return self
+
+    def __repr__(self) -> str:
+        from .printing import text
+
+        return text(self)
+
+    def _repr_latex_(self) -> str:
+        from .printing import latex
+
+        return f"$\\displaystyle {latex(self)}$"
+
+    # -- numpy ---------------------------------------------------------------------------------------------
+
+    def __array__(self, dtype: Any = None, copy: Any = None) -> npt.NDArray[Any]:
+        raise ExpressionError(
+            "An expression is not an array of numbers. Call it with values, e({name: number}), to get one; "
+            "build arrays of expressions with kv.array([...]) or numpy.stack."
+        )
+
+    def __array_ufunc__(self, ufunc: Any, method: str, *inputs: Any, **options: Any) -> Any:
+        from .numpy_protocol import apply_ufunc
+
+        return apply_ufunc(ufunc, method, inputs, options)
+
+    def __array_function__(self, function: Any, types: Any, args: Any, options: Any) -> Any:
+        from .numpy_protocol import apply_function
+
+        return apply_function(function, args, options)
+
+
+def make(sx: SX, shape: Shape, nodes: frozenset[Node]) -> Expression:
+    """Wrap an ``SX`` that only contains known symbols and the symbols of ``nodes``.
+
+    A scalar that is nothing but a symbol is that :class:`Symbol`, so ``v[0]`` can be used as a key.
+    """
+    if not shape and sx.is_symbolic():
+        symbol = SYMBOLS.get(sx.element_hash())
+        if symbol is not None:
+            return symbol
+    expression = Expression.__new__(Expression)
+    expression._set(sx, shape, nodes)
+    return expression
+
+
+def as_expression(value: ExpressionLike) -> Expression:
+    """Return numbers, arrays and nested sequences of expressions as one expression.
+
+    Raises
+    ------
+    ValueRejectedError
+        For NaN.
+    ShapeError
+        For ragged sequences.
+    ExpressionError
+        For anything that is not numeric.
+    """
+    if isinstance(value, Expression):
+        return value
+    if isinstance(value, (float, int)) and not isinstance(value, bool):
+        if value != value:
+            raise ValueRejectedError("NaN is not accepted as a constant.")
+        return make(ca.SX(float(value)), (), NO_NODES)
+    if isinstance(value, (list, tuple)) or (isinstance(value, np.ndarray) and value.dtype == object):
+        return array(value)
+    if isinstance(value, (str, bytes, Mapping)) or value is None:
+        raise ExpressionError(
+            f"{value!r} is not an expression or a number. Symbols are made by kv.position('path')."
+        )
+    try:
+        numbers = np.asarray(value, dtype=float)
+    except (TypeError, ValueError) as error:
+        raise ExpressionError(f"{type(value).__name__} is not an expression or an array of numbers: {error}") from None
+    if np.isnan(numbers).any():
+        raise ValueRejectedError(f"NaN is not accepted as a constant (in an array of shape {numbers.shape}).")
+    return make(layout.from_array(numbers), numbers.shape, NO_NODES)
+
+
+def array(values: Any) -> Expression:
+    """Return nested sequences of expressions and numbers as one expression, like ``numpy.array``."""
+    if isinstance(values, Expression):
+        return values
+    if isinstance(values, np.ndarray) and values.dtype == object:
+        values = values.tolist()
+    if not isinstance(values, (list, tuple)):
+        return as_expression(values)
+    if not values:
+        return as_expression(np.zeros(0))
+    if all(isinstance(v, (float, int, np.floating, np.integer)) and not isinstance(v, bool) for v in values):
+        return as_expression(np.asarray(values, dtype=float))
+    flat: list[Expression] = []
+    shape = _flatten(values, flat)
+    if shape is None:
+        raise ShapeError("Ragged array: entries of different shapes side by side.")
+    full = shape
+    if all(not e.shape for e in flat):
+        numbers = np.zeros(len(flat))
+        symbolic = []
+        for i, element in enumerate(flat):
+            if element._sx.is_constant():
+                numbers[i] = float(element._sx)
+            else:
+                symbolic.append(i)
+        sx = layout.from_array(numbers.reshape(full))
+        columns = 1 if len(full) == 1 else full[-1]
+        for i in symbolic:
+            sx[i // columns, i % columns] = flat[i]._sx
+        return make(sx, full, union(flat))
+    elements = ca.vertcat(*(layout.column(e._sx, e.shape) for e in flat))
+    return make(layout.from_column(elements, full), full, union(flat))
+
+
+def _flatten(values: Any, flat: list[Expression]) -> Shape | None:
+    """Append the entries of nested sequences to ``flat``; return the shape, None if it is ragged."""
+    if not isinstance(values, (list, tuple)):
+        entry = as_expression(values)
+        flat.append(entry)
+        return entry.shape
+    shapes = {_flatten(v, flat) for v in values}
+    if not shapes:
+        return (0,)
+    inner = shapes.pop()
+    return None if shapes or inner is None else (len(values), *inner)
+
+
+def union(expressions: Sequence[Expression]) -> frozenset[Node]:
+    """Return the nodes of several expressions together."""
+    nodes = NO_NODES
+    for expression in expressions:
+        if expression._nodes:
+            nodes = nodes | expression._nodes if nodes else expression._nodes
+    return nodes
+
+
+def unary(op: int, operand: Expression) -> Expression:
+    """Apply an elementwise CasADi operation."""
+    return make(ca.SX.unary(op, operand._sx), operand._shape, operand._nodes)
+
+
+def binary(op: int, left: ExpressionLike, right: ExpressionLike) -> Expression:
+    """Apply an elementwise CasADi operation of two operands, with numpy's broadcasting."""
+    a, b = as_expression(left), as_expression(right)
+    if a._nodes:
+        nodes = a._nodes | b._nodes if b._nodes else a._nodes
+    else:
+        nodes = b._nodes
+    if a._shape == b._shape or not b._shape or not a._shape:
+        return make(ca.SX.binary(op, a._sx, b._sx), a._shape or b._shape, nodes)
+    a, b = broadcast(a, b)
+    return make(ca.SX.binary(op, a._sx, b._sx), a._shape, nodes)
+
+
+def broadcast(*operands: Expression) -> tuple[Expression, ...]:
+    """Bring operands to their common shape.
+
+    Raises
+    ------
+    ShapeError
+        Naming the shapes, if there is none.
+    """
+    try:
+        shape = np.broadcast_shapes(*(o.shape for o in operands))
+    except ValueError:
+        shapes = " and ".join(str(o.shape) for o in operands)
+        raise ShapeError(f"Shapes {shapes} cannot be broadcast together.") from None
+    return tuple(broadcast_to(o, shape) for o in operands)
+
+
+def broadcast_to(operand: Expression, shape: Shape) -> Expression:
+    """Repeat an operand to fill ``shape``."""
+    if operand.shape == shape:
+        return operand
+    try:
+        return operand._rearranged(np.broadcast_to(layout.indices(operand.shape), shape))
+    except ValueError:
+        raise ShapeError(f"An expression of shape {operand.shape} does not fit shape {shape}.") from None
+
+
+def floor_divide(left: ExpressionLike, right: ExpressionLike) -> Expression:
+    """Return the largest integer not greater than the quotient, elementwise."""
+    return unary(ca.OP_FLOOR, binary(ca.OP_DIV, left, right))
+
+
+def matmul(left: ExpressionLike, right: ExpressionLike) -> Expression:
+    """Return the matrix product with numpy's rules for vectors; at most two dimensions each."""
+    a, b = as_expression(left), as_expression(right)
+    if not 1 <= a.ndim <= 2 or not 1 <= b.ndim <= 2 or a.shape[-1] != b.shape[0]:
+        raise ShapeError(
+            f"Shapes {a.shape} and {b.shape} cannot be multiplied as matrices"
+            + ("; use * to scale by a number." if not a.ndim or not b.ndim else ".")
+        )
+    left_sx = a._sx.T if a.ndim == 1 else a._sx
+    return make(ca.mtimes(left_sx, b._sx), a.shape[:-1] + b.shape[1:], union((a, b)))

@@ -1,0 +1,286 @@
+"""Elementary functions of expressions; numpy's functions of the same names give the same.
+
+What has a kink is written so that its gradient stays finite wherever a derivative can be given: selections
+never multiply the branch that was not taken, and a norm has gradient 0 at the origin.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING
+
+import casadi as ca
+import numpy as np
+
+from ..errors import ShapeError
+from . import layout
+from .expression import Expression, ExpressionLike, as_expression, binary, broadcast, make, unary
+from .leaves import gradient_keys
+from .node import Node
+
+if TYPE_CHECKING:
+    from ..symbols import Symbol
+
+
+def sin(x: ExpressionLike) -> Expression:
+    """Return the sine, elementwise; x [rad]."""
+    return unary(ca.OP_SIN, as_expression(x))
+
+
+def cos(x: ExpressionLike) -> Expression:
+    """Return the cosine, elementwise; x [rad]."""
+    return unary(ca.OP_COS, as_expression(x))
+
+
+def tan(x: ExpressionLike) -> Expression:
+    """Return the tangent, elementwise; x [rad]."""
+    return unary(ca.OP_TAN, as_expression(x))
+
+
+def arcsin(x: ExpressionLike) -> Expression:
+    """Return the inverse sine in [-π/2, π/2] [rad]; its slope is infinite at ±1."""
+    return unary(ca.OP_ASIN, as_expression(x))
+
+
+def arccos(x: ExpressionLike) -> Expression:
+    """Return the inverse cosine in [0, π] [rad]; its slope is infinite at ±1."""
+    return unary(ca.OP_ACOS, as_expression(x))
+
+
+def arctan(x: ExpressionLike) -> Expression:
+    """Return the inverse tangent in (-π/2, π/2) [rad]."""
+    return unary(ca.OP_ATAN, as_expression(x))
+
+
+def arctan2(y: ExpressionLike, x: ExpressionLike) -> Expression:
+    """Return the angle of the point (x, y) in (-π, π] [rad]; at the origin it has no derivative (NaN)."""
+    return binary(ca.OP_ATAN2, y, x)
+
+
+def sinh(x: ExpressionLike) -> Expression:
+    """Return the hyperbolic sine, elementwise."""
+    return unary(ca.OP_SINH, as_expression(x))
+
+
+def cosh(x: ExpressionLike) -> Expression:
+    """Return the hyperbolic cosine, elementwise."""
+    return unary(ca.OP_COSH, as_expression(x))
+
+
+def tanh(x: ExpressionLike) -> Expression:
+    """Return the hyperbolic tangent, elementwise."""
+    return unary(ca.OP_TANH, as_expression(x))
+
+
+def arcsinh(x: ExpressionLike) -> Expression:
+    """Return the inverse hyperbolic sine, elementwise."""
+    return unary(ca.OP_ASINH, as_expression(x))
+
+
+def arccosh(x: ExpressionLike) -> Expression:
+    """Return the inverse hyperbolic cosine, elementwise."""
+    return unary(ca.OP_ACOSH, as_expression(x))
+
+
+def arctanh(x: ExpressionLike) -> Expression:
+    """Return the inverse hyperbolic tangent, elementwise."""
+    return unary(ca.OP_ATANH, as_expression(x))
+
+
+def exp(x: ExpressionLike) -> Expression:
+    """Return e to the power x, elementwise."""
+    return unary(ca.OP_EXP, as_expression(x))
+
+
+def log(x: ExpressionLike) -> Expression:
+    """Return the natural logarithm, elementwise."""
+    return unary(ca.OP_LOG, as_expression(x))
+
+
+def expm1(x: ExpressionLike) -> Expression:
+    """Return exp(x) - 1, accurate for small x."""
+    return unary(ca.OP_EXPM1, as_expression(x))
+
+
+def log1p(x: ExpressionLike) -> Expression:
+    """Return log(1 + x), accurate for small x."""
+    return unary(ca.OP_LOG1P, as_expression(x))
+
+
+def sqrt(x: ExpressionLike) -> Expression:
+    """Return the square root, elementwise; its slope is infinite at 0."""
+    return unary(ca.OP_SQRT, as_expression(x))
+
+
+def square(x: ExpressionLike) -> Expression:
+    """Return x², elementwise."""
+    return unary(ca.OP_SQ, as_expression(x))
+
+
+def absolute(x: ExpressionLike) -> Expression:
+    """Return |x|, elementwise; gradient 0 at 0."""
+    return unary(ca.OP_FABS, as_expression(x))
+
+
+def sign(x: ExpressionLike) -> Expression:
+    """Return -1, 0 or 1, elementwise; gradient 0."""
+    return unary(ca.OP_SIGN, as_expression(x))
+
+
+def floor(x: ExpressionLike) -> Expression:
+    """Return the largest integer not greater than x, elementwise; gradient 0."""
+    return unary(ca.OP_FLOOR, as_expression(x))
+
+
+def ceil(x: ExpressionLike) -> Expression:
+    """Return the smallest integer not less than x, elementwise; gradient 0."""
+    return unary(ca.OP_CEIL, as_expression(x))
+
+
+def copysign(x: ExpressionLike, y: ExpressionLike) -> Expression:
+    """Return |x| with the sign of y, elementwise."""
+    return binary(ca.OP_COPYSIGN, x, y)
+
+
+def where(condition: ExpressionLike, if_true: ExpressionLike, if_false: ExpressionLike) -> Expression:
+    """Select elementwise: ``if_true`` where the condition is at least 0.5, else ``if_false``.
+
+    A selection, not a blend: NaN in the branch that is not taken stays there, in the gradient as well. The
+    gradient carries no trend of the condition.
+    """
+    c, a, b = broadcast(as_expression(condition), as_expression(if_true), as_expression(if_false))
+    return Select.of((c, a, b), a.shape)
+
+
+def minimum(a: ExpressionLike, b: ExpressionLike) -> Expression:
+    """Return the smaller, elementwise; the gradient is that of the smaller one, the mean of both at a tie."""
+    x, y = broadcast(as_expression(a), as_expression(b))
+    return Extremum.of((x, y), x.shape, ("min",))
+
+
+def maximum(a: ExpressionLike, b: ExpressionLike) -> Expression:
+    """Return the larger, elementwise; the gradient is that of the larger one, the mean of both at a tie."""
+    x, y = broadcast(as_expression(a), as_expression(b))
+    return Extremum.of((x, y), x.shape, ("max",))
+
+
+def clip(x: ExpressionLike, lower: ExpressionLike, upper: ExpressionLike) -> Expression:
+    """Return x limited to [lower, upper], elementwise."""
+    return minimum(maximum(x, lower), upper)
+
+
+def norm(x: ExpressionLike) -> Expression:
+    """Return the Euclidean norm over all elements, a scalar; its gradient at the origin is 0."""
+    vector = as_expression(x).ravel()
+    if vector.size == 0:
+        raise ShapeError("The norm of an empty array is not defined here.")
+    return Norm.of((vector,), ())
+
+
+def hypot(a: ExpressionLike, b: ExpressionLike) -> Expression:
+    """Return √(a² + b²), elementwise; its gradient at the origin is 0."""
+    x, y = broadcast(as_expression(a), as_expression(b))
+    squares = square(x) + square(y)
+    return where(make(ca.SX.binary(ca.OP_LT, 0, squares._sx), squares.shape, squares._nodes), sqrt(squares), 0)
+
+
+def sum_along(x: ExpressionLike, axis: int | None = None) -> Expression:
+    """Return the sum over all elements, or along one axis."""
+    operand = as_expression(x)
+    if axis is None:
+        return make(ca.sum1(layout.column(operand._sx, operand.shape)), (), operand._nodes)
+    try:
+        moved = operand._rearranged(np.moveaxis(layout.indices(operand.shape), axis, 0))
+    except np.exceptions.AxisError:
+        raise ShapeError(f"Axis {axis} does not exist in an array of shape {operand.shape}.") from None
+    rest = moved.shape[1:]
+    rows = moved.reshape(moved.shape[0], -1)
+    return make(ca.sum1(rows._sx).T, (rows.shape[1],), operand._nodes).reshape(rest)
+
+
+def inverse(matrix: ExpressionLike) -> Expression:
+    """Return the inverse of a square matrix, ``D(A⁻¹) = -A⁻¹ D(A) A⁻¹``.
+
+    For homogeneous transforms use :func:`kineverse.spatial.inverse`, which is far smaller.
+    """
+    a = as_expression(matrix)
+    if a.ndim != 2 or a.shape[0] != a.shape[1]:
+        raise ShapeError(f"Only a square matrix has an inverse, not one of shape {a.shape}.")
+    return make(ca.inv(a._sx), a.shape, a._nodes)
+
+
+def determinant(matrix: ExpressionLike) -> Expression:
+    """Return the determinant of a square matrix, a scalar."""
+    a = as_expression(matrix)
+    if a.ndim != 2 or a.shape[0] != a.shape[1]:
+        raise ShapeError(f"Only a square matrix has a determinant, not one of shape {a.shape}.")
+    return make(ca.det(a._sx), (), a._nodes)
+
+
+class Select(Node):
+    """``where``: its arguments are condition and branches, all of the node's shape."""
+
+    __slots__ = ()
+    kind = "select"
+
+    def _value(self) -> Expression:
+        return self._choose(self.arguments[1], self.arguments[2])
+
+    def _choose(self, if_true: Expression, if_false: Expression) -> Expression:
+        condition = self.arguments[0]
+        chosen = ca.if_else(ca.SX.binary(ca.OP_LE, 0.5, condition._sx), if_true._sx, if_false._sx)
+        return make(chosen, self.shape, condition._nodes | if_true._nodes | if_false._nodes)
+
+    def _gradient(self, heuristic: bool) -> Mapping[Symbol, Expression]:
+        _, a, b = (argument.gradient(heuristic) for argument in self.arguments)
+        zero = as_expression(np.zeros(self.shape))
+        return {key: self._choose(a.get(key, zero), b.get(key, zero)) for key in {**a, **b}}
+
+    def gradient_keys(self, heuristic: bool) -> frozenset[Symbol]:
+        _, a, b = self.arguments
+        return gradient_keys(a, heuristic) | gradient_keys(b, heuristic)
+
+
+class Extremum(Node):
+    """``minimum`` and ``maximum`` of two arguments of the node's shape."""
+
+    __slots__ = ()
+    kind = "extremum"
+
+    @property
+    def label(self) -> str:
+        return f"{self.options[0]}imum"
+
+    def _value(self) -> Expression:
+        return binary(ca.OP_FMIN if self.options[0] == "min" else ca.OP_FMAX, *self.arguments)
+
+    def _gradient(self, heuristic: bool) -> Mapping[Symbol, Expression]:
+        x, y = self.arguments
+        first, second = (x, y) if self.options[0] == "min" else (y, x)
+        takes_x = binary(ca.OP_LT, first, second)
+        takes_y = binary(ca.OP_LT, second, first)
+        a, b = x.gradient(heuristic), y.gradient(heuristic)
+        zero = as_expression(np.zeros(self.shape))
+        result = {}
+        for key in {**a, **b}:
+            of_x, of_y = a.get(key, zero), b.get(key, zero)
+            tie = (of_x + of_y) / 2
+            result[key] = where(takes_x, of_x, where(takes_y, of_y, tie))
+        return result
+
+
+class Norm(Node):
+    """The Euclidean norm of one vector."""
+
+    __slots__ = ()
+    kind = "norm"
+
+    def _value(self) -> Expression:
+        (vector,) = self.arguments
+        return sqrt(make(ca.sumsqr(vector._sx), (), vector._nodes))
+
+    def _gradient(self, heuristic: bool) -> Mapping[Symbol, Expression]:
+        (vector,) = self.arguments
+        away = binary(ca.OP_LT, 0, self.value)
+        length = where(away, self.value, 1)
+        return {key: vector @ entry / length for key, entry in vector.gradient(heuristic).items()}

@@ -1,0 +1,237 @@
+"""Opaque nodes: values with a gradient of their own.
+
+A node stands in a CasADi graph as a symbol that nobody else owns. It knows its value and its D, so CasADi's
+partial derivatives and the chain rule give the gradient of everything built on it, at full speed, and the override
+belongs to the node: ``g(augmented) + h(a)`` keeps ``h'``. Nodes with equal content are the same object, so two
+equal augmentations cancel.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import math
+from abc import ABC, abstractmethod
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any, ClassVar
+from weakref import WeakValueDictionary
+
+import casadi as ca
+
+from ..errors import ExpressionError, ShapeError
+from . import layout
+from .expression import Expression, ExpressionLike, as_expression, broadcast_to, make
+from .leaves import free_symbols, gradient_keys
+
+if TYPE_CHECKING:
+    from ..symbols import Symbol
+    from .substitution import Substitution
+
+_INTERNED: WeakValueDictionary[bytes, Node] = WeakValueDictionary()
+
+
+class Node(ABC):
+    """A value with a gradient of its own; immutable, and interned by content.
+
+    Subclasses name their ``kind`` and say what they are worth (:meth:`_value`) and how they change
+    (:meth:`_gradient`), in terms of their ``arguments``.
+    """
+
+    __slots__ = ("__weakref__", "_gradients", "_value_cache", "arguments", "elements", "key", "options", "shape", "sx", "symbols")
+
+    kind: ClassVar[str]
+    arguments: tuple[Expression, ...]
+    options: tuple[Any, ...]
+
+    @classmethod
+    def of(cls, arguments: tuple[Expression, ...], shape: layout.Shape, options: tuple[Any, ...] = ()) -> Expression:
+        """Return the expression that is this node, made once for equal arguments and options."""
+        key = cls._content_key(arguments, shape, options)
+        node = _INTERNED.get(key)
+        if node is None:
+            node = cls.__new__(cls)
+            node._initialise(key, arguments, shape, options)
+            node = _INTERNED.setdefault(key, node)
+        return make(node.sx, node.shape, frozenset((node,)))
+
+    @classmethod
+    def _content_key(
+        cls, arguments: tuple[Expression, ...], shape: layout.Shape, options: tuple[Any, ...]
+    ) -> bytes:
+        digest = hashlib.blake2b(f"{cls.kind}{shape}{cls._options_key(options)}".encode(), digest_size=16)
+        for argument in arguments:
+            digest.update(argument.key)
+        return digest.digest()
+
+    @classmethod
+    def _options_key(cls, options: tuple[Any, ...]) -> str:
+        return repr(options)
+
+    def _initialise(
+        self, key: bytes, arguments: tuple[Expression, ...], shape: layout.Shape, options: tuple[Any, ...]
+    ) -> None:
+        self.key = key
+        self.arguments = arguments
+        self.options = options
+        self.shape = shape
+        # The name is part of what CasADi serialises, so it must be the same in every process.
+        self.sx = ca.SX.sym(key.hex(), *layout.rows_and_columns(shape))
+        self.elements = tuple(e.element_hash() for e in ca.symvar(self.sx))
+        self._value_cache: Expression | None = None
+        self._gradients: dict[bool, Mapping[Symbol, Expression]] = {}
+        self.symbols = frozenset(free_symbols(self.value))
+
+    @property
+    def size(self) -> int:
+        """The number of elements."""
+        return math.prod(self.shape)
+
+    @property
+    def label(self) -> str:
+        """What the node is called in print."""
+        return self.kind
+
+    @property
+    def value(self) -> Expression:
+        """What the node is worth."""
+        if self._value_cache is None:
+            self._value_cache = self._value()
+        return self._value_cache
+
+    def gradient(self, heuristic: bool) -> Mapping[Symbol, Expression]:
+        """Return D of the node, entries of its shape."""
+        known = self._gradients.get(heuristic)
+        if known is None:
+            known = self._gradients[heuristic] = {
+                key: entry for key, entry in self._gradient(heuristic).items() if not entry._sx.is_zero()
+            }
+        return known
+
+    def gradient_keys(self, heuristic: bool) -> frozenset[Symbol]:
+        """Return the keys that :meth:`gradient` can have, without computing entries where that is cheap."""
+        return frozenset().union(*(gradient_keys(a, heuristic) for a in self.arguments))
+
+    def depends_on(self, substitution: Substitution) -> bool:
+        """Whether value or gradient contain one of the symbols that are to be replaced."""
+        return any(
+            symbol in substitution for argument in self.arguments for symbol in free_symbols(argument)
+        )
+
+    def substitute(self, substitution: Substitution) -> Expression:
+        """Return the composition: the same kind of node over the substituted arguments."""
+        from .substitution import apply
+
+        return type(self).of(tuple(apply(a, substitution) for a in self.arguments), self.shape, self.options)
+
+    def __reduce__(self) -> Any:
+        return _restore, (type(self), self.arguments, self.shape, self.options)
+
+    def __repr__(self) -> str:
+        return f"<{self.kind} {self.shape}>"
+
+    @abstractmethod
+    def _value(self) -> Expression:
+        """Compute the value from the arguments."""
+
+    @abstractmethod
+    def _gradient(self, heuristic: bool) -> Mapping[Symbol, Expression]:
+        """Compute D from the arguments."""
+
+
+def _restore(
+    kind: type[Node], arguments: tuple[Expression, ...], shape: layout.Shape, options: tuple[Any, ...]
+) -> Node:
+    (node,) = kind.of(arguments, shape, options)._nodes
+    return node
+
+
+class Augment(Node):
+    """A value some of whose gradient entries are given: ``augment`` and ``with_gradient``.
+
+    The arguments are the value and the given entries, whose keys are in ``options`` together with
+    ``replace`` (nothing of the value's own gradient remains) and ``heuristic`` (the entries are trends).
+    """
+
+    __slots__ = ()
+    kind = "augment"
+
+    @property
+    def replace(self) -> bool:
+        """Whether the entries are the whole gradient."""
+        return bool(self.options[0])
+
+    @property
+    def heuristic(self) -> bool:
+        """Whether the entries are trends rather than facts."""
+        return bool(self.options[1])
+
+    @property
+    def entries(self) -> dict[Symbol, Expression]:
+        """The given entries."""
+        return dict(zip(self.options[2:], self.arguments[1:], strict=True))
+
+    @classmethod
+    def _options_key(cls, options: tuple[Any, ...]) -> str:
+        return repr((options[:2], [k.sort_key for k in options[2:]]))
+
+    def _value(self) -> Expression:
+        return self.arguments[0]
+
+    def _gradient(self, heuristic: bool) -> Mapping[Symbol, Expression]:
+        own = self.arguments[0].gradient(heuristic)
+        if self.heuristic and not heuristic:
+            return own
+        return self.entries if self.replace else {**own, **self.entries}
+
+    def gradient_keys(self, heuristic: bool) -> frozenset[Symbol]:
+        own = gradient_keys(self.arguments[0], heuristic)
+        if self.heuristic and not heuristic:
+            return own
+        return frozenset(self.entries) if self.replace else own | frozenset(self.entries)
+
+    def depends_on(self, substitution: Substitution) -> bool:
+        # An entry for ȧ is carried along D(S(a)) even where a itself does not occur.
+        return super().depends_on(substitution) or any(
+            a.has_derivative and a.derivative() in self.options[2:] for a in substitution
+        )
+
+    def substitute(self, substitution: Substitution) -> Expression:
+        from .substitution import apply, compose_gradient
+
+        # After composition an overridden ẇ may also be reached through a replaced symbol, so what was
+        # "override these, keep the rest" becomes the complete mapping, for facts and trends separately.
+        value = apply(self.arguments[0], substitution)
+        facts = compose_gradient(self.gradient(False), substitution, False)
+        trends = compose_gradient(self.gradient(True), substitution, True)
+        result = augment(value, facts, replace=True, heuristic=False)
+        if facts == trends:
+            return result
+        return augment(result, trends, replace=True, heuristic=True)
+
+
+def augment(
+    value: Expression, gradient: Mapping[Symbol, ExpressionLike], *, replace: bool, heuristic: bool
+) -> Expression:
+    """Return ``value`` with a gradient that is overridden or replaced, see :meth:`Expression.augment`."""
+    from ..symbols import Symbol
+
+    if not isinstance(gradient, Mapping):
+        raise ExpressionError("A gradient is a mapping from derivative symbols to expressions.")
+    entries: dict[Symbol, Expression] = {}
+    for key, entry in gradient.items():
+        if not isinstance(key, Symbol):
+            raise ExpressionError(f"{key!r} is not a symbol; write {{kv.velocity('path'): expression}}.")
+        if key.order < 1:
+            hint = f"'{key.derivative()}'" if key.has_derivative else "a velocity symbol"
+            raise ExpressionError(f"A gradient has derivative symbols as keys: {hint}, not '{key}'.")
+        try:
+            entries[key] = broadcast_to(as_expression(entry), value.shape)
+        except ShapeError:
+            raise ShapeError(
+                f"The entry of '{key}' has shape {as_expression(entry).shape}; the expression has {value.shape}."
+            ) from None
+    if not replace and not entries:
+        return value
+    if replace:
+        entries = {k: e for k, e in entries.items() if not e._sx.is_zero()}
+    keys = tuple(sorted(entries, key=lambda s: s.sort_key))
+    return Augment.of((value, *(entries[k] for k in keys)), value.shape, (replace, heuristic, *keys))

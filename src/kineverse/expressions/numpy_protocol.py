@@ -1,0 +1,181 @@
+"""numpy's functions on expressions: ``np.sin(e)``, ``np.stack([a, b])``, ``array + e`` and their kin.
+
+Functions that only rearrange elements are applied to arrays of indices, so numpy itself decides what they mean.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import casadi as ca
+import numpy as np
+
+from ..errors import ExpressionError, ShapeError
+from . import functions as f
+from . import layout
+from .expression import Expression, array, as_expression, binary, floor_divide, make, matmul, unary, union
+
+_UNARY_OPS = {
+    np.negative: ca.OP_NEG, np.sin: ca.OP_SIN, np.cos: ca.OP_COS, np.tan: ca.OP_TAN, np.arcsin: ca.OP_ASIN,
+    np.arccos: ca.OP_ACOS, np.arctan: ca.OP_ATAN, np.sinh: ca.OP_SINH, np.cosh: ca.OP_COSH, np.tanh: ca.OP_TANH,
+    np.arcsinh: ca.OP_ASINH, np.arccosh: ca.OP_ACOSH, np.arctanh: ca.OP_ATANH, np.exp: ca.OP_EXP,
+    np.log: ca.OP_LOG, np.sqrt: ca.OP_SQRT, np.square: ca.OP_SQ, np.absolute: ca.OP_FABS, np.fabs: ca.OP_FABS,
+    np.sign: ca.OP_SIGN, np.floor: ca.OP_FLOOR, np.ceil: ca.OP_CEIL, np.expm1: ca.OP_EXPM1, np.log1p: ca.OP_LOG1P,
+}  # fmt: skip
+
+_BINARY_OPS = {
+    np.add: ca.OP_ADD, np.subtract: ca.OP_SUB, np.multiply: ca.OP_MUL, np.true_divide: ca.OP_DIV,
+    np.power: ca.OP_POW, np.float_power: ca.OP_POW, np.arctan2: ca.OP_ATAN2, np.copysign: ca.OP_COPYSIGN,
+}  # fmt: skip
+
+_UFUNCS: dict[Any, Callable[..., Any]] = {
+    np.positive: as_expression,
+    np.floor_divide: floor_divide,
+    np.remainder: lambda a, b: as_expression(a) % b,
+    np.minimum: f.minimum,
+    np.fmin: f.minimum,
+    np.maximum: f.maximum,
+    np.fmax: f.maximum,
+    np.hypot: f.hypot,
+    np.matmul: matmul,
+    np.reciprocal: lambda a: 1 / as_expression(a),
+    np.less: lambda a, b: as_expression(a) < b,
+    np.less_equal: lambda a, b: as_expression(a) < b,
+    np.greater: lambda a, b: as_expression(a) > b,
+    np.greater_equal: lambda a, b: as_expression(a) > b,
+    np.logical_and: lambda a, b: as_expression(a) & b,
+    np.logical_or: lambda a, b: as_expression(a) | b,
+    np.logical_not: lambda a: ~as_expression(a),
+    np.bitwise_and: lambda a, b: as_expression(a) & b,
+    np.bitwise_or: lambda a, b: as_expression(a) | b,
+    np.invert: lambda a: ~as_expression(a),
+    np.deg2rad: lambda a: as_expression(a) * (np.pi / 180),
+    np.radians: lambda a: as_expression(a) * (np.pi / 180),
+    np.rad2deg: lambda a: as_expression(a) * (180 / np.pi),
+    np.degrees: lambda a: as_expression(a) * (180 / np.pi),
+    np.equal: lambda a, b: as_expression(a) == as_expression(b),
+    np.not_equal: lambda a, b: as_expression(a) != as_expression(b),
+}
+
+
+def apply_ufunc(ufunc: Any, method: str, inputs: tuple[Any, ...], options: Mapping[str, Any]) -> Any:
+    """Carry out a numpy ufunc on expressions.
+
+    Raises
+    ------
+    ExpressionError
+        For ufuncs, methods or options that have no counterpart.
+    """
+    if method == "reduce" and ufunc is np.add and not set(options) - {"axis"}:
+        return f.sum_along(inputs[0], options.get("axis", 0))
+    if options.get("out") is not None:
+        raise ExpressionError(f"np.{ufunc.__name__} cannot write expressions into an existing array of numbers.")
+    if method != "__call__" or options:
+        raise ExpressionError(f"np.{ufunc.__name__}.{method} with {sorted(options)} is not available for expressions.")
+    if ufunc in _UNARY_OPS:
+        return unary(_UNARY_OPS[ufunc], as_expression(inputs[0]))
+    if ufunc in _BINARY_OPS:
+        return binary(_BINARY_OPS[ufunc], *inputs)
+    if ufunc in _UFUNCS:
+        return _UFUNCS[ufunc](*inputs)
+    raise ExpressionError(f"np.{ufunc.__name__} is not available for expressions.")
+
+
+_REARRANGING = {
+    np.transpose, np.reshape, np.ravel, np.squeeze, np.expand_dims, np.moveaxis, np.swapaxes, np.flip, np.fliplr,
+    np.flipud, np.roll, np.tile, np.repeat, np.broadcast_to, np.diagonal, np.take, np.rot90, np.atleast_1d,
+    np.atleast_2d, np.atleast_3d,
+}  # fmt: skip
+
+_JOINING = {np.concatenate, np.stack, np.vstack, np.hstack, np.dstack, np.column_stack}
+
+
+def apply_function(function: Any, args: Sequence[Any], options: Mapping[str, Any]) -> Any:
+    """Carry out a numpy function on expressions.
+
+    Raises
+    ------
+    ExpressionError
+        If it is not available.
+    """
+    if function in _REARRANGING:
+        operand = as_expression(args[0])
+        try:
+            return operand._rearranged(np.asarray(function(layout.indices(operand.shape), *args[1:], **options)))
+        except (ValueError, IndexError) as error:
+            raise ShapeError(f"np.{function.__name__}: {error} (shape {operand.shape}).") from None
+    if function in _JOINING:
+        return _join(function, args[0], args[1:], options)
+    if function in _FUNCTIONS:
+        return _FUNCTIONS[function](*args, **options)
+    name = f"{getattr(function, '__module__', 'numpy')}.{function.__name__}"
+    raise ExpressionError(f"{name} is not available for expressions.")
+
+
+def _join(function: Any, parts: Sequence[Any], args: Sequence[Any], options: Mapping[str, Any]) -> Expression:
+    operands = [as_expression(p) for p in parts]
+    offset, numbered = 0, []
+    for operand in operands:
+        numbered.append(layout.indices(operand.shape) + offset)
+        offset += operand.size
+    try:
+        index = function(numbered, *args, **options)
+    except ValueError as error:
+        raise ShapeError(f"np.{function.__name__}: {error}.") from None
+    elements = ca.vertcat(*(layout.column(o._sx, o.shape) for o in operands))
+    return make(layout.gather(elements, (offset,), index), index.shape, union(operands))
+
+
+def _trace(a: Any) -> Expression:
+    return f.sum_along(np.diagonal(a))  # type: ignore[arg-type]
+
+
+def _cross(a: Any, b: Any) -> Expression:
+    x, y = as_expression(a), as_expression(b)
+    if x.shape != (3,) or y.shape != (3,):
+        raise ShapeError(f"The cross product is one of two 3-vectors, not of shapes {x.shape} and {y.shape}.")
+    return array([x[1] * y[2] - x[2] * y[1], x[2] * y[0] - x[0] * y[2], x[0] * y[1] - x[1] * y[0]])
+
+
+def _dot(a: Any, b: Any) -> Expression:
+    x, y = as_expression(a), as_expression(b)
+    return x * y if not x.ndim or not y.ndim else matmul(x, y)
+
+
+def _norm(x: Any, ord: Any = None, axis: int | None = None) -> Expression:  # noqa: A002 - numpy's name
+    if ord not in (None, 2, "fro") or axis is not None or (ord == 2 and as_expression(x).ndim > 1):
+        raise ExpressionError("Of norms, the Euclidean one over all elements is available.")
+    return f.norm(x)
+
+
+def _product(a: Any, axis: None = None) -> Expression:
+    result = as_expression(1.0)
+    for element in as_expression(a).ravel():
+        result = result * element
+    return result
+
+
+_FUNCTIONS: dict[Any, Callable[..., Any]] = {
+    np.where: f.where,
+    np.clip: lambda a, lower, upper: f.clip(a, lower, upper),
+    np.sum: lambda a, axis=None: f.sum_along(a, axis),
+    np.mean: lambda a, axis=None: f.sum_along(a, axis)
+    / (as_expression(a).size if axis is None else as_expression(a).shape[axis]),
+    np.prod: _product,
+    np.trace: _trace,
+    np.dot: _dot,
+    np.inner: _dot,
+    np.vdot: _dot,
+    np.outer: lambda a, b: as_expression(a).reshape(-1, 1) * as_expression(b).reshape(1, -1),
+    np.cross: _cross,
+    np.linalg.norm: _norm,
+    np.linalg.inv: f.inverse,
+    np.linalg.det: f.determinant,
+    np.shape: lambda a: as_expression(a).shape,
+    np.ndim: lambda a: as_expression(a).ndim,
+    np.size: lambda a: as_expression(a).size,
+    np.zeros_like: lambda a: as_expression(np.zeros(as_expression(a).shape)),
+    np.ones_like: lambda a: as_expression(np.ones(as_expression(a).shape)),
+    np.array_equal: lambda a, b: as_expression(a) == as_expression(b),
+}

@@ -1,0 +1,170 @@
+"""Expressions as text and as LaTeX, always of bounded length."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import casadi as ca
+
+from .expression import SYMBOLS, Expression
+from .layout import SX, column
+
+if TYPE_CHECKING:
+    from ..symbols import Symbol
+    from .node import Node
+
+_LIMIT = 400
+_ELEMENTS = 16
+_DEPTH = 24
+
+_INFIX = {ca.OP_ADD: ("+", 1), ca.OP_SUB: ("-", 1), ca.OP_MUL: ("*", 2), ca.OP_DIV: ("/", 2)}
+_COMPARISONS = {ca.OP_LT: "<", ca.OP_LE: "<=", ca.OP_EQ: "==", ca.OP_NE: "!=", ca.OP_AND: "and", ca.OP_OR: "or"}
+_POWERS = (ca.OP_POW, ca.OP_CONSTPOW)
+_FUNCTIONS = {
+    ca.OP_SQRT: "sqrt", ca.OP_SIN: "sin", ca.OP_COS: "cos", ca.OP_TAN: "tan", ca.OP_ASIN: "arcsin",
+    ca.OP_ACOS: "arccos", ca.OP_ATAN: "arctan", ca.OP_ATAN2: "arctan2", ca.OP_SINH: "sinh", ca.OP_COSH: "cosh",
+    ca.OP_TANH: "tanh", ca.OP_ASINH: "arcsinh", ca.OP_ACOSH: "arccosh", ca.OP_ATANH: "arctanh", ca.OP_EXP: "exp",
+    ca.OP_LOG: "log", ca.OP_FABS: "abs", ca.OP_SIGN: "sign", ca.OP_FLOOR: "floor", ca.OP_CEIL: "ceil",
+    ca.OP_FMIN: "minimum", ca.OP_FMAX: "maximum", ca.OP_IF_ELSE_ZERO: "if_else_zero", ca.OP_NOT: "not",
+    ca.OP_EXPM1: "expm1", ca.OP_LOG1P: "log1p", ca.OP_COPYSIGN: "copysign", ca.OP_HYPOT: "hypot",
+}  # fmt: skip
+
+
+def text(expression: Expression) -> str:
+    """Return a bounded, readable form: the formula of a scalar, shape and first elements of an array."""
+    writer = _Writer(expression)
+    elements = column(expression._sx, expression.shape)
+    if not expression.shape:
+        return writer.bounded(elements)
+    shown = [writer.bounded(elements[i]) for i in range(min(expression.size, _ELEMENTS))]
+    body = ", ".join(shown)
+    if len(body) > _LIMIT or expression.size > _ELEMENTS:
+        body = f"{body[:_LIMIT]} ..."
+    return f"Expression{expression.shape}[{body}]"
+
+
+def latex(expression: Expression) -> str:
+    """Return LaTeX: ``\\dot{a}`` for velocities, matrices up to 6×6 written out."""
+    writer = _Latex(expression)
+    if not expression.shape:
+        return writer.bounded(expression._sx)
+    rows, columns = expression._sx.shape
+    if rows > 6 or columns > 6:
+        return rf"\text{{Expression of shape }} {expression.shape}".replace("(", r"\left(").replace(")", r"\right)")
+    lines = [" & ".join(writer.bounded(expression._sx[i, j]) for j in range(columns)) for i in range(rows)]
+    return r"\begin{bmatrix}" + r" \\ ".join(lines) + r"\end{bmatrix}"
+
+
+class _Writer:
+    """Writes one scalar after another, giving up politely on large ones."""
+
+    ellipsis = "..."
+
+    def __init__(self, expression: Expression) -> None:
+        self.owners: dict[int, tuple[Node, int]] = {}
+        for node in expression._nodes:
+            for i, element in enumerate(node.elements):
+                self.owners[element] = (node, i)
+        self.left = _LIMIT
+
+    def bounded(self, element: SX) -> str:
+        self.left = _LIMIT
+        written = self.write(element, 0)
+        return written if len(written) <= _LIMIT else f"{written[:_LIMIT]}{self.ellipsis}"
+
+    def write(self, element: SX, depth: int, strength: int = 0) -> str:
+        self.left -= 1
+        if depth > _DEPTH or self.left < 0:
+            return self.ellipsis
+        if element.nnz() == 0:
+            return "0"
+        if element.is_constant():
+            return self.number(float(element))
+        if element.is_symbolic():
+            return self.leaf(element)
+        operation = element.op()
+        operands = [element.dep(i) for i in range(element.n_dep())]
+        if operation in _INFIX:
+            return self.infix(operation, operands, depth, strength)
+        if operation == ca.OP_SQ:
+            operands.append(ca.SX(2))
+        elif operation == ca.OP_TWICE:
+            return self.infix(ca.OP_MUL, [ca.SX(2), operands[0]], depth, strength)
+        elif operation == ca.OP_INV:
+            return self.infix(ca.OP_DIV, [ca.SX(1), operands[0]], depth, strength)
+        elif operation == ca.OP_NEG:
+            written = f"-{self.write(operands[0], depth + 1, 2)}"
+            return self.grouped(written) if strength > 1 else written
+        if operation in (*_POWERS, ca.OP_SQ):
+            return self.power(operands, depth)
+        if operation in _COMPARISONS:
+            a, b = (self.write(o, depth + 1, 1) for o in operands)
+            return self.grouped(f"{a} {_COMPARISONS[operation]} {b}")
+        return self.call(_FUNCTIONS.get(operation, f"op{operation}"), [self.write(o, depth + 1) for o in operands])
+
+    def infix(self, operation: int, operands: list[SX], depth: int, strength: int) -> str:
+        sign, own = _INFIX[operation]
+        stronger = own + (operation in (ca.OP_SUB, ca.OP_DIV))
+        a, b = self.write(operands[0], depth + 1, own), self.write(operands[1], depth + 1, stronger)
+        written = self.join(sign, a, b)
+        return self.grouped(written) if own < strength else written
+
+    def join(self, sign: str, a: str, b: str) -> str:
+        return f"{a}{sign}{b}" if sign in "*/" else f"{a} {sign} {b}"
+
+    def power(self, operands: list[SX], depth: int) -> str:
+        return f"{self.write(operands[0], depth + 1, 3)}**{self.write(operands[1], depth + 1, 3)}"
+
+    def number(self, value: float) -> str:
+        return repr(int(value)) if value == int(value) and abs(value) < 1e6 else f"{value:.6g}"
+
+    def grouped(self, written: str) -> str:
+        return f"({written})"
+
+    def call(self, name: str, arguments: list[str]) -> str:
+        return f"{name}({', '.join(arguments)})"
+
+    def leaf(self, element: SX) -> str:
+        symbol = SYMBOLS.get(element.element_hash())
+        if symbol is not None:
+            return self.symbol(symbol)
+        node, index = self.owners[element.element_hash()]
+        suffix = f"[{index}]" if node.shape else ""
+        if self.left < 40 or any(a.shape for a in node.arguments):
+            return self.call(node.kind, [self.ellipsis]) + suffix
+        nested = [type(self)(a).bounded(a._sx) for a in node.arguments if not a.shape]
+        return self.call(node.label, nested) + suffix
+
+    def symbol(self, symbol: Symbol) -> str:
+        return str(symbol)
+
+
+class _Latex(_Writer):
+    ellipsis = r"\dots"
+
+    def join(self, sign: str, a: str, b: str) -> str:
+        return {"*": f"{a} \\, {b}", "/": f"\\frac{{{a}}}{{{b}}}"}.get(sign, f"{a} {sign} {b}")
+
+    def power(self, operands: list[SX], depth: int) -> str:
+        return f"{{{self.write(operands[0], depth + 1, 3)}}}^{{{self.write(operands[1], depth + 1)}}}"
+
+    def grouped(self, written: str) -> str:
+        return rf"\left({written}\right)"
+
+    def call(self, name: str, arguments: list[str]) -> str:
+        return rf"\operatorname{{{name}}}\left({', '.join(arguments)}\right)"
+
+    def symbol(self, symbol: Symbol) -> str:
+        name = _escaped(symbol.path)
+        if symbol.order == 0:
+            return name
+        if symbol.order <= 4:
+            return rf"\{'d' * symbol.order}ot{{{name}}}"
+        return rf"{name}^{{({symbol.order})}}"
+
+
+def _escaped(path: str) -> str:
+    if len(path) == 1:
+        return path
+    table: dict[str, Any] = {"_": r"\_", "%": r"\%", "&": r"\&", "#": r"\#", "{": r"\{", "}": r"\}", "\\": r"\backslash "}
+    return r"\mathrm{" + "".join(table.get(c, c) for c in path) + "}"

@@ -1,0 +1,48 @@
+"""Structural identity of expressions, and packing them for another process.
+
+Both use CasADi's own serialisation of a function whose inputs are the leaves in canonical order. It is
+exact to the last bit; it is for pickling between like versions only, documents have their own form.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from typing import Any
+
+import casadi as ca
+
+from .expression import Expression, make
+from .layout import SX, Shape
+from .leaves import leaves
+
+
+def structural_key(expression: Expression) -> bytes:
+    """Return a digest of shape, leaves and graph; equal for equal structure, in every process."""
+    if expression._key is None:
+        symbols, nodes = leaves(expression)
+        digest = hashlib.blake2b(repr((expression._shape, [s.sort_key for s in symbols])).encode(), digest_size=16)
+        for node in nodes:
+            digest.update(node.key)
+        shared = ca.cse(ca.densify(expression._sx))
+        digest.update(_function(shared, [*(s._sx for s in symbols), *(n.sx for n in nodes)]).serialize().encode())
+        expression._key = digest.digest()
+    return expression._key
+
+
+def pack(expression: Expression) -> tuple[Any, ...]:
+    """Return what :func:`unpack` needs, all of it picklable."""
+    symbols, nodes = leaves(expression)
+    function = _function(expression._sx, [*(s._sx for s in symbols), *(n.sx for n in nodes)])
+    return symbols, nodes, expression._shape, function.serialize()
+
+
+def unpack(symbols: tuple[Any, ...], nodes: tuple[Any, ...], shape: Shape, graph: str) -> Expression:
+    """Rebuild an expression from :func:`pack`."""
+    leaf = [*(s._sx for s in symbols), *(n.sx for n in nodes)]
+    sx = ca.Function.deserialize(graph)(ca.vertcat(*map(ca.vec, leaf)) if leaf else ca.SX(0, 1))
+    return make(sx, tuple(shape), frozenset(nodes))
+
+
+def _function(sx: SX, leaf: list[SX]) -> Any:
+    stacked = ca.vertcat(*map(ca.vec, leaf)) if leaf else ca.SX(0, 1)
+    return ca.Function("e", [stacked], [sx])

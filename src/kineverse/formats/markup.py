@@ -1,0 +1,221 @@
+"""XML text to light elements that remember their line, with every limit that keeps hostile text harmless.
+
+An element is a plain tuple ``(tag, attributes, children, line)``: a file of 10^5 links becomes as many tuples
+in linear time. Document types, and with them all declarations of entities, are refused, so nothing expands
+and nothing is fetched. Nesting and size are bounded. Text between elements is dropped.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import NoReturn, TypeAlias
+from xml.parsers import expat
+
+from kineverse.errors import FormatError
+
+MAX_BYTES = 1 << 28
+"""The largest document that is read [byte]: 256 MiB, some hundred times the largest robot we have met."""
+
+MAX_DEPTH = 200
+"""The deepest nesting of elements that is read. A URDF needs 5, however long its kinematic chains are."""
+
+Element: TypeAlias = "tuple[str, dict[str, str], list[Element], int]"
+"""Tag, attributes, children, line."""
+
+Visit: TypeAlias = Callable[[Element], None]
+Begin: TypeAlias = Callable[[Element], Visit]
+
+
+class ElementError(Exception):
+    """What is wrong with an element, on its way to the reader that knows the file; no user ever sees it."""
+
+    def __init__(self, element: Element, message: str):
+        super().__init__(message)
+        self.element = element
+        self.message = message
+
+
+def load(path: Path) -> bytes:
+    """Return the bytes of a file.
+
+    Raises
+    ------
+    FormatError
+        If there is no such file, it cannot be read, or it is larger than ``MAX_BYTES``.
+    """
+    try:
+        with path.open("rb") as file:
+            data = file.read(MAX_BYTES + 1)
+    except FileNotFoundError:
+        near = sorted(p.name for p in path.parent.glob(f"*{path.suffix}"))[:8] if path.parent.is_dir() else []
+        hint = f"The folder has: {', '.join(near)}." if near else "Check the path."
+        raise FormatError(f"{path}: there is no such file. {hint}") from None
+    except OSError as error:
+        reason = "it is a folder" if path.is_dir() else error.strerror or str(error)
+        raise FormatError(f"{path}: cannot be read: {reason}.") from error
+    if len(data) > MAX_BYTES:
+        raise FormatError(f"{path}: larger than {MAX_BYTES} bytes, the most that is read of one file.")
+    return data
+
+
+def parse(
+    data: str | bytes, source: str, skipped: frozenset[str] = frozenset(), begin: Begin | None = None
+) -> Element:
+    """Parse a document and return its root element.
+
+    Parameters
+    ----------
+    data
+        The document. Bytes are decoded as XML says (byte order mark, declaration, else UTF-8).
+    source
+        The name of the document in error messages.
+    skipped
+        Children of the root with these tags are passed over.
+    begin
+        Called with the root as soon as it opens; what it returns is called with each child of the root as
+        soon as that is complete. The children are then not kept: a long document takes no more memory than
+        its longest part.
+
+    Raises
+    ------
+    FormatError
+        If the text is not well-formed XML, declares a document type or entities, nests deeper than
+        ``MAX_DEPTH`` or is larger than ``MAX_BYTES``.
+    """
+    if len(data) > MAX_BYTES:
+        raise FormatError(f"{source}: larger than {MAX_BYTES} bytes, the most that is read of one document.")
+    parser = expat.ParserCreate()
+    document: list[Element] = []
+    open_lists = [document]
+    skipped_depth = 0
+    visit: Visit | None = None
+
+    def start_root(tag: str, attributes: dict[str, str]) -> None:
+        nonlocal visit
+        parser.StartElementHandler = start
+        start(tag, attributes)
+        if begin is not None:
+            visit = begin(document[0])
+            parser.EndElementHandler = end_visiting
+
+    # These run for every element of the file: they do nothing that could wait.
+    def start(tag: str, attributes: dict[str, str]) -> None:
+        if tag in skipped and len(open_lists) == 2:
+            parser.StartElementHandler, parser.EndElementHandler = start_skipped, end_skipped
+            return
+        children: list[Element] = []
+        open_lists[-1].append((tag, attributes, children, parser.CurrentLineNumber))
+        open_lists.append(children)
+        if len(open_lists) > MAX_DEPTH:
+            refuse_depth(tag)
+
+    def end(tag: str) -> None:
+        open_lists.pop()
+
+    def end_visiting(tag: str) -> None:
+        open_lists.pop()
+        if len(open_lists) == 2:
+            visit(open_lists[1].pop())  # type: ignore[misc]  # set before this can be called
+
+    def start_skipped(tag: str, attributes: dict[str, str]) -> None:
+        nonlocal skipped_depth
+        skipped_depth += 1
+        if skipped_depth > MAX_DEPTH:
+            refuse_depth(tag)
+
+    def end_skipped(tag: str) -> None:
+        nonlocal skipped_depth
+        if skipped_depth:
+            skipped_depth -= 1
+        else:
+            parser.StartElementHandler = start
+            parser.EndElementHandler = end if visit is None else end_visiting
+
+    def refuse_depth(tag: str) -> NoReturn:
+        raise FormatError(
+            f"{source}, line {parser.CurrentLineNumber}, <{abbreviate(tag)}>: elements are nested more than "
+            f"{MAX_DEPTH} deep; no robot description needs that."
+        )
+
+    def refuse_doctype(name: str, *_: object) -> None:
+        raise FormatError(
+            f"{source}, line {parser.CurrentLineNumber}, <!DOCTYPE {abbreviate(name)}>: document types and "
+            "entities are refused, since they can expand without bound or read other files. Remove the "
+            "declaration and write out what its entities stand for."
+        )
+
+    parser.StartElementHandler, parser.EndElementHandler = start_root, end
+    parser.StartDoctypeDeclHandler = refuse_doctype
+    try:
+        parser.Parse(data, True)
+    except expat.ExpatError as error:
+        raise FormatError(_describe(error, source, document, len(open_lists) - 1)) from None
+    except (ValueError, LookupError) as error:
+        if document:
+            raise
+        # An encoding that expat cannot have, or a str with lone surrogates.
+        raise FormatError(f"{source}, line 1: cannot be decoded: {error}. Save it as UTF-8.") from None
+    return document[0]
+
+
+def label(element: Element) -> str:
+    """Return an element as its opening tag, with its name if it has one, for messages."""
+    tag, attributes, _, _ = element
+    name = attributes.get("name")
+    return f"<{abbreviate(tag)}>" if name is None else f"<{abbreviate(tag)} name={quote(name)}>"
+
+
+def quote(text: str) -> str:
+    """Return a name in quotes, for messages."""
+    return f'"{abbreviate(text)}"'
+
+
+def abbreviate(text: str, limit: int = 80) -> str:
+    """Return text for a message: on one line, printable and bounded."""
+    shown = text if len(text) <= limit else text[: limit - 1] + "…"
+    return shown if shown.isprintable() else shown.encode("unicode_escape").decode("ascii")
+
+
+_CODES = expat.errors.codes
+_CUT_OFF = {_CODES[m] for m in (expat.errors.XML_ERROR_NO_ELEMENTS, expat.errors.XML_ERROR_UNCLOSED_TOKEN)}
+_DECLARATION = {_CODES[m] for m in (expat.errors.XML_ERROR_XML_DECL, expat.errors.XML_ERROR_MISPLACED_XML_PI)}
+_HINTS = {
+    _CODES[
+        expat.errors.XML_ERROR_XML_DECL
+    ]: 'The first line must read <?xml version="1.0"?>, or be left out.',
+    _CODES[expat.errors.XML_ERROR_MISPLACED_XML_PI]: (
+        "Nothing, not even an empty line, may come before <?xml ...?>: remove what does."
+    ),
+    _CODES[expat.errors.XML_ERROR_UNDEFINED_ENTITY]: (
+        "Only &lt; &gt; &amp; &quot; &apos; and character numbers are known."
+    ),
+    _CODES[
+        expat.errors.XML_ERROR_INVALID_TOKEN
+    ]: "A character is where none can be; & and < are written &amp; and &lt;.",
+    _CODES[expat.errors.XML_ERROR_TAG_MISMATCH]: "The closing tag is not that of the element.",
+    _CODES[expat.errors.XML_ERROR_DUPLICATE_ATTRIBUTE]: "Keep one of the two attributes.",
+    _CODES[
+        expat.errors.XML_ERROR_JUNK_AFTER_DOC_ELEMENT
+    ]: "Remove what comes after the end of the root element.",
+    _CODES[expat.errors.XML_ERROR_UNKNOWN_ENCODING]: "Save the file as UTF-8.",
+}
+
+
+def _describe(error: expat.ExpatError, source: str, document: list[Element], depth: int) -> str:
+    """Return the message for text that is not XML: the line, the open element, the reason, what to do."""
+    innermost: Element | None = None
+    children = document
+    for _ in range(depth):
+        innermost = children[-1]
+        children = innermost[2]
+    if innermost is not None:
+        inside = f", in {label(innermost)} of line {innermost[3]}"
+    else:
+        inside = "" if document else ", <?xml ...?>" if error.code in _DECLARATION else ", before any element"
+    if error.code in _CUT_OFF:
+        hint = "The text is cut off."
+    else:
+        hint = _HINTS.get(error.code, "" if document else "Is this XML at all?")
+    where = f"{source}, line {error.lineno}, column {error.offset + 1}{inside}"
+    return f"{where}: not well-formed XML: {expat.ErrorString(error.code)}. {hint}".rstrip()

@@ -1,0 +1,70 @@
+"""Numbers as robot descriptions write them: decimal text, one or several, finite.
+
+Descriptions repeat themselves ("0 0 0" by the hundred), so the results are remembered.
+"""
+
+from __future__ import annotations
+
+import math
+from functools import lru_cache
+
+_MAX_LENGTH = 1000
+
+
+@lru_cache(maxsize=8192)
+def number(text: str) -> float:
+    """Return the one finite number that the text spells.
+
+    Raises
+    ------
+    ValueError
+        With the reason, if the text is anything else.
+    """
+    return _read(text, 1)[0]
+
+
+@lru_cache(maxsize=8192)
+def numbers(text: str, count: int) -> tuple[float, ...]:
+    """Return the ``count`` finite numbers that the text spells, separated by white space.
+
+    Raises
+    ------
+    ValueError
+        With the reason, if the text is anything else.
+    """
+    return _read(text, count)
+
+
+def _read(text: str, count: int) -> tuple[float, ...]:
+    if len(text) > _MAX_LENGTH:
+        raise ValueError(f"is {len(text)} characters long, where {_expected(count)}")
+    words = text.split()
+    if len(words) != count:
+        found = {0: "is empty", 1: "is one word"}.get(len(words), f"has {len(words)} words")
+        raise ValueError(f"{found}, where {_expected(count)}{_hint(text)}")
+    return tuple([_number(word, count) for word in words])
+
+
+def _number(word: str, count: int) -> float:
+    # Python reads more than a description may say: digits grouped by underscores and those of other scripts.
+    if "_" in word or not word.isascii():
+        raise ValueError(f"has {word!r}, where {_expected(count)}")
+    try:
+        value = float(word)
+    except ValueError:
+        raise ValueError(f"has {word!r}, where {_expected(count)}{_hint(word)}") from None
+    if not math.isfinite(value):
+        raise ValueError(f"has {word!r}, where {_expected(count)}; leave a limit out if there is none")
+    return value
+
+
+def _expected(count: int) -> str:
+    return "a finite number is expected" if count == 1 else f"{count} finite numbers are expected"
+
+
+def _hint(text: str) -> str:
+    if "${" in text or "$(" in text:
+        return "; this is xacro, expand it first: xacro robot.urdf.xacro > robot.urdf"
+    if "," in text:
+        return "; numbers are separated by spaces and have a decimal point"
+    return ""

@@ -1,0 +1,88 @@
+"""The attributes of an element as names, numbers and poses.
+
+Every function raises :class:`ElementError` for what is missing or malformed; the reader adds file and line.
+"""
+
+from __future__ import annotations
+
+from typing import TypeVar
+
+from kineverse.formats import numerals, rpy
+from kineverse.formats.markup import Element, ElementError, abbreviate
+from kineverse.model.body import Pose, Vector3
+
+T = TypeVar("T")
+
+_ZERO = (0.0, 0.0, 0.0)
+_IDENTITY = Pose()
+
+
+def name_of(element: Element) -> str:
+    """Return the name of an element, which must have one."""
+    name = element[1].get("name")
+    if not name:
+        raise ElementError(
+            element, "has no name; names are required." if name is None else "has an empty name."
+        )
+    return name
+
+
+def number(element: Element, key: str, default: float | None = None) -> float:
+    """Return a number; without a default, the attribute is required."""
+    text = element[1].get(key)
+    if text is None:
+        return _default(element, key, default)
+    try:
+        return numerals.number(text)
+    except ValueError as error:
+        raise ElementError(element, f'{key}="{abbreviate(text)}" {error}.') from None
+
+
+def vector(element: Element, key: str, default: Vector3 | None = None) -> Vector3:
+    """Return three numbers; without a default, the attribute is required."""
+    text = element[1].get(key)
+    if text is None:
+        return _default(element, key, default)
+    try:
+        return numerals.numbers(text, 3)  # type: ignore[return-value]  # as many as asked for
+    except ValueError as error:
+        raise ElementError(element, f'{key}="{abbreviate(text)}" {error}.') from None
+
+
+def _default(element: Element, key: str, default: T | None) -> T:
+    if default is None:
+        raise ElementError(element, f"has no {key}; the specification requires it.")
+    return default
+
+
+def pose(origin: Element | None, version: tuple[int, int]) -> Pose:
+    """Return the pose an ``<origin>`` gives; identity without one.
+
+    URDF 1.1 brought ``quat_xyzw`` as another way to say ``rpy``. In a file of version 1.0 it is an error
+    rather than, as elsewhere, passed over: the orientation would be lost without a word.
+    """
+    if origin is None:
+        return _IDENTITY
+    xyz = vector(origin, "xyz", _ZERO)
+    quaternion = origin[1].get("quat_xyzw")
+    if quaternion is None:
+        return rpy.pose_of(xyz, vector(origin, "rpy", _ZERO))
+    if version < (1, 1):
+        raise ElementError(
+            origin,
+            'has quat_xyzw, which came with URDF 1.1. Write <robot version="1.1" ...>, or rpy instead.',
+        )
+    if "rpy" in origin[1]:
+        raise ElementError(origin, "has both rpy and quat_xyzw; keep one of them.")
+    try:
+        return rpy.pose_of_quaternion(xyz, numerals.numbers(quaternion, 4))
+    except ValueError as error:
+        raise ElementError(origin, f'quat_xyzw="{abbreviate(quaternion)}" {error}.') from None
+
+
+def child(element: Element, tag: str) -> Element | None:
+    """Return the first child with that tag, or None."""
+    for candidate in element[2]:
+        if candidate[0] == tag:
+            return candidate
+    return None

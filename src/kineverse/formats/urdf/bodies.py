@@ -1,0 +1,151 @@
+"""``<link>`` elements to links: inertia, shapes to see, shapes to touch.
+
+Specification: http://wiki.ros.org/urdf/XML/link, and urdf.xsd of ros/urdfdom for defaults. Shapes and their
+colours decide nothing about where links are: a shape that cannot be said here is left out with a remark. A
+malformed number in one is still an error.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from kineverse.formats.markup import Element, ElementError, label
+from kineverse.formats.urdf.attributes import child, name_of, number, pose, vector
+from kineverse.formats.urdf.description import Link
+from kineverse.formats.urdf.materials import Materials
+from kineverse.formats.urdf.remarks import Remarks
+from kineverse.model.body import Body, Box, Capsule, Cylinder, Geometry, Inertia, Mesh, Shape, Sphere
+
+_UNSCALED = (1.0, 1.0, 1.0)
+_NOTHING = Body()
+
+
+class LinkReader:
+    """Reads the links of one document.
+
+    Parameters
+    ----------
+    folder
+        Where the document lies; meshes remember it, to be found when somebody needs them.
+    version
+        Of the specification that the document claims to follow.
+    remarks
+        What is noticed goes here.
+    """
+
+    def __init__(self, folder: str, version: tuple[int, int], remarks: Remarks):
+        self.materials = Materials(remarks)
+        self._folder = folder
+        self._version = version
+        self._remarks = remarks
+        self._uncoloured: list[tuple[str, int, Element, Element]] = []
+
+    def read(self, element: Element) -> Link:
+        """Return the link an element describes.
+
+        Raises
+        ------
+        ElementError
+            If something is missing, malformed or without meaning.
+        """
+        name = name_of(element)
+        visuals: list[Shape] = []
+        collisions: list[Shape] = []
+        inertia: Inertia | None = None
+        for part in element[2]:
+            tag = part[0]
+            if tag == "visual":
+                shape = self._shape(part, element, name, len(visuals))
+                if shape is not None:
+                    visuals.append(shape)
+            elif tag == "collision":
+                shape = self._shape(part, element)
+                if shape is not None:
+                    collisions.append(shape)
+            elif tag == "inertial":
+                if inertia is None:
+                    inertia = self._inertia(part, element)
+                else:
+                    self._remarks.add(part, "is ignored: another one came first.", element)
+        if not visuals and not collisions and inertia is None:
+            return Link(name, _NOTHING, element[3])
+        return Link(name, Body(tuple(visuals), tuple(collisions), inertia), element[3])
+
+    def colour(self, links: dict[str, Link]) -> None:
+        """Give shapes the materials that were only named before they were defined."""
+        for name, index, material, element in self._uncoloured:
+            color, texture = self.materials.appearance_at_last(material, element)
+            link = links[name]
+            visuals = list(link.body.visuals)
+            visuals[index] = replace(visuals[index], color=color, texture=texture)
+            links[name] = replace(link, body=replace(link.body, visuals=tuple(visuals)))
+
+    def _shape(self, element: Element, link: Element, name: str = "", index: int = -1) -> Shape | None:
+        """Return a shape; the colour is looked at if an index among the visuals of the link is given."""
+        origin = geometry = material = None
+        for part in element[2]:
+            tag = part[0]
+            if tag == "origin":
+                origin = origin or part
+            elif tag == "geometry":
+                geometry = geometry or part
+            elif tag == "material":
+                material = material or part
+        form = self._geometry(geometry, element, link)
+        if form is None:
+            return None
+        place, own_name = pose(origin, self._version), element[1].get("name", "")
+        if material is None or index < 0:
+            return Shape(form, place, own_name)
+        appearance = self.materials.appearance(material, link)
+        if appearance is None:
+            self._uncoloured.append((name, index, material, link))
+            return Shape(form, place, own_name)
+        return Shape(form, place, own_name, *appearance)
+
+    def _geometry(self, geometry: Element | None, shape: Element, link: Element) -> Geometry | None:
+        if geometry is None or not geometry[2]:
+            self._remarks.add(geometry or shape, "says no shape and is left out.", link)
+            return None
+        form = geometry[2][0]
+        tag = form[0]
+        if tag == "mesh":
+            return self._mesh(form)
+        if tag == "box":
+            x, y, z = vector(form, "size")
+            if min(x, y, z) < 0.0:
+                raise ElementError(form, "has a negative size.")
+            return Box((x, y, z))
+        if tag == "sphere":
+            return Sphere(_length(form, "radius"))
+        if tag == "cylinder":
+            return Cylinder(_length(form, "radius"), _length(form, "length"))
+        if tag == "capsule":
+            return Capsule(_length(form, "radius"), _length(form, "length"))
+        self._remarks.add(form, f"is not a shape of URDF; the {label(shape)} is left out.", link)
+        return None
+
+    def _mesh(self, mesh: Element) -> Mesh:
+        uri = mesh[1].get("filename")
+        if not uri:
+            raise ElementError(mesh, "has no filename; the specification requires it.")
+        return Mesh(uri, vector(mesh, "scale", _UNSCALED), self._folder)
+
+    def _inertia(self, inertial: Element, link: Element) -> Inertia:
+        mass_element, tensor = child(inertial, "mass"), child(inertial, "inertia")
+        mass = 0.0 if mass_element is None else number(mass_element, "value", 0.0)
+        if mass < 0.0:
+            self._remarks.add(inertial, f"has the negative mass {mass!r}, which is kept as it is.", link)
+        origin = pose(child(inertial, "origin"), self._version)
+        if tensor is None:
+            return Inertia(mass, (0.0, 0.0, 0.0, 0.0, 0.0, 0.0), origin)
+        ixx, ixy, ixz = (number(tensor, "ixx", 0.0), number(tensor, "ixy", 0.0), number(tensor, "ixz", 0.0))
+        iyy, iyz, izz = (number(tensor, "iyy", 0.0), number(tensor, "iyz", 0.0), number(tensor, "izz", 0.0))
+        return Inertia(mass, (ixx, ixy, ixz, iyy, iyz, izz), origin)
+
+
+def _length(form: Element, key: str) -> float:
+    value = number(form, key)
+    if value < 0.0:
+        raise ElementError(form, f"has a negative {key}.")
+    return value

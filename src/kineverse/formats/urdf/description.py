@@ -1,0 +1,137 @@
+"""A robot as a URDF describes it, checked and resolved, before anything symbolic is made of it.
+
+Units are [m], [rad], [kg], [s]. A description is plain immutable data: nothing in it refers to the file any
+more but line numbers, and no mesh has been opened.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal, TypeAlias
+
+from kineverse.model.body import Body, Pose, Vector3
+
+Kind: TypeAlias = Literal["fixed", "revolute", "continuous", "prismatic", "planar", "floating"]
+
+FREEDOM: dict[Kind, int] = {
+    "fixed": 0,
+    "revolute": 1,
+    "continuous": 1,
+    "prismatic": 1,
+    "planar": 3,
+    "floating": 6,
+}
+"""How many independent speeds a joint of each kind has, unless it mimics another."""
+
+_IDENTITY = Pose()
+_NOTHING = Body()
+
+
+@dataclass(frozen=True, slots=True)
+class Limits:
+    """Bounds of one joint; None is no bound.
+
+    ``lower`` and ``upper`` bound the position [rad] or [m], ``velocity`` the magnitude of the speed [rad/s]
+    or [m/s], ``effort`` that of the torque [N m] or force [N].
+    """
+
+    lower: float | None = None
+    upper: float | None = None
+    velocity: float | None = None
+    effort: float | None = None
+
+
+UNLIMITED = Limits()
+
+
+@dataclass(frozen=True, slots=True)
+class Safety:
+    """What the controller of a joint keeps to, within its limits.
+
+    The speed is kept between ``-k_position (q - soft_lower)`` and ``-k_position (q - soft_upper)``, so that
+    a joint slows down towards the soft limits and is led back from beyond them (ROS wiki,
+    pr2_controller_manager/safety_limits). ``k_position`` [1/s] of 0 bounds nothing. ``k_velocity`` [N s/m] or
+    [N m s/rad] bounds the effort in the same manner around the velocity limit.
+    """
+
+    soft_lower: float = 0.0
+    soft_upper: float = 0.0
+    k_position: float = 0.0
+    k_velocity: float = 0.0
+
+
+@dataclass(frozen=True, slots=True)
+class Mimic:
+    """A position that follows another joint: ``multiplier * joint + offset``.
+
+    A chain is resolved: ``joint`` is the one at its end that moves by itself, and the factors are composed.
+    """
+
+    joint: str
+    multiplier: float = 1.0
+    offset: float = 0.0
+
+
+@dataclass(frozen=True, slots=True)
+class Dynamics:
+    """Damping [N s/m] or [N m s/rad] and static friction [N] or [N m] of a joint."""
+
+    damping: float = 0.0
+    friction: float = 0.0
+
+
+FRICTIONLESS = Dynamics()
+
+
+@dataclass(frozen=True, slots=True)
+class Joint:
+    """A joint between two links.
+
+    ``origin`` is parent_T_joint, the pose of the child link in the parent link at position zero. ``axis`` is
+    a unit vector in the joint's frame: of rotation, of translation, or the normal of the plane; None for
+    joints that have none. ``limits``, ``safety``, ``mimic`` and ``dynamics`` only have meaning for joints of
+    one DoF.
+    """
+
+    name: str
+    kind: Kind
+    parent: str
+    child: str
+    origin: Pose = _IDENTITY
+    axis: Vector3 | None = None
+    limits: Limits = UNLIMITED
+    safety: Safety | None = None
+    mimic: Mimic | None = None
+    dynamics: Dynamics = FRICTIONLESS
+    line: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class Link:
+    """A link: a frame, and what is attached to it."""
+
+    name: str
+    body: Body = _NOTHING
+    line: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class Robot:
+    """A tree of links and joints.
+
+    ``links`` are in the order of the file; ``joints`` lead from the ``root`` outwards, so that a joint comes
+    after the one that moves its parent. ``remarks`` say what was ignored, or read in a way its author may not
+    have meant; each names its line.
+    """
+
+    name: str
+    root: str
+    links: tuple[Link, ...]
+    joints: tuple[Joint, ...]
+    source: str = ""
+    remarks: tuple[str, ...] = ()
+
+    @property
+    def dof(self) -> int:
+        """The number of independent speeds; joints that mimic another have none of their own."""
+        return sum(FREEDOM[joint.kind] for joint in self.joints if joint.mimic is None)

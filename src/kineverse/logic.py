@@ -1,0 +1,184 @@
+"""Continuous boolean logic (2020 paper, III-C and Eq. 4).
+
+Values lie in [0, 1]. Every node has two kinds of derivative: as a *fact* it is locally constant, and its *trend* says
+in which direction to move for it to become true. Trends are what ``gradient()`` gives; ``gradient(heuristic=False)``
+leaves them out.
+
+For operands ``v_i`` with trends ``D_i``, ``P = Π v_i`` and ``Q = Π (1 - v_i)``:
+
+=========  ==================  ==========================
+node       value               trend
+=========  ==================  ==========================
+less(φ,ψ)  (1+tanh((ψ-φ)R))/2  D(ψ) - D(φ)
+not        1 - v               -D
+and        P                   Σ (1 - v_i + P)·D_i
+or         1 - Q               Σ (v_i + Q)·D_i
+=========  ==================  ==========================
+
+The trend of ``and`` is the product rule where at most one operand is false and the plain sum where all are, where
+the product rule would be blind; it leaves alone what already holds, and is dual to that of ``or`` under De Morgan. ``a * b``
+and ``1 - a`` keep the product rule, as the papers write them; ``&`` and ``~`` are the ones to use for locks.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from functools import reduce
+from typing import ClassVar
+
+import casadi as ca
+
+from .errors import ExpressionError, ValueRejectedError
+from .expressions.expression import Expression, ExpressionLike, as_expression, broadcast
+from .expressions.functions import tanh
+from .expressions.leaves import gradient_keys
+from .expressions.node import Node
+from .symbols import Symbol
+
+CONTRAST = 1e10
+
+
+def less(a: ExpressionLike, b: ExpressionLike, contrast: float = CONTRAST) -> Expression:
+    """Return the truth of a < b: 1 or 0, and 0.5 at equality.
+
+    Parameters
+    ----------
+    a, b
+        What is compared, elementwise.
+    contrast
+        R, per unit: the value changes within about 1/R around equality.
+    """
+    if not contrast > 0 or contrast == float("inf"):
+        raise ValueRejectedError(f"The contrast is a positive number, not {contrast!r}.")
+    x, y = broadcast(as_expression(a), as_expression(b))
+    return Less.of((x, y), x.shape, (float(contrast),))
+
+
+def logic_not(a: ExpressionLike) -> Expression:
+    """Return the truth of "not a"; also ``~a``."""
+    operand = as_expression(a)
+    return Not.of((operand,), operand.shape)
+
+
+def logic_and(*operands: ExpressionLike) -> Expression:
+    """Return the truth of "all of them"; also ``a & b``."""
+    return _joined(And, operands)
+
+
+def logic_or(*operands: ExpressionLike) -> Expression:
+    """Return the truth of "at least one of them"; also ``a | b``."""
+    return _joined(Or, operands)
+
+
+def _joined(kind: type[_Joined], operands: tuple[ExpressionLike, ...]) -> Expression:
+    if not operands:
+        raise ExpressionError(f"'{kind.kind}' needs at least one operand.")
+    flat: list[Expression] = []
+    for operand in operands:
+        expression = as_expression(operand)
+        # (a & b) & c is a & b & c: the trend is defined over all operands together.
+        inner = _is_only(expression, kind)
+        flat.extend(inner.arguments if inner is not None else (expression,))
+    shaped = broadcast(*flat)
+    return kind.of(shaped, shaped[0].shape)
+
+
+def _is_only(expression: Expression, kind: type[Node]) -> Node | None:
+    """Return the node if the expression is nothing but one node of this kind."""
+    if len(expression._nodes) != 1:
+        return None
+    (node,) = expression._nodes
+    if type(node) is kind and node.shape == expression.shape and ca.is_equal(expression._sx, node.sx):
+        return node
+    return None
+
+
+class _Logic(Node):
+    """Nodes whose gradient is a trend and nothing else."""
+
+    __slots__ = ()
+    symbol: ClassVar[str]
+
+    def _gradient(self, heuristic: bool) -> Mapping[Symbol, Expression]:
+        return self._trend() if heuristic else {}
+
+    def gradient_keys(self, heuristic: bool) -> frozenset[Symbol]:
+        if not heuristic:
+            return frozenset()
+        return frozenset().union(*(gradient_keys(a) for a in self.arguments))
+
+    def _trend(self) -> Mapping[Symbol, Expression]:
+        raise NotImplementedError
+
+
+class Less(_Logic):
+    """The truth of one expression being less than another."""
+
+    __slots__ = ()
+    kind = "less"
+
+    def _value(self) -> Expression:
+        a, b = self.arguments
+        return (1 + tanh((b - a) * self.options[0])) / 2
+
+    def _trend(self) -> Mapping[Symbol, Expression]:
+        a, b = self.arguments
+        return weighted_sum([(-1, a.gradient()), (1, b.gradient())])
+
+
+class Not(_Logic):
+    """Negation."""
+
+    __slots__ = ()
+    kind = "not"
+
+    def _value(self) -> Expression:
+        return 1 - self.arguments[0]
+
+    def _trend(self) -> Mapping[Symbol, Expression]:
+        return weighted_sum([(-1, self.arguments[0].gradient())])
+
+
+class _Joined(_Logic):
+    """Conjunction and disjunction."""
+
+    __slots__ = ()
+
+
+class And(_Joined):
+    """Conjunction of any number of operands."""
+
+    __slots__ = ()
+    kind = "and"
+
+    def _value(self) -> Expression:
+        return reduce(lambda a, b: a * b, self.arguments)
+
+    def _trend(self) -> Mapping[Symbol, Expression]:
+        return weighted_sum([(1 - v + self.value, v.gradient()) for v in self.arguments])
+
+
+class Or(_Joined):
+    """Disjunction of any number of operands."""
+
+    __slots__ = ()
+    kind = "or"
+
+    def _value(self) -> Expression:
+        return 1 - self._all_false()
+
+    def _all_false(self) -> Expression:
+        return reduce(lambda a, b: a * b, [1 - v for v in self.arguments])
+
+    def _trend(self) -> Mapping[Symbol, Expression]:
+        return weighted_sum([(v + self._all_false(), v.gradient()) for v in self.arguments])
+
+
+def weighted_sum(terms: list[tuple[ExpressionLike, Mapping[Symbol, Expression]]]) -> dict[Symbol, Expression]:
+    """Return ``Σ weight·gradient`` over the union of keys."""
+    result: dict[Symbol, Expression] = {}
+    for weight, gradient in terms:
+        for key, entry in gradient.items():
+            term = weight * entry
+            result[key] = result[key] + term if key in result else term
+    return result

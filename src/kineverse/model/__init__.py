@@ -1,0 +1,40 @@
+"""Layer 3: the model, its data and constraints, and the operations it is made of."""
+
+from .articulation import Articulation
+from .body import Body, Box, Capsule, Cylinder, Inertia, Mesh, Pose, Shape, Sphere
+from .constraint import Constraint
+from .diff import Change, Diff
+from .edit import Edit
+from .frame import WORLD, Frame
+from .model import Model, Snapshot
+from .operation import Effects, Operation
+from .rates import Rates
+from .reader import Reader
+from .violations import Violation, Violations
+
+__all__ = [
+    "WORLD",
+    "Articulation",
+    "Body",
+    "Box",
+    "Capsule",
+    "Change",
+    "Constraint",
+    "Cylinder",
+    "Diff",
+    "Edit",
+    "Effects",
+    "Frame",
+    "Inertia",
+    "Mesh",
+    "Model",
+    "Operation",
+    "Pose",
+    "Rates",
+    "Reader",
+    "Shape",
+    "Snapshot",
+    "Sphere",
+    "Violation",
+    "Violations",
+]

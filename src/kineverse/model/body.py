@@ -1,0 +1,113 @@
+"""What a frame carries: shapes to look at, shapes to touch, and mass.
+
+Everything here is plain immutable data in the units [m], [kg] and [kg m²]. Meshes are references; no file
+is opened before somebody asks for it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, TypeAlias
+
+import numpy as np
+import numpy.typing as npt
+
+Vector3: TypeAlias = tuple[float, float, float]
+Rgba: TypeAlias = tuple[float, float, float, float]
+
+
+@dataclass(frozen=True, slots=True)
+class Pose:
+    """A constant rigid transform, stored as the 12 numbers of its first three rows."""
+
+    rows: tuple[float, ...] = (1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0)
+
+    @staticmethod
+    def of(matrix: npt.ArrayLike) -> Pose:
+        """Build a pose from a 4×4 homogeneous matrix."""
+        return Pose(tuple(np.asarray(matrix, dtype=float)[:3].ravel().tolist()))
+
+    @property
+    def matrix(self) -> npt.NDArray[Any]:
+        """The 4×4 homogeneous matrix; a fresh array on every access."""
+        matrix = np.eye(4)
+        matrix[:3] = np.reshape(self.rows, (3, 4))
+        return matrix
+
+
+@dataclass(frozen=True, slots=True)
+class Box:
+    """A box centred at its origin; ``size`` are the full edge lengths along x, y, z [m]."""
+
+    size: Vector3
+
+
+@dataclass(frozen=True, slots=True)
+class Cylinder:
+    """A cylinder around z, centred at its origin; radius and length [m]."""
+
+    radius: float
+    length: float
+
+
+@dataclass(frozen=True, slots=True)
+class Capsule:
+    """A capsule around z, centred; ``length`` is that of the cylindrical part [m]."""
+
+    radius: float
+    length: float
+
+
+@dataclass(frozen=True, slots=True)
+class Sphere:
+    """A sphere around its origin; radius [m]."""
+
+    radius: float
+
+
+@dataclass(frozen=True, slots=True)
+class Mesh:
+    """A reference to a mesh file.
+
+    ``uri`` is what the description says (``package://...``, ``file://...`` or a path), ``folder`` the folder
+    of the file that said so, from which it is resolved when somebody needs the triangles.
+    """
+
+    uri: str
+    scale: Vector3 = (1.0, 1.0, 1.0)
+    folder: str = ""
+
+
+Geometry: TypeAlias = Box | Cylinder | Capsule | Sphere | Mesh
+
+
+@dataclass(frozen=True, slots=True)
+class Shape:
+    """A piece of geometry at a pose in the frame of its body, with a colour if it is meant to be seen."""
+
+    geometry: Geometry
+    origin: Pose = Pose()
+    name: str = ""
+    color: Rgba | None = None
+    texture: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Inertia:
+    """Mass [kg] and rotational inertia [kg m²] about the centre of mass, in axes given by ``origin``.
+
+    ``tensor`` is (ixx, ixy, ixz, iyy, iyz, izz); ``origin`` places the centre of mass in the body's frame.
+    """
+
+    mass: float
+    tensor: tuple[float, float, float, float, float, float]
+    origin: Pose = Pose()
+
+
+@dataclass(frozen=True, slots=True)
+class Body:
+    """Everything physical that is attached to one frame."""
+
+    visuals: tuple[Shape, ...] = ()
+    collisions: tuple[Shape, ...] = ()
+    inertia: Inertia | None = None

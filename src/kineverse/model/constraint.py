@@ -1,0 +1,88 @@
+"""Constraints: ``lower <= expression <= upper`` (2022 paper, III-A2)."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING, TypeAlias
+
+from ..errors import ShapeError, ValueRejectedError
+from ..expressions.expression import Expression, ExpressionLike, as_expression
+from ..expressions.leaves import gradient_keys
+
+if TYPE_CHECKING:
+    from ..symbols import Symbol
+
+ConstraintLike: TypeAlias = "Constraint | Sequence[ExpressionLike]"
+
+
+@dataclass(frozen=True)
+class Constraint:
+    """A dual inequality between scalars; the bounds may be expressions, ±infinity means unbounded.
+
+    What is limited shows in the symbols of ``expression``: positions, velocities, or several of them.
+    """
+
+    lower: Expression
+    expression: Expression
+    upper: Expression
+
+    @staticmethod
+    def of(lower: ExpressionLike, expression: ExpressionLike, upper: ExpressionLike) -> Constraint:
+        """Build a constraint from expressions and numbers.
+
+        Raises
+        ------
+        ShapeError
+            If one of the three is not a scalar.
+        ValueRejectedError
+            If the expression is constant, or constant bounds leave nothing between them, or one is NaN.
+        """
+        parts = []
+        for part, name in ((lower, "lower bound"), (expression, "expression"), (upper, "upper bound")):
+            checked = as_expression(part)
+            if checked.shape:
+                raise ShapeError(f"The {name} of a constraint is a scalar, not of shape {checked.shape}.")
+            parts.append(checked)
+        low, middle, high = parts
+        if not middle.symbols:
+            raise ValueRejectedError(
+                f"The constrained expression ({middle!r}) depends on no symbol. The order is lower, expression, upper."
+            )
+        if not low.symbols and not high.symbols:
+            a, b = float(low), float(high)
+            if a > b or a == math.inf or b == -math.inf:
+                raise ValueRejectedError(f"No value lies between the lower bound {a:g} and the upper bound {b:g}.")
+        return Constraint(low, middle, high)
+
+    @cached_property
+    def symbols(self) -> tuple[Symbol, ...]:
+        """All free symbols, those of the bounds included; sorted."""
+        found = {*self.lower.symbols, *self.expression.symbols, *self.upper.symbols}
+        return tuple(sorted(found, key=lambda s: s.sort_key))
+
+    @property
+    def order(self) -> int:
+        """The highest order of a symbol in the expression: 0 limits positions, 1 speeds."""
+        return max(s.order for s in self.expression.symbols)
+
+
+def as_constraint(value: ConstraintLike) -> Constraint:
+    """Return a constraint given as such or as a triple (lower, expression, upper)."""
+    if isinstance(value, Constraint):
+        return value
+    if isinstance(value, Expression) or not isinstance(value, Sequence) or len(value) != 3:
+        raise ValueRejectedError(f"A constraint is a triple (lower, expression, upper), not {value!r}.")
+    return Constraint.of(*value)
+
+
+def coordinates(*expressions: Expression) -> frozenset[str]:
+    """Return the paths of all symbols of expressions, and of every key of their gradients."""
+    paths: set[str] = set()
+    for expression in expressions:
+        paths.update(s.path for s in expression.symbols)
+        if expression._nodes:
+            paths.update(s.path for s in gradient_keys(expression))
+    return frozenset(paths)

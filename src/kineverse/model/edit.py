@@ -1,0 +1,243 @@
+"""Editing a model: a transaction that happens whole or not at all."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from ..errors import EditError
+from ..expressions.expression import ExpressionLike
+from ..symbols import Symbol
+from .body import Body
+from .constraint import Constraint
+from .frame import Frame, TransformLike
+from .history import History
+from .operation import Effects, Operation
+from .rates import Row, as_row
+from .reader import Reader
+
+
+@dataclass(frozen=True)
+class AddFrame(Operation):
+    """Places a frame in its parent, with what it carries."""
+
+    name: str
+    frame: Frame
+    body: Body | None = None
+
+    def apply(self, model: Reader) -> Effects:
+        """Write the frame, and its body if there is one."""
+        bodies = {} if self.body is None else {self.name: self.body}
+        return Effects(frames={self.name: self.frame}, bodies=bodies)
+
+    def default_tag(self) -> str:
+        """Return ``frame`` and the name."""
+        return f"frame {self.name}"
+
+
+@dataclass(frozen=True)
+class Constrain(Operation):
+    """Adds a constraint."""
+
+    name: str
+    constraint: Constraint
+
+    def apply(self, model: Reader) -> Effects:
+        """Write the constraint."""
+        return Effects(constraints={self.name: self.constraint})
+
+    def default_tag(self) -> str:
+        """Return ``constraint`` and the name."""
+        return f"constraint {self.name}"
+
+
+@dataclass(frozen=True)
+class SetRate(Operation):
+    """Says how a coordinate moves with speeds."""
+
+    coordinate: Symbol
+    row: Row
+
+    def apply(self, model: Reader) -> Effects:
+        """Write the row."""
+        return Effects(rates={self.coordinate: dict(self.row)})
+
+    def default_tag(self) -> str:
+        """Return ``rate`` and the coordinate."""
+        return f"rate {self.coordinate}"
+
+
+@dataclass(frozen=True)
+class Write(Operation):
+    """Stores data."""
+
+    name: str
+    value: Any
+
+    def apply(self, model: Reader) -> Effects:
+        """Write the value."""
+        return Effects(data={self.name: self.value})
+
+    def default_tag(self) -> str:
+        """Return ``data`` and the name."""
+        return f"data {self.name}"
+
+
+@dataclass(frozen=True)
+class Attach(Operation):
+    """Puts an existing frame, with everything below it, into another parent."""
+
+    name: str
+    frame: Frame
+
+    def apply(self, model: Reader) -> Effects:
+        """Write the frame anew."""
+        if self.name not in model.frames:
+            model.frames[self.name]  # raises, with similar names
+        return Effects(frames={self.name: self.frame})
+
+    def default_tag(self) -> str:
+        """Return ``attach``, the frame and its new parent."""
+        return f"attach {self.name} to {self.frame.parent}"
+
+
+class Edit:
+    """A transaction on a model; made by :meth:`Model.edit`, used in a ``with`` block.
+
+    Leaving the block commits, an exception leaves the model as it was. Reading the model inside the block shows the
+    edit so far; other threads wait.
+    """
+
+    def __init__(self, history: History) -> None:
+        self._history = history
+        self._open = True
+        self._added: dict[str, None] = {}
+        self._removed: dict[str, None] = {}
+        self._replaced: dict[str, None] = {}
+
+    # -- operations ----------------------------------------------------------------------------------------
+
+    def apply(self, operation: Operation, tag: str | None = None) -> str:
+        """Append an operation; returns its tag.
+
+        Raises
+        ------
+        NameTakenError
+            If the tag, or the name of one of its constraints, is taken.
+        EditError
+            If the operation raises something that is not an error of this package; those pass as they are.
+        """
+        chosen = self._tag(operation, tag)
+        self._changing().append(chosen, operation)
+        return self._note_added(chosen)
+
+    def insert(
+        self,
+        operation: Operation,
+        tag: str | None = None,
+        *,
+        before: str | None = None,
+        after: str | None = None,
+        to_affect: str | None = None,
+    ) -> str:
+        """Insert an operation before or after another one; returns its tag.
+
+        Parameters
+        ----------
+        operation, tag
+            What is inserted under which tag.
+        before, after
+            Tag of a neighbour.
+        to_affect
+            Tag of an operation, or name of a frame (then of the operation that last wrote it): the new one is put right
+            before it, so that everything it reads from the new one reaches it (2022 paper, III-A3).
+        """
+        if sum(x is not None for x in (before, after, to_affect)) != 1:
+            raise EditError("Say where to insert: exactly one of before=, after= and to_affect=.")
+        history = self._changing()
+        if to_affect is not None:
+            before = to_affect
+            writers = history.cells.get(("frames", to_affect))
+            if to_affect not in history.entries and writers:
+                before = writers[-1].tag
+        index = history.index(before) if before is not None else history.index(str(after)) + 1
+        chosen = self._tag(operation, tag)
+        history.insert(chosen, operation, index)
+        return self._note_added(chosen)
+
+    def replace(self, tag: str, operation: Operation) -> None:
+        """Exchange an operation at its place and under its tag; what depends on it is run again."""
+        self._changing().replace(tag, operation)
+        if tag not in self._added:
+            self._replaced[tag] = None
+
+    def remove(self, tag: str) -> None:
+        """Take an operation out, with its constraints and everything else it wrote."""
+        self._changing().remove(tag)
+        self._replaced.pop(tag, None)
+        if tag in self._added:
+            del self._added[tag]
+        else:
+            self._removed[tag] = None
+
+    # -- shorthands ----------------------------------------------------------------------------------------
+
+    def add_frame(
+        self,
+        name: str,
+        parent: str,
+        transform: TransformLike | Sequence[TransformLike],
+        body: Body | None = None,
+        tag: str | None = None,
+    ) -> str:
+        """Place a frame in its parent by a 4×4 transform parent_T_frame, or a sequence of them (their product)."""
+        return self.apply(AddFrame(name, Frame.of(parent, transform), body), tag)
+
+    def constrain(
+        self, name: str, lower: ExpressionLike, expression: ExpressionLike, upper: ExpressionLike, tag: str | None = None
+    ) -> str:
+        """Require ``lower <= expression <= upper``; all three are scalars, bounds may be expressions or ±inf."""
+        return self.apply(Constrain(name, Constraint.of(lower, expression, upper)), tag)
+
+    def set_rate(self, coordinate: Symbol, row: Mapping[Symbol, ExpressionLike], tag: str | None = None) -> str:
+        """Say that the coordinate's rate is ``Σ expression·speed`` over the row."""
+        return self.apply(SetRate(coordinate, as_row(coordinate, row)), tag)
+
+    def attach(
+        self, frame: str, parent: str, transform: TransformLike | Sequence[TransformLike], tag: str | None = None
+    ) -> str:
+        """Put an existing frame, with everything below it, into another parent: something is picked up."""
+        return self.apply(Attach(frame, Frame.of(parent, transform)), tag)
+
+    def write(self, name: str, value: Any, tag: str | None = None) -> str:
+        """Store an immutable value under ``data``."""
+        return self.apply(Write(name, value), tag)
+
+    def include(self, source: Any, prefix: str | None = None) -> list[str]:
+        """Append the operations of a file or shipped model; returns their tags. See :func:`kineverse.load`."""
+        from ..formats import operations_of
+
+        return [self.apply(operation, tag) for tag, operation in operations_of(source, prefix)]
+
+    # -- inside --------------------------------------------------------------------------------------------
+
+    def _tag(self, operation: Operation, tag: str | None) -> str:
+        if tag is not None:
+            return tag
+        if not isinstance(operation, Operation):
+            raise EditError(f"{operation!r} is not an operation; subclass kv.Operation as a frozen dataclass.")
+        return operation.default_tag()
+
+    def _changing(self) -> History:
+        if not self._open:
+            raise EditError("This edit is over; start another one with model.edit().")
+        return self._history
+
+    def _note_added(self, tag: str) -> str:
+        if tag in self._removed:
+            del self._removed[tag]
+            self._replaced[tag] = None
+        else:
+            self._added[tag] = None
+        return tag

@@ -1,0 +1,416 @@
+"""The sequence of operations and its fold, kept up to date by recorded reads.
+
+Every operation has a place in the sequence. A read is resolved at the reader's place: by the last writer before
+it. When what a writer wrote changes, exactly the operations whose reads resolve to it are run again, in
+order, and it stops where writes come out equal. Every change can be undone until it is committed.
+"""
+
+from __future__ import annotations
+
+import heapq
+from bisect import bisect_left, insort
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
+from operator import attrgetter
+from typing import Any
+
+from ..errors import EditError, KineverseError, ModelError, NameTakenError, UnknownNameError, suggest
+from .frame import WORLD, Frame
+from .kinematics import ancestors
+from .operation import CONSTRAINTS, FRAMES, KINDS, Effects, Operation
+from .reader import ABSENT, Cell, Read, Reader, Reads, missing
+
+_GAP = 1 << 32
+_PLACE = attrgetter("place")
+
+
+class Entry:
+    """An operation at its place, with what its last run read and wrote; never changed, only exchanged."""
+
+    __slots__ = ("operation", "place", "reads", "tag", "writes")
+
+    def __init__(self, tag: str, operation: Operation, place: int, reads: Reads, writes: dict[Cell, Any]) -> None:
+        self.tag = tag
+        self.operation = operation
+        self.place = place
+        self.reads = reads
+        self.writes = writes
+
+
+class History:
+    """Operations, cells and readers; the heart of a model. Not thread-safe by itself."""
+
+    def __init__(self, entries: Iterable[Entry] = ()) -> None:
+        self.entries: dict[str, Entry] = {}
+        self.sequence: list[Entry] = []
+        self.cells: dict[Cell, list[Entry]] = {}
+        self.head: dict[str, dict[str, Any]] = {kind: {} for kind in KINDS}
+        self.reading: dict[Cell, dict[str, Read]] = {}
+        self.listing: dict[str, set[str]] = {kind: set() for kind in KINDS}
+        self.runs = 0
+        self._undo: list[tuple[Callable[..., Any], tuple[Any, ...]]] = []
+        self._before: dict[Cell, Any] = {}
+        self._events: list[tuple[Cell, Any, Any]] = []
+        self._dirty: list[tuple[int, str]] = []
+        self._moved_frames: set[str] = set()
+        for entry in entries:
+            self._link(entry)
+        self.begin()
+
+    # -- questions -----------------------------------------------------------------------------------------
+
+    @property
+    def tags(self) -> list[str]:
+        """The tags in order of application."""
+        return [entry.tag for entry in self.sequence]
+
+    def writers(self, path: str) -> list[str]:
+        """Return the tags that write a path such as ``frames/kitchen/door``, in order."""
+        return [e.tag for e in self.cells.get(as_cell(path), [])]
+
+    def readers(self, path: str) -> list[str]:
+        """Return the tags that read a path, in order."""
+        cell = as_cell(path)
+        tags = [*self.reading.get(cell, ()), *self.listing.get(cell[0], ())]
+        return sorted(set(tags), key=lambda t: self.entries[t].place)
+
+    def entry(self, tag: str) -> Entry:
+        """Return the entry of a tag.
+
+        Raises
+        ------
+        UnknownNameError
+            Listing similar tags.
+        """
+        try:
+            return self.entries[tag]
+        except (KeyError, TypeError):
+            raise UnknownNameError(f"There is no operation {tag!r}. {suggest(str(tag), self.entries, 'tag')}") from None
+
+    # -- changes of the sequence ---------------------------------------------------------------------------
+
+    def append(self, tag: str, operation: Operation) -> None:
+        """Add an operation at the end."""
+        place = self.sequence[-1].place + _GAP if self.sequence else 0
+        self._add(tag, operation, place)
+
+    def insert(self, tag: str, operation: Operation, index: int) -> None:
+        """Add an operation in front of the one at ``index``."""
+        if index >= len(self.sequence):
+            self.append(tag, operation)
+            return
+        after = self.sequence[index].place
+        before = self.sequence[index - 1].place if index else after - 2 * _GAP
+        if after - before < 2:
+            self._renumber()
+            self.insert(tag, operation, index)
+            return
+        self._add(tag, operation, (before + after) // 2)
+
+    def index(self, tag: str) -> int:
+        """Return the position of a tag in the sequence."""
+        return bisect_left(self.sequence, self.entry(tag).place, key=_PLACE)
+
+    def replace(self, tag: str, operation: Operation) -> None:
+        """Exchange an operation, at its place and under its tag."""
+        old = self.entry(tag)
+        _check_operation(operation)
+        with self._step():
+            self._exchange(Entry(tag, operation, old.place, old.reads, old.writes))
+            if self._dirty:
+                self._soil(tag)
+            else:
+                self._run(tag)
+
+    def remove(self, tag: str) -> None:
+        """Take an operation out, with everything it wrote."""
+        entry = self.entry(tag)
+        self._unlink(entry)
+        for cell, value in entry.writes.items():
+            self._touched(cell, value, ABSENT, entry.place)
+
+    def _add(self, tag: str, operation: Operation, place: int) -> None:
+        if not isinstance(tag, str) or not tag:
+            raise EditError(f"A tag is a non-empty text, not {tag!r}.")
+        _check_operation(operation)
+        if tag in self.entries:
+            raise NameTakenError(f"The tag {tag!r} is taken; give another one with tag=, or replace the operation.")
+        with self._step():
+            self._link(Entry(tag, operation, place, Reads(), {}))
+            if self._dirty:
+                self._soil(tag)
+            else:
+                self._run(tag)
+
+    @contextmanager
+    def _step(self) -> Iterator[None]:
+        """Undo a single step if it raises, so that whoever catches the error can go on."""
+        mark, dirty = len(self._undo), list(self._dirty)
+        try:
+            yield
+        except BaseException:
+            self._undo_to(mark)
+            self._dirty = dirty
+            raise
+
+    # -- running -------------------------------------------------------------------------------------------
+
+    def settle(self) -> None:
+        """Run again whatever has to be.
+
+        Raises
+        ------
+        EditError
+            Listing every operation that could not be run, with what it misses.
+        """
+        failures: dict[str, KineverseError] = {}
+        done: set[tuple[int, str]] = set()
+        while self._dirty:
+            item = heapq.heappop(self._dirty)
+            place, tag = item
+            entry = self.entries.get(tag)
+            if item in done or entry is None or entry.place != place:
+                continue
+            done.add(item)
+            try:
+                self._run(tag)
+            except KineverseError as error:
+                failures[tag] = error
+        self._check_frames(failures)
+        if failures:
+            lines = "".join(f"\n  {tag!r}: {error}" for tag, error in failures.items())
+            raise EditError(f"The edit is refused, because these operations cannot be applied:{lines}")
+
+    def _run(self, tag: str) -> None:
+        entry = self.entries[tag]
+        self.runs += 1
+        reads = Reads()
+        reader = Reader(lambda cell: self.value_at(cell, entry.place), lambda k: self.names_at(k, entry.place), reads)
+        try:
+            effects = entry.operation.apply(reader)
+            if not isinstance(effects, Effects):
+                raise EditError(f"apply() returns kv.Effects, not {type(effects).__name__}.")
+            writes = effects.writes()
+        except KineverseError:
+            raise
+        except Exception as error:
+            raise EditError(f"Operation {tag!r} raised {type(error).__name__}: {error}") from error
+        for (kind, name), value in writes.items():
+            if not isinstance(name, str) or not name or any(not part for part in name.split("/")):
+                raise EditError(f"Operation {tag!r} writes {kind} under {name!r}, which is not a name.")
+            if kind == FRAMES:
+                self._check_parent(name, value, reads, entry.place)
+            elif kind == CONSTRAINTS:
+                self._check_free(tag, name)
+        old = entry.writes
+        self._exchange(Entry(tag, entry.operation, entry.place, reads, writes))
+        for cell in {**old, **writes} if old else writes:
+            self._touched(cell, old.get(cell, ABSENT), writes.get(cell, ABSENT), entry.place)
+
+    def _check_parent(self, name: str, frame: Frame, reads: Reads, place: int) -> None:
+        if name == WORLD:
+            raise EditError(f"The frame '{WORLD}' is the root of everything and cannot be written.")
+        if frame.parent == WORLD:
+            return
+        reads.add((FRAMES, frame.parent), Read.EXISTENCE)
+        if frame.parent == name or self.value_at((FRAMES, frame.parent), place) is ABSENT:
+            if frame.parent == name:
+                raise ModelError(f"Cyclic frames: '{name}' would be its own parent.")
+            error = missing(FRAMES, frame.parent, self.names_at(FRAMES, place))
+            raise UnknownNameError(f"The parent of frame '{name}' is missing. {error}")
+
+    def _check_free(self, tag: str, name: str) -> None:
+        others = [e.tag for e in self.cells.get((CONSTRAINTS, name), ()) if e.tag != tag]
+        if others:
+            raise NameTakenError(
+                f"There is a constraint '{name}' already, made by {others[0]!r}; choose another name or replace that operation."
+            )
+
+    def _check_frames(self, failures: dict[str, KineverseError]) -> None:
+        """Look for circles, which only frames that were written anew can close."""
+        frames = self.head[FRAMES]
+        lookup = {**frames}.__getitem__ if len(self._moved_frames) > len(frames) else frames.__getitem__
+        for name in self._moved_frames:
+            if name not in frames:
+                continue
+            try:
+                ancestors(name, lookup)
+            except ModelError as error:
+                failures[self.cells[FRAMES, name][-1].tag] = error
+            except KeyError as error:
+                failures.setdefault(self.cells[FRAMES, name][-1].tag, missing(FRAMES, error.args[0], frames))
+        self._moved_frames.clear()
+
+    def _touched(self, cell: Cell, old: Any, new: Any, place: int) -> None:
+        """Note that a write at ``place`` changed, for those who read it."""
+        if old is new or (old is not ABSENT and new is not ABSENT and old == new):
+            return
+        kind, name = cell
+        writers = self.cells.get(cell, ())
+        following = next((e.place for e in writers if e.place > place), None)
+        if following is None:
+            self._set_head(cell, writers[-1].writes[cell] if writers else ABSENT)
+            if kind == FRAMES and (old is not ABSENT or len(writers) > 1 or cell in self.reading):
+                self._moved_frames.add(name)
+        existence = (old is ABSENT) != (new is ABSENT)
+        for tag, how in self.reading.get(cell, {}).items():
+            reader = self.entries[tag].place
+            if reader > place and (following is None or reader <= following) and (how & Read.VALUE or existence):
+                self._soil(tag)
+        if existence:
+            for tag in self.listing[kind]:
+                if self.entries[tag].place > place:
+                    self._soil(tag)
+
+    def _soil(self, tag: str) -> None:
+        heapq.heappush(self._dirty, (self.entries[tag].place, tag))
+
+    def value_at(self, cell: Cell, place: int) -> Any:
+        """Return what the last writer before ``place`` wrote into a cell, or ABSENT."""
+        writers = self.cells.get(cell)
+        if not writers:
+            return ABSENT
+        index = len(writers) if writers[-1].place < place else bisect_left(writers, place, key=_PLACE)
+        return writers[index - 1].writes[cell] if index else ABSENT
+
+    def names_at(self, kind: str, place: int) -> list[str]:
+        """Return the names of a kind that exist before ``place``."""
+        if not self.sequence or self.sequence[-1].place <= place:
+            own = self.sequence[-1].writes if self.sequence and self.sequence[-1].place == place else {}
+            if not own:
+                return list(self.head[kind])
+        return [n for (k, n) in self.cells if k == kind and self.value_at((k, n), place) is not ABSENT]
+
+    # -- bookkeeping that can be undone --------------------------------------------------------------------
+
+    def begin(self) -> None:
+        """Start a transaction: forget how to undo what was before."""
+        self._undo.clear()
+        self._before.clear()
+        self._dirty.clear()
+        self._moved_frames.clear()
+
+    def roll_back(self) -> None:
+        """Undo everything since :meth:`begin`."""
+        self._undo_to(0)
+        self.begin()
+
+    def _undo_to(self, mark: int) -> None:
+        while len(self._undo) > mark:
+            function, arguments = self._undo.pop()
+            function(*arguments)
+
+    def changes(self) -> Iterator[tuple[Cell, Any, Any]]:
+        """Yield the cells whose final value differs from that at :meth:`begin`: (cell, before, after)."""
+        for cell, before in self._before.items():
+            after = self.head[cell[0]].get(cell[1], ABSENT)
+            if before is not after and (before is ABSENT or after is ABSENT or before != after):
+                yield cell, before, after
+
+    def take_events(self) -> list[tuple[Cell, Any, Any]]:
+        """Return every change of a final value since the last call: (cell, before, after), undone ones included."""
+        events, self._events = self._events, []
+        return events
+
+    def _set_head(self, cell: Cell, value: Any) -> None:
+        old = self.head[cell[0]].get(cell[1], ABSENT)
+        self._before.setdefault(cell, old)
+        self._undo.append((self._put_head, (cell, value, old)))
+        self._put_head(cell, old, value)
+
+    def _put_head(self, cell: Cell, old: Any, value: Any) -> None:
+        _put(self.head[cell[0]], cell[1], value)
+        self._events.append((cell, old, value))
+
+    def _link(self, entry: Entry) -> None:
+        self.entries[entry.tag] = entry
+        if not self.sequence or self.sequence[-1].place < entry.place:
+            self.sequence.append(entry)
+        else:
+            insort(self.sequence, entry, key=_PLACE)
+        for cell in entry.writes:
+            writers = self.cells.get(cell)
+            if writers is None:
+                self.cells[cell] = [entry]
+            else:
+                insort(writers, entry, key=_PLACE)
+            _put(self.head[cell[0]], cell[1], self.cells[cell][-1].writes[cell])
+        for cell, how in entry.reads.cells.items():
+            self.reading.setdefault(cell, {})[entry.tag] = how
+        for kind in entry.reads.listings:
+            self.listing[kind].add(entry.tag)
+        self._undo.append((self._forget, (entry,)))
+
+    def _unlink(self, entry: Entry) -> None:
+        self._forget(entry)
+        self._undo.append((self._relink, (entry,)))
+
+    def _relink(self, entry: Entry) -> None:
+        heads = {c: self.head[c[0]].get(c[1], ABSENT) for c in entry.writes}
+        self._link(entry)
+        self._undo.pop()
+        for cell, value in heads.items():
+            _put(self.head[cell[0]], cell[1], value)
+
+    def _forget(self, entry: Entry) -> None:
+        del self.entries[entry.tag]
+        del self.sequence[bisect_left(self.sequence, entry.place, key=_PLACE)]
+        for cell in entry.writes:
+            writers = self.cells[cell]
+            del writers[bisect_left(writers, entry.place, key=_PLACE)]
+            if not writers:
+                del self.cells[cell]
+        for cell in entry.reads.cells:
+            tags = self.reading[cell]
+            del tags[entry.tag]
+            if not tags:
+                del self.reading[cell]
+        for kind in entry.reads.listings:
+            self.listing[kind].discard(entry.tag)
+
+    def _exchange(self, new: Entry) -> None:
+        old = self.entries[new.tag]
+        heads = {c: self.head[c[0]].get(c[1], ABSENT) for c in (*old.writes, *new.writes)}
+        self._unlink(old)
+        self._link(new)
+        for cell, value in heads.items():
+            _put(self.head[cell[0]], cell[1], value)
+
+    def _renumber(self) -> None:
+        entries = self.sequence
+        self._undo.append((self._restore_places, ([(e, e.place) for e in entries],)))
+        self._restore_places([(e, i * _GAP) for i, e in enumerate(entries)])
+        self._dirty = [(self.entries[tag].place, tag) for _, tag in self._dirty]
+        heapq.heapify(self._dirty)
+
+    @staticmethod
+    def _restore_places(places: list[tuple[Entry, int]]) -> None:
+        # The order stays the same, so every sorted list of entries stays sorted.
+        for entry, place in places:
+            entry.place = place
+
+
+def as_cell(path: str) -> Cell:
+    """Return kind and name of a path such as ``frames/kitchen/door``.
+
+    Raises
+    ------
+    UnknownNameError
+        If it does not begin with a kind.
+    """
+    kind, _, name = path.partition("/")
+    if kind not in KINDS or not name:
+        raise UnknownNameError(f"{path!r} is not a path into a model; it begins with one of {', '.join(KINDS)}, then '/'.")
+    return kind, name
+
+
+def _check_operation(operation: object) -> None:
+    if not isinstance(operation, Operation):
+        raise EditError(f"{operation!r} is not an operation; subclass kv.Operation as a frozen dataclass.")
+
+
+def _put(names: dict[str, Any], name: str, value: Any) -> None:
+    if value is ABSENT:
+        names.pop(name, None)
+    else:
+        names[name] = value

@@ -1,0 +1,99 @@
+"""Hearing of changes, each once, after they are committed."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, replace
+
+from ..symbols import Symbol
+from .diff import Change, Diff
+from .operation import CONSTRAINTS
+
+_LOG = logging.getLogger(__name__)
+
+Callback = Callable[[Diff], None]
+
+
+@dataclass(frozen=True, eq=False)
+class Listener:
+    """A callback and what it wants to hear of; :meth:`close` ends it."""
+
+    callback: Callback
+    paths: tuple[str, ...] | None
+    coordinates: frozenset[str] | None
+    tags: frozenset[str] | None
+    registry: Listeners
+
+    def close(self) -> None:
+        """Stop listening; closing twice is fine."""
+        self.registry.remove(self)
+
+    def __enter__(self) -> Listener:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def relevant(self, diff: Diff) -> Diff | None:
+        """Return the part of a diff this listener asked for, None if there is nothing in it."""
+        if self.paths is None and self.coordinates is None and self.tags is None:
+            return diff
+        changes = tuple(c for c in diff.changes if self._wants(c))
+        tags = self.tags or frozenset()
+        added, removed, replaced = (
+            tuple(t for t in group if t in tags) for group in (diff.added, diff.removed, diff.replaced)
+        )
+        if not (changes or added or removed or replaced):
+            return None
+        return replace(diff, changes=changes, added=added, removed=removed, replaced=replaced)
+
+    def _wants(self, change: Change) -> bool:
+        if self.paths is not None and any(_below(change.path, p) for p in self.paths):
+            return True
+        wanted = self.coordinates
+        return wanted is not None and change.kind == CONSTRAINTS and not wanted.isdisjoint(change.coordinates)
+
+
+class Listeners:
+    """The listeners of one model, called in the order they came."""
+
+    def __init__(self) -> None:
+        self._listeners: list[Listener] = []
+
+    def add(
+        self,
+        callback: Callback,
+        paths: Iterable[str] | None,
+        symbols: Iterable[Symbol] | None,
+        tags: Iterable[str] | None,
+    ) -> Listener:
+        """Register a callback; with no filter at all it hears of everything."""
+        listener = Listener(
+            callback,
+            None if paths is None else tuple(paths),
+            None if symbols is None else frozenset(s.path for s in symbols),
+            None if tags is None else frozenset(tags),
+            self,
+        )
+        self._listeners.append(listener)
+        return listener
+
+    def remove(self, listener: Listener) -> None:
+        """Forget a listener."""
+        self._listeners = [known for known in self._listeners if known is not listener]
+
+    def notify(self, diff: Diff) -> None:
+        """Call everyone concerned. One that raises is logged and keeps nobody else from hearing."""
+        for listener in list(self._listeners):
+            part = listener.relevant(diff)
+            if part is None:
+                continue
+            try:
+                listener.callback(part)
+            except Exception:
+                _LOG.exception("A listener of the model raised at version %d.", diff.version)
+
+
+def _below(path: str, root: str) -> bool:
+    return not root or path == root or path.startswith(root if root.endswith("/") else f"{root}/")

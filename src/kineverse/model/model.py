@@ -1,0 +1,181 @@
+"""Articulation models A = (D, C) that can be edited while they are used (2022 paper, III-A)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
+from typing import Any
+
+from ..errors import EditError
+from ..symbols import Symbol
+from .diff import Change, Diff
+from .edit import Edit
+from .history import Entry, History
+from .listeners import Listener, Listeners
+from .reader import ABSENT
+from .view import ModelView
+
+
+class Model(ModelView):
+    """Named data and constraints, as the fold of a sequence of operations over the empty model.
+
+    The model holds no state: values are given to whatever evaluates it. It is changed in transactions::
+
+        with model.edit() as edit:
+            edit.add_frame("door", parent="world", transform=kv.rotation_z(kv.position("door")))
+            edit.constrain("door/range", 0, kv.position("door"), 1.5)
+
+    One thread edits at a time, and readers in other threads wait for it; a :meth:`snapshot` never changes.
+    """
+
+    def __init__(self, _entries: Iterable[Entry] = (), _version: int = 0) -> None:
+        self._history = History(_entries)
+        self._edit: Edit | None = None
+        self._listeners = Listeners()
+        super().__init__(self._history.head, _version)
+
+    @property
+    def history(self) -> History:
+        """The operations: ``tags``, ``entry(tag)``, ``writers(path)``, ``readers(path)``, ``runs``."""
+        return self._history
+
+    # -- editing -------------------------------------------------------------------------------------------
+
+    @contextmanager
+    def edit(self) -> Iterator[Edit]:
+        """Open a transaction: it is committed at the end of the ``with`` block, or nothing has happened.
+
+        Raises
+        ------
+        EditError
+            At the end of the block, if operations cannot be run after the edit: all of them are listed.
+        """
+        with self._lock:
+            if self._edit is not None:
+                raise EditError("The model is being edited already; use that edit.")
+            self._history.begin()
+            runs = self._history.runs
+            self._edit = edit = Edit(self._history)
+            try:
+                yield edit
+                self._history.settle()
+                self.rates  # noqa: B018 - cyclic rates are found now, not at the next question
+            except BaseException:
+                self._history.roll_back()
+                raise
+            else:
+                diff = self._commit(edit, self._history.runs - runs)
+            finally:
+                edit._open = False
+                self._edit = None
+                self._settle()
+        self._listeners.notify(diff)
+
+    def _settle(self) -> None:
+        if self._edit is not None:
+            self._history.settle()
+        events = self._history.take_events()
+        if events:
+            self._changed(events)
+
+    def _commit(self, edit: Edit, runs: int) -> Diff:
+        changes = list(self._history.changes())
+        self._history.begin()
+        self._version += 1
+        return Diff(
+            self._version,
+            tuple(
+                Change(kind, name, None if before is ABSENT else before, None if after is ABSENT else after)
+                for (kind, name), before, after in changes
+            ),
+            tuple(edit._added),
+            tuple(edit._removed),
+            tuple(edit._replaced),
+            runs,
+        )
+
+    def include(self, source: Any, prefix: str | None = None) -> list[str]:
+        """Add a file or a shipped model in one edit; returns the tags. See :func:`kineverse.load`."""
+        with self.edit() as edit:
+            return edit.include(source, prefix)
+
+    def listen(
+        self,
+        callback: Callable[[Diff], None],
+        *,
+        paths: Iterable[str] | None = None,
+        symbols: Iterable[Symbol] | None = None,
+        tags: Iterable[str] | None = None,
+    ) -> Listener:
+        """Have ``callback(diff)`` called after every commit that concerns it, with that part of the diff.
+
+        Parameters
+        ----------
+        callback
+            Called once per commit, in the thread that committed. If it raises, that is logged.
+        paths
+            Paths such as ``frames/kitchen``: everything at or below them.
+        symbols
+            Constraints about the coordinates of these symbols, in their expression, bounds or gradient.
+        tags
+            Operations that are added, removed or replaced.
+        """
+        return self._listeners.add(callback, paths, symbols, tags)
+
+    # -- copies --------------------------------------------------------------------------------------------
+
+    def snapshot(self) -> Snapshot:
+        """Return the model as it is now; it never changes and can be kept, compared and sent."""
+        with self._lock:
+            self._settle()
+            head = {kind: dict(names) for kind, names in self._history.head.items()}
+            return Snapshot(head, tuple(self._history.sequence), self._version)
+
+    def copy(self) -> Model:
+        """Return an independent model with the same operations, without running them again."""
+        return self.snapshot().model()
+
+    __copy__ = copy
+
+    def __deepcopy__(self, memo: Any) -> Model:
+        return self.copy()
+
+    def __reduce__(self) -> Any:
+        return _restore, (self.snapshot(),)
+
+
+class Snapshot(ModelView):
+    """A model at one version: everything can be asked, nothing changed. Equal if all values are equal."""
+
+    def __init__(self, head: dict[str, dict[str, Any]], entries: tuple[Entry, ...], version: int) -> None:
+        self._entries = entries
+        super().__init__(head, version)
+
+    def model(self) -> Model:
+        """Return a model that goes on from here."""
+        copies = (Entry(e.tag, e.operation, e.place, e.reads, e.writes) for e in self._entries)
+        return Model(copies, self._version)
+
+    @property
+    def tags(self) -> list[str]:
+        """The tags of the operations, in order."""
+        return [e.tag for e in self._entries]
+
+    def __eq__(self, other: object) -> bool:
+        if not isinstance(other, Snapshot):
+            return NotImplemented
+        return self.tags == other.tags and self._head == other._head
+
+    def __hash__(self) -> int:
+        return hash(tuple(self.tags))
+
+    def __reduce__(self) -> Any:
+        return _restore_snapshot, (self._head, self._entries, self._version)
+
+
+def _restore(snapshot: Snapshot) -> Model:
+    return snapshot.model()
+
+
+def _restore_snapshot(head: dict[str, dict[str, Any]], entries: tuple[Entry, ...], version: int) -> Snapshot:
+    return Snapshot(head, entries, version)

@@ -1,0 +1,261 @@
+"""Rates: how coordinates move with speeds, q̇ = R(q) u.
+
+A coordinate x without a row is free, ``{ẋ: 1}``. A row ``{v: expression}`` says ``ẋ = Σ expression·v``: the wheels of
+a differential drive, the angular velocity of a quaternion. What a model hands out has such coordinates *carried*:
+each is an opaque node whose value is x and whose gradient is its row, so every gradient shows the wheels.
+
+Rows use the carried coordinates themselves (the heading in a wheel's row turns, or accelerations are wrong), which
+may well be circular: a quaternion's rate is made of the quaternion. A carried coordinate therefore refers to its table
+and unfolds one derivative at a time.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable, Iterator, Mapping
+from functools import cached_property
+from typing import TYPE_CHECKING
+
+from ..errors import ModelError, ValueRejectedError
+from ..expressions.expression import Expression, ExpressionLike, as_expression
+from ..expressions.leaves import leaves
+from ..expressions.node import Node
+from ..expressions.substitution import apply, compose_gradient, replace_nodes
+from ..symbols import Symbol
+
+if TYPE_CHECKING:
+    from ..expressions.substitution import Substitution
+
+Row = tuple[tuple[Symbol, Expression], ...]
+
+
+def as_row(coordinate: Symbol, row: Mapping[Symbol, ExpressionLike]) -> Row:
+    """Return a row in canonical order, carried coordinates put back to plain ones.
+
+    Raises
+    ------
+    ModelError
+        If the coordinate is not a position, or a key not a velocity.
+    """
+    if coordinate.order or not coordinate.has_derivative:
+        raise ModelError(f"Only positions have a rate, and '{coordinate}' is none.")
+    entries = []
+    for speed, value in row.items():
+        if not isinstance(speed, Symbol) or speed.order != 1:
+            raise ModelError(f"The rate of '{coordinate}' has velocities as keys, not '{speed}'.")
+        entry = plain(as_expression(value))
+        if entry.shape:
+            raise ValueRejectedError(f"The rate of '{coordinate}' by '{speed}' is a scalar, not {entry.shape}.")
+        entries.append((speed, entry))
+    return tuple(sorted(entries, key=lambda item: item[0].sort_key))
+
+
+class Rates(Mapping[Symbol, Mapping[Symbol, Expression]]):
+    """An immutable rate table: from coordinates to rows over free speeds, in plain coordinates.
+
+    Rows that name the speed of a coordinate which has a row itself are resolved through it.
+
+    Raises
+    ------
+    ModelError
+        For rows that never end in free speeds, with the circle of coordinates.
+    """
+
+    def __init__(self, rows: Mapping[Symbol, Row]) -> None:
+        self._given = dict(rows)
+        self._rows: dict[Symbol, dict[Symbol, Expression]] = {}
+        for coordinate in self._given:
+            self._resolve(coordinate, [])
+
+    def _resolve(self, coordinate: Symbol, path: list[Symbol]) -> Mapping[Symbol, Expression]:
+        if coordinate in self._rows:
+            return self._rows[coordinate]
+        if coordinate in path:
+            circle = " -> ".join(map(str, [*path[path.index(coordinate) :], coordinate]))
+            raise ModelError(f"Cyclic rates, which never end in a free speed: {circle}.")
+        result: dict[Symbol, Expression] = {}
+        for speed, factor in self._given[coordinate]:
+            inner: Mapping[Symbol, ExpressionLike] = {speed: 1.0}
+            if speed.position in self._given:
+                inner = self._resolve(speed.position, [*path, coordinate])
+            for free, rate in inner.items():
+                term = factor * rate
+                result[free] = result[free] + term if free in result else term
+        self._rows[coordinate] = result
+        return result
+
+    def __getitem__(self, coordinate: Symbol) -> Mapping[Symbol, Expression]:
+        return self._rows[coordinate]
+
+    def __iter__(self) -> Iterator[Symbol]:
+        return iter(self._rows)
+
+    def __len__(self) -> int:
+        return len(self._rows)
+
+    def closure(self, coordinate: Symbol) -> Rates:
+        """Return the part of the table that the row of one coordinate is made of."""
+        wanted, found = [coordinate], set[Symbol]()
+        while wanted:
+            x = wanted.pop()
+            if x in found:
+                continue
+            found.add(x)
+            for speed, value in self._given[x]:
+                wanted += [s for s in (*value.symbols, speed.position) if s in self._given]
+        return Rates({x: self._given[x] for x in sorted(found, key=lambda s: s.sort_key)})
+
+    @cached_property
+    def key(self) -> bytes:
+        """A digest of the content, the same in every process."""
+        digest = hashlib.blake2b(digest_size=16)
+        for x in sorted(self._given, key=lambda s: s.sort_key):
+            digest.update(repr(x.sort_key).encode())
+            for speed, value in self._given[x]:
+                digest.update(repr(speed.sort_key).encode() + value.key)
+        return digest.digest()
+
+    @cached_property
+    def symbols(self) -> frozenset[Symbol]:
+        """Every coordinate, every symbol of a row, and the coordinates of the speeds."""
+        found = set(self._rows)
+        for row in self._rows.values():
+            for speed, value in row.items():
+                found |= {speed, speed.position, *value.symbols}
+        return frozenset(found)
+
+    @cached_property
+    def carried(self) -> Mapping[Symbol, Expression]:
+        """The carried form of every coordinate in the table."""
+        return {x: Carried.of((x,), (), (self.closure(x),)) for x in self._rows}
+
+    def carry(self, expression: Expression) -> Expression:
+        """Return the expression in carried coordinates; it must be in plain ones."""
+        if not self._rows:
+            return expression
+        wanted = {s: self.carried[s] for s in _all_symbols(expression) if s in self._rows}
+        return apply(expression, wanted)
+
+    def eliminate(self, expression: Expression) -> Expression:
+        """Return the expression with every left-over ẋ replaced by ``Σ R[x][v]·v``."""
+        wanted = {
+            s: sum((self.carry(g) * v for v, g in self._rows[s.position].items()), as_expression(0.0))
+            for s in expression.symbols
+            if s.order == 1 and s.position in self._rows
+        }
+        return apply(expression, wanted)
+
+    def __reduce__(self) -> tuple[type[Rates], tuple[dict[Symbol, Row]]]:
+        return Rates, (self._given,)
+
+
+class Carried(Node):
+    """A coordinate whose gradient is its row."""
+
+    __slots__ = ()
+    kind = "carried"
+
+    @property
+    def rates(self) -> Rates:
+        """The table, closed over what the row is made of."""
+        table: Rates = self.options[0]
+        return table
+
+    @property
+    def coordinate(self) -> Symbol:
+        """The plain coordinate."""
+        (symbol,) = self.arguments
+        assert isinstance(symbol, Symbol)
+        return symbol
+
+    @property
+    def label(self) -> str:
+        return "carried"
+
+    @classmethod
+    def _options_key(cls, options: tuple[Rates, ...]) -> str:
+        return options[0].key.hex()
+
+    def _value(self) -> Expression:
+        return self.coordinate
+
+    def _gradient(self, heuristic: bool) -> Mapping[Symbol, Expression]:
+        return {v: self.rates.carry(g) for v, g in self.rates[self.coordinate].items()}
+
+    def gradient_keys(self, heuristic: bool) -> frozenset[Symbol]:
+        return frozenset(self.rates[self.coordinate])
+
+    def depends_on(self, substitution: Substitution) -> bool:
+        return any(s in self.rates.symbols for s in substitution)
+
+    def substitute(self, substitution: Substitution) -> Expression:
+        relevant = {s: e for s, e in substitution.items() if s in self.rates.symbols}
+        itself = _expression_of(self)
+        return Composed.of((itself, *relevant.values()), (), tuple(relevant))
+
+
+class Composed(Node):
+    """A carried coordinate after a substitution, unfolded one derivative at a time."""
+
+    __slots__ = ()
+    kind = "composed"
+
+    @property
+    def substitution(self) -> dict[Symbol, Expression]:
+        """What was replaced by what."""
+        return dict(zip(self.options, self.arguments[1:], strict=True))
+
+    @classmethod
+    def _options_key(cls, options: tuple[Symbol, ...]) -> str:
+        return repr([s.sort_key for s in options])
+
+    def _inner(self) -> Node:
+        (node,) = self.arguments[0]._nodes
+        return node
+
+    def _value(self) -> Expression:
+        return apply(self._inner().value, self.substitution)
+
+    def _gradient(self, heuristic: bool) -> Mapping[Symbol, Expression]:
+        return compose_gradient(self._inner().gradient(heuristic), self.substitution, heuristic)
+
+    def gradient_keys(self, heuristic: bool) -> frozenset[Symbol]:
+        return frozenset(self.gradient(heuristic))
+
+    def depends_on(self, substitution: Substitution) -> bool:
+        return super().depends_on(substitution) or self._inner().depends_on(substitution)
+
+    def substitute(self, substitution: Substitution) -> Expression:
+        return Composed.of((_expression_of(self), *substitution.values()), (), tuple(substitution))
+
+
+def plain(expression: Expression) -> Expression:
+    """Return the expression with carried coordinates put back to plain ones, looking into nodes."""
+    return _rebuilt(expression, lambda node: node.coordinate if isinstance(node, Carried) else None)
+
+
+def _rebuilt(expression: Expression, exchange: Callable[[Node], Expression | None]) -> Expression:
+    if not expression._nodes:
+        return expression
+    replacements = {}
+    for node in leaves(expression)[1]:
+        replacement = exchange(node)
+        if replacement is None and not isinstance(node, Composed):
+            arguments = tuple(_rebuilt(a, exchange) for a in node.arguments)
+            if any(new is not old for new, old in zip(arguments, node.arguments, strict=True)):
+                replacement = type(node).of(arguments, node.shape, node.options)
+        if replacement is not None:
+            replacements[node] = replacement
+    return replace_nodes(expression, replacements)
+
+
+def _all_symbols(expression: Expression) -> set[Symbol]:
+    """Return the symbols of values and of given gradients."""
+    symbols, nodes = leaves(expression)
+    return set(symbols).union(*(_all_symbols(a) for node in nodes for a in node.arguments))
+
+
+def _expression_of(node: Node) -> Expression:
+    from ..expressions.expression import make
+
+    return make(node.sx, node.shape, frozenset((node,)))

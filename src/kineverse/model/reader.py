@@ -1,0 +1,131 @@
+"""What an operation sees of the model, with every look remembered."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from enum import IntFlag
+from typing import Any, Generic, TypeVar
+
+from ..errors import UnknownNameError, suggest
+from ..expressions.expression import Expression
+from ..symbols import Symbol
+from .articulation import Articulation
+from .body import Body
+from .constraint import Constraint
+from .frame import WORLD, Frame
+from .kinematics import relative
+from .operation import ARTICULATIONS, BODIES, CONSTRAINTS, DATA, FRAMES, RATES
+from .rates import Rates, Row
+
+Cell = tuple[str, str]
+V = TypeVar("V")
+ABSENT: Any = object()
+
+
+class Read(IntFlag):
+    """How closely something was looked at."""
+
+    EXISTENCE = 1
+    VALUE = 2
+
+
+class Reads:
+    """The recorded reads of one run: cells with how closely they were read, and listings by kind."""
+
+    __slots__ = ("cells", "listings")
+
+    def __init__(self) -> None:
+        self.cells: dict[Cell, Read] = {}
+        self.listings: set[str] = set()
+
+    def add(self, cell: Cell, how: Read) -> None:
+        """Remember a look at a cell."""
+        self.cells[cell] = self.cells.get(cell, Read(0)) | how
+
+
+class Reader:
+    """The model before an operation: the same names as on :class:`~kineverse.Model`, every read recorded.
+
+    Attributes
+    ----------
+    frames, bodies, articulations, constraints, data
+        Mappings by name, in plain coordinates.
+    """
+
+    def __init__(self, value_at: Callable[[Cell], Any], names_at: Callable[[str], list[str]], reads: Reads) -> None:
+        self._value_at = value_at
+        self._reads = reads
+        self.frames: Mapping[str, Frame] = _View(FRAMES, value_at, names_at, reads)
+        self.bodies: Mapping[str, Body] = _View(BODIES, value_at, names_at, reads)
+        self.articulations: Mapping[str, Articulation] = _View(ARTICULATIONS, value_at, names_at, reads)
+        self.constraints: Mapping[str, Constraint] = _View(CONSTRAINTS, value_at, names_at, reads)
+        self.data: Mapping[str, Any] = _View(DATA, value_at, names_at, reads)
+
+    def fk(self, frame: str, relative_to: str = WORLD) -> Expression:
+        """Return relative_to_T_frame, 4×4, coordinates carried by the rates that hold here."""
+        return self.carry(relative(frame, relative_to, self.frames.__getitem__))
+
+    def carry(self, expression: Expression) -> Expression:
+        """Return an expression with its coordinates carried by the rates that hold here."""
+        rows: dict[Symbol, Row] = {}
+        wanted = list(expression.symbols)
+        while wanted:
+            x = wanted.pop()
+            if x.order or x in rows or not x.has_derivative:
+                continue
+            cell = (RATES, str(x))
+            self._reads.add(cell, Read.VALUE)
+            found = self._value_at(cell)
+            if found is not ABSENT:
+                rows[x] = found[1]
+                for speed, value in found[1]:
+                    wanted += [speed.position, *value.symbols]
+        return Rates(rows).carry(expression) if rows else expression
+
+
+class _View(Mapping[str, V], Generic[V]):
+    """One kind of data by name; reading is recorded."""
+
+    def __init__(
+        self, kind: str, value_at: Callable[[Cell], Any], names_at: Callable[[str], list[str]], reads: Reads
+    ) -> None:
+        self._kind = kind
+        self._value_at = value_at
+        self._names_at = names_at
+        self._reads = reads
+
+    def __getitem__(self, name: str) -> V:
+        cell = (self._kind, name)
+        self._reads.add(cell, Read.VALUE)
+        value = self._value_at(cell)
+        if value is ABSENT:
+            raise missing(self._kind, name, self._names_at(self._kind))
+        result: V = value
+        return result
+
+    def get(self, name: str, default: Any = None) -> Any:
+        self._reads.add((self._kind, name), Read.VALUE)
+        value = self._value_at((self._kind, name))
+        return default if value is ABSENT else value
+
+    def __contains__(self, name: object) -> bool:
+        if not isinstance(name, str):
+            return False
+        self._reads.add((self._kind, name), Read.EXISTENCE)
+        return self._value_at((self._kind, name)) is not ABSENT
+
+    def __iter__(self) -> Iterator[str]:
+        self._reads.listings.add(self._kind)
+        return iter(self._names_at(self._kind))
+
+    def __len__(self) -> int:
+        self._reads.listings.add(self._kind)
+        return len(self._names_at(self._kind))
+
+
+def missing(kind: str, name: str, available: Any) -> UnknownNameError:
+    """Return the error for something that is not there."""
+    noun = {BODIES: "body", RATES: "rate", DATA: "datum"}.get(kind, kind[:-1])
+    if not isinstance(name, str):
+        return UnknownNameError(f"A {noun} is asked for by its name, a text, not by {name!r}.")
+    return UnknownNameError(f"There is no {noun} {name!r}. {suggest(name, available, noun)}")

@@ -1,0 +1,106 @@
+"""Which constraints matter for an expression (2022 paper, III-A2).
+
+An index from coordinates to constraints, so that a question costs what its answer is long, not what the model is.
+"""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Iterable, Mapping
+
+from ..errors import ExpressionError
+from ..expressions.expression import Expression
+from ..symbols import Symbol
+from .constraint import Constraint, coordinates
+
+
+class Relevance:
+    """Constraints by the coordinates in their expressions and in their bounds."""
+
+    def __init__(self) -> None:
+        self._by_expression: defaultdict[str, dict[str, None]] = defaultdict(dict)
+        self._by_bounds: defaultdict[str, dict[str, None]] = defaultdict(dict)
+        self._alone: dict[Symbol, dict[str, None]] = {}
+
+    def add(self, name: str, constraint: Constraint) -> None:
+        """Take a constraint into the index."""
+        for path in {s.path for s in constraint.expression.symbols}:
+            self._by_expression[path][name] = None
+        for path in _bounds(constraint):
+            self._by_bounds[path][name] = None
+        if isinstance(constraint.expression, Symbol):
+            self._alone.setdefault(constraint.expression, {})[name] = None
+
+    def remove(self, name: str, constraint: Constraint) -> None:
+        """Take a constraint out."""
+        for path in {s.path for s in constraint.expression.symbols}:
+            self._by_expression[path].pop(name, None)
+        for path in _bounds(constraint):
+            self._by_bounds[path].pop(name, None)
+        if isinstance(constraint.expression, Symbol):
+            self._alone.get(constraint.expression, {}).pop(name, None)
+
+    def on(self, symbol: Symbol) -> list[str]:
+        """Return the names of the constraints whose expression is just this symbol."""
+        return list(self._alone.get(symbol, ()))
+
+    def of(
+        self,
+        subject: Expression | Iterable[Symbol | Expression],
+        constraints: Mapping[str, Constraint],
+        *,
+        exact: bool,
+        bounds: bool,
+        closure: bool,
+    ) -> list[str]:
+        """Return the names of relevant constraints, sorted; see :meth:`Model.constraints_for`."""
+        expressions = [subject] if isinstance(subject, Expression) else list(subject)
+        for expression in expressions:
+            if not isinstance(expression, Expression):
+                raise ExpressionError(f"Constraints are found for expressions or symbols, not for {expression!r}.")
+        if exact:
+            symbols = {s for e in expressions for s in e.symbols}
+            return self._exact(symbols, constraints, bounds, closure)
+        found: dict[str, None] = {}
+        wanted = list(coordinates(*expressions))
+        seen = set(wanted)
+        while wanted:
+            path = wanted.pop()
+            new = dict(self._by_expression.get(path, ()))
+            if bounds:
+                new.update(self._by_bounds.get(path, ()))
+            if closure:
+                for name in new.keys() - found.keys():
+                    c = constraints[name]
+                    parts = (c.lower, c.expression, c.upper) if bounds else (c.expression,)
+                    fresh = coordinates(*parts) - seen
+                    seen |= fresh
+                    wanted += fresh
+            found.update(new)
+        return sorted(found)
+
+    def _exact(
+        self, symbols: set[Symbol], constraints: Mapping[str, Constraint], bounds: bool, closure: bool
+    ) -> list[str]:
+        found: set[str] = set()
+        while True:
+            names: set[str] = set()
+            for path in {s.path for s in symbols}:
+                names |= self._by_expression.get(path, {}).keys()
+                if bounds:
+                    names |= self._by_bounds.get(path, {}).keys()
+            new = set()
+            for name in names - found:
+                c = constraints[name]
+                if not symbols.isdisjoint(c.symbols if bounds else c.expression.symbols):
+                    new.add(name)
+            found |= new
+            if not closure or not new:
+                return sorted(found)
+            for name in new:
+                c = constraints[name]
+                symbols = symbols | set(c.symbols if bounds else c.expression.symbols)
+
+
+def _bounds(constraint: Constraint) -> set[str]:
+    return {s.path for bound in (constraint.lower, constraint.upper) for s in bound.symbols}

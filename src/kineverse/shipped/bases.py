@@ -1,0 +1,34 @@
+"""The mobile bases of the robots that ship; a URDF cannot say how they move."""
+
+from __future__ import annotations
+
+from ..articulations import DifferentialDrive, Joint, OmniBase
+
+
+def base_of(model: str, prefix: str | None) -> Joint | None:
+    """Return the base that carries a shipped robot, None for what stands still.
+
+    Parameters
+    ----------
+    model
+        Name of the shipped model.
+    prefix
+        The prefix it is loaded under.
+    """
+
+    def named(name: str) -> str:
+        return f"{prefix}/{name}" if prefix else name
+
+    common = {"name": named("base"), "parent": "world", "child": named("base")}
+    if model in ("pr2", "hsr"):
+        return OmniBase(**common, speed=1.0, turn=0.6)
+    if model == "fetch":
+        return DifferentialDrive(
+            **common,
+            radius=0.06,
+            track=0.3748,
+            left=named("l_wheel_joint"),
+            right=named("r_wheel_joint"),
+            wheel_speed=17.4,
+        )
+    return None

@@ -1,0 +1,208 @@
+"""Symbols: the degrees of freedom and parameters that expressions are about.
+
+A symbol has a path (``kitchen/fridge_door``), an order (0 position, 1 velocity, 2 acceleration ...) and a role.
+Symbols are interned, so equal ones are the same object in one process, and they sort by path and order in every
+process. Their text name is the path for a position and ``path:velocity`` and so on for the others.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Sequence
+from typing import Any, Literal, TypeAlias, get_args
+
+import casadi as ca
+
+from .errors import ExpressionError, ValueRejectedError
+from .expressions.expression import NO_NODES, SYMBOLS, Expression
+
+Role: TypeAlias = Literal["dof", "parameter", "contact", "location"]
+
+ROLES: tuple[Role, ...] = get_args(Role)
+ORDER_NAMES = ("position", "velocity", "acceleration", "jerk", "snap")
+
+_INTERNED: dict[tuple[str, int, str, float | None], Symbol] = {}
+
+
+class Symbol(Expression):
+    """A scalar symbol; make one with :func:`position`, :func:`velocity`, :func:`symbol` or :func:`parameter`.
+
+    Attributes
+    ----------
+    path
+        Namespaced name, such as ``kitchen/fridge_door``.
+    order
+        How many times the position is differentiated by time; 0 for parameters.
+    role
+        What the symbol stands for: ``dof``, ``parameter``, ``contact``, ``location``.
+    value
+        The value a parameter has unless another is given; None for everything else.
+    """
+
+    __slots__ = ("_text", "order", "path", "role", "sort_key", "value")
+
+    path: str
+    order: int
+    role: Role
+    value: float | None
+    sort_key: tuple[str, int, str, float]
+
+    def __new__(cls, path: str, order: int = 0, role: Role = "dof", value: float | None = None) -> Symbol:
+        """Return the one symbol of this path, order, role and value."""
+        key = (path, order, role, value)
+        known = _INTERNED.get(key)
+        if known is not None:
+            return known
+        _check(path, order, role, value)
+        self = object.__new__(cls)
+        self._text = symbol_name(path, order)
+        self._set(ca.SX.sym(self._text), (), NO_NODES)
+        self.path, self.order, self.role, self.value = path, order, role, value
+        self.sort_key = (path, order, role, 0.0 if value is None else value)
+        self._leaves = ((self,), ())
+        self = _INTERNED.setdefault(key, self)
+        SYMBOLS[self._sx.element_hash()] = self
+        return self
+
+    def __init__(self, *_: Any, **__: Any) -> None:
+        # Everything happens once, in __new__.
+        pass
+
+    @property
+    def has_derivative(self) -> bool:
+        """Whether the symbol moves with time; parameters do not."""
+        return self.role != "parameter"
+
+    def derivative(self) -> Symbol:
+        """Return the symbol of the time derivative: ȧ for a, ä for ȧ.
+
+        Raises
+        ------
+        ExpressionError
+            For parameters.
+        """
+        if not self.has_derivative:
+            raise ExpressionError(f"Parameter '{self}' has no derivative: it does not change with time.")
+        return Symbol(self.path, self.order + 1, self.role)
+
+    def integral(self) -> Symbol:
+        """Return the symbol this is the time derivative of.
+
+        Raises
+        ------
+        ExpressionError
+            For positions and parameters.
+        """
+        if self.order == 0:
+            raise ExpressionError(f"'{self}' is not the derivative of anything.")
+        return Symbol(self.path, self.order - 1, self.role)
+
+    @property
+    def position(self) -> Symbol:
+        """The symbol of order 0 at the same path."""
+        return Symbol(self.path, 0, self.role, self.value)
+
+    def __str__(self) -> str:
+        return self._text
+
+    def __repr__(self) -> str:
+        return self._text
+
+    def __hash__(self) -> int:
+        return hash(self.sort_key)
+
+    def __eq__(self, other: object) -> bool:
+        if self is other:
+            return True
+        if isinstance(other, Symbol):
+            return False
+        return Expression.__eq__(self, other)
+
+    def __reduce__(self) -> Any:
+        return Symbol, (self.path, self.order, self.role, self.value)
+
+
+def _check(path: str, order: int, role: str, value: float | None) -> None:
+    if not isinstance(path, str) or not path:
+        raise ExpressionError(f"A symbol needs a path, a non-empty text such as 'kitchen/fridge_door', not {path!r}.")
+    if any(not part for part in path.split("/")) or any(ord(c) < 32 for c in path):
+        raise ExpressionError(f"The path {path!r} has an empty part or a control character.")
+    if role not in ROLES:
+        raise ExpressionError(f"Unknown role {role!r}; roles are {', '.join(ROLES)}.")
+    if isinstance(order, bool) or not isinstance(order, int) or order < 0:
+        raise ExpressionError(f"The order of a symbol is a whole number from 0 on, not {order!r}.")
+    if role == "parameter":
+        if order:
+            raise ExpressionError("A parameter has no derivatives.")
+        if value is None or not isinstance(value, float) or value != value:
+            raise ValueRejectedError(f"Parameter '{path}' needs a number as its value, not {value!r}.")
+    elif value is not None:
+        raise ExpressionError("Only parameters have a value of their own.")
+
+
+def symbol(path: str, order: int = 0, role: Role = "dof") -> Symbol:
+    """Return the symbol of any order and role."""
+    return Symbol(path, order, role)
+
+
+def position(path: str) -> Symbol:
+    """Return the position symbol of a degree of freedom."""
+    return Symbol(path)
+
+
+def velocity(path: str) -> Symbol:
+    """Return the velocity symbol of a degree of freedom."""
+    return Symbol(path, 1)
+
+
+def parameter(path: str, value: float) -> Symbol:
+    """Return a symbol that does not move, with the value it has unless another is given.
+
+    ``D`` of a parameter is empty. Two parameters of one path and different values are different symbols.
+    """
+    return Symbol(path, 0, "parameter", float(value))
+
+
+def symbol_name(path: str, order: int) -> str:
+    """Return the text name; ``%`` and ``:`` inside the path are percent-escaped, so the name can be parsed."""
+    escaped = path.replace("%", "%25").replace(":", "%3A") if "%" in path or ":" in path else path
+    if order == 0:
+        return escaped
+    return f"{escaped}:{ORDER_NAMES[order] if order < len(ORDER_NAMES) else order}"
+
+
+def parse_symbol_name(name: str) -> tuple[str, int]:
+    """Return path and order of a text name; the inverse of :func:`symbol_name`.
+
+    Raises
+    ------
+    ExpressionError
+        If the part behind the colon is not an order.
+    """
+    escaped, colon, suffix = name.partition(":")
+    path = re.sub("%(25|3A)", lambda m: {"25": "%", "3A": ":"}[m[1]], escaped)
+    if not colon:
+        return path, 0
+    if suffix in ORDER_NAMES:
+        return path, ORDER_NAMES.index(suffix)
+    if suffix.isdecimal():
+        return path, int(suffix)
+    raise ExpressionError(f"{name!r}: ':{suffix}' is not an order; write {', '.join(ORDER_NAMES[1:])} or a number.")
+
+
+def check_symbols(symbols: Iterable[object]) -> Sequence[Symbol]:
+    """Return the symbols as a sequence.
+
+    Raises
+    ------
+    ExpressionError
+        If one of them is not a :class:`Symbol`.
+    """
+    if isinstance(symbols, Symbol):
+        raise ExpressionError(f"A sequence of symbols is wanted: [{symbols}].")
+    checked = []
+    for item in symbols:
+        if not isinstance(item, Symbol):
+            raise ExpressionError(f"{item!r} is not a symbol; symbols are made by kv.position('path') and the like.")
+        checked.append(item)
+    return checked

@@ -1,0 +1,172 @@
+"""Mesh files as triangles, read when somebody wants to see them."""
+
+from __future__ import annotations
+
+import hashlib
+import importlib
+import logging
+import re
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from kineverse.errors import KineverseError, MissingExtraError
+from kineverse.model.body import Mesh
+from kineverse.view.primitives import placeholder
+from kineverse.view.triangles import Floats, Triangles, creased, join
+
+logger = logging.getLogger(__name__)
+
+LARGEST = 256 * 2**20
+"""No mesh file above this size is read [bytes]: a description is not trusted with the viewer's memory."""
+
+
+@dataclass(frozen=True, slots=True)
+class Loaded:
+    """A mesh that was asked for: its surface, or a placeholder and what was wrong."""
+
+    surface: Triangles
+    problem: str = ""
+
+
+_by_reference: dict[Mesh, Loaded] = {}
+_by_content: dict[tuple[object, ...], Triangles] = {}
+_reported: set[str] = set()
+
+
+def load(mesh: Mesh) -> Loaded:
+    """Return the triangles of a mesh file, scaled, in the frame of the mesh [m].
+
+    Files of equal content are parsed once, whatever name led to them. What cannot be loaded becomes a
+    placeholder; the reason is logged once a file and kept in ``problem``.
+
+    Parameters
+    ----------
+    mesh
+        The reference: uri, scale along x, y, z, and the folder from which a relative uri is resolved.
+    """
+    if mesh not in _by_reference:
+        try:
+            _by_reference[mesh] = Loaded(_read(mesh))
+        except (KineverseError, OSError) as error:
+            _by_reference[mesh] = _missing(mesh, str(error))
+        except Exception as error:  # Parsers of other people's formats raise anything at all.
+            _by_reference[mesh] = _missing(mesh, f"{type(error).__name__}: {error}")
+    return _by_reference[mesh]
+
+
+def _missing(mesh: Mesh, problem: str) -> Loaded:
+    first_line = (problem.strip().splitlines() or ["unknown error"])[0]
+    if mesh.uri not in _reported:
+        _reported.add(mesh.uri)
+        logger.warning("mesh %s is shown as a placeholder: %s", mesh.uri, first_line)
+    return Loaded(placeholder(), first_line)
+
+
+def _read(mesh: Mesh) -> Triangles:
+    # Imported late: the formats layer is not needed to draw a box.
+    packages = importlib.import_module("kineverse.formats.packages")
+
+    path = Path(packages.locate(mesh.uri, mesh.folder))
+    size = path.stat().st_size
+    if size > LARGEST:
+        raise OSError(f"{path} has {size / 2**20:.0f} MiB, more than the {LARGEST / 2**20:.0f} MiB read here")
+    digest = hashlib.sha256(path.read_bytes()).hexdigest()
+    # The folder is part of the key because materials and textures lie beside the file.
+    source = (digest, path.suffix.lower(), str(path.parent))
+    if source not in _by_content:
+        _by_content[source] = _parse(path)
+    if mesh.scale == (1.0, 1.0, 1.0):
+        return _by_content[source]
+    scaled = (*source, mesh.scale)
+    if scaled not in _by_content:
+        _by_content[scaled] = _by_content[source].scaled(mesh.scale)
+    return _by_content[scaled]
+
+
+def _parse(path: Path) -> Triangles:
+    """Read a file by trimesh and return its triangles in metres."""
+    try:
+        import trimesh
+    except ImportError as error:
+        raise MissingExtraError(
+            "reading meshes needs trimesh: pip install 'kineverse-articulation[view]'"
+        ) from error
+    with _quiet("trimesh"):
+        scene = trimesh.load_scene(path, process=False)
+        pieces = [_piece(g) for g in scene.dump() if isinstance(g, trimesh.Trimesh) and len(g.faces)]
+    pieces = [piece for piece in pieces if len(piece.faces)]
+    if not pieces:
+        raise OSError(f"{path} holds no triangles")
+    if any(piece.colors is not None for piece in pieces):
+        pieces = [_colored(piece) for piece in pieces]
+    return join(pieces).scaled(_metres(path))
+
+
+@contextmanager
+def _quiet(name: str) -> Iterator[None]:
+    """Keep a library from logging: a missing texture of a mesh costs it its colour, nothing else."""
+    log, nowhere = logging.getLogger(name), logging.NullHandler()
+    before = log.propagate
+    log.addHandler(nowhere)
+    log.propagate = False
+    try:
+        yield
+    finally:
+        log.propagate = before
+        log.removeHandler(nowhere)
+
+
+def _piece(mesh: Any) -> Triangles:
+    surface, kept = creased(mesh.vertices, mesh.faces)
+    try:
+        colors = _face_colors(mesh)
+    except Exception:  # A picture that cannot be decoded is no reason not to show the shape.
+        logger.debug("no colours from %s", mesh, exc_info=True)
+        colors = None
+    return surface if colors is None else surface.painted(colors[kept])
+
+
+def _metres(path: Path) -> float:
+    """Return the length of the file's unit [m].
+
+    Only COLLADA says what its numbers mean; like RViz this honours the unit and ignores the up axis, which
+    is what the authors of robot descriptions have come to rely on.
+    """
+    if path.suffix.lower() != ".dae":
+        return 1.0
+    with path.open("rb") as file:
+        match = re.search(rb"<unit\b[^>]*\bmeter\s*=\s*[\"']\s*([-+.\deE]+)", file.read(2**16))
+    factor = float(match.group(1)) if match else 1.0
+    return factor if np.isfinite(factor) and factor > 0.0 else 1.0
+
+
+def _face_colors(mesh: Any) -> Floats | None:
+    """Return (F, 4) colours of the faces of a trimesh, or None where the file says nothing."""
+    visual = mesh.visual
+    if visual.kind != "texture":
+        return np.asarray(visual.face_colors, dtype=float) / 255.0 if visual.defined else None
+    if visual.uv is not None and _has_picture(visual.material):
+        corners = np.asarray(visual.to_color().vertex_colors, dtype=float)
+        if corners.shape == (len(mesh.vertices), 4):
+            return np.asarray(corners[mesh.faces].mean(axis=1) / 255.0)
+    main = np.asarray(visual.material.main_color, dtype=float) / 255.0
+    return np.tile(main, (len(mesh.faces), 1))
+
+
+def _has_picture(material: Any) -> bool:
+    names = ("image", "baseColorTexture")
+    return any(getattr(material, name, None) is not None for name in names)
+
+
+def _colored(
+    piece: Triangles, fallback: tuple[float, float, float, float] = (0.7, 0.7, 0.72, 1.0)
+) -> Triangles:
+    """Return the piece with colours, so that pieces with and without can be joined."""
+    if piece.colors is not None:
+        return piece
+    return piece.painted(np.tile(fallback, (len(piece.faces), 1)))

@@ -1,0 +1,90 @@
+"""Where all frames of a model are, from one compiled function."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+import kineverse as kv
+from kineverse.errors import UnknownNameError, suggest
+from kineverse.model.view import ModelView
+from kineverse.view.triangles import Floats
+
+ROOT = "world"
+
+
+class Poses:
+    """The poses of frames in the world, as a function of the values of symbols.
+
+    Parameters
+    ----------
+    model
+        The model.
+    names
+        The frames wanted, in this order; all of the model, the world first, if None.
+
+    Attributes
+    ----------
+    names
+        The frames, in the order of the results.
+    inputs
+        The names of the symbols that the poses depend on.
+    """
+
+    def __init__(self, model: ModelView, names: Iterable[str] | None = None) -> None:
+        everything = (ROOT, *(name for name in model.frames if name != ROOT))
+        self.names = everything if names is None else tuple(names)
+        self._index = {name: k for k, name in enumerate(self.names)}
+        # The world stands still, and a compiled function without outputs is no use to anyone.
+        self._moving = tuple(name for name in self.names if name != ROOT)
+        self._function = kv.compile([model.fk(name) for name in self._moving]) if self._moving else None
+        self.inputs = tuple(map(str, self._function.inputs)) if self._function else ()
+
+    def at(self, values: Mapping[str, float]) -> Floats:
+        """Return (N, 4, 4) poses; ``values`` may hold more symbols than are needed [m], [rad]."""
+        poses = np.tile(np.eye(4), (len(self.names), 1, 1))
+        if self._function is not None:
+            x = np.array([values[name] for name in self.inputs], dtype=float)
+            for name, pose in zip(self._moving, self._function(x), strict=True):
+                poses[self._index[name]] = pose
+        return poses
+
+    def batch(self, rows: npt.NDArray[np.float64]) -> list[Floats]:
+        """Return, for each frame but the world, the (K, 4, 4) poses at K rows of values of ``inputs``."""
+        return [] if self._function is None else list(self._function.batch(rows))
+
+    def index(self, name: str) -> int:
+        """Return the place of a frame in the results."""
+        if name not in self._index:
+            raise UnknownNameError(f"There is no frame '{name}'. {suggest(name, self.names, 'frame')}")
+        return self._index[name]
+
+
+def complete(model: ModelView, state: Mapping[Any, float] | None = None) -> dict[str, float]:
+    """Return values of all symbols by name: the given ones, and the default state for the others.
+
+    Parameters
+    ----------
+    model
+        The model.
+    state
+        Values by symbol or name; a :class:`kineverse.State` may know more than the model, a mapping of names
+        may not.
+
+    Raises
+    ------
+    UnknownNameError
+        For a name the model does not know.
+    """
+    values = {str(symbol): float(value) for symbol, value in model.default_state().items()}
+    known = values.keys() | {str(symbol) for symbol in model.symbols}
+    for key, value in (state or {}).items():
+        name = str(key)
+        if name in known:
+            values[name] = float(value)
+        elif isinstance(key, str):
+            raise UnknownNameError(f"The model has no symbol '{name}'. {suggest(name, known, 'symbol')}")
+    return values

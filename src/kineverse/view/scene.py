@@ -1,0 +1,216 @@
+"""The three-dimensional half of the page: bodies, frames and floor of a model."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+import numpy as np
+
+from kineverse.model.view import ModelView
+from kineverse.view import stage
+from kineverse.view.axes import axis_length
+from kineverse.view.parts import Kind, Part, parts
+from kineverse.view.poses import Poses
+from kineverse.view.rotation import quaternions
+from kineverse.view.surfaces import Surfaces
+from kineverse.view.triangles import Floats, Integers, Triangles
+from kineverse.view.viewpoint import automatic, importance
+
+FIELD_OF_VIEW, ASPECT = 0.8, 1.25
+ROOT = "/model"
+
+
+class Scene:
+    """What the page shows of a model, kept up to date by sending only what moved.
+
+    Parameters
+    ----------
+    server
+        A viser server.
+    model
+        The model to show.
+    values
+        The values of all symbols at first, by name [m], [rad].
+
+    Attributes
+    ----------
+    poses
+        (N, 4, 4): where the frames of :attr:`names` were put last.
+    problems
+        What could not be loaded, one line each.
+    """
+
+    def __init__(self, server: Any, model: ModelView, values: Mapping[str, float]) -> None:
+        self._server = server
+        # Switches on the page and the motion of the model come from different threads.
+        self._lock = threading.RLock()
+        self._frames_shown, self._labels_shown, self._filter = False, False, ""
+        self._collisions_shown, self._ground_shown = False, True
+        self._collisions_built = False
+        stage.set_up(server)
+        self.refresh(model, values)
+
+    def refresh(self, model: ModelView, values: Mapping[str, float]) -> None:
+        """Show another model, or this one after an edit; what is switched on stays on."""
+        with self._lock:
+            self._model = model
+            self._kinematics = Poses(model)
+            self.names = self._kinematics.names
+            self.poses = self._kinematics.at(values)
+            visuals = parts(model)
+            self.problems = sorted({f"{part.frame}: {part.problem}" for part in visuals if part.problem})
+            with self._server.atomic():
+                self._server.scene.remove_by_name(ROOT)
+                self._nodes: dict[str, Any] = {}
+                self._collisions_built = False
+                self._add(visuals, "visual")
+                self._place_camera(visuals)
+                self.show_ground(self._ground_shown)
+                self.show_collisions(self._collisions_shown)
+                self.show_frames(self._frames_shown, self._labels_shown, self._filter)
+            # A model without bodies would be an empty page.
+            if not visuals:
+                self.show_frames(True, True)
+
+    def update(self, values: Mapping[str, float]) -> int:
+        """Move everything to where it is at given values of all symbols; return how many frames moved."""
+        with self._lock:
+            poses = self._kinematics.at(values)
+            moved = np.flatnonzero(np.abs(poses - self.poses).max(axis=(1, 2)) > 1e-9)
+            self.poses = poses
+            if not len(moved):
+                return 0
+            turned = quaternions(poses[moved])
+            with self._server.atomic():
+                for k, wxyz in zip(moved, turned, strict=True):
+                    node = self._nodes.get(self.names[k])
+                    if node is not None:
+                        node.position, node.wxyz = poses[k, :3, 3], wxyz
+                self._move_frames()
+            return len(moved)
+
+    def pose(self, frame: str) -> Floats:
+        """Return where a frame was put last, 4×4."""
+        return np.array(self.poses[self._kinematics.index(frame)])
+
+    def show_frames(self, axes: bool, labels: bool = False, containing: str = "") -> None:
+        """Show or hide the axes and the names of those frames whose name contains a text."""
+        with self._lock:
+            self._frames_shown, self._labels_shown, self._filter = axes, labels, containing
+            for name in ("/axes", "/labels"):
+                self._server.scene.remove_by_name(name)
+            wanted = [k for k, name in enumerate(self.names) if containing.lower() in name.lower()]
+            self._shown, self._labels = wanted, []
+            self._axes = None
+            if axes and wanted:
+                self._axes = self._server.scene.add_batched_axes(
+                    "/axes",
+                    quaternions(self.poses[wanted]),
+                    self.poses[wanted, :3, 3],
+                    axes_length=self._length,
+                    axes_radius=0.035 * self._length,
+                )
+            if labels:
+                add = self._server.scene.add_label
+                self._labels = [
+                    add(f"/labels/{k}", self.names[k], position=self.poses[k, :3, 3], font_screen_scale=0.8)
+                    for k in wanted
+                ]
+
+    def show_collisions(self, shown: bool) -> None:
+        """Show or hide the collision shapes, half transparent; they are built when first asked for."""
+        with self._lock:
+            self._collisions_shown = shown
+            if shown and not self._collisions_built:
+                self._add(parts(self._model, "collision"), "collision")
+                self._collisions_built = True
+            for node in self._shapes["collision"]:
+                node.visible = shown
+
+    def show_visuals(self, shown: bool) -> None:
+        """Show or hide what is meant to be seen."""
+        for node in self._shapes["visual"]:
+            node.visible = shown
+
+    def show_ground(self, shown: bool) -> None:
+        """Show or hide the floor."""
+        self._ground_shown = shown
+        stage.set_floor(self._server, self._floor, self._extent, shown)
+
+    def _add(self, items: Iterable[Part], kind: Kind) -> None:
+        """Add shapes under the nodes of their frames; those of one frame and colour become one mesh."""
+        if kind == "visual":
+            self._shapes: dict[str, list[Any]] = {"visual": [], "collision": []}
+        for number, part in enumerate(items):
+            node = self._node(part.frame)
+            for k, (surface, color) in enumerate(_by_color(part)):
+                self._shapes[kind].append(
+                    self._server.scene.add_mesh_simple(
+                        f"{node.name}/{kind}{number}_{k}",
+                        surface.vertices,
+                        surface.faces,
+                        color=tuple(round(255 * c) for c in color[:3]),
+                        opacity=None if color[3] >= 1.0 else color[3],
+                        side="front" if surface.closed else "double",
+                        cast_shadow=kind == "visual",
+                    )
+                )
+
+    def _node(self, frame: str) -> Any:
+        """Return the scene node of a frame; added at its pose if there is none yet."""
+        if frame not in self._nodes:
+            k = self._kinematics.index(frame)
+            # Slashes would make viser nest the nodes, and our poses are all relative to the world.
+            self._nodes[frame] = self._server.scene.add_frame(
+                f"{ROOT}/{frame.replace('/', '∕')}",
+                show_axes=False,
+                position=self.poses[k, :3, 3],
+                wxyz=quaternions(self.poses[k : k + 1])[0],
+            )
+        return self._nodes[frame]
+
+    def _move_frames(self) -> None:
+        if self._axes is not None:
+            self._axes.batched_wxyzs = quaternions(self.poses[self._shown]).astype(np.float32)
+            self._axes.batched_positions = self.poses[self._shown, :3, 3].astype(np.float32)
+        for k, label in zip(self._shown, self._labels, strict=False):
+            label.position = self.poses[k, :3, 3]
+
+    def _place_camera(self, visuals: list[Part]) -> None:
+        at = dict(zip(self.names, self.poses, strict=True))
+        surfaces = Surfaces.of(visuals, at)
+        self._length = axis_length(surfaces.corners, at)
+        points = surfaces.corners.reshape(-1, 3) if len(surfaces.corners) else self.poses[:, :3, 3]
+        low, high = points.min(axis=0), points.max(axis=0)
+        self._floor, self._extent = float(low[2]), float(np.linalg.norm(high - low))
+        weights = importance(self._model, visuals)
+        camera = automatic(surfaces, weights, at, ASPECT, FIELD_OF_VIEW)
+        start = self._server.initial_camera
+        start.position, start.look_at = np.array(camera.position), np.array(camera.target)
+        start.fov = FIELD_OF_VIEW
+        away = np.subtract(camera.position, camera.target)
+        stage.set_lamp(self._server, float(np.arctan2(away[1], away[0])))
+
+
+def _by_color(part: Part) -> list[tuple[Triangles, tuple[float, ...]]]:
+    """Return a surface in pieces of one colour each: the page knows one colour a mesh."""
+    surface = part.surface
+    if surface.colors is None:
+        return [(surface, part.color)]
+    # Pictures on surfaces are reduced to a few dozen tones.
+    tones, which = np.unique(np.round(surface.colors * 12.0) / 12.0, axis=0, return_inverse=True)
+    pieces = []
+    for k in range(len(tones)):
+        chosen = np.flatnonzero(which.reshape(-1) == k)
+        mean = surface.colors[chosen].mean(axis=0)
+        pieces.append((_piece(surface, chosen), tuple(float(c) for c in mean)))
+    return pieces
+
+
+def _piece(surface: Triangles, chosen: Integers) -> Triangles:
+    used, faces = np.unique(surface.faces[chosen], return_inverse=True)
+    return Triangles(
+        surface.vertices[used], faces.reshape(-1, 3), surface.normals[used], closed=surface.closed
+    )

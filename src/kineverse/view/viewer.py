@@ -1,0 +1,250 @@
+"""The page in the browser: a model, its sliders, and one thread that keeps both in step."""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+from kineverse.errors import KineverseError
+from kineverse.model.view import ModelView
+from kineverse.view import server as web
+from kineverse.view.motion import Show
+from kineverse.view.panel import Panel
+from kineverse.view.poses import complete
+from kineverse.view.ranges import Ranges
+from kineverse.view.scene import Scene
+from kineverse.view.triangles import Floats
+from kineverse.view.units import units
+from kineverse.view.violations import failure, report
+
+logger = logging.getLogger(__name__)
+
+PERIOD = 1.0 / 30.0
+"""Least time between two updates of the page [s]; what happens in between is drawn once."""
+
+PANEL = 380
+"""Width of the controls: room for the names of joints [pixels]."""
+
+
+class Viewer:
+    """A model shown on a web page of this computer.
+
+    The page is up when the constructor returns. Use it as a context, or call :meth:`stop`.
+
+    Parameters
+    ----------
+    model
+        The model to show.
+    state
+        Values by symbol or name [m], [rad]; the default state for the others.
+    port
+        The port, 0 for any free one; None for 8080 or any free one.
+    label
+        The title of the page.
+
+    Raises
+    ------
+    MissingExtraError
+        If viser is not installed.
+    UnknownNameError
+        If the state names what the model does not have.
+    """
+
+    def __init__(
+        self,
+        model: ModelView,
+        state: Mapping[Any, float] | None = None,
+        *,
+        port: int | None = None,
+        label: str = "Kineverse",
+    ) -> None:
+        self.model = model
+        self._initial = complete(model, state)
+        self._values = dict(self._initial)
+        self._change = threading.Condition()
+        self._asked, self._done = 1, 0
+        self._stopping, self._edited = False, False
+        self._driven: set[str] = set()
+        self._show: Show | None = None
+        self._server = web.start(port, label)
+        try:
+            self._server.gui.configure_theme(
+                show_logo=False, show_share_button=False, brand_color=(34, 104, 172)
+            )
+            self._server.gui.main_panel.dock_right()
+            self._server.gui.main_panel.set_width(PANEL)
+            self._scene = Scene(self._server, model, self._values)
+            self._panel = self._build_panel()
+        except BaseException:
+            web.stop(self._server)
+            raise
+        listen = getattr(model, "listen", None)  # Snapshots never change and have none.
+        self._listener = listen(lambda _: self.refresh()) if listen else None
+        self._worker = threading.Thread(target=self._work, name="kineverse-view", daemon=True)
+        self._worker.start()
+
+    @property
+    def address(self) -> str:
+        """The address of the page."""
+        return f"http://{web.HOST}:{self._server.get_port()}"
+
+    @property
+    def values(self) -> dict[str, float]:
+        """The values of all symbols that the page shows or is about to show, by name."""
+        with self._change:
+            return dict(self._values)
+
+    @property
+    def problems(self) -> list[str]:
+        """What could not be loaded, one line each."""
+        return list(self._scene.problems)
+
+    def pose(self, frame: str) -> Floats:
+        """Return where a frame was drawn last, as a 4×4 transform to the world."""
+        return self._scene.pose(frame)
+
+    def move(self, values: Mapping[Any, float]) -> None:
+        """Set the values of some symbols, by symbol or name, as if their sliders had been moved.
+
+        Raises
+        ------
+        UnknownNameError
+            If the model has no such symbol; nothing has moved then.
+        """
+        with self._change:
+            self._values = complete(self.model, {**self._values, **{str(k): v for k, v in values.items()}})
+            self._ask(str(name) for name in values)
+
+    def reset(self) -> None:
+        """Go back to the state of the start."""
+        with self._change:
+            self._show = None
+            self._values = dict(self._initial)
+            self._ask(self._values)
+        self._panel.playing.value = False
+
+    def play(self, running: bool = True) -> None:
+        """Start or stop moving everything through its range."""
+        with self._change:
+            limits = {name: self._panel.range(name) for name in self._ranges.names}
+            self._show = Show(self._values, limits, time.monotonic()) if running else None
+            self._ask()
+        self._panel.playing.value = running
+
+    def refresh(self) -> None:
+        """Show the model as it is now; values of symbols that remain are kept.
+
+        This happens by itself after every edit of the model that was given.
+        """
+        with self._change:
+            self._edited = True
+            self._ask()
+
+    def settled(self, timeout: float = 10.0) -> bool:
+        """Wait at most ``timeout`` [s] for the page to be up to date; return whether it is."""
+        with self._change:
+            return self._change.wait_for(lambda: self._done >= self._asked, timeout)
+
+    def wait(self) -> None:
+        """Keep the page up until :meth:`stop` or Ctrl-C."""
+        while self._worker.is_alive():
+            # A join without a limit cannot be interrupted on every platform.
+            self._worker.join(timeout=0.5)
+
+    def stop(self) -> None:
+        """Take the page down; calling it again does nothing."""
+        with self._change:
+            if self._stopping:
+                return
+            self._stopping = True
+            self._change.notify_all()
+        if self._listener is not None:
+            self._listener.close()
+        self._worker.join(timeout=5.0)
+        web.stop(self._server)
+
+    def __enter__(self) -> Viewer:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.stop()
+
+    def _build_panel(self) -> Panel:
+        self._ranges = Ranges(self.model)
+        return Panel(
+            self._server.gui,
+            self._scene,
+            self._ranges,
+            units(self.model, self._values, self._ranges.names),
+            self._values,
+            moved=self._moved,
+            reset=self.reset,
+            play=self.play,
+        )
+
+    def _moved(self, name: str, value: float) -> None:
+        with self._change:
+            if name in self._values:
+                self._values[name] = value
+                self._ask()
+
+    def _ask(self, set_by_program: Iterable[str] = ()) -> None:
+        """Have the page updated; to be called with the lock held.
+
+        Only sliders of values that a program has set are moved: one that is being dragged is ahead of what is
+        drawn, and would be torn from the hand.
+        """
+        self._asked += 1
+        self._driven.update(set_by_program)
+        self._change.notify_all()
+
+    def _work(self) -> None:
+        """Draw what was asked for, newest first, until told to stop."""
+        while True:
+            with self._change:
+                wanted = lambda: self._stopping or self._asked > self._done or self._show  # noqa: E731
+                self._change.wait_for(wanted)
+                if self._stopping:
+                    return
+                if self._show is not None:
+                    shown = self._show.at(time.monotonic())
+                    self._values.update(shown)
+                    self._driven.update(shown)
+                asked, edited, self._edited = self._asked, self._edited, False
+                values, driven, self._driven = dict(self._values), self._driven, set()
+            if edited:
+                values = self._rebuild(values)
+            self._draw(values, driven)
+            with self._change:
+                self._done = max(self._done, asked)
+                self._change.notify_all()
+                self._change.wait_for(lambda: self._stopping, timeout=PERIOD)
+
+    def _rebuild(self, values: Mapping[str, float]) -> dict[str, float]:
+        """Build the page anew for a model that was edited, and return the values of its symbols."""
+        known = {str(symbol) for symbol in self.model.symbols}
+        current = complete(self.model, {name: value for name, value in values.items() if name in known})
+        with self._change:
+            self._initial = complete(self.model, {k: v for k, v in self._initial.items() if k in known})
+            self._values = dict(current)
+            self._show = None
+        self._panel.remove()
+        self._scene.refresh(self.model, current)
+        self._panel = self._build_panel()
+        return current
+
+    def _draw(self, values: Mapping[str, float], driven: Iterable[str]) -> None:
+        try:
+            self._scene.update(values)
+            self._panel.update(values, driven)
+            violated = self.model.violations(values)
+            self._panel.show(report(violated, violated.unchecked))
+        except KineverseError as error:
+            self._panel.show(failure(str(error)))
+        except Exception as error:
+            # The thread outlives whatever one state of a model does to it, and says so.
+            logger.exception("the page could not be updated")
+            self._panel.show(failure(f"{type(error).__name__}: {error}"))

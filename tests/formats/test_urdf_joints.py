@@ -1,0 +1,168 @@
+"""Joints of every type: what is read, what is the default, what is normalised."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from robots import LIMIT, joint, pair, robot
+
+from kineverse.formats.urdf import Dynamics, Limits, Mimic, Safety, parse_urdf
+
+
+def test_defaults_are_those_of_the_specification():
+    (j,) = parse_urdf(pair()).joints
+    assert (j.name, j.kind, j.parent, j.child, j.line) == ("j", "revolute", "l0", "l1", 4)
+    assert np.array_equal(j.origin.matrix, np.eye(4))
+    assert j.axis == (1.0, 0.0, 0.0)
+    assert j.limits == Limits(-1.0, 2.0, 3.0, 10.0)
+    assert (j.safety, j.mimic, j.dynamics) == (None, None, Dynamics(0.0, 0.0))
+
+
+@pytest.mark.parametrize(
+    ("kind", "dof", "axis"),
+    [
+        ("fixed", 0, None),
+        ("revolute", 1, (0.0, 0.0, 1.0)),
+        ("continuous", 1, (0.0, 0.0, 1.0)),
+        ("prismatic", 1, (0.0, 0.0, 1.0)),
+        ("planar", 3, (0.0, 0.0, 1.0)),
+        ("floating", 6, None),
+    ],
+)
+def test_every_type(kind, dof, axis):
+    robot = parse_urdf(pair('<axis xyz="0 0 2"/>' + LIMIT, kind))
+    assert robot.dof == dof
+    assert robot.joints[0].axis == axis
+
+
+@pytest.mark.parametrize("kind", ["continuous", "fixed", "planar", "floating"])
+def test_types_without_limits_need_none(kind):
+    assert parse_urdf(pair("", kind)).joints[0].limits == Limits()
+
+
+def test_a_continuous_joint_keeps_speed_and_effort_but_has_no_range():
+    assert parse_urdf(pair(LIMIT, "continuous")).joints[0].limits == Limits(None, None, 3.0, 10.0)
+
+
+def test_a_missing_bound_is_zero():
+    text = pair('<limit lower="-1" effort="1" velocity="1"/>')
+    assert parse_urdf(text).joints[0].limits == Limits(-1.0, 0.0, 1.0, 1.0)
+    robot = parse_urdf(pair('<limit effort="1" velocity="1"/>'))
+    assert robot.joints[0].limits == Limits(0.0, 0.0, 1.0, 1.0)
+    assert "neither lower nor upper" in robot.remarks[0]
+
+
+@pytest.mark.parametrize(("effort", "velocity"), [("-1", "-1"), ("1", "0"), ("-1", "2")])
+def test_a_magnitude_that_bounds_nothing_is_no_bound_and_remarked(effort, velocity):
+    robot = parse_urdf(pair(f'<limit lower="0" upper="1" effort="{effort}" velocity="{velocity}"/>'))
+    limits = robot.joints[0].limits
+    assert limits.velocity == (2.0 if velocity == "2" else None)
+    assert limits.effort == (1.0 if effort == "1" else None)
+    assert 'line 4, <joint name="j">: <limit>' in robot.remarks[0]
+
+
+def test_safety_mimic_and_dynamics():
+    text = robot(
+        joint("a", "l0", "l1"),
+        joint(
+            "b",
+            "l1",
+            "l2",
+            inside=LIMIT
+            + '<safety_controller k_velocity="5" k_position="7"'
+            + ' soft_lower_limit="-.5" soft_upper_limit=".5"/>'
+            + '<mimic joint="a" multiplier="-2" offset=".1"/><dynamics damping="3"/>',
+        ),
+        links=3,
+    )
+    b = parse_urdf(text).joints[1]
+    assert b.safety == Safety(-0.5, 0.5, 7.0, 5.0)
+    assert b.mimic == Mimic("a", -2.0, 0.1)
+    assert b.dynamics == Dynamics(3.0, 0.0)
+
+
+def test_an_empty_dynamics_is_the_default():
+    # urdfdom refuses it; by the specification both attributes are optional.
+    assert parse_urdf(pair(LIMIT + "<dynamics/>")).joints[0].dynamics == Dynamics(0.0, 0.0)
+
+
+def test_an_axis_without_xyz_is_the_default():
+    # urdfdom makes it zero; by the specification the attribute's default is x.
+    assert parse_urdf(pair("<axis/>" + LIMIT)).joints[0].axis == (1.0, 0.0, 0.0)
+
+
+@given(st.tuples(*[st.floats(-1e3, 1e3)] * 3).filter(lambda v: math.hypot(*v) > 1e-3))
+def test_axes_are_unit_vectors_in_their_direction(xyz):
+    (x, y, z) = xyz
+    axis = parse_urdf(pair(f'<axis xyz="{x!r} {y!r} {z!r}"/>' + LIMIT)).joints[0].axis
+    assert math.isclose(math.hypot(*axis), 1.0, abs_tol=1e-14)
+    assert np.allclose(np.cross(axis, xyz), 0.0, atol=1e-11 * math.hypot(*xyz))
+    assert np.dot(axis, xyz) > 0.0
+
+
+def test_components_of_an_axis_that_are_noise_vanish():
+    assert parse_urdf(pair('<axis xyz="2.2e-16 0 1"/>' + LIMIT)).joints[0].axis == (0.0, 0.0, 1.0)
+
+
+def test_an_axis_that_is_far_from_unit_length_is_remarked():
+    assert "has length 2" in parse_urdf(pair('<axis xyz="0 0 2"/>' + LIMIT)).remarks[0]
+
+
+def test_what_a_fixed_joint_cannot_have_is_not_looked_at():
+    inside = '<axis xyz="0 0 0"/><limit effort="what"/><mimic joint="nobody"/><dynamics damping="a b"/>'
+    assert parse_urdf(pair(inside, "fixed")).dof == 0
+
+
+def test_the_first_of_two_elements_counts_and_the_other_is_remarked():
+    robot = parse_urdf(pair('<origin xyz="0 0 1"/><origin xyz="0 0 2"/><origin xyz="0 0 1"/>' + LIMIT))
+    assert robot.joints[0].origin.matrix[2, 3] == 1.0
+    assert len(robot.remarks) == 1
+    assert "<origin> is ignored" in robot.remarks[0]
+
+
+def test_quaternions_came_with_version_1_1():
+    inside = '<origin xyz="1 2 3" quat_xyzw="0 0 2 2"/>' + LIMIT
+    (j,) = parse_urdf(pair(inside, attributes='name="r" version="1.1"')).joints
+    assert np.array_equal(j.origin.matrix, [[0, -1, 0, 1], [1, 0, 0, 2], [0, 0, 1, 3], [0, 0, 0, 1]])
+
+
+@pytest.mark.parametrize("version", ["1", "1.0", "1.1", "1.2"])
+def test_versions(version):
+    assert parse_urdf(pair(attributes=f'name="r" version="{version}"')).dof == 1
+
+
+def test_gazebo_transmissions_sensors_and_strangers_are_ignored():
+    text = robot(
+        "<gazebo/>",
+        '<gazebo reference="l0"><joint name="no" type="ball"><x><y/></x></joint><gazebo/></gazebo>',
+        '<transmission name="t"><joint name="also_no"/></transmission>',
+        '<sensor name="s"><parent link="l0"/></sensor>',
+        "<!-- <joint/> -->",
+        '<whatever><link name="no"/></whatever>',
+        joint(
+            "j",
+            "l0",
+            "l1",
+            inside=LIMIT + "<calibration rising='x'/><hardwareInterface/><hardwareInterface/>",
+        ),
+        links=2,
+    )
+    description = parse_urdf(text)
+    assert [j.name for j in description.joints] == ["j"]
+    assert [link.name for link in description.links] == ["l0", "l1"]
+    assert description.remarks == ()
+
+
+def test_macros_that_were_not_expanded_are_remarked():
+    text = robot(
+        "<m:arm/>",
+        joint("j", "l0", "l1"),
+        links=2,
+        attributes='name="r" xmlns:m="http://www.ros.org/wiki/xacro"',
+    )
+    (remark,) = parse_urdf(text).remarks
+    assert remark.startswith("line 4, <m:arm> is ignored: it is xacro")

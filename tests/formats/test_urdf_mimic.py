@@ -1,0 +1,86 @@
+"""Chains of joints that follow joints are composed."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from robots import joint, robot
+
+from kineverse.errors import FormatError
+from kineverse.formats.urdf import Mimic, parse_urdf
+
+FACTOR = st.floats(-3, 3, allow_subnormal=False)
+
+
+def followers(factors, order):
+    """Return a star of joints: ``j0`` moves by itself, each other one follows the one before it."""
+    inside = [""] + [
+        f'<mimic joint="j{i}" multiplier="{m!r}" offset="{o!r}"/>' for i, (m, o) in enumerate(factors)
+    ]
+    joints = [joint(f"j{i}", "l0", f"l{i + 1}", "continuous", text) for i, text in enumerate(inside)]
+    return robot(*(joints[i] for i in order), links=len(joints) + 1)
+
+
+@given(st.data())
+def test_a_chain_says_what_its_links_say_one_by_one(data):
+    factors = data.draw(st.lists(st.tuples(FACTOR, FACTOR), min_size=1, max_size=6))
+    order = data.draw(st.permutations(range(len(factors) + 1)))
+    q = data.draw(FACTOR)
+    joints = {j.name: j for j in parse_urdf(followers(factors, order)).joints}
+    value = q
+    assert joints["j0"].mimic is None
+    for i, (multiplier, offset) in enumerate(factors):
+        value = multiplier * value + offset
+        mimic = joints[f"j{i + 1}"].mimic
+        assert mimic.joint == "j0"
+        assert math.isclose(mimic.multiplier * q + mimic.offset, value, rel_tol=1e-9, abs_tol=1e-9)
+
+
+def test_defaults():
+    text = robot(
+        joint("a", "l0", "l1", "continuous", ""),
+        joint("b", "l1", "l2", "continuous", '<mimic joint="a"/>'),
+        links=3,
+    )
+    description = parse_urdf(text)
+    assert description.joints[1].mimic == Mimic("a", 1.0, 0.0)
+    assert description.dof == 1
+
+
+def test_a_slider_may_follow_a_hinge():
+    text = robot(
+        joint("a", "l0", "l1", "continuous", ""),
+        joint(
+            "b", "l1", "l2", "prismatic", '<limit effort="1" velocity="1"/><mimic joint="a" multiplier=".1"/>'
+        ),
+        links=3,
+    )
+    assert parse_urdf(text).dof == 1
+
+
+def test_circles_are_refused_and_shown():
+    def follow(name: str, i: int) -> str:
+        return joint(name, "l0", f"l{i}", "continuous", f'<mimic joint="{"abc"[i % 3]}"/>')
+
+    with pytest.raises(FormatError, match='it mimics itself, by way of "a" -> "b" -> "c"'):
+        parse_urdf(robot(*(follow(name, i + 1) for i, name in enumerate("abc")), links=4))
+
+
+def test_a_chain_that_leads_nowhere_names_the_joint_that_breaks_it():
+    text = robot(
+        joint("a", "l0", "l1", "continuous", '<mimic joint="finger_jiont"/>'),
+        joint("b", "l0", "l2", "continuous", '<mimic joint="a"/>'),
+        joint("finger_joint", "l0", "l3", "continuous", ""),
+        links=4,
+    )
+    with pytest.raises(FormatError, match=r"<mimic> of <joint name=\"a\">: .*Did you mean 'finger_joint'\?"):
+        parse_urdf(text)
+
+
+def test_factors_that_overflow_are_refused():
+    text = followers([(1e200, 0.0), (1e200, 0.0)], range(3))
+    with pytest.raises(FormatError, match="overflow"):
+        parse_urdf(text)

@@ -1,0 +1,155 @@
+"""Links and joints form one tree, of any shape and depth."""
+
+from __future__ import annotations
+
+import sys
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from robots import chain, joint, robot
+
+from kineverse.errors import FormatError
+from kineverse.formats.urdf import parse_urdf
+
+
+@st.composite
+def trees(draw: st.DrawFn) -> tuple[list[int], list[int]]:
+    """Return the parent of each link but the first, and an order in which to write the joints."""
+    parents = [draw(st.integers(0, i)) for i in range(draw(st.integers(0, 12)))]
+    return parents, draw(st.permutations(range(len(parents))))
+
+
+def tree_text(parents: list[int], order: list[int]) -> str:
+    return robot(
+        *(joint(f"j{i}", f"l{parents[i]}", f"l{i + 1}", "continuous", "") for i in order),
+        links=len(parents) + 1,
+    )
+
+
+@given(trees())
+def test_joints_come_from_the_root_outwards_in_the_order_of_the_file(tree):
+    parents, order = tree
+    description = parse_urdf(tree_text(parents, order))
+    assert description.root == "l0"
+    names = [j.name for j in description.joints]
+    assert sorted(names) == sorted(f"j{i}" for i in order)
+    known = {"l0"}
+    for j in description.joints:
+        assert j.parent in known
+        known.add(j.child)
+    for parent in set(parents):
+        siblings = [f"j{i}" for i in order if parents[i] == parent]
+        assert [name for name in names if name in siblings] == siblings
+
+
+@given(trees(), st.data())
+def test_one_more_joint_is_one_too_many(tree, data):
+    parents, order = tree
+    links = st.integers(0, len(parents))
+    extra = joint("extra", f"l{data.draw(links)}", f"l{data.draw(links)}", "fixed", "")
+    text = tree_text(parents, order).replace("</robot>", extra + "</robot>")
+    with pytest.raises(FormatError, match="URDF describes trees only"):
+        parse_urdf(text, source="r.urdf")
+
+
+@given(trees().filter(lambda tree: tree[0]), st.data())
+def test_one_joint_less_leaves_two_roots(tree, data):
+    parents, order = tree
+    gone = data.draw(st.sampled_from(order))
+    with pytest.raises(FormatError, match=f"where one root is expected: .*l{gone + 1}"):
+        parse_urdf(tree_text(parents, [i for i in order if i != gone]))
+
+
+def test_links_that_do_not_exist():
+    with pytest.raises(FormatError, match=r"its parent link \"l7\" does not exist; .* Available: l0, l1"):
+        parse_urdf(robot(joint("j", "l7", "l1"), links=2))
+    with pytest.raises(
+        FormatError, match=r"its child link \"base_lnk\" does not exist; .*Did you mean 'base_link'"
+    ):
+        parse_urdf(robot('<link name="base_link"/>', joint("j", "l0", "base_lnk"), links=1))
+
+
+def test_a_second_parent_names_the_first():
+    text = robot(joint("a", "l0", "l2"), joint("b", "l1", "l2"), links=3)
+    with pytest.raises(
+        FormatError, match=r'<joint name="b">: its child link "l2" has a parent already, by the joint "a" on'
+    ):
+        parse_urdf(text)
+
+
+def test_a_circle_is_shown():
+    text = robot(*(joint(f"j{i}", f"l{i}", f"l{(i + 1) % 3}") for i in range(3)), links=3)
+    with pytest.raises(
+        FormatError, match='line 5, <joint name="j0">: the joints "j0" -> "j1" -> "j2" lead in a circle'
+    ):
+        parse_urdf(text)
+
+
+def test_a_circle_beside_a_tree_is_shown():
+    text = robot(joint("a", "l1", "l2"), joint("b", "l2", "l1"), joint("c", "l2", "l3"), links=4)
+    with pytest.raises(FormatError, match='<joint name="a">: the joints "a" -> "b" lead in a circle'):
+        parse_urdf(text)
+
+
+def test_a_link_that_is_its_own_parent():
+    with pytest.raises(FormatError, match="its child link is its own parent"):
+        parse_urdf(robot(joint("j", "l0", "l0"), links=1))
+
+
+def test_joints_of_other_dialects_are_named_when_there_is_no_tree():
+    with pytest.raises(
+        FormatError, match=r'Ignored, since URDF does not know it: <drake:joint name="j"> \(line 4\)'
+    ):
+        parse_urdf(robot('<drake:joint name="j" type="ball"/>', links=2))
+
+
+def work(text: str) -> int:
+    """Return how many calls and lines it takes to read a text."""
+    steps = 0
+
+    def count(*_: object):
+        nonlocal steps
+        steps += 1
+        return count
+
+    before = sys.gettrace(), sys.getprofile()
+    sys.settrace(count)
+    sys.setprofile(count)
+    try:
+        parse_urdf(text)
+    finally:
+        sys.settrace(before[0])
+        sys.setprofile(before[1])
+    return steps
+
+
+MIMIC = '<limit effort="1" velocity="1"/><mimic joint="j{before}"/>'
+STAR = robot(*(joint(f"j{i}", "l0", f"l{i + 1}") for i in range(400)), links=401)
+
+
+@pytest.mark.parametrize("inside", ['<limit effort="1" velocity="1"/>', MIMIC])
+def test_work_grows_with_the_length_of_a_chain_and_no_faster(inside):
+    def text(length: int) -> str:
+        return chain(length, inside).replace('<mimic joint="j0"/>', "", 1)
+
+    work(text(20))
+    short, long = work(text(200)), work(text(800))
+    assert long < 4.2 * short
+
+
+def test_work_does_not_depend_on_the_shape():
+    line, star = work(chain(400)), work(STAR)
+    assert abs(star - line) < 0.1 * line
+
+
+def test_a_chain_of_a_hundred_thousand_links():
+    length = 100_000
+    text = chain(length, '<mimic joint="j{before}" multiplier="1" offset="1"/>', "continuous")
+    text = text.replace('<mimic joint="j0" multiplier="1" offset="1"/>', "", 1)
+    description = parse_urdf(text)
+    assert len(description.links) == length + 1
+    assert description.joints[-1].name == f"j{length - 1}"
+    assert description.joints[-1].mimic.joint == "j0"
+    assert description.joints[-1].mimic.offset == length - 1
+    assert description.dof == 1
