@@ -76,7 +76,7 @@ def drawer(
     inside: list[Shape] | None = None,
     box_material: str = "birch",
 ) -> None:
-    """Add a drawer with its front over y × z and a box that starts `lift` above its edge and is `rim` high."""
+    """Add a drawer with its front over y × z; its box starts `lift` above its edge and is `rim` high."""
     middle, half = _middle_and_half(y, z)
     side = half[0] - 0.03
     low = -half[1] + lift

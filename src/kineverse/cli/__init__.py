@@ -1,0 +1,7 @@
+"""The ``kineverse`` command."""
+
+from __future__ import annotations
+
+from kineverse.cli.main import main
+
+__all__ = ["main"]

@@ -18,11 +18,13 @@ from .articulation import Articulation
 from .body import Body
 from .constraint import Constraint
 from .frame import WORLD, Frame
+from .integration import integrate
 from .kinematics import Placement
 from .operation import ARTICULATIONS, BODIES, CONSTRAINTS, DATA, FRAMES, KINDS, RATES
 from .rates import Rates
 from .reader import ABSENT, Cell, missing
 from .relevance import Relevance
+from .velocity import VelocityRows, velocity_rows
 from .violations import Checks, Violations, find_violations
 
 JacobianForm = Literal["world_aligned", "world", "body"]
@@ -423,6 +425,25 @@ class ModelView:
                 if all(s in known or s.value is not None for s in (*c.lower.symbols, *c.upper.symbols)):
                     values[symbol] = float(min(max(values[symbol], c.lower(known)), c.upper(known)))
             return State(values, source="default")
+
+    def velocity_rows(
+        self,
+        dt: float,
+        subject: Expression | Iterable[Symbol | Expression] | None = None,
+        *,
+        speeds: Sequence[Symbol] | None = None,
+        gain: float | None = None,
+    ) -> VelocityRows:
+        """Return the linear rows in speeds that keep the constraints over a step of ``dt`` seconds.
+
+        Of the constraints relevant for ``subject``, or of all; see :mod:`kineverse.model.velocity`.
+        """
+        constraints = self.constraints if subject is None else self.constraints_for(subject)
+        return velocity_rows(constraints, dt, rates=self.rates, speeds=speeds, gain=gain)
+
+    def integrate(self, state: State, speeds: Mapping[Any, float], dt: float) -> State:
+        """Return the state after ``dt`` seconds at constant free speeds; see :mod:`kineverse.model.integration`."""
+        return integrate(self.degrees_of_freedom, self.rates, state, speeds, dt)
 
     # -- printing ------------------------------------------------------------------------------------------
 

@@ -16,7 +16,7 @@ from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 from kineverse.view.camera import Camera
-from kineverse.view.picture import picture, save
+from kineverse.view.drawing import picture, save
 
 if TYPE_CHECKING:
     from kineverse.model.view import ModelView

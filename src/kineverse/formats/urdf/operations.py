@@ -1,131 +1,213 @@
-"""A robot description as the sequence of operations that builds it (2022 paper, III-B)."""
+"""A description as operations: one for each joint, one for each body, one for each pair of soft limits.
+
+Links become frames and joints degrees of freedom of the same name, below the prefix. The tags are those of the
+things: ``joint pr2/l_elbow_flex_joint``, ``body pr2/l_elbow_flex_link``, ``soft limits pr2/l_elbow_flex_joint``.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any
 
-from ...articulations import Continuous, Fixed, Floating, Planar, Prismatic, Revolute
+from ...articulations import AxisJoint, Continuous, Fixed, Floating, Planar, Prismatic, Revolute
+from ...articulations import Joint as JointOperation
+from ...errors import FormatError
 from ...expressions.expression import Expression
-from ...model.body import Body
+from ...expressions.functions import maximum, minimum
+from ...expressions.gradient import total_derivative
+from ...model.body import Body, Pose
+from ...model.edit import AddFrame
 from ...model.frame import WORLD, Frame
 from ...model.operation import Effects, Operation
 from ...model.reader import Reader
-from ...symbols import Symbol, position
-from .description import Joint, Robot, Safety
+from ...symbols import position
+from ..markup import quote
+from .description import FREEDOM, Joint, Limits, Robot, Safety
+
+_AXIS_JOINTS: dict[str, type[AxisJoint]] = {
+    "revolute": Revolute,
+    "continuous": Continuous,
+    "prismatic": Prismatic,
+}
+_SUFFIXES = {"planar": ("x", "y", "angle"), "floating": ("x", "y", "z", "qx", "qy", "qz", "qw", "wx", "wy", "wz")}
+_ROOT = Pose()
 
 
 @dataclass(frozen=True)
-class AttachBody(Operation):
-    """Gives a frame something to see, to touch and to weigh."""
+class SetBody(Operation):
+    """Gives a frame its body: what of it is seen and touched, and its inertia."""
 
     name: str
     body: Body
 
     def apply(self, model: Reader) -> Effects:
         """Write the body."""
+        if self.name != WORLD and self.name not in model.frames:
+            model.frames[self.name]  # raises, with similar names
         return Effects(bodies={self.name: self.body})
 
     def default_tag(self) -> str:
-        """Return ``body`` and the frame."""
+        """Return ``body`` and the name of the frame."""
         return f"body {self.name}"
 
 
 @dataclass(frozen=True)
-class Root(Operation):
-    """Puts the root link of a description into the world."""
-
-    name: str
-    parent: str = WORLD
-
-    def apply(self, model: Reader) -> Effects:
-        """Write the frame."""
-        return Effects(frames={self.name: Frame(self.parent, ())})
-
-    def default_tag(self) -> str:
-        """Return ``root`` and the frame."""
-        return f"root {self.name}"
-
-
-@dataclass(frozen=True)
 class SoftLimits(Operation):
-    """Keeps a joint's speed between lines that pass through zero at its soft limits.
+    """Keeps a joint from running into its end stops: k (lower - q) <= q̇ <= k (upper - q).
 
-    ``-k (q - soft_lower) <= q̇ <= -k (q - soft_upper)``: slower towards a soft limit, led back from beyond.
+    The bounds stay within the limit of the speed, so both can be kept from wherever the joint is; from beyond
+    the soft limits it is led back (ROS wiki, pr2_controller_manager/safety_limits).
+
+    Attributes
+    ----------
+    name
+        Of the articulation; the constraint is called ``name/soft_limits``.
+    q
+        The coordinate, or the expression that stands for it [rad] or [m].
+    lower, upper
+        The soft limits [rad] or [m].
+    gain
+        k [1/s].
+    velocity
+        Limit of the speed [rad/s] or [m/s]; None for no limit.
     """
 
     name: str
-    position: Symbol
-    safety: Safety
+    q: Expression
+    lower: float
+    upper: float
+    gain: float
+    velocity: float | None = None
 
     def apply(self, model: Reader) -> Effects:
-        """Write the constraint ``name/safety``."""
-        q, k = self.position, self.safety.k_position
-        lower, upper = -k * (q - self.safety.soft_lower), -k * (q - self.safety.soft_upper)
-        return Effects(constraints={f"{self.name}/safety": (lower, q.derivative(), upper)})
+        """Write the constraint."""
+        if self.name not in model.articulations:
+            model.articulations[self.name]  # raises, with similar names
+        rate = total_derivative(self.q)
+        if not rate.symbols:
+            return Effects()
+        slowest, fastest = self.gain * (self.lower - self.q), self.gain * (self.upper - self.q)
+        if self.velocity is not None:
+            slowest, fastest = minimum(slowest, self.velocity), maximum(fastest, -self.velocity)
+        return Effects(constraints={f"{self.name}/soft_limits": (slowest, rate, fastest)})
 
     def default_tag(self) -> str:
-        """Return ``safety`` and the joint."""
-        return f"safety {self.name}"
+        """Return ``soft limits`` and the name."""
+        return f"soft limits {self.name}"
 
 
 def robot_operations(robot: Robot, prefix: str | None = None, parent: str = WORLD) -> Iterator[Operation]:
-    """Yield the operations that build a robot: its root, joints from there outwards, bodies as they appear.
+    """Yield the operations that build a robot, from its root outwards.
 
     Parameters
     ----------
     robot
         The description.
     prefix
-        Put in front of all names, with a slash; without one a root link ``world`` is the world itself.
+        Put in front of the names of frames and degrees of freedom, with a slash.
     parent
-        The frame the root link is put into.
+        The frame to which the root link is attached. A root link ``world`` without prefix is the world itself.
+
+    Raises
+    ------
+    FormatError
+        If names of the description cannot be names here: two things would have the same, or a part is empty.
     """
-
-    def named(name: str) -> str:
-        return f"{prefix}/{name}" if prefix else name
-
-    bodies = {link.name: link.body for link in robot.links if link.body != Body()}
-    if named(robot.root) != WORLD:
-        yield Root(named(robot.root), parent)
-    if robot.root in bodies:
-        yield AttachBody(named(robot.root), bodies[robot.root])
-    for joint in robot.joints:
-        yield _joint(joint, named)
-        if joint.safety is not None and joint.safety.k_position > 0 and joint.mimic is None and joint.kind != "fixed":
-            yield SoftLimits(named(joint.name), position(named(joint.name)), joint.safety)
-        if joint.child in bodies:
-            yield AttachBody(named(joint.child), bodies[joint.child])
-
-
-def _joint(joint: Joint, named: Any) -> Operation:
-    dynamics = [
-        (key, value)
-        for key, value in (
-            ("effort", joint.limits.effort),
-            ("damping", joint.dynamics.damping or None),
-            ("friction", joint.dynamics.friction or None),
+    _check_names(robot, prefix)
+    named: Callable[[str], str] = f"{prefix}/{{}}".format if prefix else str
+    root = named(robot.root)
+    bodies = {link.name: link.body for link in robot.links if link.body != _NO_BODY}
+    if root != WORLD:
+        yield AddFrame(root, Frame(parent, (_ROOT,)))
+    elif parent != WORLD:
+        raise FormatError(
+            f"{robot.source}: its root link is the world, so it cannot be attached to {quote(parent)}. Give it a prefix."
         )
-        if value is not None
-    ]
+    if robot.root in bodies:
+        yield SetBody(root, bodies[robot.root])
+    for joint in robot.joints:
+        yield from _joint_operations(joint, named)
+        if joint.child in bodies:
+            yield SetBody(named(joint.child), bodies[joint.child])
+
+
+_NO_BODY = Body()
+
+
+def _joint_operations(joint: Joint, named: Callable[[str], str]) -> Iterator[Operation]:
+    name = named(joint.name)
     common: dict[str, Any] = {
-        "name": named(joint.name),
+        "name": name,
         "parent": named(joint.parent),
         "child": named(joint.child),
         "origin": joint.origin,
-        "dynamics": tuple(dynamics),
     }
     if joint.kind == "fixed":
-        return Fixed(**common)
-    if joint.kind == "floating":
-        return Floating(**common)
-    axis = joint.axis or (1.0, 0.0, 0.0)
-    if joint.kind == "planar":
-        return Planar(**common, axis=axis)
-    limits = {"lower": joint.limits.lower, "upper": joint.limits.upper, "velocity": joint.limits.velocity}
-    follows: Expression | None = None
-    if joint.mimic is not None:
-        follows = joint.mimic.multiplier * position(named(joint.mimic.joint)) + joint.mimic.offset
-    kinds = {"revolute": Revolute, "continuous": Continuous, "prismatic": Prismatic}
-    return kinds[joint.kind](**common, axis=axis, **limits, position=follows)
+        yield Fixed(**common)
+    elif joint.kind == "floating":
+        yield Floating(**common)
+    elif joint.kind == "planar":
+        assert joint.axis is not None
+        yield Planar(**common, axis=joint.axis)
+    else:
+        followed = _followed(joint, named)
+        yield _axis_joint(joint, common, followed)
+        safety, velocity = joint.safety, joint.limits.velocity
+        if safety is not None and safety.k_position > 0.0 and joint.kind != "continuous":
+            q = position(name) if followed is None else followed
+            yield SoftLimits(name, q, safety.soft_lower, safety.soft_upper, safety.k_position, velocity)
+
+
+def _axis_joint(joint: Joint, common: dict[str, Any], followed: Expression | None) -> JointOperation:
+    assert joint.axis is not None
+    return _AXIS_JOINTS[joint.kind](
+        **common,
+        axis=joint.axis,
+        lower=joint.limits.lower,
+        upper=joint.limits.upper,
+        velocity=joint.limits.velocity,
+        position=followed,
+        dynamics=_dynamics(joint),
+    )
+
+
+def _followed(joint: Joint, named: Callable[[str], str]) -> Expression | None:
+    """Return the expression that stands for the position of a joint that mimics another one."""
+    if joint.mimic is None:
+        return None
+    return joint.mimic.multiplier * position(named(joint.mimic.joint)) + joint.mimic.offset
+
+
+def _dynamics(joint: Joint) -> tuple[tuple[str, float], ...]:
+    values = {
+        "effort": joint.limits.effort,
+        "damping": joint.dynamics.damping or None,
+        "friction": joint.dynamics.friction or None,
+        "k_velocity": None if joint.safety is None else joint.safety.k_velocity,
+    }
+    return tuple((name, value) for name, value in values.items() if value is not None)
+
+
+def _check_names(robot: Robot, prefix: str | None) -> None:
+    for what, parts in (("link", robot.links), ("joint", robot.joints)):
+        for part in parts:
+            name = part.name
+            if name[0] == "/" or name[-1] == "/" or "//" in name or not name.isprintable():
+                raise FormatError(
+                    f"{robot.source}, line {part.line}, <{what} name={quote(name)}>: the name has an empty part or a control "
+                    "character; slashes separate the parts of a name. Rename it."
+                )
+            if what == "link" and name == WORLD and not prefix and name != robot.root:
+                raise FormatError(
+                    f"{robot.source}, line {part.line}, <link name={quote(name)}>: a link that is not the root is called as "
+                    "the frame at the root of everything. Load the robot with a prefix."
+                )
+    taken = {joint.name for joint in robot.joints}
+    for joint in robot.joints:
+        for suffix in _SUFFIXES.get(joint.kind, ()):
+            if f"{joint.name}/{suffix}" in taken:
+                raise FormatError(
+                    f"{robot.source}, line {joint.line}, <joint name={quote(joint.name)}>: its coordinate "
+                    f"{quote(f'{joint.name}/{suffix}')} has the name of another joint. Rename one of them."
+                )

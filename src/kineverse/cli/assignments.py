@@ -1,0 +1,72 @@
+"""``--set NAME=VALUE``: positions on the command line."""
+
+from __future__ import annotations
+
+import argparse
+import math
+import re
+from collections.abc import Iterable
+
+from kineverse.errors import ValueRejectedError
+
+_NUMBER = r"(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
+_VALUE = re.compile(
+    rf"(?P<sign>[-+]?)\s*(?:(?P<number>{_NUMBER})?\s*(?:(?P<times>\*?)\s*(?P<pi>pi|π))?)"
+    rf"\s*(?:/\s*(?P<divisor>{_NUMBER}))?\s*(?P<unit>deg|°|rad|mm|cm|m)?"
+)
+
+UNITS = {None: 1.0, "rad": 1.0, "deg": math.pi / 180.0, "°": math.pi / 180.0, "m": 1.0, "cm": 0.01, "mm": 0.001}
+
+
+def add_set_option(parser: argparse.ArgumentParser) -> None:
+    """Add ``--set`` to a command."""
+    parser.add_argument(
+        "--set",
+        metavar="NAME=VALUE",
+        action="append",
+        default=[],
+        dest="assignments",
+        help="a position in rad or m: 0.3, pi/2, 30deg, 12cm; may be given several times",
+    )
+
+
+def parse_assignments(texts: Iterable[str]) -> dict[str, float]:
+    """Return values by name from texts like ``kitchen/fridge_door=30deg``; the last of several counts.
+
+    Raises
+    ------
+    ValueRejectedError
+        If a text is no assignment, or the value no finite number.
+    """
+    values = {}
+    for text in texts:
+        # A value has no equals sign in it; a name may.
+        name, equals, value = text.rpartition("=")
+        if not equals or not name.strip():
+            raise ValueRejectedError(f"--set {text!r}: write NAME=VALUE, such as kitchen/fridge_door=0.3")
+        values[name.strip()] = parse_value(value)
+    return values
+
+
+def parse_value(text: str) -> float:
+    """Return the number [rad] or [m] of a text such as ``0.3``, ``-pi/2``, ``1.5pi``, ``30deg``, ``12 cm``.
+
+    Raises
+    ------
+    ValueRejectedError
+        If it is none, or not finite.
+    """
+    match = _VALUE.fullmatch(text.strip())
+    if match is None or not (match["number"] or match["pi"]) or (match["times"] and not match["number"]):
+        raise ValueRejectedError(
+            f"{text.strip()!r} is not a value; write a finite number of rad or m (0.3, 1e-2), "
+            "parts of pi (pi/2, -0.5*pi), or a unit (30deg, 12cm, 5mm)"
+        )
+    value = float(match["number"] or 1.0) * (math.pi if match["pi"] else 1.0)
+    divisor = float(match["divisor"] or 1.0)
+    if divisor == 0.0:
+        raise ValueRejectedError(f"{text.strip()!r} divides by zero")
+    value = value / divisor * UNITS[match["unit"]] * (-1.0 if match["sign"] == "-" else 1.0)
+    if not math.isfinite(value):
+        raise ValueRejectedError(f"{text.strip()!r} is not finite")
+    return value

@@ -1,0 +1,80 @@
+"""``kineverse fk``: where a frame is."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+
+from kineverse.cli.assignments import add_set_option, parse_assignments
+from kineverse.cli.table import figure
+
+HELP = """print where a frame is, for given positions
+
+Positions that are not set have their default: 0, or the nearest value within the limits.
+
+examples:
+  kineverse fk kitchen kitchen/fridge_door_handle
+  kineverse fk kitchen kitchen/fridge_door_handle --set kitchen/fridge_door=30deg --json
+  kineverse fk pr2 pr2/l_gripper_tool_frame --relative-to pr2/torso_lift_link"""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the options."""
+    parser.add_argument("model", metavar="MODEL", help="name of a shipped model, or path of a file")
+    parser.add_argument("frame", metavar="FRAME", help="name of a frame, such as kitchen/fridge_door")
+    parser.add_argument("--relative-to", metavar="FRAME", default="world", help="in whose axes (world)")
+    add_set_option(parser)
+    parser.add_argument("--json", action="store_true", help="one JSON object on standard output")
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Evaluate and print."""
+    # Before the model is loaded: a typing error should not take seconds to be found.
+    assigned = parse_assignments(arguments.assignments)
+
+    import numpy as np
+
+    import kineverse as kv
+    from kineverse.view.poses import complete
+    from kineverse.view.rotation import quaternions, roll_pitch_yaw
+
+    model = kv.load(arguments.model)
+    expression = model.fk(arguments.frame, arguments.relative_to)
+    values = complete(model, assigned)
+    pose = np.asarray(expression(kv.State(values)), dtype=float)
+    position, wxyz, rpy = pose[:3, 3], quaternions(pose[None])[0], roll_pitch_yaw(pose)
+    used = {str(s): values[str(s)] for s in expression.symbols if str(s) in values}
+    if arguments.json:
+        answer = {
+            "frame": arguments.frame,
+            "relative_to": arguments.relative_to,
+            "transform": pose.tolist(),
+            "position": position.tolist(),
+            "quaternion_wxyz": wxyz.tolist(),
+            "roll_pitch_yaw": rpy.tolist(),
+            "depends_on": used,
+        }
+        print(json.dumps(answer, allow_nan=False))
+    else:
+        print(f"{arguments.frame} in {arguments.relative_to}")
+        print("\n".join("  " + "".join(f"{figure(x, 6):>12}" for x in row) for row in pose))
+        for name, numbers, unit in (
+            ("position", position, "m"),
+            ("roll pitch yaw", rpy, "rad"),
+            ("quaternion wxyz", wxyz, ""),
+        ):
+            print(f"  {name:<16}" + "".join(f"{figure(x, 6):>12}" for x in numbers) + f"  {unit}".rstrip())
+        if used:
+            print("  at " + ", ".join(f"{name}={figure(value, 6)}" for name, value in used.items()))
+    _warn_of_violations(model, values)
+    return 0
+
+
+def _warn_of_violations(model, values) -> None:  # type: ignore[no-untyped-def]
+    for violation in model.violations(values):
+        print(
+            f"kineverse: note: {violation.name} is violated: {figure(violation.value)} is not in "
+            f"[{figure(violation.lower)}, {figure(violation.upper)}]",
+            file=sys.stderr,
+        )

@@ -1,0 +1,119 @@
+"""``kineverse info``: what a model consists of."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from typing import TYPE_CHECKING, Any
+
+from kineverse.cli.table import figure, table
+
+if TYPE_CHECKING:
+    from kineverse.cli.summary import Summary
+
+HELP = """print what a model consists of: frames, degrees of freedom, constraints, size
+
+examples:
+  kineverse info kitchen
+  kineverse info my_robot.urdf --frames
+  kineverse info pr2 --json"""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the options."""
+    parser.add_argument("model", metavar="MODEL", help="name of a shipped model, or path of a file")
+    parser.add_argument("--frames", action="store_true", help="also print the tree of frames")
+    parser.add_argument("--constraints", action="store_true", help="also print all constraints")
+    parser.add_argument("--json", action="store_true", help="everything, as one JSON object")
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Load, count and print."""
+    import kineverse as kv
+    from kineverse.cli.summary import summarise
+
+    model = kv.load(arguments.model)
+    summary = summarise(arguments.model, model)
+    if arguments.json:
+        print(json.dumps(as_json(summary), allow_nan=False))
+        return 0
+    print("\n\n".join(sections(summary, arguments.frames, arguments.constraints)))
+    return 0
+
+
+def sections(summary: Summary, frames: bool = False, constraints: bool = False) -> list[str]:
+    """Return the paragraphs of the report."""
+    extent = " x ".join(f"{edge:.2f}" for edge in summary.extent)
+    lines = [
+        summary.name,
+        f"  {len(summary.frames)} frames, {len(summary.freedoms)} DoF, {len(summary.constraints)} constraints",
+        f"  {extent} m, {summary.mass:.4g} kg, {summary.shapes} shapes"
+        + (f", {len(summary.problems)} of them not loaded" if summary.problems else ""),
+    ]
+    found = ["\n".join(lines)]
+    if summary.freedoms:
+        rows = [
+            (f.name, f.unit, figure(f.lower), figure(f.upper), figure(f.default), figure(f.speed))
+            for f in summary.freedoms
+        ]
+        found.append(table(("DoF", "unit", "lower", "upper", "default", "speed"), rows, "<<>>>>"))
+    shown = summary.constraints if constraints else [c for c in summary.constraints if not c.simple]
+    if shown:
+        title = "constraint" if constraints else "constraint on more than one DoF, or depending on the state"
+        found.append(table((title, ""), [(c.name, c.text) for c in shown]))
+    if frames:
+        found.append("frames\n" + "\n".join(_tree(summary.frames)))
+    hidden = [] if frames else ["--frames"]
+    if not constraints and len(shown) < len(summary.constraints):
+        hidden.append("--constraints")
+    if hidden:
+        found.append(f"More with {' and '.join(hidden)}.")
+    return found
+
+
+def as_json(summary: Summary) -> dict[str, Any]:
+    """Return the summary as what JSON can say; a limit that is not there is null."""
+
+    def finite(value: float) -> float | None:
+        return value if abs(value) < float("inf") else None
+
+    return {
+        "model": summary.name,
+        "counts": {
+            "frames": len(summary.frames),
+            "dof": len(summary.freedoms),
+            "constraints": len(summary.constraints),
+            "shapes": summary.shapes,
+        },
+        "size": {"low": summary.low, "high": summary.high, "extent": summary.extent, "mass": summary.mass},
+        "frames": [{"name": name, "parent": parent} for name, parent in summary.frames.items()],
+        "dof": [
+            {
+                "name": f.name,
+                "unit": f.unit or None,
+                "lower": finite(f.lower),
+                "upper": finite(f.upper),
+                "default": f.default,
+                "speed": finite(f.speed),
+            }
+            for f in summary.freedoms
+        ],
+        "constraints": [
+            {"name": c.name, "text": c.text, "symbols": c.symbols, "simple": c.simple}
+            for c in summary.constraints
+        ],
+        "not_loaded": summary.problems,
+    }
+
+
+def _tree(frames: dict[str, str]) -> list[str]:
+    """Return the frames, each below its parent and two spaces to the right of it."""
+    children: dict[str, list[str]] = {}
+    for name, parent in frames.items():
+        children.setdefault(parent, []).append(name)
+    lines, stack = [], [(name, 1) for name in reversed(children.get("world", []))]
+    while stack:
+        name, depth = stack.pop()
+        lines.append("  " * depth + name)
+        stack.extend((child, depth + 1) for child in reversed(children.get(name, [])))
+    return lines

@@ -1,0 +1,116 @@
+"""From the words on the command line to an exit status."""
+
+from __future__ import annotations
+
+import argparse
+import logging
+import os
+import sys
+from collections.abc import Sequence
+from typing import TextIO
+
+from kineverse._version import __version__
+from kineverse.cli import bench, demo, fk, info, view
+from kineverse.errors import KineverseError
+
+WRONG, INTERRUPTED, PIPE_CLOSED = 2, 130, 141
+"""Exit statuses: what was asked for cannot be done; Ctrl-C; nobody reads on (128 and the signal's number)."""
+
+EXAMPLES = """\
+A MODEL is the name of a shipped model (kitchen, pr2 ...) or the path of a file.
+
+examples:
+  kineverse info kitchen                              what it consists of
+  kineverse fk kitchen kitchen/fridge_door_handle --set kitchen/fridge_door=30deg
+  kineverse view kitchen                              move it in the browser
+  kineverse demo --headless                           a picture of kitchen and robot
+"""
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the command and return its exit status.
+
+    Parameters
+    ----------
+    argv
+        The arguments, without the name of the program; those of the process if None.
+
+    Returns
+    -------
+    0 if all went well; 2 if what was asked for cannot be done, with one line on standard error that says why;
+    130 after Ctrl-C; 141 if whoever read the output went away.
+    """
+    try:
+        arguments = parser().parse_args(argv)
+    except SystemExit as stop:  # argparse ends the process itself; a function returns.
+        return stop.code if isinstance(stop.code, int) else WRONG
+    _log_to(sys.stderr, arguments.verbose)
+    try:
+        status: int = arguments.run(arguments)
+        sys.stdout.flush()
+    except BrokenPipeError:
+        _forget_stdout()
+        return PIPE_CLOSED
+    except KeyboardInterrupt:
+        print(file=sys.stderr)
+        return INTERRUPTED
+    except (KineverseError, OSError) as error:
+        print(f"kineverse: {one_line(error)}", file=sys.stderr)
+        return WRONG
+    return status
+
+
+def parser() -> argparse.ArgumentParser:
+    """Return the parser of the whole command line."""
+    top = argparse.ArgumentParser(
+        prog="kineverse",
+        description="Articulation models: look at them, move them, ask them.",
+        epilog=EXAMPLES,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    top.add_argument("--version", action="version", version=f"kineverse {__version__}")
+    top.add_argument("-v", "--verbose", action="store_true", help="say more on standard error")
+    commands = top.add_subparsers(title="commands", metavar="COMMAND", required=True)
+    for command in (info, fk, view, demo, bench):
+        name = command.__name__.rpartition(".")[2]
+        summary, _, description = command.HELP.partition("\n")
+        sub = commands.add_parser(
+            name,
+            help=summary,
+            description=f"{summary}\n{description}".strip(),
+            formatter_class=argparse.RawDescriptionHelpFormatter,
+        )
+        command.add_arguments(sub)
+        sub.set_defaults(run=command.run)
+    return top
+
+
+def one_line(error: BaseException) -> str:
+    """Return what an error says, on one line."""
+    if isinstance(error, OSError) and error.strerror:
+        where = f"{error.filename}: " if error.filename else ""
+        return f"{where}{error.strerror}"
+    return " ".join(str(error).split()) or type(error).__name__
+
+
+def _log_to(stream: TextIO, verbose: bool) -> None:
+    """Show the library's warnings on a line each; meshes that are missing are counted by the commands."""
+    log = logging.getLogger("kineverse")
+    for handler in [h for h in log.handlers if h.get_name() == "command line"]:
+        log.removeHandler(handler)
+    handler = logging.StreamHandler(stream)
+    handler.set_name("command line")
+    handler.setFormatter(logging.Formatter("kineverse: %(message)s"))
+    log.addHandler(handler)
+    log.setLevel(logging.INFO if verbose else logging.WARNING)
+    logging.getLogger("kineverse.view.meshes").setLevel(logging.INFO if verbose else logging.ERROR)
+
+
+def _forget_stdout() -> None:
+    """Send what is left of the output nowhere, so that the interpreter does not complain at its end."""
+    try:
+        nowhere = os.open(os.devnull, os.O_WRONLY)
+        os.dup2(nowhere, sys.stdout.fileno())
+        os.close(nowhere)
+    except (OSError, ValueError):
+        pass  # A stdout that is no file, as under a test, has nothing to flush to.

@@ -1,0 +1,30 @@
+"""Progress of long work: a bar on a terminal, nothing in a pipe."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterable, Iterator, Sized
+from typing import TypeVar
+
+Item = TypeVar("Item")
+
+
+def progress(items: Iterable[Item], what: str, unit: str = "") -> Iterator[Item]:
+    """Yield the items, with a bar on standard error if that is a terminal.
+
+    Parameters
+    ----------
+    items
+        What is worked on.
+    what
+        What is being done, in front of the bar.
+    unit
+        What is counted.
+    """
+    if not sys.stderr.isatty():
+        yield from items
+        return
+    from tqdm import tqdm
+
+    total = len(items) if isinstance(items, Sized) else None
+    yield from tqdm(items, desc=what, total=total, unit=f" {unit}" if unit else "it", leave=False)

@@ -1,0 +1,96 @@
+"""``kineverse view``: a model in the browser."""
+
+from __future__ import annotations
+
+import argparse
+import os
+import signal
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import TYPE_CHECKING
+
+from kineverse.cli.assignments import add_set_option, parse_assignments
+
+if TYPE_CHECKING:
+    from kineverse.view.viewer import Viewer
+
+HELP = """show a model in the browser, with a slider for everything that moves
+
+The page is served to this computer only, until Ctrl-C.
+
+examples:
+  kineverse view kitchen
+  kineverse view my_robot.urdf --set elbow=45deg --port 8090"""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the options."""
+    parser.add_argument("model", metavar="MODEL", help="name of a shipped model, or path of a file")
+    add_set_option(parser)
+    add_page_options(parser)
+
+
+def add_page_options(parser: argparse.ArgumentParser) -> None:
+    """Declare the options of a command that opens a page."""
+    parser.add_argument("--port", type=int, metavar="N", help="port of the page (8080, or any free one)")
+    parser.add_argument("--no-browser", action="store_true", help="only print the address")
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Serve the page until interrupted."""
+    assigned = parse_assignments(arguments.assignments)
+
+    import kineverse as kv
+    from kineverse.view.viewer import Viewer
+
+    model = kv.load(arguments.model)
+    label = os.path.basename(arguments.model)
+    with terminated_as_interrupted(), Viewer(model, assigned, port=arguments.port, label=label) as page:
+        note_problems(page.problems)
+        announce(page, browser=not arguments.no_browser)
+        print(model)
+        wait(page)
+    return 0
+
+
+def announce(page: Viewer, browser: bool) -> None:
+    """Print the address of a page and open it, if there is a screen to open it on."""
+    print(f"{page.address}   (Ctrl-C ends)", flush=True)
+    has_screen = sys.platform in ("win32", "darwin") or any(
+        os.environ.get(name) for name in ("DISPLAY", "WAYLAND_DISPLAY", "BROWSER")
+    )
+    if browser and has_screen:
+        import webbrowser
+
+        webbrowser.open(page.address)
+
+
+def wait(page: Viewer) -> None:
+    """Wait for Ctrl-C, which is how one is supposed to leave."""
+    sys.stdout.flush()
+    try:
+        page.wait()
+    except KeyboardInterrupt:
+        print(file=sys.stderr)
+
+
+def note_problems(problems: list[str]) -> None:
+    """Say on standard error, in one line, that meshes are missing."""
+    if problems:
+        more = f" and {len(problems) - 1} more" if len(problems) > 1 else ""
+        print(f"kineverse: shown as placeholders: {problems[0]}{more}", file=sys.stderr)
+
+
+@contextmanager
+def terminated_as_interrupted() -> Iterator[None]:
+    """Let SIGTERM, by which service managers stop programs, end as Ctrl-C does."""
+
+    def interrupt(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    before = signal.signal(signal.SIGTERM, interrupt)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
