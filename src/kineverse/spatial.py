@@ -7,13 +7,14 @@
 
 from __future__ import annotations
 
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
+import casadi as ca
 import numpy as np
 import numpy.typing as npt
 
 from .errors import ShapeError, ValueRejectedError
-from .expressions.expression import Expression, ExpressionLike, array, as_expression
+from .expressions.expression import Expression, ExpressionLike, array, as_expression, make, union
 from .expressions.functions import arctan2, cos, norm, sin, sqrt, where
 
 Vector: TypeAlias = ExpressionLike
@@ -23,28 +24,50 @@ def translation(x: ExpressionLike, y: ExpressionLike = 0.0, z: ExpressionLike = 
     """Return the 4×4 transform that moves by (x, y, z) [m]; a single vector of three is taken apart."""
     first = as_expression(x)
     if first.shape == (3,):
-        x, y, z = first
-    elif first.shape:
-        raise ShapeError(f"A translation is given as x, y, z or as one vector of shape (3,), not {first.shape}.")
-    return array([[1, 0, 0, x], [0, 1, 0, y], [0, 0, 1, z], [0, 0, 0, 1]])
+        parts = tuple(first)
+    else:
+        parts = (first, as_expression(y), as_expression(z))
+    for part in parts:
+        if part.shape:
+            raise ShapeError(f"A translation is given as x, y, z or as one vector of shape (3,), not {part.shape}.")
+    column = ca.vertcat(_ONE, _ONE, _ONE, *(p._sx for p in parts), _ONE)
+    return make(ca.SX(_TRANSLATION, column), (4, 4), union(parts))
+
+
+_TRANSLATION = ca.Sparsity.triplet(4, 4, [0, 1, 2, 0, 1, 2, 3], [0, 1, 2, 3, 3, 3, 3])
 
 
 def rotation_x(angle: ExpressionLike) -> Expression:
     """Return the 4×4 rotation by ``angle`` [rad] about x."""
-    c, s = cos(angle), sin(angle)
-    return array([[1, 0, 0, 0], [0, c, -s, 0], [0, s, c, 0], [0, 0, 0, 1]])
+    return _turn(angle, _ABOUT_X)
 
 
 def rotation_y(angle: ExpressionLike) -> Expression:
     """Return the 4×4 rotation by ``angle`` [rad] about y."""
-    c, s = cos(angle), sin(angle)
-    return array([[c, 0, s, 0], [0, 1, 0, 0], [-s, 0, c, 0], [0, 0, 0, 1]])
+    return _turn(angle, _ABOUT_Y)
 
 
 def rotation_z(angle: ExpressionLike) -> Expression:
     """Return the 4×4 rotation by ``angle`` [rad] about z."""
-    c, s = cos(angle), sin(angle)
-    return array([[c, -s, 0, 0], [s, c, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
+    return _turn(angle, _ABOUT_Z)
+
+
+# Column by column, where a rotation about an axis has entries, and which: cos, sin, -sin or 1. Built sparse, because a
+# robot has dozens of these and each would cost ten times as much element by element.
+_ABOUT_X = ca.Sparsity.triplet(4, 4, [0, 1, 2, 1, 2, 3], [0, 1, 1, 2, 2, 3]), (3, 0, 1, 2, 0, 3)
+_ABOUT_Y = ca.Sparsity.triplet(4, 4, [0, 2, 1, 0, 2, 3], [0, 0, 1, 2, 2, 3]), (0, 2, 3, 1, 0, 3)
+_ABOUT_Z = ca.Sparsity.triplet(4, 4, [0, 1, 0, 1, 2, 3], [0, 0, 1, 1, 2, 3]), (0, 1, 2, 0, 3, 3)
+_ONE = ca.SX(1)
+
+
+def _turn(angle: ExpressionLike, pattern: tuple[Any, tuple[int, ...]]) -> Expression:
+    a = as_expression(angle)
+    if a.shape:
+        raise ShapeError(f"An angle is a scalar, not of shape {a.shape}.")
+    s = ca.SX.unary(ca.OP_SIN, a._sx)
+    entries = (ca.SX.unary(ca.OP_COS, a._sx), s, ca.SX.unary(ca.OP_NEG, s), _ONE)
+    sparsity, which = pattern
+    return make(ca.SX(sparsity, ca.vertcat(*(entries[i] for i in which))), (4, 4), a._nodes)
 
 
 def axis_angle(axis: Vector, angle: ExpressionLike) -> Expression:

@@ -87,10 +87,13 @@ CASES = {
     ),
     "no k_velocity": (pair(LIMIT + "<safety_controller/>"), J + "<safety_controller> has no k_velocity"),
     "empty soft range": (
-        pair(LIMIT + '<safety_controller k_velocity="1" k_position="1" soft_lower_limit="1"/>'),
-        J + "<safety_controller> has soft_lower_limit above",
+        pair(LIMIT + '<safety_controller k_velocity="1" soft_lower_limit="1"/>'),
+        J + "<safety_controller> has soft_lower_limit=1.0 above soft_upper_limit=0.0",
     ),
-    "repelling": (pair(LIMIT + '<safety_controller k_velocity="1" k_position="-1"/>'), "negative k_position"),
+    "soft range elsewhere": (
+        pair(LIMIT + '<safety_controller k_velocity="1" soft_lower_limit="3" soft_upper_limit="4"/>'),
+        J + "<safety_controller> has soft limits [3.0, 4.0] outside of the limits [-1.0, 2.0]",
+    ),
     "mimics nothing": (pair(LIMIT + "<mimic/>"), J + "<mimic> does not say which joint"),
     "mimics nobody": (
         pair(LIMIT + '<mimic joint="jj"/>'),

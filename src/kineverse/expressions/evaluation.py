@@ -20,17 +20,17 @@ from .lowering import lower
 def evaluate(expression: Expression, values: Mapping[Any, Any]) -> npt.NDArray[Any]:
     """Return the value at numbers, see :meth:`Expression.__call__`."""
     symbols = expression.symbols
-    vector = assign(symbols, values)
+    vector = assign(symbols, values, exact=False)
     (column,) = lower([expression])
     inputs = ca.vertcat(*(s._sx for s in symbols)) if symbols else ca.SX(0, 1)
     result = np.array(ca.Function("e", [inputs], [column])(vector)).reshape(expression.shape)
     return result[()]  # type: ignore[no-any-return]
 
 
-def assign(symbols: tuple[Any, ...], values: Mapping[Any, Any]) -> npt.NDArray[np.float64]:
+def assign(symbols: tuple[Any, ...], values: Mapping[Any, Any], exact: bool = True) -> npt.NDArray[np.float64]:
     """Return the numbers of ``symbols`` in their order, from a mapping by symbol or by name.
 
-    Names that are not among the symbols are an error unless ``values`` is a
+    If ``exact``, names that are not among the symbols are an error, unless ``values`` is a
     :class:`~kineverse.State`, which describes a whole world.
 
     Raises
@@ -46,7 +46,7 @@ def assign(symbols: tuple[Any, ...], values: Mapping[Any, Any]) -> npt.NDArray[n
         raise ExpressionError(f"Values are given as a mapping {{name: number}}, not as {type(values).__name__}.")
     given = {str(k): v for k, v in values.items()}
     names = [str(s) for s in symbols]
-    unknown = [n for n in given if n not in names] if not isinstance(values, State) else []
+    unknown = [n for n in given if n not in names] if exact and not isinstance(values, State) else []
     if unknown:
         raise UnknownNameError(f"Unknown symbol {unknown[0]!r}. {suggest(unknown[0], names, 'symbol')}")
     missing = [n for n, s in zip(names, symbols, strict=True) if n not in given and s.value is None]

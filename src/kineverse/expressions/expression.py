@@ -353,19 +353,22 @@ class Expression:
         Parameters
         ----------
         values
-            A mapping from symbols or their names to numbers, or a :class:`~kineverse.State`, which may know
-            more symbols than there are here. Parameters that are not given have their own values.
+            A mapping from symbols or their names to numbers, or a :class:`~kineverse.State`. It may know more
+            symbols than there are here, as a derivative depends on fewer than its function. Parameters that are not
+            given have their own values.
 
         Raises
         ------
         UnknownNameError
-            Listing what is missing or not known.
+            Listing what is missing.
         """
         from .evaluation import evaluate
 
         return evaluate(self, {**(values or {}), **by_name} if by_name else (values or {}))
 
     def __float__(self) -> float:
+        if not self._shape and self._sx.is_constant():
+            return float(self._sx)
         if self._shape or self.symbols:
             raise ExpressionError(
                 f"float() needs a constant scalar; this has shape {self._shape} and the symbols "

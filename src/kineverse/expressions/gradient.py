@@ -132,6 +132,9 @@ def _last_axis(matrix: layout.SX, shape: layout.Shape) -> layout.SX:
 
 def total_derivative(expression: Expression, heuristic: bool = False) -> Expression:
     """Return ``ė = Σ D(e)[v]·v``, of the expression's shape: its rate as a function of the speeds."""
+    if not expression._shape and not expression._nodes and expression._sx.is_symbolic():
+        (symbol,) = expression.symbols  # by far the most frequent case: a limit on a joint's speed
+        return symbol.derivative() if symbol.has_derivative else make(layout.from_array(np.zeros(())), (), NO_NODES)
     rate = make(layout.from_array(np.zeros(expression.shape)), expression.shape, NO_NODES)
     for key, entry in gradient(expression, heuristic).items():
         rate = rate + entry * key

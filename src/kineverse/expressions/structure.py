@@ -1,7 +1,7 @@
 """Structural identity of expressions, and packing them for another process.
 
-Both use CasADi's own serialisation of a function whose inputs are the leaves in canonical order. It is
-exact to the last bit; it is for pickling between like versions only, documents have their own form.
+Both use CasADi's own serialisation, which is exact to the last bit. It is for pickling between like versions only,
+documents have their own form.
 """
 
 from __future__ import annotations
@@ -23,8 +23,12 @@ def structural_key(expression: Expression) -> bytes:
         digest = hashlib.blake2b(repr((expression._shape, [s.sort_key for s in symbols])).encode(), digest_size=16)
         for node in nodes:
             digest.update(node.key)
-        shared = ca.cse(ca.densify(expression._sx))
-        digest.update(_function(shared, [*(s._sx for s in symbols), *(n.sx for n in nodes)]).serialize().encode())
+        sx = expression._sx
+        if not sx.is_dense():
+            sx = ca.densify(sx)
+        if not sx.is_constant() and not sx.is_symbolic():
+            sx = ca.cse(sx)  # whether equal parts are shared is no difference
+        digest.update(sx.serialize().encode())
         expression._key = digest.digest()
     return expression._key
 

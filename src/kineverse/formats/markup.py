@@ -152,7 +152,7 @@ def parse(
     except expat.ExpatError as error:
         raise FormatError(_describe(error, source, document, len(open_lists) - 1)) from None
     except (ValueError, LookupError) as error:
-        if document:
+        if document or isinstance(error, FormatError):
             raise
         # An encoding that expat cannot have, or a str with lone surrogates.
         raise FormatError(f"{source}, line 1: cannot be decoded: {error}. Save it as UTF-8.") from None

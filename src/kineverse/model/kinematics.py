@@ -25,13 +25,24 @@ FrameLookup = Callable[[str], Frame]
 
 
 @dataclass(frozen=True, slots=True)
+class Step:
+    """A moving factor, and rotation and position of the place in front of it."""
+
+    rotation: SX
+    position: SX
+    nodes: frozenset[Node]
+    factor: Expression
+
+
+@dataclass(frozen=True, slots=True)
 class Placement:
-    """Where a frame is in the root of a chain: anchor_R, anchor_p (None for the identity), then a constant."""
+    """Where a frame is in the root of a chain: rotation and position of the anchor (None for the identity), then a constant."""
 
     rotation: SX | None
     position: SX | None
     nodes: frozenset[Node]
     offset: npt.NDArray[np.float64]
+    steps: tuple[Step, ...] = ()
     # The chain this was composed from, to see whether it still holds.
     frame: Frame | None = None
     parent: Placement | None = None
@@ -39,55 +50,59 @@ class Placement:
     def then(self, frame: Frame) -> Placement:
         """Return the placement of a child frame."""
         rotation, position, nodes, offset = self.rotation, self.position, self.nodes, self.offset
+        steps = []
         for factor in frame.factors:
             if isinstance(factor, Pose):
                 offset = offset @ factor.matrix
                 continue
-            rotation, position = compose(rotation, position, offset, factor)
+            rotation, position = _with_offset(rotation, position, offset)
+            steps.append(Step(rotation, position, nodes, factor))
             nodes = nodes | factor._nodes if factor._nodes else nodes
+            sx = factor._sx
+            position = ca.mtimes(rotation, sx[:3, 3]) + position
+            rotation = ca.mtimes(rotation, sx[:3, :3])
             offset = IDENTITY
-        return Placement(rotation, position, nodes, offset, frame, self)
+        return Placement(rotation, position, nodes, offset, tuple(steps), frame, self)
+
+    def parts(self) -> tuple[SX, SX]:
+        """Return rotation and position."""
+        return _with_offset(self.rotation, self.position, self.offset)
 
     def matrix(self) -> Expression:
         """Return the 4×4 transform."""
-        if self.rotation is None or self.position is None:
+        if self.rotation is None:
             return make(ca.SX(ca.DM(self.offset)), (4, 4), NO_NODES)
-        rotation, position = apply_offset(self.rotation, self.position, self.offset)
-        return homogeneous(rotation, position, self.nodes)
+        rotation, position = self.parts()
+        return make(ca.densify(ca.vertcat(ca.horzcat(rotation, position), _BOTTOM)), (4, 4), self.nodes)
+
+    def all_steps(self) -> list[Step]:
+        """Return the moving factors of the whole chain, from the root on."""
+        steps: list[Step] = []
+        placement: Placement | None = self
+        while placement is not None:
+            steps += reversed(placement.steps)
+            placement = placement.parent
+        return steps[::-1]
 
 
 IDENTITY = np.eye(4)
 IDENTITY.flags.writeable = False
 ROOT = Placement(None, None, NO_NODES, IDENTITY)
 _BOTTOM = ca.SX(ca.DM([[0, 0, 0, 1]]))
+_EYE3 = np.eye(3)
 
 
-def homogeneous(rotation: SX, position: SX, nodes: frozenset[Node]) -> Expression:
-    """Return the 4×4 expression of a rotation and a position."""
-    return make(ca.densify(ca.vertcat(ca.horzcat(rotation, position), _BOTTOM)), (4, 4), nodes)
-
-
-def compose(rotation: SX | None, position: SX | None, offset: npt.NDArray[np.float64], factor: Expression) -> tuple[SX, SX]:
-    """Return rotation and position of anchor @ offset @ factor."""
-    sx = factor._sx
-    factor_rotation, factor_position = sx[:3, :3], sx[:3, 3]
-    if offset is not IDENTITY:
-        c, t = _sparse(offset[:3, :3]), _sparse(offset[:3, 3])
-        factor_position = ca.mtimes(c, factor_position) + t
-        factor_rotation = ca.mtimes(c, factor_rotation)
-    if rotation is None:
-        return factor_rotation, factor_position
-    return ca.mtimes(rotation, factor_rotation), ca.mtimes(rotation, factor_position) + position
-
-
-def apply_offset(rotation: SX, position: SX, offset: npt.NDArray[np.float64]) -> tuple[SX, SX]:
-    """Return rotation and position of anchor @ offset."""
+def _with_offset(rotation: SX | None, position: SX | None, offset: npt.NDArray[np.float64]) -> tuple[SX, SX]:
+    """Return rotation and position of anchor @ offset; constants that do nothing cost nothing."""
+    if rotation is None or position is None:
+        return _sparse(offset[:3, :3]), ca.SX(ca.DM(offset[:3, 3]))
     if offset is IDENTITY:
         return rotation, position
-    return (
-        ca.mtimes(rotation, _sparse(offset[:3, :3])),
-        ca.mtimes(rotation, _sparse(offset[:3, 3])) + position,
-    )
+    if offset[:3, 3].any():
+        position = ca.mtimes(rotation, _sparse(offset[:3, 3])) + position
+    if not np.array_equal(offset[:3, :3], _EYE3):
+        rotation = ca.mtimes(rotation, _sparse(offset[:3, :3]))
+    return rotation, position
 
 
 def _sparse(numbers: npt.NDArray[np.float64]) -> SX:
@@ -142,69 +157,64 @@ def relative(frame: str, relative_to: str, lookup: FrameLookup) -> Expression:
     return root @ tip if down else root
 
 
-def jacobian_columns(
-    frame: str, relative_to: str, lookup: FrameLookup, heuristic: bool
-) -> tuple[SX, SX, dict[Symbol, tuple[SX, SX, frozenset[Node]]]]:
-    """Return rotation and position of the frame, and per speed (linear, angular, nodes), in ``relative_to``.
+@dataclass(slots=True)
+class Twist:
+    """How one speed moves a frame: velocity of its origin and angular velocity."""
 
-    Linear parts are the velocity of the frame's origin. Every moving factor contributes the twist it makes in
-    front of itself, carried to the tip by a cross product; so the cost is linear in the length of the chain.
+    linear: SX
+    angular: SX
+    nodes: frozenset[Node]
+
+
+def twists(
+    base: Placement, tip: Placement, heuristic: bool
+) -> tuple[SX, SX, dict[Symbol, Twist]]:
+    """Return rotation and position of the tip in the base, and its twist by each speed, in axes of the base.
+
+    Both placements are relative to a common ancestor. Every moving factor contributes the twist it makes in front
+    of itself, carried to the tip by a cross product; so the cost is linear in the length of the chain.
     """
-    base, down = branches(frame, relative_to, lookup)
-    base_twists, base_placement = _twists(base, lookup, heuristic)
-    tip_twists, tip_placement = _twists(down, lookup, heuristic)
-    base_rotation, base_position = _dense(base_placement)
-    tip_rotation, tip_position = _dense(tip_placement)
-    columns: dict[Symbol, tuple[SX, SX, frozenset[Node]]] = {}
-    # In the common ancestor: the tip moves with its own factors, and against those of the other branch.
-    for sign, twists in ((1, tip_twists), (-1, base_twists)):
-        for key, origin, linear, angular, nodes in twists:
-            v = linear + ca.cross(angular, tip_position - origin)
-            if sign < 0:
-                v, angular = -v, -angular
-            if key in columns:
-                old_v, old_w, old_nodes = columns[key]
-                v, angular, nodes = old_v + v, old_w + angular, old_nodes | nodes
-            columns[key] = v, angular, nodes
-    if not base:
-        return tip_rotation, tip_position, columns
+    rotation, position = tip.parts()
+    found: dict[Symbol, Twist] = {}
+    # In the common ancestor, the tip moves with its own factors, and against those of the base.
+    for sign, placement in ((1, tip), (-1, base)):
+        for step in placement.all_steps():
+            _add_step(found, step, position, sign, heuristic)
+    if base is ROOT:
+        return rotation, position, found
+    base_rotation, base_position = base.parts()
     turn = base_rotation.T
-    turned = {k: (ca.mtimes(turn, v), ca.mtimes(turn, w), n) for k, (v, w, n) in columns.items()}
-    rotation = ca.mtimes(turn, tip_rotation)
-    return rotation, ca.mtimes(turn, tip_position - base_position), turned
+    for twist in found.values():
+        twist.linear, twist.angular = ca.mtimes(turn, twist.linear), ca.mtimes(turn, twist.angular)
+        twist.nodes = twist.nodes | base.nodes
+    return ca.mtimes(turn, rotation), ca.mtimes(turn, position - base_position), found
 
 
-Twist = tuple[Symbol, SX, SX, SX, frozenset[Node]]
-
-
-def _twists(chain: Sequence[str], lookup: FrameLookup, heuristic: bool) -> tuple[list[Twist], Placement]:
-    """Return (speed, origin, linear at origin, angular, nodes) of every moving factor, and the placement."""
-    twists: list[Twist] = []
-    rotation, position, nodes, offset = None, None, NO_NODES, IDENTITY
-    for name in chain:
-        for factor in lookup(name).factors:
-            if isinstance(factor, Pose):
-                offset = offset @ factor.matrix
-                continue
-            if rotation is None or position is None:
-                at_rotation, at_position = _sparse(offset[:3, :3]), ca.densify(_sparse(offset[:3, 3]))
-            else:
-                at_rotation, at_position = apply_offset(rotation, position, offset)
-            factor_rotation = factor._sx[:3, :3]
-            for key, entry in factor.gradient(heuristic).items():
-                omega_cross = ca.mtimes(entry._sx[:3, :3], factor_rotation.T)
-                omega = ca.vertcat(omega_cross[2, 1], omega_cross[0, 2], omega_cross[1, 0])
-                linear = entry._sx[:3, 3] - ca.cross(omega, factor._sx[:3, 3])
-                twists.append(
-                    (key, at_position, ca.mtimes(at_rotation, linear), ca.mtimes(at_rotation, omega), entry._nodes | nodes)
-                )
-            rotation, position = compose(rotation, position, offset, factor)
-            nodes = nodes | factor._nodes if factor._nodes else nodes
-            offset = IDENTITY
-    return twists, Placement(rotation, position, nodes, offset)
-
-
-def _dense(placement: Placement) -> tuple[SX, SX]:
-    if placement.rotation is None or placement.position is None:
-        return ca.SX(ca.DM(placement.offset[:3, :3])), ca.SX(ca.DM(placement.offset[:3, 3]))
-    return apply_offset(placement.rotation, placement.position, placement.offset)
+def _add_step(found: dict[Symbol, Twist], step: Step, tip: SX, sign: int, heuristic: bool) -> None:
+    factor = step.factor
+    entries = factor.gradient(heuristic)
+    if not entries:
+        return
+    factor_rotation, factor_position = factor._sx[:3, :3].T, factor._sx[:3, 3]
+    arm = tip - step.position
+    for key, entry in entries.items():
+        spin = ca.mtimes(ca.sparsify(entry._sx[:3, :3]), factor_rotation)
+        linear = ca.sparsify(entry._sx[:3, 3])
+        velocity, omega = ca.SX(3, 1), ca.SX(3, 1)
+        if spin.nnz():
+            local = ca.sparsify(ca.vertcat(spin[2, 1], spin[0, 2], spin[1, 0]))
+            omega = ca.mtimes(step.rotation, local)
+            velocity = ca.cross(omega, arm)
+            if factor_position.nnz():
+                linear = linear - ca.cross(local, factor_position)
+        if linear.nnz():
+            velocity = velocity + ca.mtimes(step.rotation, linear)
+        if sign < 0:
+            velocity, omega = -velocity, -omega
+        nodes = entry._nodes | step.nodes
+        if key in found:
+            known = found[key]
+            known.linear, known.angular = known.linear + velocity, known.angular + omega
+            known.nodes = known.nodes | nodes
+        else:
+            found[key] = Twist(velocity, omega, nodes)

@@ -248,15 +248,21 @@ class ModelView:
         self, frame: str, relative_to: str, form: str, symbols: tuple[Symbol, ...] | None, heuristic: bool
     ) -> Expression:
         rates = self.rates
-        rotation, position, columns = kinematics.jacobian_columns(frame, relative_to, self._frame, heuristic)
+        if relative_to == WORLD:
+            base, tip = kinematics.ROOT, self._placement(frame)
+        else:
+            to_base, to_tip = kinematics.branches(frame, relative_to, self._frame)
+            base, tip = kinematics.place(to_base, self._frame), kinematics.place(to_tip, self._frame)
+        rotation, position, columns = kinematics.twists(base, tip, heuristic)
+        tip_nodes = tip.nodes | base.nodes
         by_speed: dict[Symbol, Expression] = {}
-        nodes = NO_NODES
-        for key, (v, w, own) in columns.items():
+        for key, twist in columns.items():
+            v, w = twist.linear, twist.angular
             if form == "world":
                 v = v + ca.cross(position, w)
             elif form == "body":
                 v, w = ca.mtimes(rotation.T, v), ca.mtimes(rotation.T, w)
-            column = rates.carry(make(ca.densify(ca.vertcat(v, w)), (6,), own))
+            column = rates.carry(make(ca.densify(ca.vertcat(v, w)), (6,), twist.nodes | tip_nodes))
             row = rates.get(key.position) if key.order == 1 else None
             for speed, rate in row.items() if row is not None else ((key, as_expression(1.0)),):
                 term = column if row is None else column * rates.carry(rate)
@@ -267,7 +273,7 @@ class ModelView:
             chosen = [s.derivative() if s.order == 0 and s.has_derivative else s for s in symbols]
         zero = as_expression(np.zeros(6))
         parts = [by_speed.get(s, zero) for s in chosen]
-        nodes = nodes.union(*(p._nodes for p in parts))
+        nodes = NO_NODES.union(*(p._nodes for p in parts))
         sx = ca.horzcat(*(p._sx for p in parts)) if parts else ca.SX(6, 0)
         return make(ca.densify(sx), (6, len(parts)), nodes)
 

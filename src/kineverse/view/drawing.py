@@ -93,7 +93,7 @@ def _render(scene: Surfaces, projection: Projection, camera: Camera) -> Singles:
     """Return (height, width, 3) display values of a scene on its ground."""
     image = _backdrop(projection)
     if len(scene.corners):
-        seen, _ = visible(projection, scene.corners, scene.closed, scene.colors[:, 3])
+        seen, near = visible(projection, scene.corners, scene.closed, scene.colors[:, 3])
         away = np.subtract(camera.position, camera.target)
         lamp = Lamp.over(scene.corners, float(np.arctan2(away[1], away[0])) + 0.6, 0.85)
         covered = np.flatnonzero(seen >= 0)
@@ -102,7 +102,7 @@ def _render(scene: Surfaces, projection: Projection, camera: Camera) -> Singles:
             points, normals = _surface_points(scene, projection, covered, triangle)
             colors = to_linear(scene.colors[:, :3]).astype(np.float32)[triangle]
             display = to_display(shade(colors, normals, lamp, lamp.reaches(points, normals, covered)))
-            display *= outlines(scene.source[triangle], normals, covered, projection)[:, None]
+            display *= outlines(scene.group[triangle], normals, near, covered, projection)[:, None]
             image[covered] = display
         draw_ground(image, np.flatnonzero(seen < 0), scene.corners, projection, lamp)
     return image.reshape(projection.height, projection.width, 3)

@@ -29,7 +29,9 @@ class Poses:
     Attributes
     ----------
     names
-        The frames, in the order of the results.
+        The frames, in the order of the results of :meth:`at`.
+    moving
+        Those among them that are compiled, in the order of the results of :meth:`batch`: all but the world.
     inputs
         The names of the symbols that the poses depend on.
     """
@@ -39,8 +41,8 @@ class Poses:
         self.names = everything if names is None else tuple(names)
         self._index = {name: k for k, name in enumerate(self.names)}
         # The world stands still, and a compiled function without outputs is no use to anyone.
-        self._moving = tuple(name for name in self.names if name != ROOT)
-        self._function = kv.compile([model.fk(name) for name in self._moving]) if self._moving else None
+        self.moving = tuple(name for name in self.names if name != ROOT)
+        self._function = kv.compile([model.fk(name) for name in self.moving]) if self.moving else None
         self.inputs = tuple(map(str, self._function.inputs)) if self._function else ()
 
     def at(self, values: Mapping[str, float]) -> Floats:
@@ -48,7 +50,7 @@ class Poses:
         poses = np.tile(np.eye(4), (len(self.names), 1, 1))
         if self._function is not None:
             x = np.array([values[name] for name in self.inputs], dtype=float)
-            for name, pose in zip(self._moving, self._function(x), strict=True):
+            for name, pose in zip(self.moving, self._function(x), strict=True):
                 poses[self._index[name]] = pose
         return poses
 

@@ -15,15 +15,23 @@ SHARP = 0.75
 """Cosine of the angle from which on an edge is drawn."""
 
 
-def outlines(source: Integers, normals: Singles, covered: Integers, projection: Projection) -> Singles:
+STEP = 0.02
+"""How far, as a part of the distance, a surface has to lie behind another to be set off by a line."""
+
+
+def outlines(
+    group: Integers, normals: Singles, near: Singles, covered: Integers, projection: Projection
+) -> Singles:
     """Return (N,) factors that darken the outlines of parts and their sharp edges.
 
     Parameters
     ----------
-    source
-        (N,) the part seen at each covered pixel.
+    group
+        (N,) what is seen at each covered pixel: shapes of one frame and colour are one thing.
     normals
         (N, 3) the normal there.
+    near
+        (height·width,) the nearness of all pixels.
     covered
         (N,) the pixels, as y·width + x.
     projection
@@ -31,13 +39,17 @@ def outlines(source: Integers, normals: Singles, covered: Integers, projection: 
     """
     size = projection.width * projection.height
     part = np.full(size, -1, dtype=np.int32)
-    part[covered] = source
+    part[covered] = group
+    limit = np.float32(STEP)
     facing = np.zeros((size, 3), dtype=np.float32)
     facing[covered] = normals
     darker = np.zeros(size, dtype=np.float32)
     for step in (1, projection.width):
         # The last pixel of a row is compared with the first of the next: a speck at the rim nobody sees.
         other = part[:-step] != part[step:]
+        with np.errstate(invalid="ignore"):  # Where nothing is seen, the nearness is infinitely small.
+            gap = np.abs(near[:-step] - near[step:])
+            other |= gap > limit * np.maximum(near[:-step], near[step:])
         crease = ~other & (dot(facing[:-step], facing[step:]) < SHARP) & (part[:-step] >= 0)
         np.maximum(darker[:-step], np.float32(OUTLINE) * other, out=darker[:-step])
         np.maximum(darker[:-step], np.float32(CREASE) * crease, out=darker[:-step])

@@ -21,7 +21,7 @@ FRONT = 0.62
 
 TRIALS = 12
 
-LOOK = 96
+LOOK = 80
 """Pixels along the height of the trial pictures: enough to see a handle, small enough to make a dozen."""
 
 MOVES = 4.0
@@ -60,14 +60,26 @@ def automatic(
         origins = np.array([pose[:3, 3] for pose in poses.values()])
         return framing(np.concatenate([origins, origins + 0.2]), FRONT, ELEVATION, aspect, field_of_view)
     points = scene.corners.reshape(-1, 3)
+    outermost, corners = _outermost(points), scene.corners.astype(np.float32)
     trials = []
     for k in range(TRIALS):
         azimuth = FRONT + 2 * np.pi * k / TRIALS
-        camera = framing(points, azimuth, ELEVATION, aspect, field_of_view)
+        camera = framing(outermost, azimuth, ELEVATION, aspect, field_of_view)
         projection = Projection.of(camera, max(int(LOOK * aspect), 8), LOOK)
-        seen, _ = visible(projection, scene.corners, scene.closed)
+        seen, _ = visible(projection, corners, scene.closed)
         area = np.bincount(scene.source[seen[seen >= 0]], minlength=len(weights))
         # The logarithm makes many parts in view worth more than one large wall; the cosine breaks ties.
         score = float(weights @ np.log1p(area)) * (1.0 + 0.06 * np.cos(azimuth - FRONT))
-        trials.append((score, -k, camera))
-    return max(trials, key=lambda trial: trial[:2])[2]
+        trials.append((score, -k))
+    azimuth = FRONT - 2 * np.pi * max(trials)[1] / TRIALS
+    return framing(points, azimuth, ELEVATION, aspect, field_of_view)
+
+
+def _outermost(points: Floats) -> Floats:
+    """Return those of many points that lie farthest out in some hundred directions."""
+    k = np.arange(128)
+    z, angle = 1.0 - (2.0 * k + 1.0) / len(k), 2.399963 * k
+    flat = np.sqrt(1.0 - z * z)
+    directions = np.stack([flat * np.cos(angle), flat * np.sin(angle), z], axis=1).astype(np.float32)
+    farthest = np.argmax(directions @ points.astype(np.float32).T, axis=1)
+    return np.asarray(points[np.unique(farthest)])

@@ -46,18 +46,23 @@ UNLIMITED = Limits()
 
 @dataclass(frozen=True, slots=True)
 class Safety:
-    """What the controller of a joint keeps to, within its limits.
+    """What the safety controller of a joint does (ROS wiki, pr2_controller_manager/safety_limits).
 
-    The speed is kept between ``-k_position (q - soft_lower)`` and ``-k_position (q - soft_upper)``, so that
-    a joint slows down towards the soft limits and is led back from beyond them (ROS wiki,
-    pr2_controller_manager/safety_limits). ``k_position`` [1/s] of 0 bounds nothing. ``k_velocity`` [N s/m] or
-    [N m s/rad] bounds the effort in the same manner around the velocity limit.
+    It keeps the speed between ``-k_position (q - soft_lower)`` and ``-k_position (q - soft_upper)``, so that
+    the joint slows down towards the soft limits and is led back from beyond them; ``k_velocity`` bounds the
+    effort around the velocity limit in the same manner. Soft limits are in [rad] or [m], ``k_position`` is in
+    [1/s].
     """
 
     soft_lower: float = 0.0
     soft_upper: float = 0.0
     k_position: float = 0.0
     k_velocity: float = 0.0
+
+    @property
+    def bounds(self) -> bool:
+        """Whether the soft limits leave a range; those left out are both 0 and bound nothing."""
+        return self.soft_lower < self.soft_upper
 
 
 @dataclass(frozen=True, slots=True)

@@ -55,6 +55,7 @@ def read_joint(element: Element, version: tuple[int, int], remarks: Remarks) -> 
         axis = _axis(parts.get("axis"), element, remarks) if kind == "planar" else None
         return Joint(name, kind, parent, child, origin, axis, line=line)
     limit, safety, mimic, dynamics = map(parts.get, ("limit", "safety_controller", "mimic", "dynamics"))
+    limits = _limits(limit, kind, element, remarks)
     return Joint(
         name,
         kind,
@@ -62,8 +63,8 @@ def read_joint(element: Element, version: tuple[int, int], remarks: Remarks) -> 
         child,
         origin,
         _axis(parts.get("axis"), element, remarks),
-        _limits(limit, kind, element, remarks),
-        None if safety is None else _safety(safety),
+        limits,
+        _safety(safety, limits),
         None if mimic is None else _mimic(mimic),
         FRICTIONLESS
         if dynamics is None
@@ -148,18 +149,20 @@ def _limits(limit: Element | None, kind: Kind, joint: Element, remarks: Remarks)
     return Limits(lower, upper, velocity if velocity > 0.0 else None, effort if effort >= 0.0 else None)
 
 
-def _safety(safety: Element) -> Safety:
-    result = Safety(
-        number(safety, "soft_lower_limit", 0.0),
-        number(safety, "soft_upper_limit", 0.0),
-        number(safety, "k_position", 0.0),
-        number(safety, "k_velocity"),
-    )
-    if result.k_position > 0.0 and result.soft_lower > result.soft_upper:
-        raise ElementError(safety, "has soft_lower_limit above soft_upper_limit: no speed would be safe.")
-    if result.k_position < 0.0:
+def _safety(safety: Element | None, limits: Limits) -> Safety | None:
+    if safety is None:
+        return None
+    lower, upper = number(safety, "soft_lower_limit", 0.0), number(safety, "soft_upper_limit", 0.0)
+    if lower > upper:
+        raise ElementError(safety, f"has soft_lower_limit={lower!r} above soft_upper_limit={upper!r}.")
+    result = Safety(lower, upper, number(safety, "k_position", 0.0), number(safety, "k_velocity"))
+    if limits.lower is None or limits.upper is None or not result.bounds:
+        return result
+    if upper < limits.lower or lower > limits.upper:
         raise ElementError(
-            safety, "has a negative k_position, which would drive the joint away from its limits."
+            safety,
+            f"has soft limits [{lower!r}, {upper!r}] outside of the limits "
+            f"[{limits.lower!r}, {limits.upper!r}]: no position would be valid.",
         )
     return result
 

@@ -1,7 +1,7 @@
 """A description as operations: one for each joint, one for each body, one for each pair of soft limits.
 
-Links become frames and joints degrees of freedom of the same name, below the prefix. The tags are those of the
-things: ``joint pr2/l_elbow_flex_joint``, ``body pr2/l_elbow_flex_link``, ``soft limits pr2/l_elbow_flex_joint``.
+Links become frames and joints degrees of freedom of the same name, below the prefix. The tags are those of
+the things: ``joint pr2/l_elbow_flex_joint``, ``body pr2/l_elbow_flex_link``, ``soft limits ...``.
 """
 
 from __future__ import annotations
@@ -10,27 +10,28 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any
 
-from ...articulations import AxisJoint, Continuous, Fixed, Floating, Planar, Prismatic, Revolute
-from ...articulations import Joint as JointOperation
-from ...errors import FormatError
-from ...expressions.expression import Expression
-from ...expressions.functions import maximum, minimum
-from ...expressions.gradient import total_derivative
-from ...model.body import Body, Pose
-from ...model.edit import AddFrame
-from ...model.frame import WORLD, Frame
-from ...model.operation import Effects, Operation
-from ...model.reader import Reader
-from ...symbols import position
-from ..markup import quote
-from .description import FREEDOM, Joint, Limits, Robot, Safety
+from kineverse.articulations import AxisJoint, Continuous, Fixed, Floating, Planar, Prismatic, Revolute
+from kineverse.articulations import Joint as JointOperation
+from kineverse.errors import FormatError
+from kineverse.expressions.expression import Expression
+from kineverse.formats.markup import quote
+from kineverse.formats.urdf.description import Joint, Robot
+from kineverse.model.body import Body, Pose
+from kineverse.model.edit import AddFrame
+from kineverse.model.frame import WORLD, Frame
+from kineverse.model.operation import Effects, Operation
+from kineverse.model.reader import Reader
+from kineverse.symbols import position
 
 _AXIS_JOINTS: dict[str, type[AxisJoint]] = {
     "revolute": Revolute,
     "continuous": Continuous,
     "prismatic": Prismatic,
 }
-_SUFFIXES = {"planar": ("x", "y", "angle"), "floating": ("x", "y", "z", "qx", "qy", "qz", "qw", "wx", "wy", "wz")}
+_SUFFIXES = {
+    "planar": ("x", "y", "angle"),
+    "floating": ("x", "y", "z", "qx", "qy", "qz", "qw", "wx", "wy", "wz"),
+}
 _ROOT = Pose()
 
 
@@ -54,10 +55,7 @@ class SetBody(Operation):
 
 @dataclass(frozen=True)
 class SoftLimits(Operation):
-    """Keeps a joint from running into its end stops: k (lower - q) <= q̇ <= k (upper - q).
-
-    The bounds stay within the limit of the speed, so both can be kept from wherever the joint is; from beyond
-    the soft limits it is led back (ROS wiki, pr2_controller_manager/safety_limits).
+    """Keeps a joint within the range its safety controller defends, which lies inside its end stops.
 
     Attributes
     ----------
@@ -67,30 +65,20 @@ class SoftLimits(Operation):
         The coordinate, or the expression that stands for it [rad] or [m].
     lower, upper
         The soft limits [rad] or [m].
-    gain
-        k [1/s].
-    velocity
-        Limit of the speed [rad/s] or [m/s]; None for no limit.
     """
 
     name: str
     q: Expression
     lower: float
     upper: float
-    gain: float
-    velocity: float | None = None
 
     def apply(self, model: Reader) -> Effects:
         """Write the constraint."""
         if self.name not in model.articulations:
             model.articulations[self.name]  # raises, with similar names
-        rate = total_derivative(self.q)
-        if not rate.symbols:
+        if not self.q.symbols:
             return Effects()
-        slowest, fastest = self.gain * (self.lower - self.q), self.gain * (self.upper - self.q)
-        if self.velocity is not None:
-            slowest, fastest = minimum(slowest, self.velocity), maximum(fastest, -self.velocity)
-        return Effects(constraints={f"{self.name}/soft_limits": (slowest, rate, fastest)})
+        return Effects(constraints={f"{self.name}/soft_limits": (self.lower, self.q, self.upper)})
 
     def default_tag(self) -> str:
         """Return ``soft limits`` and the name."""
@@ -107,7 +95,7 @@ def robot_operations(robot: Robot, prefix: str | None = None, parent: str = WORL
     prefix
         Put in front of the names of frames and degrees of freedom, with a slash.
     parent
-        The frame to which the root link is attached. A root link ``world`` without prefix is the world itself.
+        The frame to which the root link is attached. A root link ``world`` without prefix is the world.
 
     Raises
     ------
@@ -122,7 +110,8 @@ def robot_operations(robot: Robot, prefix: str | None = None, parent: str = WORL
         yield AddFrame(root, Frame(parent, (_ROOT,)))
     elif parent != WORLD:
         raise FormatError(
-            f"{robot.source}: its root link is the world, so it cannot be attached to {quote(parent)}. Give it a prefix."
+            f"{robot.source}: its root link is the world, so it cannot be attached to {quote(parent)}. "
+            "Load it with a prefix."
         )
     if robot.root in bodies:
         yield SetBody(root, bodies[robot.root])
@@ -153,10 +142,10 @@ def _joint_operations(joint: Joint, named: Callable[[str], str]) -> Iterator[Ope
     else:
         followed = _followed(joint, named)
         yield _axis_joint(joint, common, followed)
-        safety, velocity = joint.safety, joint.limits.velocity
-        if safety is not None and safety.k_position > 0.0 and joint.kind != "continuous":
+        safety = joint.safety
+        if safety is not None and safety.bounds and joint.kind != "continuous":
             q = position(name) if followed is None else followed
-            yield SoftLimits(name, q, safety.soft_lower, safety.soft_upper, safety.k_position, velocity)
+            yield SoftLimits(name, q, safety.soft_lower, safety.soft_upper)
 
 
 def _axis_joint(joint: Joint, common: dict[str, Any], followed: Expression | None) -> JointOperation:
@@ -184,6 +173,7 @@ def _dynamics(joint: Joint) -> tuple[tuple[str, float], ...]:
         "effort": joint.limits.effort,
         "damping": joint.dynamics.damping or None,
         "friction": joint.dynamics.friction or None,
+        "k_position": None if joint.safety is None else joint.safety.k_position,
         "k_velocity": None if joint.safety is None else joint.safety.k_velocity,
     }
     return tuple((name, value) for name, value in values.items() if value is not None)
@@ -195,13 +185,13 @@ def _check_names(robot: Robot, prefix: str | None) -> None:
             name = part.name
             if name[0] == "/" or name[-1] == "/" or "//" in name or not name.isprintable():
                 raise FormatError(
-                    f"{robot.source}, line {part.line}, <{what} name={quote(name)}>: the name has an empty part or a control "
-                    "character; slashes separate the parts of a name. Rename it."
+                    f"{robot.source}, line {part.line}, <{what} name={quote(name)}>: the name has an "
+                    "empty part or a control character; slashes separate the parts of a name. Rename it."
                 )
             if what == "link" and name == WORLD and not prefix and name != robot.root:
                 raise FormatError(
-                    f"{robot.source}, line {part.line}, <link name={quote(name)}>: a link that is not the root is called as "
-                    "the frame at the root of everything. Load the robot with a prefix."
+                    f"{robot.source}, line {part.line}, <link name={quote(name)}>: a link that is not "
+                    "the root has the name of the frame at the root of everything. Load it with a prefix."
                 )
     taken = {joint.name for joint in robot.joints}
     for joint in robot.joints:
