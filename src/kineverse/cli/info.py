@@ -59,7 +59,7 @@ def sections(summary: Summary, frames: bool = False, constraints: bool = False) 
         found.append(table(("DoF", "unit", "lower", "upper", "default", "speed"), rows, "<<>>>>"))
     shown = summary.constraints if constraints else [c for c in summary.constraints if not c.simple]
     if shown:
-        title = "constraint" if constraints else "constraint on more than one DoF, or depending on the state"
+        title = "constraint" if constraints else "other constraints"
         found.append(table((title, ""), [(c.name, c.text) for c in shown]))
     if frames:
         found.append("frames\n" + "\n".join(_tree(summary.frames)))

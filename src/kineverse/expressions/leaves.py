@@ -16,6 +16,9 @@ if TYPE_CHECKING:
 def leaves(expression: Expression) -> tuple[tuple[Symbol, ...], tuple[Node, ...]]:
     """Return the symbols and the nodes that occur in the graph itself, each in canonical order."""
     if expression._leaves is None:
+        if expression._sx.is_constant():
+            expression._leaves = (), ()
+            return expression._leaves
         symbols: list[Symbol] = []
         nodes: set[Node] = set()
         owners = {element: node for node in expression._nodes for element in node.elements}

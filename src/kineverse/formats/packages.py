@@ -251,7 +251,7 @@ def _plain(text: str, folder: Folder, search: Sequence[Folder]) -> Path:
     tried = [Path(folder).absolute() / path, *(Path(place).absolute() / path for place in search)]
     for candidate in tried:
         if candidate.is_file():
-            return Path(os.path.normpath(candidate))
+            return candidate
     where = ", ".join(str(candidate) for candidate in dict.fromkeys(tried))
     hint = "" if path.is_absolute() else " Paths are relative to the folder of the description."
     raise FormatError(f"{quote(text)}: there is no such file. Looked for: {where}.{hint}")

@@ -55,6 +55,8 @@ class History:
         self._moved_frames: set[str] = set()
         for entry in entries:
             self._link(entry)
+        for (kind, name), writers in self.cells.items():
+            self.head[kind][name] = writers[-1].writes[kind, name]
         self.begin()
 
     # -- questions -----------------------------------------------------------------------------------------
@@ -136,11 +138,15 @@ class History:
         if tag in self.entries:
             raise NameTakenError(f"The tag {tag!r} is taken; give another one with tag=, or replace the operation.")
         with self._step():
-            self._link(Entry(tag, operation, place, Reads(), {}))
+            entry = Entry(tag, operation, place, Reads(), {})
             if self._dirty:
+                self._link(entry)
                 self._soil(tag)
             else:
-                self._run(tag)
+                entry = self._applied(entry)
+                self._link(entry)
+                for cell, value in entry.writes.items():
+                    self._touched(cell, ABSENT, value, place)
 
     @contextmanager
     def _step(self) -> Iterator[None]:
@@ -182,8 +188,16 @@ class History:
             raise EditError(f"The edit is refused, because these operations cannot be applied:{lines}")
 
     def _run(self, tag: str) -> None:
-        entry = self.entries[tag]
+        old = self.entries[tag]
+        new = self._applied(old)
+        self._exchange(new)
+        for cell in {**old.writes, **new.writes}:
+            self._touched(cell, old.writes.get(cell, ABSENT), new.writes.get(cell, ABSENT), new.place)
+
+    def _applied(self, entry: Entry) -> Entry:
+        """Run an operation at its place; return its entry with what it read and wrote."""
         self.runs += 1
+        tag = entry.tag
         reads = Reads()
         reader = Reader(lambda cell: self.value_at(cell, entry.place), lambda k: self.names_at(k, entry.place), reads)
         try:
@@ -202,10 +216,7 @@ class History:
                 self._check_parent(name, value, reads, entry.place)
             elif kind == CONSTRAINTS:
                 self._check_free(tag, name)
-        old = entry.writes
-        self._exchange(Entry(tag, entry.operation, entry.place, reads, writes))
-        for cell in {**old, **writes} if old else writes:
-            self._touched(cell, old.get(cell, ABSENT), writes.get(cell, ABSENT), entry.place)
+        return Entry(tag, entry.operation, entry.place, reads, writes)
 
     def _check_parent(self, name: str, frame: Frame, reads: Reads, place: int) -> None:
         if name == WORLD:
@@ -334,7 +345,6 @@ class History:
                 self.cells[cell] = [entry]
             else:
                 insort(writers, entry, key=_PLACE)
-            _put(self.head[cell[0]], cell[1], self.cells[cell][-1].writes[cell])
         for cell, how in entry.reads.cells.items():
             self.reading.setdefault(cell, {})[entry.tag] = how
         for kind in entry.reads.listings:
@@ -346,11 +356,8 @@ class History:
         self._undo.append((self._relink, (entry,)))
 
     def _relink(self, entry: Entry) -> None:
-        heads = {c: self.head[c[0]].get(c[1], ABSENT) for c in entry.writes}
         self._link(entry)
         self._undo.pop()
-        for cell, value in heads.items():
-            _put(self.head[cell[0]], cell[1], value)
 
     def _forget(self, entry: Entry) -> None:
         del self.entries[entry.tag]
@@ -370,11 +377,8 @@ class History:
 
     def _exchange(self, new: Entry) -> None:
         old = self.entries[new.tag]
-        heads = {c: self.head[c[0]].get(c[1], ABSENT) for c in (*old.writes, *new.writes)}
         self._unlink(old)
         self._link(new)
-        for cell, value in heads.items():
-            _put(self.head[cell[0]], cell[1], value)
 
     def _renumber(self) -> None:
         entries = self.sequence

@@ -31,8 +31,9 @@ def view(
     *,
     port: int | None = None,
     label: str = "Kineverse",
+    camera: Camera | None = None,
 ) -> Viewer:
     """Show a model on a web page of this computer; see :class:`kineverse.view.viewer.Viewer`."""
     from kineverse.view.viewer import Viewer
 
-    return Viewer(model, state, port=port, label=label)
+    return Viewer(model, state, port=port, label=label, camera=camera)

@@ -11,6 +11,7 @@ import numpy as np
 from kineverse.model.view import ModelView
 from kineverse.view import stage
 from kineverse.view.axes import axis_length
+from kineverse.view.camera import Camera
 from kineverse.view.parts import Kind, Part, parts
 from kineverse.view.poses import Poses
 from kineverse.view.rotation import quaternions
@@ -33,6 +34,8 @@ class Scene:
         The model to show.
     values
         The values of all symbols at first, by name [m], [rad].
+    camera
+        Where the page is seen from at first; None for a place from which much of what moves is seen.
 
     Attributes
     ----------
@@ -42,8 +45,10 @@ class Scene:
         What could not be loaded, one line each.
     """
 
-    def __init__(self, server: Any, model: ModelView, values: Mapping[str, float]) -> None:
-        self._server = server
+    def __init__(
+        self, server: Any, model: ModelView, values: Mapping[str, float], camera: Camera | None = None
+    ) -> None:
+        self._server, self._camera = server, camera
         # Switches on the page and the motion of the model come from different threads.
         self._lock = threading.RLock()
         self._frames_shown, self._labels_shown, self._filter = False, False, ""
@@ -185,11 +190,12 @@ class Scene:
         points = surfaces.corners.reshape(-1, 3) if len(surfaces.corners) else self.poses[:, :3, 3]
         low, high = points.min(axis=0), points.max(axis=0)
         self._floor, self._extent = float(low[2]), float(np.linalg.norm(high - low))
-        weights = importance(self._model, visuals)
-        camera = automatic(surfaces, weights, at, ASPECT, FIELD_OF_VIEW)
+        camera = self._camera
+        if camera is None:
+            camera = automatic(surfaces, importance(self._model, visuals), at, ASPECT, FIELD_OF_VIEW)
         start = self._server.initial_camera
         start.position, start.look_at = np.array(camera.position), np.array(camera.target)
-        start.fov = FIELD_OF_VIEW
+        start.fov = camera.field_of_view
         away = np.subtract(camera.position, camera.target)
         stage.set_lamp(self._server, float(np.arctan2(away[1], away[0])))
 

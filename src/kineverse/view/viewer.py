@@ -11,6 +11,7 @@ from typing import Any
 from kineverse.errors import KineverseError
 from kineverse.model.view import ModelView
 from kineverse.view import server as web
+from kineverse.view.camera import Camera
 from kineverse.view.motion import Show
 from kineverse.view.panel import Panel
 from kineverse.view.poses import complete
@@ -44,6 +45,8 @@ class Viewer:
         The port, 0 for any free one; None for 8080 or any free one.
     label
         The title of the page.
+    camera
+        Where the page is seen from at first; None for a place from which much of what moves is seen.
 
     Raises
     ------
@@ -60,6 +63,7 @@ class Viewer:
         *,
         port: int | None = None,
         label: str = "Kineverse",
+        camera: Camera | None = None,
     ) -> None:
         self.model = model
         self._initial = complete(model, state)
@@ -76,7 +80,7 @@ class Viewer:
             )
             self._server.gui.main_panel.dock_right()
             self._server.gui.main_panel.set_width(PANEL)
-            self._scene = Scene(self._server, model, self._values)
+            self._scene = Scene(self._server, model, self._values, camera)
             self._panel = self._build_panel()
         except BaseException:
             web.stop(self._server)

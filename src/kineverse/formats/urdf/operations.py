@@ -6,7 +6,7 @@ the things: ``joint pr2/l_elbow_flex_joint``, ``body pr2/l_elbow_flex_link``, ``
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from typing import Any
 
@@ -15,7 +15,7 @@ from kineverse.articulations import Joint as JointOperation
 from kineverse.errors import FormatError
 from kineverse.expressions.expression import Expression
 from kineverse.formats.markup import quote
-from kineverse.formats.urdf.description import Joint, Robot
+from kineverse.formats.urdf.description import Joint, Link, Robot
 from kineverse.model.body import Body, Pose
 from kineverse.model.edit import AddFrame
 from kineverse.model.frame import WORLD, Frame
@@ -97,13 +97,18 @@ def robot_operations(robot: Robot, prefix: str | None = None, parent: str = WORL
     parent
         The frame to which the root link is attached. A root link ``world`` without prefix is the world.
 
+    Empty parts of names are left out: ``/base_link`` becomes ``base_link``.
+
     Raises
     ------
     FormatError
-        If names of the description cannot be names here: two things would have the same, or a part is empty.
+        If names of the description cannot be names here, or two things would have the same.
     """
     _check_names(robot, prefix)
-    named: Callable[[str], str] = f"{prefix}/{{}}".format if prefix else str
+
+    def named(name: str) -> str:
+        return f"{prefix}/{_plain(name)}" if prefix else _plain(name)
+
     root = named(robot.root)
     bodies = {link.name: link.body for link in robot.links if link.body != _NO_BODY}
     if root != WORLD:
@@ -180,24 +185,36 @@ def _dynamics(joint: Joint) -> tuple[tuple[str, float], ...]:
 
 
 def _check_names(robot: Robot, prefix: str | None) -> None:
-    for what, parts in (("link", robot.links), ("joint", robot.joints)):
-        for part in parts:
-            name = part.name
-            if name[0] == "/" or name[-1] == "/" or "//" in name or not name.isprintable():
-                raise FormatError(
-                    f"{robot.source}, line {part.line}, <{what} name={quote(name)}>: the name has an "
-                    "empty part or a control character; slashes separate the parts of a name. Rename it."
-                )
-            if what == "link" and name == WORLD and not prefix and name != robot.root:
-                raise FormatError(
-                    f"{robot.source}, line {part.line}, <link name={quote(name)}>: a link that is not "
-                    "the root has the name of the frame at the root of everything. Load it with a prefix."
-                )
-    taken = {joint.name for joint in robot.joints}
+    """Raise where names of the description cannot be names of the model."""
+    parts: tuple[tuple[str, Iterable[Link | Joint]], ...] = (("link", robot.links), ("joint", robot.joints))
+    for what, things in parts:
+        known: dict[str, Link | Joint] = {}
+        for thing in things:
+            name = _plain(thing.name)
+            if not name or any(ord(character) < 32 for character in name):
+                problem = "the name has nothing but slashes, or a control character"
+            elif known.setdefault(name, thing) is not thing:
+                problem = f"only slashes tell it from the one on line {known[name].line}"
+            elif what == "link" and name == WORLD and not prefix and thing.name != robot.root:
+                problem = "it is not the root, but has the name of the root of all frames. Give a prefix"
+            else:
+                continue
+            raise FormatError(f"{_place(robot, thing, what)}: {problem}. Rename it.")
+    taken = {_plain(joint.name) for joint in robot.joints}
     for joint in robot.joints:
         for suffix in _SUFFIXES.get(joint.kind, ()):
-            if f"{joint.name}/{suffix}" in taken:
+            if f"{_plain(joint.name)}/{suffix}" in taken:
+                coordinate = quote(f"{joint.name}/{suffix}")
                 raise FormatError(
-                    f"{robot.source}, line {joint.line}, <joint name={quote(joint.name)}>: its coordinate "
-                    f"{quote(f'{joint.name}/{suffix}')} has the name of another joint. Rename one of them."
+                    f"{_place(robot, joint, 'joint')}: its coordinate {coordinate} has the name of another "
+                    "joint. Rename one of them."
                 )
+
+
+def _plain(name: str) -> str:
+    """Return a name without empty parts: descriptions older than tf2 call links ``/base_link``."""
+    return "/".join(filter(None, name.split("/"))) if "/" in name else name
+
+
+def _place(robot: Robot, thing: Link | Joint, what: str) -> str:
+    return f"{robot.source}, line {thing.line}, <{what} name={quote(thing.name)}>"
