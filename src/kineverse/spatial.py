@@ -29,7 +29,9 @@ def translation(x: ExpressionLike, y: ExpressionLike = 0.0, z: ExpressionLike = 
         parts = (first, as_expression(y), as_expression(z))
     for part in parts:
         if part.shape:
-            raise ShapeError(f"A translation is given as x, y, z or as one vector of shape (3,), not {part.shape}.")
+            raise ShapeError(
+                f"A translation is given as x, y, z or as one vector of shape (3,), not {part.shape}."
+            )
     column = ca.vertcat(_ONE, _ONE, _ONE, *(p._sx for p in parts), _ONE)
     return make(ca.SX(_TRANSLATION, column), (4, 4), union(parts))
 
@@ -102,7 +104,13 @@ def rpy_of(a_R_b: ExpressionLike) -> Expression:
     At pitch ±π/2 roll and yaw are not defined apart, and the derivative does not exist.
     """
     r = rotation_of(a_R_b)
-    return array([arctan2(r[2, 1], r[2, 2]), arctan2(-r[2, 0], norm(array([r[0, 0], r[1, 0]]))), arctan2(r[1, 0], r[0, 0])])
+    return array(
+        [
+            arctan2(r[2, 1], r[2, 2]),
+            arctan2(-r[2, 0], norm(array([r[0, 0], r[1, 0]]))),
+            arctan2(r[1, 0], r[0, 0]),
+        ]
+    )
 
 
 def quaternion(x: ExpressionLike, y: ExpressionLike, z: ExpressionLike, w: ExpressionLike) -> Expression:

@@ -124,7 +124,9 @@ class Symbol(Expression):
 
 def _check(path: str, order: int, role: str, value: float | None) -> None:
     if not isinstance(path, str) or not path:
-        raise ExpressionError(f"A symbol needs a path, a non-empty text such as 'kitchen/fridge_door', not {path!r}.")
+        raise ExpressionError(
+            f"A symbol needs a path, a non-empty text such as 'kitchen/fridge_door', not {path!r}."
+        )
     if any(not part for part in path.split("/")) or any(ord(c) < 32 for c in path):
         raise ExpressionError(f"The path {path!r} has an empty part or a control character.")
     if role not in ROLES:
@@ -187,7 +189,9 @@ def parse_symbol_name(name: str) -> tuple[str, int]:
         return path, ORDER_NAMES.index(suffix)
     if suffix.isdecimal():
         return path, int(suffix)
-    raise ExpressionError(f"{name!r}: ':{suffix}' is not an order; write {', '.join(ORDER_NAMES[1:])} or a number.")
+    raise ExpressionError(
+        f"{name!r}: ':{suffix}' is not an order; write {', '.join(ORDER_NAMES[1:])} or a number."
+    )
 
 
 def check_symbols(symbols: Iterable[object]) -> Sequence[Symbol]:
@@ -203,6 +207,8 @@ def check_symbols(symbols: Iterable[object]) -> Sequence[Symbol]:
     checked = []
     for item in symbols:
         if not isinstance(item, Symbol):
-            raise ExpressionError(f"{item!r} is not a symbol; symbols are made by kv.position('path') and the like.")
+            raise ExpressionError(
+                f"{item!r} is not a symbol; symbols are made by kv.position('path') and the like."
+            )
         checked.append(item)
     return checked

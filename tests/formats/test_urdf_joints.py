@@ -56,13 +56,33 @@ def test_a_missing_bound_is_zero():
     assert "neither lower nor upper" in robot.remarks[0]
 
 
-@pytest.mark.parametrize(("effort", "velocity"), [("-1", "-1"), ("1", "0"), ("-1", "2")])
-def test_a_magnitude_that_bounds_nothing_is_no_bound_and_remarked(effort, velocity):
-    robot = parse_urdf(pair(f'<limit lower="0" upper="1" effort="{effort}" velocity="{velocity}"/>'))
-    limits = robot.joints[0].limits
-    assert limits.velocity == (2.0 if velocity == "2" else None)
-    assert limits.effort == (1.0 if effort == "1" else None)
-    assert 'line 4, <joint name="j">: <limit>' in robot.remarks[0]
+@pytest.mark.parametrize("velocity", ["-1", "0"])
+def test_a_velocity_that_bounds_nothing_is_no_bound_and_remarked(velocity):
+    robot = parse_urdf(pair(f'<limit lower="0" upper="1" effort="1" velocity="{velocity}"/>'))
+    assert robot.joints[0].limits.velocity is None
+    assert 'line 4, <joint name="j">: <limit> has velocity' in robot.remarks[0]
+
+
+def test_efforts_are_magnitudes():
+    # |applied effort| < |effort| is what the specification says.
+    text = pair('<limit lower="0" upper="1" effort="-5" velocity="1"/>')
+    assert parse_urdf(text).joints[0].limits.effort == 5.0
+
+
+V1_2 = 'name="r" version="1.2"'
+
+
+def test_limits_of_version_1_2_are_open_where_left_out():
+    text = pair('<limit lower="-1" upper="1" velocity="0" acceleration="3" jerk="9"/>', attributes=V1_2)
+    assert parse_urdf(text).joints[0].limits == Limits(-1.0, 1.0, 0.0, None, 3.0, 3.0, 9.0)
+    text = pair('<limit deceleration="4"/>', "continuous", attributes=V1_2)
+    assert parse_urdf(text).joints[0].limits == Limits(deceleration=4.0)
+
+
+def test_limits_of_version_1_2_are_ignored_before_with_a_remark():
+    robot = parse_urdf(pair('<limit upper="1" effort="1" velocity="1" acceleration="x" jerk="1"/>'))
+    assert robot.joints[0].limits == Limits(0.0, 1.0, 1.0, 1.0)
+    assert ["acceleration" in robot.remarks[0], "jerk" in robot.remarks[1]] == [True, True]
 
 
 def test_safety_mimic_and_dynamics():
@@ -130,7 +150,13 @@ def test_quaternions_came_with_version_1_1():
     assert np.array_equal(j.origin.matrix, [[0, -1, 0, 1], [1, 0, 0, 2], [0, 0, 1, 3], [0, 0, 0, 1]])
 
 
-@pytest.mark.parametrize("version", ["1", "1.0", "1.1", "1.2"])
+def test_quaternions_are_ignored_before_with_a_remark():
+    robot = parse_urdf(pair('<origin xyz="1 2 3" quat_xyzw="0 0 2 2"/>' + LIMIT))
+    assert np.array_equal(robot.joints[0].origin.matrix[:3, :3], np.eye(3))
+    assert '<joint name="j">: <origin> has quat_xyzw, which is ignored' in robot.remarks[0]
+
+
+@pytest.mark.parametrize("version", ["1.0", "1.1", "1.2"])
 def test_versions(version):
     assert parse_urdf(pair(attributes=f'name="r" version="{version}"')).dof == 1
 

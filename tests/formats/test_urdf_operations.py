@@ -138,8 +138,19 @@ def test_a_continuous_joint_has_no_range():
 
 
 def test_a_magnitude_that_bounds_nothing_makes_no_constraint():
-    text = pair('<limit lower="0" upper="1" effort="-1" velocity="-1"/>')
+    text = pair('<limit lower="0" upper="1" effort="1" velocity="-1"/>')
     assert list(model_of(text).constraints) == ["j/position"]
+
+
+def test_what_is_not_kinematics_is_on_record():
+    inside = '<limit lower="0" upper="1" acceleration="3" jerk="9"/><dynamics damping="2"/>'
+    model = model_of(pair(inside, attributes='name="r" version="1.2"'))
+    assert dict(model.articulations["j"].dynamics) == {
+        "acceleration": 3.0,
+        "deceleration": 3.0,
+        "jerk": 9.0,
+        "damping": 2.0,
+    }
 
 
 SOFT = '<safety_controller k_velocity="5" k_position="7" soft_lower_limit="-.5" soft_upper_limit="1.5"/>'

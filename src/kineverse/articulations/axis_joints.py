@@ -6,9 +6,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..expressions.expression import Expression
-from ..model.body import Pose, Vector3
-from ..spatial import normalised, rotation_x, rotation_y, rotation_z, snapped, translation
+from kineverse.expressions.expression import Expression
+from kineverse.model.body import Pose, Vector3
+from kineverse.spatial import normalised, rotation_x, rotation_y, rotation_z, snapped, translation
+
 from .joint import AxisJoint
 
 

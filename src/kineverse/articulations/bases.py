@@ -6,13 +6,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..errors import ValueRejectedError
-from ..expressions.expression import array
-from ..expressions.functions import norm
-from ..model.operation import Effects
-from ..model.reader import Reader
-from ..spatial import rotation_z, translation
-from ..symbols import position, velocity
+from kineverse.errors import ValueRejectedError
+from kineverse.expressions.expression import array
+from kineverse.expressions.functions import norm
+from kineverse.model.operation import Effects
+from kineverse.model.reader import Reader
+from kineverse.spatial import rotation_z, translation
+from kineverse.symbols import position, velocity
+
 from .joint import Joint
 
 
@@ -46,7 +47,9 @@ class OmniBase(Joint):
             frames={self.child: (self.parent, (self.origin, translation(x, y, 0), rotation_z(angle)))},
             constraints=constraints,
             articulations={
-                self.name: self.record(coordinates, (0.0, 0.0, 0.0), tuple(c.derivative() for c in coordinates))
+                self.name: self.record(
+                    coordinates, (0.0, 0.0, 0.0), tuple(c.derivative() for c in coordinates)
+                )
             },
         )
 

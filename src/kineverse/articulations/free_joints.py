@@ -6,12 +6,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..model.body import Pose, Vector3
-from ..model.constraint import Constraint
-from ..model.operation import Effects
-from ..model.reader import Reader
-from ..spatial import quaternion, rotation_z, snapped, translation
-from ..symbols import position, velocity
+from kineverse.model.body import Pose, Vector3
+from kineverse.model.constraint import Constraint
+from kineverse.model.operation import Effects
+from kineverse.model.reader import Reader
+from kineverse.spatial import quaternion, rotation_z, snapped, translation
+from kineverse.symbols import position, velocity
+
 from .axis_joints import unit_axis
 from .joint import Joint
 
@@ -54,7 +55,9 @@ class Planar(Joint):
             frames={self.child: (self.parent, (self.origin, *motion))},
             constraints=constraints,
             articulations={
-                self.name: self.record(coordinates, (0.0, 0.0, 0.0), tuple(c.derivative() for c in coordinates))
+                self.name: self.record(
+                    coordinates, (0.0, 0.0, 0.0), tuple(c.derivative() for c in coordinates)
+                )
             },
         )
 

@@ -7,16 +7,16 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
-from ..errors import ValueRejectedError
-from ..expressions.expression import Expression, ExpressionLike
-from ..expressions.gradient import total_derivative
-from ..model.articulation import Articulation
-from ..model.body import Pose, Vector3
-from ..model.constraint import Constraint
-from ..model.operation import Effects, Operation
-from ..model.reader import Reader
-from ..spatial import normalised
-from ..symbols import Symbol, position
+from kineverse.errors import ValueRejectedError
+from kineverse.expressions.expression import Expression, ExpressionLike
+from kineverse.expressions.gradient import total_derivative
+from kineverse.model.articulation import Articulation
+from kineverse.model.body import Pose, Vector3
+from kineverse.model.constraint import Constraint
+from kineverse.model.operation import Effects, Operation
+from kineverse.model.reader import Reader
+from kineverse.spatial import normalised
+from kineverse.symbols import Symbol, position
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -50,7 +50,12 @@ class Joint(Operation):
         """The name of the class in lower case."""
         return type(self).__name__.lower()
 
-    def record(self, coordinates: tuple[Symbol, ...] = (), home: tuple[float, ...] = (), speeds: tuple[Symbol, ...] = ()) -> Articulation:
+    def record(
+        self,
+        coordinates: tuple[Symbol, ...] = (),
+        home: tuple[float, ...] = (),
+        speeds: tuple[Symbol, ...] = (),
+    ) -> Articulation:
         """Return the record of this joint."""
         return Articulation(self.kind, self.parent, self.child, coordinates, home, speeds, self.dynamics)
 
@@ -109,7 +114,9 @@ class AxisJoint(Joint):
             frames={self.child: (self.parent, (self.origin, *self.motion(self.q)))},
             constraints=dict(limits(self.name, self.q, self.lower, self.upper, self.velocity)),
             articulations={
-                self.name: self.record(coordinates, (0.0,) * len(coordinates), tuple(c.derivative() for c in coordinates))
+                self.name: self.record(
+                    coordinates, (0.0,) * len(coordinates), tuple(c.derivative() for c in coordinates)
+                )
             },
         )
 
@@ -124,10 +131,15 @@ def limits(
     """Yield the constraints ``name/position`` and ``name/velocity``, as far as there are any."""
     inf = float("inf")
     if (lower is not None or upper is not None) and q.symbols:
-        yield f"{name}/position", Constraint.of(-inf if lower is None else lower, q, inf if upper is None else upper)
+        yield (
+            f"{name}/position",
+            Constraint.of(-inf if lower is None else lower, q, inf if upper is None else upper),
+        )
     if velocity is not None and velocity != inf:
         rate = total_derivative(q)
         if rate.symbols:
             if not velocity >= 0:
-                raise ValueRejectedError(f"The velocity limit of '{name}' is {velocity!r}; it cannot be negative.")
+                raise ValueRejectedError(
+                    f"The velocity limit of '{name}' is {velocity!r}; it cannot be negative."
+                )
             yield f"{name}/velocity", Constraint.of(-velocity, rate, velocity)

@@ -15,7 +15,15 @@ _VALUE = re.compile(
     rf"\s*(?:/\s*(?P<divisor>{_NUMBER}))?\s*(?P<unit>deg|°|rad|mm|cm|m)?"
 )
 
-UNITS = {None: 1.0, "rad": 1.0, "deg": math.pi / 180.0, "°": math.pi / 180.0, "m": 1.0, "cm": 0.01, "mm": 0.001}
+UNITS = {
+    None: 1.0,
+    "rad": 1.0,
+    "deg": math.pi / 180.0,
+    "°": math.pi / 180.0,
+    "m": 1.0,
+    "cm": 0.01,
+    "mm": 0.001,
+}
 
 
 def add_set_option(parser: argparse.ArgumentParser) -> None:

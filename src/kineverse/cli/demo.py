@@ -11,6 +11,7 @@ from kineverse.cli.view import add_page_options, announce, terminated_as_interru
 
 if TYPE_CHECKING:
     import kineverse as kv
+    from kineverse.view.camera import Camera
 
 HELP = """show the kitchen and a robot that ship with Kineverse
 
@@ -24,13 +25,35 @@ examples:
 MODELS = ("kitchen", "pr2")
 
 STATE = {
-    "pr2/base/x": 0.25,
-    "pr2/base/y": 0.1,
-    "pr2/base/angle": 0.35,
-    "pr2/torso_lift_joint": 0.18,
+    "kitchen/fridge_door": 1.0,
+    "kitchen/oven_door": 0.5,
+    "kitchen/oven_knob": 1.2,
+    "kitchen/oven_right_drawer": 0.3,
+    "kitchen/sink_left_middle_drawer": 0.14,
+    "kitchen/sink_left_upper_drawer": 0.32,
+    "kitchen/sink_trash_drawer": 0.22,
+    "pr2/base/angle": 0.95,
+    "pr2/base/x": 0.1,
+    "pr2/base/y": -0.35,
+    "pr2/head_pan_joint": 0.1,
     "pr2/head_tilt_joint": 0.35,
+    "pr2/l_elbow_flex_joint": -1.75,
+    "pr2/l_gripper_joint": 0.05,
+    "pr2/l_shoulder_lift_joint": 0.55,
+    "pr2/l_shoulder_pan_joint": 0.75,
+    "pr2/l_upper_arm_roll_joint": 1.0,
+    "pr2/l_wrist_flex_joint": -0.9,
+    "pr2/r_elbow_flex_joint": -0.75,
+    "pr2/r_gripper_joint": 0.07,
+    "pr2/r_shoulder_lift_joint": 0.1,
+    "pr2/r_shoulder_pan_joint": -0.55,
+    "pr2/r_wrist_flex_joint": -0.35,
+    "pr2/torso_lift_joint": 0.15,
 }
-"""Where things are at first [m], [rad]: the robot has come to the row, some doors are open."""
+"""The opening scene [m], [rad]: the robot stands before the row, and somebody forgot to shut the doors."""
+
+EYE, TARGET, VIEW = (-3.5, 4.9, 2.75), (0.2, 0.0, 0.8), 0.66
+"""Where it is seen from [m], [rad]: over the island's corner, along the open doors."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -53,7 +76,7 @@ def run(arguments: argparse.Namespace) -> int:
 
     with (
         terminated_as_interrupted(),
-        Viewer(model, _state(model), port=arguments.port, label="Kineverse demo") as page,
+        Viewer(model, _state(model), port=arguments.port, label="Kineverse demo", camera=_camera()) as page,
     ):
         announce(page, browser=not arguments.no_browser)
         print(_contents(model))
@@ -65,6 +88,12 @@ def _state(model: kv.Model) -> dict[str, float]:
     """Return the opening scene, of which those symbols count that the models have."""
     known = {str(symbol) for symbol in model.symbols}
     return {name: value for name, value in STATE.items() if name in known}
+
+
+def _camera() -> Camera:
+    from kineverse.view.camera import Camera
+
+    return Camera(EYE, TARGET, field_of_view=VIEW)
 
 
 def _contents(model: kv.Model) -> str:
@@ -96,6 +125,6 @@ def _headless(model: kv.Model, path: str) -> int:
     )
     for line in result.problems[:10]:
         print(f"kineverse: {line}", file=sys.stderr)
-    save(path, model, _state(model))
+    save(path, model, _state(model), camera=_camera())
     print(f"picture: {path}")
     return 1 if result.problems else 0

@@ -44,9 +44,10 @@ def run(arguments: argparse.Namespace) -> int:
 def sections(summary: Summary, frames: bool = False, constraints: bool = False) -> list[str]:
     """Return the paragraphs of the report."""
     extent = " x ".join(f"{edge:.2f}" for edge in summary.extent)
+    frames_, freedoms, conditions = map(len, (summary.frames, summary.freedoms, summary.constraints))
     lines = [
         summary.name,
-        f"  {len(summary.frames)} frames, {len(summary.freedoms)} DoF, {len(summary.constraints)} constraints",
+        f"  {frames_} frames, {freedoms} DoF, {conditions} constraints",
         f"  {extent} m, {summary.mass:.4g} kg, {summary.shapes} shapes"
         + (f", {len(summary.problems)} of them not loaded" if summary.problems else ""),
     ]

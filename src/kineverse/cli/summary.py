@@ -41,8 +41,8 @@ class Condition:
 class Summary:
     """What a model consists of.
 
-    ``frames`` are the parents by name; ``low``, ``high`` and ``extent`` the box around all shapes at the default
-    state [m]; ``mass`` that of all bodies [kg]; ``problems`` what could not be loaded.
+    ``frames`` are the parents by name; ``low``, ``high`` and ``extent`` the box around all shapes at the
+    default state [m]; ``mass`` that of all bodies [kg]; ``problems`` what could not be loaded.
     """
 
     name: str
@@ -63,7 +63,7 @@ def summarise(name: str, model: ModelView) -> Summary:
     poses = Poses(model)
     at = dict(zip(poses.names, poses.at(values), strict=True))
     shown = parts(model)
-    loaded = [part for part in shown if not part.problem]
+    loaded = [part for part in shown if not part.placeholder]
     corners = Surfaces.of(loaded, at).corners.reshape(-1, 3)
     if not len(corners):
         corners = np.array([pose[:3, 3] for pose in at.values()])

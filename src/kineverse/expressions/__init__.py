@@ -5,4 +5,12 @@ from .gradient import total_derivative
 from .leaves import gradient_keys
 from .lowering import lower
 
-__all__ = ["Expression", "ExpressionLike", "array", "as_expression", "gradient_keys", "lower", "total_derivative"]
+__all__ = [
+    "Expression",
+    "ExpressionLike",
+    "array",
+    "as_expression",
+    "gradient_keys",
+    "lower",
+    "total_derivative",
+]

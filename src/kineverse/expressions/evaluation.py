@@ -12,7 +12,8 @@ import casadi as ca
 import numpy as np
 import numpy.typing as npt
 
-from ..errors import ExpressionError, UnknownNameError, ValueRejectedError, suggest
+from kineverse.errors import ExpressionError, UnknownNameError, ValueRejectedError, suggest
+
 from .expression import Expression
 from .lowering import lower
 
@@ -27,7 +28,9 @@ def evaluate(expression: Expression, values: Mapping[Any, Any]) -> npt.NDArray[A
     return result[()]  # type: ignore[no-any-return]
 
 
-def assign(symbols: tuple[Any, ...], values: Mapping[Any, Any], exact: bool = True) -> npt.NDArray[np.float64]:
+def assign(
+    symbols: tuple[Any, ...], values: Mapping[Any, Any], exact: bool = True
+) -> npt.NDArray[np.float64]:
     """Return the numbers of ``symbols`` in their order, from a mapping by symbol or by name.
 
     If ``exact``, names that are not among the symbols are an error, unless ``values`` is a
@@ -40,10 +43,12 @@ def assign(symbols: tuple[Any, ...], values: Mapping[Any, Any], exact: bool = Tr
     ValueRejectedError
         For NaN.
     """
-    from ..state import State
+    from kineverse.state import State
 
     if not isinstance(values, Mapping):
-        raise ExpressionError(f"Values are given as a mapping {{name: number}}, not as {type(values).__name__}.")
+        raise ExpressionError(
+            f"Values are given as a mapping {{name: number}}, not as {type(values).__name__}."
+        )
     given = {str(k): v for k, v in values.items()}
     names = [str(s) for s in symbols]
     unknown = [n for n in given if n not in names] if exact and not isinstance(values, State) else []
@@ -51,12 +56,16 @@ def assign(symbols: tuple[Any, ...], values: Mapping[Any, Any], exact: bool = Tr
         raise UnknownNameError(f"Unknown symbol {unknown[0]!r}. {suggest(unknown[0], names, 'symbol')}")
     missing = [n for n, s in zip(names, symbols, strict=True) if n not in given and s.value is None]
     if missing:
-        raise UnknownNameError(f"No value for {', '.join(map(repr, missing[:10]))}{' ...' if len(missing) > 10 else ''}.")
+        raise UnknownNameError(
+            f"No value for {', '.join(map(repr, missing[:10]))}{' ...' if len(missing) > 10 else ''}."
+        )
     vector = np.empty(len(names))
     for i, (name, symbol) in enumerate(zip(names, symbols, strict=True)):
         value = given.get(name, symbol.value)
         if isinstance(value, Expression):
-            raise ExpressionError(f"The value of '{name}' is an expression; use substitute({{symbol: expression}}).")
+            raise ExpressionError(
+                f"The value of '{name}' is an expression; use substitute({{symbol: expression}})."
+            )
         try:
             vector[i] = value
         except (TypeError, ValueError):

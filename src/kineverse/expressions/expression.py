@@ -16,12 +16,14 @@ import casadi as ca
 import numpy as np
 import numpy.typing as npt
 
-from ..errors import ExpressionError, ShapeError, ValueRejectedError
+from kineverse.errors import ExpressionError, ShapeError, ValueRejectedError
+
 from . import layout
 from .layout import SX, Shape
 
 if TYPE_CHECKING:
-    from ..symbols import Symbol
+    from kineverse.symbols import Symbol
+
     from .node import Node
 
 ExpressionLike: TypeAlias = "Expression | float | int | npt.ArrayLike | Sequence[Any]"
@@ -119,7 +121,9 @@ class Expression:
         if isinstance(key, Expression) or (
             isinstance(key, tuple) and any(isinstance(k, Expression) for k in key)
         ):
-            raise ExpressionError("An index must be a number or a slice; use where(condition, a, b) to select.")
+            raise ExpressionError(
+                "An index must be a number or a slice; use where(condition, a, b) to select."
+            )
         if type(key) is tuple and len(key) == 2 and type(key[0]) is int and type(key[1]) is int:
             if len(self._shape) == 2 and 0 <= key[0] < self._shape[0] and 0 <= key[1] < self._shape[1]:
                 return make(self._sx[key[0], key[1]], (), self._nodes)
@@ -146,7 +150,9 @@ class Expression:
         try:
             return self._rearranged(layout.indices(self._shape).reshape(wanted))
         except ValueError:
-            raise ShapeError(f"An expression of shape {self._shape} cannot be reshaped to {wanted}.") from None
+            raise ShapeError(
+                f"An expression of shape {self._shape} cannot be reshaped to {wanted}."
+            ) from None
 
     def ravel(self) -> Expression:
         """Return the elements in C order, shape (size,)."""
@@ -230,12 +236,12 @@ class Expression:
     # -- logic (kineverse.logic says what it means) --------------------------------------------------------
 
     def __lt__(self, other: ExpressionLike) -> Expression:
-        from ..logic import less
+        from kineverse.logic import less
 
         return less(self, other)
 
     def __gt__(self, other: ExpressionLike) -> Expression:
-        from ..logic import less
+        from kineverse.logic import less
 
         return less(other, self)
 
@@ -243,27 +249,27 @@ class Expression:
     __ge__ = __gt__
 
     def __and__(self, other: ExpressionLike) -> Expression:
-        from ..logic import logic_and
+        from kineverse.logic import logic_and
 
         return logic_and(self, other)
 
     def __rand__(self, other: ExpressionLike) -> Expression:
-        from ..logic import logic_and
+        from kineverse.logic import logic_and
 
         return logic_and(other, self)
 
     def __or__(self, other: ExpressionLike) -> Expression:
-        from ..logic import logic_or
+        from kineverse.logic import logic_or
 
         return logic_or(self, other)
 
     def __ror__(self, other: ExpressionLike) -> Expression:
-        from ..logic import logic_or
+        from kineverse.logic import logic_or
 
         return logic_or(other, self)
 
     def __invert__(self) -> Expression:
-        from ..logic import logic_not
+        from kineverse.logic import logic_not
 
         return logic_not(self)
 
@@ -479,7 +485,9 @@ def as_expression(value: ExpressionLike) -> Expression:
     try:
         numbers = np.asarray(value, dtype=float)
     except (TypeError, ValueError) as error:
-        raise ExpressionError(f"{type(value).__name__} is not an expression or an array of numbers: {error}") from None
+        raise ExpressionError(
+            f"{type(value).__name__} is not an expression or an array of numbers: {error}"
+        ) from None
     if np.isnan(numbers).any():
         raise ValueRejectedError(f"NaN is not accepted as a constant (in an array of shape {numbers.shape}).")
     return make(layout.from_array(numbers), numbers.shape, NO_NODES)

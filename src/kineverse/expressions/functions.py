@@ -12,14 +12,15 @@ from typing import TYPE_CHECKING
 import casadi as ca
 import numpy as np
 
-from ..errors import ShapeError
+from kineverse.errors import ShapeError
+
 from . import layout
 from .expression import Expression, ExpressionLike, as_expression, binary, broadcast, make, unary
 from .leaves import gradient_keys
 from .node import Node
 
 if TYPE_CHECKING:
-    from ..symbols import Symbol
+    from kineverse.symbols import Symbol
 
 
 def sin(x: ExpressionLike) -> Expression:
@@ -181,7 +182,9 @@ def hypot(a: ExpressionLike, b: ExpressionLike) -> Expression:
     """Return √(a² + b²), elementwise; its gradient at the origin is 0."""
     x, y = broadcast(as_expression(a), as_expression(b))
     squares = square(x) + square(y)
-    return where(make(ca.SX.binary(ca.OP_LT, 0, squares._sx), squares.shape, squares._nodes), sqrt(squares), 0)
+    return where(
+        make(ca.SX.binary(ca.OP_LT, 0, squares._sx), squares.shape, squares._nodes), sqrt(squares), 0
+    )
 
 
 def sum_along(x: ExpressionLike, axis: int | None = None) -> Expression:

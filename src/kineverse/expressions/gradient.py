@@ -14,13 +14,15 @@ from typing import TYPE_CHECKING
 import casadi as ca
 import numpy as np
 
-from ..errors import ExpressionError
+from kineverse.errors import ExpressionError
+
 from . import layout
 from .expression import NO_NODES, Expression, make
 from .leaves import leaves
 
 if TYPE_CHECKING:
-    from ..symbols import Symbol
+    from kineverse.symbols import Symbol
+
     from .node import Node
 
 
@@ -81,15 +83,13 @@ def _collect(
         if entry.is_zero():
             continue
         nodes = expression._nodes | nodes_of.get(key, NO_NODES)
-        result[key] = make(
-            layout.from_column(ca.densify(entry), expression._shape), expression._shape, nodes
-        )
+        result[key] = make(layout.from_column(ca.densify(entry), expression._shape), expression._shape, nodes)
     return result
 
 
 def jacobian(expression: Expression, symbols: Sequence[Symbol], heuristic: bool = True) -> Expression:
     """Return the derivatives by ``symbols`` along the last axis, see :meth:`Expression.jacobian`."""
-    from ..symbols import check_symbols
+    from kineverse.symbols import check_symbols
 
     entries = gradient(expression, heuristic)
     columns = []
@@ -112,7 +112,8 @@ def jacobian(expression: Expression, symbols: Sequence[Symbol], heuristic: bool 
 
 def partial(expression: Expression, symbols: Sequence[Symbol]) -> Expression:
     """Return the plain partial derivatives, see :meth:`Expression.partial`."""
-    from ..symbols import check_symbols
+    from kineverse.symbols import check_symbols
+
     from .lowering import lowered
 
     shape = (*expression._shape, len(symbols))
@@ -134,7 +135,11 @@ def total_derivative(expression: Expression, heuristic: bool = False) -> Express
     """Return ``ė = Σ D(e)[v]·v``, of the expression's shape: its rate as a function of the speeds."""
     if not expression._shape and not expression._nodes and expression._sx.is_symbolic():
         (symbol,) = expression.symbols  # by far the most frequent case: a limit on a joint's speed
-        return symbol.derivative() if symbol.has_derivative else make(layout.from_array(np.zeros(())), (), NO_NODES)
+        return (
+            symbol.derivative()
+            if symbol.has_derivative
+            else make(layout.from_array(np.zeros(())), (), NO_NODES)
+        )
     rate = make(layout.from_array(np.zeros(expression.shape)), expression.shape, NO_NODES)
     for key, entry in gradient(expression, heuristic).items():
         rate = rate + entry * key

@@ -9,7 +9,8 @@ import casadi as ca
 from .expression import SYMBOLS, Expression
 
 if TYPE_CHECKING:
-    from ..symbols import Symbol
+    from kineverse.symbols import Symbol
+
     from .node import Node
 
 

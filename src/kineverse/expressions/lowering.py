@@ -8,8 +8,8 @@ import casadi as ca
 
 from . import layout
 from .expression import Expression
-from .leaves import leaves
 from .layout import SX
+from .leaves import leaves
 
 
 def lowered(expression: Expression) -> SX:

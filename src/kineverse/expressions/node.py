@@ -17,13 +17,15 @@ from weakref import WeakValueDictionary
 
 import casadi as ca
 
-from ..errors import ExpressionError, ShapeError
+from kineverse.errors import ExpressionError, ShapeError
+
 from . import layout
 from .expression import Expression, ExpressionLike, as_expression, broadcast_to, make
 from .leaves import free_symbols, gradient_keys
 
 if TYPE_CHECKING:
-    from ..symbols import Symbol
+    from kineverse.symbols import Symbol
+
     from .substitution import Substitution
 
 _INTERNED: WeakValueDictionary[bytes, Node] = WeakValueDictionary()
@@ -36,14 +38,27 @@ class Node(ABC):
     (:meth:`_gradient`), in terms of their ``arguments``.
     """
 
-    __slots__ = ("__weakref__", "_gradients", "_value_cache", "arguments", "elements", "key", "options", "shape", "sx", "symbols")
+    __slots__ = (
+        "__weakref__",
+        "_gradients",
+        "_value_cache",
+        "arguments",
+        "elements",
+        "key",
+        "options",
+        "shape",
+        "sx",
+        "symbols",
+    )
 
     kind: ClassVar[str]
     arguments: tuple[Expression, ...]
     options: tuple[Any, ...]
 
     @classmethod
-    def of(cls, arguments: tuple[Expression, ...], shape: layout.Shape, options: tuple[Any, ...] = ()) -> Expression:
+    def of(
+        cls, arguments: tuple[Expression, ...], shape: layout.Shape, options: tuple[Any, ...] = ()
+    ) -> Expression:
         """Return the expression that is this node, made once for equal arguments and options."""
         key = cls._content_key(arguments, shape, options)
         node = _INTERNED.get(key)
@@ -112,9 +127,7 @@ class Node(ABC):
 
     def depends_on(self, substitution: Substitution) -> bool:
         """Whether value or gradient contain one of the symbols that are to be replaced."""
-        return any(
-            symbol in substitution for argument in self.arguments for symbol in free_symbols(argument)
-        )
+        return any(symbol in substitution for argument in self.arguments for symbol in free_symbols(argument))
 
     def substitute(self, substitution: Substitution) -> Expression:
         """Return the composition: the same kind of node over the substituted arguments."""
@@ -212,7 +225,7 @@ def augment(
     value: Expression, gradient: Mapping[Symbol, ExpressionLike], *, replace: bool, heuristic: bool
 ) -> Expression:
     """Return ``value`` with a gradient that is overridden or replaced, see :meth:`Expression.augment`."""
-    from ..symbols import Symbol
+    from kineverse.symbols import Symbol
 
     if not isinstance(gradient, Mapping):
         raise ExpressionError("A gradient is a mapping from derivative symbols to expressions.")

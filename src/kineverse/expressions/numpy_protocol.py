@@ -11,7 +11,8 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from ..errors import ExpressionError, ShapeError
+from kineverse.errors import ExpressionError, ShapeError
+
 from . import functions as f
 from . import layout
 from .expression import Expression, array, as_expression, binary, floor_divide, make, matmul, unary, union
@@ -70,9 +71,13 @@ def apply_ufunc(ufunc: Any, method: str, inputs: tuple[Any, ...], options: Mappi
     if method == "reduce" and ufunc is np.add and not set(options) - {"axis"}:
         return f.sum_along(inputs[0], options.get("axis", 0))
     if options.get("out") is not None:
-        raise ExpressionError(f"np.{ufunc.__name__} cannot write expressions into an existing array of numbers.")
+        raise ExpressionError(
+            f"np.{ufunc.__name__} cannot write expressions into an existing array of numbers."
+        )
     if method != "__call__" or options:
-        raise ExpressionError(f"np.{ufunc.__name__}.{method} with {sorted(options)} is not available for expressions.")
+        raise ExpressionError(
+            f"np.{ufunc.__name__}.{method} with {sorted(options)} is not available for expressions."
+        )
     if ufunc in _UNARY_OPS:
         return unary(_UNARY_OPS[ufunc], as_expression(inputs[0]))
     if ufunc in _BINARY_OPS:
@@ -102,7 +107,9 @@ def apply_function(function: Any, args: Sequence[Any], options: Mapping[str, Any
     if function in _REARRANGING:
         operand = as_expression(args[0])
         try:
-            return operand._rearranged(np.asarray(function(layout.indices(operand.shape), *args[1:], **options)))
+            return operand._rearranged(
+                np.asarray(function(layout.indices(operand.shape), *args[1:], **options))
+            )
         except (ValueError, IndexError) as error:
             raise ShapeError(f"np.{function.__name__}: {error} (shape {operand.shape}).") from None
     if function in _JOINING:
@@ -160,8 +167,9 @@ _FUNCTIONS: dict[Any, Callable[..., Any]] = {
     np.where: f.where,
     np.clip: lambda a, lower, upper: f.clip(a, lower, upper),
     np.sum: lambda a, axis=None: f.sum_along(a, axis),
-    np.mean: lambda a, axis=None: f.sum_along(a, axis)
-    / (as_expression(a).size if axis is None else as_expression(a).shape[axis]),
+    np.mean: lambda a, axis=None: (
+        f.sum_along(a, axis) / (as_expression(a).size if axis is None else as_expression(a).shape[axis])
+    ),
     np.prod: _product,
     np.trace: _trace,
     np.dot: _dot,

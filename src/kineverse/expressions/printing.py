@@ -10,7 +10,8 @@ from .expression import SYMBOLS, Expression
 from .layout import SX, column
 
 if TYPE_CHECKING:
-    from ..symbols import Symbol
+    from kineverse.symbols import Symbol
+
     from .node import Node
 
 _LIMIT = 400
@@ -18,7 +19,14 @@ _ELEMENTS = 16
 _DEPTH = 24
 
 _INFIX = {ca.OP_ADD: ("+", 1), ca.OP_SUB: ("-", 1), ca.OP_MUL: ("*", 2), ca.OP_DIV: ("/", 2)}
-_COMPARISONS = {ca.OP_LT: "<", ca.OP_LE: "<=", ca.OP_EQ: "==", ca.OP_NE: "!=", ca.OP_AND: "and", ca.OP_OR: "or"}
+_COMPARISONS = {
+    ca.OP_LT: "<",
+    ca.OP_LE: "<=",
+    ca.OP_EQ: "==",
+    ca.OP_NE: "!=",
+    ca.OP_AND: "and",
+    ca.OP_OR: "or",
+}
 _POWERS = (ca.OP_POW, ca.OP_CONSTPOW)
 _FUNCTIONS = {
     ca.OP_SQRT: "sqrt", ca.OP_SIN: "sin", ca.OP_COS: "cos", ca.OP_TAN: "tan", ca.OP_ASIN: "arcsin",
@@ -50,7 +58,9 @@ def latex(expression: Expression) -> str:
         return writer.bounded(expression._sx)
     rows, columns = expression._sx.shape
     if rows > 6 or columns > 6:
-        return rf"\text{{Expression of shape }} {expression.shape}".replace("(", r"\left(").replace(")", r"\right)")
+        return rf"\text{{Expression of shape }} {expression.shape}".replace("(", r"\left(").replace(
+            ")", r"\right)"
+        )
     lines = [" & ".join(writer.bounded(expression._sx[i, j]) for j in range(columns)) for i in range(rows)]
     return r"\begin{bmatrix}" + r" \\ ".join(lines) + r"\end{bmatrix}"
 
@@ -100,7 +110,9 @@ class _Writer:
         if operation in _COMPARISONS:
             a, b = (self.write(o, depth + 1, 1) for o in operands)
             return self.grouped(f"{a} {_COMPARISONS[operation]} {b}")
-        return self.call(_FUNCTIONS.get(operation, f"op{operation}"), [self.write(o, depth + 1) for o in operands])
+        return self.call(
+            _FUNCTIONS.get(operation, f"op{operation}"), [self.write(o, depth + 1) for o in operands]
+        )
 
     def infix(self, operation: int, operands: list[SX], depth: int, strength: int) -> str:
         sign, own = _INFIX[operation]
@@ -166,5 +178,13 @@ class _Latex(_Writer):
 def _escaped(path: str) -> str:
     if len(path) == 1:
         return path
-    table: dict[str, Any] = {"_": r"\_", "%": r"\%", "&": r"\&", "#": r"\#", "{": r"\{", "}": r"\}", "\\": r"\backslash "}
+    table: dict[str, Any] = {
+        "_": r"\_",
+        "%": r"\%",
+        "&": r"\&",
+        "#": r"\#",
+        "{": r"\{",
+        "}": r"\}",
+        "\\": r"\backslash ",
+    }
     return r"\mathrm{" + "".join(table.get(c, c) for c in path) + "}"

@@ -20,7 +20,9 @@ def structural_key(expression: Expression) -> bytes:
     """Return a digest of shape, leaves and graph; equal for equal structure, in every process."""
     if expression._key is None:
         symbols, nodes = leaves(expression)
-        digest = hashlib.blake2b(repr((expression._shape, [s.sort_key for s in symbols])).encode(), digest_size=16)
+        digest = hashlib.blake2b(
+            repr((expression._shape, [s.sort_key for s in symbols])).encode(), digest_size=16
+        )
         for node in nodes:
             digest.update(node.key)
         sx = expression._sx

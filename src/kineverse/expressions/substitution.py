@@ -7,12 +7,14 @@ from typing import TYPE_CHECKING, TypeAlias
 
 import casadi as ca
 
-from ..errors import ExpressionError, ShapeError
+from kineverse.errors import ExpressionError, ShapeError
+
 from .expression import NO_NODES, Expression, ExpressionLike, as_expression, make
 from .leaves import leaves
 
 if TYPE_CHECKING:
-    from ..symbols import Symbol
+    from kineverse.symbols import Symbol
+
     from .node import Node
 
 Substitution: TypeAlias = "Mapping[Symbol, Expression]"
@@ -20,7 +22,7 @@ Substitution: TypeAlias = "Mapping[Symbol, Expression]"
 
 def substitute(expression: Expression, values: Mapping[Symbol, ExpressionLike]) -> Expression:
     """Return e∘S, see :meth:`Expression.substitute`."""
-    from ..symbols import Symbol
+    from kineverse.symbols import Symbol
 
     substitution: dict[Symbol, Expression] = {}
     for symbol, value in values.items():
@@ -30,7 +32,9 @@ def substitute(expression: Expression, values: Mapping[Symbol, ExpressionLike]) 
             )
         replacement = as_expression(value)
         if replacement.shape:
-            raise ShapeError(f"'{symbol}' is a scalar and cannot become an array of shape {replacement.shape}.")
+            raise ShapeError(
+                f"'{symbol}' is a scalar and cannot become an array of shape {replacement.shape}."
+            )
         if replacement is not symbol:
             substitution[symbol] = replacement
     return apply(expression, substitution)

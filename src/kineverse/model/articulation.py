@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-from ..symbols import Symbol
+from kineverse.symbols import Symbol
 
 
 @dataclass(frozen=True, slots=True)

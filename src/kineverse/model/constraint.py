@@ -8,12 +8,12 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING, TypeAlias
 
-from ..errors import ShapeError, ValueRejectedError
-from ..expressions.expression import Expression, ExpressionLike, as_expression
-from ..expressions.leaves import gradient_keys
+from kineverse.errors import ShapeError, ValueRejectedError
+from kineverse.expressions.expression import Expression, ExpressionLike, as_expression
+from kineverse.expressions.leaves import gradient_keys
 
 if TYPE_CHECKING:
-    from ..symbols import Symbol
+    from kineverse.symbols import Symbol
 
 ConstraintLike: TypeAlias = "Constraint | Sequence[ExpressionLike]"
 
@@ -54,7 +54,9 @@ class Constraint:
         if not low.symbols and not high.symbols:
             a, b = float(low), float(high)
             if a > b or a == math.inf or b == -math.inf:
-                raise ValueRejectedError(f"No value lies between the lower bound {a:g} and the upper bound {b:g}.")
+                raise ValueRejectedError(
+                    f"No value lies between the lower bound {a:g} and the upper bound {b:g}."
+                )
         return Constraint(low, middle, high)
 
     @cached_property

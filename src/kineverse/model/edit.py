@@ -6,9 +6,10 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from ..errors import EditError
-from ..expressions.expression import ExpressionLike
-from ..symbols import Symbol
+from kineverse.errors import EditError
+from kineverse.expressions.expression import ExpressionLike
+from kineverse.symbols import Symbol
+
 from .body import Body
 from .constraint import Constraint
 from .frame import Frame, TransformLike
@@ -195,17 +196,28 @@ class Edit:
         return self.apply(AddFrame(name, Frame.of(parent, transform), body), tag)
 
     def constrain(
-        self, name: str, lower: ExpressionLike, expression: ExpressionLike, upper: ExpressionLike, tag: str | None = None
+        self,
+        name: str,
+        lower: ExpressionLike,
+        expression: ExpressionLike,
+        upper: ExpressionLike,
+        tag: str | None = None,
     ) -> str:
         """Require ``lower <= expression <= upper``; all three are scalars, bounds may be expressions or ±inf."""
         return self.apply(Constrain(name, Constraint.of(lower, expression, upper)), tag)
 
-    def set_rate(self, coordinate: Symbol, row: Mapping[Symbol, ExpressionLike], tag: str | None = None) -> str:
+    def set_rate(
+        self, coordinate: Symbol, row: Mapping[Symbol, ExpressionLike], tag: str | None = None
+    ) -> str:
         """Say that the coordinate's rate is ``Σ expression·speed`` over the row."""
         return self.apply(SetRate(coordinate, as_row(coordinate, row)), tag)
 
     def attach(
-        self, frame: str, parent: str, transform: TransformLike | Sequence[TransformLike], tag: str | None = None
+        self,
+        frame: str,
+        parent: str,
+        transform: TransformLike | Sequence[TransformLike],
+        tag: str | None = None,
     ) -> str:
         """Put an existing frame, with everything below it, into another parent: something is picked up."""
         return self.apply(Attach(frame, Frame.of(parent, transform)), tag)
@@ -216,7 +228,7 @@ class Edit:
 
     def include(self, source: Any, prefix: str | None = None) -> list[str]:
         """Append the operations of a file or shipped model; returns their tags. See :func:`kineverse.load`."""
-        from ..formats import operations_of
+        from kineverse.formats import operations_of
 
         return [self.apply(operation, tag) for tag, operation in operations_of(source, prefix)]
 
@@ -226,7 +238,9 @@ class Edit:
         if tag is not None:
             return tag
         if not isinstance(operation, Operation):
-            raise EditError(f"{operation!r} is not an operation; subclass kv.Operation as a frozen dataclass.")
+            raise EditError(
+                f"{operation!r} is not an operation; subclass kv.Operation as a frozen dataclass."
+            )
         return operation.default_tag()
 
     def _changing(self) -> History:

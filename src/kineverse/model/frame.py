@@ -11,8 +11,9 @@ import casadi as ca
 import numpy as np
 import numpy.typing as npt
 
-from ..errors import ShapeError, ValueRejectedError
-from ..expressions.expression import Expression, as_expression
+from kineverse.errors import ShapeError, ValueRejectedError
+from kineverse.expressions.expression import Expression, as_expression
+
 from .body import Pose
 
 WORLD = "world"

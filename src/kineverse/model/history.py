@@ -14,7 +14,8 @@ from contextlib import contextmanager
 from operator import attrgetter
 from typing import Any
 
-from ..errors import EditError, KineverseError, ModelError, NameTakenError, UnknownNameError, suggest
+from kineverse.errors import EditError, KineverseError, ModelError, NameTakenError, UnknownNameError, suggest
+
 from .frame import WORLD, Frame
 from .kinematics import ancestors
 from .operation import CONSTRAINTS, FRAMES, KINDS, Effects, Operation
@@ -29,7 +30,9 @@ class Entry:
 
     __slots__ = ("operation", "place", "reads", "tag", "writes")
 
-    def __init__(self, tag: str, operation: Operation, place: int, reads: Reads, writes: dict[Cell, Any]) -> None:
+    def __init__(
+        self, tag: str, operation: Operation, place: int, reads: Reads, writes: dict[Cell, Any]
+    ) -> None:
         self.tag = tag
         self.operation = operation
         self.place = place
@@ -87,7 +90,9 @@ class History:
         try:
             return self.entries[tag]
         except (KeyError, TypeError):
-            raise UnknownNameError(f"There is no operation {tag!r}. {suggest(str(tag), self.entries, 'tag')}") from None
+            raise UnknownNameError(
+                f"There is no operation {tag!r}. {suggest(str(tag), self.entries, 'tag')}"
+            ) from None
 
     # -- changes of the sequence ---------------------------------------------------------------------------
 
@@ -136,7 +141,9 @@ class History:
             raise EditError(f"A tag is a non-empty text, not {tag!r}.")
         _check_operation(operation)
         if tag in self.entries:
-            raise NameTakenError(f"The tag {tag!r} is taken; give another one with tag=, or replace the operation.")
+            raise NameTakenError(
+                f"The tag {tag!r} is taken; give another one with tag=, or replace the operation."
+            )
         with self._step():
             entry = Entry(tag, operation, place, Reads(), {})
             if self._dirty:
@@ -199,7 +206,9 @@ class History:
         self.runs += 1
         tag = entry.tag
         reads = Reads()
-        reader = Reader(lambda cell: self.value_at(cell, entry.place), lambda k: self.names_at(k, entry.place), reads)
+        reader = Reader(
+            lambda cell: self.value_at(cell, entry.place), lambda k: self.names_at(k, entry.place), reads
+        )
         try:
             effects = entry.operation.apply(reader)
             if not isinstance(effects, Effects):
@@ -266,7 +275,11 @@ class History:
         existence = (old is ABSENT) != (new is ABSENT)
         for tag, how in self.reading.get(cell, {}).items():
             reader = self.entries[tag].place
-            if reader > place and (following is None or reader <= following) and (how & Read.VALUE or existence):
+            if (
+                reader > place
+                and (following is None or reader <= following)
+                and (how & Read.VALUE or existence)
+            ):
                 self._soil(tag)
         if existence:
             for tag in self.listing[kind]:
@@ -404,7 +417,9 @@ def as_cell(path: str) -> Cell:
     """
     kind, _, name = path.partition("/")
     if kind not in KINDS or not name:
-        raise UnknownNameError(f"{path!r} is not a path into a model; it begins with one of {', '.join(KINDS)}, then '/'.")
+        raise UnknownNameError(
+            f"{path!r} is not a path into a model; it begins with one of {', '.join(KINDS)}, then '/'."
+        )
     return kind, name
 
 

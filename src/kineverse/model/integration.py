@@ -10,11 +10,12 @@ import casadi as ca
 import numpy as np
 import numpy.typing as npt
 
-from ..errors import UnknownNameError, ValueRejectedError, suggest
-from ..expressions.evaluation import assign
-from ..expressions.lowering import lower
-from ..state import State
-from ..symbols import Symbol
+from kineverse.errors import UnknownNameError, ValueRejectedError, suggest
+from kineverse.expressions.evaluation import assign
+from kineverse.expressions.lowering import lower
+from kineverse.state import State
+from kineverse.symbols import Symbol
+
 from .rates import Rates
 
 Vector: TypeAlias = npt.NDArray[np.float64]
@@ -71,7 +72,12 @@ def integrate(
 
 
 def _driven(
-    driven: list[Symbol], wheels: list[Symbol], rates: Rates, state: State, given: Mapping[Symbol, float], dt: float
+    driven: list[Symbol],
+    wheels: list[Symbol],
+    rates: Rates,
+    state: State,
+    given: Mapping[Symbol, float],
+    dt: float,
 ) -> dict[Symbol, float]:
     """Integrate the coordinates that have rows, together with the free ones their rows look at."""
     wanted = {s for x in driven for g in rates[x].values() for s in g.symbols}

@@ -13,11 +13,12 @@ import casadi as ca
 import numpy as np
 import numpy.typing as npt
 
-from ..errors import ModelError
-from ..expressions.expression import NO_NODES, Expression, make
-from ..expressions.layout import SX
-from ..expressions.node import Node
-from ..symbols import Symbol
+from kineverse.errors import ModelError
+from kineverse.expressions.expression import NO_NODES, Expression, make
+from kineverse.expressions.layout import SX
+from kineverse.expressions.node import Node
+from kineverse.symbols import Symbol
+
 from .body import Pose
 from .frame import WORLD, Frame
 
@@ -147,7 +148,7 @@ def place(chain: Sequence[str], lookup: FrameLookup, start: Placement = ROOT) ->
 
 def relative(frame: str, relative_to: str, lookup: FrameLookup) -> Expression:
     """Return relative_to_T_frame in plain coordinates."""
-    from ..spatial import inverse
+    from kineverse.spatial import inverse
 
     base, down = branches(frame, relative_to, lookup)
     tip = place(down, lookup).matrix()
@@ -166,9 +167,7 @@ class Twist:
     nodes: frozenset[Node]
 
 
-def twists(
-    base: Placement, tip: Placement, heuristic: bool
-) -> tuple[SX, SX, dict[Symbol, Twist]]:
+def twists(base: Placement, tip: Placement, heuristic: bool) -> tuple[SX, SX, dict[Symbol, Twist]]:
     """Return rotation and position of the tip in the base, and its twist by each speed, in axes of the base.
 
     Both placements are relative to a common ancestor. Every moving factor contributes the twist it makes in front

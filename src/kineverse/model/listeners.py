@@ -6,7 +6,8 @@ import logging
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 
-from ..symbols import Symbol
+from kineverse.symbols import Symbol
+
 from .diff import Change, Diff
 from .operation import CONSTRAINTS
 

@@ -6,8 +6,9 @@ from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
-from ..errors import EditError
-from ..symbols import Symbol
+from kineverse.errors import EditError
+from kineverse.symbols import Symbol
+
 from .diff import Change, Diff
 from .edit import Edit
 from .history import Entry, History

@@ -11,8 +11,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
-from ..expressions.expression import Expression, ExpressionLike
-from ..symbols import Symbol
+from kineverse.expressions.expression import Expression, ExpressionLike
+from kineverse.symbols import Symbol
+
 from .articulation import Articulation
 from .body import Body
 from .constraint import Constraint, ConstraintLike, as_constraint
@@ -50,7 +51,9 @@ class Effects:
         Anything else: immutable values that can be compared.
     """
 
-    frames: Mapping[str, Frame | tuple[str, TransformLike | Sequence[TransformLike]]] = field(default_factory=dict)
+    frames: Mapping[str, Frame | tuple[str, TransformLike | Sequence[TransformLike]]] = field(
+        default_factory=dict
+    )
     constraints: Mapping[str, ConstraintLike] = field(default_factory=dict)
     rates: Mapping[Symbol, Mapping[Symbol, ExpressionLike]] = field(default_factory=dict)
     bodies: Mapping[str, Body] = field(default_factory=dict)
@@ -63,7 +66,9 @@ class Effects:
         for name, frame in self.frames.items():
             value = frame if isinstance(frame, Frame) else Frame.of(*frame)
             if any(isinstance(f, Expression) and f._nodes for f in value.factors):
-                value = Frame(value.parent, tuple(plain(f) if isinstance(f, Expression) else f for f in value.factors))
+                value = Frame(
+                    value.parent, tuple(plain(f) if isinstance(f, Expression) else f for f in value.factors)
+                )
             result[FRAMES, name] = value
         for name, triple in self.constraints.items():
             c = as_constraint(triple)

@@ -16,15 +16,15 @@ from collections.abc import Callable, Iterator, Mapping
 from functools import cached_property
 from typing import TYPE_CHECKING
 
-from ..errors import ModelError, ValueRejectedError
-from ..expressions.expression import Expression, ExpressionLike, as_expression
-from ..expressions.leaves import leaves
-from ..expressions.node import Node
-from ..expressions.substitution import apply, compose_gradient, replace_nodes
-from ..symbols import Symbol
+from kineverse.errors import ModelError, ValueRejectedError
+from kineverse.expressions.expression import Expression, ExpressionLike, as_expression
+from kineverse.expressions.leaves import leaves
+from kineverse.expressions.node import Node
+from kineverse.expressions.substitution import apply, compose_gradient, replace_nodes
+from kineverse.symbols import Symbol
 
 if TYPE_CHECKING:
-    from ..expressions.substitution import Substitution
+    from kineverse.expressions.substitution import Substitution
 
 Row = tuple[tuple[Symbol, Expression], ...]
 
@@ -45,7 +45,9 @@ def as_row(coordinate: Symbol, row: Mapping[Symbol, ExpressionLike]) -> Row:
             raise ModelError(f"The rate of '{coordinate}' has velocities as keys, not '{speed}'.")
         entry = plain(as_expression(value))
         if entry.shape:
-            raise ValueRejectedError(f"The rate of '{coordinate}' by '{speed}' is a scalar, not {entry.shape}.")
+            raise ValueRejectedError(
+                f"The rate of '{coordinate}' by '{speed}' is a scalar, not {entry.shape}."
+            )
         entries.append((speed, entry))
     return tuple(sorted(entries, key=lambda item: item[0].sort_key))
 
@@ -256,6 +258,6 @@ def _all_symbols(expression: Expression) -> set[Symbol]:
 
 
 def _expression_of(node: Node) -> Expression:
-    from ..expressions.expression import make
+    from kineverse.expressions.expression import make
 
     return make(node.sx, node.shape, frozenset((node,)))

@@ -6,9 +6,10 @@ from collections.abc import Callable, Iterator, Mapping
 from enum import IntFlag
 from typing import Any, Generic, TypeVar
 
-from ..errors import UnknownNameError, suggest
-from ..expressions.expression import Expression
-from ..symbols import Symbol
+from kineverse.errors import UnknownNameError, suggest
+from kineverse.expressions.expression import Expression
+from kineverse.symbols import Symbol
+
 from .articulation import Articulation
 from .body import Body
 from .constraint import Constraint
@@ -52,7 +53,9 @@ class Reader:
         Mappings by name, in plain coordinates.
     """
 
-    def __init__(self, value_at: Callable[[Cell], Any], names_at: Callable[[str], list[str]], reads: Reads) -> None:
+    def __init__(
+        self, value_at: Callable[[Cell], Any], names_at: Callable[[str], list[str]], reads: Reads
+    ) -> None:
         self._value_at = value_at
         self._reads = reads
         self.frames: Mapping[str, Frame] = _View(FRAMES, value_at, names_at, reads)

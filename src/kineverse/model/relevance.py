@@ -8,9 +8,10 @@ from __future__ import annotations
 from collections import defaultdict
 from collections.abc import Iterable, Mapping
 
-from ..errors import ExpressionError
-from ..expressions.expression import Expression
-from ..symbols import Symbol
+from kineverse.errors import ExpressionError
+from kineverse.expressions.expression import Expression
+from kineverse.symbols import Symbol
+
 from .constraint import Constraint, coordinates
 
 
@@ -57,7 +58,9 @@ class Relevance:
         expressions = [subject] if isinstance(subject, Expression) else list(subject)
         for expression in expressions:
             if not isinstance(expression, Expression):
-                raise ExpressionError(f"Constraints are found for expressions or symbols, not for {expression!r}.")
+                raise ExpressionError(
+                    f"Constraints are found for expressions or symbols, not for {expression!r}."
+                )
         if exact:
             symbols = {s for e in expressions for s in e.symbols}
             return self._exact(symbols, constraints, bounds, closure)

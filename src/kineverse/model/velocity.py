@@ -18,11 +18,12 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-from ..errors import ValueRejectedError
-from ..expressions.expression import Expression, array, as_expression
-from ..expressions.functions import Norm, maximum, minimum, sqrt
-from ..expressions.gradient import partial
-from ..symbols import Symbol
+from kineverse.errors import ValueRejectedError
+from kineverse.expressions.expression import Expression, array, as_expression
+from kineverse.expressions.functions import Norm, maximum, minimum, sqrt
+from kineverse.expressions.gradient import partial
+from kineverse.symbols import Symbol
+
 from .constraint import Constraint
 from .rates import Rates
 
@@ -182,7 +183,9 @@ def _fastest_retreat(
     return minimum(total, 0)
 
 
-def _total(towards: Mapping[Symbol, Expression], magnitudes: Mapping[Symbol, Expression]) -> Expression | None:
+def _total(
+    towards: Mapping[Symbol, Expression], magnitudes: Mapping[Symbol, Expression]
+) -> Expression | None:
     total = as_expression(0.0)
     for speed, weight in towards.items():
         if speed not in magnitudes:
@@ -265,4 +268,3 @@ def _affine(expression: Expression) -> tuple[dict[Symbol, Expression], Expressio
         return None
     offset = expression.substitute(dict.fromkeys(speeds, 0.0))
     return {s: slopes[i] for i, s in enumerate(speeds)}, offset
-

@@ -9,10 +9,11 @@ from typing import Any, Literal
 import casadi as ca
 import numpy as np
 
-from ..errors import UnknownNameError, suggest
-from ..expressions.expression import NO_NODES, Expression, as_expression, make
-from ..state import State
-from ..symbols import Symbol, parse_symbol_name
+from kineverse.errors import UnknownNameError, suggest
+from kineverse.expressions.expression import NO_NODES, Expression, as_expression, make
+from kineverse.state import State
+from kineverse.symbols import Symbol, parse_symbol_name
+
 from . import kinematics
 from .articulation import Articulation
 from .body import Body
@@ -150,7 +151,9 @@ class ModelView:
         known = self._carried_constraints.get(name)
         if known is None:
             known = Constraint(
-                rates.carry(constraint.lower), rates.carry(constraint.expression), rates.carry(constraint.upper)
+                rates.carry(constraint.lower),
+                rates.carry(constraint.expression),
+                rates.carry(constraint.upper),
             )
             self._carried_constraints[name] = known
         return known
@@ -235,7 +238,9 @@ class ModelView:
             Whether heuristic gradient entries count; a Jacobian is about facts, so by default they do not.
         """
         if form not in ("world_aligned", "world", "body"):
-            raise UnknownNameError(f"There is no form {form!r}; forms are 'world_aligned', 'world' and 'body'.")
+            raise UnknownNameError(
+                f"There is no form {form!r}; forms are 'world_aligned', 'world' and 'body'."
+            )
         key = (frame, relative_to, form, None if symbols is None else tuple(symbols), heuristic)
         with self._lock:
             self._settle()
@@ -381,13 +386,22 @@ class ModelView:
             for name in self._relevance.on(wanted):
                 c = self._head[CONSTRAINTS][name]
                 low, high = self._bound(c.lower, values), self._bound(c.upper, values)
-                lower, upper = max(lower, -np.inf if low is None else low), min(upper, np.inf if high is None else high)
+                lower, upper = (
+                    max(lower, -np.inf if low is None else low),
+                    min(upper, np.inf if high is None else high),
+                )
             return float(lower), float(upper)
 
     def _bound(self, bound: Expression, values: Mapping[Any, float] | None) -> float | None:
         if not bound.symbols:
             return float(bound())
-        known = values if isinstance(values, State) else State(values) if values is not None else self.default_state()
+        known = (
+            values
+            if isinstance(values, State)
+            else State(values)
+            if values is not None
+            else self.default_state()
+        )
         if any(s not in known and s.value is None for s in bound.symbols):
             return None
         return float(bound(known))
@@ -407,7 +421,9 @@ class ModelView:
         for speed in self.speeds:
             if speed.path == path and order >= 1:
                 return Symbol(path, order, speed.role)
-        raise UnknownNameError(f"There is no symbol {name!r}. {suggest(name, map(str, self.symbols), 'symbol')}")
+        raise UnknownNameError(
+            f"There is no symbol {name!r}. {suggest(name, map(str, self.symbols), 'symbol')}"
+        )
 
     def default_state(self) -> State:
         """Return a value for every symbol: 0 (or an articulation's home) clipped into the limits, parameters' own."""

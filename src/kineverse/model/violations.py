@@ -8,11 +8,12 @@ from typing import Any, NamedTuple
 import casadi as ca
 import numpy as np
 
-from ..errors import UnknownNameError, suggest
-from ..expressions.evaluation import assign
-from ..expressions.lowering import lower
-from ..state import State
-from ..symbols import Symbol
+from kineverse.errors import UnknownNameError, suggest
+from kineverse.expressions.evaluation import assign
+from kineverse.expressions.lowering import lower
+from kineverse.state import State
+from kineverse.symbols import Symbol
+
 from .constraint import Constraint
 
 
@@ -38,7 +39,9 @@ class Violations(tuple[Violation, ...]):
         return self
 
     def __repr__(self) -> str:
-        lines = [f"  {v.name}: {v.lower:g} <= {v.value:g} <= {v.upper:g} is off by {v.excess:g}" for v in self]
+        lines = [
+            f"  {v.name}: {v.lower:g} <= {v.value:g} <= {v.upper:g} is off by {v.excess:g}" for v in self
+        ]
         return f"{len(self)} violated\n" + "\n".join(lines) if lines else "none violated"
 
 
@@ -56,7 +59,9 @@ class Checks:
         inputs = ca.vertcat(*(s._sx for s in self.symbols)) if self.symbols else ca.SX(0, 1)
         self._function = ca.Function("constraints", [inputs], [stacked])
 
-    def evaluate(self, values: np.ndarray[Any, np.dtype[np.float64]]) -> np.ndarray[Any, np.dtype[np.float64]]:
+    def evaluate(
+        self, values: np.ndarray[Any, np.dtype[np.float64]]
+    ) -> np.ndarray[Any, np.dtype[np.float64]]:
         """Return rows (lower, value, upper) for a vector of values."""
         return np.array(self._function(values)).reshape(-1, 3)
 
@@ -65,7 +70,11 @@ def find_violations(
     checks: Checks, values: Mapping[Any, float], known: Iterable[Symbol], tolerance: float
 ) -> Violations:
     """Return the violations at ``values``, see :meth:`ModelView.violations`."""
-    state = values if isinstance(values, State) else _checked(values, {str(s): s for s in (*known, *checks.symbols)})
+    state = (
+        values
+        if isinstance(values, State)
+        else _checked(values, {str(s): s for s in (*known, *checks.symbols)})
+    )
     vector = np.zeros(len(checks.symbols))
     given = [s for s in checks.symbols if s in state]
     vector_of = dict(zip(given, assign(tuple(given), State({s: state[s] for s in given})), strict=True))

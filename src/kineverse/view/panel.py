@@ -93,10 +93,6 @@ class Panel:
             for name in self._ranges.varying:
                 self._fit(name, float(self._sliders[name].value))
 
-    def range(self, name: str) -> tuple[float, float]:
-        """Return the range of a slider [unit of its degree of freedom]."""
-        return float(self._sliders[name].min), float(self._sliders[name].max)
-
     def _add_controls(self, reset: Callable[[], None], play: Callable[[bool], None]) -> None:
         gui = self._gui
         find = gui.add_text("find", "", hint="Show only the sliders whose name contains this.")

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
-from kineverse.model.body import Mesh, Shape
+from kineverse.model.body import Body, Mesh, Shape
 from kineverse.model.view import ModelView
 from kineverse.view.meshes import load
 from kineverse.view.primitives import triangles_of
@@ -40,11 +40,13 @@ class Part:
     surface
         Its triangles in that frame [m].
     color
-        Red, green, blue, alpha in [0, 1]; where the surface brings colours of its own, they count.
+        Red, green, blue, alpha in [0, 1]; colours that the surface brings count more, as in RViz.
     kind
         Whether it is there to be seen or to be touched.
     problem
-        Why it is a placeholder; empty if it is not.
+        What could not be loaded, and why; empty if nothing.
+    placeholder
+        Whether the surface only marks the place of what could not be loaded.
     """
 
     frame: str
@@ -52,6 +54,7 @@ class Part:
     color: Rgba
     kind: Kind
     problem: str = ""
+    placeholder: bool = False
 
 
 def parts(model: ModelView, kind: Kind = "visual") -> list[Part]:
@@ -66,27 +69,36 @@ def parts(model: ModelView, kind: Kind = "visual") -> list[Part]:
         ``"collision"``: what is meant to be touched.
     """
     found: list[Part] = []
+    bare = kind == "visual" and not any(body.visuals for body in model.bodies.values())
     for number, (frame, body) in enumerate(model.bodies.items()):
-        shapes = body.visuals if kind == "visual" else body.collisions
-        fallback = UNPAINTED[number % len(UNPAINTED)] if kind == "visual" else COLLISION
-        found.extend(_part(frame, shape, kind, fallback) for shape in shapes)
-    if not found and kind == "visual":
-        for number, (frame, body) in enumerate(model.bodies.items()):
-            fallback = UNPAINTED[number % len(UNPAINTED)]
-            found.extend(_part(frame, shape, "visual", fallback) for shape in body.collisions)
+        if kind == "collision":
+            found += [_part(frame, shape, "collision", COLLISION) for shape in body.collisions]
+            continue
+        fallback = UNPAINTED[number % len(UNPAINTED)]
+        shapes = body.collisions if bare else body.visuals
+        found += _instead([_part(frame, shape, "visual", fallback) for shape in shapes], body, fallback)
     return found
 
 
+def _instead(visuals: list[Part], body: Body, color: Rgba) -> list[Part]:
+    """Return the visual parts of a body, or its collision shapes if no visual one could be loaded.
+
+    Descriptions are often passed on with the small collision meshes only; those show a robot well enough.
+    """
+    if not visuals or not all(part.placeholder for part in visuals):
+        return visuals
+    frame, problem = visuals[0].frame, visuals[0].problem
+    touched = [_part(frame, shape, "visual", color) for shape in body.collisions]
+    touched = [part for part in touched if not part.placeholder]
+    return [replace(touched[0], problem=problem), *touched[1:]] if touched else visuals
+
+
 def _part(frame: str, shape: Shape, kind: Kind, fallback: Rgba) -> Part:
-    problem, surface = "", triangles_of(shape.geometry)
+    surface, problem, color = triangles_of(shape.geometry), "", shape.color or fallback
     if isinstance(shape.geometry, Mesh):
         problem = load(shape.geometry).problem
-    color = shape.color or fallback
     if problem:
         color = MISSING
     elif kind == "collision":
-        surface, color = Triangles(surface.vertices, surface.faces, surface.normals), COLLISION
-    elif shape.color is not None and surface.colors is not None:
-        # A description that names a colour means it, as in RViz.
-        surface = Triangles(surface.vertices, surface.faces, surface.normals, closed=surface.closed)
-    return Part(frame, surface.moved(shape.origin.matrix), color, kind, problem)
+        surface, color = surface.unpainted(), COLLISION
+    return Part(frame, surface.moved(shape.origin.matrix), color, kind, problem, bool(problem))

@@ -63,6 +63,10 @@ class Triangles:
         """Return the surface with (F, 4) colours of its faces."""
         return replace(self, colors=colors)
 
+    def unpainted(self) -> Triangles:
+        """Return the surface without colours of its own."""
+        return self if self.colors is None else replace(self, colors=None)
+
     def scaled(self, scale: npt.ArrayLike) -> Triangles:
         """Return the surface stretched along x, y, z; a mirrored one keeps its outside outside."""
         factors = np.broadcast_to(np.asarray(scale, dtype=float), (3,))

@@ -133,7 +133,12 @@ class Viewer:
     def play(self, running: bool = True) -> None:
         """Start or stop moving everything through its range."""
         with self._change:
-            limits = {name: self._panel.range(name) for name in self._ranges.names}
+            # What has no limits has no range to be moved through, and a robot would drive off the page.
+            limits = {
+                name: (low, high)
+                for name, (low, high) in self._ranges.at(self._values).items()
+                if high - low < 1e6
+            }
             self._show = Show(self._values, limits, time.monotonic()) if running else None
             self._ask()
         self._panel.playing.value = running

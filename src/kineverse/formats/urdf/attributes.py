@@ -9,6 +9,7 @@ from typing import TypeVar
 
 from kineverse.formats import numerals, rpy
 from kineverse.formats.markup import Element, ElementError, abbreviate
+from kineverse.formats.urdf.remarks import Remarks
 from kineverse.model.body import Pose, Vector3
 
 T = TypeVar("T")
@@ -55,23 +56,24 @@ def _default(element: Element, key: str, default: T | None) -> T:
     return default
 
 
-def pose(origin: Element | None, version: tuple[int, int]) -> Pose:
+def pose(origin: Element | None, owner: Element, version: tuple[int, int], remarks: Remarks) -> Pose:
     """Return the pose an ``<origin>`` gives; identity without one.
 
-    URDF 1.1 brought ``quat_xyzw`` as another way to say ``rpy``. In a file of version 1.0 it is an error
-    rather than, as elsewhere, passed over: the orientation would be lost without a word.
+    URDF 1.1 brought ``quat_xyzw`` as another way to say ``rpy``; in a file of version 1.0 it is ignored.
     """
     if origin is None:
         return _IDENTITY
     xyz = vector(origin, "xyz", _ZERO)
     quaternion = origin[1].get("quat_xyzw")
+    if quaternion is not None and version < (1, 1):
+        remarks.add(
+            origin,
+            'has quat_xyzw, which is ignored: it came with URDF 1.1. Write <robot version="1.1" ...>.',
+            owner,
+        )
+        quaternion = None
     if quaternion is None:
         return rpy.pose_of(xyz, vector(origin, "rpy", _ZERO))
-    if version < (1, 1):
-        raise ElementError(
-            origin,
-            'has quat_xyzw, which came with URDF 1.1. Write <robot version="1.1" ...>, or rpy instead.',
-        )
     if "rpy" in origin[1]:
         raise ElementError(origin, "has both rpy and quat_xyzw; keep one of them.")
     try:

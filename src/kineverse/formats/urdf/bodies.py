@@ -94,7 +94,7 @@ class LinkReader:
         form = self._geometry(geometry, element, link)
         if form is None:
             return None
-        place, own_name = pose(origin, self._version), element[1].get("name", "")
+        place, own_name = pose(origin, link, self._version, self._remarks), element[1].get("name", "")
         if material is None or index < 0:
             return Shape(form, place, own_name)
         appearance = self.materials.appearance(material, link)
@@ -136,7 +136,7 @@ class LinkReader:
         mass = 0.0 if mass_element is None else number(mass_element, "value", 0.0)
         if mass < 0.0:
             self._remarks.add(inertial, f"has the negative mass {mass!r}, which is kept as it is.", link)
-        origin = pose(child(inertial, "origin"), self._version)
+        origin = pose(child(inertial, "origin"), link, self._version, self._remarks)
         if tensor is None:
             return Inertia(mass, (0.0, 0.0, 0.0, 0.0, 0.0, 0.0), origin)
         ixx, ixy, ixz = (number(tensor, "ixx", 0.0), number(tensor, "ixy", 0.0), number(tensor, "ixz", 0.0))

@@ -32,13 +32,17 @@ class Limits:
     """Bounds of one joint; None is no bound.
 
     ``lower`` and ``upper`` bound the position [rad] or [m], ``velocity`` the magnitude of the speed [rad/s]
-    or [m/s], ``effort`` that of the torque [N m] or force [N].
+    or [m/s], ``effort`` that of the torque [N m] or force [N]; from URDF 1.2 on, ``acceleration`` and
+    ``deceleration`` those of gaining and losing speed [rad/s²] or [m/s²], ``jerk`` that of their change.
     """
 
     lower: float | None = None
     upper: float | None = None
     velocity: float | None = None
     effort: float | None = None
+    acceleration: float | None = None
+    deceleration: float | None = None
+    jerk: float | None = None
 
 
 UNLIMITED = Limits()

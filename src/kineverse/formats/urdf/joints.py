@@ -44,7 +44,7 @@ def read_joint(element: Element, version: tuple[int, int], remarks: Remarks) -> 
     name = name_of(element)
     kind = _kind(element)
     parts = _parts(element, remarks)
-    origin = pose(parts.get("origin"), version)
+    origin = pose(parts.get("origin"), element, version, remarks)
     parent, child = _link(element, parts, "parent"), _link(element, parts, "child")
     line = element[3]
     if kind in ("fixed", "floating", "planar"):
@@ -55,7 +55,7 @@ def read_joint(element: Element, version: tuple[int, int], remarks: Remarks) -> 
         axis = _axis(parts.get("axis"), element, remarks) if kind == "planar" else None
         return Joint(name, kind, parent, child, origin, axis, line=line)
     limit, safety, mimic, dynamics = map(parts.get, ("limit", "safety_controller", "mimic", "dynamics"))
-    limits = _limits(limit, kind, element, remarks)
+    limits = _limits(limit, kind, element, version, remarks)
     return Joint(
         name,
         kind,
@@ -120,7 +120,9 @@ def _axis(axis: Element | None, joint: Element, remarks: Remarks) -> Vector3:
     return (snap(x / length), snap(y / length), snap(z / length))
 
 
-def _limits(limit: Element | None, kind: Kind, joint: Element, remarks: Remarks) -> Limits:
+def _limits(
+    limit: Element | None, kind: Kind, joint: Element, version: tuple[int, int], remarks: Remarks
+) -> Limits:
     if limit is None:
         if kind == "continuous":
             return UNLIMITED
@@ -130,23 +132,43 @@ def _limits(limit: Element | None, kind: Kind, joint: Element, remarks: Remarks)
             '<limit lower="..." upper="..." effort="..." velocity="..."/>'
             + (', or type="continuous" for a joint without bounds.' if kind == "revolute" else "."),
         )
+    if version >= (1, 2):
+        return _limits_1_2(limit, kind)
     effort, velocity = number(limit, "effort"), number(limit, "velocity")
-    if effort < 0.0 or velocity < 0.0:
-        remarks.add(limit, "has a negative effort or velocity, which is taken as no bound at all.", joint)
-    elif velocity == 0.0:
-        remarks.add(limit, "has velocity 0, which is taken as no bound at all.", joint)
+    if velocity <= 0.0:
+        remarks.add(limit, f"has velocity {velocity:g}, which is taken as no bound at all.", joint)
     lower = upper = None
     if kind != "continuous":
-        lower, upper = number(limit, "lower", 0.0), number(limit, "upper", 0.0)
-        if lower > upper:
-            raise ElementError(
-                limit, f"has lower={lower!r} above upper={upper!r}: no position would be valid."
-            )
+        lower, upper = _range(limit, number(limit, "lower", 0.0), number(limit, "upper", 0.0))
         if "lower" not in limit[1] and "upper" not in limit[1]:
             remarks.add(
                 limit, "has neither lower nor upper; both are 0 by the specification: it cannot move.", joint
             )
-    return Limits(lower, upper, velocity if velocity > 0.0 else None, effort if effort >= 0.0 else None)
+    for key in ("acceleration", "deceleration", "jerk"):
+        if key in limit[1]:
+            remarks.add(limit, f"has {key}, which is ignored: it came with URDF 1.2.", joint)
+    return Limits(lower, upper, velocity if velocity > 0.0 else None, abs(effort))
+
+
+def _limits_1_2(limit: Element, kind: Kind) -> Limits:
+    """Return limits as URDF 1.2 reads them: open where left out, but a range needs both ends."""
+    lower = upper = None
+    if kind != "continuous":
+        lower, upper = _range(limit, number(limit, "lower"), number(limit, "upper"))
+    keys = ("velocity", "effort", "acceleration", "deceleration", "jerk")
+    values = {key: number(limit, key) for key in keys if key in limit[1]}
+    for key, value in values.items():
+        if value < 0.0:
+            raise ElementError(limit, f"has {key}={value!r}; URDF 1.2 refuses negative magnitudes.")
+    if "acceleration" in values:
+        values.setdefault("deceleration", values["acceleration"])
+    return Limits(lower, upper, **values)
+
+
+def _range(limit: Element, lower: float, upper: float) -> tuple[float, float]:
+    if lower > upper:
+        raise ElementError(limit, f"has lower={lower!r} above upper={upper!r}: no position would be valid.")
+    return lower, upper
 
 
 def _safety(safety: Element | None, limits: Limits) -> Safety | None:

@@ -110,7 +110,7 @@ def robot_operations(robot: Robot, prefix: str | None = None, parent: str = WORL
         return f"{prefix}/{_plain(name)}" if prefix else _plain(name)
 
     root = named(robot.root)
-    bodies = {link.name: link.body for link in robot.links if link.body != _NO_BODY}
+    bodies = {link.name: link.body for link in robot.links if not _is_empty(link.body)}
     if root != WORLD:
         yield AddFrame(root, Frame(parent, (_ROOT,)))
     elif parent != WORLD:
@@ -126,7 +126,8 @@ def robot_operations(robot: Robot, prefix: str | None = None, parent: str = WORL
             yield SetBody(named(joint.child), bodies[joint.child])
 
 
-_NO_BODY = Body()
+def _is_empty(body: Body) -> bool:
+    return not body.visuals and not body.collisions and body.inertia is None
 
 
 def _joint_operations(joint: Joint, named: Callable[[str], str]) -> Iterator[Operation]:
@@ -176,6 +177,9 @@ def _followed(joint: Joint, named: Callable[[str], str]) -> Expression | None:
 def _dynamics(joint: Joint) -> tuple[tuple[str, float], ...]:
     values = {
         "effort": joint.limits.effort,
+        "acceleration": joint.limits.acceleration,
+        "deceleration": joint.limits.deceleration,
+        "jerk": joint.limits.jerk,
         "damping": joint.dynamics.damping or None,
         "friction": joint.dynamics.friction or None,
         "k_position": None if joint.safety is None else joint.safety.k_position,
@@ -191,7 +195,7 @@ def _check_names(robot: Robot, prefix: str | None) -> None:
         known: dict[str, Link | Joint] = {}
         for thing in things:
             name = _plain(thing.name)
-            if not name or any(ord(character) < 32 for character in name):
+            if not name or not (name.isprintable() or all(ord(character) >= 32 for character in name)):
                 problem = "the name has nothing but slashes, or a control character"
             elif known.setdefault(name, thing) is not thing:
                 problem = f"only slashes tell it from the one on line {known[name].line}"

@@ -7,7 +7,6 @@ disagree and how it is decided here.
 from __future__ import annotations
 
 import os
-import re
 from pathlib import Path
 from typing import TypeVar
 
@@ -20,6 +19,7 @@ from kineverse.formats.urdf.mimicry import resolve
 from kineverse.formats.urdf.remarks import Remarks
 from kineverse.formats.urdf.tree import root_outwards
 
+_VERSIONS = {"1.0": (1, 0), "1.1": (1, 1), "1.2": (1, 2)}
 _EXTENSIONS = frozenset(("gazebo", "transmission"))
 _OTHER_FORMATS = {
     "sdf": "an SDF",
@@ -135,12 +135,11 @@ def _version(root: Element) -> tuple[int, int]:
     if "name" not in root[1]:
         raise ElementError(root, 'has no name; the specification requires <robot name="...">.')
     text = root[1].get("version", "1.0")
-    match = re.fullmatch(r"([0-9]{1,3})(?:\.([0-9]{1,3}))?", text)
-    if match is None:
-        raise ElementError(root, f"version={quote(text)} is not of the form x.y, such as 1.0.")
-    if match[1] != "1":
-        raise ElementError(root, f"version={quote(text)} of URDF is not known; 1.0, 1.1 and 1.2 are.")
-    return (1, int(match[2] or 0))
+    if text not in _VERSIONS:
+        raise ElementError(
+            root, f"version={quote(text)} is not one that is read; {', '.join(_VERSIONS)} are."
+        )
+    return _VERSIONS[text]
 
 
 def _note_strangers(root: Element, strangers: list[Element], remarks: Remarks) -> str:

@@ -1,0 +1,50 @@
+# Needs Python >= 3.11 with venv, git and make. Everything else goes into .venv, in this checkout.
+
+PYTHON ?= python3
+ARGS ?=
+JOBS ?= 2
+VENV := .venv
+BIN := $(VENV)/bin
+INSTALL := $(BIN)/python -m pip install --quiet --no-input --disable-pip-version-check --no-deps
+
+.PHONY: help demo test format clean
+.NOTPARALLEL:
+
+help:
+	@echo "make demo    open a kitchen and a robot in the browser (ARGS=--headless: write a picture and end)"
+	@echo "make test    formatter, linter, types, tests"
+	@echo "make format  format the code and mend what the linter can mend"
+	@echo "make clean   remove the environment and what the tools left"
+
+demo: $(VENV)/demo.installed
+	$(BIN)/kineverse demo $(ARGS)
+
+test: $(VENV)/test.installed
+	$(BIN)/ruff format --check .
+	$(BIN)/ruff check .
+	$(BIN)/mypy
+	$(BIN)/python -m pytest -q -n $(JOBS) $(ARGS)
+
+format: $(VENV)/test.installed
+	$(BIN)/ruff format .
+	$(BIN)/ruff check --fix .
+
+clean:
+	rm -rf $(VENV) .mypy_cache .pytest_cache .ruff_cache .hypothesis build dist
+
+$(BIN)/python:
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || { \
+	    echo "Kineverse needs Python 3.11 or newer, and $(PYTHON) is not: make PYTHON=/path/to/python"; exit 1; }
+	$(PYTHON) -m venv $(VENV)
+
+# The package goes in last and as it lies here, so that an edit needs no second installation.
+$(VENV)/demo.installed: requirements/build.txt requirements/core.txt requirements/view.txt pyproject.toml | $(BIN)/python
+	@echo "Installing into $(VENV); this takes a minute, once."
+	$(INSTALL) -r requirements/build.txt -r requirements/core.txt -r requirements/view.txt
+	$(INSTALL) --no-build-isolation --editable .
+	@touch $@
+
+$(VENV)/test.installed: requirements/test.txt $(VENV)/demo.installed | $(BIN)/python
+	@echo "Installing what the tests need into $(VENV); this takes a few minutes, once."
+	$(INSTALL) -r requirements/test.txt
+	@touch $@

@@ -1,0 +1,272 @@
+"""Expressions as functions of numbers."""
+
+from __future__ import annotations
+
+import logging
+import threading
+from collections.abc import Iterable, Sequence
+from typing import Any, Literal, TypeAlias
+from weakref import WeakSet
+
+import casadi as ca
+import numpy as np
+import numpy.typing as npt
+
+from ..errors import CompileError, ValueRejectedError
+from ..expressions import Expression, ExpressionLike, array
+from ..symbols import Symbol
+from .batch import Batch
+from .binding import Shape, pooled
+from .evaluator import Evaluator
+from .library import NO_COMPILER, Library
+from .program import NAME, CasadiFunction, Program
+from .signature import signature
+
+logger = logging.getLogger("kineverse.compile")
+
+Tier: TypeAlias = Literal["interpreter", "c"]
+WantedTier: TypeAlias = Literal["auto", "interpreter", "c"]
+
+# Below, a call costs the same in both tiers: it is all overhead.
+_WORTH_COMPILING = 12
+
+
+def compile(  # noqa: A001
+    outputs: ExpressionLike | Sequence[ExpressionLike],
+    inputs: Iterable[Symbol] | None = None,
+    *,
+    tier: WantedTier = "auto",
+    wait: bool = False,
+) -> CompiledFunction:
+    """Return a fast function of numbers that evaluates expressions.
+
+    The function can be called at once, by CasADi's interpreter. Meanwhile C is generated and compiled in the
+    background; it takes over when it is ready, gives the same numbers to the last bit, and is kept for later.
+
+    Parameters
+    ----------
+    outputs
+        An expression (calls return one array), or a list or tuple of them (calls return a tuple of arrays).
+    inputs
+        The symbols that make up the input vector, in this order; by default all symbols of the outputs, sorted.
+    tier
+        ``"auto"`` as described; without a C compiler, or where C is of no use, the interpreter stays.
+        ``"interpreter"`` never compiles. ``"c"`` insists on C.
+    wait
+        Whether to return only when C is ready (or is known not to come).
+
+    Raises
+    ------
+    ExpressionError
+        If something else than symbols is among the inputs.
+    NameTakenError
+        If a symbol is among the inputs twice.
+    UnknownNameError
+        If outputs depend on symbols that are not among the inputs.
+    CompileError
+        If there is nothing to compile, or if tier ``"c"`` is known to be impossible.
+    """
+    if tier not in ("auto", "interpreter", "c"):
+        raise ValueRejectedError(f"Unknown tier {tier!r}; tiers are 'auto', 'interpreter' and 'c'.")
+    single = not isinstance(outputs, (list, tuple))
+    expressions = tuple(array(o) for o in ((outputs,) if single else outputs))  # type: ignore[union-attr]
+    if not expressions:
+        raise CompileError("There is no output to compile.")
+    return CompiledFunction(expressions, inputs, single=single, tier=tier, wait=wait)
+
+
+class CompiledFunction:
+    """A function of a vector of numbers, made by :func:`compile`.
+
+    It may be called from any number of threads.
+
+    Parameters
+    ----------
+    outputs
+        What is computed.
+    inputs
+        The symbols in the order of the vector, or None.
+    single
+        Whether calls return one array instead of a tuple.
+    tier, wait
+        See :func:`compile`.
+
+    Attributes
+    ----------
+    inputs
+        The symbols whose values make up the input vector, in its order.
+    names
+        Their text names.
+    shapes
+        The shape of every output.
+    tier
+        What evaluates at the moment: ``"interpreter"`` or ``"c"``.
+    """
+
+    __slots__ = (
+        "__weakref__", "_batch", "_call", "_evaluators", "_function", "_library", "_lock", "_outputs", "_program",
+        "_signature", "_single", "_wanted", "inputs", "names", "shapes", "tier",
+    )  # fmt: skip
+
+    inputs: tuple[Symbol, ...]
+    names: tuple[str, ...]
+    shapes: tuple[Shape, ...]
+    tier: Tier
+
+    def __init__(
+        self,
+        outputs: tuple[Expression, ...],
+        inputs: Iterable[Symbol] | None,
+        *,
+        single: bool,
+        tier: WantedTier = "auto",
+        wait: bool = False,
+    ) -> None:
+        self._signature = signature(outputs, inputs)
+        self.inputs = self._signature.inputs
+        self.names = self._signature.names
+        self.shapes = tuple(e.shape for e in outputs)
+        self._outputs = outputs
+        self._single = single
+        self._wanted = tier
+        self._lock = threading.Lock()
+        self._evaluators: WeakSet[Evaluator] = WeakSet()
+        self._program = program = Program(outputs, self.inputs)
+        self._batch: Batch | None = None
+        self._library: Library[CasadiFunction] | None = None
+        if tier == "c" or (tier == "auto" and program.instructions >= _WORTH_COMPILING):
+            self._library = Library(program, "single", program.source, _load, self._ready)
+            if tier == "c" and self._library.error:
+                raise CompileError(f"The function cannot be compiled: {self._library.error}.")
+        if self._library is not None and self._library.find():
+            self._ready()
+            return
+        self._evaluate_by(program.function, "interpreter")
+        if self._library is not None:
+            self._library.request(urgent=wait)
+            if wait:
+                self.wait()
+
+    def __call__(self, x: Any, /) -> Any:
+        """Return the outputs at ``x``, in arrays that belong to the caller.
+
+        Parameters
+        ----------
+        x
+            The values of :attr:`inputs`, a sequence of n numbers; or a mapping from symbols or their names to
+            numbers, where parameters may be left out; or a State, which may know more.
+
+        Returns
+        -------
+        numpy.ndarray or tuple of numpy.ndarray
+            An array per output, of its shape; for a function of a single expression that array alone.
+
+        Raises
+        ------
+        ShapeError
+            If ``x`` is no vector of n numbers.
+        UnknownNameError
+            If a mapping misses a symbol or knows one that is not among the inputs.
+        ValueRejectedError
+            If a mapping contains NaN or what is not a number.
+        """
+        return self._call(x)
+
+    def batch(self, x: npt.ArrayLike, out: Any = None) -> Any:
+        """Return the outputs at many points.
+
+        Rows are spread over all cores. The numbers are those of single calls but for the last digits (4 ulp) of
+        elementary functions. The first batch that is large enough to pay for it waits for a compiler.
+
+        Parameters
+        ----------
+        x
+            A point per row, shape (N, n).
+        out
+            Where to write: contiguous float64 arrays of shape (N, *shape), one per output (alone if there is a
+            single output). New ones are made if None.
+
+        Returns
+        -------
+        numpy.ndarray or tuple of numpy.ndarray
+            An array of shape (N, *shape) per output; for a function of a single expression that array alone.
+
+        Raises
+        ------
+        ShapeError
+            If ``x`` is no array of n columns of numbers, or ``out`` does not fit.
+        """
+        if self._batch is None:
+            self._batch = Batch(self._program, self._signature, self.shapes, self._single, self._wanted)
+        return self._batch(x, out, self._function)
+
+    def bind(self) -> Evaluator:
+        """Return an evaluator of one's own: no checks and no new arrays, for one thread."""
+        evaluator = Evaluator(self.shapes, self._signature.size, self._signature.vector)
+        with self._lock:
+            evaluator._rebind(self._function, self._program.calls_others)
+            if self.tier != "c":
+                self._evaluators.add(evaluator)
+        return evaluator
+
+    def wait(self, timeout: float | None = None) -> bool:
+        """Wait until C evaluates, or is known not to come; return whether it does.
+
+        Parameters
+        ----------
+        timeout
+            In seconds; forever if None.
+
+        Raises
+        ------
+        CompileError
+            If C was insisted on (``tier="c"``) and cannot be had.
+        """
+        if self._library is None:
+            return False
+        there = self._library.wait(timeout)
+        if self._wanted == "c" and self._library.error:
+            raise CompileError(f"The function cannot be compiled: {self._library.error}.")
+        return there
+
+    def _ready(self) -> None:
+        """Let C take over, in whichever thread it was loaded."""
+        if self._library is not None and self._library.code is not None:
+            self._evaluate_by(self._library.code, "c")
+
+    def _evaluate_by(self, function: CasadiFunction, tier: Tier) -> None:
+        shapes, checked = self.shapes, self._program.calls_others
+        call = pooled(function, self._signature.size, shapes, self._single, self._signature.vector, checked)
+        with self._lock:
+            self._function = function
+            # One assignment: a call sees the old function with its bindings or the new one with its own.
+            self._call = call
+            self.tier = tier
+            if tier == "c":
+                for evaluator in self._evaluators:
+                    evaluator._rebind(function, checked)
+                self._evaluators.clear()
+
+    def __copy__(self) -> CompiledFunction:
+        return self
+
+    def __deepcopy__(self, memo: Any) -> CompiledFunction:
+        return self
+
+    def __reduce__(self) -> Any:
+        return _restore, (self._outputs, self.inputs, self._single, self._wanted)
+
+    def __repr__(self) -> str:
+        inputs = ", ".join(self.names[:4]) + (", ..." if len(self.names) > 4 else "")
+        outputs = ", ".join(map(str, self.shapes[:6])) + (", ..." if len(self.shapes) > 6 else "")
+        return f"CompiledFunction({len(self.names)} inputs: {inputs} -> {outputs}; {self.tier})"
+
+
+def _load(path: str) -> CasadiFunction:
+    return ca.external(NAME, path)
+
+
+def _restore(
+    outputs: tuple[Expression, ...], inputs: tuple[Symbol, ...], single: bool, tier: WantedTier
+) -> CompiledFunction:
+    return CompiledFunction(outputs, inputs, single=single, tier=tier)

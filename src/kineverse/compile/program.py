@@ -1,0 +1,89 @@
+"""Expressions as one function of a vector of numbers, without any name from outside.
+
+The symbols are replaced by elements of one neutral vector first. So the same mechanism under other names is the
+same program, with the same compiled library, and no name of a document can reach generated code.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import re
+from collections.abc import Sequence
+from typing import Any, TypeAlias
+
+import casadi as ca
+
+from ..errors import CompileError
+from ..expressions import Expression, layout
+from ..symbols import Symbol
+
+CasadiFunction: TypeAlias = Any
+
+# Part of every key: raise it when the sources that are generated from the same program change.
+REVISION = 1
+NAME = "kineverse_function"
+
+
+class Program:
+    """What is computed: n numbers in, and one column of numbers, in C order, per output.
+
+    Parameters
+    ----------
+    outputs
+        The expressions.
+    inputs
+        All symbols that occur in them, and maybe others, in the order of the input vector.
+    """
+
+    def __init__(self, outputs: Sequence[Expression], inputs: Sequence[Symbol]) -> None:
+        self.size = len(inputs)
+        self.sizes = tuple(e.size for e in outputs)
+        self._vector = ca.SX.sym("x", self.size)
+        columns = [ca.densify(layout.column(e.casadi, e.shape)) for e in outputs]
+        symbols = ca.vertcat(*(s.casadi for s in inputs)) if inputs else ca.SX(0, 1)
+        self._columns = ca.substitute(columns, [symbols], [self._vector])
+        self._function: CasadiFunction = None
+        # Common parts are not shared yet: for a library that exists already, that would be time lost.
+        graph = ca.Function(NAME, [self._vector], self._columns)
+        self.instructions: int = graph.n_instructions()
+        # Such as the solver inside of a closed loop.
+        self.calls_others = bool(graph.find_functions(1))
+        text = f"{REVISION} {ca.CasadiMeta.version()} {graph.serialize()}"
+        self.digest = hashlib.sha256(text.encode())
+
+    def key(self, *details: str) -> str:
+        """Return the digest of this program and of how it is compiled; equal for equal ones, in every process."""
+        digest = self.digest.copy()
+        digest.update(repr(details).encode())
+        return digest.hexdigest()[:40]
+
+    @property
+    def function(self) -> CasadiFunction:
+        """CasADi's function of one input vector, common parts shared."""
+        if self._function is None:
+            shared = ca.vertsplit(ca.cse(ca.vertcat(*self._columns)), _offsets(self.sizes))
+            self._function = ca.Function(NAME, [self._vector], [ca.densify(c) for c in shared])
+        return self._function
+
+    def source(self) -> str:
+        """Return the C source of the function, as CasADi generates it, comments removed.
+
+        Raises
+        ------
+        CompileError
+            If an operation has no definition in C.
+        """
+        generator = ca.CodeGenerator("kineverse.c")
+        generator.add(self.function)
+        # Comments hold the names of functions that are called inside, such as those of loops.
+        code = re.sub(r"/\*.*?\*/", "", generator.dump(), flags=re.DOTALL)
+        if re.search(r"\berfinv\(", code):
+            raise CompileError("CasADi has no C for the inverse error function.")
+        return f'#define CASADI_SYMBOL_EXPORT __attribute__((visibility("default")))\n{code}'
+
+
+def _offsets(sizes: Sequence[int]) -> list[int]:
+    offsets = [0]
+    for size in sizes:
+        offsets.append(offsets[-1] + size)
+    return offsets

@@ -1,0 +1,182 @@
+"""What a compiled function takes: symbols in an order of its own, and numbers for them in many guises."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from ..errors import ExpressionError, NameTakenError, ShapeError, UnknownNameError, ValueRejectedError, suggest
+from ..expressions import Expression
+from ..state import State
+from ..symbols import Symbol
+
+_LISTED = 12
+
+
+class Signature:
+    """The inputs of a function.
+
+    Attributes
+    ----------
+    inputs
+        The symbols, in the order of the vector.
+    names
+        Their text names.
+    """
+
+    def __init__(self, inputs: tuple[Symbol, ...]) -> None:
+        self.inputs = inputs
+        self.names = tuple(map(str, inputs))
+        self.size = len(inputs)
+        self._positions: dict[Any, int] | None = None
+
+    @property
+    def positions(self) -> dict[Any, int]:
+        """The place of each symbol and of each name in the vector."""
+        if self._positions is None:
+            self._positions = {key: i for keys in (self.names, self.inputs) for i, key in enumerate(keys)}
+        return self._positions
+
+    def vector(self, x: Any) -> npt.NDArray[np.float64]:
+        """Return the numbers of all inputs as a contiguous vector, shape (n,).
+
+        Parameters
+        ----------
+        x
+            A sequence of n numbers, or a mapping from symbols or names to numbers.
+
+        Raises
+        ------
+        ShapeError
+            If it is no vector of n numbers.
+        UnknownNameError
+            If a mapping lacks a symbol that has no value of its own, or has one that is none of the inputs.
+        ValueRejectedError
+            If a mapping has NaN or what is not a number.
+        """
+        if isinstance(x, Mapping):
+            return self._from_mapping(x)
+        array = numbers(x, f"a vector of {self._described()}")
+        if array.shape != (self.size,):
+            raise ShapeError(f"Expected a vector of {self._described()}, not an array of shape {array.shape}.")
+        return np.ascontiguousarray(array)
+
+    def _from_mapping(self, values: Mapping[Any, Any]) -> npt.NDArray[np.float64]:
+        positions = self.positions
+        vector = [s.value for s in self.inputs]
+        unknown = []
+        given = set()
+        for key, value in values.items():
+            position = positions.get(key)
+            if position is None:
+                unknown.append(str(key))
+                continue
+            if position in given:
+                raise NameTakenError(f"'{self.names[position]}' is given twice, by name and as a symbol.")
+            given.add(position)
+            vector[position] = self._number(position, value)
+        # A state describes the whole world; other mappings are written for this function, typing errors included.
+        if unknown and not isinstance(values, State):
+            raise UnknownNameError(
+                f"Not among the inputs: {_listed(unknown)}. {suggest(unknown[0], self.names, 'input')}"
+            )
+        missing = [name for name, value in zip(self.names, vector, strict=True) if value is None]
+        if missing:
+            raise UnknownNameError(f"No value is given for {_listed(missing)}.")
+        return np.array(vector, dtype=np.float64)
+
+    def _number(self, position: int, value: Any) -> float:
+        try:
+            number = float(value) if not isinstance(value, (str, bytes)) else None
+        except (TypeError, ValueError, OverflowError, ExpressionError):
+            number = None
+        if number is None:
+            raise ValueRejectedError(f"The value of '{self.names[position]}' is not a number: {value!r}.")
+        if number != number:
+            raise ValueRejectedError(f"The value of '{self.names[position]}' is NaN.")
+        return number
+
+    def _described(self) -> str:
+        return f"{self.size} numbers ({_listed(self.names, 6)})" if self.size else "no numbers"
+
+
+def signature(outputs: Sequence[Expression], inputs: Iterable[Symbol] | None) -> Signature:
+    """Return the signature of a function of ``outputs``.
+
+    Parameters
+    ----------
+    outputs
+        What the function computes.
+    inputs
+        The symbols in the order wanted; those of the outputs in their canonical order if None.
+
+    Raises
+    ------
+    ExpressionError
+        If something else than symbols is among the inputs.
+    NameTakenError
+        If a symbol occurs twice, or two have the same text name.
+    UnknownNameError
+        If the outputs depend on symbols that are not among the inputs.
+    """
+    needed = set().union(*(e.symbols for e in outputs))
+    if inputs is None:
+        found = Signature(tuple(sorted(needed, key=lambda s: s.sort_key)))
+    else:
+        found = Signature(_symbols(inputs))
+        missing = needed.difference(found.inputs)
+        if missing:
+            names = sorted(str(s) for s in missing)
+            raise UnknownNameError(f"The outputs depend on symbols that are not among the inputs: {_listed(names)}.")
+    if len(set(found.names)) < found.size:
+        names = sorted({n for n in found.names if found.names.count(n) > 1})
+        equal = len(set(found.inputs)) < found.size
+        reason = "given twice" if equal else "the name of several symbols (of different roles or values)"
+        raise NameTakenError(f"The inputs of a function have names of their own: {_listed(names)} is {reason}.")
+    return found
+
+
+def numbers(x: Any, wanted: str) -> npt.NDArray[np.float64]:
+    """Return what holds real numbers as an array of doubles, of any shape and strides.
+
+    Raises
+    ------
+    ShapeError
+        If it does not; the message says what was ``wanted``.
+    """
+    try:
+        array = np.asarray(x)
+    except (TypeError, ValueError):
+        raise ShapeError(f"Expected {wanted}, not a {type(x).__name__} of entries that form no array.") from None
+    if array.dtype.kind not in "fiub":
+        kind = type(x).__name__ if array.dtype.kind == "O" else f"{type(x).__name__} of {array.dtype}"
+        raise ShapeError(f"Expected {wanted}, not a {kind}.")
+    return array.astype(np.float64, copy=False)
+
+
+def _symbols(inputs: Iterable[Symbol]) -> tuple[Symbol, ...]:
+    question = "Were outputs and inputs swapped? It is compile(outputs, inputs)."
+    if isinstance(inputs, Symbol):
+        raise ExpressionError(f"Inputs are a sequence of symbols: write [{inputs}] for only one. {question}")
+    if isinstance(inputs, (Expression, str)) or not isinstance(inputs, Iterable):
+        raise ExpressionError(f"Inputs are a sequence of symbols, not {_brief(inputs)}. {question}")
+    symbols = tuple(inputs)
+    for symbol in symbols:
+        if not isinstance(symbol, Symbol):
+            raise ExpressionError(f"Inputs are symbols, and {_brief(symbol)} is none. {question}")
+    return symbols
+
+
+def _brief(value: object) -> str:
+    if isinstance(value, Expression):
+        return f"an expression of shape {value.shape}"
+    text = repr(value)
+    return text if len(text) <= 60 else f"a {type(value).__name__}"
+
+
+def _listed(names: Sequence[str], limit: int = _LISTED) -> str:
+    more = f" and {len(names) - limit} more" if len(names) > limit else ""
+    return ", ".join(f"'{n}'" for n in names[:limit]) + more

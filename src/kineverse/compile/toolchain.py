@@ -1,0 +1,126 @@
+"""The C compiler of this machine, how it is called, and what identifies the code it makes.
+
+Compiled libraries are kept on disk, where another machine may find them (a home directory on a network) and
+where they outlive an update of the compiler. So everything that code made here depends on goes into
+:attr:`Toolchain.identity`. It is read off files rather than asked of the compiler, because it is needed whenever
+a function is compiled and starting a compiler takes longer than everything else.
+"""
+
+from __future__ import annotations
+
+import functools
+import hashlib
+import logging
+import os
+import platform
+import shlex
+import shutil
+import subprocess
+import sys
+from dataclasses import dataclass
+
+logger = logging.getLogger("kineverse.compile")
+
+# No contraction to fused operations: with it interpreter and C differ. No -ffast-math: it deletes checks for NaN.
+ARITHMETIC = ("-march=native", "-ffp-contract=off", "-fno-math-errno")
+# Undefined names shall fail here and not when the function is called.
+_LINK = ("-lm", "-Wl,-z,defs") if sys.platform.startswith("linux") else ("-lm",)
+
+_CPU_LINES = (
+    "vendor_id", "cpu family", "model", "stepping", "flags",
+    "CPU implementer", "CPU architecture", "CPU variant", "CPU part", "Features",
+)  # fmt: skip
+
+
+@dataclass(frozen=True, slots=True)
+class Toolchain:
+    """A C compiler.
+
+    Attributes
+    ----------
+    command
+        The absolute path of the compiler, and arguments it is always given.
+    identity
+        A digest of compiler, processor and platform; libraries of different identities are not exchanged.
+    """
+
+    command: tuple[str, ...]
+    identity: str
+
+    def arguments(self, optimisation: str, output: str) -> list[str]:
+        """Return the command line that compiles C from standard input to a shared library.
+
+        Parameters
+        ----------
+        optimisation
+            Such as ``-O3``.
+        output
+            Where the library is written.
+        """
+        return [
+            *self.command, optimisation, *ARITHMETIC, "-std=gnu11", "-fPIC", "-shared", "-fvisibility=hidden",
+            "-w", "-x", "c", "-", "-o", output, *_LINK,
+        ]  # fmt: skip
+
+    def version(self) -> str:
+        """Return the first line of what the compiler says about itself."""
+        return (self._ask("--version").splitlines() or ["unknown"])[0]
+
+    def vector_unit(self) -> str:
+        """Return the widest vector instructions of doubles it uses: avx512, avx2, avx, sse2, neon or none."""
+        macros = self._ask(*ARITHMETIC, "-dM", "-E", "-x", "c", os.devnull)
+        units = {
+            "__AVX512DQ__": "avx512",
+            "__AVX2__": "avx2",
+            "__AVX__": "avx",
+            "__SSE2__": "sse2",
+            "__ARM_NEON": "neon",
+        }
+        return next((unit for macro, unit in units.items() if f" {macro} " in macros), "none")
+
+    def _ask(self, *arguments: str) -> str:
+        try:
+            answer = subprocess.run(
+                [*self.command, *arguments], capture_output=True, text=True, timeout=20, stdin=subprocess.DEVNULL
+            )
+        except (OSError, subprocess.TimeoutExpired):
+            return ""
+        return answer.stdout
+
+
+def toolchain() -> Toolchain | None:
+    """Return the compiler to use: the one ``CC`` names, else ``cc``, ``gcc`` or ``clang``; None if there is none.
+
+    That there is none is logged once.
+    """
+    return _find(os.environ.get("CC", ""), os.environ.get("PATH", os.defpath))
+
+
+@functools.lru_cache(maxsize=16)
+def _find(preferred: str, path: str) -> Toolchain | None:
+    for candidate in (preferred, "cc", "gcc", "clang"):
+        words = shlex.split(candidate)
+        found = shutil.which(words[0], path=path) if words else None
+        if found:
+            command = (os.path.abspath(found), *words[1:])
+            return Toolchain(command, _identity(command))
+    logger.warning("No C compiler (cc, gcc, clang) was found: functions stay with CasADi's interpreter.")
+    return None
+
+
+def _identity(command: tuple[str, ...]) -> str:
+    program = os.path.realpath(command[0])
+    file = os.stat(program)
+    parts = (program, file.st_size, file.st_mtime_ns, command[1:], platform.system(), platform.machine(), _cpu())
+    return hashlib.sha256(repr(parts).encode()).hexdigest()[:16]
+
+
+def _cpu() -> str:
+    """Return what decides which instructions exist here."""
+    try:
+        with open("/proc/cpuinfo") as file:
+            # The first processor is enough, and the kernel writes the text of the others only when it is read.
+            lines = file.read(8192).split("\n\n", 1)[0].splitlines()
+    except OSError:
+        return platform.processor()
+    return "\n".join(line for line in lines if line.split("\t", 1)[0].rstrip(" :") in _CPU_LINES)

@@ -1,0 +1,70 @@
+"""Every file of ``urdf_conformance`` has its degrees of freedom or is refused for its reason."""
+
+from __future__ import annotations
+
+import csv
+from pathlib import Path
+
+import pytest
+from robots import SHARED, shared
+from verdicts import COUNT, verdict
+
+import kineverse as kv
+from kineverse.formats.urdf import read_urdf
+
+FOLDER = SHARED / "urdf_conformance"
+FILES = sorted(path.relative_to(FOLDER) for path in FOLDER.rglob("*.urdf")) if FOLDER.is_dir() else [None]
+DOCS = Path(__file__).parents[2] / "docs" / "urdf.md"
+
+
+@pytest.mark.parametrize("file", FILES, ids=str)
+def test_verdicts(file: Path | None):
+    if file is None:
+        pytest.skip(f"no {FOLDER}")
+    expected = verdict(file)
+    if isinstance(expected, str):
+        with pytest.raises(kv.FormatError) as info:
+            kv.load(FOLDER / file)
+        assert str(info.value).startswith(f"{file.name}, {expected}")
+    else:
+        model = kv.load(FOLDER / file, prefix="p")
+        assert sum(len(record.speeds) for record in model.articulations.values()) == expected
+        assert len(model.frames) == len(read_urdf(FOLDER / file).links)
+
+
+def parsers() -> dict[str, list[str]]:
+    """Return what five parsers say of each file: ``ok``, ``fail:...``, ``nv=...``, ``dof=...``."""
+    with (shared("urdf_conformance") / "verdicts.tsv").open() as table:
+        return {row[0]: row[1:6] for row in list(csv.reader(table, delimiter="\t"))[1:]}
+
+
+def test_no_file_is_left_out():
+    assert len(parsers()) == len(FILES) == COUNT
+
+
+def test_what_all_parsers_say_is_said_here():
+    for file, said in parsers().items():
+        failures = sum(text.startswith("fail") for text in said)
+        loaded = isinstance(verdict(Path(file)), int)
+        if failures in (0, 5):
+            assert loaded == (failures == 0), file
+
+
+def test_degrees_of_freedom_are_those_of_the_other_parsers():
+    for file, said in parsers().items():
+        expected = verdict(Path(file))
+        counts = {int(text.partition("=")[2]) for text in said if text.startswith(("nv=", "dof="))}
+        if isinstance(expected, int) and counts:
+            assert expected in counts, file
+
+
+def test_the_documentation_decides_every_disagreement():
+    text = DOCS.read_text()
+    disagreed = [
+        Path(file).name
+        for file, said in parsers().items()
+        if 0 < sum(answer.startswith("fail") for answer in said) < 5
+    ]
+    assert len(disagreed) == 41
+    # Long names are listed by their last part.
+    assert [name for name in disagreed if name not in text and name.rpartition("__")[2] not in text] == []
