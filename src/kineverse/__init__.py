@@ -1,7 +1,7 @@
 """Kineverse: articulation models as symbolic expressions and constraints.
 
-``import kineverse as kv`` gives the whole public face: symbols and expressions (layer 1), :func:`compile` (layer 2),
-models, operations and :func:`load` (layer 3). Articulations are in :mod:`kineverse.articulations`.
+``import kineverse as kv`` gives the whole public face: symbols and expressions (layer 1), :func:`compile`
+(layer 2), models, operations and :func:`load` (layer 3). Articulations are in :mod:`kineverse.articulations`.
 """
 
 from . import articulations, logic, spatial

@@ -1,8 +1,8 @@
 """Continuous boolean logic (2020 paper, III-C and Eq. 4).
 
-Values lie in [0, 1]. Every node has two kinds of derivative: as a *fact* it is locally constant, and its *trend* says
-in which direction to move for it to become true. Trends are what ``gradient()`` gives; ``gradient(heuristic=False)``
-leaves them out.
+Values lie in [0, 1]. Every node has two kinds of derivative: as a *fact* it is locally constant, and its
+*trend* says in which direction to move for it to become true. Trends are what ``gradient()`` gives;
+``gradient(heuristic=False)`` leaves them out.
 
 For operands ``v_i`` with trends ``D_i``, ``P = Π v_i`` and ``Q = Π (1 - v_i)``:
 
@@ -15,9 +15,10 @@ and        P                   Σ (1 - v_i + P)·D_i
 or         1 - Q               Σ (v_i + Q)·D_i
 =========  ==================  ==========================
 
-The trend of ``and`` is the product rule where at most one operand is false and the plain sum where all are, where
-the product rule would be blind; it leaves alone what already holds, and is dual to that of ``or`` under De Morgan. ``a * b``
-and ``1 - a`` keep the product rule, as the papers write them; ``&`` and ``~`` are the ones to use for locks.
+The trend of ``and`` is the product rule where at most one operand is false and the plain sum where all are,
+where the product rule would be blind; it leaves alone what already holds, and is dual to that of ``or`` under
+De Morgan. ``a * b`` and ``1 - a`` keep the product rule, as the papers write them; ``&`` and ``~`` are the
+ones to use for locks.
 """
 
 from __future__ import annotations
@@ -103,6 +104,7 @@ class _Logic(Node):
         return self._trend() if heuristic else {}
 
     def gradient_keys(self, heuristic: bool) -> frozenset[Symbol]:
+        """Return the derivative symbols of the gradient, without building it."""
         if not heuristic:
             return frozenset()
         return frozenset().union(*(gradient_keys(a) for a in self.arguments))

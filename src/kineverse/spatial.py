@@ -1,8 +1,9 @@
 """Positions, rotations and rigid motions as expressions.
 
 ``a_T_b`` is the 4×4 homogeneous transform that maps coordinates in frame b to coordinates in frame a, so
-``a_T_c = a_T_b @ b_T_c``. Rotations are right-handed, angles in [rad], lengths in [m], quaternions in the order
-(x, y, z, w). Axes and quaternions are normalised. Twists have the linear part first, then the angular part.
+``a_T_c = a_T_b @ b_T_c``. Rotations are right-handed, angles in [rad], lengths in [m], quaternions in the
+order (x, y, z, w). Axes and quaternions are normalised. Twists have the linear part first, then the angular
+part.
 """
 
 from __future__ import annotations
@@ -54,8 +55,8 @@ def rotation_z(angle: ExpressionLike) -> Expression:
     return _turn(angle, _ABOUT_Z)
 
 
-# Column by column, where a rotation about an axis has entries, and which: cos, sin, -sin or 1. Built sparse, because a
-# robot has dozens of these and each would cost ten times as much element by element.
+# Column by column, where a rotation about an axis has entries, and which: cos, sin, -sin or 1. Built sparse,
+# because a robot has dozens of these and each would cost ten times as much element by element.
 _ABOUT_X = ca.Sparsity.triplet(4, 4, [0, 1, 2, 1, 2, 3], [0, 1, 1, 2, 2, 3]), (3, 0, 1, 2, 0, 3)
 _ABOUT_Y = ca.Sparsity.triplet(4, 4, [0, 2, 1, 0, 2, 3], [0, 0, 1, 2, 2, 3]), (0, 2, 3, 1, 0, 3)
 _ABOUT_Z = ca.Sparsity.triplet(4, 4, [0, 1, 0, 1, 2, 3], [0, 0, 1, 1, 2, 3]), (0, 1, 2, 0, 3, 3)
@@ -73,7 +74,7 @@ def _turn(angle: ExpressionLike, pattern: tuple[Any, tuple[int, ...]]) -> Expres
 
 
 def axis_angle(axis: Vector, angle: ExpressionLike) -> Expression:
-    """Return the 4×4 rotation by ``angle`` [rad] about ``axis``, shape (3,), of any length but zero (Rodrigues).
+    """Return the 4×4 rotation by ``angle`` [rad] about ``axis`` (Rodrigues).
 
     Raises
     ------
@@ -170,7 +171,8 @@ def rotation_vector(a_R_b: ExpressionLike) -> Expression:
     q = quaternion_of(a_R_b)
     v, w = q[:3], q[3]
     squared = v @ v
-    # 2·atan2(√s, w)/√s, by its series in s/w² where s is small; the series is in no danger as w is near 1 there.
+    # 2·atan2(√s, w)/√s, by its series in s/w² where s is small; the series is in no danger as w is near 1
+    # there.
     small = _greater(1e-3, squared)
     ratio = squared / where(small, w * w, 1)
     series = 2 / where(small, w, 1) * _polynomial(ratio, [(-1) ** k / (2 * k + 1) for k in range(7)])
@@ -205,7 +207,7 @@ def twist_exponential(twist: Vector) -> Expression:
 
 
 def twist_logarithm(a_T_b: ExpressionLike) -> Expression:
-    """Return the twist (v, ω), shape (6,) [m], [rad], whose exponential is the transform; the angle is below π."""
+    """Return the twist (v, ω), shape (6,) [m], [rad], whose exponential is the transform; angles below π."""
     t = transform_like(a_T_b)
     omega = rotation_vector(t)
     s, c, _ = _sine_series(omega @ omega)
@@ -230,7 +232,8 @@ def transform(a_R_b: ExpressionLike, a_p: Vector) -> Expression:
     """Return the 4×4 transform of a 3×3 (or 4×4) rotation and a position of shape (3,) [m]."""
     r = rotation_of(a_R_b)
     p = _three(a_p, "A position")
-    return np.concatenate([np.concatenate([r, p.reshape(3, 1)], axis=1), [[0.0, 0.0, 0.0, 1.0]]])  # type: ignore[arg-type, list-item, return-value]
+    upper = np.concatenate([r, p.reshape(3, 1)], axis=1)
+    return np.concatenate([upper, [[0.0, 0.0, 0.0, 1.0]]])  # type: ignore[return-value]
 
 
 def rotation_of(a_T_b: ExpressionLike) -> Expression:
@@ -266,8 +269,8 @@ def adjoint(a_T_b: ExpressionLike) -> Expression:
     """Return the 6×6 matrix that maps twists (v, ω) in frame b to twists in frame a."""
     t = transform_like(a_T_b)
     r = t[:3, :3]
-    upper = np.concatenate([r, skew(t[:3, 3]) @ r], axis=1)  # type: ignore[arg-type]
-    lower = np.concatenate([np.zeros((3, 3)), r], axis=1)  # type: ignore[arg-type]
+    upper = np.concatenate([r, skew(t[:3, 3]) @ r], axis=1)
+    lower = np.concatenate([np.zeros((3, 3)), r], axis=1)
     return np.concatenate([upper, lower])  # type: ignore[return-value]
 
 

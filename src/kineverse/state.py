@@ -12,8 +12,8 @@ from .symbols import Symbol, parse_symbol_name
 class State(Mapping[Symbol, float]):
     """An immutable mapping from symbols to numbers, with the time it was true at and who said so.
 
-    Whatever takes values takes a state; other than a plain mapping it may know more symbols than are asked for.
-    It can be indexed by symbols and by their names.
+    Whatever takes values takes a state; other than a plain mapping it may know more symbols than are asked
+    for. It can be indexed by symbols and by their names.
 
     Parameters
     ----------

@@ -1,8 +1,8 @@
 """Symbols: the degrees of freedom and parameters that expressions are about.
 
-A symbol has a path (``kitchen/fridge_door``), an order (0 position, 1 velocity, 2 acceleration ...) and a role.
-Symbols are interned, so equal ones are the same object in one process, and they sort by path and order in every
-process. Their text name is the path for a position and ``path:velocity`` and so on for the others.
+A symbol has a path (``kitchen/fridge_door``), an order (0 position, 1 velocity, 2 acceleration ...) and a
+role. Symbols are interned, so equal ones are the same object in one process, and they sort by path and order
+in every process. Their text name is the path for a position and ``path:velocity`` and so on for the others.
 """
 
 from __future__ import annotations
@@ -45,6 +45,7 @@ class Symbol(Expression):
     order: int
     role: Role
     value: float | None
+    _text: str
     sort_key: tuple[str, int, str, float]
 
     def __new__(cls, path: str, order: int = 0, role: Role = "dof", value: float | None = None) -> Symbol:
@@ -166,7 +167,7 @@ def parameter(path: str, value: float) -> Symbol:
 
 
 def symbol_name(path: str, order: int) -> str:
-    """Return the text name; ``%`` and ``:`` inside the path are percent-escaped, so the name can be parsed."""
+    """Return the text name; ``%`` and ``:`` in the path are percent-escaped, so it can be parsed."""
     escaped = path.replace("%", "%25").replace(":", "%3A") if "%" in path or ":" in path else path
     if order == 0:
         return escaped

@@ -48,7 +48,8 @@ def unit_axis(axis: Vector3) -> tuple[float, float, float]:
 def rotation_factors(axis: Vector3, q: Expression) -> tuple[Pose | Expression, ...]:
     """Return the rotation about any axis as constants around one about x, y or z.
 
-    Such factors keep the Jacobian constant in q and the chain short: A · rotation_z(q) · Aᵀ with A's last column the axis.
+    Such factors keep the Jacobian constant in q and the chain short: A · rotation_z(q) · Aᵀ with A's last
+    column the axis.
     """
     x, y, z = unit_axis(axis)
     for component, rotation in ((x, rotation_x), (y, rotation_y), (z, rotation_z)):

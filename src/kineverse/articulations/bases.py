@@ -9,6 +9,7 @@ import numpy as np
 from kineverse.errors import ValueRejectedError
 from kineverse.expressions.expression import array
 from kineverse.expressions.functions import norm
+from kineverse.model.constraint import ConstraintLike
 from kineverse.model.operation import Effects
 from kineverse.model.reader import Reader
 from kineverse.spatial import rotation_z, translation
@@ -28,7 +29,7 @@ class OmniBase(Joint):
     speed
         Limit of the speed √(ẋ² + ẏ²) [m/s], whatever the direction; None for no limit.
     turn
-        Limit of \\|θ̇\\| [rad/s]; None for no limit.
+        Limit of the turning speed, either way [rad/s]; None for no limit.
     """
 
     speed: float | None = 1.0
@@ -37,7 +38,7 @@ class OmniBase(Joint):
     def apply(self, model: Reader) -> Effects:
         """Write the child frame and the speed limits."""
         x, y, angle = (position(f"{self.name}/{c}") for c in ("x", "y", "angle"))
-        constraints = {}
+        constraints: dict[str, ConstraintLike] = {}
         if self.speed is not None:
             constraints[f"{self.name}/speed"] = (0, norm(array([x.derivative(), y.derivative()])), self.speed)
         if self.turn is not None:
@@ -58,8 +59,9 @@ class OmniBase(Joint):
 class DifferentialDrive(Joint):
     """A base on two driven wheels: parent_T_child = origin · translation(x, y, 0) · rotation_z(θ).
 
-    Coordinates ``name/x``, ``name/y`` [m] and ``name/angle`` [rad] move by the wheels' speeds only (2022 paper, III-A1): with radius r and track b,
-    ẋ = r/2 cos θ (ω_l + ω_r), ẏ = r/2 sin θ (ω_l + ω_r), θ̇ = r/b (ω_r - ω_l).
+    Coordinates ``name/x``, ``name/y`` [m] and ``name/angle`` [rad] move by the wheels' speeds only (2022
+    paper, III-A1): with radius r and track b, ẋ = r/2 cos θ (ω_l + ω_r), ẏ = r/2 sin θ (ω_l + ω_r), θ̇ = r/b
+    (ω_r - ω_l).
 
     Attributes
     ----------
@@ -80,7 +82,8 @@ class DifferentialDrive(Joint):
     def __post_init__(self) -> None:
         if not (self.radius > 0 and self.track > 0):
             raise ValueRejectedError(
-                f"Base '{self.name}' needs a positive wheel radius and track, not {self.radius} and {self.track}."
+                f"Base '{self.name}' needs a positive wheel radius and track, "
+                f"not {self.radius} and {self.track}."
             )
 
     def apply(self, model: Reader) -> Effects:

@@ -21,9 +21,9 @@ from .joint import Joint
 class Planar(Joint):
     """Motion in a plane: parent_T_child = origin · A · translation(x, y, 0) · rotation_z(θ) · Aᵀ.
 
-    The columns of A are two directions in the plane and its normal, the axis. Coordinates are ``name/x``, ``name/y`` [m] and
-    ``name/angle`` [rad], all free. For the axis z, A is the identity; for another axis n, A is the smallest rotation that
-    turns z into n (about z × n), and a half turn about x for -z.
+    The columns of A are two directions in the plane and its normal, the axis. Coordinates are ``name/x``,
+    ``name/y`` [m] and ``name/angle`` [rad], all free. For the axis z, A is the identity; for another axis n,
+    A is the smallest rotation that turns z into n (about z × n), and a half turn about x for -z.
 
     Attributes
     ----------
@@ -66,9 +66,10 @@ class Planar(Joint):
 class Floating(Joint):
     """Free motion: parent_T_child = origin · translation(x, y, z) · rotation(quaternion).
 
-    Seven coordinates ``name/x|y|z`` [m] and ``name/qx|qy|qz|qw``, six speeds: the velocities of x, y, z [m/s], and the angular
-    velocity ω of the child in its own axes, ``name/wx|wy|wz`` [rad/s]. The quaternion moves by q̇ = ½ q ⊗ (ω, 0), which
-    keeps its length; a quaternion of another length is normalised where it is used.
+    Seven coordinates ``name/x|y|z`` [m] and ``name/qx|qy|qz|qw``, six speeds: the velocities of x, y, z
+    [m/s], and the angular velocity ω of the child in its own axes, ``name/wx|wy|wz`` [rad/s]. The quaternion
+    moves by q̇ = ½ q ⊗ (ω, 0), which keeps its length; a quaternion of another length is normalised where it
+    is used.
     """
 
     def apply(self, model: Reader) -> Effects:

@@ -82,7 +82,7 @@ class AxisJoint(Joint):
     lower, upper
         Limits of q [m] or [rad], numbers or expressions; None leaves that side open.
     velocity
-        Limit of \\|q̇\\| [m/s] or [rad/s]; None for no limit.
+        Limit of the speed, either way [m/s] or [rad/s]; None for no limit.
     position
         The expression to use for q instead of a degree of freedom of its own: a mimic joint, linear or not.
     """

@@ -1,1 +1,179 @@
-class Batch: pass
+"""Evaluation at many points: compiled for vectors of configurations, and what there is until that is ready."""
+
+from __future__ import annotations
+
+import ctypes
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from ..errors import CompileError, ShapeError
+from .batch_source import batch_source, vectorisable
+from .binding import Array, Shape, bind
+from .library import Library
+from .program import CasadiFunction, Program
+from .rows import cores, over_rows
+from .signature import Signature, numbers
+
+# Results beyond this are written past the caches: nobody could read them from there in time.
+_STREAMED_BYTES = 8 * 2**20
+_CACHE_LINE = 64
+# So many rows at a time go through CasADi's map.
+_MAPPED = 32
+
+Compiled = Callable[[int, int, int, int], int]
+
+
+class Batch:
+    """Evaluation of one program at many points.
+
+    The program is compiled for vectors when that pays: a call whose rows would keep the interpreter busy for
+    longer than the compiler waits for it, smaller ones add up until it is compiled in the background. What
+    cannot be done on vectors (solvers inside of loops) stays with CasADi's map over the function of single calls.
+
+    Parameters
+    ----------
+    program
+        What is computed.
+    signature
+        Its inputs.
+    shapes
+        The shape of each output.
+    single
+        Whether the one array is returned rather than a tuple.
+    tier
+        As for :func:`compile`.
+    """
+
+    def __init__(
+        self, program: Program, signature: Signature, shapes: Sequence[Shape], single: bool, tier: str
+    ) -> None:
+        self._program = program
+        self._signature = signature
+        self._shapes = shapes
+        self._single = single
+        self._insist = tier == "c"
+        self._spent = 0.0
+        self._library: Library[Compiled] | None = None
+        if tier != "interpreter" and vectorisable(program):
+            self._library = Library(program, "batch", lambda: batch_source(program), _load)
+
+    def __call__(self, x: npt.ArrayLike, out: Any, function: CasadiFunction) -> Any:
+        """Return the outputs at all rows of ``x``, see :meth:`CompiledFunction.batch`.
+
+        Parameters
+        ----------
+        x
+            The points, shape (N, n).
+        out
+            Arrays to write to, or None.
+        function
+            CasADi's function, for as long as there is nothing better.
+        """
+        points = self._points(x)
+        rows = len(points)
+        results = self._allocated(rows) if out is None else self._checked(out, rows, points)
+        if any(np.may_share_memory(points, result) for result in results):
+            points = points.copy()
+        code = self._code(rows)
+        if code is None:
+            self._interpret(points, results, function)
+        else:
+            self._run(code, points, results)
+        return results[0] if self._single else tuple(results)
+
+    def _points(self, x: npt.ArrayLike) -> Array:
+        size = self._signature.size
+        wanted = f"an array of shape (N, {size}), a configuration per row"
+        points = numbers(x, wanted)
+        if points.ndim != 2 or points.shape[1] != size:
+            raise ShapeError(f"Expected {wanted}, not an array of shape {points.shape}.")
+        return np.ascontiguousarray(points)
+
+    def _allocated(self, rows: int) -> list[Array]:
+        """Return new arrays that begin at cache lines, so that they can be written in whole lines."""
+        results = []
+        for shape, size in zip(self._shapes, self._program.sizes, strict=True):
+            memory = np.empty(rows * size + _CACHE_LINE // 8)
+            start = -memory.ctypes.data % _CACHE_LINE // 8
+            results.append(memory[start : start + rows * size].reshape(rows, *shape))
+        return results
+
+    def _checked(self, out: Any, rows: int, points: Array) -> list[Array]:
+        given = [out] if isinstance(out, np.ndarray) else list(out)
+        if len(given) != len(self._shapes):
+            raise ShapeError(f"out= takes {len(self._shapes)} arrays, one per output, not {len(given)}.")
+        for i, (array, shape) in enumerate(zip(given, self._shapes, strict=True)):
+            wanted = (rows, *shape)
+            if not isinstance(array, np.ndarray) or array.dtype != np.float64 or array.shape != wanted:
+                found = f"{array.dtype} {array.shape}" if isinstance(array, np.ndarray) else type(array).__name__
+                raise ShapeError(f"out= for output {i} must be a float64 array of shape {wanted}, not {found}.")
+            if not (array.flags.c_contiguous and array.flags.writeable and array.flags.aligned):
+                raise ShapeError(f"out= for output {i} must be C-contiguous, aligned and writeable.")
+            if any(np.may_share_memory(array, other) for other in given[:i]):
+                raise ShapeError(f"out= for output {i} shares memory with another output.")
+        return given
+
+    def _code(self, rows: int) -> Compiled | None:
+        """Return compiled code if there is some, or if it pays to wait for it."""
+        library = self._library
+        if library is None or library.error is not None:
+            if self._insist and library is not None:
+                raise CompileError(f"The batch cannot be compiled: {library.error}.")
+            return None
+        if library.code is None and not library.find():
+            # Seconds on one core, as measured with gcc 12 and CasADi 3.8.
+            compiling = 0.3 + 1e-3 * self._program.instructions
+            interpreting = rows * (50e-9 + 3e-9 * self._program.instructions) / cores()
+            self._spent += interpreting
+            if self._insist or interpreting > compiling:
+                library.wait()
+                return self._code(0) if self._insist else library.code
+            if self._spent > 0.1 * compiling:
+                library.request()
+        return library.code
+
+    def _run(self, code: Compiled, points: Array, results: list[Array]) -> None:
+        rows, size = points.shape
+        sizes = self._program.sizes
+        streaming = sum(result.nbytes for result in results) > _STREAMED_BYTES
+        begin, begins = points.ctypes.data, [result.ctypes.data for result in results]
+
+        def work(first: int, end: int) -> None:
+            places = (ctypes.c_void_p * len(sizes))(
+                *(b + 8 * first * s for b, s in zip(begins, sizes, strict=True))
+            )
+            if code(begin + 8 * first * size, ctypes.addressof(places), end - first, streaming):
+                raise MemoryError("There is no memory for a batch.")
+
+        # Half of what starting a thread takes.
+        over_rows(work, rows, 200_000 // (self._program.instructions + 20))
+
+    def _interpret(self, points: Array, results: list[Array], function: CasadiFunction) -> None:
+        flat = [r.reshape(len(points), size) for r, size in zip(results, self._program.sizes, strict=True)]
+        rows, size = points.shape
+
+        def work(first: int, end: int) -> None:
+            count = min(_MAPPED, end - first)
+            vectors = np.zeros((count, size))
+            outputs = [np.zeros((count, s)) for s in self._program.sizes]
+            several = function.map(count) if count > 1 else function
+            run, _keep = bind(several, vectors, outputs, self._program.calls_others)
+            for start in range(first, end, count):
+                stop = min(start + count, end)
+                # Rows of an earlier round stay behind the last ones and are computed for nothing.
+                vectors[: stop - start] = points[start:stop]
+                run()
+                for target, output in zip(flat, outputs, strict=True):
+                    target[start:stop] = output[: stop - start]
+
+        over_rows(work, rows, 50 * _MAPPED, _MAPPED)
+
+
+def _load(path: str) -> Compiled:
+    code = ctypes.CDLL(path).kineverse_batch
+    code.argtypes = (ctypes.c_void_p, ctypes.c_void_p, ctypes.c_longlong, ctypes.c_int)
+    code.restype = ctypes.c_int
+    return code  # type: ignore[no-any-return]

@@ -30,6 +30,7 @@ typedef double Unaligned __attribute__((vector_size(8 * W), aligned(8), may_alia
 typedef double Aligned __attribute__((vector_size(8 * W), may_alias));
 
 #define INLINE static inline __attribute__((always_inline))
+#define NOINLINE __attribute__((noinline))
 #define APART static __attribute__((noinline, cold))
 #define UNROLLED _Pragma("GCC unroll 8")
 

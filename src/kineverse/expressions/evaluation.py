@@ -25,7 +25,7 @@ def evaluate(expression: Expression, values: Mapping[Any, Any]) -> npt.NDArray[A
     (column,) = lower([expression])
     inputs = ca.vertcat(*(s._sx for s in symbols)) if symbols else ca.SX(0, 1)
     result = np.array(ca.Function("e", [inputs], [column])(vector)).reshape(expression.shape)
-    return result[()]  # type: ignore[no-any-return]
+    return result[()]
 
 
 def assign(

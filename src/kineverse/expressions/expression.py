@@ -1,9 +1,9 @@
 """The one type of layer 1: arrays of symbolic expressions that know their gradient.
 
-An :class:`Expression` behaves like a numpy array of fixed shape. CasADi's ``SX`` does the algebra inside. What
-CasADi cannot say, such as gradients that differ from the partial derivatives, lives in opaque nodes
-(:mod:`kineverse.expressions.node`) that stand in the ``SX`` graph as symbols of their own until the expression
-is lowered to numbers.
+An :class:`Expression` behaves like a numpy array of fixed shape. CasADi's ``SX`` does the algebra inside.
+What CasADi cannot say, such as gradients that differ from the partial derivatives, lives in opaque nodes
+(:mod:`kineverse.expressions.node`) that stand in the ``SX`` graph as symbols of their own until the
+expression is lowered to numbers.
 """
 
 from __future__ import annotations
@@ -30,16 +30,16 @@ ExpressionLike: TypeAlias = "Expression | float | int | npt.ArrayLike | Sequence
 
 NO_NODES: frozenset[Node] = frozenset()
 
-# Symbols by the hash of their SX element. Strong on purpose: CasADi reuses the addresses (and so the hashes) of
-# freed elements, and a symbol is a name, of which there are finitely many.
+# Symbols by the hash of their SX element. Strong on purpose: CasADi reuses the addresses (and so the hashes)
+# of freed elements, and a symbol is a name, of which there are finitely many.
 SYMBOLS: dict[int, Symbol] = {}
 
 
 class Expression:
     """An immutable array of symbolic expressions.
 
-    Arithmetic, slicing and numpy's functions work as on arrays. Three things differ, each on purpose:
-    ``==`` and ``hash`` compare structure and give a plain ``bool``; ``<``, ``>``, ``&``, ``|`` and ``~`` build
+    Arithmetic, slicing and numpy's functions work as on arrays. Three things differ, each on purpose: ``==``
+    and ``hash`` compare structure and give a plain ``bool``; ``<``, ``>``, ``&``, ``|`` and ``~`` build
     continuous logic (:mod:`kineverse.logic`); and :meth:`gradient` is a mapping from derivative symbols to
     expressions that may be overridden (:meth:`augment`).
     """
@@ -168,7 +168,8 @@ class Expression:
 
     def sum(self, axis: int | None = None) -> Expression:
         """Return the sum over all elements or along one axis."""
-        return np.sum(self, axis=axis)  # type: ignore[call-overload, no-any-return]
+        result: Expression = np.sum(self, axis=axis)
+        return result
 
     def dot(self, other: ExpressionLike) -> Expression:
         """Return the matrix product, as ``@``."""
@@ -284,14 +285,14 @@ class Expression:
     def gradient(self, heuristic: bool = True) -> Mapping[Symbol, Expression]:
         """Return D(e): a mapping from derivative symbols to expressions of this shape.
 
-        The augmented gradient of the papers (2022, Eqs. 5-8): where nothing was augmented, the entry of ``ȧ`` is
-        ∂e/∂a. Entries that are structurally zero are left out.
+        The augmented gradient of the papers (2022, Eqs. 5-8): where nothing was augmented, the entry of ``ȧ``
+        is ∂e/∂a. Entries that are structurally zero are left out.
 
         Parameters
         ----------
         heuristic
-            Whether logic and ``augment(..., heuristic=True)`` contribute their trends. ``False`` takes a logic
-            node as locally constant and such an augmentation as absent: only facts remain.
+            Whether logic and ``augment(..., heuristic=True)`` contribute their trends. ``False`` takes a
+            logic node as locally constant and such an augmentation as absent: only facts remain.
         """
         from .gradient import gradient
 
@@ -314,8 +315,8 @@ class Expression:
     def partial(self, symbols: Sequence[Symbol]) -> Expression:
         """Return the plain partial derivatives of the value, shape ``e.shape + (n,)``.
 
-        Augmentations are ignored and parameters are symbols like any other. A filter's transition matrix is one
-        of these.
+        Augmentations are ignored and parameters are symbols like any other. A filter's transition matrix is
+        one of these.
         """
         from .gradient import partial
 
@@ -327,8 +328,8 @@ class Expression:
         Parameters
         ----------
         gradient
-            From derivative symbols (order at least 1; they need not be derivatives of symbols in here, such as
-            the speeds of wheels) to expressions that fit this shape.
+            From derivative symbols (order at least 1; they need not be derivatives of symbols in here, such
+            as the speeds of wheels) to expressions that fit this shape.
         heuristic
             Marks the entries as directions to try rather than rates (see :meth:`gradient`).
         """
@@ -360,8 +361,8 @@ class Expression:
         ----------
         values
             A mapping from symbols or their names to numbers, or a :class:`~kineverse.State`. It may know more
-            symbols than there are here, as a derivative depends on fewer than its function. Parameters that are not
-            given have their own values.
+            symbols than there are here, as a derivative depends on fewer than its function. Parameters that
+            are not given have their own values.
 
         Raises
         ------

@@ -240,6 +240,7 @@ class Select(Node):
         return {key: self._choose(a.get(key, zero), b.get(key, zero)) for key in {**a, **b}}
 
     def gradient_keys(self, heuristic: bool) -> frozenset[Symbol]:
+        """Return the derivative symbols of the gradient, without building it."""
         _, a, b = self.arguments
         return gradient_keys(a, heuristic) | gradient_keys(b, heuristic)
 
@@ -252,6 +253,7 @@ class Extremum(Node):
 
     @property
     def label(self) -> str:
+        """``minimum`` or ``maximum``."""
         return f"{self.options[0]}imum"
 
     def _value(self) -> Expression:

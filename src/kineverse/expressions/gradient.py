@@ -1,8 +1,8 @@
 """Augmented gradients: the chain rule over symbols and opaque nodes (2022 paper, Eqs. 5-8).
 
-For an expression e with leaves l (symbols and elements of nodes), ``D(e)[w] = Σ_l ∂e/∂l · D(l)[w]``, where a symbol
-a has ``D(a) = {ȧ: 1}``, a parameter ``{}`` and a node says itself what its D is. CasADi computes the partial
-derivatives, all keys at once.
+For an expression e with leaves l (symbols and elements of nodes), ``D(e)[w] = Σ_l ∂e/∂l · D(l)[w]``, where a
+symbol a has ``D(a) = {ȧ: 1}``, a parameter ``{}`` and a node says itself what its D is. CasADi computes the
+partial derivatives, all keys at once.
 """
 
 from __future__ import annotations
@@ -97,7 +97,8 @@ def jacobian(expression: Expression, symbols: Sequence[Symbol], heuristic: bool 
     for symbol in check_symbols(symbols):
         if not symbol.has_derivative:
             raise ExpressionError(
-                f"Parameter '{symbol}' has no derivative to read a column from; use partial([...]) for ∂/∂parameter."
+                f"Parameter '{symbol}' has no derivative to read a column from; "
+                "use partial([...]) for ∂/∂parameter."
             )
         entry = entries.get(symbol.derivative())
         if entry is None:

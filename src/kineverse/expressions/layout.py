@@ -1,8 +1,8 @@
 """How arrays of any dimension lie in CasADi's two-dimensional matrices.
 
 An expression of shape ``(a, b, c)`` is stored as an ``SX`` of ``a*b`` rows and ``c`` columns, a vector as one
-column, a scalar as 1×1. Rearrangements are computed on arrays of indices, where numpy itself says what a slice
-or a transpose means, and carried out once on the elements.
+column, a scalar as 1×1. Rearrangements are computed on arrays of indices, where numpy itself says what a
+slice or a transpose means, and carried out once on the elements.
 """
 
 from __future__ import annotations

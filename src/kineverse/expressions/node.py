@@ -1,9 +1,9 @@
 """Opaque nodes: values with a gradient of their own.
 
 A node stands in a CasADi graph as a symbol that nobody else owns. It knows its value and its D, so CasADi's
-partial derivatives and the chain rule give the gradient of everything built on it, at full speed, and the override
-belongs to the node: ``g(augmented) + h(a)`` keeps ``h'``. Nodes with equal content are the same object, so two
-equal augmentations cancel.
+partial derivatives and the chain rule give the gradient of everything built on it, at full speed, and the
+override belongs to the node: ``g(augmented) + h(a)`` keeps ``h'``. Nodes with equal content are the same
+object, so two equal augmentations cancel.
 """
 
 from __future__ import annotations
@@ -196,18 +196,21 @@ class Augment(Node):
         return self.entries if self.replace else {**own, **self.entries}
 
     def gradient_keys(self, heuristic: bool) -> frozenset[Symbol]:
+        """Return the derivative symbols of the gradient, without building it."""
         own = gradient_keys(self.arguments[0], heuristic)
         if self.heuristic and not heuristic:
             return own
         return frozenset(self.entries) if self.replace else own | frozenset(self.entries)
 
     def depends_on(self, substitution: Substitution) -> bool:
+        """Return whether a substitution changes the node."""
         # An entry for ȧ is carried along D(S(a)) even where a itself does not occur.
         return super().depends_on(substitution) or any(
             a.has_derivative and a.derivative() in self.options[2:] for a in substitution
         )
 
     def substitute(self, substitution: Substitution) -> Expression:
+        """Return what the node becomes under a substitution."""
         from .substitution import apply, compose_gradient
 
         # After composition an overridden ẇ may also be reached through a replaced symbol, so what was
@@ -240,7 +243,8 @@ def augment(
             entries[key] = broadcast_to(as_expression(entry), value.shape)
         except ShapeError:
             raise ShapeError(
-                f"The entry of '{key}' has shape {as_expression(entry).shape}; the expression has {value.shape}."
+                f"The entry of '{key}' has shape {as_expression(entry).shape}; "
+                f"the expression has {value.shape}."
             ) from None
     if not replace and not entries:
         return value

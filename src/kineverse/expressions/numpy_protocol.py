@@ -1,6 +1,7 @@
 """numpy's functions on expressions: ``np.sin(e)``, ``np.stack([a, b])``, ``array + e`` and their kin.
 
-Functions that only rearrange elements are applied to arrays of indices, so numpy itself decides what they mean.
+Functions that only rearrange elements are applied to arrays of indices, so numpy itself decides what they
+mean.
 """
 
 from __future__ import annotations
@@ -19,10 +20,11 @@ from .expression import Expression, array, as_expression, binary, floor_divide, 
 
 _UNARY_OPS = {
     np.negative: ca.OP_NEG, np.sin: ca.OP_SIN, np.cos: ca.OP_COS, np.tan: ca.OP_TAN, np.arcsin: ca.OP_ASIN,
-    np.arccos: ca.OP_ACOS, np.arctan: ca.OP_ATAN, np.sinh: ca.OP_SINH, np.cosh: ca.OP_COSH, np.tanh: ca.OP_TANH,
-    np.arcsinh: ca.OP_ASINH, np.arccosh: ca.OP_ACOSH, np.arctanh: ca.OP_ATANH, np.exp: ca.OP_EXP,
-    np.log: ca.OP_LOG, np.sqrt: ca.OP_SQRT, np.square: ca.OP_SQ, np.absolute: ca.OP_FABS, np.fabs: ca.OP_FABS,
-    np.sign: ca.OP_SIGN, np.floor: ca.OP_FLOOR, np.ceil: ca.OP_CEIL, np.expm1: ca.OP_EXPM1, np.log1p: ca.OP_LOG1P,
+    np.arccos: ca.OP_ACOS, np.arctan: ca.OP_ATAN, np.sinh: ca.OP_SINH, np.cosh: ca.OP_COSH,
+    np.tanh: ca.OP_TANH, np.arcsinh: ca.OP_ASINH, np.arccosh: ca.OP_ACOSH, np.arctanh: ca.OP_ATANH,
+    np.exp: ca.OP_EXP, np.log: ca.OP_LOG, np.sqrt: ca.OP_SQRT, np.square: ca.OP_SQ, np.absolute: ca.OP_FABS,
+    np.fabs: ca.OP_FABS, np.sign: ca.OP_SIGN, np.floor: ca.OP_FLOOR, np.ceil: ca.OP_CEIL,
+    np.expm1: ca.OP_EXPM1, np.log1p: ca.OP_LOG1P,
 }  # fmt: skip
 
 _BINARY_OPS = {
@@ -88,9 +90,9 @@ def apply_ufunc(ufunc: Any, method: str, inputs: tuple[Any, ...], options: Mappi
 
 
 _REARRANGING = {
-    np.transpose, np.reshape, np.ravel, np.squeeze, np.expand_dims, np.moveaxis, np.swapaxes, np.flip, np.fliplr,
-    np.flipud, np.roll, np.tile, np.repeat, np.broadcast_to, np.diagonal, np.take, np.rot90, np.atleast_1d,
-    np.atleast_2d, np.atleast_3d,
+    np.transpose, np.reshape, np.ravel, np.squeeze, np.expand_dims, np.moveaxis, np.swapaxes, np.flip,
+    np.fliplr, np.flipud, np.roll, np.tile, np.repeat, np.broadcast_to, np.diagonal, np.take, np.rot90,
+    np.atleast_1d, np.atleast_2d, np.atleast_3d,
 }  # fmt: skip
 
 _JOINING = {np.concatenate, np.stack, np.vstack, np.hstack, np.dstack, np.column_stack}
@@ -135,7 +137,7 @@ def _join(function: Any, parts: Sequence[Any], args: Sequence[Any], options: Map
 
 
 def _trace(a: Any) -> Expression:
-    return f.sum_along(np.diagonal(a))  # type: ignore[arg-type]
+    return f.sum_along(np.diagonal(a))
 
 
 def _cross(a: Any, b: Any) -> Expression:

@@ -30,11 +30,12 @@ _COMPARISONS = {
 _POWERS = (ca.OP_POW, ca.OP_CONSTPOW)
 _FUNCTIONS = {
     ca.OP_SQRT: "sqrt", ca.OP_SIN: "sin", ca.OP_COS: "cos", ca.OP_TAN: "tan", ca.OP_ASIN: "arcsin",
-    ca.OP_ACOS: "arccos", ca.OP_ATAN: "arctan", ca.OP_ATAN2: "arctan2", ca.OP_SINH: "sinh", ca.OP_COSH: "cosh",
-    ca.OP_TANH: "tanh", ca.OP_ASINH: "arcsinh", ca.OP_ACOSH: "arccosh", ca.OP_ATANH: "arctanh", ca.OP_EXP: "exp",
-    ca.OP_LOG: "log", ca.OP_FABS: "abs", ca.OP_SIGN: "sign", ca.OP_FLOOR: "floor", ca.OP_CEIL: "ceil",
-    ca.OP_FMIN: "minimum", ca.OP_FMAX: "maximum", ca.OP_IF_ELSE_ZERO: "if_else_zero", ca.OP_NOT: "not",
-    ca.OP_EXPM1: "expm1", ca.OP_LOG1P: "log1p", ca.OP_COPYSIGN: "copysign", ca.OP_HYPOT: "hypot",
+    ca.OP_ACOS: "arccos", ca.OP_ATAN: "arctan", ca.OP_ATAN2: "arctan2", ca.OP_SINH: "sinh",
+    ca.OP_COSH: "cosh", ca.OP_TANH: "tanh", ca.OP_ASINH: "arcsinh", ca.OP_ACOSH: "arccosh",
+    ca.OP_ATANH: "arctanh", ca.OP_EXP: "exp", ca.OP_LOG: "log", ca.OP_FABS: "abs", ca.OP_SIGN: "sign",
+    ca.OP_FLOOR: "floor", ca.OP_CEIL: "ceil", ca.OP_FMIN: "minimum", ca.OP_FMAX: "maximum",
+    ca.OP_IF_ELSE_ZERO: "if_else_zero", ca.OP_NOT: "not", ca.OP_EXPM1: "expm1", ca.OP_LOG1P: "log1p",
+    ca.OP_COPYSIGN: "copysign", ca.OP_HYPOT: "hypot",
 }  # fmt: skip
 
 
@@ -52,7 +53,7 @@ def text(expression: Expression) -> str:
 
 
 def latex(expression: Expression) -> str:
-    """Return LaTeX: ``\\dot{a}`` for velocities, matrices up to 6×6 written out."""
+    r"""Return LaTeX: ``\dot{a}`` for velocities, matrices up to 6×6 written out."""
     writer = _Latex(expression)
     if not expression.shape:
         return writer.bounded(expression._sx)

@@ -1,7 +1,7 @@
 """Structural identity of expressions, and packing them for another process.
 
-Both use CasADi's own serialisation, which is exact to the last bit. It is for pickling between like versions only,
-documents have their own form.
+Both use CasADi's own serialisation, which is exact to the last bit. It is for pickling between like versions
+only, documents have their own form.
 """
 
 from __future__ import annotations

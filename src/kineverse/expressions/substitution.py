@@ -10,6 +10,7 @@ import casadi as ca
 from kineverse.errors import ExpressionError, ShapeError
 
 from .expression import NO_NODES, Expression, ExpressionLike, as_expression, make
+from .layout import SX
 from .leaves import leaves
 
 if TYPE_CHECKING:
@@ -45,7 +46,9 @@ def apply(expression: Expression, substitution: Substitution) -> Expression:
     if not substitution:
         return expression
     symbols, nodes = leaves(expression)
-    old, new, kept = [], [], set()
+    old: list[ca.SX] = []
+    new: list[ca.SX] = []
+    kept: set[Node] = set()
     for symbol in symbols:
         if symbol in substitution:
             replacement = substitution[symbol]
@@ -67,7 +70,7 @@ def apply(expression: Expression, substitution: Substitution) -> Expression:
 
 
 def replace_nodes(expression: Expression, replacements: Mapping[Node, Expression]) -> Expression:
-    """Return the expression with nodes that occur in its own graph exchanged for expressions of their shape."""
+    """Return the expression with nodes of its own graph exchanged for expressions of their shape."""
     _, nodes = leaves(expression)
     chosen = [n for n in nodes if n in replacements]
     if not chosen:
@@ -84,7 +87,7 @@ def replace_nodes(expression: Expression, replacements: Mapping[Node, Expression
 def compose_gradient(
     entries: Mapping[Symbol, Expression], substitution: Substitution, heuristic: bool
 ) -> dict[Symbol, Expression]:
-    """Return D(e∘S) from D(e): ``Σ_a (D(e)[ȧ]∘S)·D(S(a))[w]`` plus the keys that belong to no replaced symbol."""
+    """Return D(e∘S) from D(e): ``Σ_a (D(e)[ȧ]∘S)·D(S(a))[w]`` and the keys that no replaced symbol has."""
     result: dict[Symbol, Expression] = {}
 
     def add(key: Symbol, value: Expression) -> None:
@@ -101,5 +104,5 @@ def compose_gradient(
     return result
 
 
-def _as_stored(replacement: Expression, node: Node) -> object:
+def _as_stored(replacement: Expression, node: Node) -> SX:
     return ca.densify(replacement._sx)

@@ -49,7 +49,8 @@ class Constraint:
         low, middle, high = parts
         if not middle.symbols:
             raise ValueRejectedError(
-                f"The constrained expression ({middle!r}) depends on no symbol. The order is lower, expression, upper."
+                f"The constrained expression ({middle!r}) depends on no symbol. "
+                "The order is lower, expression, upper."
             )
         if not low.symbols and not high.symbols:
             a, b = float(low), float(high)

@@ -10,7 +10,7 @@ from .constraint import Constraint, coordinates
 
 @dataclass(frozen=True, slots=True)
 class Change:
-    """One value that is structurally different: ``before`` or ``after`` is None where there was or is nothing."""
+    """One value that is structurally different; ``before`` or ``after`` is None where there is nothing."""
 
     kind: str
     name: str

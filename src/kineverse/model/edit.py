@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -106,8 +107,8 @@ class Attach(Operation):
 class Edit:
     """A transaction on a model; made by :meth:`Model.edit`, used in a ``with`` block.
 
-    Leaving the block commits, an exception leaves the model as it was. Reading the model inside the block shows the
-    edit so far; other threads wait.
+    Leaving the block commits, an exception leaves the model as it was. Reading the model inside the block
+    shows the edit so far; other threads wait.
     """
 
     def __init__(self, history: History) -> None:
@@ -151,8 +152,8 @@ class Edit:
         before, after
             Tag of a neighbour.
         to_affect
-            Tag of an operation, or name of a frame (then of the operation that last wrote it): the new one is put right
-            before it, so that everything it reads from the new one reaches it (2022 paper, III-A3).
+            Tag of an operation, or name of a frame (then of the operation that last wrote it): the new one is
+            put right before it, so that everything it reads from the new one reaches it (2022 paper, III-A3).
         """
         if sum(x is not None for x in (before, after, to_affect)) != 1:
             raise EditError("Say where to insert: exactly one of before=, after= and to_affect=.")
@@ -192,7 +193,7 @@ class Edit:
         body: Body | None = None,
         tag: str | None = None,
     ) -> str:
-        """Place a frame in its parent by a 4×4 transform parent_T_frame, or a sequence of them (their product)."""
+        """Place a frame in its parent by a 4×4 transform parent_T_frame, or by several (their product)."""
         return self.apply(AddFrame(name, Frame.of(parent, transform), body), tag)
 
     def constrain(
@@ -203,7 +204,7 @@ class Edit:
         upper: ExpressionLike,
         tag: str | None = None,
     ) -> str:
-        """Require ``lower <= expression <= upper``; all three are scalars, bounds may be expressions or ±inf."""
+        """Require ``lower <= expression <= upper``: three scalars; bounds may be expressions or ±inf."""
         return self.apply(Constrain(name, Constraint.of(lower, expression, upper)), tag)
 
     def set_rate(
@@ -227,10 +228,17 @@ class Edit:
         return self.apply(Write(name, value), tag)
 
     def include(self, source: Any, prefix: str | None = None) -> list[str]:
-        """Append the operations of a file or shipped model; returns their tags. See :func:`kineverse.load`."""
+        """Append the operations of a file or shipped model, see :func:`kineverse.load`; return their tags."""
         from kineverse.formats import operations_of
 
-        return [self.apply(operation, tag) for tag, operation in operations_of(source, prefix)]
+        # Loading makes many objects and no garbage; the collector would look at all of them again and again.
+        collecting = gc.isenabled()
+        gc.disable()
+        try:
+            return [self.apply(operation, tag) for tag, operation in operations_of(source, prefix)]
+        finally:
+            if collecting:
+                gc.enable()
 
     # -- inside --------------------------------------------------------------------------------------------
 

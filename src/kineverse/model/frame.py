@@ -30,8 +30,9 @@ class Frame:
     parent
         Name of the parent frame; ``world`` is the root of all.
     factors
-        Transforms whose product is parent_T_frame: constants as :class:`Pose`, the rest as 4×4 expressions. Kept
-        apart because the geometric Jacobian of a product is far shorter than that of the multiplied matrix.
+        Transforms whose product is parent_T_frame: constants as :class:`Pose`, the rest as 4×4 expressions.
+        Kept apart because the geometric Jacobian of a product is far shorter than that of the multiplied
+        matrix.
     """
 
     parent: str
@@ -70,7 +71,7 @@ class Frame:
 def _factor(transform: TransformLike) -> Pose | Expression:
     if isinstance(transform, Pose):
         return transform
-    expression = as_expression(transform)  # type: ignore[arg-type]
+    expression = as_expression(transform)
     if expression.shape != (4, 4):
         raise ShapeError(f"A frame is placed by a 4×4 transform, not by one of shape {expression.shape}.")
     if not expression.is_constant:

@@ -1,8 +1,8 @@
 """The sequence of operations and its fold, kept up to date by recorded reads.
 
-Every operation has a place in the sequence. A read is resolved at the reader's place: by the last writer before
-it. When what a writer wrote changes, exactly the operations whose reads resolve to it are run again, in
-order, and it stops where writes come out equal. Every change can be undone until it is committed.
+Every operation has a place in the sequence. A read is resolved at the reader's place: by the last writer
+before it. When what a writer wrote changes, exactly the operations whose reads resolve to it are run again,
+in order, and it stops where writes come out equal. Every change can be undone until it is committed.
 """
 
 from __future__ import annotations
@@ -243,7 +243,8 @@ class History:
         others = [e.tag for e in self.cells.get((CONSTRAINTS, name), ()) if e.tag != tag]
         if others:
             raise NameTakenError(
-                f"There is a constraint '{name}' already, made by {others[0]!r}; choose another name or replace that operation."
+                f"There is a constraint '{name}' already, made by {others[0]!r}; "
+                "choose another name or replace that operation."
             )
 
     def _check_frames(self, failures: dict[str, KineverseError]) -> None:
@@ -332,7 +333,7 @@ class History:
                 yield cell, before, after
 
     def take_events(self) -> list[tuple[Cell, Any, Any]]:
-        """Return every change of a final value since the last call: (cell, before, after), undone ones included."""
+        """Return the changes of final values since the last call, undone ones too: (cell, before, after)."""
         events, self._events = self._events, []
         return events
 

@@ -30,8 +30,9 @@ def integrate(
 ) -> State:
     """Return the state after ``dt`` seconds at constant speeds.
 
-    Free coordinates move linearly. The others follow their rows by extrapolated midpoint steps (Gragg, Bulirsch, Stoer), short enough that
-    the error stays near the rounding of floating point; for a quaternion this is its exponential.
+    Free coordinates move linearly. The others follow their rows by extrapolated midpoint steps (Gragg,
+    Bulirsch, Stoer), short enough that the error stays near the rounding of floating point; for a quaternion
+    this is its exponential.
 
     Parameters
     ----------

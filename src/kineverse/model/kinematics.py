@@ -1,7 +1,8 @@
 """Forward kinematics and geometric Jacobians along chains of frames.
 
-A frame's pose is kept as an *anchor*, the product up to its last moving factor, and a constant offset behind it.
-Constants are multiplied as numbers before they meet an expression, so rigidly attached frames cost nothing.
+A frame's pose is kept as an *anchor*, the product up to its last moving factor, and a constant offset behind
+it. Constants are multiplied as numbers before they meet an expression, so rigidly attached frames cost
+nothing.
 """
 
 from __future__ import annotations
@@ -37,7 +38,10 @@ class Step:
 
 @dataclass(frozen=True, slots=True)
 class Placement:
-    """Where a frame is in the root of a chain: rotation and position of the anchor (None for the identity), then a constant."""
+    """Where a frame is in the root of a chain.
+
+    Rotation and position of the anchor (None for the identity), then a constant.
+    """
 
     rotation: SX | None
     position: SX | None
@@ -170,8 +174,8 @@ class Twist:
 def twists(base: Placement, tip: Placement, heuristic: bool) -> tuple[SX, SX, dict[Symbol, Twist]]:
     """Return rotation and position of the tip in the base, and its twist by each speed, in axes of the base.
 
-    Both placements are relative to a common ancestor. Every moving factor contributes the twist it makes in front
-    of itself, carried to the tip by a cross product; so the cost is linear in the length of the chain.
+    Both placements are relative to a common ancestor. Every moving factor contributes the twist it makes in
+    front of itself, carried to the tip by a cross product; so the cost is linear in the length of the chain.
     """
     rotation, position = tip.parts()
     found: dict[Symbol, Twist] = {}

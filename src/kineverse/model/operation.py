@@ -1,7 +1,8 @@
 """Operations: the steps a model is made of (2022 paper, III-A3 and Eq. 10).
 
-An operation is a frozen value. Its ``apply`` reads from the model as it is at the operation's place in the sequence and
-returns its :class:`Effects`; what it read is recorded, so it is run again when, and only when, that changes.
+An operation is a frozen value. Its ``apply`` reads from the model as it is at the operation's place in the
+sequence and returns its :class:`Effects`; what it read is recorded, so it is run again when, and only when,
+that changes.
 """
 
 from __future__ import annotations
@@ -42,7 +43,8 @@ class Effects:
     frames
         :class:`Frame` values, or pairs (parent, transform) with anything :meth:`Frame.of` takes.
     constraints
-        :class:`Constraint` values or triples (lower, expression, upper). They live and die with the operation.
+        :class:`Constraint` values or triples (lower, expression, upper). They live and die with the
+        operation.
     rates
         From coordinates to rows ``{speed: expression}``, see :mod:`kineverse.model.rates`.
     bodies, articulations
@@ -75,9 +77,14 @@ class Effects:
             result[CONSTRAINTS, name] = Constraint(plain(c.lower), plain(c.expression), plain(c.upper))
         for coordinate, row in self.rates.items():
             result[RATES, str(coordinate)] = (coordinate, as_row(coordinate, row))
-        for kind, values in ((BODIES, self.bodies), (ARTICULATIONS, self.articulations), (DATA, self.data)):
-            for name, value in values.items():
-                result[kind, name] = value
+        others: tuple[tuple[str, Mapping[str, Any]], ...] = (
+            (BODIES, self.bodies),
+            (ARTICULATIONS, self.articulations),
+            (DATA, self.data),
+        )
+        for kind, values in others:
+            for name, datum in values.items():
+                result[kind, name] = datum
         return result
 
 

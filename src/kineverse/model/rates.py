@@ -1,12 +1,13 @@
 """Rates: how coordinates move with speeds, q̇ = R(q) u.
 
-A coordinate x without a row is free, ``{ẋ: 1}``. A row ``{v: expression}`` says ``ẋ = Σ expression·v``: the wheels of
-a differential drive, the angular velocity of a quaternion. What a model hands out has such coordinates *carried*:
-each is an opaque node whose value is x and whose gradient is its row, so every gradient shows the wheels.
+A coordinate x without a row is free, ``{ẋ: 1}``. A row ``{v: expression}`` says ``ẋ = Σ expression·v``: the
+wheels of a differential drive, the angular velocity of a quaternion. What a model hands out has such
+coordinates *carried*: each is an opaque node whose value is x and whose gradient is its row, so every
+gradient shows the wheels.
 
-Rows use the carried coordinates themselves (the heading in a wheel's row turns, or accelerations are wrong), which
-may well be circular: a quaternion's rate is made of the quaternion. A carried coordinate therefore refers to its table
-and unfolds one derivative at a time.
+Rows use the carried coordinates themselves (the heading in a wheel's row turns, or accelerations are wrong),
+which may well be circular: a quaternion's rate is made of the quaternion. A carried coordinate therefore
+refers to its table and unfolds one derivative at a time.
 """
 
 from __future__ import annotations
@@ -172,6 +173,7 @@ class Carried(Node):
 
     @property
     def label(self) -> str:
+        """What errors and printing call it."""
         return "carried"
 
     @classmethod
@@ -185,12 +187,15 @@ class Carried(Node):
         return {v: self.rates.carry(g) for v, g in self.rates[self.coordinate].items()}
 
     def gradient_keys(self, heuristic: bool) -> frozenset[Symbol]:
+        """Return the derivative symbols of the gradient, without building it."""
         return frozenset(self.rates[self.coordinate])
 
     def depends_on(self, substitution: Substitution) -> bool:
+        """Return whether a substitution changes the node."""
         return any(s in self.rates.symbols for s in substitution)
 
     def substitute(self, substitution: Substitution) -> Expression:
+        """Return what the node becomes under a substitution."""
         relevant = {s: e for s, e in substitution.items() if s in self.rates.symbols}
         itself = _expression_of(self)
         return Composed.of((itself, *relevant.values()), (), tuple(relevant))
@@ -222,12 +227,15 @@ class Composed(Node):
         return compose_gradient(self._inner().gradient(heuristic), self.substitution, heuristic)
 
     def gradient_keys(self, heuristic: bool) -> frozenset[Symbol]:
+        """Return the derivative symbols of the gradient, without building it."""
         return frozenset(self.gradient(heuristic))
 
     def depends_on(self, substitution: Substitution) -> bool:
+        """Return whether a substitution changes the node."""
         return super().depends_on(substitution) or self._inner().depends_on(substitution)
 
     def substitute(self, substitution: Substitution) -> Expression:
+        """Return what the node becomes under a substitution."""
         return Composed.of((_expression_of(self), *substitution.values()), (), tuple(substitution))
 
 

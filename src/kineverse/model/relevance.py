@@ -1,6 +1,7 @@
 """Which constraints matter for an expression (2022 paper, III-A2).
 
-An index from coordinates to constraints, so that a question costs what its answer is long, not what the model is.
+An index from coordinates to constraints, so that a question costs what its answer is long, not what the model
+is.
 """
 
 from __future__ import annotations

@@ -4,12 +4,12 @@ For a constraint on positions, ``l <= φ <= u``, at rate γ <= 1/Δt and without
 
     (D(φ) - D(u))·v <= γ (u - φ)        (D(φ) - D(l))·v >= γ (l - φ)
 
-so one step of Δt never crosses a bound. Outside a bound the right side asks for the way back, as fast as γ says but
-never faster than the speed limits allow, so the row stays feasible. Where accelerations are limited, the
-speed towards a bound stays below what can be braked within the distance left.
+so one step of Δt never crosses a bound. Outside a bound the right side asks for the way back, as fast as γ
+says but never faster than the speed limits allow, so the row stays feasible. Where accelerations are limited,
+the speed towards a bound stays below what can be braked within the distance left.
 
-A constraint that is affine in speeds is the row itself. A limited norm of two speeds becomes the 16 sides of the polygon
-inscribed in the circle, which gives away 1.9 % at most and never exceeds the limit.
+A constraint that is affine in speeds is the row itself. A limited norm of two speeds becomes the 16 sides of
+the polygon inscribed in the circle, which gives away 1.9 % at most and never exceeds the limit.
 """
 
 from __future__ import annotations
@@ -140,7 +140,7 @@ def _position_rows(
     limits: Mapping[Symbol, tuple[Expression, Expression]],
     accelerations: Mapping[Symbol, Expression],
 ) -> list[_Row]:
-    sides = []
+    sides: list[tuple[dict[Symbol, Expression] | None, Expression]] = []
     for bound, sign in ((constraint.lower, -1), (constraint.upper, 1)):
         if not bound.symbols and math.isinf(float(bound)):
             sides.append((None, as_expression(sign * _INF)))
@@ -166,8 +166,8 @@ def _position_rows(
             _Row(name, low_weights, lower, as_expression(_INF)),
             _Row(name, high_weights, as_expression(-_INF), upper),
         ]
-    weights = low_weights if low_weights is not None else high_weights
-    return [_Row(name, weights, lower, upper)] if weights else []
+    either = low_weights if low_weights is not None else high_weights
+    return [_Row(name, either, lower, upper)] if either else []
 
 
 def _fastest_retreat(
@@ -227,13 +227,14 @@ def _speed_rows(
     directions = _directions(len(affine_parts))
     reach = math.cos(math.pi / SIDES) if len(affine_parts) == 2 else 1.0
     for direction in directions:
-        weights: dict[Symbol, Expression] = {}
+        combined: dict[Symbol, Expression] = {}
         offset = as_expression(0.0)
         for factor, (own, constant) in zip(direction, affine_parts, strict=True):
             offset = offset + factor * constant
             for speed, weight in own.items():
-                weights[speed] = weights[speed] + factor * weight if speed in weights else factor * weight
-        rows.append(_Row(name, weights, as_expression(-_INF), upper * reach - offset))
+                term = factor * weight
+                combined[speed] = combined[speed] + term if speed in combined else term
+        rows.append(_Row(name, combined, as_expression(-_INF), upper * reach - offset))
     if all(isinstance(c, Symbol) for c in norm):
         # The largest box inside the polygon, for what counts on single speeds.
         side = upper * (reach / math.sqrt(len(norm)))

@@ -38,6 +38,7 @@ class SymbolIndex:
         self._count: dict[Symbol, int] = {}
 
     def add(self, value: Any, sign: int) -> None:
+        """Count the symbols of a value, which comes (1) or goes (-1)."""
         for symbol in _symbols_of(value):
             count = self._count.get(symbol, 0) + sign
             if count:
@@ -46,6 +47,7 @@ class SymbolIndex:
                 del self._count[symbol]
 
     def sorted(self) -> tuple[Symbol, ...]:
+        """Return the symbols in their order."""
         return tuple(sorted(self._count, key=lambda s: s.sort_key))
 
 
@@ -92,7 +94,7 @@ class ModelView:
                     self._carried_constraints.pop(name, None)
 
     def _settle(self) -> None:
-        """Hook: bring an edit in progress up to date before it is read."""
+        """Bring an edit in progress up to date before it is read; there is none here."""
 
     def _catch_up(self) -> None:
         self._settle()
@@ -169,7 +171,7 @@ class ModelView:
 
     @property
     def symbols(self) -> tuple[Symbol, ...]:
-        """The coordinates and parameters of all frames and constraints, sorted: what a configuration consists of."""
+        """The coordinates and parameters of all frames and constraints, sorted: what a configuration is."""
         with self._lock:
             if self._all_symbols is None or self._pending:
                 self._catch_up()
@@ -229,11 +231,11 @@ class ModelView:
         frame, relative_to
             What moves and with respect to what.
         form
-            ``world_aligned``: velocity of the frame's origin in axes of ``relative_to``; ``world``: the spatial twist
-            there; ``body``: in the frame itself.
+            ``world_aligned``: velocity of the frame's origin in axes of ``relative_to``; ``world``: the
+            spatial twist there; ``body``: in the frame itself.
         symbols
-            One column for each: positions or their velocities. By default the speeds that move the frame, sorted
-            (:meth:`speeds_of`).
+            One column for each: positions or their velocities. By default the speeds that move the frame,
+            sorted (:meth:`speeds_of`).
         heuristic
             Whether heuristic gradient entries count; a Jacobian is about facts, so by default they do not.
         """
@@ -376,8 +378,8 @@ class ModelView:
     def limits(self, symbol: Symbol | str, values: Mapping[Any, float] | None = None) -> tuple[float, float]:
         """Return the bounds that constraints put on a single symbol, ±inf where there are none.
 
-        Bounds that are expressions are evaluated at ``values``, by default at :meth:`default_state`; those that
-        cannot be evaluated are left out.
+        Bounds that are expressions are evaluated at ``values``, by default at :meth:`default_state`; those
+        that cannot be evaluated are left out.
         """
         with self._lock:
             self._catch_up()
@@ -426,7 +428,7 @@ class ModelView:
         )
 
     def default_state(self) -> State:
-        """Return a value for every symbol: 0 (or an articulation's home) clipped into the limits, parameters' own."""
+        """Return a value for every symbol: 0, or its home, clipped into limits; parameters keep theirs."""
         with self._lock:
             symbols = self.symbols
             values: dict[Symbol, float] = {s: s.value or 0.0 for s in symbols}
@@ -464,15 +466,15 @@ class ModelView:
         return velocity_rows(constraints, dt, rates=self.rates, speeds=speeds, gain=gain)
 
     def integrate(self, state: State, speeds: Mapping[Any, float], dt: float) -> State:
-        """Return the state after ``dt`` seconds at constant free speeds; see :mod:`kineverse.model.integration`."""
+        """Return the state ``dt`` seconds later, at constant speeds: :mod:`kineverse.model.integration`."""
         return integrate(self.degrees_of_freedom, self.rates, state, speeds, dt)
 
     # -- printing ------------------------------------------------------------------------------------------
 
     def __str__(self) -> str:
         return (
-            f"{len(self.frames)} frames, {len(self.degrees_of_freedom)} DoF, {len(self.constraints)} constraints "
-            f"(version {self.version})"
+            f"{len(self.frames)} frames, {len(self.degrees_of_freedom)} DoF, "
+            f"{len(self.constraints)} constraints (version {self.version})"
         )
 
     def __repr__(self) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from ..articulations import DifferentialDrive, Joint, OmniBase
+from ..model.frame import WORLD
 
 
 def base_of(model: str, prefix: str | None) -> Joint | None:
@@ -19,12 +20,14 @@ def base_of(model: str, prefix: str | None) -> Joint | None:
     def named(name: str) -> str:
         return f"{prefix}/{name}" if prefix else name
 
-    common = {"name": named("base"), "parent": "world", "child": named("base")}
+    name = named("base")
     if model in ("pr2", "hsr"):
-        return OmniBase(**common, speed=1.0, turn=0.6)
+        return OmniBase(name=name, parent=WORLD, child=name, speed=1.0, turn=0.6)
     if model == "fetch":
         return DifferentialDrive(
-            **common,
+            name=name,
+            parent=WORLD,
+            child=name,
             radius=0.06,
             track=0.3748,
             left=named("l_wheel_joint"),

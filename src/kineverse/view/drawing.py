@@ -126,9 +126,11 @@ def _surface_points(
     flat = np.cross(u, v)
     square = np.maximum(dot(flat, flat), 1e-300)
     reach = dot(flat, a)
-    steady = np.where(np.abs(reach) < 1e-300, 1e-300, reach)
-    # A ray r meets the plane n·p = d at p = r d / (n·r).
-    points = rays / dot(rays, _single(flat / steady[:, None])[triangle])[:, None]
+    # A ray r meets the plane n·p = d at p = r d / (n·r); planes through the camera are never seen.
+    edge_on = np.abs(reach) < 1e-12 * np.sqrt(square)
+    planes = np.where(edge_on[:, None], 0.0, flat / np.where(edge_on, 1.0, reach)[:, None])
+    along = dot(rays, _single(planes)[triangle])
+    points = rays / np.where(along == 0.0, np.float32(1.0), along)[:, None]
     # Barycentric coordinates are linear in the point: w_b = (v x n)·(p - a) / n², w_c = (n x u)·(p - a) / n².
     to_b, to_c = np.cross(v, flat) / square[:, None], np.cross(flat, u) / square[:, None]
     b = dot(_single(to_b)[triangle], points) - _single(dot(to_b, a))[triangle]

@@ -35,7 +35,7 @@ class Loaded:
 
 _by_reference: dict[Mesh, Loaded] = {}
 _by_content: dict[tuple[object, ...], Triangles] = {}
-_reported: set[str] = set()
+_reported: set[tuple[str, str]] = set()
 
 
 def load(mesh: Mesh) -> Loaded:
@@ -61,8 +61,8 @@ def load(mesh: Mesh) -> Loaded:
 
 def _missing(mesh: Mesh, problem: str) -> Loaded:
     first_line = (problem.strip().splitlines() or ["unknown error"])[0]
-    if mesh.uri not in _reported:
-        _reported.add(mesh.uri)
+    if (mesh.uri, mesh.folder) not in _reported:
+        _reported.add((mesh.uri, mesh.folder))
         logger.warning("mesh %s is shown as a placeholder: %s", mesh.uri, first_line)
     return Loaded(placeholder(), first_line)
 

@@ -128,11 +128,15 @@ def creased(vertices: npt.ArrayLike, faces: npt.ArrayLike, angle: float = 0.6) -
     """
     points = np.asarray(vertices, dtype=float).reshape(-1, 3)
     indices = np.asarray(faces, dtype=np.int64).reshape(-1, 3)
-    points, merged = np.unique(points, axis=0, return_inverse=True)
-    indices = merged.reshape(-1)[indices] if len(indices) else indices
+    if not len(points) or not len(indices):
+        return join([]), np.zeros(0, dtype=np.int64)
+    # Corners closer than anyone can see are one; files repeat them with other last digits.
+    grain = 1e-8 * max(float(np.ptp(points, axis=0).max()), 1e-12)
+    _, first, merged = np.unique(np.round(points / grain), axis=0, return_index=True, return_inverse=True)
+    points, indices = points[first], merged.reshape(-1)[indices]
     corners = points[indices]
     areas: Floats = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    solid = np.linalg.norm(areas, axis=1) > 0.0
+    solid = np.linalg.norm(areas, axis=1) > grain**2
     indices, areas = indices[solid], areas[solid]
     if not len(indices):
         return join([]), np.flatnonzero(solid)

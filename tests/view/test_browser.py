@@ -1,0 +1,161 @@
+"""The page as a person meets it: a real Chromium opens it, moves a slider and sees the part move."""
+
+from __future__ import annotations
+
+import io
+
+import numpy as np
+import pytest
+from small_models import cabinet
+
+from kineverse.view import Camera, view
+
+pytest.importorskip("viser", reason="the page needs the extra 'view'")
+playwright = pytest.importorskip("playwright.sync_api", reason="driving a browser needs playwright")
+imaging = pytest.importorskip("PIL.Image")
+
+pytestmark = pytest.mark.browser
+
+PATIENCE = 60_000
+"""Longest wait for anything on the page [ms]: software rendering on a busy machine is slow."""
+
+ARGUMENTS = ["--no-sandbox", "--headless=new", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
+
+
+@pytest.fixture(scope="module")
+def browser(chromium):
+    with playwright.sync_playwright() as driver:
+        browser = driver.chromium.launch(executable_path=chromium, args=ARGUMENTS, timeout=PATIENCE)
+        yield browser
+        browser.close()
+
+
+@pytest.fixture
+def opened(browser):
+    """A viewer of the cabinet, and the page a browser has of it."""
+    camera = Camera((-2.4, -1.6, 1.3), (0.0, 0.0, 0.5))
+    with view(cabinet(), port=0, camera=camera) as viewer:
+        page = browser.new_page(viewport={"width": 1000, "height": 700})
+        page.set_default_timeout(PATIENCE)
+        errors = []
+        page.on("pageerror", lambda error: errors.append(str(error)))
+        page.goto(viewer.address)
+        page.wait_for_selector("[role=slider]")
+        # The picture is there once the red front of the drawer is.
+        until(page, lambda: reddish(shot(page)).sum() > 500)
+        yield viewer, page
+        page.close()
+        assert errors == []
+
+
+def until(page, condition):
+    """Wait for a condition on what is seen, frame by frame of the browser."""
+    for _ in range(600):
+        if condition():
+            return
+        page.evaluate("() => new Promise(done => requestAnimationFrame(() => requestAnimationFrame(done)))")
+    pytest.fail("waited in vain for the page")
+
+
+def shot(page):
+    """The left half of the page, where nothing but the scene is drawn."""
+    clip = {"x": 0, "y": 0, "width": 600, "height": 700}
+    data = page.screenshot(clip=clip)
+    return np.asarray(imaging.open(io.BytesIO(data)).convert("RGB")).astype(int)
+
+
+def reddish(image):
+    r, g, b = np.moveaxis(image, -1, 0)
+    return (r > 1.6 * g) & (r > 1.6 * b)
+
+
+def row(page, label):
+    """The line of controls with a label."""
+    return page.get_by_text(label, exact=True)
+
+
+def slider(page, viewer, name):
+    """The thumb of the slider of a degree of freedom; they come in the order of the model."""
+    order = list(viewer._panel._sliders)
+    return page.locator("[role=slider]").nth(order.index(name))
+
+
+def test_moving_a_slider_moves_the_part(opened, tmp_path):
+    viewer, page = opened
+    row(page, "drawer [m]").wait_for()
+    before, pose = shot(page), viewer.pose("cabinet/drawer")
+    thumb = slider(page, viewer, "cabinet/drawer")
+    thumb.focus()
+    page.keyboard.press("End")
+    until(page, lambda: viewer.values["cabinet/drawer"] == 0.4)
+    assert viewer.settled()
+    np.testing.assert_allclose(viewer.pose("cabinet/drawer")[:3, 3] - pose[:3, 3], [-0.4, 0, 0], atol=1e-9)
+    until(page, lambda: reddish(shot(page)).sum() > 1.5 * reddish(before).sum())
+    assert (shot(page) != before).any(axis=2).sum() > 2000
+    page.screenshot(path=tmp_path / "moved.png")
+    assert (tmp_path / "moved.png").stat().st_size > 10_000
+    # And back, by the keyboard and by the button.
+    page.keyboard.press("Home")
+    until(page, lambda: viewer.values["cabinet/drawer"] == 0.0)
+    page.keyboard.press("ArrowRight")
+    until(page, lambda: 0.0 < viewer.values["cabinet/drawer"] <= 0.001)
+    page.get_by_role("button", name="Reset").click()
+    until(page, lambda: viewer.values["cabinet/drawer"] == 0.0)
+    until(page, lambda: thumb.get_attribute("aria-valuenow") == "0")
+
+
+def test_violated_constraints_are_on_the_page(opened):
+    viewer, page = opened
+    page.get_by_text("All constraints hold.").wait_for()
+    thumb = slider(page, viewer, "cabinet/door")
+    thumb.focus()
+    page.keyboard.press("End")
+    until(page, lambda: viewer.values["cabinet/door"] == 1.5)
+    page.get_by_text("All constraints hold.").wait_for()
+    # Each slider stays inside its own limits; only together they are wrong.
+    slider(page, viewer, "cabinet/drawer").focus()
+    page.keyboard.press("End")
+    page.get_by_text("cabinet/no_clash").wait_for()
+    page.get_by_label("beyond limits").check()
+    until(page, lambda: thumb.get_attribute("aria-valuemax") == "1.8")
+    thumb.focus()
+    page.keyboard.press("End")
+    page.get_by_text("cabinet/door/range").wait_for()
+    assert viewer.values["cabinet/door"] == 1.8
+
+
+def test_frames_and_their_names_are_shown_on_demand(opened):
+    viewer, page = opened
+    before = shot(page)
+    page.get_by_role("tab", name="Show").click()
+    page.get_by_label("frames", exact=True).check()
+    until(page, lambda: viewer._scene._axes is not None)
+    until(page, lambda: (shot(page) != before).any(axis=2).sum() > 200)
+    page.get_by_label("frame names").check()
+    page.get_by_text("cabinet/knob", exact=True).wait_for()
+    page.get_by_label("bodies").uncheck()
+    until(page, lambda: reddish(shot(page)).sum() < 0.2 * reddish(before).sum())
+
+
+def test_sliders_can_be_found_by_name_and_edits_arrive(opened):
+    import kineverse as kv
+
+    viewer, page = opened
+    page.get_by_role("textbox").first.fill("door")
+    row(page, "drawer [m]").wait_for(state="hidden")
+    row(page, "door [rad]").wait_for()
+    with viewer.model.edit() as edit:
+        edit.add_frame("lid", parent="world", transform=kv.translation(0, 0, kv.position("lid")))
+    row(page, "lid [m]").wait_for()
+
+
+def test_a_second_browser_sees_what_the_first_one_moved(opened, browser):
+    viewer, page = opened
+    viewer.move({"cabinet/drawer": 0.4})
+    other = browser.new_page(viewport={"width": 1000, "height": 700})
+    other.set_default_timeout(PATIENCE)
+    other.goto(viewer.address)
+    other.wait_for_selector("[role=slider]")
+    until(other, lambda: slider(other, viewer, "cabinet/drawer").get_attribute("aria-valuenow") == "0.4")
+    until(page, lambda: slider(page, viewer, "cabinet/drawer").get_attribute("aria-valuenow") == "0.4")
+    other.close()

@@ -1,0 +1,110 @@
+from __future__ import annotations
+
+import logging
+
+import numpy as np
+import pytest
+from small_models import with_mesh
+
+from kineverse.model.body import Body, Box, Mesh, Shape
+from kineverse.view.meshes import load
+from kineverse.view.parts import MISSING, parts
+
+trimesh = pytest.importorskip("trimesh", reason="reading meshes needs the extra 'view'")
+
+OBJ = """\
+mtllib two.mtl
+v 0 0 0
+v 1 0 0
+v 0 1 0
+v 0 0 1
+usemtl red
+f 1 3 2
+f 1 2 4
+usemtl green
+f 1 4 3
+f 2 3 4
+"""
+MTL = "newmtl red\nKd 1 0 0\nnewmtl green\nKd 0 1 0\n"
+
+
+@pytest.fixture
+def tetrahedron(tmp_path):
+    (tmp_path / "two.obj").write_text(OBJ)
+    (tmp_path / "two.mtl").write_text(MTL)
+    trimesh.load_mesh(tmp_path / "two.obj").export(tmp_path / "two.stl")
+    return tmp_path
+
+
+@pytest.mark.parametrize("name", ["two.obj", "two.stl"])
+def test_a_mesh_has_its_size_and_scale(tetrahedron, name):
+    surface = load(Mesh(name, scale=(1.0, 2.0, 0.001), folder=str(tetrahedron))).surface
+    np.testing.assert_allclose(surface.bounds, [[0, 0, 0], [1, 2, 0.001]], atol=1e-7)
+    assert len(surface.faces) == 4
+
+
+def test_materials_of_an_obj_become_colours(tetrahedron):
+    colors = load(Mesh("two.obj", folder=str(tetrahedron))).surface.colors
+    assert {tuple(color) for color in colors.tolist()} == {(1.0, 0.0, 0.0, 1.0), (0.0, 1.0, 0.0, 1.0)}
+
+
+def test_equal_files_are_read_once(tetrahedron):
+    (tetrahedron / "copy.stl").write_bytes((tetrahedron / "two.stl").read_bytes())
+    one, other = (load(Mesh(name, folder=str(tetrahedron))) for name in ("two.stl", "copy.stl"))
+    assert one.surface is other.surface
+
+
+def test_a_unit_of_collada_is_honoured(tmp_path):
+    pytest.importorskip("collada")
+    data = trimesh.exchange.dae.export_collada(trimesh.creation.box())
+    data = data if isinstance(data, bytes) else data.encode()
+    start = data.index(b"<asset>") + len(b"<asset>")
+    inches = data[:start] + b'<unit name="inch" meter="0.0254"/>' + data[start:]
+    (tmp_path / "box.dae").write_bytes(data)
+    (tmp_path / "inches.dae").write_bytes(inches)
+    for name, edge in (("box.dae", 1.0), ("inches.dae", 0.0254)):
+        low, high = load(Mesh(name, folder=str(tmp_path))).surface.bounds
+        np.testing.assert_allclose(high - low, edge, rtol=1e-6)
+
+
+@pytest.mark.parametrize("content", [None, b"", b"this is no mesh", b"\x00\x01" * 400])
+@pytest.mark.parametrize("suffix", ["stl", "dae", "obj", "xyz123"])
+def test_what_cannot_be_loaded_is_a_marked_placeholder_and_said_once(tmp_path, caplog, content, suffix):
+    uri = f"broken_{suffix}_{len(content or b'')}.{suffix}"
+    if content is not None:
+        (tmp_path / uri).write_bytes(content)
+    caplog.set_level(logging.DEBUG)
+    for scale in (1.0, 2.0):
+        (part,) = parts(with_mesh(uri, str(tmp_path), scale=(scale, scale, scale)))
+        assert part.placeholder
+        assert part.problem
+        assert "\n" not in part.problem
+        assert part.color == MISSING
+    warnings = [r for r in caplog.records if r.levelno >= logging.WARNING]
+    assert len(warnings) == 1
+    assert uri in warnings[0].getMessage()
+
+
+def test_a_body_whose_meshes_are_missing_is_shown_by_its_collision_shapes(tmp_path):
+    model = with_mesh("missing.stl", str(tmp_path))
+    with model.edit() as edit:
+        body = Body(
+            visuals=(Shape(Mesh("gone.stl", folder=str(tmp_path))),), collisions=(Shape(Box((1, 2, 3))),)
+        )
+        edit.add_frame("other", parent="world", transform=np.eye(4), body=body)
+    by_frame = {part.frame: part for part in parts(model)}
+    assert by_frame["part"].placeholder
+    assert not by_frame["other"].placeholder
+    assert "gone.stl" in by_frame["other"].problem
+    np.testing.assert_allclose(by_frame["other"].surface.bounds[1], [0.5, 1.0, 1.5])
+
+
+def test_a_model_that_is_only_there_to_be_touched_is_shown_by_that():
+    import kineverse as kv
+
+    model = kv.Model()
+    with model.edit() as edit:
+        body = Body(collisions=(Shape(Box((1, 2, 3))),))
+        edit.add_frame("stone", parent="world", transform=np.eye(4), body=body)
+    assert [part.kind for part in parts(model)] == ["visual"]
+    assert [part.kind for part in parts(model, "collision")] == ["collision"]

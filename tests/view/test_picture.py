@@ -1,0 +1,145 @@
+from __future__ import annotations
+
+import struct
+import zlib
+
+import numpy as np
+import pytest
+from small_models import BLUE, RED, cabinet
+
+import kineverse as kv
+from kineverse.errors import ShapeError, UnknownNameError, ValueRejectedError
+from kineverse.view import Camera, picture, save
+from kineverse.view.png import encode_png
+
+FRONT = Camera((-3.0, 0.3, 1.0), (0.0, 0.0, 0.5))
+SMALL = (160, 120)
+
+
+def reddish(image):
+    r, g, b = np.moveaxis(image.astype(int), -1, 0)
+    return (r > 1.8 * g) & (r > 1.8 * b)
+
+
+def bluish(image):
+    r, g, b = np.moveaxis(image.astype(int), -1, 0)
+    return (b > 1.4 * r) & (b > 1.4 * g)
+
+
+def test_parts_are_seen_in_their_colours():
+    image = picture(cabinet(), camera=FRONT, size=SMALL)
+    assert image.shape == (120, 160, 3)
+    assert image.dtype == np.uint8
+    assert 150 < reddish(image).sum() < 3000
+    assert bluish(image).sum() > 300
+
+
+def test_opening_the_drawer_moves_red_pixels_and_shows_more_of_it():
+    model = cabinet()
+    side = Camera((-2.0, -3.0, 1.2), (0.0, 0.0, 0.5))
+    shut = reddish(picture(model, camera=side, size=SMALL))
+    open_ = reddish(picture(model, {"cabinet/drawer": 0.4}, camera=side, size=SMALL))
+    assert open_.sum() > 1.5 * shut.sum()
+
+
+def test_what_is_behind_is_hidden():
+    image = picture(cabinet(), camera=Camera((3.0, 0.0, 1.0), (0.0, 0.0, 0.5)), size=SMALL)
+    assert reddish(image).sum() == bluish(image).sum() == 0
+
+
+def test_the_automatic_camera_stands_where_moving_parts_are_seen():
+    image = picture(cabinet(), size=SMALL)
+    assert reddish(image).sum() > 50
+    assert bluish(image).sum() > 50
+
+
+def test_states_may_be_given_by_symbol_by_name_or_as_states_that_know_more():
+    model = cabinet()
+    door = kv.position("cabinet/door")
+    by_name = picture(model, {"cabinet/door": 1.0}, camera=FRONT, size=SMALL)
+    np.testing.assert_array_equal(by_name, picture(model, {door: 1.0}, camera=FRONT, size=SMALL))
+    more = kv.State({door: 1.0, kv.position("elsewhere"): 3.0})
+    np.testing.assert_array_equal(by_name, picture(model, more, camera=FRONT, size=SMALL))
+    np.testing.assert_array_equal(by_name, picture(model.snapshot(), more, camera=FRONT, size=SMALL))
+
+
+def test_unknown_names_are_refused_with_the_right_ones():
+    with pytest.raises(UnknownNameError, match="cabinet/door"):
+        picture(cabinet(), {"cabinet/dor": 1.0}, size=SMALL)
+
+
+def test_frames_are_drawn_on_demand_and_through_bodies():
+    plain = picture(cabinet(), camera=FRONT, size=(480, 360))
+    axes = picture(cabinet(), camera=FRONT, size=(480, 360), frames=True)
+    assert 200 < (plain != axes).any(axis=2).sum() < 10_000
+
+
+def test_collision_shapes_on_demand():
+    model = cabinet()
+    image = picture(model, camera=FRONT, size=SMALL, collisions=True)
+    assert bluish(image).sum() == 0
+
+
+@pytest.mark.parametrize("frames", [False, True])
+def test_models_without_bodies_show_their_frames(frames):
+    model = kv.Model()
+    empty = picture(model, size=(64, 48), frames=frames)
+    assert empty.shape == (48, 64, 3)
+    with model.edit() as edit:
+        edit.add_frame("a", parent="world", transform=kv.translation(1, kv.position("a"), 0))
+    assert len(np.unique(picture(model, size=(64, 48)).reshape(-1, 3), axis=0)) > 20
+
+
+@pytest.mark.parametrize("size", [(0, 10), (10, -1), (100_000, 100_000)])
+def test_sizes_that_are_no_picture_are_refused(size):
+    with pytest.raises(ValueRejectedError):
+        picture(cabinet(), size=size)
+
+
+@pytest.mark.parametrize("name", kv.shipped_models())
+def test_every_shipped_model_makes_a_picture(name):
+    image = picture(kv.load(name), size=SMALL)
+    assert len(np.unique(image.reshape(-1, 3), axis=0)) > 200
+
+
+def test_pictures_are_the_same_every_time():
+    np.testing.assert_array_equal(picture(cabinet(), size=SMALL), picture(cabinet(), size=SMALL))
+
+
+def test_save_writes_a_png_that_others_read(tmp_path):
+    imaging = pytest.importorskip("PIL.Image")
+    save(tmp_path / "cabinet.png", cabinet(), {"cabinet/door": 0.7}, size=SMALL)
+    with imaging.open(tmp_path / "cabinet.png") as file:
+        np.testing.assert_array_equal(np.asarray(file), picture(cabinet(), {"cabinet/door": 0.7}, size=SMALL))
+
+
+@pytest.mark.parametrize("channels", [3, 4])
+def test_a_png_says_what_it_is(channels):
+    pixels = np.random.default_rng(0).integers(0, 256, (5, 7, channels), dtype=np.uint8)
+    data = encode_png(pixels)
+    assert data.startswith(b"\x89PNG\r\n\x1a\n")
+    position, kinds = 8, []
+    while position < len(data):
+        (length,), kind = (
+            struct.unpack(">I", data[position : position + 4]),
+            data[position + 4 : position + 8],
+        )
+        body = data[position + 8 : position + 8 + length]
+        (check,) = struct.unpack(">I", data[position + 8 + length : position + 12 + length])
+        assert check == zlib.crc32(kind + body)
+        kinds.append(kind)
+        position += 12 + length
+    assert kinds == [b"IHDR", b"IDAT", b"IEND"]
+
+
+@pytest.mark.parametrize(
+    "wrong", [np.zeros((4, 4)), np.zeros((4, 4, 2), np.uint8), np.zeros((0, 4, 3), np.uint8)]
+)
+def test_what_is_no_image_is_refused(wrong):
+    with pytest.raises(ShapeError):
+        encode_png(wrong)
+
+
+def test_colours_of_the_models_are_what_this_file_takes_them_for():
+    assert RED[0] > 1.8 * max(RED[1:3])
+    assert BLUE[2] > 1.4 * max(BLUE[:2])

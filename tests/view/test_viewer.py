@@ -1,0 +1,168 @@
+from __future__ import annotations
+
+import socket
+import sys
+import urllib.request
+
+import numpy as np
+import pytest
+from small_models import cabinet, dependent, with_mesh
+
+import kineverse as kv
+from kineverse.errors import MissingExtraError, UnknownNameError, ValueRejectedError
+from kineverse.view import view
+
+pytest.importorskip("viser", reason="the page needs the extra 'view'")
+
+
+@pytest.fixture
+def page():
+    with view(cabinet(), port=0) as viewer:
+        yield viewer
+
+
+def sliders(viewer):
+    """Label, range and value of all sliders, by name; what the page shows."""
+    return {
+        name: (s.label, s.min, s.max, s.value)
+        for name, s in viewer._panel._sliders.items()  # the page itself is looked at in test_browser
+    }
+
+
+def test_the_page_is_served_to_this_computer_only(page, capfd):
+    assert page.address.startswith("http://127.0.0.1:")
+    with urllib.request.urlopen(page.address, timeout=10) as answer:
+        assert b"<html" in answer.read().lower()
+    port = int(page.address.rpartition(":")[2])
+    own = socket.gethostbyname(socket.gethostname())
+    if not own.startswith("127."):
+        with socket.socket() as probe, pytest.raises(OSError):
+            probe.settimeout(1.0)
+            probe.connect((own, port))
+    assert page._server.request_share_url() is None
+    assert capfd.readouterr().out == ""
+
+
+def test_there_is_a_slider_inside_its_limits_for_each_degree_of_freedom(page):
+    found = sliders(page)
+    assert found["cabinet/drawer"] == ("drawer [m]", 0.0, 0.4, 0.0)
+    assert found["cabinet/door"] == ("door [rad]", 0.0, 1.5, 0.0)
+    assert found["cabinet/knob"] == ("knob [rad]", -np.pi, np.pi, 0.0)
+
+
+def test_moving_and_resetting(page):
+    page.move({"cabinet/drawer": 0.3, kv.position("cabinet/door"): 0.5})
+    assert page.settled()
+    np.testing.assert_allclose(page.pose("cabinet/drawer")[:3, 3], [-0.3, 0, 0.7])
+    assert sliders(page)["cabinet/door"][3] == 0.5
+    page.reset()
+    assert page.settled()
+    np.testing.assert_allclose(page.pose("cabinet/drawer")[:3, 3], [0, 0, 0.7], atol=1e-12)
+    assert sliders(page)["cabinet/door"][3] == 0.0
+    with pytest.raises(UnknownNameError, match="cabinet/door"):
+        page.move({"cabinet/dor": 1.0})
+
+
+def test_violated_constraints_are_shown_also_those_on_several(page):
+    page.move({"cabinet/drawer": 0.4, "cabinet/door": 1.4})
+    assert page.settled()
+    assert "cabinet/no_clash" in page._panel._status.content
+    assert "1.8 is not in [−1, 1.6], by 0.2" in page._panel._status.content
+    # A value beyond its limits has a slider that reaches it.
+    page.move({"cabinet/door": 2.0})
+    assert page.settled()
+    assert sliders(page)["cabinet/door"][2] == 2.0
+    assert "cabinet/door/range" in page._panel._status.content
+
+
+def test_sliders_follow_limits_that_depend_on_the_state():
+    with view(dependent(), {"door": 0.2}, port=0) as page:
+        assert sliders(page)["drawer"][2] == pytest.approx(0.1)
+        page.move({"door": 1.0})
+        assert page.settled()
+        assert sliders(page)["drawer"][2] == pytest.approx(0.5)
+
+
+def test_the_page_follows_edits_and_keeps_what_is_still_there(page):
+    page.move({"cabinet/drawer": 0.25})
+    with page.model.edit() as edit:
+        edit.add_frame("lid", parent="world", transform=kv.translation(0, 0, kv.position("lid")))
+        edit.constrain("lid/range", 0.1, kv.position("lid"), 0.5)
+    assert page.settled()
+    assert sliders(page)["lid"] == ("lid [m]", 0.1, 0.5, 0.1)
+    assert sliders(page)["cabinet/drawer"][3] == 0.25
+    np.testing.assert_allclose(page.pose("lid")[2, 3], 0.1)
+
+
+def test_the_show_moves_what_has_limits(page):
+    page.play()
+    before = page.pose("cabinet/drawer")
+    for _ in range(200):
+        with page._change:
+            page._change.wait(timeout=0.5)
+        if np.abs(page.pose("cabinet/drawer") - before).max() > 0.01:
+            break
+    else:
+        pytest.fail("nothing moves")
+    assert page.values["cabinet/knob"] == 0.0
+    page.play(False)
+    assert page.settled()
+    page.reset()
+    assert page.values["cabinet/drawer"] == 0.0
+
+
+def test_a_model_without_anything_has_a_page():
+    with view(kv.Model(), port=0) as page:
+        assert page.settled()
+        assert page.values == {}
+
+
+def test_snapshots_have_a_page():
+    with view(cabinet().snapshot(), {"cabinet/door": 0.1}, port=0) as page:
+        assert page.values["cabinet/door"] == 0.1
+
+
+def test_switches_do_not_fail(page):
+    scene = page._scene
+    scene.show_frames(True, True, "door")
+    page.move({"cabinet/door": 0.3})
+    assert page.settled()
+    assert "This state cannot be shown" not in page._panel._status.content
+    scene.show_collisions(True)
+    scene.show_visuals(False)
+    scene.show_ground(False)
+    scene.show_frames(False)
+
+
+def test_missing_meshes_are_said(tmp_path):
+    with view(with_mesh("nowhere.stl", str(tmp_path)), port=0) as page:
+        (line,) = page.problems
+        assert "nowhere.stl" in line
+
+
+def test_ports_that_are_taken_or_none_are_refused(page):
+    taken = int(page.address.rpartition(":")[2])
+    with pytest.raises(ValueRejectedError, match="taken"):
+        view(cabinet(), port=taken)
+    with pytest.raises(ValueRejectedError, match="65535"):
+        view(cabinet(), port=70_000)
+
+
+def test_stopping_twice_is_fine_and_frees_the_port():
+    page = view(cabinet(), port=0)
+    page.stop()
+    page.stop()
+    with socket.socket() as probe:
+        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        probe.bind(("127.0.0.1", int(page.address.rpartition(":")[2])))
+
+
+def test_without_viser_the_extra_is_named(monkeypatch):
+    monkeypatch.setitem(sys.modules, "viser", None)
+    with pytest.raises(MissingExtraError, match=r"pip install 'kineverse-articulation\[view\]'"):
+        view(cabinet(), port=0)
+
+
+def test_an_unknown_name_in_the_state_leaves_no_server_behind():
+    with pytest.raises(UnknownNameError):
+        view(cabinet(), {"nothing": 1.0}, port=0)
