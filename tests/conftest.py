@@ -1,8 +1,8 @@
 """What holds for every test: where models are found, a cache of its own, and what becomes of browser tests.
 
-A test that drives a browser carries the marker ``browser`` and asks for the fixture ``chromium``, the path of the
-system's Chromium. Without one it is skipped, and the summary names it; with ``KINEVERSE_REQUIRE_BROWSER=1`` it
-fails.
+A test that drives a browser carries the marker ``browser`` and asks for the fixture ``chromium``, the path of
+the system's Chromium. Without one it is skipped and the summary names it, or with
+``KINEVERSE_REQUIRE_BROWSER=1`` it fails.
 """
 
 from __future__ import annotations

@@ -8,6 +8,7 @@ import io
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import zip_longest
 from pathlib import Path
 
 import pytest
@@ -33,10 +34,14 @@ def examples(file: Path, language: str = "python") -> Iterator[Example]:
     """Yield the examples of a file in their order."""
     text = file.read_text(encoding="utf-8")
     blocks = list(_BLOCK.finditer(text))
-    for block, following in zip(blocks, [*blocks[1:], None], strict=True):
+    for block, following in zip_longest(blocks, blocks[1:]):
         if block[1] != language:
             continue
-        below = following is not None and following[1] == "text" and not text[block.end() : following.start()].strip()
+        below = (
+            following is not None
+            and following[1] == "text"
+            and not text[block.end() : following.start()].strip()
+        )
         output = following[2] if following is not None and below else None
         yield Example(file, text.count("\n", 0, block.start()) + 1, block[2], output)
 
@@ -52,9 +57,7 @@ def run(file: Path) -> None:
             exec(code, names)
         if example.output is not None and not agree(example.output, printed.getvalue()):
             where = f"{example.file.relative_to(ROOT)}, line {example.line}"
-            pytest.fail(
-                f"{where} says\n{example.output}\nbut it prints\n{printed.getvalue()}", pytrace=False
-            )
+            pytest.fail(f"{where} says\n{example.output}\nbut it prints\n{printed.getvalue()}", pytrace=False)
 
 
 def agree(wanted: str, got: str) -> bool:

@@ -6,6 +6,7 @@ import re
 from pathlib import Path
 
 import pytest
+
 from examples import ROOT, agree, examples, run
 
 PAGES = [ROOT / name for name in ("README.md", "CONTRIBUTING.md", "CHANGELOG.md")]

@@ -1,4 +1,7 @@
-"""The README: its tour is short and runs as printed, its commands exist, and it says what the package is called."""
+"""The README: its tour is short, its commands work, and it says what the package is called.
+
+That the tour prints what is printed below it is tested with the other pages in ``test_docs``.
+"""
 
 from __future__ import annotations
 
@@ -7,8 +10,8 @@ import tomllib
 from pathlib import Path
 
 import pytest
-from examples import ROOT, examples
 
+from examples import ROOT, examples
 from kineverse.cli import main
 
 README = ROOT / "README.md"

@@ -32,7 +32,6 @@ import casadi as ca
 from .errors import ExpressionError, ValueRejectedError
 from .expressions.expression import Expression, ExpressionLike, as_expression, broadcast
 from .expressions.functions import tanh
-from .expressions.leaves import gradient_keys
 from .expressions.node import Node
 from .symbols import Symbol
 
@@ -103,11 +102,9 @@ class _Logic(Node):
     def _gradient(self, heuristic: bool) -> Mapping[Symbol, Expression]:
         return self._trend() if heuristic else {}
 
-    def gradient_keys(self, heuristic: bool) -> frozenset[Symbol]:
-        """Return the derivative symbols of the gradient, without building it."""
-        if not heuristic:
-            return frozenset()
-        return frozenset().union(*(gradient_keys(a) for a in self.arguments))
+    def differentiated(self, heuristic: bool) -> tuple[Expression, ...]:
+        """Return the operands for a trend; as a fact the node is constant."""
+        return self.arguments if heuristic else ()
 
     def _trend(self) -> Mapping[Symbol, Expression]:
         raise NotImplementedError

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from typing import Any
 
-from .errors import UnknownNameError, ValueRejectedError, suggest
+from .errors import ExpressionError, NameTakenError, UnknownNameError, ValueRejectedError, suggest
 from .symbols import Symbol, parse_symbol_name
 
 
@@ -28,6 +28,8 @@ class State(Mapping[Symbol, float]):
     ------
     ValueRejectedError
         For NaN or values that are not numbers.
+    NameTakenError
+        If a symbol is given a value and its name another one.
     """
 
     __slots__ = ("_by_name", "_values", "source", "stamp")
@@ -35,19 +37,23 @@ class State(Mapping[Symbol, float]):
     def __init__(
         self, values: Mapping[Any, float] | None = None, *, stamp: float | None = None, source: str = ""
     ) -> None:
-        self._values: dict[Symbol, float] = {}
+        if not isinstance(values, Mapping | None):
+            raise ExpressionError(f"A state is made from a mapping {{name: number}}, not {values!r}.")
+        known: dict[Symbol, float] = {}
         for key, value in (values or {}).items():
-            symbol = key if isinstance(key, Symbol) else Symbol(*parse_symbol_name(key))
-            try:
-                number = float(value)
-            except (TypeError, ValueError):
-                raise ValueRejectedError(f"The value of '{symbol}' is not a number: {value!r}.") from None
-            if number != number:
-                raise ValueRejectedError(f"The value of '{symbol}' is NaN.")
-            self._values[symbol] = number
-        self._by_name = {str(s): s for s in self._values}
+            symbol = _symbol(key)
+            if symbol in known:
+                raise NameTakenError(f"There are two values for '{symbol}'.")
+            known[symbol] = _number(symbol, value)
+        self._values = known
+        self._by_name = {str(s): s for s in known}
         self.stamp = stamp
-        self.source = source
+        self.source = source  # from here on immutable
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        if hasattr(self, "source"):
+            raise ExpressionError("States are immutable; use updated({symbol: number}, stamp=...).")
+        object.__setattr__(self, name, value)
 
     def __getitem__(self, key: Symbol | str) -> float:
         symbol = self._by_name.get(key) if isinstance(key, str) else key
@@ -94,6 +100,26 @@ class State(Mapping[Symbol, float]):
         more = f", ... {len(self) - 8} more" if len(self) > 8 else ""
         when = "" if self.stamp is None else f", stamp={self.stamp:g}"
         return f"State({{{shown}{more}}}{when})"
+
+
+def _symbol(key: object) -> Symbol:
+    if isinstance(key, Symbol):
+        return key
+    if not isinstance(key, str):
+        raise ExpressionError(f"A state has symbols or their names as keys, not {key!r}.")
+    return Symbol(*parse_symbol_name(key))
+
+
+def _number(symbol: Symbol, value: Any) -> float:
+    try:
+        if isinstance(value, (str, bytes)):
+            raise TypeError
+        number = float(value)
+    except (TypeError, ValueError, OverflowError):
+        raise ValueRejectedError(f"The value of '{symbol}' is not a number: {value!r}.") from None
+    if number != number:
+        raise ValueRejectedError(f"The value of '{symbol}' is NaN.")
+    return number
 
 
 def _restore(values: dict[Symbol, float], stamp: float | None, source: str) -> State:

@@ -8,6 +8,7 @@ in every process. Their text name is the path for a position and ``path:velocity
 from __future__ import annotations
 
 import re
+import threading
 from collections.abc import Iterable, Sequence
 from typing import Any, Literal, TypeAlias, get_args
 
@@ -19,9 +20,11 @@ from .expressions.expression import NO_NODES, SYMBOLS, Expression
 Role: TypeAlias = Literal["dof", "parameter", "contact", "location"]
 
 ROLES: tuple[Role, ...] = get_args(Role)
+_UNPRINTABLE = re.compile("[\x00-\x1f\ud800-\udfff]")
 ORDER_NAMES = ("position", "velocity", "acceleration", "jerk", "snap")
 
 _INTERNED: dict[tuple[str, int, str, float | None], Symbol] = {}
+_INTERNING = threading.Lock()
 
 
 class Symbol(Expression):
@@ -51,23 +54,32 @@ class Symbol(Expression):
     def __new__(cls, path: str, order: int = 0, role: Role = "dof", value: float | None = None) -> Symbol:
         """Return the one symbol of this path, order, role and value."""
         key = (path, order, role, value)
-        known = _INTERNED.get(key)
-        if known is not None:
-            return known
+        if type(path) is str and type(order) is int and key in _INTERNED:
+            return _INTERNED[key]
         _check(path, order, role, value)
         self = object.__new__(cls)
         self._text = symbol_name(path, order)
-        self._set(ca.SX.sym(self._text), (), NO_NODES)
-        self.path, self.order, self.role, self.value = path, order, role, value
-        self.sort_key = (path, order, role, 0.0 if value is None else value)
+        # The name is part of what CasADi serialises, so symbols that differ have names that differ.
+        kind = "" if role == "dof" else f":{role}" if value is None else f":{role}:{value!r}"
+        self._set(ca.SX.sym(f"{self._text}{kind}"), (), NO_NODES)
         self._leaves = ((self,), ())
-        self = _INTERNED.setdefault(key, self)
-        SYMBOLS[self._sx.element_hash()] = self
-        return self
+        self.path, self.order, self.role, self.value = path, order, role, value
+        self.sort_key = (path, order, role, 0.0 if value is None else value)  # from here on immutable
+        with _INTERNING:
+            known = _INTERNED.get(key)
+            if known is None:
+                SYMBOLS[self._sx.element_hash()] = self
+                _INTERNED[key] = known = self
+        return known
 
     def __init__(self, *_: Any, **__: Any) -> None:
         # Everything happens once, in __new__.
         pass
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        if not name.startswith("_") and hasattr(self, "sort_key"):
+            raise ExpressionError(f"Symbols are immutable: '{self}' keeps its {name}.")
+        object.__setattr__(self, name, value)
 
     @property
     def has_derivative(self) -> bool:
@@ -128,8 +140,10 @@ def _check(path: str, order: int, role: str, value: float | None) -> None:
         raise ExpressionError(
             f"A symbol needs a path, a non-empty text such as 'kitchen/fridge_door', not {path!r}."
         )
-    if any(not part for part in path.split("/")) or any(ord(c) < 32 for c in path):
-        raise ExpressionError(f"The path {path!r} has an empty part or a control character.")
+    if any(not part for part in path.split("/")) or _UNPRINTABLE.search(path):
+        raise ExpressionError(
+            f"The path {path!r} has an empty part, a control character or half of a surrogate pair."
+        )
     if role not in ROLES:
         raise ExpressionError(f"Unknown role {role!r}; roles are {', '.join(ROLES)}.")
     if isinstance(order, bool) or not isinstance(order, int) or order < 0:
@@ -163,7 +177,13 @@ def parameter(path: str, value: float) -> Symbol:
 
     ``D`` of a parameter is empty. Two parameters of one path and different values are different symbols.
     """
-    return Symbol(path, 0, "parameter", float(value))
+    if isinstance(value, (str, bytes, bool)):
+        raise ValueRejectedError(f"Parameter '{path}' needs a number as its value, not {value!r}.")
+    try:
+        number = float(value)
+    except (TypeError, ValueError, OverflowError):
+        raise ValueRejectedError(f"Parameter '{path}' needs a number as its value, not {value!r}.") from None
+    return Symbol(path, 0, "parameter", number)
 
 
 def symbol_name(path: str, order: int) -> str:

@@ -131,8 +131,9 @@ def test_frames_and_their_names_are_shown_on_demand(opened):
     page.get_by_label("frames", exact=True).check()
     until(page, lambda: viewer._scene._axes is not None)
     until(page, lambda: (shot(page) != before).any(axis=2).sum() > 200)
+    unnamed = shot(page)
     page.get_by_label("frame names").check()
-    page.get_by_text("cabinet/knob", exact=True).wait_for()
+    until(page, lambda: (shot(page) != unnamed).any(axis=2).sum() > 200)
     page.get_by_label("bodies").uncheck()
     until(page, lambda: reddish(shot(page)).sum() < 0.2 * reddish(before).sum())
 

@@ -80,6 +80,7 @@ class DifferentialDrive(Joint):
     wheel_speed: float | None = None
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         if not (self.radius > 0 and self.track > 0):
             raise ValueRejectedError(
                 f"Base '{self.name}' needs a positive wheel radius and track, "

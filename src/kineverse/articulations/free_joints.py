@@ -14,7 +14,7 @@ from kineverse.spatial import quaternion, rotation_z, snapped, translation
 from kineverse.symbols import position, velocity
 
 from .axis_joints import unit_axis
-from .joint import Joint
+from .joint import Joint, checked_axis, limits
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -40,10 +40,12 @@ class Planar(Joint):
     upper: float | None = None
     velocity: float | None = None
 
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        object.__setattr__(self, "axis", checked_axis(self.axis, self.name))
+
     def apply(self, model: Reader) -> Effects:
         """Write the child frame and the limits."""
-        from .joint import limits
-
         x, y, angle = (position(f"{self.name}/{c}") for c in ("x", "y", "angle"))
         turn = _from_z(self.axis)
         motion = (Pose.of(turn), translation(x, y, 0), rotation_z(angle), Pose.of(turn.T))

@@ -41,6 +41,10 @@ class Joint(Operation):
     origin: Pose = Pose()
     dynamics: tuple[tuple[str, Any], ...] = ()
 
+    def __post_init__(self) -> None:
+        if not isinstance(self.origin, (Pose, Expression)):
+            object.__setattr__(self, "origin", Pose.of(self.origin))
+
     def default_tag(self) -> str:
         """Return ``joint`` and the name."""
         return f"joint {self.name}"
@@ -94,8 +98,8 @@ class AxisJoint(Joint):
     position: Expression | None = None
 
     def __post_init__(self) -> None:
-        if normalised(self.axis) is None:
-            raise ValueRejectedError(f"The axis of joint '{self.name}' has length zero.")
+        super().__post_init__()
+        object.__setattr__(self, "axis", checked_axis(self.axis, self.name))
 
     @property
     def q(self) -> Expression:
@@ -119,6 +123,24 @@ class AxisJoint(Joint):
                 )
             },
         )
+
+
+def checked_axis(axis: Vector3, name: str) -> Vector3:
+    """Return the axis of a joint as a tuple of numbers.
+
+    Raises
+    ------
+    ValueRejectedError
+        If it is not three numbers with a direction.
+    """
+    try:
+        x, y, z = map(float, axis)
+    except (TypeError, ValueError):
+        raise ValueRejectedError(f"The axis of joint '{name}' is three numbers, not {axis!r}.") from None
+    if normalised((x, y, z)) is None:
+        problem = "has length zero" if (x, y, z) == (0, 0, 0) else f"is {(x, y, z)}, which is no direction"
+        raise ValueRejectedError(f"The axis of joint '{name}' {problem}.")
+    return x, y, z
 
 
 def limits(

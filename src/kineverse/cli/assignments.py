@@ -9,7 +9,7 @@ from collections.abc import Iterable
 
 from kineverse.errors import ValueRejectedError
 
-_NUMBER = r"(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
+_NUMBER = r"(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][-+]?[0-9]+)?"
 _VALUE = re.compile(
     rf"(?P<sign>[-+]?)\s*(?:(?P<number>{_NUMBER})?\s*(?:(?P<times>\*?)\s*(?P<pi>pi|π))?)"
     rf"\s*(?:/\s*(?P<divisor>{_NUMBER}))?\s*(?P<unit>deg|°|rad|mm|cm|m)?"

@@ -7,7 +7,7 @@ import sys
 from typing import TYPE_CHECKING
 
 from kineverse.cli.table import figure, table
-from kineverse.cli.view import add_page_options, announce, terminated_as_interrupted, wait
+from kineverse.cli.view import add_page_options, announce, until_interrupted
 
 if TYPE_CHECKING:
     import kineverse as kv
@@ -75,12 +75,12 @@ def run(arguments: argparse.Namespace) -> int:
     from kineverse.view.viewer import Viewer
 
     with (
-        terminated_as_interrupted(),
+        until_interrupted(),
         Viewer(model, _state(model), port=arguments.port, label="Kineverse demo", camera=_camera()) as page,
     ):
         announce(page, browser=not arguments.no_browser)
-        print(_contents(model))
-        wait(page)
+        print(_contents(model), flush=True)
+        page.wait()
     return 0
 
 
@@ -117,6 +117,8 @@ def _headless(model: kv.Model, path: str) -> int:
     from kineverse.cli.drive import drive
     from kineverse.view import save
 
+    # First: a path that cannot be written to should not be found out at the end.
+    save(path, model, _state(model), camera=_camera())
     print(_contents(model), flush=True)
     result = drive(model)
     print(
@@ -125,6 +127,5 @@ def _headless(model: kv.Model, path: str) -> int:
     )
     for line in result.problems[:10]:
         print(f"kineverse: {line}", file=sys.stderr)
-    save(path, model, _state(model), camera=_camera())
     print(f"picture: {path}")
     return 1 if result.problems else 0

@@ -5,9 +5,14 @@ from __future__ import annotations
 import argparse
 import json
 import sys
+from collections.abc import Mapping
+from typing import TYPE_CHECKING
 
 from kineverse.cli.assignments import add_set_option, parse_assignments
 from kineverse.cli.table import figure
+
+if TYPE_CHECKING:
+    import kineverse as kv
 
 HELP = """print where a frame is, for given positions
 
@@ -43,7 +48,8 @@ def run(arguments: argparse.Namespace) -> int:
     expression = model.fk(arguments.frame, arguments.relative_to)
     values = complete(model, assigned)
     pose = np.asarray(expression(kv.State(values)), dtype=float)
-    position, wxyz, rpy = pose[:3, 3], quaternions(pose[None])[0], roll_pitch_yaw(pose)
+    position, rpy = pose[:3, 3], roll_pitch_yaw(pose)
+    xyzw = np.roll(quaternions(pose[None])[0], -1)
     used = {str(s): values[str(s)] for s in expression.symbols if str(s) in values}
     if arguments.json:
         answer = {
@@ -51,7 +57,7 @@ def run(arguments: argparse.Namespace) -> int:
             "relative_to": arguments.relative_to,
             "transform": pose.tolist(),
             "position": position.tolist(),
-            "quaternion_wxyz": wxyz.tolist(),
+            "quaternion_xyzw": xyzw.tolist(),
             "roll_pitch_yaw": rpy.tolist(),
             "depends_on": used,
         }
@@ -62,7 +68,7 @@ def run(arguments: argparse.Namespace) -> int:
         for name, numbers, unit in (
             ("position", position, "m"),
             ("roll pitch yaw", rpy, "rad"),
-            ("quaternion wxyz", wxyz, ""),
+            ("quaternion xyzw", xyzw, ""),
         ):
             print(f"  {name:<16}" + "".join(f"{figure(x, 6):>12}" for x in numbers) + f"  {unit}".rstrip())
         if used:
@@ -71,7 +77,7 @@ def run(arguments: argparse.Namespace) -> int:
     return 0
 
 
-def _warn_of_violations(model, values) -> None:  # type: ignore[no-untyped-def]
+def _warn_of_violations(model: kv.Model, values: Mapping[str, float]) -> None:
     for violation in model.violations(values):
         print(
             f"kineverse: note: {violation.name} is violated: {figure(violation.value)} is not in "

@@ -6,7 +6,8 @@ import argparse
 import logging
 import os
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from typing import TextIO
 
 from kineverse._version import __version__
@@ -44,9 +45,9 @@ def main(argv: Sequence[str] | None = None) -> int:
         arguments = parser().parse_args(argv)
     except SystemExit as stop:  # argparse ends the process itself; a function returns.
         return stop.code if isinstance(stop.code, int) else WRONG
-    _log_to(sys.stderr, arguments.verbose)
     try:
-        status: int = arguments.run(arguments)
+        with _warnings_on(sys.stderr, arguments.verbose):
+            status: int = arguments.run(arguments)
         sys.stdout.flush()
     except BrokenPipeError:
         _forget_stdout()
@@ -93,17 +94,22 @@ def one_line(error: BaseException) -> str:
     return " ".join(str(error).split()) or type(error).__name__
 
 
-def _log_to(stream: TextIO, verbose: bool) -> None:
-    """Show the library's warnings on a line each; meshes that are missing are counted by the commands."""
-    log = logging.getLogger("kineverse")
-    for handler in [h for h in log.handlers if h.get_name() == "command line"]:
-        log.removeHandler(handler)
+@contextmanager
+def _warnings_on(stream: TextIO, verbose: bool) -> Iterator[None]:
+    """Show what the library logs, on a line each; meshes that are missing are counted by the commands."""
     handler = logging.StreamHandler(stream)
-    handler.set_name("command line")
     handler.setFormatter(logging.Formatter("kineverse: %(message)s"))
+    log, meshes = logging.getLogger("kineverse"), logging.getLogger("kineverse.view.meshes")
+    levels = log.level, meshes.level
     log.addHandler(handler)
     log.setLevel(logging.INFO if verbose else logging.WARNING)
-    logging.getLogger("kineverse.view.meshes").setLevel(logging.INFO if verbose else logging.ERROR)
+    meshes.setLevel(logging.INFO if verbose else logging.ERROR)
+    try:
+        yield
+    finally:
+        log.removeHandler(handler)
+        log.setLevel(levels[0])
+        meshes.setLevel(levels[1])
 
 
 def _forget_stdout() -> None:

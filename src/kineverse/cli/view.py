@@ -44,13 +44,13 @@ def run(arguments: argparse.Namespace) -> int:
     import kineverse as kv
     from kineverse.view.viewer import Viewer
 
-    model = kv.load(arguments.model)
     label = os.path.basename(arguments.model)
-    with terminated_as_interrupted(), Viewer(model, assigned, port=arguments.port, label=label) as page:
+    model = kv.load(arguments.model)
+    with until_interrupted(), Viewer(model, assigned, port=arguments.port, label=label) as page:
         note_problems(page.problems)
         announce(page, browser=not arguments.no_browser)
-        print(model)
-        wait(page)
+        print(model, flush=True)
+        page.wait()
     return 0
 
 
@@ -66,15 +66,6 @@ def announce(page: Viewer, browser: bool) -> None:
         webbrowser.open(page.address)
 
 
-def wait(page: Viewer) -> None:
-    """Wait for Ctrl-C, which is how one is supposed to leave."""
-    sys.stdout.flush()
-    try:
-        page.wait()
-    except KeyboardInterrupt:
-        print(file=sys.stderr)
-
-
 def note_problems(problems: list[str]) -> None:
     """Say on standard error, in one line, that meshes are missing."""
     if problems:
@@ -83,8 +74,8 @@ def note_problems(problems: list[str]) -> None:
 
 
 @contextmanager
-def terminated_as_interrupted() -> Iterator[None]:
-    """Let SIGTERM, by which service managers stop programs, end as Ctrl-C does."""
+def until_interrupted() -> Iterator[None]:
+    """Take Ctrl-C as the way to leave that it is, and SIGTERM, by which programs are stopped, as the same."""
 
     def interrupt(*_: object) -> None:
         raise KeyboardInterrupt
@@ -92,5 +83,7 @@ def terminated_as_interrupted() -> Iterator[None]:
     before = signal.signal(signal.SIGTERM, interrupt)
     try:
         yield
+    except KeyboardInterrupt:
+        print(file=sys.stderr)
     finally:
         signal.signal(signal.SIGTERM, before)

@@ -9,17 +9,18 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ..errors import CompileError, ShapeError
+from kineverse.errors import CompileError, ShapeError
+
 from .batch_source import batch_source, vectorisable
 from .binding import Array, Shape, bind
 from .library import Library
+from .memory import aligned
 from .program import CasadiFunction, Program
 from .rows import cores, over_rows
 from .signature import Signature, numbers
 
 # Results beyond this are written past the caches: nobody could read them from there in time.
 _STREAMED_BYTES = 8 * 2**20
-_CACHE_LINE = 64
 # So many rows at a time go through CasADi's map.
 _MAPPED = 32
 
@@ -74,9 +75,12 @@ class Batch:
         """
         points = self._points(x)
         rows = len(points)
-        results = self._allocated(rows) if out is None else self._checked(out, rows, points)
-        if any(np.may_share_memory(points, result) for result in results):
-            points = points.copy()
+        if out is None:
+            results = self._allocated(rows)
+        else:
+            results = self._checked(out, rows)
+            if any(np.may_share_memory(points, result) for result in results):
+                points = points.copy()
         code = self._code(rows)
         if code is None:
             self._interpret(points, results, function)
@@ -93,23 +97,25 @@ class Batch:
         return np.ascontiguousarray(points)
 
     def _allocated(self, rows: int) -> list[Array]:
-        """Return new arrays that begin at cache lines, so that they can be written in whole lines."""
-        results = []
-        for shape, size in zip(self._shapes, self._program.sizes, strict=True):
-            memory = np.empty(rows * size + _CACHE_LINE // 8)
-            start = -memory.ctypes.data % _CACHE_LINE // 8
-            results.append(memory[start : start + rows * size].reshape(rows, *shape))
-        return results
+        """Return arrays that begin at cache lines, so that they can be written in whole lines."""
+        return [
+            aligned(rows * size).reshape(rows, *shape)
+            for shape, size in zip(self._shapes, self._program.sizes, strict=True)
+        ]
 
-    def _checked(self, out: Any, rows: int, points: Array) -> list[Array]:
+    def _checked(self, out: Any, rows: int) -> list[Array]:
         given = [out] if isinstance(out, np.ndarray) else list(out)
         if len(given) != len(self._shapes):
             raise ShapeError(f"out= takes {len(self._shapes)} arrays, one per output, not {len(given)}.")
         for i, (array, shape) in enumerate(zip(given, self._shapes, strict=True)):
             wanted = (rows, *shape)
             if not isinstance(array, np.ndarray) or array.dtype != np.float64 or array.shape != wanted:
-                found = f"{array.dtype} {array.shape}" if isinstance(array, np.ndarray) else type(array).__name__
-                raise ShapeError(f"out= for output {i} must be a float64 array of shape {wanted}, not {found}.")
+                found = (
+                    f"{array.dtype} {array.shape}" if isinstance(array, np.ndarray) else type(array).__name__
+                )
+                raise ShapeError(
+                    f"out= for output {i} must be a float64 array of shape {wanted}, not {found}."
+                )
             if not (array.flags.c_contiguous and array.flags.writeable and array.flags.aligned):
                 raise ShapeError(f"out= for output {i} must be C-contiguous, aligned and writeable.")
             if any(np.may_share_memory(array, other) for other in given[:i]):
@@ -139,7 +145,7 @@ class Batch:
         rows, size = points.shape
         sizes = self._program.sizes
         streaming = sum(result.nbytes for result in results) > _STREAMED_BYTES
-        begin, begins = points.ctypes.data, [result.ctypes.data for result in results]
+        begin, *begins = (array.__array_interface__["data"][0] for array in (points, *results))
 
         def work(first: int, end: int) -> None:
             places = (ctypes.c_void_p * len(sizes))(

@@ -122,7 +122,16 @@ int kineverse_batch(const double *in, double *const *out, long long rows, int st
 def vectorisable(program: Program) -> bool:
     """Whether every operation of the program can be done on vectors."""
     function = program.function
-    known = {*_PLAIN, *_TRUTH, ca.OP_SIN, ca.OP_COS, ca.OP_IF_ELSE_ZERO, ca.OP_INPUT, ca.OP_OUTPUT, ca.OP_CONST}
+    known = {
+        *_PLAIN,
+        *_TRUTH,
+        ca.OP_SIN,
+        ca.OP_COS,
+        ca.OP_IF_ELSE_ZERO,
+        ca.OP_INPUT,
+        ca.OP_OUTPUT,
+        ca.OP_CONST,
+    }
     return all(function.instruction_id(k) in known for k in range(function.n_instructions()))
 
 
@@ -162,7 +171,9 @@ def batch_source(program: Program) -> str:
 def _part(plan: Schedule, part: Part, number: int) -> str:
     lines = [f"static NOINLINE void part{number}(const V *restrict x, V *restrict store, V *restrict o) {{"]
     lines += [f"  const V v{value} = store[{place}];" for value, place in part.loads.items()]
-    angles = {op: {plan.steps[v].arguments[0]: v for v in part.values if plan.steps[v].op == op} for op in _CIRCLE}
+    angles = {
+        op: {plan.steps[v].arguments[0]: v for v in part.values if plan.steps[v].op == op} for op in _CIRCLE
+    }
     truths: set[int] = set()
     done: set[int] = set()
     for value in part.values:

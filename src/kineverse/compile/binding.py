@@ -14,7 +14,8 @@ from typing import Any, TypeAlias
 import numpy as np
 import numpy.typing as npt
 
-from ..errors import ValueRejectedError
+from kineverse.errors import ValueRejectedError
+
 from .program import CasadiFunction
 
 Vector: TypeAlias = npt.NDArray[np.float64]
@@ -24,7 +25,9 @@ Call: TypeAlias = Callable[[Any], Any]
 Shape: TypeAlias = tuple[int, ...]
 
 
-def bind(function: CasadiFunction, vector: Vector, outputs: Sequence[Array], checked: bool) -> tuple[Run, object]:
+def bind(
+    function: CasadiFunction, vector: Vector, outputs: Sequence[Array], checked: bool
+) -> tuple[Run, object]:
     """Bind a function of one vector to arrays.
 
     Parameters

@@ -131,7 +131,9 @@ def _open(folder: str | None, caches: str | None, home: str | None) -> LibraryCa
     reason = _why_not(wanted)
     if reason is None:
         return LibraryCache(wanted)
-    logger.warning("Compiled functions are not kept for other processes: the cache folder %s %s.", wanted, reason)
+    logger.warning(
+        "Compiled functions are not kept for other processes: the cache folder %s %s.", wanted, reason
+    )
     return LibraryCache(Path(_private_folder().name))
 
 

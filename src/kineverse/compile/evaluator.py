@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
+from abc import ABCMeta
 from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 
-from .binding import Array, Run, Shape, Vector, bind
-from .program import CasadiFunction
+from .binding import Array, Run, Shape, Vector
 
 
-class Evaluator:
+class Evaluator(metaclass=ABCMeta):
     """A function with a place for its input and for its outputs, for one thread.
 
     Fill :attr:`input`, call, read :attr:`outputs`. Every call rewrites the arrays in :attr:`outputs` in place:
@@ -59,11 +59,18 @@ class Evaluator:
                 self._view[:] = self._convert(x)
         self._run()
 
-    def _rebind(self, function: CasadiFunction, checked: bool) -> None:
-        """Evaluate by another function from the next call on, in the same memory."""
-        run, buffer = bind(function, self.input, self.outputs, checked)
+    def _evaluate_by(self, run: Run, keep: object) -> None:
+        """Evaluate by something else from the next call on, in the same memory.
+
+        Parameters
+        ----------
+        run
+            What reads :attr:`input` and writes :attr:`outputs`.
+        keep
+            What has to live as long as ``run`` may be called.
+        """
         # A call may be running in another thread: what it uses must stay.
-        self._kept.append(buffer)
+        self._kept.append(keep)
         object.__setattr__(self, "_run", run)
 
     _kept: list[object]
@@ -72,8 +79,12 @@ class Evaluator:
     _convert: Callable[[Any], Vector]
 
     def __setattr__(self, name: str, value: object) -> None:
-        raise AttributeError(f"Evaluators write in place; for the input, say evaluator.input[:] = x (not {name} = ...).")
+        raise AttributeError(
+            f"Evaluators write in place; for the input, say evaluator.input[:] = x (not {name} = ...)."
+        )
 
     def __repr__(self) -> str:
-        outputs = ", ".join(str(o.shape) for o in self.outputs[:6]) + (", ..." if len(self.outputs) > 6 else "")
+        outputs = ", ".join(str(o.shape) for o in self.outputs[:6]) + (
+            ", ..." if len(self.outputs) > 6 else ""
+        )
         return f"Evaluator({self.input.size} inputs -> {outputs})"

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import ctypes
 import logging
 import threading
 from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 from typing import Any, Literal, TypeAlias
 from weakref import WeakSet
 
@@ -12,13 +14,15 @@ import casadi as ca
 import numpy as np
 import numpy.typing as npt
 
-from ..errors import CompileError, ValueRejectedError
-from ..expressions import Expression, ExpressionLike, array
-from ..symbols import Symbol
+from kineverse.errors import CompileError, ValueRejectedError
+from kineverse.expressions import Expression, ExpressionLike, array
+from kineverse.symbols import Symbol
+
 from .batch import Batch
-from .binding import Shape, pooled
+from .binding import Array, Shape, Vector, bind, pooled
 from .evaluator import Evaluator
-from .library import NO_COMPILER, Library
+from .library import Library
+from .native import MOST_OUTPUTS, native
 from .program import NAME, CasadiFunction, Program
 from .signature import signature
 
@@ -29,6 +33,8 @@ WantedTier: TypeAlias = Literal["auto", "interpreter", "c"]
 
 # Below, a call costs the same in both tiers: it is all overhead.
 _WORTH_COMPILING = 12
+# So many operations take some microseconds: others may have the GIL meanwhile.
+_LENGTHY = 5000
 
 
 def compile(  # noqa: A001
@@ -104,7 +110,7 @@ class CompiledFunction:
     """
 
     __slots__ = (
-        "__weakref__", "_batch", "_call", "_evaluators", "_function", "_library", "_lock", "_outputs", "_program",
+        "__weakref__", "_batch", "_call", "_evaluators", "_function", "_library", "_lock", "_native", "_outputs", "_program",
         "_signature", "_single", "_wanted", "inputs", "names", "shapes", "tier",
     )  # fmt: skip
 
@@ -133,15 +139,18 @@ class CompiledFunction:
         self._evaluators: WeakSet[Evaluator] = WeakSet()
         self._program = program = Program(outputs, self.inputs)
         self._batch: Batch | None = None
-        self._library: Library[CasadiFunction] | None = None
+        self._library: Library[_Code] | None = None
         if tier == "c" or (tier == "auto" and program.instructions >= _WORTH_COMPILING):
             self._library = Library(program, "single", program.source, _load, self._ready)
             if tier == "c" and self._library.error:
                 raise CompileError(f"The function cannot be compiled: {self._library.error}.")
+        if self._library is not None:
+            # First, so that it is there when the function's own library is.
+            native.prepare(self._ready, urgent=wait)
         if self._library is not None and self._library.find():
             self._ready()
             return
-        self._evaluate_by(program.function, "interpreter")
+        self._evaluate_by(program.function, None)
         if self._library is not None:
             self._library.request(urgent=wait)
             if wait:
@@ -202,9 +211,13 @@ class CompiledFunction:
 
     def bind(self) -> Evaluator:
         """Return an evaluator of one's own: no checks and no new arrays, for one thread."""
-        evaluator = Evaluator(self.shapes, self._signature.size, self._signature.vector)
+        size, convert = self._signature.size, self._signature.vector
         with self._lock:
-            evaluator._rebind(self._function, self._program.calls_others)
+            if self._native:
+                outputs = tuple(np.zeros(shape) for shape in self.shapes)
+                return self._native_evaluator(np.zeros(size), outputs)
+            evaluator = Evaluator(self.shapes, size, convert)
+            self._let_evaluate(evaluator)
             if self.tier != "c":
                 self._evaluators.add(evaluator)
         return evaluator
@@ -230,22 +243,53 @@ class CompiledFunction:
         return there
 
     def _ready(self) -> None:
-        """Let C take over, in whichever thread it was loaded."""
+        """Let C take over, or the extension that calls it, in whichever thread it was loaded."""
         if self._library is not None and self._library.code is not None:
-            self._evaluate_by(self._library.code, "c")
+            self._evaluate_by(self._library.code.function, self._library.code.address)
 
-    def _evaluate_by(self, function: CasadiFunction, tier: Tier) -> None:
-        shapes, checked = self.shapes, self._program.calls_others
-        call = pooled(function, self._signature.size, shapes, self._single, self._signature.vector, checked)
+    def _evaluate_by(self, function: CasadiFunction, address: int | None) -> None:
+        """Evaluate by another function from the next call on.
+
+        Parameters
+        ----------
+        function
+            CasADi's function.
+        address
+            Where its C is, if it is compiled.
+        """
+        shapes, checked, convert = self.shapes, self._program.calls_others, self._signature.vector
+        direct = address is not None and not checked and len(shapes) <= MOST_OUTPUTS and native.module is not None
+        if direct:
+            lengthy = self._program.instructions > _LENGTHY
+            call = native.module.Call(address, self._signature.size, shapes, self._single, lengthy, convert)
+        else:
+            call = pooled(function, self._signature.size, shapes, self._single, convert, checked)
         with self._lock:
             self._function = function
+            self._native = address if direct else None
             # One assignment: a call sees the old function with its bindings or the new one with its own.
             self._call = call
-            self.tier = tier
-            if tier == "c":
+            self.tier = "interpreter" if address is None else "c"
+            if self.tier == "c":
                 for evaluator in self._evaluators:
-                    evaluator._rebind(function, checked)
+                    self._let_evaluate(evaluator)
                 self._evaluators.clear()
+
+    def _let_evaluate(self, evaluator: Evaluator) -> None:
+        """Have an evaluator use the present function."""
+        if self._native:
+            run = self._native_evaluator(evaluator.input, evaluator.outputs)
+            evaluator._evaluate_by(run, None)
+        else:
+            checked = self._program.calls_others
+            evaluator._evaluate_by(*bind(self._function, evaluator.input, evaluator.outputs, checked))
+
+    def _native_evaluator(self, vector: Vector, outputs: tuple[Array, ...]) -> Evaluator:
+        lengthy = self._program.instructions > _LENGTHY
+        evaluator: Evaluator = native.module.Evaluator(
+            self._native, vector, outputs, lengthy, self._signature.vector
+        )
+        return evaluator
 
     def __copy__(self) -> CompiledFunction:
         return self
@@ -262,8 +306,17 @@ class CompiledFunction:
         return f"CompiledFunction({len(self.names)} inputs: {inputs} -> {outputs}; {self.tier})"
 
 
-def _load(path: str) -> CasadiFunction:
-    return ca.external(NAME, path)
+@dataclass(frozen=True, slots=True)
+class _Code:
+    """A compiled function: as CasADi's, and where it is."""
+
+    function: CasadiFunction
+    address: int
+
+
+def _load(path: str) -> _Code:
+    address = ctypes.cast(ctypes.CDLL(path)[NAME], ctypes.c_void_p).value
+    return _Code(ca.external(NAME, path), address or 0)
 
 
 def _restore(

@@ -9,7 +9,7 @@ from weakref import WeakMethod
 
 from .cache import library_cache
 from .program import Program
-from .toolchain import Toolchain, toolchain
+from .toolchain import CLOSED, Toolchain, toolchain
 from .worker import Build, request
 
 Code = TypeVar("Code")
@@ -57,13 +57,14 @@ class Library(Generic[Code]):
         self._ready = WeakMethod(ready) if ready is not None else None  # type: ignore[arg-type]
         self._build: Build | None = None
         self._toolchain: Toolchain | None = toolchain()
-        self._optimisation = optimisation(program.instructions)
+        level = optimisation(program.instructions)
+        self._flags = (level or "", *CLOSED)
         if self._toolchain is None:
             self.error = NO_COMPILER
-        elif self._optimisation is None:
+        elif level is None:
             self.error = f"{program.instructions} operations are too many for a C compiler"
         else:
-            self._key = program.key(kind, self._toolchain.identity, self._optimisation)
+            self._key = program.key(kind, self._toolchain.identity, level)
 
     def find(self) -> bool:
         """Take it from the cache; return whether it is there now."""
@@ -79,7 +80,7 @@ class Library(Generic[Code]):
             return
         if self._build is None or self._build.done:
             self._build = request(
-                self._key, self._toolchain, self._source, self._optimisation or "", self._built, urgent
+                self._key, self._toolchain, self._source, self._flags, self._built, urgent
             )
 
     def wait(self, timeout: float | None = None) -> bool:

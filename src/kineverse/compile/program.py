@@ -13,9 +13,9 @@ from typing import Any, TypeAlias
 
 import casadi as ca
 
-from ..errors import CompileError
-from ..expressions import Expression, layout
-from ..symbols import Symbol
+from kineverse.errors import CompileError
+from kineverse.expressions import Expression, layout
+from kineverse.symbols import Symbol
 
 CasadiFunction: TypeAlias = Any
 

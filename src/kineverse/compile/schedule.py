@@ -100,7 +100,11 @@ def _values(function: CasadiFunction) -> tuple[list[Step], list[tuple[int, int]]
     outputs: list[tuple[int, int]] = []
     holds: dict[int, int] = {}
     for k in range(function.n_instructions()):
-        op, reads, writes = function.instruction_id(k), function.instruction_input(k), function.instruction_output(k)
+        op, reads, writes = (
+            function.instruction_id(k),
+            function.instruction_input(k),
+            function.instruction_output(k),
+        )
         if op == ca.OP_OUTPUT:
             outputs.append((offsets[writes[0]] + writes[1], holds[reads[0]]))
             continue

@@ -8,10 +8,17 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ..errors import ExpressionError, NameTakenError, ShapeError, UnknownNameError, ValueRejectedError, suggest
-from ..expressions import Expression
-from ..state import State
-from ..symbols import Symbol
+from kineverse.errors import (
+    ExpressionError,
+    NameTakenError,
+    ShapeError,
+    UnknownNameError,
+    ValueRejectedError,
+    suggest,
+)
+from kineverse.expressions import Expression
+from kineverse.state import State
+from kineverse.symbols import Symbol
 
 _LISTED = 12
 
@@ -61,7 +68,9 @@ class Signature:
             return self._from_mapping(x)
         array = numbers(x, f"a vector of {self._described()}")
         if array.shape != (self.size,):
-            raise ShapeError(f"Expected a vector of {self._described()}, not an array of shape {array.shape}.")
+            raise ShapeError(
+                f"Expected a vector of {self._described()}, not an array of shape {array.shape}."
+            )
         return np.ascontiguousarray(array)
 
     def _from_mapping(self, values: Mapping[Any, Any]) -> npt.NDArray[np.float64]:
@@ -130,12 +139,16 @@ def signature(outputs: Sequence[Expression], inputs: Iterable[Symbol] | None) ->
         missing = needed.difference(found.inputs)
         if missing:
             names = sorted(str(s) for s in missing)
-            raise UnknownNameError(f"The outputs depend on symbols that are not among the inputs: {_listed(names)}.")
+            raise UnknownNameError(
+                f"The outputs depend on symbols that are not among the inputs: {_listed(names)}."
+            )
     if len(set(found.names)) < found.size:
         names = sorted({n for n in found.names if found.names.count(n) > 1})
         equal = len(set(found.inputs)) < found.size
         reason = "given twice" if equal else "the name of several symbols (of different roles or values)"
-        raise NameTakenError(f"The inputs of a function have names of their own: {_listed(names)} is {reason}.")
+        raise NameTakenError(
+            f"The inputs of a function have names of their own: {_listed(names)} is {reason}."
+        )
     return found
 
 
@@ -150,7 +163,9 @@ def numbers(x: Any, wanted: str) -> npt.NDArray[np.float64]:
     try:
         array = np.asarray(x)
     except (TypeError, ValueError):
-        raise ShapeError(f"Expected {wanted}, not a {type(x).__name__} of entries that form no array.") from None
+        raise ShapeError(
+            f"Expected {wanted}, not a {type(x).__name__} of entries that form no array."
+        ) from None
     if array.dtype.kind not in "fiub":
         kind = type(x).__name__ if array.dtype.kind == "O" else f"{type(x).__name__} of {array.dtype}"
         raise ShapeError(f"Expected {wanted}, not a {kind}.")

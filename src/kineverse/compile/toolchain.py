@@ -17,14 +17,15 @@ import shlex
 import shutil
 import subprocess
 import sys
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 logger = logging.getLogger("kineverse.compile")
 
 # No contraction to fused operations: with it interpreter and C differ. No -ffast-math: it deletes checks for NaN.
 ARITHMETIC = ("-march=native", "-ffp-contract=off", "-fno-math-errno")
-# Undefined names shall fail here and not when the function is called.
-_LINK = ("-lm", "-Wl,-z,defs") if sys.platform.startswith("linux") else ("-lm",)
+# Undefined names shall fail when a function is linked and not when it is called.
+CLOSED = ("-Wl,-z,defs",) if sys.platform.startswith("linux") else ()
 
 _CPU_LINES = (
     "vendor_id", "cpu family", "model", "stepping", "flags",
@@ -47,20 +48,18 @@ class Toolchain:
     command: tuple[str, ...]
     identity: str
 
-    def arguments(self, optimisation: str, output: str) -> list[str]:
+    def arguments(self, flags: Sequence[str], output: str) -> list[str]:
         """Return the command line that compiles C from standard input to a shared library.
 
         Parameters
         ----------
-        optimisation
-            Such as ``-O3``.
+        flags
+            Beside those that every library is compiled with.
         output
             Where the library is written.
         """
-        return [
-            *self.command, optimisation, *ARITHMETIC, "-std=gnu11", "-fPIC", "-shared", "-fvisibility=hidden",
-            "-w", "-x", "c", "-", "-o", output, *_LINK,
-        ]  # fmt: skip
+        always = ("-std=gnu11", "-fPIC", "-shared", "-fvisibility=hidden", "-w")
+        return [*self.command, *ARITHMETIC, *always, *flags, "-x", "c", "-", "-o", output, "-lm"]
 
     def version(self) -> str:
         """Return the first line of what the compiler says about itself."""
@@ -81,7 +80,11 @@ class Toolchain:
     def _ask(self, *arguments: str) -> str:
         try:
             answer = subprocess.run(
-                [*self.command, *arguments], capture_output=True, text=True, timeout=20, stdin=subprocess.DEVNULL
+                [*self.command, *arguments],
+                capture_output=True,
+                text=True,
+                timeout=20,
+                stdin=subprocess.DEVNULL,
             )
         except (OSError, subprocess.TimeoutExpired):
             return ""
@@ -111,7 +114,15 @@ def _find(preferred: str, path: str) -> Toolchain | None:
 def _identity(command: tuple[str, ...]) -> str:
     program = os.path.realpath(command[0])
     file = os.stat(program)
-    parts = (program, file.st_size, file.st_mtime_ns, command[1:], platform.system(), platform.machine(), _cpu())
+    parts = (
+        program,
+        file.st_size,
+        file.st_mtime_ns,
+        command[1:],
+        platform.system(),
+        platform.machine(),
+        _cpu(),
+    )
     return hashlib.sha256(repr(parts).encode()).hexdigest()[:16]
 
 

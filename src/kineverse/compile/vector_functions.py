@@ -26,8 +26,9 @@ INLINE void sincos_(V x, V *sine, V *cosine) {
   I quadrant = (I)shifted;
 #if FUSED
   V r = fused(k, splat(-0x1.921fb54442d18p+0), x);
-  r = fused(k, splat(-0x1.1a62633145c07p-54), r);
-  r = fused(k, splat(0x1.f1976b7ed8fbcp-110), r);
+  /* All parts are positive, so that zero keeps its sign. */
+  r = fused(k, splat(-0x1.1a62633145c06p-54), r);
+  r = fused(k, splat(-0x1.c1cd129024e09p-107), r);
 #else
   V r = x - k * splat(0x1.921fb544p+0);
   r = r - k * splat(0x1.0b4611a6p-34);
@@ -127,7 +128,7 @@ INLINE V expm1_reduced(V x, V *k) {
   p = fused(r, p, splat(0.0416666666666667));
   p = fused(r, p, splat(0.16666666666666677));
   p = fused(r, p, splat(0.5));
-  return fused(z, p, r) + lost;
+  return r + fused(z, p, lost);
 }
 
 INLINE V power_of_two(V k) {
@@ -201,9 +202,9 @@ INLINE V log_(V x) {
 """
 
 ARITHMETIC = r"""
-/* As the C library has them on this machine where an operand is NaN: the other one. */
-INLINE V smaller(V a, V b) { return select_(b == b, select_(a < b, a, b), a); }
-INLINE V larger(V a, V b) { return select_(b == b, select_(a > b, a, b), a); }
+/* The first of two equal ones, and where an operand is NaN the other one, as in the C library. */
+INLINE V smaller(V a, V b) { return select_((a <= b) | (b != b), a, b); }
+INLINE V larger(V a, V b) { return select_((a >= b) | (b != b), a, b); }
 INLINE V sign_(V x) {
   return select_(x < splat(0.0), splat(-1.0), select_(x > splat(0.0), splat(1.0), x));
 }

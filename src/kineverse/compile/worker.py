@@ -18,7 +18,7 @@ import signal
 import subprocess
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import TypeAlias
 from weakref import WeakMethod
 
@@ -47,11 +47,11 @@ class Build:
         Whether it was given up although nothing is wrong with it.
     """
 
-    def __init__(self, key: str, compiler: Toolchain, source: Callable[[], str], optimisation: str) -> None:
+    def __init__(self, key: str, compiler: Toolchain, source: Callable[[], str], flags: Sequence[str]) -> None:
         self.key = key
         self.compiler = compiler
         self.source = source
-        self.optimisation = optimisation
+        self.flags = flags
         self.cache = library_cache()
         self.path: str | None = None
         self.error: str | None = None
@@ -92,7 +92,7 @@ def request(
     key: str,
     compiler: Toolchain,
     source: Callable[[], str],
-    optimisation: str,
+    flags: Sequence[str],
     watcher: Watcher,
     urgent: bool = False,
 ) -> Build | None:
@@ -106,8 +106,8 @@ def request(
         The compiler.
     source
         Returns the C source; called in the worker's thread.
-    optimisation
-        Such as ``-O3``.
+    flags
+        Of the compiler.
     watcher
         A method that is called when it is done, in the worker's thread. It is held weakly: a build whose
         watchers are all gone is not begun.
@@ -119,7 +119,7 @@ def request(
     Build or None
         None if too many are waiting already.
     """
-    return _worker.request(Build(key, compiler, source, optimisation), watcher, urgent)
+    return _worker.request(Build(key, compiler, source, flags), watcher, urgent)
 
 
 class _Worker:
@@ -140,7 +140,9 @@ class _Worker:
             known = self._wanted.get(build.key)
             if known is None:
                 if not urgent and len(self._wanted) >= MAXIMUM_WAITING:
-                    logger.info("%d functions wait for the compiler; one more stays interpreted.", MAXIMUM_WAITING)
+                    logger.info(
+                        "%d functions wait for the compiler; one more stays interpreted.", MAXIMUM_WAITING
+                    )
                     return None
                 known = self._wanted[build.key] = build
                 known.urgent = urgent
@@ -196,7 +198,7 @@ class _Worker:
                 self._workplace = workplace = build.cache.workplace()
                 output = os.path.join(workplace, "library.so")
                 compiler = self._compiler = subprocess.Popen(
-                    build.compiler.arguments(build.optimisation, output),
+                    build.compiler.arguments(build.flags, output),
                     stdin=subprocess.PIPE,
                     stdout=subprocess.DEVNULL,
                     stderr=subprocess.PIPE,

@@ -5,6 +5,7 @@ For a few evaluations by hand; whoever evaluates often compiles (:mod:`kineverse
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping
 from typing import Any
 
@@ -12,15 +13,19 @@ import casadi as ca
 import numpy as np
 import numpy.typing as npt
 
-from kineverse.errors import ExpressionError, UnknownNameError, ValueRejectedError, suggest
+from kineverse.errors import ExpressionError, NameTakenError, UnknownNameError, ValueRejectedError, suggest
 
 from .expression import Expression
 from .lowering import lower
 
 
-def evaluate(expression: Expression, values: Mapping[Any, Any]) -> npt.NDArray[Any]:
+def evaluate(
+    expression: Expression, values: Mapping[Any, Any], by_name: Mapping[str, Any] | None = None
+) -> npt.NDArray[Any]:
     """Return the value at numbers, see :meth:`Expression.__call__`."""
     symbols = expression.symbols
+    if by_name and isinstance(values, Mapping):
+        values = {**values, **by_name}
     vector = assign(symbols, values, exact=False)
     (column,) = lower([expression])
     inputs = ca.vertcat(*(s._sx for s in symbols)) if symbols else ca.SX(0, 1)
@@ -33,15 +38,17 @@ def assign(
 ) -> npt.NDArray[np.float64]:
     """Return the numbers of ``symbols`` in their order, from a mapping by symbol or by name.
 
-    If ``exact``, names that are not among the symbols are an error, unless ``values`` is a
-    :class:`~kineverse.State`, which describes a whole world.
+    A value by name is for the symbol of that name, whatever its role. If ``exact``, names that are not among
+    the symbols are an error, unless ``values`` is a :class:`~kineverse.State`, which describes a whole world.
 
     Raises
     ------
     UnknownNameError
         For symbols without a value and values without a symbol.
+    NameTakenError
+        If several of the symbols have the name that a value is given by, or a symbol has two values.
     ValueRejectedError
-        For NaN.
+        For NaN and whatever is not a number.
     """
     from kineverse.state import State
 
@@ -49,26 +56,44 @@ def assign(
         raise ExpressionError(
             f"Values are given as a mapping {{name: number}}, not as {type(values).__name__}."
         )
-    given = {str(k): v for k, v in values.items()}
     names = [str(s) for s in symbols]
-    unknown = [n for n in given if n not in names] if exact and not isinstance(values, State) else []
+    asked = {*names, *symbols}
+    given = {k if k in asked else str(k): v for k, v in values.items()}
+    unknown = [] if not exact or isinstance(values, State) else [k for k in given if k not in asked]
     if unknown:
         raise UnknownNameError(f"Unknown symbol {unknown[0]!r}. {suggest(unknown[0], names, 'symbol')}")
-    missing = [n for n, s in zip(names, symbols, strict=True) if n not in given and s.value is None]
+    twice = [s for s in symbols if s in given and str(s) in given]
+    if twice:
+        raise NameTakenError(f"There are two values for '{twice[0]}', by symbol and by name.")
+    ambiguous = [n for n, count in Counter(names).items() if count > 1 and n in given]
+    if ambiguous:
+        raise NameTakenError(
+            f"Several symbols have the name '{ambiguous[0]}'; give their values by symbol, not by name."
+        )
+    missing = [
+        name
+        for name, symbol in zip(names, symbols, strict=True)
+        if name not in given and symbol not in given and symbol.value is None
+    ]
     if missing:
+        listed = ", ".join(map(repr, missing[:10]))
+        others = [repr(str(k)) for k in given if k not in asked][:10]
         raise UnknownNameError(
-            f"No value for {', '.join(map(repr, missing[:10]))}{' ...' if len(missing) > 10 else ''}."
+            f"No value for {listed}{' ...' if len(missing) > 10 else ''}."
+            + (f" Values were given for {', '.join(others)}, which do not occur here." if others else "")
         )
     vector = np.empty(len(names))
     for i, (name, symbol) in enumerate(zip(names, symbols, strict=True)):
-        value = given.get(name, symbol.value)
+        value = given[symbol] if symbol in given else given.get(name, symbol.value)
         if isinstance(value, Expression):
             raise ExpressionError(
                 f"The value of '{name}' is an expression; use substitute({{symbol: expression}})."
             )
         try:
+            if value is None or isinstance(value, (str, bytes)):
+                raise TypeError
             vector[i] = value
-        except (TypeError, ValueError):
+        except (TypeError, ValueError, OverflowError):
             raise ValueRejectedError(f"The value of '{name}' is not a number: {value!r}.") from None
         if vector[i] != vector[i]:
             raise ValueRejectedError(f"The value of '{name}' is NaN.")

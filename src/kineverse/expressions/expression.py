@@ -51,9 +51,9 @@ class Expression:
     _shape: Shape
     _nodes: frozenset[Node]
 
-    def __init__(self, value: ExpressionLike) -> None:
-        source = as_expression(value)
-        self._set(source._sx, source._shape, source._nodes)
+    def __new__(cls, value: ExpressionLike) -> Expression:
+        """Return numbers, arrays and nested sequences of expressions as an expression."""
+        return as_expression(value)
 
     def _set(self, sx: SX, shape: Shape, nodes: frozenset[Node]) -> None:
         self._sx = sx
@@ -371,7 +371,7 @@ class Expression:
         """
         from .evaluation import evaluate
 
-        return evaluate(self, {**(values or {}), **by_name} if by_name else (values or {}))
+        return evaluate(self, {} if values is None else values, by_name)
 
     def __float__(self) -> float:
         if not self._shape and self._sx.is_constant():
@@ -454,7 +454,7 @@ def make(sx: SX, shape: Shape, nodes: frozenset[Node]) -> Expression:
         symbol = SYMBOLS.get(sx.element_hash())
         if symbol is not None:
             return symbol
-    expression = Expression.__new__(Expression)
+    expression = object.__new__(Expression)
     expression._set(sx, shape, nodes)
     return expression
 
@@ -476,16 +476,22 @@ def as_expression(value: ExpressionLike) -> Expression:
     if isinstance(value, (float, int)) and not isinstance(value, bool):
         if value != value:
             raise ValueRejectedError("NaN is not accepted as a constant.")
-        return make(ca.SX(float(value)), (), NO_NODES)
+        try:
+            return make(ca.SX(float(value)), (), NO_NODES)
+        except OverflowError:
+            raise ValueRejectedError("The number is too large for a 64-bit float.") from None
     if isinstance(value, (list, tuple)) or (isinstance(value, np.ndarray) and value.dtype == object):
         return array(value)
     if isinstance(value, (str, bytes, Mapping)) or value is None:
         raise ExpressionError(
             f"{value!r} is not an expression or a number. Symbols are made by kv.position('path')."
         )
+    given = np.asarray(value)
     try:
-        numbers = np.asarray(value, dtype=float)
-    except (TypeError, ValueError) as error:
+        if given.dtype.kind not in "biufO":
+            raise TypeError(f"its entries are of type {given.dtype}.")
+        numbers = given.astype(float)
+    except (TypeError, ValueError, OverflowError) as error:
         raise ExpressionError(
             f"{type(value).__name__} is not an expression or an array of numbers: {error}"
         ) from None
@@ -505,7 +511,7 @@ def array(values: Any) -> Expression:
     if not values:
         return as_expression(np.zeros(0))
     if all(isinstance(v, (float, int, np.floating, np.integer)) and not isinstance(v, bool) for v in values):
-        return as_expression(np.asarray(values, dtype=float))
+        return as_expression(np.asarray(values))
     flat: list[Expression] = []
     shape = _flatten(values, flat)
     if shape is None:
@@ -607,5 +613,6 @@ def matmul(left: ExpressionLike, right: ExpressionLike) -> Expression:
             f"Shapes {a.shape} and {b.shape} cannot be multiplied as matrices"
             + ("; use * to scale by a number." if not a.ndim or not b.ndim else ".")
         )
-    left_sx = a._sx.T if a.ndim == 1 else a._sx
-    return make(ca.mtimes(left_sx, b._sx), a.shape[:-1] + b.shape[1:], union((a, b)))
+    product = ca.mtimes(a._sx.T if a.ndim == 1 else a._sx, b._sx)
+    stored = product.T if a.ndim == 1 else product
+    return make(stored, a.shape[:-1] + b.shape[1:], union((a, b)))

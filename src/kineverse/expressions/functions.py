@@ -16,7 +16,6 @@ from kineverse.errors import ShapeError
 
 from . import layout
 from .expression import Expression, ExpressionLike, as_expression, binary, broadcast, make, unary
-from .leaves import gradient_keys
 from .node import Node
 
 if TYPE_CHECKING:
@@ -140,7 +139,8 @@ def ceil(x: ExpressionLike) -> Expression:
 
 def copysign(x: ExpressionLike, y: ExpressionLike) -> Expression:
     """Return |x| with the sign of y, elementwise."""
-    return binary(ca.OP_COPYSIGN, x, y)
+    # CasADi's derivative by x is that of a positive x.
+    return binary(ca.OP_COPYSIGN, absolute(x), y)
 
 
 def where(condition: ExpressionLike, if_true: ExpressionLike, if_false: ExpressionLike) -> Expression:
@@ -239,10 +239,9 @@ class Select(Node):
         zero = as_expression(np.zeros(self.shape))
         return {key: self._choose(a.get(key, zero), b.get(key, zero)) for key in {**a, **b}}
 
-    def gradient_keys(self, heuristic: bool) -> frozenset[Symbol]:
-        """Return the derivative symbols of the gradient, without building it."""
-        _, a, b = self.arguments
-        return gradient_keys(a, heuristic) | gradient_keys(b, heuristic)
+    def differentiated(self, heuristic: bool) -> tuple[Expression, ...]:
+        """Return the branches; the condition selects and has no part in the gradient."""
+        return self.arguments[1:]
 
 
 class Extremum(Node):

@@ -18,7 +18,7 @@ from kineverse.errors import ExpressionError
 
 from . import layout
 from .expression import NO_NODES, Expression, make
-from .leaves import leaves
+from .leaves import bottom_up, leaves
 
 if TYPE_CHECKING:
     from kineverse.symbols import Symbol
@@ -41,6 +41,8 @@ def _gradient(expression: Expression, heuristic: bool) -> dict[Symbol, Expressio
     # Only leaves with a gradient take part: the partial derivative by a parameter in an exponent is NaN for a
     # negative base, and nobody asked for it.
     moving = [s for s in symbols if s.has_derivative]
+    for node in bottom_up(nodes, lambda n: n.differentiated(heuristic), lambda n: heuristic in n._gradients):
+        node.gradient(heuristic)
     opaque = [(node, entries) for node in nodes if (entries := node.gradient(heuristic))]
     if not moving and not opaque:
         return {}
@@ -66,7 +68,8 @@ def _gradient(expression: Expression, heuristic: bool) -> dict[Symbol, Expressio
             rows[:, position[key]] = layout.column(value._sx, value._shape)
             nodes_of[key] = nodes_of.get(key, NO_NODES) | value._nodes
         seeds.append(ca.sparsify(rows))
-    by_key = ca.jtimes(elements, ca.vertcat(*blocks), ca.vertcat(*seeds))
+    # Cheaper than ca.jtimes, which differentiates once per key.
+    by_key = ca.mtimes(ca.jacobian(elements, ca.vertcat(*blocks)), ca.vertcat(*seeds))
     return _collect(expression, by_key, list(range(len(keys))), keys, nodes_of)
 
 

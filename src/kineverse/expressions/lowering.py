@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 import casadi as ca
 
 from . import layout
 from .expression import Expression
 from .layout import SX
-from .leaves import leaves
+from .leaves import bottom_up, leaves
+
+if TYPE_CHECKING:
+    from .node import Node
 
 
 def lowered(expression: Expression) -> SX:
@@ -17,14 +21,23 @@ def lowered(expression: Expression) -> SX:
     if not expression._nodes:
         return expression._sx
     if expression._lowered is None:
-        _, nodes = leaves(expression)
-        if nodes:
-            (expression._lowered,) = ca.substitute(
-                [expression._sx], [n.sx for n in nodes], [lowered(n.value) for n in nodes]
-            )
-        else:
-            expression._lowered = expression._sx
+        for node in bottom_up(leaves(expression)[1], lambda n: (n.value,), _is_lowered):
+            _lower(node.value)
+        _lower(expression)
     return expression._lowered
+
+
+def _is_lowered(node: Node) -> bool:
+    return not node.value._nodes or node.value._lowered is not None
+
+
+def _lower(expression: Expression) -> None:
+    _, nodes = leaves(expression)
+    if nodes:
+        values = [ca.densify(lowered(n.value)) for n in nodes]
+        (expression._lowered,) = ca.substitute([expression._sx], [n.sx for n in nodes], values)
+    else:
+        expression._lowered = expression._sx
 
 
 def lower(expressions: Sequence[Expression]) -> list[SX]:

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import hashlib
 import math
+import threading
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any, ClassVar
@@ -21,7 +22,7 @@ from kineverse.errors import ExpressionError, ShapeError
 
 from . import layout
 from .expression import Expression, ExpressionLike, as_expression, broadcast_to, make
-from .leaves import free_symbols, gradient_keys
+from .leaves import gradient_keys, symbols_below
 
 if TYPE_CHECKING:
     from kineverse.symbols import Symbol
@@ -29,6 +30,7 @@ if TYPE_CHECKING:
     from .substitution import Substitution
 
 _INTERNED: WeakValueDictionary[bytes, Node] = WeakValueDictionary()
+_INTERNING = threading.Lock()
 
 
 class Node(ABC):
@@ -41,14 +43,16 @@ class Node(ABC):
     __slots__ = (
         "__weakref__",
         "_gradients",
+        "_keys",
+        "_symbols",
         "_value_cache",
         "arguments",
+        "depth",
         "elements",
         "key",
         "options",
         "shape",
         "sx",
-        "symbols",
     )
 
     kind: ClassVar[str]
@@ -65,7 +69,8 @@ class Node(ABC):
         if node is None:
             node = cls.__new__(cls)
             node._initialise(key, arguments, shape, options)
-            node = _INTERNED.setdefault(key, node)
+            with _INTERNING:
+                node = _INTERNED.setdefault(key, node)
         return make(node.sx, node.shape, frozenset((node,)))
 
     @classmethod
@@ -93,7 +98,16 @@ class Node(ABC):
         self.elements = tuple(e.element_hash() for e in ca.symvar(self.sx))
         self._value_cache: Expression | None = None
         self._gradients: dict[bool, Mapping[Symbol, Expression]] = {}
-        self.symbols = frozenset(free_symbols(self.value))
+        self._keys: dict[bool, frozenset[Symbol]] = {}
+        self._symbols: frozenset[Symbol] | None = None
+        self.depth = 1 + max((inner.depth for a in arguments for inner in a._nodes), default=0)
+
+    @property
+    def symbols(self) -> frozenset[Symbol]:
+        """The symbols that the value depends on."""
+        if self._symbols is None:
+            self._symbols = symbols_below(self)
+        return self._symbols
 
     @property
     def size(self) -> int:
@@ -123,11 +137,15 @@ class Node(ABC):
 
     def gradient_keys(self, heuristic: bool) -> frozenset[Symbol]:
         """Return the keys that :meth:`gradient` can have, without computing entries where that is cheap."""
-        return frozenset().union(*(gradient_keys(a, heuristic) for a in self.arguments))
+        return frozenset().union(*(gradient_keys(a, heuristic) for a in self.differentiated(heuristic)))
+
+    def differentiated(self, heuristic: bool) -> tuple[Expression, ...]:
+        """Return the arguments whose D is part of this node's."""
+        return self.arguments
 
     def depends_on(self, substitution: Substitution) -> bool:
         """Whether value or gradient contain one of the symbols that are to be replaced."""
-        return any(symbol in substitution for argument in self.arguments for symbol in free_symbols(argument))
+        return any(substitution.changes(argument) for argument in self.arguments)
 
     def substitute(self, substitution: Substitution) -> Expression:
         """Return the composition: the same kind of node over the substituted arguments."""
@@ -190,17 +208,19 @@ class Augment(Node):
         return self.arguments[0]
 
     def _gradient(self, heuristic: bool) -> Mapping[Symbol, Expression]:
-        own = self.arguments[0].gradient(heuristic)
         if self.heuristic and not heuristic:
-            return own
-        return self.entries if self.replace else {**own, **self.entries}
+            return self.arguments[0].gradient(heuristic)
+        return self.entries if self.replace else {**self.arguments[0].gradient(heuristic), **self.entries}
 
     def gradient_keys(self, heuristic: bool) -> frozenset[Symbol]:
         """Return the derivative symbols of the gradient, without building it."""
-        own = gradient_keys(self.arguments[0], heuristic)
         if self.heuristic and not heuristic:
-            return own
-        return frozenset(self.entries) if self.replace else own | frozenset(self.entries)
+            return gradient_keys(self.arguments[0], heuristic)
+        return super().gradient_keys(heuristic).union(self.options[2:])
+
+    def differentiated(self, heuristic: bool) -> tuple[Expression, ...]:
+        """Return the value, unless its own gradient is replaced."""
+        return () if self.replace and (heuristic or not self.heuristic) else self.arguments[:1]
 
     def depends_on(self, substitution: Substitution) -> bool:
         """Return whether a substitution changes the node."""

@@ -90,7 +90,8 @@ class _Writer:
         if element.nnz() == 0:
             return "0"
         if element.is_constant():
-            return self.number(float(element))
+            written = self.number(float(element))
+            return self.grouped(written) if strength > 2 and written.startswith("-") else written
         if element.is_symbolic():
             return self.leaf(element)
         operation = element.op()
@@ -104,7 +105,8 @@ class _Writer:
         elif operation == ca.OP_INV:
             return self.infix(ca.OP_DIV, [ca.SX(1), operands[0]], depth, strength)
         elif operation == ca.OP_NEG:
-            written = f"-{self.write(operands[0], depth + 1, 2)}"
+            written = self.write(operands[0], depth + 1, 2)
+            written = written[1:] if written.startswith("-") else f"-{written}"
             return self.grouped(written) if strength > 1 else written
         if operation in (*_POWERS, ca.OP_SQ):
             return self.power(operands, depth)
@@ -119,6 +121,8 @@ class _Writer:
         sign, own = _INFIX[operation]
         stronger = own + (operation in (ca.OP_SUB, ca.OP_DIV))
         a, b = self.write(operands[0], depth + 1, own), self.write(operands[1], depth + 1, stronger)
+        if sign in "+-" and b.startswith("-"):
+            sign, b = "-" if sign == "+" else "+", b[1:]
         written = self.join(sign, a, b)
         return self.grouped(written) if own < strength else written
 

@@ -2,23 +2,51 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import TYPE_CHECKING, TypeAlias
+from collections.abc import Iterable, Mapping
+from typing import TYPE_CHECKING
 
 import casadi as ca
 
 from kineverse.errors import ExpressionError, ShapeError
 
 from .expression import NO_NODES, Expression, ExpressionLike, as_expression, make
-from .layout import SX
-from .leaves import leaves
+from .leaves import bottom_up, leaves
 
 if TYPE_CHECKING:
     from kineverse.symbols import Symbol
 
     from .node import Node
 
-Substitution: TypeAlias = "Mapping[Symbol, Expression]"
+
+class Substitution(dict["Symbol", Expression]):
+    """What is replaced by what, and what the nodes met so far have become."""
+
+    def __init__(self, replacements: Mapping[Symbol, Expression]) -> None:
+        super().__init__(replacements)
+        self._images: dict[Node, Expression | None] = {}
+
+    @classmethod
+    def of(cls, replacements: Mapping[Symbol, Expression]) -> Substitution:
+        """Return the replacements as a substitution, itself if it is one."""
+        return replacements if isinstance(replacements, cls) else cls(replacements)
+
+    def changes(self, expression: Expression) -> bool:
+        """Whether value or gradient of the expression become others."""
+        symbols, nodes = leaves(expression)
+        if any(symbol in self for symbol in symbols):
+            return True
+        self.meet(nodes)
+        return any(self._images[node] is not None for node in nodes)
+
+    def image(self, node: Node) -> Expression | None:
+        """Return what a node becomes, None if it stays what it is."""
+        self.meet((node,))
+        return self._images[node]
+
+    def meet(self, nodes: Iterable[Node]) -> None:
+        """Find out what nodes become, those below them first."""
+        for node in bottom_up(nodes, lambda n: n.arguments, self._images.__contains__):
+            self._images[node] = node.substitute(self) if node.depends_on(self) else None
 
 
 def substitute(expression: Expression, values: Mapping[Symbol, ExpressionLike]) -> Expression:
@@ -41,10 +69,11 @@ def substitute(expression: Expression, values: Mapping[Symbol, ExpressionLike]) 
     return apply(expression, substitution)
 
 
-def apply(expression: Expression, substitution: Substitution) -> Expression:
+def apply(expression: Expression, replacements: Mapping[Symbol, Expression]) -> Expression:
     """Return e∘S for a substitution that is known to be well formed."""
-    if not substitution:
+    if not replacements:
         return expression
+    substitution = Substitution.of(replacements)
     symbols, nodes = leaves(expression)
     old: list[ca.SX] = []
     new: list[ca.SX] = []
@@ -53,16 +82,17 @@ def apply(expression: Expression, substitution: Substitution) -> Expression:
         if symbol in substitution:
             replacement = substitution[symbol]
             old.append(symbol._sx)
-            new.append(replacement._sx)
+            new.append(ca.densify(replacement._sx))
             kept |= replacement._nodes
+    substitution.meet(nodes)
     for node in nodes:
-        if node.depends_on(substitution):
-            replacement = node.substitute(substitution)
-            old.append(node.sx)
-            new.append(_as_stored(replacement, node))
-            kept |= replacement._nodes
-        else:
+        image = substitution.image(node)
+        if image is None:
             kept.add(node)
+        else:
+            old.append(node.sx)
+            new.append(ca.densify(image._sx))
+            kept |= image._nodes
     if not old:
         return expression
     (sx,) = ca.substitute([expression._sx], old, new)
@@ -79,15 +109,16 @@ def replace_nodes(expression: Expression, replacements: Mapping[Node, Expression
         *(replacements[n]._nodes for n in chosen)
     )
     (sx,) = ca.substitute(
-        [expression._sx], [n.sx for n in chosen], [_as_stored(replacements[n], n) for n in chosen]
+        [expression._sx], [n.sx for n in chosen], [ca.densify(replacements[n]._sx) for n in chosen]
     )
     return make(sx, expression._shape, kept)
 
 
 def compose_gradient(
-    entries: Mapping[Symbol, Expression], substitution: Substitution, heuristic: bool
+    entries: Mapping[Symbol, Expression], replacements: Mapping[Symbol, Expression], heuristic: bool
 ) -> dict[Symbol, Expression]:
     """Return D(e∘S) from D(e): ``Σ_a (D(e)[ȧ]∘S)·D(S(a))[w]`` and the keys that no replaced symbol has."""
+    substitution = Substitution.of(replacements)
     result: dict[Symbol, Expression] = {}
 
     def add(key: Symbol, value: Expression) -> None:
@@ -102,7 +133,3 @@ def compose_gradient(
         else:
             add(key, carried)
     return result
-
-
-def _as_stored(replacement: Expression, node: Node) -> SX:
-    return ca.densify(replacement._sx)

@@ -5,10 +5,10 @@ from __future__ import annotations
 import os
 from collections.abc import Iterator
 
-from ..errors import FormatError
-from ..model.model import Model
-from ..model.operation import Operation
-from ..shipped.bases import base_of
+from kineverse.errors import FormatError
+from kineverse.model.model import Model
+from kineverse.model.operation import Operation
+from kineverse.shipped.bases import base_of
 from .sources import Source, locate_model
 
 
@@ -21,8 +21,8 @@ def load(source: str | os.PathLike[str], prefix: str | None = None) -> Model:
         The path of a ``.urdf`` file, or a name such as ``kitchen`` or ``pr2``, see
         :func:`kineverse.formats.sources.locate_model`.
     prefix
-        Put in front of the names of all frames and degrees of freedom, with a slash. A model that ships has its own name as
-        prefix unless another is given; ``""`` means none.
+        Put in front of the names of all frames and degrees of freedom, with a slash. A model that ships has
+        its own name as prefix unless another is given; ``""`` means none.
 
     Raises
     ------
@@ -36,7 +36,9 @@ def load(source: str | os.PathLike[str], prefix: str | None = None) -> Model:
     return model
 
 
-def operations_of(source: str | os.PathLike[str], prefix: str | None = None) -> Iterator[tuple[str, Operation]]:
+def operations_of(
+    source: str | os.PathLike[str], prefix: str | None = None
+) -> Iterator[tuple[str, Operation]]:
     """Yield the operations of a file or shipped model, each with its tag."""
     found = locate_model(source)
     if prefix is None:
@@ -60,7 +62,6 @@ def _read(source: Source, prefix: str | None) -> Iterator[Operation]:
             yield from robot_operations(robot, prefix, parent=base.child)
         return
     raise FormatError(
-        f"{source.path}: this version reads URDF (.urdf, .xml), not '{''.join(source.path.suffixes) or name}'."
+        f"{source.path}: this version reads URDF (.urdf, .xml), "
+        f"not '{''.join(source.path.suffixes) or name}'."
     )
-
-

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path
 
-from ..errors import UnknownNameError, suggest
+from kineverse.errors import UnknownNameError, suggest
 
 SUFFIXES = (".urdf", ".sdf", ".xml", ".kv.json")
 MODEL_PATH = "KINEVERSE_MODEL_PATH"
@@ -33,8 +33,8 @@ def shipped_models() -> tuple[str, ...]:
 def locate_model(name: str | os.PathLike[str]) -> Source:
     """Return the file of a model given by path or by name.
 
-    A path to a file is taken as it is. A name is looked for among the shipped models, then below the folders of
-    ``KINEVERSE_MODEL_PATH``, then in installed packages that carry robots. It may have folders in front
+    A path to a file is taken as it is. A name is looked for among the shipped models, then below the folders
+    of ``KINEVERSE_MODEL_PATH``, then in installed packages that carry robots. It may have folders in front
     (``urdf_obj/kitchen``) to tell files of the same name apart.
 
     Raises
@@ -59,12 +59,15 @@ def locate_model(name: str | os.PathLike[str]) -> Source:
             found = sorted(p for p in found if len(p.parts) == shallowest)
             if len(found) > 1:
                 choices = ", ".join(repr(p.relative_to(folder).as_posix()) for p in found[:6])
-                raise UnknownNameError(f"{text!r} is ambiguous in {folder}: {choices}. Give one of these paths.")
+                raise UnknownNameError(
+                    f"{text!r} is ambiguous in {folder}: {choices}. Give one of these paths."
+                )
             return Source(found[0].resolve())
     raise UnknownNameError(
         f"There is no model {text!r}.{_beside(path)} {suggest(text, shipped_models(), 'shipped model')} "
-        f"Searched after the shipped ones: {'; '.join(searched) or 'nothing else'}. Give the path of a file, or add its folder "
-        f"to the environment variable {MODEL_PATH}, or install robots with 'pip install example-robot-data'."
+        f"Searched after the shipped ones: {'; '.join(searched) or 'nothing else'}. Give the path of a file, "
+        f"or add its folder to the environment variable {MODEL_PATH}, or install robots with "
+        "'pip install example-robot-data'."
     )
 
 

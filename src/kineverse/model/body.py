@@ -6,11 +6,16 @@ is opened before somebody asks for it.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Any, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
+
+from kineverse.errors import ShapeError, ValueRejectedError
+
+_RIGID = 2e-5
 
 Vector3: TypeAlias = tuple[float, float, float]
 Rgba: TypeAlias = tuple[float, float, float, float]
@@ -22,9 +27,33 @@ class Pose:
 
     rows: tuple[float, ...] = (1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0)
 
+    def __post_init__(self) -> None:
+        if len(self.rows) != 12:
+            raise ShapeError(f"A pose has 12 numbers, not {len(self.rows)}.")
+        a, b, c, x, d, e, f, y, g, h, i, z = self.rows
+        squares = a * a + b * b + c * c - 1, d * d + e * e + f * f - 1, g * g + h * h + i * i - 1
+        products = a * d + b * e + c * f, a * g + b * h + c * i, d * g + e * h + f * i
+        turns = a * (e * i - f * h) - b * (d * i - f * g) + c * (d * h - e * g) > 0
+        # Written so that NaN fails every one of them.
+        if not (
+            turns and all(-_RIGID < v < _RIGID for v in (*squares, *products)) and math.isfinite(x + y + z)
+        ):
+            raise ValueRejectedError(
+                f"The pose is not rigid: the first three columns of {self.rows} must be a rotation "
+                "and all numbers finite."
+            )
+
     @staticmethod
     def of(matrix: npt.ArrayLike) -> Pose:
-        """Build a pose from a 4×4 homogeneous matrix."""
+        """Build a pose from a 4×4 homogeneous matrix.
+
+        Raises
+        ------
+        ShapeError, ValueRejectedError
+            If it is not 4×4, or not rigid.
+        """
+        if np.shape(matrix) != (4, 4):
+            raise ShapeError(f"A pose is made from a 4×4 matrix, not from one of shape {np.shape(matrix)}.")
         return Pose(tuple(np.asarray(matrix, dtype=float)[:3].ravel().tolist()))
 
     @property

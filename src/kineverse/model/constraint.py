@@ -75,7 +75,9 @@ class Constraint:
 def as_constraint(value: ConstraintLike) -> Constraint:
     """Return a constraint given as such or as a triple (lower, expression, upper)."""
     if isinstance(value, Constraint):
-        return value
+        if all(isinstance(part, Expression) for part in (value.lower, value.expression, value.upper)):
+            return value
+        return Constraint.of(value.lower, value.expression, value.upper)
     if isinstance(value, Expression) or not isinstance(value, Sequence) or len(value) != 3:
         raise ValueRejectedError(f"A constraint is a triple (lower, expression, upper), not {value!r}.")
     return Constraint.of(*value)

@@ -8,7 +8,7 @@ in order, and it stops where writes come out equal. Every change can be undone u
 from __future__ import annotations
 
 import heapq
-from bisect import bisect_left, insort
+from bisect import bisect_left, bisect_right, insort
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from operator import attrgetter
@@ -55,9 +55,12 @@ class History:
         self._before: dict[Cell, Any] = {}
         self._events: list[tuple[Cell, Any, Any]] = []
         self._dirty: list[tuple[int, str]] = []
-        self._moved_frames: set[str] = set()
-        for entry in entries:
-            self._link(entry)
+        self._moved_frames: dict[str, None] = {}
+        self._contested: dict[str, None] = {}
+        self._disordered: set[str] = set()
+        for i, e in enumerate(entries):
+            # Placed anew: entries are shared with snapshots, and only some have been renumbered since.
+            self._link(Entry(e.tag, e.operation, i * _GAP, e.reads, e.writes))
         for (kind, name), writers in self.cells.items():
             self.head[kind][name] = writers[-1].writes[kind, name]
         self.begin()
@@ -128,6 +131,7 @@ class History:
                 self._soil(tag)
             else:
                 self._run(tag)
+                self._check_free(self.entries[tag])
 
     def remove(self, tag: str) -> None:
         """Take an operation out, with everything it wrote."""
@@ -151,6 +155,7 @@ class History:
                 self._soil(tag)
             else:
                 entry = self._applied(entry)
+                self._check_free(entry)
                 self._link(entry)
                 for cell, value in entry.writes.items():
                     self._touched(cell, ABSENT, value, place)
@@ -177,6 +182,7 @@ class History:
             Listing every operation that could not be run, with what it misses.
         """
         failures: dict[str, KineverseError] = {}
+        failed: list[tuple[int, str]] = []
         done: set[tuple[int, str]] = set()
         while self._dirty:
             item = heapq.heappop(self._dirty)
@@ -189,10 +195,18 @@ class History:
                 self._run(tag)
             except KineverseError as error:
                 failures[tag] = error
-        self._check_frames(failures)
+                failed.append(item)
+        if self._contested:
+            self._check_names(failures)
+        if self._moved_frames:
+            self._check_frames(failures)
         if failures:
+            # Whoever catches this inside an edit may mend it; what is not mended fails again at the end.
+            self._dirty = failed
             lines = "".join(f"\n  {tag!r}: {error}" for tag, error in failures.items())
             raise EditError(f"The edit is refused, because these operations cannot be applied:{lines}")
+        self._contested.clear()
+        self._moved_frames.clear()
 
     def _run(self, tag: str) -> None:
         old = self.entries[tag]
@@ -223,8 +237,6 @@ class History:
                 raise EditError(f"Operation {tag!r} writes {kind} under {name!r}, which is not a name.")
             if kind == FRAMES:
                 self._check_parent(name, value, reads, entry.place)
-            elif kind == CONSTRAINTS:
-                self._check_free(tag, name)
         return Entry(tag, entry.operation, entry.place, reads, writes)
 
     def _check_parent(self, name: str, frame: Frame, reads: Reads, place: int) -> None:
@@ -239,40 +251,59 @@ class History:
             error = missing(FRAMES, frame.parent, self.names_at(FRAMES, place))
             raise UnknownNameError(f"The parent of frame '{name}' is missing. {error}")
 
-    def _check_free(self, tag: str, name: str) -> None:
-        others = [e.tag for e in self.cells.get((CONSTRAINTS, name), ()) if e.tag != tag]
-        if others:
-            raise NameTakenError(
-                f"There is a constraint '{name}' already, made by {others[0]!r}; "
-                "choose another name or replace that operation."
-            )
+    def _check_free(self, entry: Entry) -> None:
+        for kind, name in entry.writes:
+            if kind == CONSTRAINTS:
+                others = [e.tag for e in self.cells.get((kind, name), ()) if e.tag != entry.tag]
+                if others:
+                    raise _taken(name, others[0])
+
+    def _check_names(self, failures: dict[str, KineverseError]) -> None:
+        """Look for constraints that have two makers."""
+        for name in self._contested:
+            first, *others = self.cells.get((CONSTRAINTS, name), (None,))
+            for entry in others:
+                if first is not None and entry is not None:
+                    failures.setdefault(entry.tag, _taken(name, first.tag))
 
     def _check_frames(self, failures: dict[str, KineverseError]) -> None:
         """Look for circles, which only frames that were written anew can close."""
         frames = self.head[FRAMES]
-        lookup = {**frames}.__getitem__ if len(self._moved_frames) > len(frames) else frames.__getitem__
+        sound = {WORLD}
         for name in self._moved_frames:
             if name not in frames:
                 continue
+            chain: dict[str, None] = {}
+            link = name
+            while link not in sound and link not in chain and link in frames:
+                chain[link] = None
+                link = frames[link].parent
+            if link in sound:
+                sound.update(chain)
+                continue
             try:
-                ancestors(name, lookup)
+                ancestors(name, frames.__getitem__)
             except ModelError as error:
                 failures[self.cells[FRAMES, name][-1].tag] = error
             except KeyError as error:
                 failures.setdefault(self.cells[FRAMES, name][-1].tag, missing(FRAMES, error.args[0], frames))
-        self._moved_frames.clear()
 
     def _touched(self, cell: Cell, old: Any, new: Any, place: int) -> None:
         """Note that a write at ``place`` changed, for those who read it."""
+        if old is ABSENT or new is ABSENT:
+            # What readers find instead is what was written before.
+            earlier = self.value_at(cell, place)
+            old, new = (earlier if value is ABSENT else value for value in (old, new))
         if old is new or (old is not ABSENT and new is not ABSENT and old == new):
             return
         kind, name = cell
         writers = self.cells.get(cell, ())
-        following = next((e.place for e in writers if e.place > place), None)
+        index = bisect_right(writers, place, key=_PLACE)
+        following = writers[index].place if index < len(writers) else None
         if following is None:
             self._set_head(cell, writers[-1].writes[cell] if writers else ABSENT)
             if kind == FRAMES and (old is not ABSENT or len(writers) > 1 or cell in self.reading):
-                self._moved_frames.add(name)
+                self._moved_frames[name] = None
         existence = (old is ABSENT) != (new is ABSENT)
         for tag, how in self.reading.get(cell, {}).items():
             reader = self.entries[tag].place
@@ -284,7 +315,8 @@ class History:
                 self._soil(tag)
         if existence:
             for tag in self.listing[kind]:
-                if self.entries[tag].place > place:
+                reader = self.entries[tag].place
+                if reader > place and (following is None or reader <= following):
                     self._soil(tag)
 
     def _soil(self, tag: str) -> None:
@@ -299,12 +331,23 @@ class History:
         return writers[index - 1].writes[cell] if index else ABSENT
 
     def names_at(self, kind: str, place: int) -> list[str]:
-        """Return the names of a kind that exist before ``place``."""
+        """Return the names of a kind that exist before ``place``, sorted."""
         if not self.sequence or self.sequence[-1].place <= place:
             own = self.sequence[-1].writes if self.sequence and self.sequence[-1].place == place else {}
             if not own:
-                return list(self.head[kind])
-        return [n for (k, n) in self.cells if k == kind and self.value_at((k, n), place) is not ABSENT]
+                return sorted(self.head[kind])
+        return sorted(n for (k, n) in self.cells if k == kind and self.value_at((k, n), place) is not ABSENT)
+
+    def ordered(self, kind: str) -> dict[str, Any]:
+        """Return the final values of a kind, in the order in which the sequence first writes them."""
+        names = self.head[kind]
+        if kind in self._disordered:
+            cells = [cell for entry in self.sequence for cell in entry.writes if cell[0] == kind]
+            values = {name: names[name] for _, name in cells if name in names}
+            names.clear()
+            names.update(values)
+            self._disordered.discard(kind)
+        return names
 
     # -- bookkeeping that can be undone --------------------------------------------------------------------
 
@@ -314,6 +357,7 @@ class History:
         self._before.clear()
         self._dirty.clear()
         self._moved_frames.clear()
+        self._contested.clear()
 
     def roll_back(self) -> None:
         """Undo everything since :meth:`begin`."""
@@ -344,7 +388,15 @@ class History:
         self._put_head(cell, old, value)
 
     def _put_head(self, cell: Cell, old: Any, value: Any) -> None:
-        _put(self.head[cell[0]], cell[1], value)
+        kind, name = cell
+        if value is ABSENT:
+            self.head[kind].pop(name, None)
+        else:
+            if name not in self.head[kind]:
+                writers = self.cells.get(cell)
+                if not writers or writers[0] is not self.sequence[-1]:
+                    self._disordered.add(kind)
+            self.head[kind][name] = value
         self._events.append((cell, old, value))
 
     def _link(self, entry: Entry) -> None:
@@ -359,6 +411,9 @@ class History:
                 self.cells[cell] = [entry]
             else:
                 insort(writers, entry, key=_PLACE)
+                self._disordered.add(cell[0])
+                if cell[0] == CONSTRAINTS:
+                    self._contested[cell[1]] = None
         for cell, how in entry.reads.cells.items():
             self.reading.setdefault(cell, {})[entry.tag] = how
         for kind in entry.reads.listings:
@@ -379,7 +434,9 @@ class History:
         for cell in entry.writes:
             writers = self.cells[cell]
             del writers[bisect_left(writers, entry.place, key=_PLACE)]
-            if not writers:
+            if writers:
+                self._disordered.add(cell[0])
+            else:
                 del self.cells[cell]
         for cell in entry.reads.cells:
             tags = self.reading[cell]
@@ -398,7 +455,7 @@ class History:
         entries = self.sequence
         self._undo.append((self._restore_places, ([(e, e.place) for e in entries],)))
         self._restore_places([(e, i * _GAP) for i, e in enumerate(entries)])
-        self._dirty = [(self.entries[tag].place, tag) for _, tag in self._dirty]
+        self._dirty = [(self.entries[tag].place, tag) for _, tag in self._dirty if tag in self.entries]
         heapq.heapify(self._dirty)
 
     @staticmethod
@@ -429,8 +486,8 @@ def _check_operation(operation: object) -> None:
         raise EditError(f"{operation!r} is not an operation; subclass kv.Operation as a frozen dataclass.")
 
 
-def _put(names: dict[str, Any], name: str, value: Any) -> None:
-    if value is ABSENT:
-        names.pop(name, None)
-    else:
-        names[name] = value
+def _taken(name: str, maker: str) -> NameTakenError:
+    return NameTakenError(
+        f"There is a constraint '{name}' already, made by {maker!r}; "
+        "choose another name or replace that operation."
+    )

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import logging
+import threading
+from collections import deque
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 
-from kineverse.symbols import Symbol
+from kineverse.symbols import Symbol, check_symbols
 
 from .diff import Change, Diff
 from .operation import CONSTRAINTS
@@ -57,10 +59,13 @@ class Listener:
 
 
 class Listeners:
-    """The listeners of one model, called in the order they came."""
+    """The listeners of one model, called in the order they came, in the order of versions."""
 
     def __init__(self) -> None:
         self._listeners: list[Listener] = []
+        self._waiting: deque[tuple[Diff, tuple[Listener, ...]]] = deque()
+        self._delivering = False
+        self._lock = threading.Lock()
 
     def add(
         self,
@@ -72,9 +77,9 @@ class Listeners:
         """Register a callback; with no filter at all it hears of everything."""
         listener = Listener(
             callback,
-            None if paths is None else tuple(paths),
-            None if symbols is None else frozenset(s.path for s in symbols),
-            None if tags is None else frozenset(tags),
+            None if paths is None else _names(paths),
+            None if symbols is None else frozenset(s.path for s in check_symbols(symbols)),
+            None if tags is None else frozenset(_names(tags)),
             self,
         )
         self._listeners.append(listener)
@@ -84,16 +89,43 @@ class Listeners:
         """Forget a listener."""
         self._listeners = [known for known in self._listeners if known is not listener]
 
-    def notify(self, diff: Diff) -> None:
-        """Call everyone concerned. One that raises is logged and keeps nobody else from hearing."""
-        for listener in list(self._listeners):
-            part = listener.relevant(diff)
-            if part is None:
-                continue
+    def post(self, diff: Diff) -> None:
+        """Note a diff for those who listen now; called in the order of versions."""
+        if self._listeners:
+            with self._lock:
+                self._waiting.append((diff, tuple(self._listeners)))
+
+    def deliver(self) -> None:
+        """Tell everyone concerned what is waiting; one that raises is logged and stops nobody else.
+
+        One thread does it at a time, so diffs arrive in order. Whoever comes meanwhile, a callback that edits
+        the model among them, leaves its diff to that thread and goes on.
+        """
+        while True:
+            with self._lock:
+                if self._delivering or not self._waiting:
+                    return
+                self._delivering = True
+                diff, listeners = self._waiting.popleft()
             try:
-                listener.callback(part)
-            except Exception:
-                _LOG.exception("A listener of the model raised at version %d.", diff.version)
+                for listener in listeners:
+                    self._tell(listener, diff)
+            finally:
+                with self._lock:
+                    self._delivering = False
+
+    def _tell(self, listener: Listener, diff: Diff) -> None:
+        part = listener.relevant(diff) if listener in self._listeners else None
+        if part is None:
+            return
+        try:
+            listener.callback(part)
+        except Exception:
+            _LOG.exception("A listener of the model raised at version %d.", diff.version)
+
+
+def _names(names: Iterable[str]) -> tuple[str, ...]:
+    return (names,) if isinstance(names, str) else tuple(names)
 
 
 def _below(path: str, root: str) -> bool:

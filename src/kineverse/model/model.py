@@ -65,12 +65,12 @@ class Model(ModelView):
                 self._history.roll_back()
                 raise
             else:
-                diff = self._commit(edit, self._history.runs - runs)
+                self._listeners.post(self._commit(edit, self._history.runs - runs))
             finally:
                 edit._open = False
                 self._edit = None
                 self._settle()
-        self._listeners.notify(diff)
+        self._listeners.deliver()
 
     def _settle(self) -> None:
         if self._edit is not None:
@@ -78,6 +78,9 @@ class Model(ModelView):
         events = self._history.take_events()
         if events:
             self._changed(events)
+
+    def _ordered(self, kind: str) -> dict[str, Any]:
+        return self._history.ordered(kind)
 
     def _commit(self, edit: Edit, runs: int) -> Diff:
         changes = list(self._history.changes())
@@ -113,7 +116,8 @@ class Model(ModelView):
         Parameters
         ----------
         callback
-            Called once per commit, in the thread that committed. If it raises, that is logged.
+            Called once per commit, in the order of versions, after the edit is over. It may edit the model
+            itself: of that is heard when everybody has heard of the first. If it raises, that is logged.
         paths
             Paths such as ``frames/kitchen``: everything at or below them.
         symbols
@@ -129,7 +133,7 @@ class Model(ModelView):
         """Return the model as it is now; it never changes and can be kept, compared and sent."""
         with self._lock:
             self._settle()
-            head = {kind: dict(names) for kind, names in self._history.head.items()}
+            head = {kind: dict(self._history.ordered(kind)) for kind in self._history.head}
             return Snapshot(head, tuple(self._history.sequence), self._version)
 
     def copy(self) -> Model:
@@ -154,8 +158,7 @@ class Snapshot(ModelView):
 
     def model(self) -> Model:
         """Return a model that goes on from here."""
-        copies = (Entry(e.tag, e.operation, e.place, e.reads, e.writes) for e in self._entries)
-        return Model(copies, self._version)
+        return Model(self._entries, self._version)
 
     @property
     def tags(self) -> list[str]:

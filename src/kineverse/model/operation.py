@@ -12,11 +12,12 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
+from kineverse.errors import ValueRejectedError
 from kineverse.expressions.expression import Expression, ExpressionLike
 from kineverse.symbols import Symbol
 
 from .articulation import Articulation
-from .body import Body
+from .body import Body, Pose
 from .constraint import Constraint, ConstraintLike, as_constraint
 from .frame import Frame, TransformLike
 from .rates import as_row, plain
@@ -66,7 +67,7 @@ class Effects:
         """Return all of it in canonical form, by kind and name, in plain coordinates."""
         result: dict[tuple[str, str], Any] = {}
         for name, frame in self.frames.items():
-            value = frame if isinstance(frame, Frame) else Frame.of(*frame)
+            value = _as_frame(name, frame)
             if any(isinstance(f, Expression) and f._nodes for f in value.factors):
                 value = Frame(
                     value.parent, tuple(plain(f) if isinstance(f, Expression) else f for f in value.factors)
@@ -74,7 +75,9 @@ class Effects:
             result[FRAMES, name] = value
         for name, triple in self.constraints.items():
             c = as_constraint(triple)
-            result[CONSTRAINTS, name] = Constraint(plain(c.lower), plain(c.expression), plain(c.upper))
+            if c.lower._nodes or c.expression._nodes or c.upper._nodes:
+                c = Constraint(plain(c.lower), plain(c.expression), plain(c.upper))
+            result[CONSTRAINTS, name] = c
         for coordinate, row in self.rates.items():
             result[RATES, str(coordinate)] = (coordinate, as_row(coordinate, row))
         others: tuple[tuple[str, Mapping[str, Any]], ...] = (
@@ -84,8 +87,42 @@ class Effects:
         )
         for kind, values in others:
             for name, datum in values.items():
+                _check_value(kind, name, datum)
                 result[kind, name] = datum
         return result
+
+
+def _as_frame(name: str, frame: Frame | tuple[str, TransformLike | Sequence[TransformLike]]) -> Frame:
+    if not isinstance(frame, Frame):
+        if not isinstance(frame, (tuple, list)) or len(frame) != 2:
+            raise ValueRejectedError(
+                f"Frame {name!r} is written as a pair (parent, transform), not as {frame!r}."
+            )
+        frame = Frame.of(*frame)
+    if not isinstance(frame.parent, str):
+        raise ValueRejectedError(
+            f"The parent of frame {name!r} is given by its name, not by {frame.parent!r}."
+        )
+    if not all(
+        isinstance(f, Pose) or (isinstance(f, Expression) and f.shape == (4, 4)) for f in frame.factors
+    ):
+        return Frame.of(frame.parent, frame.factors)
+    return frame
+
+
+_TYPES = {BODIES: Body, ARTICULATIONS: Articulation}
+
+
+def _check_value(kind: str, name: str, value: object) -> None:
+    if kind in _TYPES and not isinstance(value, _TYPES[kind]):
+        raise ValueRejectedError(f"{kind}/{name} is a kv.{_TYPES[kind].__name__}, not {value!r}.")
+    try:
+        hash(value)
+    except TypeError:
+        raise ValueRejectedError(
+            f"{kind}/{name} can be changed from outside, as it is or contains a list, a dict or an array; "
+            "write tuples, frozen dataclasses or expressions instead."
+        ) from None
 
 
 class Operation(ABC):

@@ -105,7 +105,7 @@ class Rates(Mapping[Symbol, Mapping[Symbol, Expression]]):
                 continue
             found.add(x)
             for speed, value in self._given[x]:
-                wanted += [s for s in (*value.symbols, speed.position) if s in self._given]
+                wanted += [s for s in (*all_symbols(value), speed.position) if s in self._given]
         return Rates({x: self._given[x] for x in sorted(found, key=lambda s: s.sort_key)})
 
     @cached_property
@@ -124,7 +124,7 @@ class Rates(Mapping[Symbol, Mapping[Symbol, Expression]]):
         found = set(self._rows)
         for row in self._rows.values():
             for speed, value in row.items():
-                found |= {speed, speed.position, *value.symbols}
+                found |= {speed, speed.position, *all_symbols(value)}
         return frozenset(found)
 
     @cached_property
@@ -133,10 +133,11 @@ class Rates(Mapping[Symbol, Mapping[Symbol, Expression]]):
         return {x: Carried.of((x,), (), (self.closure(x),)) for x in self._rows}
 
     def carry(self, expression: Expression) -> Expression:
-        """Return the expression in carried coordinates; it must be in plain ones."""
+        """Return the expression in carried coordinates; carried twice is carried once."""
         if not self._rows:
             return expression
-        wanted = {s: self.carried[s] for s in _all_symbols(expression) if s in self._rows}
+        expression = plain(expression)
+        wanted = {s: self.carried[s] for s in all_symbols(expression) if s in self._rows}
         return apply(expression, wanted)
 
     def eliminate(self, expression: Expression) -> Expression:
@@ -250,7 +251,9 @@ def _rebuilt(expression: Expression, exchange: Callable[[Node], Expression | Non
     replacements = {}
     for node in leaves(expression)[1]:
         replacement = exchange(node)
-        if replacement is None and not isinstance(node, Composed):
+        if isinstance(node, Composed):
+            replacement = _recomposed(node)
+        elif replacement is None:
             arguments = tuple(_rebuilt(a, exchange) for a in node.arguments)
             if any(new is not old for new, old in zip(arguments, node.arguments, strict=True)):
                 replacement = type(node).of(arguments, node.shape, node.options)
@@ -259,10 +262,26 @@ def _rebuilt(expression: Expression, exchange: Callable[[Node], Expression | Non
     return replace_nodes(expression, replacements)
 
 
-def _all_symbols(expression: Expression) -> set[Symbol]:
+def _recomposed(node: Composed) -> Expression | None:
+    """Return a composition over plain replacements, None if they are plain already."""
+    given = node.substitution
+    inner = node.arguments[0]
+    (inside,) = inner._nodes
+    source = inner if isinstance(inside, Carried) else plain(inner)
+    replacements = {s: p for s, e in given.items() if (p := plain(e)) != s}
+    if source is inner and all(replacements.get(s) is e for s, e in given.items()):
+        return None
+    if not replacements:
+        return plain(inner)
+    return apply(source, replacements)
+
+
+def all_symbols(expression: Expression) -> set[Symbol]:
     """Return the symbols of values and of given gradients."""
     symbols, nodes = leaves(expression)
-    return set(symbols).union(*(_all_symbols(a) for node in nodes for a in node.arguments))
+    # What was replaced in a composition is inside it, but it is not about that any more.
+    parts = (a for node in nodes for a in node.arguments[isinstance(node, Composed) :])
+    return set(symbols).union(*map(all_symbols, parts))
 
 
 def _expression_of(node: Node) -> Expression:

@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterator, Mapping
 from enum import IntFlag
 from typing import Any, Generic, TypeVar
 
-from kineverse.errors import UnknownNameError, suggest
+from kineverse.errors import KineverseError, UnknownNameError, suggest
 from kineverse.expressions.expression import Expression
 from kineverse.symbols import Symbol
 
@@ -14,9 +14,9 @@ from .articulation import Articulation
 from .body import Body
 from .constraint import Constraint
 from .frame import WORLD, Frame
-from .kinematics import relative
+from .kinematics import branches, relative
 from .operation import ARTICULATIONS, BODIES, CONSTRAINTS, DATA, FRAMES, RATES
-from .rates import Rates, Row
+from .rates import Rates, Row, all_symbols
 
 Cell = tuple[str, str]
 V = TypeVar("V")
@@ -66,12 +66,28 @@ class Reader:
 
     def fk(self, frame: str, relative_to: str = WORLD) -> Expression:
         """Return relative_to_T_frame, 4×4, coordinates carried by the rates that hold here."""
-        return self.carry(relative(frame, relative_to, self.frames.__getitem__))
+        recorded = self.frames.__getitem__
+        try:
+            # Frames above the last common ancestor are walked but do not matter, so they are not remembered.
+            base, down = branches(frame, relative_to, self._peek)
+        except (KineverseError, KeyError):
+            base, down = branches(frame, relative_to, recorded)
+        for name in (*base, *down):
+            recorded(name)
+        for end in (frame, relative_to):
+            self._reads.add((FRAMES, end), Read.EXISTENCE)
+        return self.carry(relative(frame, relative_to, self._peek))
+
+    def _peek(self, name: str) -> Frame:
+        value: Frame = self._value_at((FRAMES, name))
+        if value is ABSENT:
+            raise KeyError(name)
+        return value
 
     def carry(self, expression: Expression) -> Expression:
         """Return an expression with its coordinates carried by the rates that hold here."""
         rows: dict[Symbol, Row] = {}
-        wanted = list(expression.symbols)
+        wanted = list(all_symbols(expression))
         while wanted:
             x = wanted.pop()
             if x.order or x in rows or not x.has_derivative:
@@ -82,7 +98,7 @@ class Reader:
             if found is not ABSENT:
                 rows[x] = found[1]
                 for speed, value in found[1]:
-                    wanted += [speed.position, *value.symbols]
+                    wanted += [speed.position, *all_symbols(value)]
         return Rates(rows).carry(expression) if rows else expression
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import ItemsView, Iterable, Iterator, Mapping, Sequence, ValuesView
 from typing import Any, Literal
 
 import casadi as ca
@@ -12,7 +12,7 @@ import numpy as np
 from kineverse.errors import UnknownNameError, suggest
 from kineverse.expressions.expression import NO_NODES, Expression, as_expression, make
 from kineverse.state import State
-from kineverse.symbols import Symbol, parse_symbol_name
+from kineverse.symbols import Symbol, check_symbols, parse_symbol_name
 
 from . import kinematics
 from .articulation import Articulation
@@ -96,6 +96,10 @@ class ModelView:
     def _settle(self) -> None:
         """Bring an edit in progress up to date before it is read; there is none here."""
 
+    def _ordered(self, kind: str) -> dict[str, Any]:
+        """Return the values of a kind in the order in which operations write them."""
+        return self._head[kind]
+
     def _catch_up(self) -> None:
         self._settle()
         pending, self._pending = self._pending, []
@@ -173,11 +177,13 @@ class ModelView:
     def symbols(self) -> tuple[Symbol, ...]:
         """The coordinates and parameters of all frames and constraints, sorted: what a configuration is."""
         with self._lock:
+            self._settle()
             if self._all_symbols is None or self._pending:
                 self._catch_up()
                 found = {s for s in self._index.sorted() if s.order == 0}
-                if self.rates:
-                    found |= set(self.rates)
+                for coordinate, row in self.rates.items():
+                    found.add(coordinate)
+                    found.update(s for value in row.values() for s in value.symbols if s.order == 0)
                 self._all_symbols = tuple(sorted(found, key=lambda s: s.sort_key))
             return self._all_symbols
 
@@ -189,11 +195,12 @@ class ModelView:
     @property
     def speeds(self) -> tuple[Symbol, ...]:
         """The free speeds that move the coordinates, sorted."""
-        rates = self.rates
-        found: set[Symbol] = set()
-        for coordinate in self.degrees_of_freedom:
-            found.update(rates[coordinate] if coordinate in rates else (coordinate.derivative(),))
-        return tuple(sorted(found, key=lambda s: s.sort_key))
+        with self._lock:
+            rates = self.rates
+            found: set[Symbol] = set()
+            for coordinate in self.degrees_of_freedom:
+                found.update(rates[coordinate] if coordinate in rates else (coordinate.derivative(),))
+            return tuple(sorted(found, key=lambda s: s.sort_key))
 
     # -- kinematics ----------------------------------------------------------------------------------------
 
@@ -243,7 +250,13 @@ class ModelView:
             raise UnknownNameError(
                 f"There is no form {form!r}; forms are 'world_aligned', 'world' and 'body'."
             )
-        key = (frame, relative_to, form, None if symbols is None else tuple(symbols), heuristic)
+        key = (
+            frame,
+            relative_to,
+            form,
+            None if symbols is None else tuple(check_symbols(symbols)),
+            heuristic,
+        )
         with self._lock:
             self._settle()
             known = self._jacobians.get(key)
@@ -444,10 +457,15 @@ class ModelView:
                         later.append((symbol, c))
                     else:
                         values[symbol] = min(max(values[symbol], float(c.lower)), float(c.upper))
-            for symbol, c in later:
-                known = State(values)
-                if all(s in known or s.value is not None for s in (*c.lower.symbols, *c.upper.symbols)):
-                    values[symbol] = float(min(max(values[symbol], c.lower(known)), c.upper(known)))
+            # Bounds may be about symbols that have such bounds too: at most so many rounds until all fit.
+            for _ in later:
+                before = dict(values)
+                for symbol, c in later:
+                    known = State(values)
+                    if all(s in known or s.value is not None for s in (*c.lower.symbols, *c.upper.symbols)):
+                        values[symbol] = float(min(max(values[symbol], c.lower(known)), c.upper(known)))
+                if values == before:
+                    break
             return State(values, source="default")
 
     def velocity_rows(
@@ -462,12 +480,15 @@ class ModelView:
 
         Of the constraints relevant for ``subject``, or of all; see :mod:`kineverse.model.velocity`.
         """
-        constraints = self.constraints if subject is None else self.constraints_for(subject)
-        return velocity_rows(constraints, dt, rates=self.rates, speeds=speeds, gain=gain)
+        with self._lock:
+            constraints = dict(self.constraints) if subject is None else self.constraints_for(subject)
+            return velocity_rows(constraints, dt, rates=self.rates, speeds=speeds, gain=gain)
 
     def integrate(self, state: State, speeds: Mapping[Any, float], dt: float) -> State:
         """Return the state ``dt`` seconds later, at constant speeds: :mod:`kineverse.model.integration`."""
-        return integrate(self.degrees_of_freedom, self.rates, state, speeds, dt)
+        with self._lock:
+            coordinates, rates = self.degrees_of_freedom, self.rates
+        return integrate(coordinates, rates, state, speeds, dt)
 
     # -- printing ------------------------------------------------------------------------------------------
 
@@ -504,7 +525,16 @@ class _Named(Mapping[str, Any]):
 
     def __iter__(self) -> Iterator[str]:
         with self._view._lock:
-            return iter(list(self._values()))
+            self._view._settle()
+            return iter(list(self._view._ordered(self._kind)))
+
+    def items(self) -> ItemsView[str, Any]:
+        with self._view._lock:
+            return {name: self[name] for name in self}.items()
+
+    def values(self) -> ValuesView[Any]:
+        with self._view._lock:
+            return {name: self[name] for name in self}.values()
 
     def __len__(self) -> int:
         with self._view._lock:

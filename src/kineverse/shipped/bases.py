@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from ..articulations import DifferentialDrive, Joint, OmniBase
-from ..model.frame import WORLD
+from kineverse.articulations import DifferentialDrive, Joint, OmniBase
+from kineverse.model.frame import WORLD
 
 
 def base_of(model: str, prefix: str | None) -> Joint | None:

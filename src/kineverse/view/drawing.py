@@ -143,7 +143,7 @@ def _surface_points(
     normals /= np.sqrt(np.maximum(dot(normals, normals), 1e-12))[:, None]
     # An open surface seen from behind is lit like one seen from the front.
     normals *= np.where(dot(normals, rays) > 0.0, np.float32(-1.0), np.float32(1.0))[:, None]
-    return points + projection.origin.astype(np.float32), normals
+    return np.asarray(points + _single(projection.origin), dtype=np.float32), normals
 
 
 def _single(values: Floats) -> Singles:

@@ -22,6 +22,9 @@ from kineverse.view.viewpoint import automatic, importance
 FIELD_OF_VIEW, ASPECT = 0.8, 1.25
 ROOT = "/model"
 
+SEE_THROUGH = 0.45
+"""How opaque bodies are while frames are shown."""
+
 
 class Scene:
     """What the page shows of a model, kept up to date by sending only what moved.
@@ -52,8 +55,7 @@ class Scene:
         # Switches on the page and the motion of the model come from different threads.
         self._lock = threading.RLock()
         self._frames_shown, self._labels_shown, self._filter = False, False, ""
-        self._collisions_shown, self._ground_shown = False, True
-        self._collisions_built = False
+        self._visuals_shown, self._collisions_shown, self._ground_shown = True, False, True
         stage.set_up(server)
         self.refresh(model, values)
 
@@ -69,10 +71,10 @@ class Scene:
             with self._server.atomic():
                 self._server.scene.remove_by_name(ROOT)
                 self._nodes: dict[str, Any] = {}
-                self._collisions_built = False
-                self._add(visuals, "visual")
+                self._visuals, self._collisions = self._add(visuals, "visual"), list[Any]()
                 self._place_camera(visuals)
                 self.show_ground(self._ground_shown)
+                self.show_visuals(self._visuals_shown)
                 self.show_collisions(self._collisions_shown)
                 self.show_frames(self._frames_shown, self._labels_shown, self._filter)
             # A model without bodies would be an empty page.
@@ -109,6 +111,9 @@ class Scene:
             wanted = [k for k, name in enumerate(self.names) if containing.lower() in name.lower()]
             self._shown, self._labels = wanted, []
             self._axes = None
+            # Most frames lie inside of bodies.
+            for node, opacity in self._visuals:
+                node.opacity = min(opacity or 1.0, SEE_THROUGH) if axes else opacity
             if axes and wanted:
                 self._axes = self._server.scene.add_batched_axes(
                     "/axes",
@@ -128,40 +133,42 @@ class Scene:
         """Show or hide the collision shapes, half transparent; they are built when first asked for."""
         with self._lock:
             self._collisions_shown = shown
-            if shown and not self._collisions_built:
-                self._add(parts(self._model, "collision"), "collision")
-                self._collisions_built = True
-            for node in self._shapes["collision"]:
+            if shown and not self._collisions:
+                added = self._add(parts(self._model, "collision"), "collision")
+                self._collisions = [node for node, _ in added]
+            for node in self._collisions:
                 node.visible = shown
 
     def show_visuals(self, shown: bool) -> None:
         """Show or hide what is meant to be seen."""
-        for node in self._shapes["visual"]:
-            node.visible = shown
+        with self._lock:
+            self._visuals_shown = shown
+            for node, _ in self._visuals:
+                node.visible = shown
 
     def show_ground(self, shown: bool) -> None:
         """Show or hide the floor."""
         self._ground_shown = shown
         stage.set_floor(self._server, self._floor, self._extent, shown)
 
-    def _add(self, items: Iterable[Part], kind: Kind) -> None:
-        """Add shapes under the nodes of their frames; those of one frame and colour become one mesh."""
-        if kind == "visual":
-            self._shapes: dict[str, list[Any]] = {"visual": [], "collision": []}
+    def _add(self, items: Iterable[Part], kind: Kind) -> list[tuple[Any, float | None]]:
+        """Add shapes below the nodes of their frames; return their nodes and how opaque they are."""
+        added = []
         for number, part in enumerate(items):
-            node = self._node(part.frame)
+            frame = self._node(part.frame)
             for k, (surface, color) in enumerate(_by_color(part)):
-                self._shapes[kind].append(
-                    self._server.scene.add_mesh_simple(
-                        f"{node.name}/{kind}{number}_{k}",
-                        surface.vertices,
-                        surface.faces,
-                        color=tuple(round(255 * c) for c in color[:3]),
-                        opacity=None if color[3] >= 1.0 else color[3],
-                        side="front" if surface.closed else "double",
-                        cast_shadow=kind == "visual",
-                    )
+                opacity = None if color[3] >= 1.0 else color[3]
+                node = self._server.scene.add_mesh_simple(
+                    f"{frame.name}/{kind}{number}_{k}",
+                    surface.vertices,
+                    surface.faces,
+                    color=tuple(round(255 * c) for c in color[:3]),
+                    opacity=opacity,
+                    side="front" if surface.closed else "double",
+                    cast_shadow=kind == "visual",
                 )
+                added.append((node, opacity))
+        return added
 
     def _node(self, frame: str) -> Any:
         """Return the scene node of a frame; added at its pose if there is none yet."""

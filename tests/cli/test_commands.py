@@ -1,0 +1,231 @@
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+import kineverse as kv
+from kineverse.cli import main
+
+COMMAND = [sys.executable, "-m", "kineverse.cli"]
+
+
+@pytest.fixture
+def run(capsys):
+    """Run the command in this process: status, standard output, standard error."""
+
+    def call(*words):
+        status = main([str(word) for word in words])
+        captured = capsys.readouterr()
+        return status, captured.out, captured.err
+
+    return call
+
+
+def python(*words):
+    return subprocess.run([sys.executable, *words], capture_output=True, text=True, timeout=300, check=False)
+
+
+def test_help_names_all_commands_and_gives_examples(run):
+    status, out, err = run("--help")
+    assert (status, err) == (0, "")
+    for word in ("info", "fk", "view", "demo", "bench", "examples"):
+        assert word in out
+    for command in ("info", "fk", "view", "demo", "bench"):
+        status, out, _ = run(command, "--help")
+        assert status == 0
+        assert "examples:" in out
+
+
+def test_help_imports_nothing_heavy():
+    heavy = ("viser", "trimesh", "tqdm", "scipy", "PIL", "websockets")
+    code = (
+        "import sys; from kineverse.cli import main; main(['--help']); "
+        f"print([name for name in {heavy!r} if name in sys.modules], file=sys.stderr)"
+    )
+    done = python("-c", code)
+    assert (done.returncode, done.stderr) == (0, "[]\n")
+
+
+def test_version(run):
+    status, out, _ = run("--version")
+    assert (status, out) == (0, f"kineverse {kv.__version__}\n")
+
+
+@pytest.mark.parametrize(
+    "words", [[], ["nothing"], ["info"], ["fk", "kitchen"], ["view", "kitchen", "--port", "x"]]
+)
+def test_wrong_words_are_status_2(run, words):
+    status, out, err = run(*words)
+    assert (status, out) == (2, "")
+    assert "usage: kineverse" in err
+
+
+def test_info_in_words(run):
+    status, out, err = run("info", "kitchen")
+    assert (status, err) == (0, "")
+    assert "54 frames, 23 DoF, 46 constraints" in out
+    assert "kitchen/fridge_door" in out
+    assert "rad" in out
+    assert "--frames" in out
+    status, out, _ = run("info", "kitchen", "--frames", "--constraints")
+    assert "kitchen/fridge_door_handle" in out
+    assert "<=" in out
+
+
+def test_info_as_json_is_one_object_and_nothing_else(run):
+    status, out, err = run("info", "pr2", "--json")
+    assert (status, err) == (0, "")
+    answer = json.loads(out, parse_constant=lambda name: pytest.fail(f"{name} is not JSON"))
+    model = kv.load("pr2")
+    assert answer["counts"]["frames"] == len(answer["frames"]) == len(model.frames)
+    assert [dof["name"] for dof in answer["dof"]] == [str(s) for s in model.degrees_of_freedom]
+    assert [c["name"] for c in answer["constraints"]] == list(model.constraints)
+    by_name = {dof["name"]: dof for dof in answer["dof"]}
+    assert by_name["pr2/torso_lift_joint"]["unit"] == "m"
+    assert by_name["pr2/l_elbow_flex_joint"]["unit"] == "rad"
+    assert by_name["pr2/l_forearm_roll_joint"]["lower"] is None
+    assert by_name["pr2/head_tilt_joint"]["upper"] == pytest.approx(model.limits("pr2/head_tilt_joint")[1])
+    assert all(edge > 0.3 for edge in answer["size"]["extent"])
+    assert answer["size"]["mass"] > 10
+
+
+@pytest.mark.parametrize("name", kv.shipped_models())
+def test_info_of_everything_that_ships(run, name):
+    status, out, err = run("info", name)
+    assert (status, err) == (0, "")
+    assert "DoF" in out
+
+
+def test_fk_in_words_and_as_json(run):
+    words = ("fk", "kitchen", "kitchen/fridge_door_handle", "--set", "kitchen/fridge_door=30deg")
+    status, out, err = run(*words)
+    assert (status, err) == (0, "")
+    assert "position" in out
+    status, out, err = run(*words, "--json")
+    assert (status, err) == (0, "")
+    answer = json.loads(out)
+    expected = kv.load("kitchen").fk("kitchen/fridge_door_handle")({"kitchen/fridge_door": np.pi / 6})
+    np.testing.assert_allclose(answer["transform"], expected, atol=1e-12)
+    np.testing.assert_allclose(answer["position"], np.asarray(expected)[:3, 3], atol=1e-12)
+    assert answer["depends_on"] == {"kitchen/fridge_door": pytest.approx(np.pi / 6)}
+
+
+def test_fk_relative_to_a_frame(run):
+    _, out, _ = run(
+        "fk", "kitchen", "kitchen/fridge_door_handle", "--relative-to", "kitchen/fridge", "--json"
+    )
+    expected = kv.load("kitchen").fk("kitchen/fridge_door_handle", "kitchen/fridge")(
+        {"kitchen/fridge_door": 0.0}
+    )
+    np.testing.assert_allclose(json.loads(out)["transform"], expected, atol=1e-12)
+
+
+def test_a_posture_beyond_limits_is_evaluated_and_said(run):
+    status, out, err = run(
+        "fk", "kitchen", "kitchen/fridge_door", "--set", "kitchen/fridge_door=9.9", "--json"
+    )
+    assert status == 0
+    assert json.loads(out)
+    assert "violated" in err
+    assert len(err.splitlines()) == 1
+
+
+@pytest.mark.parametrize(
+    ("words", "hint"),
+    [
+        (("info", "kitchn"), "kitchen"),
+        (("info", "/nowhere/robot.urdf"), "robot.urdf"),
+        (("info", "."), ""),
+        (("fk", "kitchen", "kitchen/fridge_dor"), "kitchen/fridge_door"),
+        (("fk", "kitchen", "kitchen/fridge_door", "--set", "fridge_door=1"), "kitchen/fridge_door"),
+        (("fk", "kitchen", "kitchen/fridge_door", "--set", "kitchen/fridge_door=nan"), "finite"),
+        (("fk", "kitchen", "kitchen/fridge_door", "--relative-to", "wrld"), "wrld"),
+        (("view", "kitchn"), "kitchen"),
+        (("view", "kitchen", "--port", "99999"), "65535"),
+        (("view", "kitchen", "--set", "nothing"), "NAME=VALUE"),
+    ],
+)
+def test_errors_are_one_line_with_the_right_names_and_status_2(run, words, hint):
+    status, out, err = run(*words)
+    assert (status, out) == (2, "")
+    assert len(err.splitlines()) == 1
+    assert err.startswith("kineverse: ")
+    assert hint in err
+    assert "Traceback" not in err
+
+
+def test_a_file_that_is_no_model_is_one_line(run, tmp_path):
+    path = tmp_path / "broken.urdf"
+    path.write_text("<robot name='x'><link name='a'>")
+    status, out, err = run("info", path)
+    assert (status, out, len(err.splitlines())) == (2, "", 1)
+
+
+def test_meshes_that_are_missing_are_counted(run, tmp_path):
+    path = tmp_path / "box.urdf"
+    mesh = "<geometry><mesh filename='package://nowhere/box.stl'/></geometry>"
+    path.write_text(f"<robot name='x'><link name='a'><visual>{mesh}</visual></link></robot>")
+    status, out, err = run("info", path)
+    assert (status, err) == (0, "")
+    assert "1 shapes, 1 of them not loaded" in out
+    _, out, _ = run("info", path, "--json")
+    assert json.loads(out)["not_loaded"] == ["a"]
+
+
+def test_a_closed_pipe_is_quiet():
+    done = subprocess.run(
+        f"'{sys.executable}' -m kineverse.cli info kitchen --frames --constraints | head -n 1",
+        shell=True,
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=False,
+    )
+    assert done.stdout == "kitchen\n"
+    assert done.stderr == ""
+
+
+def test_ctrl_c_is_130_and_one_empty_line(monkeypatch, run):
+    def interrupted(*_, **__):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(kv, "load", interrupted)
+    assert run("info", "kitchen") == (130, "", "\n")
+
+
+@pytest.mark.parametrize("stop", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("words", [["view", "shelf_door", "--port", "0"], ["demo", "--port", "0"]])
+def test_pages_end_with_status_0(stop, words):
+    pytest.importorskip("viser")
+    environment = {k: v for k, v in os.environ.items() if k not in ("DISPLAY", "WAYLAND_DISPLAY", "BROWSER")}
+    with subprocess.Popen(
+        [*COMMAND, *words],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        env={**environment, "PYTHONUNBUFFERED": "1"},
+    ) as process:
+        first = process.stdout.readline()
+        assert first.startswith("http://127.0.0.1:")
+        second = process.stdout.readline()
+        assert "DoF" in second
+        process.send_signal(stop)
+        out, err = process.communicate(timeout=60)
+    assert process.returncode == 0
+    assert "Traceback" not in err
+    assert "viser" not in out + err
+
+
+def test_bench_hands_its_words_on(monkeypatch, run):
+    import kineverse.bench
+
+    heard = []
+    monkeypatch.setattr(kineverse.bench, "run", lambda words: heard.append(words) or 0, raising=False)
+    assert run("bench", "fk", "--json")[0] == 0
+    assert heard == [["fk", "--json"]]

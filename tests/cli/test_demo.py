@@ -1,0 +1,78 @@
+from __future__ import annotations
+
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+import kineverse as kv
+from kineverse.cli import main
+from kineverse.cli.demo import MODELS, STATE
+from kineverse.cli.drive import SAMPLES, drive
+
+
+@pytest.fixture(scope="module")
+def both():
+    model = kv.Model()
+    for name in MODELS:
+        model.include(name)
+    return model
+
+
+def test_the_opening_scene_is_one_the_models_have_and_allow(both):
+    known = {str(symbol) for symbol in both.degrees_of_freedom}
+    assert set(STATE) <= known
+    assert list(both.violations(both.default_state().updated(STATE))) == []
+
+
+def test_headless_drives_everything_writes_a_picture_and_ends(tmp_path, capsys):
+    path = tmp_path / "picture.png"
+    assert main(["demo", "--headless", "--picture", str(path)]) == 0
+    out, err = capsys.readouterr()
+    assert err == ""
+    assert "45 DoF driven" in out
+    assert "0 limits violated" in out
+    assert path.read_bytes().startswith(b"\x89PNG")
+
+
+def test_headless_needs_the_core_alone(tmp_path):
+    extras = ("viser", "trimesh", "PIL", "scipy", "collada")
+    code = (
+        f"import sys\nfor name in {extras!r}: sys.modules[name] = None\n"
+        f"from kineverse.cli import main\n"
+        f"sys.exit(main(['demo', '--headless', '--picture', {str(tmp_path / 'core.png')!r}]))"
+    )
+    words = [sys.executable, "-c", code]
+    done = subprocess.run(words, capture_output=True, text=True, timeout=300, check=False)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert (tmp_path / "core.png").exists()
+
+
+def test_a_picture_that_cannot_be_written_is_one_line(tmp_path, capsys):
+    assert main(["demo", "--headless", "--picture", str(tmp_path / "none" / "x.png")]) == 2
+    err = capsys.readouterr().err
+    assert err.endswith("No such file or directory\n")
+    assert len(err.splitlines()) == 1
+
+
+def test_driving_finds_what_is_wrong_with_a_model():
+    a, b = kv.position("a"), kv.position("b")
+    model = kv.Model()
+    with model.edit() as edit:
+        edit.add_frame("lid", parent="world", transform=kv.rotation_x(a))
+        edit.add_frame("rod", parent="world", transform=kv.translation(0, 0, np.sqrt(b)))
+        edit.constrain("a/range", 0, a, 1)
+        edit.constrain("a/really", -1, 2 * a, 1)
+        edit.constrain("b/range", -1, b, 1)
+    result = drive(model)
+    assert result.freedoms == 2
+    assert result.poses == 2 * 2 * SAMPLES
+    assert result.violations == 1
+    assert any("a/really" in line for line in result.problems)
+    assert any(line.startswith("b: 1 frames have no rigid pose, such as rod") for line in result.problems)
+
+
+def test_driving_nothing_is_no_trouble():
+    result = drive(kv.Model())
+    assert (result.freedoms, result.poses, result.problems) == (0, 0, [])
