@@ -173,7 +173,7 @@ def test_meshes_that_are_missing_are_counted(run, tmp_path):
     path.write_text(f"<robot name='x'><link name='a'><visual>{mesh}</visual></link></robot>")
     status, out, err = run("info", path)
     assert (status, err) == (0, "")
-    assert "1 shapes, 1 of them not loaded" in out
+    assert "1 shape, 1 of them not loaded" in out
     _, out, _ = run("info", path, "--json")
     assert json.loads(out)["not_loaded"] == ["a"]
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import importlib
 
 HELP = """measure the speed of this installation, beside its peers where they are installed
 
@@ -21,7 +22,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Measure and print."""
-    from kineverse.bench import run as measure
-
+    measurements = importlib.import_module("kineverse.bench")
     words = [*arguments.names, *(["--json"] if arguments.json else [])]
-    return int(measure(words) or 0)
+    return int(measurements.run(words) or 0)

@@ -48,7 +48,7 @@ def sections(summary: Summary, frames: bool = False, constraints: bool = False) 
     lines = [
         summary.name,
         f"  {frames_} frames, {freedoms} DoF, {conditions} constraints",
-        f"  {extent} m, {summary.mass:.4g} kg, {summary.shapes} shapes"
+        f"  {extent} m, {summary.mass:.4g} kg, {summary.shapes} shape{'' if summary.shapes == 1 else 's'}"
         + (f", {len(summary.problems)} of them not loaded" if summary.problems else ""),
     ]
     found = ["\n".join(lines)]

@@ -1,4 +1,4 @@
-"""Evaluation at many points: compiled for vectors of configurations, and what there is until that is ready."""
+"""Evaluation at many points: on vectors of configurations, and what there is until that is compiled."""
 
 from __future__ import annotations
 
@@ -32,7 +32,8 @@ class Batch:
 
     The program is compiled for vectors when that pays: a call whose rows would keep the interpreter busy for
     longer than the compiler waits for it, smaller ones add up until it is compiled in the background. What
-    cannot be done on vectors (solvers inside of loops) stays with CasADi's map over the function of single calls.
+    cannot be done on vectors (solvers inside of loops) stays with CasADi's map over the function of single
+    calls.
 
     Parameters
     ----------
@@ -182,4 +183,4 @@ def _load(path: str) -> Compiled:
     code = ctypes.CDLL(path).kineverse_batch
     code.argtypes = (ctypes.c_void_p, ctypes.c_void_p, ctypes.c_longlong, ctypes.c_int)
     code.restype = ctypes.c_int
-    return code  # type: ignore[no-any-return]
+    return code

@@ -138,8 +138,8 @@ def vectorisable(program: Program) -> bool:
 def batch_source(program: Program) -> str:
     """Return the C source of ``kineverse_batch``, which evaluates a program at many points.
 
-    Its arguments are the rows of inputs, a pointer to the rows of each output, the number of rows, and whether
-    the outputs are written past the caches.
+    Its arguments are the rows of inputs, a pointer to the rows of each output, the number of rows, and
+    whether the outputs are written past the caches.
     """
     plan = schedule(program.function, _PART_LENGTH)
     definitions = {

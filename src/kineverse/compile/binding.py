@@ -1,8 +1,8 @@
 """CasADi functions bound to memory, and calls of them that share nothing.
 
-A plain call of a CasADi function takes some 17 µs whatever it computes; one that is bound to its arguments and
-results takes a tenth of one. But it has one place for its results and no lock, so a function that may be called
-from anywhere keeps a pool of bindings, takes one out for each call and hands out copies.
+A plain call of a CasADi function takes some 17 µs whatever it computes; one that is bound to its arguments
+and results takes a tenth of one. But it has one place for its results and no lock, so a function that may be
+called from anywhere keeps a pool of bindings, takes one out for each call and hands out copies.
 """
 
 from __future__ import annotations
@@ -47,9 +47,9 @@ def bind(
         What evaluates, and an object that must be kept for as long as that may be called.
     """
     buffer, run = function.buffer()
-    buffer.set_arg(0, memoryview(vector))
+    buffer.set_arg(0, vector.data)
     for i, output in enumerate(outputs):
-        buffer.set_res(i, memoryview(output.reshape(-1)))
+        buffer.set_res(i, output.reshape(-1).data)
     if not checked:
         return run, buffer
 
@@ -93,7 +93,7 @@ def pooled(
         outputs = tuple(np.zeros(shape) for shape in shapes)
         run, keep = bind(function, vector, outputs, checked)
         copies = tuple(output.copy for output in outputs)
-        return memoryview(vector), run, copies[0] if single else copies, keep
+        return vector.data, run, copies[0] if single else copies, keep
 
     # Three times the same but for the copies: a loop over one or two of them takes a fifth of the whole call.
     if single:

@@ -1,9 +1,9 @@
 """Compiled libraries on disk, by the digest of what they are made from.
 
-Code from this folder is loaded into the process, so nobody else may be able to write there: it is made with mode
-0700, and refused if it belongs to someone else or others may write to it. Every library ends in a digest of
-itself that is checked before it is loaded; a broken one counts as absent. Libraries arrive by renaming, so any
-number of processes can share the folder.
+Code from this folder is loaded into the process, so nobody else may be able to write there: it is made with
+mode 0700, and refused if it belongs to someone else or others may write to it. Every library ends in a digest
+of itself that is checked before it is loaded; a broken one counts as absent. Libraries arrive by renaming, so
+any number of processes can share the folder.
 """
 
 from __future__ import annotations
@@ -22,7 +22,8 @@ logger = logging.getLogger("kineverse.compile")
 
 MAXIMUM_BYTES = 512 * 2**20
 
-# The end of every library: this, then the SHA-256 of everything before it. Loaders ignore what follows the image.
+# The end of every library: this, then the SHA-256 of everything before it. Loaders ignore what follows the
+# image.
 _MARK = b"\nkineverse library sha256 "
 _TRAILER = len(_MARK) + 32
 _STALE_SECONDS = 3600.0
@@ -112,9 +113,9 @@ class LibraryCache:
 def library_cache() -> LibraryCache:
     """Return the cache of this user.
 
-    The folder is ``KINEVERSE_CACHE_DIR``, else ``kineverse`` in ``XDG_CACHE_HOME``, else ``~/.cache/kineverse``.
-    Where that cannot be used, a private folder that is removed when the process ends takes its place, and the
-    log says why.
+    The folder is ``KINEVERSE_CACHE_DIR``, else ``kineverse`` in ``XDG_CACHE_HOME``, else
+    ``~/.cache/kineverse``. Where that cannot be used, a private folder that is removed when the process ends
+    takes its place, and the log says why.
     """
     get = os.environ.get
     return _open(get("KINEVERSE_CACHE_DIR"), get("XDG_CACHE_HOME"), get("HOME"))
@@ -138,7 +139,7 @@ def _open(folder: str | None, caches: str | None, home: str | None) -> LibraryCa
 
 
 def _why_not(folder: Path) -> str | None:
-    """Return why libraries must not be loaded from the folder or cannot be written to it; None if all is well."""
+    """Return why libraries cannot or must not be kept in the folder; None if all is well."""
     try:
         folder.parent.mkdir(parents=True, exist_ok=True)
         with contextlib.suppress(FileExistsError):

@@ -14,9 +14,9 @@ from .binding import Array, Run, Shape, Vector
 class Evaluator(metaclass=ABCMeta):
     """A function with a place for its input and for its outputs, for one thread.
 
-    Fill :attr:`input`, call, read :attr:`outputs`. Every call rewrites the arrays in :attr:`outputs` in place:
-    copy what has to outlive the next one. Made by :meth:`CompiledFunction.bind`; it becomes faster by itself when
-    the function's C is ready.
+    Fill :attr:`input`, call, read :attr:`outputs`. Every call rewrites the arrays in :attr:`outputs` in
+    place: copy what has to outlive the next one. Made by :meth:`CompiledFunction.bind`; it becomes faster by
+    itself when the function's C is ready.
 
     Attributes
     ----------
@@ -35,7 +35,7 @@ class Evaluator(metaclass=ABCMeta):
         put = super().__setattr__
         put("input", np.zeros(size))
         put("outputs", tuple(np.zeros(shape) for shape in shapes))
-        put("_view", memoryview(self.input))
+        put("_view", self.input.data)
         put("_convert", convert)
         put("_kept", [])
 
@@ -56,7 +56,7 @@ class Evaluator(metaclass=ABCMeta):
             try:
                 self._view[:] = x
             except (ValueError, TypeError):
-                self._view[:] = self._convert(x)
+                self.input[:] = self._convert(x)
         self._run()
 
     def _evaluate_by(self, run: Run, keep: object) -> None:

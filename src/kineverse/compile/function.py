@@ -31,8 +31,9 @@ logger = logging.getLogger("kineverse.compile")
 Tier: TypeAlias = Literal["interpreter", "c"]
 WantedTier: TypeAlias = Literal["auto", "interpreter", "c"]
 
-# Below, a call costs the same in both tiers: it is all overhead.
-_WORTH_COMPILING = 12
+# Inputs and outputs count as operations too: below this there is nothing to compute. Everything else is worth it,
+# as the extension calls a compiled sum in a fifth of the time that CasADi's interpreter needs.
+_WORTH_COMPILING = 4
 # So many operations take some microseconds: others may have the GIL meanwhile.
 _LENGTHY = 5000
 
@@ -54,7 +55,8 @@ def compile(  # noqa: A001
     outputs
         An expression (calls return one array), or a list or tuple of them (calls return a tuple of arrays).
     inputs
-        The symbols that make up the input vector, in this order; by default all symbols of the outputs, sorted.
+        The symbols that make up the input vector, in this order; by default all symbols of the outputs,
+        sorted.
     tier
         ``"auto"`` as described; without a C compiler, or where C is of no use, the interpreter stays.
         ``"interpreter"`` never compiles. ``"c"`` insists on C.
@@ -110,8 +112,8 @@ class CompiledFunction:
     """
 
     __slots__ = (
-        "__weakref__", "_batch", "_call", "_evaluators", "_function", "_library", "_lock", "_native", "_outputs", "_program",
-        "_signature", "_single", "_wanted", "inputs", "names", "shapes", "tier",
+        "__weakref__", "_batch", "_call", "_evaluators", "_function", "_library", "_lock", "_native",
+        "_outputs", "_program", "_signature", "_single", "_wanted", "inputs", "names", "shapes", "tier",
     )  # fmt: skip
 
     inputs: tuple[Symbol, ...]
@@ -184,16 +186,16 @@ class CompiledFunction:
     def batch(self, x: npt.ArrayLike, out: Any = None) -> Any:
         """Return the outputs at many points.
 
-        Rows are spread over all cores. The numbers are those of single calls but for the last digits (4 ulp) of
-        elementary functions. The first batch that is large enough to pay for it waits for a compiler.
+        Rows are spread over all cores. The numbers are those of single calls but for the last digits (4 ulp)
+        of elementary functions. The first batch that is large enough to pay for it waits for a compiler.
 
         Parameters
         ----------
         x
             A point per row, shape (N, n).
         out
-            Where to write: contiguous float64 arrays of shape (N, *shape), one per output (alone if there is a
-            single output). New ones are made if None.
+            Where to write: contiguous float64 arrays of shape (N, *shape), one per output (alone if there is
+            a single output). New ones are made if None.
 
         Returns
         -------
@@ -258,7 +260,9 @@ class CompiledFunction:
             Where its C is, if it is compiled.
         """
         shapes, checked, convert = self.shapes, self._program.calls_others, self._signature.vector
-        direct = address is not None and not checked and len(shapes) <= MOST_OUTPUTS and native.module is not None
+        direct = (
+            address is not None and not checked and len(shapes) <= MOST_OUTPUTS and native.module is not None
+        )
         if direct:
             lengthy = self._program.instructions > _LENGTHY
             call = native.module.Call(address, self._signature.size, shapes, self._single, lengthy, convert)

@@ -23,7 +23,8 @@ class CompilerInformation:
     flags
         What it is told about optimisation and arithmetic, for functions of moderate size.
     vector_unit
-        The widest vector instructions that batches use: ``avx512``, ``avx2``, ``avx``, ``sse2``, ``neon``, ``none``.
+        The widest vector instructions that batches use: ``avx512``, ``avx2``, ``avx``, ``sse2``, ``neon``,
+        ``none``.
     cores
         How many cores batches are spread over.
     cache_folder

@@ -54,7 +54,7 @@ class Library(Generic[Code]):
         self._program = program
         self._source = source
         self._load = load
-        self._ready = WeakMethod(ready) if ready is not None else None  # type: ignore[arg-type]
+        self._ready = WeakMethod(ready) if ready is not None else None
         self._build: Build | None = None
         self._toolchain: Toolchain | None = toolchain()
         level = optimisation(program.instructions)
@@ -79,9 +79,7 @@ class Library(Generic[Code]):
         if self.code is not None or self.error is not None or self._toolchain is None:
             return
         if self._build is None or self._build.done:
-            self._build = request(
-                self._key, self._toolchain, self._source, self._flags, self._built, urgent
-            )
+            self._build = request(self._key, self._toolchain, self._source, self._flags, self._built, urgent)
 
     def wait(self, timeout: float | None = None) -> bool:
         """Wait until it is there or cannot be made; return whether it is there.
@@ -117,10 +115,10 @@ class Library(Generic[Code]):
 
 
 def optimisation(instructions: int) -> str | None:
-    """Return how hard the compiler shall try, for its time to stay within some seconds; None if there is no hope.
+    """Return how hard the compiler may try without taking minutes; None if it should not be asked at all.
 
-    gcc 12 takes 0.2 ms an instruction at -O3, 0.12 ms at -O1 (7 % slower code) and 0.06 ms at -O0 (three times
-    slower, and four times faster than the interpreter).
+    gcc 12 takes 0.2 ms an instruction at -O3, 0.12 ms at -O1 (7 % slower code) and 0.06 ms at -O0 (three
+    times slower, and four times faster than the interpreter).
     """
     if instructions <= 8_000:
         return "-O3"

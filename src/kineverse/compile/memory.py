@@ -1,8 +1,8 @@
 """Memory for large results, used again when nobody holds the results any more.
 
-Memory that is new to a process is filled with zeros by the system at first touch, which takes three times as long
-as computing and writing poses does. A loop over batches drops one result for each it makes, so it gets that
-memory back.
+Memory that is new to a process is filled with zeros by the system at first touch, which takes three times as
+long as computing and writing poses does. A loop over batches drops one result for each it makes, so it gets
+that memory back.
 """
 
 from __future__ import annotations
@@ -17,8 +17,8 @@ _CACHE_LINE = 64
 _SMALLEST = 4 * 2**20
 _LARGEST_TOTAL = 128 * 2**20
 
-# Longest free first. Used by operations that are atomic: garbage collection may interrupt this very code to give
-# back a block.
+# Longest free first. Used by operations that are atomic: garbage collection may interrupt this very code to
+# give back a block.
 _free: list[npt.NDArray[np.float64]] = []
 
 
@@ -38,7 +38,7 @@ def aligned(size: int) -> npt.NDArray[np.float64]:
     if block is None:
         block = np.empty(size + _CACHE_LINE // 8)
     # Arrays refer to the object they are made from, so this one lives as long as the last of them.
-    lease = memoryview(block)
+    lease = block.data
     weakref.finalize(lease, _give_back, block).atexit = False
     return _from_line(np.frombuffer(lease))[:size]
 

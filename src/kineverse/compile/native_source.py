@@ -1,6 +1,7 @@
 """C text: a Python extension that calls compiled functions with next to no overhead.
 
-It does what :mod:`.binding` and :mod:`.evaluator` do in Python, and is used where Python's headers are installed.
+It does what :mod:`.binding` and :mod:`.evaluator` do in Python, and is used where Python's headers are
+installed.
 """
 
 NATIVE = r"""
@@ -127,7 +128,7 @@ static PyObject *call_new(PyTypeObject *type, PyObject *args, PyObject *names) {
   for (Py_ssize_t i = 0; i < outputs; i++) {
     PyObject *shape = PyTuple_GET_ITEM(shapes, i);
     self->dimensions[i] = (int)PyTuple_GET_SIZE(shape);
-    for (Py_ssize_t k = 0; k < PyTuple_GET_SIZE(shape); k++) *to++ = PyLong_AsSsize_t(PyTuple_GET_ITEM(shape, k));
+    for (Py_ssize_t k = 0; k < self->dimensions[i]; k++) *to++ = PyLong_AsSsize_t(PyTuple_GET_ITEM(shape, k));
   }
   if (PyErr_Occurred()) {
     Py_DECREF(self);
@@ -159,7 +160,8 @@ typedef struct {
   PyObject *input, *outputs, *convert;
 } Evaluator;
 
-static PyObject *evaluator_vectorcall(PyObject *object, PyObject *const *args, size_t count, PyObject *names) {
+static PyObject *evaluator_vectorcall(PyObject *object, PyObject *const *args, size_t count,
+                                      PyObject *names) {
   Evaluator *self = (Evaluator *)object;
   const Py_ssize_t given = PyVectorcall_NARGS(count);
   if (given > 1 || names) {
@@ -189,7 +191,8 @@ static void evaluator_dealloc(PyObject *object) {
 static PyObject *evaluator_new(PyTypeObject *type, PyObject *args, PyObject *names) {
   PyObject *address, *input, *outputs, *convert;
   int lengthy;
-  if (!PyArg_ParseTuple(args, "OO!O!pO", &address, &PyArray_Type, &input, &PyTuple_Type, &outputs, &lengthy, &convert))
+  if (!PyArg_ParseTuple(args, "OO!O!pO", &address, &PyArray_Type, &input, &PyTuple_Type, &outputs, &lengthy,
+                        &convert))
     return NULL;
   Evaluator *self = (Evaluator *)type->tp_alloc(type, 0);
   if (!self) return NULL;
@@ -223,8 +226,8 @@ static PyObject *evaluator_repr(PyObject *object) {
 }
 
 static PyMemberDef evaluator_members[] = {
-    {"input", T_OBJECT_EX, offsetof(Evaluator, input), READONLY, "The vector that is evaluated at, shape (n,)."},
-    {"outputs", T_OBJECT_EX, offsetof(Evaluator, outputs), READONLY, "The arrays that calls rewrite in place."},
+    {"input", T_OBJECT_EX, offsetof(Evaluator, input), READONLY, "The vector that is evaluated at."},
+    {"outputs", T_OBJECT_EX, offsetof(Evaluator, outputs), READONLY, "The arrays that calls rewrite."},
     {NULL},
 };
 

@@ -1,7 +1,7 @@
 """Expressions as one function of a vector of numbers, without any name from outside.
 
-The symbols are replaced by elements of one neutral vector first. So the same mechanism under other names is the
-same program, with the same compiled library, and no name of a document can reach generated code.
+The symbols are replaced by elements of one neutral vector first. So the same mechanism under other names is
+the same program, with the same compiled library, and no name of a document can reach generated code.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ class Program:
         self.digest = hashlib.sha256(text.encode())
 
     def key(self, *details: str) -> str:
-        """Return the digest of this program and of how it is compiled; equal for equal ones, in every process."""
+        """Return the digest of this program and of how it is compiled, the same in every process."""
         digest = self.digest.copy()
         digest.update(repr(details).encode())
         return digest.hexdigest()[:40]

@@ -1,8 +1,8 @@
 """The instructions of a CasADi function as values that are each computed once, cut into parts.
 
-CasADi's instructions write to places of a work vector again and again. Here every result is a value with a number
-of its own. Long programs are cut into parts, each of which becomes a C function, because the time of a compiler
-grows faster than the length of a function. Values that a later part needs wait in places of a store.
+CasADi's instructions write to places of a work vector again and again. Here every result is a value with a
+number of its own. Long programs are cut into parts, each of which becomes a C function, because the time of a
+compiler grows faster than the length of a function. Values that a later part needs wait in places of a store.
 """
 
 from __future__ import annotations
@@ -19,8 +19,8 @@ from .program import CasadiFunction
 class Step:
     """One value: an operation and the numbers of the values it is applied to.
 
-    For inputs (``OP_INPUT``) the one argument is the place in the input vector, and ``constant`` is the number
-    of a constant (``OP_CONST``).
+    For inputs (``OP_INPUT``) the one argument is the place in the input vector, and ``constant`` is the
+    number of a constant (``OP_CONST``).
     """
 
     op: int

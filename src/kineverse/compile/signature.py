@@ -71,7 +71,7 @@ class Signature:
             raise ShapeError(
                 f"Expected a vector of {self._described()}, not an array of shape {array.shape}."
             )
-        return np.ascontiguousarray(array)
+        return np.ascontiguousarray(array) if array.flags.aligned else array.copy()
 
     def _from_mapping(self, values: Mapping[Any, Any]) -> npt.NDArray[np.float64]:
         positions = self.positions
@@ -87,7 +87,8 @@ class Signature:
                 raise NameTakenError(f"'{self.names[position]}' is given twice, by name and as a symbol.")
             given.add(position)
             vector[position] = self._number(position, value)
-        # A state describes the whole world; other mappings are written for this function, typing errors included.
+        # A state describes the whole world; other mappings are written for this function, typing errors
+        # included.
         if unknown and not isinstance(values, State):
             raise UnknownNameError(
                 f"Not among the inputs: {_listed(unknown)}. {suggest(unknown[0], self.names, 'input')}"

@@ -2,8 +2,8 @@
 
 Compiled libraries are kept on disk, where another machine may find them (a home directory on a network) and
 where they outlive an update of the compiler. So everything that code made here depends on goes into
-:attr:`Toolchain.identity`. It is read off files rather than asked of the compiler, because it is needed whenever
-a function is compiled and starting a compiler takes longer than everything else.
+:attr:`Toolchain.identity`. It is read off files rather than asked of the compiler, because it is needed
+whenever a function is compiled and starting a compiler takes longer than everything else.
 """
 
 from __future__ import annotations
@@ -22,7 +22,8 @@ from dataclasses import dataclass
 
 logger = logging.getLogger("kineverse.compile")
 
-# No contraction to fused operations: with it interpreter and C differ. No -ffast-math: it deletes checks for NaN.
+# No contraction to fused operations: with it interpreter and C differ. No -ffast-math: it deletes checks for
+# NaN.
 ARITHMETIC = ("-march=native", "-ffp-contract=off", "-fno-math-errno")
 # Undefined names shall fail when a function is linked and not when it is called.
 CLOSED = ("-Wl,-z,defs",) if sys.platform.startswith("linux") else ()
@@ -92,9 +93,9 @@ class Toolchain:
 
 
 def toolchain() -> Toolchain | None:
-    """Return the compiler to use: the one ``CC`` names, else ``cc``, ``gcc`` or ``clang``; None if there is none.
+    """Return the compiler that ``CC`` names, else ``cc``, ``gcc`` or ``clang``.
 
-    That there is none is logged once.
+    None if there is none, which is logged once.
     """
     return _find(os.environ.get("CC", ""), os.environ.get("PATH", os.defpath))
 
@@ -130,7 +131,8 @@ def _cpu() -> str:
     """Return what decides which instructions exist here."""
     try:
         with open("/proc/cpuinfo") as file:
-            # The first processor is enough, and the kernel writes the text of the others only when it is read.
+            # The first processor is enough, and the kernel writes the text of the others only when it is
+            # read.
             lines = file.read(8192).split("\n\n", 1)[0].splitlines()
     except OSError:
         return platform.processor()

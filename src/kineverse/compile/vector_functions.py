@@ -1,13 +1,14 @@
 """C text: elementary functions of vectors, within 4 ulp of the C library's.
 
 Every function reduces its argument to a small interval and evaluates a polynomial there whose coefficients
-minimise the largest relative error (Remez' algorithm in 60 digits, then rounded; the error is given beside each,
-an ulp being 1.1e-16 to 2.2e-16). Lanes that the reduction is not made for (huge, tiny, infinite, outside of the
-domain) are given to the C library one by one, so they come out as it says. NaN goes through.
+minimise the largest relative error (Remez' algorithm in 60 digits, then rounded; the error is given beside
+each, an ulp being 1.1e-16 to 2.2e-16). Lanes that the reduction is not made for (huge, tiny, infinite,
+outside of the domain) are given to the C library one by one, so they come out as it says. NaN goes through.
 """
 
 TRIGONOMETRIC = r"""
-/* Where x is close to a multiple of pi/2 the reduced argument is a small difference: pi/2 is subtracted in parts.
+/* Where x is close to a multiple of pi/2 the reduced argument is a small difference: pi/2 is subtracted in
+parts.
    Up to LARGEST_ANGLE the product of the number of quarter turns and the first part is exact. */
 #define LARGEST_ANGLE 1.6e6
 
@@ -194,7 +195,8 @@ INLINE V log_(V x) {
   p = fused(z, p, splat(0.3999999999941642));
   p = fused(z, p, splat(0.6666666666666734));
   V mantissa = fused(s * z, p, s + s);
-  V result = fused(exponent, splat(0x1.62e42fefa3p-1), fused(exponent, splat(0x1.3de6af278ece6p-42), mantissa));
+  V result = fused(exponent, splat(0x1.3de6af278ece6p-42), mantissa);
+  result = fused(exponent, splat(0x1.62e42fefa3p-1), result);
   I right = (x >= splat(0x1p-1022)) & (x <= splat(0x1.fffffffffffffp+1023));
   if (__builtin_expect(any(~right), 0)) result = log_lanes(x, result);
   return result;
@@ -217,6 +219,7 @@ BINARY_BY_LANE = ("pow", "fmod", "remainder", "hypot")
 
 def by_lane() -> str:
     """Return C of the functions that have no version for vectors."""
-    unary = "static NOINLINE V {0}_(V x) {{ for (int i = 0; i < W; i++) x[i] = {0}(x[i]); return x; }}\n"
-    binary = "static NOINLINE V {0}_(V x, V y) {{ for (int i = 0; i < W; i++) x[i] = {0}(x[i], y[i]); return x; }}\n"
+    lanes = "for (int i = 0; i < W; i++)"
+    unary = f"static NOINLINE V {{0}}_(V x) {{{{ {lanes} x[i] = {{0}}(x[i]); return x; }}}}\n"
+    binary = f"static NOINLINE V {{0}}_(V x, V y) {{{{ {lanes} x[i] = {{0}}(x[i], y[i]); return x; }}}}\n"
     return "".join(map(unary.format, UNARY_BY_LANE)) + "".join(map(binary.format, BINARY_BY_LANE))

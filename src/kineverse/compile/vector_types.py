@@ -1,8 +1,8 @@
 """C text: vectors of doubles in GCC's (and Clang's) vector extension, and how rows of numbers become vectors.
 
 A vector ``V`` holds the same quantity of W configurations, as many as the widest register of this machine has
-room for. Rows of numbers are brought to that form and back by transposing W×W blocks. Everything is written for
-any W; the few instructions that the extension has no notation for are named once, here.
+room for. Rows of numbers are brought to that form and back by transposing W×W blocks. Everything is written
+for any W; the few instructions that the extension has no notation for are named once, here.
 """
 
 TYPES = r"""
@@ -81,7 +81,9 @@ INLINE V up(V x) { return (V)_mm256_ceil_pd((__m256d)x); }
 #else
 #ifdef __FP_FAST_FMA
 #define FUSED 1
-INLINE V fused(V a, V b, V c) { return (V){__builtin_fma(a[0], b[0], c[0]), __builtin_fma(a[1], b[1], c[1])}; }
+INLINE V fused(V a, V b, V c) {
+  return (V){__builtin_fma(a[0], b[0], c[0]), __builtin_fma(a[1], b[1], c[1])};
+}
 #else
 #define FUSED 0
 INLINE V fused(V a, V b, V c) { return a * b + c; }
@@ -150,8 +152,8 @@ INLINE void read_rows(const double *rows, int n, V *x) {
   }
 }
 
-/* Write W rows of m numbers; past the caches if `streaming`, for which `rows` and m must be multiples of W. */
-INLINE void write_rows(const V *x, int m, double *rows, int streaming) {
+/* Write W rows of m numbers; past the caches if `streaming`, for which `rows` and m must be multiples of W.
+*/ INLINE void write_rows(const V *x, int m, double *rows, int streaming) {
   V r[W];
   int c = 0;
   for (; c + W <= m; c += W) {
@@ -178,7 +180,8 @@ INLINE void write_rows(const V *x, int m, double *rows, int streaming) {
   }
 }
 
-/* One output. Where rows do not begin at multiples of W they go through `pending`, a piece of them in a cache that
+/* One output. Where rows do not begin at multiples of W they go through `pending`, a piece of them in a cache
+that
    is streamed in whole vectors; what is left of a vector waits there for the next rows. */
 typedef struct {
   double *next;      /* where the next rows go */

@@ -1,7 +1,7 @@
 """Compiling C in the background: one library at a time, niced, for the whole process.
 
-A :class:`Build` is one library that is wanted. Builds nobody is interested in any more when their turn comes are
-dropped, and builds somebody waits for go first. The thread is a daemon and ends with the process, and the
+A :class:`Build` is one library that is wanted. Builds nobody is interested in any more when their turn comes
+are dropped, and builds somebody waits for go first. The thread is a daemon and ends with the process, and the
 compiler with it; sources go through a pipe and everything else lives in one folder that is always removed.
 """
 
@@ -47,7 +47,9 @@ class Build:
         Whether it was given up although nothing is wrong with it.
     """
 
-    def __init__(self, key: str, compiler: Toolchain, source: Callable[[], str], flags: Sequence[str]) -> None:
+    def __init__(
+        self, key: str, compiler: Toolchain, source: Callable[[], str], flags: Sequence[str]
+    ) -> None:
         self.key = key
         self.compiler = compiler
         self.source = source
@@ -134,6 +136,7 @@ class _Worker:
         # Held while the compiler is started or the process ends, so that neither misses the other.
         self._starting = threading.Lock()
         self._closing = False
+        self._complained = False
 
     def request(self, build: Build, watcher: Watcher, urgent: bool) -> Build | None:
         with self._lock:
@@ -150,7 +153,7 @@ class _Worker:
                 if self._thread is None:
                     self._thread = threading.Thread(target=self._run, name="kineverse-compile", daemon=True)
                     self._thread.start()
-            known.watchers.append(WeakMethod(watcher))  # type: ignore[arg-type]
+            known.watchers.append(WeakMethod(watcher))
         if urgent:
             self.hurry(known)
         return known
@@ -182,8 +185,7 @@ class _Worker:
                 path = self._compile(build)
             except Exception as problem:
                 error = str(problem)
-                if not self._closing:
-                    logger.warning("A function stays with CasADi's interpreter: %s", error)
+                self._complain(error)
             with self._lock:
                 self._wanted.pop(build.key, None)
             build.finish(path, error)
@@ -226,6 +228,13 @@ class _Worker:
             if self._workplace is not None:
                 shutil.rmtree(self._workplace, ignore_errors=True)
             self._workplace = None
+
+    def _complain(self, error: str) -> None:
+        """Log loudly once: a compiler that fails for one function will fail for all."""
+        if not self._closing:
+            level = logging.DEBUG if self._complained else logging.WARNING
+            logger.log(level, "A function stays with CasADi's interpreter: %s", error)
+            self._complained = True
 
     def close(self) -> None:
         """End the compiler and remove its folder, when the process ends."""

@@ -11,6 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, TypeAlias
+from weakref import WeakValueDictionary
 
 import casadi as ca
 import numpy as np
@@ -33,6 +34,9 @@ NO_NODES: frozenset[Node] = frozenset()
 # Symbols by the hash of their SX element. Strong on purpose: CasADi reuses the addresses (and so the hashes)
 # of freed elements, and a symbol is a name, of which there are finitely many.
 SYMBOLS: dict[int, Symbol] = {}
+
+# Nodes likewise, as long as someone holds them: expressions hold the nodes in their graphs.
+NODES: WeakValueDictionary[int, Node] = WeakValueDictionary()
 
 
 class Expression:
@@ -166,10 +170,11 @@ class Expression:
             return make(self._sx.T, self._shape[::-1], self._nodes)
         return self._rearranged(layout.indices(self._shape).transpose(*axes))
 
-    def sum(self, axis: int | None = None) -> Expression:
-        """Return the sum over all elements or along one axis."""
-        result: Expression = np.sum(self, axis=axis)
-        return result
+    def sum(self, axis: int | tuple[int, ...] | None = None) -> Expression:
+        """Return the sum over all elements, or along one axis or several."""
+        from .functions import sum_along
+
+        return sum_along(self, axis)
 
     def dot(self, other: ExpressionLike) -> Expression:
         """Return the matrix product, as ``@``."""
@@ -549,11 +554,11 @@ def _flatten(values: Any, flat: list[Expression]) -> Shape | None:
 
 def union(expressions: Sequence[Expression]) -> frozenset[Node]:
     """Return the nodes of several expressions together."""
-    nodes = NO_NODES
-    for expression in expressions:
-        if expression._nodes:
-            nodes = nodes | expression._nodes if nodes else expression._nodes
-    return nodes
+    # Most of them share one and the same set.
+    sets = {id(e._nodes): e._nodes for e in expressions if e._nodes}
+    if len(sets) < 2:
+        return next(iter(sets.values()), NO_NODES)
+    return NO_NODES.union(*sets.values())
 
 
 def unary(op: int, operand: Expression) -> Expression:
@@ -564,7 +569,7 @@ def unary(op: int, operand: Expression) -> Expression:
 def binary(op: int, left: ExpressionLike, right: ExpressionLike) -> Expression:
     """Apply an elementwise CasADi operation of two operands, with numpy's broadcasting."""
     a, b = as_expression(left), as_expression(right)
-    if a._nodes:
+    if a._nodes and a._nodes is not b._nodes:
         nodes = a._nodes | b._nodes if b._nodes else a._nodes
     else:
         nodes = b._nodes

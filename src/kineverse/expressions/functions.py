@@ -6,7 +6,8 @@ never multiply the branch that was not taken, and a norm has gradient 0 at the o
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import math
+from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING
 
 import casadi as ca
@@ -15,7 +16,18 @@ import numpy as np
 from kineverse.errors import ShapeError
 
 from . import layout
-from .expression import Expression, ExpressionLike, as_expression, binary, broadcast, make, unary
+from .expression import (
+    Expression,
+    ExpressionLike,
+    array,
+    as_expression,
+    binary,
+    broadcast,
+    make,
+    matmul,
+    unary,
+    union,
+)
 from .node import Node
 
 if TYPE_CHECKING:
@@ -139,8 +151,7 @@ def ceil(x: ExpressionLike) -> Expression:
 
 def copysign(x: ExpressionLike, y: ExpressionLike) -> Expression:
     """Return |x| with the sign of y, elementwise."""
-    # CasADi's derivative by x is that of a positive x.
-    return binary(ca.OP_COPYSIGN, absolute(x), y)
+    return binary(ca.OP_COPYSIGN, x, y)
 
 
 def where(condition: ExpressionLike, if_true: ExpressionLike, if_false: ExpressionLike) -> Expression:
@@ -187,18 +198,49 @@ def hypot(a: ExpressionLike, b: ExpressionLike) -> Expression:
     )
 
 
-def sum_along(x: ExpressionLike, axis: int | None = None) -> Expression:
-    """Return the sum over all elements, or along one axis."""
+def sum_along(x: ExpressionLike, axis: int | tuple[int, ...] | None = None) -> Expression:
+    """Return the sum over all elements, or along one axis or several."""
+    rows, rest = _axis_first(x, axis)
+    return make(ca.sum1(rows._sx).T, (rows.shape[1],), rows._nodes).reshape(rest)
+
+
+def smallest(x: ExpressionLike, axis: int | tuple[int, ...] | None = None) -> Expression:
+    """Return the smallest of all elements, or along one axis or several; see :func:`minimum`."""
+    return _knocked_out(minimum, x, axis)
+
+
+def largest(x: ExpressionLike, axis: int | tuple[int, ...] | None = None) -> Expression:
+    """Return the largest of all elements, or along one axis or several; see :func:`maximum`."""
+    return _knocked_out(maximum, x, axis)
+
+
+def _knocked_out(
+    winner: Callable[[Expression, Expression], Expression],
+    x: ExpressionLike,
+    axis: int | tuple[int, ...] | None,
+) -> Expression:
+    """Return who wins against all others, in rounds, so that depth grows as the logarithm of their number."""
+    rows, rest = _axis_first(x, axis)
+    if not rows.shape[0]:
+        raise ShapeError("Nothing has no smallest or largest element.")
+    columns = [list(column) for column in rows.T]
+    for elements in columns:
+        while len(elements) > 1:
+            odd = elements[-1:] if len(elements) % 2 else []
+            elements[:] = [winner(a, b) for a, b in zip(elements[:-1:2], elements[1::2], strict=False)] + odd
+    return array([elements[0] for elements in columns]).reshape(rest)
+
+
+def _axis_first(x: ExpressionLike, axis: int | tuple[int, ...] | None) -> tuple[Expression, tuple[int, ...]]:
+    """Return a matrix with the wanted axes as its rows and all others as its columns; the others' shape."""
     operand = as_expression(x)
-    if axis is None:
-        return make(ca.sum1(layout.column(operand._sx, operand.shape)), (), operand._nodes)
+    axes = tuple(range(operand.ndim)) if axis is None else (axis,) if isinstance(axis, int) else tuple(axis)
     try:
-        moved = operand._rearranged(np.moveaxis(layout.indices(operand.shape), axis, 0))
-    except np.exceptions.AxisError:
-        raise ShapeError(f"Axis {axis} does not exist in an array of shape {operand.shape}.") from None
-    rest = moved.shape[1:]
-    rows = moved.reshape(moved.shape[0], -1)
-    return make(ca.sum1(rows._sx).T, (rows.shape[1],), operand._nodes).reshape(rest)
+        index = np.moveaxis(layout.indices(operand.shape), axes, range(len(axes)))
+    except (ValueError, TypeError):
+        raise ShapeError(f"Axis {axis} does not fit an array of shape {operand.shape}.") from None
+    along, rest = index.shape[: len(axes)], index.shape[len(axes) :]
+    return operand._rearranged(index.reshape(math.prod(along), math.prod(rest))), rest
 
 
 def inverse(matrix: ExpressionLike) -> Expression:
@@ -217,7 +259,17 @@ def determinant(matrix: ExpressionLike) -> Expression:
     a = as_expression(matrix)
     if a.ndim != 2 or a.shape[0] != a.shape[1]:
         raise ShapeError(f"Only a square matrix has a determinant, not one of shape {a.shape}.")
-    return make(ca.det(a._sx), (), a._nodes)
+    n = a.shape[0]
+    if n < 5:
+        return make(ca.det(a._sx), (), a._nodes)
+    # Minors grow with n!, so larger ones by the characteristic polynomial (Faddeev-LeVerrier).
+    identity = as_expression(np.eye(n))
+    power, coefficient = identity, as_expression(1.0)
+    for k in range(1, n + 1):
+        product = matmul(a, power)
+        coefficient = sum_along(product[np.arange(n), np.arange(n)]) / -k
+        power = product + coefficient * identity
+    return coefficient if n % 2 == 0 else -coefficient
 
 
 class Select(Node):
@@ -225,23 +277,30 @@ class Select(Node):
 
     __slots__ = ()
     kind = "select"
+    own_partials = True
+
+    @property
+    def _holds(self) -> Expression:
+        return binary(ca.OP_LE, 0.5, self.arguments[0])
 
     def _value(self) -> Expression:
-        return self._choose(self.arguments[1], self.arguments[2])
-
-    def _choose(self, if_true: Expression, if_false: Expression) -> Expression:
-        condition = self.arguments[0]
-        chosen = ca.if_else(ca.SX.binary(ca.OP_LE, 0.5, condition._sx), if_true._sx, if_false._sx)
-        return make(chosen, self.shape, condition._nodes | if_true._nodes | if_false._nodes)
+        return _selected(self._holds, self.arguments[1], self.arguments[2])
 
     def _gradient(self, heuristic: bool) -> Mapping[Symbol, Expression]:
-        _, a, b = (argument.gradient(heuristic) for argument in self.arguments)
-        zero = as_expression(np.zeros(self.shape))
-        return {key: self._choose(a.get(key, zero), b.get(key, zero)) for key in {**a, **b}}
+        a, b = (argument.gradient(heuristic) for argument in self.arguments[1:])
+        zero, holds = as_expression(np.zeros(self.shape)), self._holds
+        return {key: _selected(holds, a.get(key, zero), b.get(key, zero)) for key in {**a, **b}}
 
     def differentiated(self, heuristic: bool) -> tuple[Expression, ...]:
         """Return the branches; the condition selects and has no part in the gradient."""
         return self.arguments[1:]
+
+
+def _selected(holds: Expression, if_true: Expression, if_false: Expression) -> Expression:
+    """Return a choice by a comparison; CasADi keeps such choices free of NaN in every derivative."""
+    return make(
+        ca.if_else(holds._sx, if_true._sx, if_false._sx), holds._shape, union((holds, if_true, if_false))
+    )
 
 
 class Extremum(Node):
@@ -249,6 +308,7 @@ class Extremum(Node):
 
     __slots__ = ()
     kind = "extremum"
+    own_partials = True
 
     @property
     def label(self) -> str:
@@ -261,15 +321,15 @@ class Extremum(Node):
     def _gradient(self, heuristic: bool) -> Mapping[Symbol, Expression]:
         x, y = self.arguments
         first, second = (x, y) if self.options[0] == "min" else (y, x)
-        takes_x = binary(ca.OP_LT, first, second)
-        takes_y = binary(ca.OP_LT, second, first)
-        a, b = x.gradient(heuristic), y.gradient(heuristic)
-        zero = as_expression(np.zeros(self.shape))
-        result = {}
-        for key in {**a, **b}:
-            of_x, of_y = a.get(key, zero), b.get(key, zero)
-            tie = (of_x + of_y) / 2
-            result[key] = where(takes_x, of_x, where(takes_y, of_y, tie))
+        share = (
+            1 + binary(ca.OP_LT, first, second) - binary(ca.OP_LT, second, first)
+        ) / 2  # 1, 0, at a tie 0.5
+        result: dict[Symbol, Expression] = {}
+        for part, gradient in ((share, x.gradient(heuristic)), (1 - share, y.gradient(heuristic))):
+            for key, entry in gradient.items():
+                # Zero times NaN would be NaN; what has no share is not looked at.
+                term = binary(ca.OP_IF_ELSE_ZERO, part, part * entry)
+                result[key] = result[key] + term if key in result else term
         return result
 
 
@@ -278,6 +338,7 @@ class Norm(Node):
 
     __slots__ = ()
     kind = "norm"
+    own_partials = True
 
     def _value(self) -> Expression:
         (vector,) = self.arguments

@@ -7,6 +7,7 @@ partial derivatives, all keys at once.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from types import MappingProxyType
 from typing import TYPE_CHECKING
@@ -17,8 +18,9 @@ import numpy as np
 from kineverse.errors import ExpressionError
 
 from . import layout
-from .expression import NO_NODES, Expression, make
+from .expression import NO_NODES, Expression, make, union
 from .leaves import bottom_up, leaves
+from .substitution import apply, replace_nodes
 
 if TYPE_CHECKING:
     from kineverse.symbols import Symbol
@@ -37,13 +39,15 @@ def gradient(expression: Expression, heuristic: bool = True) -> Mapping[Symbol, 
 
 
 def _gradient(expression: Expression, heuristic: bool) -> dict[Symbol, Expression]:
-    symbols, nodes = leaves(expression)
+    symbols, inner = leaves(expression)
     # Only leaves with a gradient take part: the partial derivative by a parameter in an exponent is NaN for a
     # negative base, and nobody asked for it.
     moving = [s for s in symbols if s.has_derivative]
-    for node in bottom_up(nodes, lambda n: n.differentiated(heuristic), lambda n: heuristic in n._gradients):
+    for node in bottom_up(inner, lambda n: n.differentiated(heuristic), lambda n: heuristic in n._gradients):
         node.gradient(heuristic)
-    opaque = [(node, entries) for node in nodes if (entries := node.gradient(heuristic))]
+    if len(inner) == 1 and expression._sx is inner[0].sx:
+        return dict(sorted(inner[0].gradient(heuristic).items(), key=lambda item: item[0].sort_key))
+    opaque = [(node, entries) for node in inner if (entries := node.gradient(heuristic))]
     if not moving and not opaque:
         return {}
     keys = sorted(
@@ -53,7 +57,7 @@ def _gradient(expression: Expression, heuristic: bool) -> dict[Symbol, Expressio
     if not opaque:
         by_key = ca.jacobian(elements, ca.vertcat(*(s._sx for s in moving)))
         column_of = {s.derivative(): i for i, s in enumerate(moving)}
-        return _collect(expression, by_key, [column_of[k] for k in keys], keys, {})
+        return _collect(expression, by_key, [column_of[k] for k in keys], keys, expression._nodes)
     position = {key: i for i, key in enumerate(keys)}
     blocks = [s._sx for s in moving] + [layout.column(n.sx, n.shape) for n, _ in opaque]
     seeds = []
@@ -61,16 +65,16 @@ def _gradient(expression: Expression, heuristic: bool) -> dict[Symbol, Expressio
         row = ca.SX(1, len(keys))
         row[0, position[symbol.derivative()]] = 1
         seeds.append(row)
-    nodes_of: dict[Symbol, frozenset[Node]] = {}
+    nodes = expression._nodes
     for node, entries in opaque:
         rows = ca.SX(node.size, len(keys))
         for key, value in entries.items():
             rows[:, position[key]] = layout.column(value._sx, value._shape)
-            nodes_of[key] = nodes_of.get(key, NO_NODES) | value._nodes
+        nodes = nodes | union(list(entries.values()))
         seeds.append(ca.sparsify(rows))
     # Cheaper than ca.jtimes, which differentiates once per key.
     by_key = ca.mtimes(ca.jacobian(elements, ca.vertcat(*blocks)), ca.vertcat(*seeds))
-    return _collect(expression, by_key, list(range(len(keys))), keys, nodes_of)
+    return _collect(expression, by_key, list(range(len(keys))), keys, nodes)
 
 
 def _collect(
@@ -78,15 +82,14 @@ def _collect(
     by_key: layout.SX,
     columns: list[int],
     keys: list[Symbol],
-    nodes_of: Mapping[Symbol, frozenset[Node]],
+    nodes: frozenset[Node],
 ) -> dict[Symbol, Expression]:
+    shape = expression._shape
     result = {}
     for key, index in zip(keys, columns, strict=True):
         entry = by_key[:, index]
-        if entry.is_zero():
-            continue
-        nodes = expression._nodes | nodes_of.get(key, NO_NODES)
-        result[key] = make(layout.from_column(ca.densify(entry), expression._shape), expression._shape, nodes)
+        if not entry.is_zero():
+            result[key] = make(layout.from_column(ca.densify(entry), shape), shape, nodes)
     return result
 
 
@@ -94,39 +97,50 @@ def jacobian(expression: Expression, symbols: Sequence[Symbol], heuristic: bool 
     """Return the derivatives by ``symbols`` along the last axis, see :meth:`Expression.jacobian`."""
     from kineverse.symbols import check_symbols
 
-    entries = gradient(expression, heuristic)
-    columns = []
-    nodes = NO_NODES
-    for symbol in check_symbols(symbols):
+    wanted = check_symbols(symbols)
+    for symbol in wanted:
         if not symbol.has_derivative:
             raise ExpressionError(
                 f"Parameter '{symbol}' has no derivative to read a column from; "
                 "use partial([...]) for ∂/∂parameter."
             )
-        entry = entries.get(symbol.derivative())
-        if entry is None:
-            columns.append(ca.SX.zeros(expression.size, 1))
-        else:
-            columns.append(layout.column(entry._sx, entry._shape))
-            nodes = nodes | entry._nodes
-    shape = (*expression._shape, len(columns))
-    matrix = ca.horzcat(*columns) if columns else ca.SX.zeros(expression.size, 0)
-    return make(_last_axis(matrix, shape), shape, nodes)
+    entries = gradient(expression, heuristic)
+    return _side_by_side([entries.get(symbol.derivative()) for symbol in wanted], expression._shape)
 
 
 def partial(expression: Expression, symbols: Sequence[Symbol]) -> Expression:
     """Return the plain partial derivatives, see :meth:`Expression.partial`."""
-    from kineverse.symbols import check_symbols
+    from kineverse.symbols import Symbol, check_symbols
 
-    from .lowering import lowered
-
-    shape = (*expression._shape, len(symbols))
-    elements = layout.column(lowered(expression), expression._shape)
     wanted = check_symbols(symbols)
-    if not wanted:
-        return make(_last_axis(ca.SX.zeros(expression.size, 0), shape), shape, NO_NODES)
-    matrix = ca.densify(ca.jacobian(elements, ca.vertcat(*(s._sx for s in wanted))))
-    return make(_last_axis(matrix, shape), shape, NO_NODES)
+    # Parameters do not move, so D has nothing to say about them; symbols that do move take their places.
+    moving = {s: Symbol(f"∂/{i}/{s.path}") for i, s in enumerate(wanted) if not s.has_derivative}
+    entries = gradient(apply(_without_augmentation(expression), moving), False)
+    back = {stand_in: s for s, stand_in in moving.items()}
+    columns = [entries.get(moving.get(s, s).derivative()) for s in wanted]
+    return _side_by_side([c if c is None else apply(c, back) for c in columns], expression._shape)
+
+
+def _without_augmentation(expression: Expression) -> Expression:
+    """Return an expression of the same value whose gradient is that of the value."""
+    plain: dict[Node, Expression] = {}
+
+    def parts(node: Node) -> tuple[Expression, ...]:
+        return node.arguments if node.own_partials else (node.value,)
+
+    for node in bottom_up(leaves(expression)[1], parts, plain.__contains__):
+        replaced = tuple(replace_nodes(part, plain) for part in parts(node))
+        plain[node] = type(node).of(replaced, node.shape, node.options) if node.own_partials else replaced[0]
+    return replace_nodes(expression, plain)
+
+
+def _side_by_side(columns: list[Expression | None], shape: layout.Shape) -> Expression:
+    """Return expressions of one shape, None for zero, along a new last axis."""
+    size = math.prod(shape)
+    stored = [ca.SX.zeros(size, 1) if c is None else layout.column(c._sx, c._shape) for c in columns]
+    matrix = ca.horzcat(*stored) if stored else ca.SX.zeros(size, 0)
+    full = (*shape, len(columns))
+    return make(_last_axis(matrix, full), full, union([c for c in columns if c is not None]))
 
 
 def _last_axis(matrix: layout.SX, shape: layout.Shape) -> layout.SX:

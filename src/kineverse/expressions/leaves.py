@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import casadi as ca
 
-from .expression import SYMBOLS, Expression
+from .expression import NODES, SYMBOLS, Expression
 
 if TYPE_CHECKING:
     from kineverse.symbols import Symbol
@@ -23,14 +23,13 @@ def leaves(expression: Expression) -> tuple[tuple[Symbol, ...], tuple[Node, ...]
             return expression._leaves
         symbols: list[Symbol] = []
         nodes: set[Node] = set()
-        owners = {element: node for node in expression._nodes for element in node.elements}
         for element in ca.symvar(expression._sx):
             name = element.element_hash()
             symbol = SYMBOLS.get(name)
             if symbol is not None:
                 symbols.append(symbol)
             else:
-                nodes.add(owners[name])
+                nodes.add(NODES[name])
         symbols.sort(key=lambda s: s.sort_key)
         expression._leaves = tuple(symbols), tuple(sorted(nodes, key=lambda n: n.key))
     return expression._leaves

@@ -21,7 +21,7 @@ import casadi as ca
 from kineverse.errors import ExpressionError, ShapeError
 
 from . import layout
-from .expression import Expression, ExpressionLike, as_expression, broadcast_to, make
+from .expression import NODES, Expression, ExpressionLike, as_expression, broadcast_to, make
 from .leaves import gradient_keys, symbols_below
 
 if TYPE_CHECKING:
@@ -56,8 +56,12 @@ class Node(ABC):
     )
 
     kind: ClassVar[str]
+    own_partials: ClassVar[bool] = False
+    """Whether plain partial derivatives are those of :meth:`_gradient`, as the value's are NaN at a kink."""
+
     arguments: tuple[Expression, ...]
     options: tuple[Any, ...]
+    depth: int
 
     @classmethod
     def of(
@@ -71,6 +75,7 @@ class Node(ABC):
             node._initialise(key, arguments, shape, options)
             with _INTERNING:
                 node = _INTERNED.setdefault(key, node)
+                NODES.update(dict.fromkeys(node.elements, node))
         return make(node.sx, node.shape, frozenset((node,)))
 
     @classmethod

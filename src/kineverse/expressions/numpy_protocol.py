@@ -7,6 +7,7 @@ mean.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from inspect import signature
 from typing import Any
 
 import casadi as ca
@@ -29,11 +30,12 @@ _UNARY_OPS = {
 
 _BINARY_OPS = {
     np.add: ca.OP_ADD, np.subtract: ca.OP_SUB, np.multiply: ca.OP_MUL, np.true_divide: ca.OP_DIV,
-    np.power: ca.OP_POW, np.float_power: ca.OP_POW, np.arctan2: ca.OP_ATAN2, np.copysign: ca.OP_COPYSIGN,
+    np.power: ca.OP_POW, np.float_power: ca.OP_POW, np.arctan2: ca.OP_ATAN2,
 }  # fmt: skip
 
 _UFUNCS: dict[Any, Callable[..., Any]] = {
     np.positive: as_expression,
+    np.copysign: f.copysign,
     np.floor_divide: floor_divide,
     np.remainder: lambda a, b: as_expression(a) % b,
     np.minimum: f.minimum,
@@ -95,6 +97,7 @@ _REARRANGING = {
     np.atleast_1d, np.atleast_2d, np.atleast_3d,
 }  # fmt: skip
 
+_AT_LEAST = {np.atleast_1d, np.atleast_2d, np.atleast_3d}
 _JOINING = {np.concatenate, np.stack, np.vstack, np.hstack, np.dstack, np.column_stack}
 
 
@@ -106,20 +109,29 @@ def apply_function(function: Any, args: Sequence[Any], options: Mapping[str, Any
     ExpressionError
         If it is not available.
     """
-    if function in _REARRANGING:
-        operand = as_expression(args[0])
-        try:
-            return operand._rearranged(
-                np.asarray(function(layout.indices(operand.shape), *args[1:], **options))
-            )
-        except (ValueError, IndexError) as error:
-            raise ShapeError(f"np.{function.__name__}: {error} (shape {operand.shape}).") from None
-    if function in _JOINING:
-        return _join(function, args[0], args[1:], options)
-    if function in _FUNCTIONS:
-        return _FUNCTIONS[function](*args, **options)
     name = f"{getattr(function, '__module__', 'numpy')}.{function.__name__}"
-    raise ExpressionError(f"{name} is not available for expressions.")
+    if function in _AT_LEAST and len(args) != 1:
+        return tuple(function(as_expression(a)) for a in args)
+    if function in _FUNCTIONS:
+        try:
+            bound = signature(_FUNCTIONS[function]).bind(*args, **options)
+        except TypeError as error:
+            raise ExpressionError(f"{name} of expressions: {error}.") from None
+        return _FUNCTIONS[function](*bound.args, **bound.kwargs)
+    if function not in _REARRANGING and function not in _JOINING:
+        raise ExpressionError(f"{name} is not available for expressions.")
+    if not args or {"out", "dtype", "casting"} & options.keys():
+        raise ExpressionError(f"{name} takes expressions as its first argument, and neither out= nor dtype=.")
+    try:
+        return (_rearrange if function in _REARRANGING else _join)(function, args[0], args[1:], options)
+    except (ValueError, IndexError) as error:
+        raise ShapeError(f"{name}: {error} (shape {np.shape(args[0])}).") from None
+
+
+def _rearrange(function: Any, operand: Any, args: Sequence[Any], options: Mapping[str, Any]) -> Expression:
+    expression = as_expression(operand)
+    index = function(layout.indices(expression.shape), *args, **options)
+    return expression._rearranged(np.asarray(index))
 
 
 def _join(function: Any, parts: Sequence[Any], args: Sequence[Any], options: Mapping[str, Any]) -> Expression:
@@ -128,10 +140,7 @@ def _join(function: Any, parts: Sequence[Any], args: Sequence[Any], options: Map
     for operand in operands:
         numbered.append(layout.indices(operand.shape) + offset)
         offset += operand.size
-    try:
-        index = function(numbered, *args, **options)
-    except ValueError as error:
-        raise ShapeError(f"np.{function.__name__}: {error}.") from None
+    index = function(numbered, *args, **options)
     elements = ca.vertcat(*(layout.column(o._sx, o.shape) for o in operands))
     return make(layout.gather(elements, (offset,), index), index.shape, union(operands))
 
@@ -152,6 +161,24 @@ def _dot(a: Any, b: Any) -> Expression:
     return x * y if not x.ndim or not y.ndim else matmul(x, y)
 
 
+def _clip(
+    a: Any,
+    a_min: Any = None,
+    a_max: Any = None,
+    *,
+    min: Any = None,  # noqa: A002 - numpy's name
+    max: Any = None,  # noqa: A002 - numpy's name
+) -> Expression:
+    lower, upper = min if a_min is None else a_min, max if a_max is None else a_max
+    result = as_expression(a) if lower is None else f.maximum(a, lower)
+    return result if upper is None else f.minimum(result, upper)
+
+
+def _mean(a: Any, axis: int | tuple[int, ...] | None = None) -> Expression:
+    total = f.sum_along(a, axis)
+    return total * (total.size / as_expression(a).size)
+
+
 def _norm(x: Any, ord: Any = None, axis: int | None = None) -> Expression:  # noqa: A002 - numpy's name
     if ord not in (None, 2, "fro") or axis is not None or (ord == 2 and as_expression(x).ndim > 1):
         raise ExpressionError("Of norms, the Euclidean one over all elements is available.")
@@ -167,16 +194,16 @@ def _product(a: Any, axis: None = None) -> Expression:
 
 _FUNCTIONS: dict[Any, Callable[..., Any]] = {
     np.where: f.where,
-    np.clip: lambda a, lower, upper: f.clip(a, lower, upper),
+    np.clip: _clip,
     np.sum: lambda a, axis=None: f.sum_along(a, axis),
-    np.mean: lambda a, axis=None: (
-        f.sum_along(a, axis) / (as_expression(a).size if axis is None else as_expression(a).shape[axis])
-    ),
+    np.mean: _mean,
+    np.min: lambda a, axis=None: f.smallest(a, axis),
+    np.max: lambda a, axis=None: f.largest(a, axis),
     np.prod: _product,
     np.trace: _trace,
     np.dot: _dot,
-    np.inner: _dot,
-    np.vdot: _dot,
+    np.inner: lambda a, b: _dot(a, as_expression(b).T),
+    np.vdot: lambda a, b: _dot(as_expression(a).ravel(), as_expression(b).ravel()),
     np.outer: lambda a, b: as_expression(a).reshape(-1, 1) * as_expression(b).reshape(1, -1),
     np.cross: _cross,
     np.linalg.norm: _norm,

@@ -5,14 +5,14 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 import casadi as ca
+import numpy as np
 
-from .expression import SYMBOLS, Expression
-from .layout import SX, column
+from .expression import NODES, SYMBOLS, Expression
+from .layout import SX, column, rows_and_columns
 
 if TYPE_CHECKING:
     from kineverse.symbols import Symbol
 
-    from .node import Node
 
 _LIMIT = 400
 _ELEMENTS = 16
@@ -41,7 +41,7 @@ _FUNCTIONS = {
 
 def text(expression: Expression) -> str:
     """Return a bounded, readable form: the formula of a scalar, shape and first elements of an array."""
-    writer = _Writer(expression)
+    writer = _Writer()
     elements = column(expression._sx, expression.shape)
     if not expression.shape:
         return writer.bounded(elements)
@@ -54,7 +54,7 @@ def text(expression: Expression) -> str:
 
 def latex(expression: Expression) -> str:
     r"""Return LaTeX: ``\dot{a}`` for velocities, matrices up to 6×6 written out."""
-    writer = _Latex(expression)
+    writer = _Latex()
     if not expression.shape:
         return writer.bounded(expression._sx)
     rows, columns = expression._sx.shape
@@ -70,18 +70,17 @@ class _Writer:
     """Writes one scalar after another, giving up politely on large ones."""
 
     ellipsis = "..."
+    limit = _LIMIT
 
-    def __init__(self, expression: Expression) -> None:
-        self.owners: dict[int, tuple[Node, int]] = {}
-        for node in expression._nodes:
-            for i, element in enumerate(node.elements):
-                self.owners[element] = (node, i)
-        self.left = _LIMIT
+    left = _LIMIT
 
     def bounded(self, element: SX) -> str:
-        self.left = _LIMIT
-        written = self.write(element, 0)
-        return written if len(written) <= _LIMIT else f"{written[:_LIMIT]}{self.ellipsis}"
+        for budget in (self.limit, self.limit // 4, self.limit // 16):
+            self.left = budget
+            written = self.write(element, 0)
+            if len(written) <= self.limit:
+                return written
+        return self.ellipsis
 
     def write(self, element: SX, depth: int, strength: int = 0) -> str:
         self.left -= 1
@@ -93,7 +92,7 @@ class _Writer:
             written = self.number(float(element))
             return self.grouped(written) if strength > 2 and written.startswith("-") else written
         if element.is_symbolic():
-            return self.leaf(element)
+            return self.leaf(element, depth)
         operation = element.op()
         operands = [element.dep(i) for i in range(element.n_dep())]
         if operation in _INFIX:
@@ -109,7 +108,8 @@ class _Writer:
             written = written[1:] if written.startswith("-") else f"-{written}"
             return self.grouped(written) if strength > 1 else written
         if operation in (*_POWERS, ca.OP_SQ):
-            return self.power(operands, depth)
+            written = self.power(operands, depth)
+            return self.grouped(written) if strength > 2 else written
         if operation in _COMPARISONS:
             a, b = (self.write(o, depth + 1, 1) for o in operands)
             return self.grouped(f"{a} {_COMPARISONS[operation]} {b}")
@@ -133,7 +133,7 @@ class _Writer:
         return f"{self.write(operands[0], depth + 1, 3)}**{self.write(operands[1], depth + 1, 3)}"
 
     def number(self, value: float) -> str:
-        return repr(int(value)) if value == int(value) and abs(value) < 1e6 else f"{value:.6g}"
+        return repr(int(value)) if abs(value) < 1e6 and value == int(value) else f"{value:.6g}"
 
     def grouped(self, written: str) -> str:
         return f"({written})"
@@ -141,16 +141,18 @@ class _Writer:
     def call(self, name: str, arguments: list[str]) -> str:
         return f"{name}({', '.join(arguments)})"
 
-    def leaf(self, element: SX) -> str:
+    def leaf(self, element: SX, depth: int) -> str:
         symbol = SYMBOLS.get(element.element_hash())
         if symbol is not None:
             return self.symbol(symbol)
-        node, index = self.owners[element.element_hash()]
-        suffix = f"[{index}]" if node.shape else ""
-        if self.left < 40 or any(a.shape for a in node.arguments):
-            return self.call(node.kind, [self.ellipsis]) + suffix
-        nested = [type(self)(a).bounded(a._sx) for a in node.arguments if not a.shape]
-        return self.call(node.label, nested) + suffix
+        node = NODES[element.element_hash()]
+        index = node.elements.index(element.element_hash())
+        rows, columns = rows_and_columns(node.shape)
+        place = np.unravel_index(index % rows * columns + index // rows, node.shape) if node.shape else ()
+        suffix = f"[{', '.join(map(str, place))}]" if node.shape else ""
+        if any(a.shape for a in node.arguments):
+            return self.call(node.label, [self.ellipsis]) + suffix
+        return self.call(node.label, [self.write(a._sx, depth + 1) for a in node.arguments]) + suffix
 
     def symbol(self, symbol: Symbol) -> str:
         return str(symbol)
@@ -158,6 +160,7 @@ class _Writer:
 
 class _Latex(_Writer):
     ellipsis = r"\dots"
+    limit = 4 * _LIMIT
 
     def join(self, sign: str, a: str, b: str) -> str:
         return {"*": f"{a} \\, {b}", "/": f"\\frac{{{a}}}{{{b}}}"}.get(sign, f"{a} {sign} {b}")

@@ -7,13 +7,18 @@ only, documents have their own form.
 from __future__ import annotations
 
 import hashlib
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import casadi as ca
 
 from .expression import Expression, make
 from .layout import SX, Shape
-from .leaves import leaves
+from .leaves import bottom_up, leaves
+
+if TYPE_CHECKING:
+    from .node import Node
+
+_STOREY = 16
 
 
 def structural_key(expression: Expression) -> bytes:
@@ -39,10 +44,20 @@ def pack(expression: Expression) -> tuple[Any, ...]:
     """Return what :func:`unpack` needs, all of it picklable."""
     symbols, nodes = leaves(expression)
     function = _function(expression._sx, [*(s._sx for s in symbols), *(n.sx for n in nodes)])
-    return symbols, nodes, expression._shape, function.serialize()
+    return symbols, nodes, expression._shape, function.serialize(), _landings(nodes)
 
 
-def unpack(symbols: tuple[Any, ...], nodes: tuple[Any, ...], shape: Shape, graph: str) -> Expression:
+def _landings(nodes: tuple[Node, ...]) -> tuple[Node, ...]:
+    """Return nodes on the way down, lowest first: pickled in this order, none of them is deep any more."""
+    if all(node.depth <= _STOREY for node in nodes):
+        return ()
+    below = bottom_up(nodes, lambda n: n.arguments, lambda n: False)
+    return tuple(node for node in below if node.depth % _STOREY == 0)
+
+
+def unpack(
+    symbols: tuple[Any, ...], nodes: tuple[Any, ...], shape: Shape, graph: str, _: tuple[Any, ...] = ()
+) -> Expression:
     """Rebuild an expression from :func:`pack`."""
     leaf = [*(s._sx for s in symbols), *(n.sx for n in nodes)]
     sx = ca.Function.deserialize(graph)(ca.vertcat(*map(ca.vec, leaf)) if leaf else ca.SX(0, 1))

@@ -10,6 +10,7 @@ import casadi as ca
 from kineverse.errors import ExpressionError, ShapeError
 
 from .expression import NO_NODES, Expression, ExpressionLike, as_expression, make
+from .layout import SX
 from .leaves import bottom_up, leaves
 
 if TYPE_CHECKING:
@@ -75,8 +76,8 @@ def apply(expression: Expression, replacements: Mapping[Symbol, Expression]) -> 
         return expression
     substitution = Substitution.of(replacements)
     symbols, nodes = leaves(expression)
-    old: list[ca.SX] = []
-    new: list[ca.SX] = []
+    old: list[SX] = []
+    new: list[SX] = []
     kept: set[Node] = set()
     for symbol in symbols:
         if symbol in substitution:

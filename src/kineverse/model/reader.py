@@ -74,7 +74,7 @@ class Reader:
             base, down = branches(frame, relative_to, recorded)
         for name in (*base, *down):
             recorded(name)
-        for end in (frame, relative_to):
+        for end in {frame, relative_to} - {WORLD}:
             self._reads.add((FRAMES, end), Read.EXISTENCE)
         return self.carry(relative(frame, relative_to, self._peek))
 

@@ -20,7 +20,7 @@ def axis_length(corners: Floats, poses: Mapping[str, Floats]) -> float:
     origins = np.array([pose[:3, 3] for pose in poses.values()]).reshape(-1, 3)
     points = np.concatenate([corners.reshape(-1, 3), origins])
     spread = float(np.linalg.norm(points.max(axis=0) - points.min(axis=0))) if len(points) else 1.0
-    return float(np.clip(0.06 * spread, 0.02, 0.5))
+    return float(np.clip(0.05 * spread, 0.02, 0.5))
 
 
 def triad(model: ModelView, corners: Floats, poses: Mapping[str, Floats]) -> list[Part]:

@@ -1,0 +1,128 @@
+"""Programs to compile: an arm, and random ones that use every operation."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import casadi as ca
+import numpy as np
+from hypothesis import strategies as st
+
+import kineverse as kv
+from kineverse.expressions.expression import Expression, binary, unary
+
+UNARY = [
+    ca.OP_NEG, ca.OP_SQ, ca.OP_TWICE, ca.OP_INV, ca.OP_SQRT, ca.OP_FABS, ca.OP_SIGN, ca.OP_FLOOR, ca.OP_CEIL,
+    ca.OP_NOT, ca.OP_SIN, ca.OP_COS, ca.OP_TAN, ca.OP_ASIN, ca.OP_ACOS, ca.OP_ATAN, ca.OP_EXP, ca.OP_EXPM1,
+    ca.OP_LOG, ca.OP_LOG1P, ca.OP_SINH, ca.OP_COSH, ca.OP_TANH, ca.OP_ASINH, ca.OP_ACOSH, ca.OP_ATANH, ca.OP_ERF,
+]  # fmt: skip
+BINARY = [
+    ca.OP_ADD, ca.OP_SUB, ca.OP_MUL, ca.OP_DIV, ca.OP_POW, ca.OP_FMOD, ca.OP_REMAINDER, ca.OP_HYPOT, ca.OP_ATAN2,
+    ca.OP_COPYSIGN, ca.OP_FMIN, ca.OP_FMAX, ca.OP_LT, ca.OP_LE, ca.OP_EQ, ca.OP_NE, ca.OP_AND, ca.OP_OR,
+    ca.OP_IF_ELSE_ZERO,
+]  # fmt: skip
+# Computed by polynomials in batches; everything else is the same there to the last bit.
+APPROXIMATED = {
+    ca.OP_SIN, ca.OP_COS, ca.OP_TAN, ca.OP_ASIN, ca.OP_ACOS, ca.OP_ATAN, ca.OP_ATAN2, ca.OP_EXP, ca.OP_EXPM1,
+    ca.OP_LOG, ca.OP_TANH,
+}  # fmt: skip
+
+SPECIAL = [
+    0.0, -0.0, 1.0, -1.0, 2.0, -2.0, 0.5, -0.5, np.inf, -np.inf, np.nan, 5e-324, -1e-320, 1e-300, 1e300, 1e308,
+    -1e308, np.pi, -np.pi, np.pi / 2, np.pi / 4, 709.5, -708.5, 745.0, -745.0, 1e10, -1e10, 1e22, 1.6e6, 1.7e6,
+    19.9, -20.0, 1 - 1e-16, 1 + 2e-16, 2.2250738585072014e-308, 3e5,
+]  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Arm:
+    """A chain of joints: symbols, pose of the tip (4, 4) and its geometric Jacobian (6, n)."""
+
+    symbols: list[kv.Symbol]
+    pose: Expression
+    jacobian: Expression
+
+
+def arm(prefix: str = "arm", joints: int = 7) -> Arm:
+    symbols = [kv.position(f"{prefix}/joint_{i}") for i in range(joints)]
+    pose = kv.translation(0.1, 0.2, 0.3)
+    axes, origins = [], []
+    for i, q in enumerate(symbols):
+        pose = pose @ kv.translation(0.1, -0.05 * i, 0.2)
+        axis = i % 3
+        axes.append(pose[:3, axis])
+        origins.append(pose[:3, 3])
+        pose = pose @ (kv.rotation_x, kv.rotation_y, kv.rotation_z)[axis](q)
+    pose = pose @ kv.translation(0.1, 0.05, 0.02)
+    columns = []
+    for a, o in zip(axes, origins, strict=True):
+        r = pose[:3, 3] - o
+        cross = [a[1] * r[2] - a[2] * r[1], a[2] * r[0] - a[0] * r[2], a[0] * r[1] - a[1] * r[0]]
+        columns.append(kv.array([*cross, *a]))
+    return Arm(symbols, pose, np.stack(columns, axis=1))
+
+
+@dataclass(frozen=True)
+class RandomProgram:
+    """Values computed from inputs and from each other: (operation, operands) for each value behind the inputs."""
+
+    inputs: int
+    steps: list[tuple[int, tuple[int, ...]]]
+
+    def expressions(self) -> tuple[list[kv.Symbol], list[Expression]]:
+        symbols = [kv.position(f"random/x{i:02}") for i in range(self.inputs)]
+        values: list[Expression] = [*symbols, kv.array(0.3), kv.array(-2.0)]
+        for op, operands in self.steps:
+            arguments = [values[o] for o in operands]
+            values.append(unary(op, *arguments) if len(arguments) == 1 else binary(op, *arguments))
+        return symbols, values
+
+
+@st.composite
+def random_programs(draw: st.DrawFn, inputs: int = 5, length: int = 60) -> RandomProgram:
+    available = inputs + 2
+    steps = []
+    for _ in range(draw(st.integers(1, length))):
+        op = draw(st.sampled_from(UNARY + BINARY))
+        count = 1 if op in UNARY else 2
+        steps.append((op, tuple(draw(st.integers(0, available - 1)) for _ in range(count))))
+        available += 1
+    return RandomProgram(inputs, steps)
+
+
+def every_operation(depth: int = 4, seed: int = 0) -> RandomProgram:
+    """A program with every operation on the inputs, and ``depth`` times more on what came out."""
+    rng = np.random.default_rng(seed)
+    steps = [(op, (int(rng.integers(5)),)) for op in UNARY]
+    steps += [(op, tuple(int(i) for i in rng.integers(5, size=2))) for op in BINARY]
+    for _ in range(depth):
+        top = 7 + len(steps)
+        steps += [(op, (int(rng.integers(top)),)) for op in UNARY]
+        steps += [(op, tuple(int(i) for i in rng.integers(top, size=2))) for op in BINARY]
+    return RandomProgram(5, steps)
+
+
+def points(count: int, size: int, seed: int = 0) -> np.ndarray:
+    """Numbers of all kinds, shape (count, size): ordinary, large, tiny, and those that are special."""
+    rng = np.random.default_rng(seed)
+    kinds = [
+        rng.uniform(-4, 4, (count, size)),
+        rng.uniform(-1, 1, (count, size)),
+        rng.normal(size=(count, size)) * 10.0 ** rng.uniform(-20, 20, (count, size)),
+        rng.uniform(-1.5e6, 1.5e6, (count, size)),
+        rng.choice(SPECIAL, (count, size)),
+    ]
+    kind = rng.choice(5, (count, size), p=[0.5, 0.2, 0.1, 0.1, 0.1])
+    return np.choose(kind, kinds)
+
+
+def same_bits(a: np.ndarray, b: np.ndarray) -> bool:
+    """Whether arrays are equal to the last bit; of NaN there is one kind."""
+    return bool(np.all((a.view(np.int64) == b.view(np.int64)) | (np.isnan(a) & np.isnan(b))))
+
+
+def ulps(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """How many units in the last place numbers are apart; infinity where only one is NaN or infinite."""
+    with np.errstate(all="ignore"):
+        apart = np.abs(a - b) / np.spacing(np.minimum(np.abs(a), 1.7e308))
+    return np.where((a == b) | (np.isnan(a) & np.isnan(b)), 0.0, np.where(np.isnan(apart), np.inf, apart))

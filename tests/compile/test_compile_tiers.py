@@ -1,0 +1,217 @@
+"""Interpreter and C: the same to the last bit, and nobody notices the change."""
+
+from __future__ import annotations
+
+import logging
+import threading
+from pathlib import Path
+
+import numpy as np
+import pytest
+from compiled_programs import arm, every_operation, points, random_programs, same_bits
+from hypothesis import HealthCheck, given, settings
+
+import kineverse as kv
+from kineverse.compile import worker
+from kineverse.compile.batch_source import batch_source
+from kineverse.compile.native import native
+from kineverse.compile.program import Program
+
+a, b = kv.position("door/a"), kv.position("door/b")
+
+
+def agree(first: kv.CompiledFunction, second: kv.CompiledFunction, rows: np.ndarray) -> None:
+    for x in rows:
+        for v, w in zip(first(x), second(x), strict=True):
+            assert same_bits(v, w)
+
+
+def test_tiers_agree_to_the_bit_on_an_arm() -> None:
+    mechanism = arm()
+    outputs = [mechanism.pose, mechanism.jacobian]
+    slow, fast = kv.compile(outputs, tier="interpreter"), kv.compile(outputs, tier="c", wait=True)
+    assert (slow.tier, fast.tier) == ("interpreter", "c")
+    agree(slow, fast, np.random.default_rng(0).uniform(-7, 7, (4000, 7)))
+
+
+def test_tiers_agree_to_the_bit_on_every_operation() -> None:
+    symbols, values = every_operation(depth=6).expressions()
+    slow = kv.compile([kv.array(values)], symbols, tier="interpreter")
+    fast = kv.compile([kv.array(values)], symbols, tier="c", wait=True)
+    agree(slow, fast, points(3000, 5))
+
+
+@settings(max_examples=8, suppress_health_check=[HealthCheck.too_slow])
+@given(random_programs())
+def test_tiers_agree_to_the_bit_on_random_programs(program) -> None:
+    symbols, values = program.expressions()
+    slow = kv.compile([kv.array(values)], symbols, tier="interpreter")
+    fast = kv.compile([kv.array(values)], symbols, tier="c", wait=True)
+    agree(slow, fast, points(300, 5))
+
+
+def test_calls_through_casadi_and_through_the_extension_agree(monkeypatch: pytest.MonkeyPatch) -> None:
+    mechanism = arm()
+    direct = kv.compile([mechanism.pose, mechanism.jacobian], tier="c", wait=True)
+    if native.module is None:
+        pytest.skip("Python's headers are not installed, so there is no extension to compare")
+    monkeypatch.setattr(native, "module", None)
+    buffered = kv.compile([mechanism.pose, mechanism.jacobian], tier="c", wait=True)
+    assert type(direct.bind()) is not type(buffered.bind())
+    agree(direct, buffered, points(500, 7))
+
+
+def test_other_names_are_the_same_library() -> None:
+    first, second = arm("left"), arm("right")
+    assert Program([first.pose], first.symbols).key() == Program([second.pose], second.symbols).key()
+    assert Program([first.pose], first.symbols).key() != Program([first.jacobian], first.symbols).key()
+    assert Program([first.pose], first.symbols).key() != Program([first.pose], first.symbols[::-1]).key()
+
+
+def test_no_name_reaches_generated_code() -> None:
+    names = ["secret", 'x"; system("true"); "', "*/ evil /*", "unicode_é", "a\\nb", "sin"]
+    symbols = [kv.position(f"house/{name}") for name in names]
+    program = Program([np.sin(sum(symbols[1:], symbols[0]))], symbols)
+    for source in (program.source(), batch_source(program)):
+        assert not any(word in source for word in ("secret", "house", "system(", "evil", "unicode", "a\\nb"))
+
+
+def test_c_takes_over_in_the_background_under_calls_from_many_threads() -> None:
+    mechanism = arm("busy", joints=6)
+    outputs = [mechanism.pose, mechanism.jacobian]
+    reference = kv.compile(outputs, tier="interpreter")
+    rows = np.random.default_rng(1).uniform(-3, 3, (64, 6))
+    wanted = [reference(x) for x in rows]
+    # A constant that no other test has, so that it is compiled now.
+    f = kv.compile([*outputs, mechanism.pose * 1.0625])
+    evaluator = f.bind()
+    wrong, after_the_change = [], []
+    stop = threading.Event()
+
+    def work(offset: int) -> None:
+        i = offset
+        calls_in_c = 0
+        while not stop.is_set() or calls_in_c < 200:
+            i = (i + 1) % len(rows)
+            calls_in_c += f.tier == "c"
+            pose, jacobian, _ = f(rows[i])
+            if not (same_bits(pose, wanted[i][0]) and same_bits(jacobian, wanted[i][1])):
+                wrong.append(i)
+        after_the_change.append(calls_in_c)
+
+    threads = [threading.Thread(target=work, args=(k * 16,)) for k in range(4)]
+    for thread in threads:
+        thread.start()
+    assert f.wait(60)
+    stop.set()
+    for thread in threads:
+        thread.join()
+    assert not wrong
+    assert len(after_the_change) == 4
+    assert f.tier == "c"
+    evaluator(rows[3])
+    assert same_bits(evaluator.outputs[0], wanted[3][0])
+
+
+def test_evaluators_change_with_their_function() -> None:
+    f = kv.compile([a * 3.25 + b, b / a])
+    evaluator = f.bind()
+    outputs = evaluator.outputs
+    evaluator([2.0, 3.0])
+    assert f.wait(60)
+    evaluator([4.0, 5.0])
+    assert evaluator.outputs is outputs
+    assert [float(v) for v in outputs] == [18.0, 1.25]
+
+
+def test_interpreter_stays_when_it_is_asked_for() -> None:
+    f = kv.compile(a * b * 2.125, tier="interpreter", wait=True)
+    assert f.tier == "interpreter"
+    assert not f.wait(0.0)
+
+
+def test_without_a_compiler(monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, tmp_path: Path) -> None:
+    monkeypatch.setenv("PATH", str(tmp_path))
+    monkeypatch.delenv("CC", raising=False)
+    with caplog.at_level(logging.WARNING, "kineverse.compile"):
+        for factor in (1.5, 2.5):
+            f = kv.compile(a * b * factor, wait=True)
+            assert f.tier == "interpreter"
+            assert not f.wait()
+            assert f([2.0, 3.0]) == 6.0 * factor
+            assert f.batch([[2.0, 3.0]] * 70).tolist() == [6.0 * factor] * 70
+        with pytest.raises(kv.CompileError, match="no C compiler"):
+            kv.compile(a * b, tier="c")
+    assert [r.getMessage() for r in caplog.records if "No C compiler" in r.getMessage()] != []
+    assert len(caplog.records) == 1
+    assert kv.compile_information().compiler is None if hasattr(kv, "compile_information") else True
+
+
+def broken_compiler(tmp_path: Path, script: str) -> str:
+    path = tmp_path / "cc"
+    path.write_text(f"#!/bin/sh\n{script}\n")
+    path.chmod(0o755)
+    return str(path)
+
+
+def test_a_compiler_that_fails(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, tmp_path: Path
+) -> None:
+    monkeypatch.setenv("CC", broken_compiler(tmp_path, "echo 'cannot do that' >&2; exit 3"))
+    monkeypatch.setattr(worker, "_worker", worker._Worker())
+    with caplog.at_level(logging.WARNING, "kineverse.compile"):
+        f = kv.compile(a * b * 4.5, wait=True)
+        g = kv.compile(a * b * 5.5, wait=True)
+    assert (f.tier, g.tier) == ("interpreter", "interpreter")
+    assert f([1.0, 2.0]) == 9.0
+    assert len(caplog.records) == 1
+    assert "cannot do that" in caplog.text
+    with pytest.raises(kv.CompileError, match="cannot do that"):
+        kv.compile(a * b * 6.5, tier="c", wait=True)
+    h = kv.compile(a * b * 7.5, tier="c")
+    with pytest.raises(kv.CompileError, match="cannot do that"):
+        h.wait()
+    with pytest.raises(kv.CompileError, match="cannot do that"):
+        h.batch([[1.0, 2.0]])
+
+
+def test_a_compiler_that_never_ends(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    # The process that hangs is a child of the compiler's, as with gcc: both have to go.
+    marker = tmp_path / "alive"
+    monkeypatch.setenv("CC", broken_compiler(tmp_path, f"(while :; do date > {marker}; sleep 0.01; done) & wait"))
+    monkeypatch.setattr(worker, "TIME_LIMIT", 0.2)
+    with pytest.raises(kv.CompileError, match="more than"):
+        kv.compile(a * b * 8.5, tier="c", wait=True)
+    assert marker.exists()
+    marker.unlink()
+    assert not kv.compile(a * b * 8.5).wait(0.0)
+    assert not [p for p in worker.library_cache().folder.iterdir() if p.name.startswith(".build-")]
+
+
+def test_waiting_has_an_end(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    gate = tmp_path / "gate"
+    script = f"while [ ! -e {gate} ]; do sleep 0.01; done; exit 1"
+    monkeypatch.setenv("CC", broken_compiler(tmp_path, script))
+    monkeypatch.setattr(worker, "_worker", worker._Worker())
+    f = kv.compile(a * b * 9.5)
+    assert not f.wait(0.01)
+    assert f.tier == "interpreter"
+    waiting = [kv.compile(a * b * (10.5 + i)) for i in range(3)]
+    # Nobody is interested in these when their turn comes, so the compiler never sees them.
+    for i in range(20):
+        kv.compile(a * b * (20.5 + i))
+    gate.touch()
+    assert not any(g.wait(60) for g in waiting)
+    assert not worker._worker._wanted
+
+
+def test_the_queue_is_bounded(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    gate = tmp_path / "gate"
+    monkeypatch.setenv("CC", broken_compiler(tmp_path, f"while [ ! -e {gate} ]; do sleep 0.01; done; exit 1"))
+    monkeypatch.setattr(worker, "_worker", worker._Worker())
+    monkeypatch.setattr(worker, "MAXIMUM_WAITING", 3)
+    functions = [kv.compile(a * b * (50.5 + i)) for i in range(6)]
+    assert len(worker._worker._wanted) == 3
+    assert [f([1.0, 2.0]) for f in functions] == [2 * (50.5 + i) for i in range(6)]
+    gate.touch()
+    assert not functions[-1].wait(60)
