@@ -70,10 +70,17 @@ class RandomProgram:
     steps: list[tuple[int, tuple[int, ...]]]
 
     def expressions(self) -> tuple[list[kv.Symbol], list[Expression]]:
+        """Return the inputs, and everything that is computed, inputs included."""
         symbols = [kv.position(f"random/x{i:02}") for i in range(self.inputs)]
         values: list[Expression] = [*symbols, kv.array(0.3), kv.array(-2.0)]
         for op, operands in self.steps:
             arguments = [values[o] for o in operands]
+            if op == ca.OP_COPYSIGN:
+                # The sign of NaN is nobody's business, and differs.
+                arguments[1] = binary(ca.OP_FMIN, arguments[1], 1e300)
+            elif op == ca.OP_REMAINDER:
+                # For subnormal divisors C libraries disagree about the sign of a zero remainder.
+                arguments[1] = binary(ca.OP_FMAX, arguments[1], 1e-300)
             values.append(unary(op, *arguments) if len(arguments) == 1 else binary(op, *arguments))
         return symbols, values
 

@@ -53,11 +53,12 @@ def test_tiers_agree_to_the_bit_on_random_programs(program) -> None:
 def test_calls_through_casadi_and_through_the_extension_agree(monkeypatch: pytest.MonkeyPatch) -> None:
     mechanism = arm()
     direct = kv.compile([mechanism.pose, mechanism.jacobian], tier="c", wait=True)
+    evaluator = direct.bind()
     if native.module is None:
         pytest.skip("Python's headers are not installed, so there is no extension to compare")
     monkeypatch.setattr(native, "module", None)
     buffered = kv.compile([mechanism.pose, mechanism.jacobian], tier="c", wait=True)
-    assert type(direct.bind()) is not type(buffered.bind())
+    assert type(evaluator) is not type(buffered.bind())
     agree(direct, buffered, points(500, 7))
 
 
@@ -190,7 +191,7 @@ def test_a_compiler_that_never_ends(monkeypatch: pytest.MonkeyPatch, tmp_path: P
 
 def test_waiting_has_an_end(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     gate = tmp_path / "gate"
-    script = f"while [ ! -e {gate} ]; do sleep 0.01; done; exit 1"
+    script = f"echo >> {tmp_path}/runs; while [ ! -e {gate} ]; do sleep 0.01; done; exit 1"
     monkeypatch.setenv("CC", broken_compiler(tmp_path, script))
     monkeypatch.setattr(worker, "_worker", worker._Worker())
     f = kv.compile(a * b * 9.5)
@@ -200,9 +201,11 @@ def test_waiting_has_an_end(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> 
     # Nobody is interested in these when their turn comes, so the compiler never sees them.
     for i in range(20):
         kv.compile(a * b * (20.5 + i))
+    last = kv.compile(a * b * 40.5)
     gate.touch()
     assert not any(g.wait(60) for g in waiting)
-    assert not worker._worker._wanted
+    assert last._library._build._done.wait(60)
+    assert len((tmp_path / "runs").read_text().splitlines()) == 5
 
 
 def test_the_queue_is_bounded(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

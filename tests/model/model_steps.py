@@ -203,7 +203,7 @@ def fold(sequence: Sequence[Sequenced]) -> Fold:
         seen: dict[Any, Any] = {}
         for cell, how in reads.cells.items():
             found = result.value(cell)
-            seen[cell] = found if how & Read.VALUE else found is ABSENT
+            seen[cell] = (how, found if how & Read.VALUE else found is ABSENT)
         for kind in reads.listings:
             seen[kind] = sorted(result.head[kind])
         result.reads[tag], result.seen[tag] = reads, seen

@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 from kineverse.errors import CompileError, ShapeError
 
-from .batch_source import batch_source, vectorisable
+from .batch_source import KIND, batch_source, vectorisable
 from .binding import Array, Shape, bind
 from .library import Library
 from .memory import aligned
@@ -21,6 +21,9 @@ from .signature import Signature, numbers
 
 # Results beyond this are written past the caches: nobody could read them from there in time.
 _STREAMED_BYTES = 8 * 2**20
+# Seconds on one core, in all and for each instruction, as measured with gcc 12 and CasADi 3.8.
+_COMPILING, _COMPILING_ONE = 0.3, 1e-3
+_INTERPRETING, _INTERPRETING_ONE = 50e-9, 3e-9
 # So many rows at a time go through CasADi's map.
 _MAPPED = 32
 
@@ -60,7 +63,7 @@ class Batch:
         self._spent = 0.0
         self._library: Library[Compiled] | None = None
         if tier != "interpreter" and vectorisable(program):
-            self._library = Library(program, "batch", lambda: batch_source(program), _load)
+            self._library = Library(program, KIND, lambda: batch_source(program), _load)
 
     def __call__(self, x: npt.ArrayLike, out: Any, function: CasadiFunction) -> Any:
         """Return the outputs at all rows of ``x``, see :meth:`CompiledFunction.batch`.
@@ -131,9 +134,8 @@ class Batch:
                 raise CompileError(f"The batch cannot be compiled: {library.error}.")
             return None
         if library.code is None and not library.find():
-            # Seconds on one core, as measured with gcc 12 and CasADi 3.8.
-            compiling = 0.3 + 1e-3 * self._program.instructions
-            interpreting = rows * (50e-9 + 3e-9 * self._program.instructions) / cores()
+            compiling = _COMPILING + _COMPILING_ONE * self._program.instructions
+            interpreting = rows * (_INTERPRETING + _INTERPRETING_ONE * self._program.instructions) / cores()
             self._spent += interpreting
             if self._insist or interpreting > compiling:
                 library.wait()

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import hashlib
+
 import casadi as ca
 
 from .program import Program
@@ -119,6 +121,12 @@ int kineverse_batch(const double *in, double *const *out, long long rows, int st
 """
 
 
+_TEXTS = "\n".join([TYPES, ROWS, ARITHMETIC, TRIGONOMETRIC, EXPONENTIAL, by_lane()])
+
+# Raise the number when other source is generated from the same program and texts.
+KIND = "batch 1 " + hashlib.sha256((_TEXTS + _LOOP + repr((_PLAIN, _TRUTH))).encode()).hexdigest()
+
+
 def vectorisable(program: Program) -> bool:
     """Whether every operation of the program can be done on vectors."""
     function = program.function
@@ -153,12 +161,7 @@ def batch_source(program: Program) -> str:
     constants = "\n".join(f"  o[{place}] = splat({_number(c)});" for place, c in plan.constants)
     return "\n".join(
         [
-            TYPES,
-            ROWS,
-            ARITHMETIC,
-            TRIGONOMETRIC,
-            EXPONENTIAL,
-            by_lane(),
+            _TEXTS,
             *(f"#define {name} {value}" for name, value in definitions.items()),
             *(_part(plan, part, i) for i, part in enumerate(plan.parts)),
             f"static void compute(const V *x, V *store, V *o) {{\n{calls}\n}}",

@@ -25,7 +25,7 @@ class Library(Generic[Code]):
     program
         What it computes.
     kind
-        What is generated from the program; two kinds are two libraries.
+        What is generated from the program, and by which version of what generates it.
     source
         Generates the C; called in another thread, if at all.
     load

@@ -37,10 +37,18 @@ def aligned(size: int) -> npt.NDArray[np.float64]:
     block = _freed(size + _CACHE_LINE // 8)
     if block is None:
         block = np.empty(size + _CACHE_LINE // 8)
-    # Arrays refer to the object they are made from, so this one lives as long as the last of them.
-    lease = block.data
+    lease = _Lease(block)
     weakref.finalize(lease, _give_back, block).atexit = False
-    return _from_line(np.frombuffer(lease))[:size]
+    return _from_line(np.asarray(lease))[:size]
+
+
+class _Lease:
+    """What arrays in a block are made from: they refer to it, so it lives as long as the last of them."""
+
+    __slots__ = ("__array_interface__", "__weakref__")
+
+    def __init__(self, block: npt.NDArray[np.float64]) -> None:
+        self.__array_interface__ = block.__array_interface__
 
 
 def _from_line(block: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:

@@ -19,9 +19,17 @@ from kineverse.symbols import Symbol
 
 CasadiFunction: TypeAlias = Any
 
-# Part of every key: raise it when the sources that are generated from the same program change.
-REVISION = 1
 NAME = "kineverse_function"
+
+# Of two zeros CasADi's interpreter returns the first, the C library the second.
+_PRELUDE = """
+#include <math.h>
+#define CASADI_SYMBOL_EXPORT __attribute__((visibility("default")))
+static inline double first_smaller(double x, double y) { return x <= y || y != y ? x : y; }
+static inline double first_larger(double x, double y) { return x >= y || y != y ? x : y; }
+#define fmin(x, y) first_smaller(x, y)
+#define fmax(x, y) first_larger(x, y)
+"""
 
 
 class Program:
@@ -48,11 +56,17 @@ class Program:
         self.instructions: int = graph.n_instructions()
         # Such as the solver inside of a closed loop.
         self.calls_others = bool(graph.find_functions(1))
-        text = f"{REVISION} {ca.CasadiMeta.version()} {graph.serialize()}"
+        text = f"{_PRELUDE} {ca.CasadiMeta.version()} {graph.serialize()}"
         self.digest = hashlib.sha256(text.encode())
 
     def key(self, *details: str) -> str:
-        """Return the digest of this program and of how it is compiled, the same in every process."""
+        """Return the digest of this program and of how it is compiled, the same in every process.
+
+        Parameters
+        ----------
+        details
+            All that the library depends on beside the program.
+        """
         digest = self.digest.copy()
         digest.update(repr(details).encode())
         return digest.hexdigest()[:40]
@@ -79,7 +93,7 @@ class Program:
         code = re.sub(r"/\*.*?\*/", "", generator.dump(), flags=re.DOTALL)
         if re.search(r"\berfinv\(", code):
             raise CompileError("CasADi has no C for the inverse error function.")
-        return f'#define CASADI_SYMBOL_EXPORT __attribute__((visibility("default")))\n{code}'
+        return _PRELUDE + code
 
 
 def _offsets(sizes: Sequence[int]) -> list[int]:

@@ -266,6 +266,10 @@ def _end(compiler: subprocess.Popen[bytes]) -> None:
         with contextlib.suppress(OSError):
             os.killpg(compiler.pid, signal.SIGKILL)
         compiler.wait()
+    for pipe in (compiler.stdin, compiler.stderr):
+        if pipe is not None:
+            with contextlib.suppress(OSError):
+                pipe.close()
 
 
 _worker = _Worker()

@@ -44,7 +44,7 @@ def pack(expression: Expression) -> tuple[Any, ...]:
     """Return what :func:`unpack` needs, all of it picklable."""
     symbols, nodes = leaves(expression)
     function = _function(expression._sx, [*(s._sx for s in symbols), *(n.sx for n in nodes)])
-    return symbols, nodes, expression._shape, function.serialize(), _landings(nodes)
+    return _landings(nodes), symbols, nodes, expression._shape, function.serialize()
 
 
 def _landings(nodes: tuple[Node, ...]) -> tuple[Node, ...]:
@@ -56,7 +56,7 @@ def _landings(nodes: tuple[Node, ...]) -> tuple[Node, ...]:
 
 
 def unpack(
-    symbols: tuple[Any, ...], nodes: tuple[Any, ...], shape: Shape, graph: str, _: tuple[Any, ...] = ()
+    _: tuple[Any, ...], symbols: tuple[Any, ...], nodes: tuple[Any, ...], shape: Shape, graph: str
 ) -> Expression:
     """Rebuild an expression from :func:`pack`."""
     leaf = [*(s._sx for s in symbols), *(n.sx for n in nodes)]

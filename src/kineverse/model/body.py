@@ -54,7 +54,11 @@ class Pose:
         """
         if np.shape(matrix) != (4, 4):
             raise ShapeError(f"A pose is made from a 4×4 matrix, not from one of shape {np.shape(matrix)}.")
-        return Pose(tuple(np.asarray(matrix, dtype=float)[:3].ravel().tolist()))
+        numbers = np.asarray(matrix, dtype=float)
+        x, y, z, w = numbers[3].tolist()
+        if not max(abs(x), abs(y), abs(z), abs(w - 1)) < _RIGID:
+            raise ValueRejectedError(f"The last row of a rigid transform is (0, 0, 0, 1), not {numbers[3]}.")
+        return Pose(tuple(numbers[:3].ravel().tolist()))
 
     @property
     def matrix(self) -> npt.NDArray[Any]:

@@ -11,7 +11,7 @@ import casadi as ca
 import numpy as np
 import numpy.typing as npt
 
-from kineverse.errors import ShapeError, ValueRejectedError
+from kineverse.errors import ShapeError
 from kineverse.expressions.expression import Expression, as_expression
 
 from .body import Pose
@@ -53,7 +53,7 @@ class Frame:
             return Frame(parent, (transform,))
         if isinstance(transform, (list, tuple)) and transform and not np.isscalar(transform[0]):
             parts: Sequence[Any] = transform
-            if not all(isinstance(p, Pose) or np.shape(p) == (4, 4) for p in parts):
+            if not all(map(_is_transform, parts)):
                 parts = [as_expression(transform)]  # a nested list of rows is one matrix
         else:
             parts = [transform]
@@ -77,10 +77,10 @@ def _factor(transform: TransformLike) -> Pose | Expression:
     if not expression.is_constant:
         return expression
     matrix = np.array(ca.DM(expression.casadi))
-    rotation = matrix[:3, :3]
-    rigid = np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-6) and np.linalg.det(rotation) > 0
-    if not rigid or not np.array_equal(matrix[3], [0, 0, 0, 1]) or not np.isfinite(matrix).all():
-        raise ValueRejectedError(
-            "The transform is not rigid: its upper left 3×3 must be a rotation and its last row (0, 0, 0, 1)."
-        )
     return Pose.of(matrix)
+
+
+def _is_transform(part: Any) -> bool:
+    if isinstance(part, (list, tuple)):
+        return len(part) == 4 and all(isinstance(row, (list, tuple)) and len(row) == 4 for row in part)
+    return isinstance(part, Pose) or getattr(part, "shape", None) == (4, 4)

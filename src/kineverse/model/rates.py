@@ -38,8 +38,10 @@ def as_row(coordinate: Symbol, row: Mapping[Symbol, ExpressionLike]) -> Row:
     ModelError
         If the coordinate is not a position, or a key not a velocity.
     """
-    if coordinate.order or not coordinate.has_derivative:
+    if not isinstance(coordinate, Symbol) or coordinate.order or not coordinate.has_derivative:
         raise ModelError(f"Only positions have a rate, and '{coordinate}' is none.")
+    if not isinstance(row, Mapping):
+        raise ModelError(f"The rate of '{coordinate}' is a mapping {{speed: expression}}, not {row!r}.")
     entries = []
     for speed, value in row.items():
         if not isinstance(speed, Symbol) or speed.order != 1:

@@ -41,7 +41,8 @@ class Reads:
 
     def add(self, cell: Cell, how: Read) -> None:
         """Remember a look at a cell."""
-        self.cells[cell] = self.cells.get(cell, Read(0)) | how
+        known = self.cells.get(cell)
+        self.cells[cell] = how if known is None else known | how
 
 
 class Reader:

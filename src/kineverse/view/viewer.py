@@ -72,6 +72,7 @@ class Viewer:
         self._asked, self._done = 1, 0
         self._stopping, self._edited = False, False
         self._driven: set[str] = set()
+        self._ended = threading.Event()
         self._show: Show | None = None
         self._server = web.start(port, label)
         try:
@@ -159,9 +160,10 @@ class Viewer:
 
     def wait(self) -> None:
         """Keep the page up until :meth:`stop` or Ctrl-C."""
-        while self._worker.is_alive():
-            # A join without a limit cannot be interrupted on every platform.
-            self._worker.join(timeout=0.5)
+        # A join that Ctrl-C interrupts takes the thread for finished (Python 3.11), and a wait without a limit
+        # cannot be interrupted on every platform.
+        while not self._ended.wait(timeout=0.5):
+            pass
 
     def stop(self) -> None:
         """Take the page down; calling it again does nothing."""
@@ -174,6 +176,7 @@ class Viewer:
             self._listener.close()
         self._worker.join(timeout=5.0)
         web.stop(self._server)
+        self._ended.set()
 
     def __enter__(self) -> Viewer:
         return self

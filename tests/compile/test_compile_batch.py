@@ -1,0 +1,287 @@
+"""Many points at once: the same numbers as one by one."""
+
+from __future__ import annotations
+
+import gc
+import threading
+
+import casadi as ca
+import numpy as np
+import pytest
+from compiled_programs import APPROXIMATED, UNARY, arm, every_operation, points, random_programs, same_bits, ulps
+from hypothesis import HealthCheck, given, settings
+
+import kineverse as kv
+from kineverse.compile import batch, batch_source, memory, rows
+from kineverse.expressions.expression import binary, make, unary
+
+a, b = kv.position("door/a"), kv.position("door/b")
+
+
+@pytest.fixture(scope="module")
+def function() -> kv.CompiledFunction:
+    """Outputs whose rows are whole vectors, odd, single and shorter than a vector; the last is constant."""
+    mechanism = arm()
+    p = mechanism.pose[:3, 3]
+    return kv.compile([mechanism.pose, mechanism.jacobian, p @ p, p, np.eye(2)], tier="c", wait=True)
+
+
+def one_by_one(f: kv.CompiledFunction, x: np.ndarray) -> list[np.ndarray]:
+    results = [f(row) for row in x]
+    return [np.array([r[i] for r in results]).reshape(len(x), *shape) for i, shape in enumerate(f.shapes)]
+
+
+def close(first: np.ndarray, second: np.ndarray) -> bool:
+    return np.allclose(first, second, rtol=0, atol=1e-14, equal_nan=True) and first.shape == second.shape
+
+
+@pytest.mark.parametrize("count", [0, 1, 2, 7, 8, 9, 15, 16, 17, 33, 100])
+def test_any_number_of_rows(function: kv.CompiledFunction, count: int) -> None:
+    x = np.random.default_rng(count).uniform(-3, 3, (count, 7))
+    results = function.batch(x)
+    assert all(close(v, w) for v, w in zip(results, one_by_one(function, x), strict=True))
+    assert all(v.flags.c_contiguous and v.flags.writeable for v in results)
+
+
+@pytest.mark.parametrize("offset", [0, 1, 2, 5])
+@pytest.mark.parametrize("count", [64, 77])
+def test_results_written_past_the_caches(
+    function: kv.CompiledFunction, monkeypatch: pytest.MonkeyPatch, offset: int, count: int
+) -> None:
+    monkeypatch.setattr(batch, "_STREAMED_BYTES", -1)
+    x = np.random.default_rng(offset).uniform(-3, 3, (count, 7))
+    out, fences = [], []
+    for shape in function.shapes:
+        size = count * int(np.prod(shape))
+        memory = np.full(size + 40, 7.0)
+        start = -memory.ctypes.data % 64 // 8 + 8 + offset
+        out.append(memory[start : start + size].reshape(count, *shape))
+        fences.append((memory[:start], memory[start + size :]))
+    assert function.batch(x, out)[0] is out[0]
+    assert all(close(v, w) for v, w in zip(out, one_by_one(function, x), strict=True))
+    assert all(np.all(fence == 7.0) for pair in fences for fence in pair)
+
+
+def test_one_output_gives_an_array() -> None:
+    f = kv.compile(a * b, tier="c")
+    assert f.batch([[1, 2], [3, 4]]).tolist() == [2.0, 12.0]
+    out = np.empty(2)
+    assert f.batch([[1, 2], [3, 4]], out=out) is out
+    assert f.batch([[1, 2], [3, 5]], out=[out]) is out
+    assert out.tolist() == [2.0, 15.0]
+
+
+def test_points_of_any_type_and_strides(function: kv.CompiledFunction) -> None:
+    x = np.random.default_rng(0).integers(-2, 3, (20, 7))
+    wanted = function.batch(x.astype(float))
+    wide = np.zeros((40, 14))
+    wide[::2, ::2] = x
+    readonly = x.astype(float)
+    readonly.flags.writeable = False
+    for same in (x.astype(np.float32), x, wide[::2, ::2], np.asfortranarray(x), x.astype(">f8"), x.tolist(), readonly):
+        assert all(same_bits(v, w) for v, w in zip(function.batch(same), wanted, strict=True))
+
+
+@pytest.mark.parametrize(
+    "x",
+    [np.zeros(7), np.zeros((2, 6)), np.zeros((2, 7, 1)), [], 1.0, "text", np.zeros((2, 7), complex), [[None] * 7], None],
+)
+def test_what_are_no_points_is_refused(function: kv.CompiledFunction, x: object) -> None:
+    with pytest.raises(kv.ShapeError, match=r"shape \(N, 7\)"):
+        function.batch(x)
+
+
+def test_out_that_does_not_fit_is_refused() -> None:
+    f = kv.compile([kv.array([a, b, a]), a * b])
+    x = np.ones((4, 2))
+    first, second = np.empty((4, 3)), np.empty(4)
+    readonly = np.empty((4, 3))
+    readonly.flags.writeable = False
+    shared = np.empty(14)
+    for out in (
+        first, [first], [first, second, second], [second, first], [np.empty((3, 3)), second], [np.empty((4, 3), np.float32), second],
+        [np.empty((3, 4)).T, second], [np.empty((4, 6))[:, ::2], second], [readonly, second], [[0.0] * 12, second],
+        [shared[:12].reshape(4, 3), shared[10:]],
+    ):  # fmt: skip
+        with pytest.raises(kv.ShapeError, match="out="):
+            f.batch(x, out=out)
+    assert f.batch(x, out=[first, second])[1] is second
+
+
+def test_out_may_be_where_the_points_are() -> None:
+    f = kv.compile(kv.array([b, a + b]), [a, b])
+    x = np.arange(40.0).reshape(20, 2)
+    wanted = f.batch(x.copy())
+    assert np.array_equal(f.batch(x, out=x), wanted)
+
+
+def test_nan_stays_in_its_row(function: kv.CompiledFunction) -> None:
+    x = np.random.default_rng(3).uniform(-3, 3, (64, 7))
+    wanted = [v.copy() for v in function.batch(x)]
+    x[5, 2], x[17, 0], x[63, 6] = np.nan, np.inf, 1e300
+    results = function.batch(x)
+    others = np.delete(np.arange(64), [5, 17, 63])
+    assert all(same_bits(v[others], w[others]) for v, w in zip(results, wanted, strict=True))
+    assert np.isnan(results[0][5]).any()
+    assert np.isnan(results[0][17]).any()
+    assert close(results[0][63], function(x[63])[0])
+
+
+def check_every_value(program, f: kv.CompiledFunction, x: np.ndarray) -> None:
+    """Compare each value with its operation applied to the operands that the batch itself computed.
+
+    So that nothing is amplified, and every operation answers for itself.
+    """
+    (results,) = f.batch(x)
+    columns = list(results.T)
+    for (op, operands), value in zip(program.steps, columns[program.inputs + 2 :], strict=True):
+        arguments = np.array([columns[o] for o in operands])
+        wanted = _single_operation(op, operands)(arguments).full().ravel()
+        if op in APPROXIMATED:
+            assert ulps(wanted, value).max() <= 4
+        else:
+            assert same_bits(wanted, value)
+
+
+def _single_operation(op: int, places: tuple[int, ...]) -> ca.Function:
+    v = ca.SX.sym("v", len(places))
+    # CasADi knows what x <= x is.
+    operands = [make(v[places.index(place)], (), frozenset()) for place in places]
+    if op == ca.OP_COPYSIGN:
+        operands[1] = binary(ca.OP_FMIN, operands[1], 1e300)
+    elif op == ca.OP_REMAINDER:
+        operands[1] = binary(ca.OP_FMAX, operands[1], 1e-300)
+    result = unary(op, *operands) if op in UNARY else binary(op, *operands)
+    return ca.Function("f", [v], [result.casadi])
+
+
+def test_every_operation() -> None:
+    program = every_operation(depth=4)
+    symbols, values = program.expressions()
+    check_every_value(program, kv.compile([kv.array(values)], symbols, tier="c"), points(4003, 5))
+
+
+@settings(max_examples=8, suppress_health_check=[HealthCheck.too_slow])
+@given(random_programs())
+def test_random_programs(program) -> None:
+    symbols, values = program.expressions()
+    check_every_value(program, kv.compile([kv.array(values)], symbols, tier="c"), points(1003, 5))
+
+
+def test_programs_longer_than_one_c_function(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(batch_source, "_PART_LENGTH", 7)
+    # A constant of its own, for a library of its own.
+    mechanism = arm()
+    f = kv.compile([mechanism.pose, mechanism.jacobian * 1.03125], tier="c")
+    x = np.random.default_rng(0).uniform(-3, 3, (20, 7))
+    assert all(close(v, w) for v, w in zip(f.batch(x), one_by_one(f, x), strict=True))
+
+
+@pytest.mark.parametrize("count", [0, 1, 5, 32, 33, 100])
+def test_the_interpreter_does_batches_too(count: int) -> None:
+    mechanism = arm()
+    f = kv.compile([mechanism.pose, mechanism.jacobian], tier="interpreter")
+    x = np.random.default_rng(0).uniform(-3, 3, (count, 7))
+    results = f.batch(x)
+    assert all(same_bits(v, w) for v, w in zip(results, one_by_one(f, x), strict=True))
+    assert f._batch._library is None
+
+
+def test_small_batches_are_interpreted_and_add_up() -> None:
+    f = kv.compile([a * b * 3.375, kv.array([a, b])])
+    x = np.ones((10, 2))
+    f.batch(x)
+    assert f._batch._library._build is None
+    library = f._batch._library
+    f._batch._spent = 1.0
+    f.batch(x)
+    assert library.wait(60)
+    assert f.batch(x)[0].tolist() == [3.375] * 10
+
+
+def test_large_batches_wait_for_the_compiler(monkeypatch: pytest.MonkeyPatch) -> None:
+    f = kv.compile([kv.array([np.sin(a * 1.4375), b])])
+    x = np.random.default_rng(0).uniform(-3, 3, (100, 2))
+    monkeypatch.setattr(batch, "_INTERPRETING", 0.1)
+    assert close(f.batch(x)[0], one_by_one(f, x)[0])
+    assert f._batch._library.code is not None
+
+
+def test_a_solver_inside_stays_with_casadi() -> None:
+    x, p = ca.SX.sym("x"), ca.SX.sym("p")
+    solve = ca.rootfinder("secret_loop", "fast_newton", {"x": x, "p": p, "g": x * x - p})
+    root = make(solve(x0=1.0, p=a.casadi + 1.0)["x"], (), frozenset())
+    f = kv.compile([root, a], tier="c", wait=True)
+    assert "secret" not in f._program.source()
+    assert f([3.0])[0] == pytest.approx(2.0, abs=1e-12)
+    assert np.allclose(f.batch(np.arange(50.0).reshape(50, 1))[0], np.sqrt(np.arange(50) + 1.0))
+
+
+def test_many_threads_and_pieces(function: kv.CompiledFunction, monkeypatch: pytest.MonkeyPatch) -> None:
+    x = np.random.default_rng(0).uniform(-3, 3, (5000, 7))
+    wanted = [v.copy() for v in function.batch(x)]
+    monkeypatch.setattr(rows, "cores", lambda: 4)
+    monkeypatch.setattr(rows, "_threads", None)
+    wrong = []
+
+    def work() -> None:
+        for _ in range(5):
+            if not all(same_bits(v, w) for v, w in zip(function.batch(x), wanted, strict=True)):
+                wrong.append(True)
+
+    threads = [threading.Thread(target=work) for _ in range(3)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert not wrong
+
+
+def test_errors_in_threads_reach_the_caller(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(rows, "cores", lambda: 3)
+
+    def work(first: int, end: int) -> None:
+        raise MemoryError(f"{first} {end}")
+
+    with pytest.raises(MemoryError):
+        rows.over_rows(work, 1000, 1)
+
+
+def test_pieces_make_up_all_rows(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(rows, "cores", lambda: 3)
+    for count in (0, 1, 7, 8, 1000, 1001):
+        done = []
+        rows.over_rows(lambda first, end, done=done: done.extend(range(first, end)), count, 4)
+        assert sorted(done) == list(range(count))
+
+
+def test_memory_of_results_is_used_again_only_when_they_are_gone() -> None:
+    size = memory._SMALLEST // 8 + 1
+    first = memory.aligned(size)
+    assert first.ctypes.data % 64 == 0
+    assert first.shape == (size,)
+    first[:] = 1.0
+    piece = first[100:200].reshape(10, 10)
+    address = first.ctypes.data
+    del first
+    gc.collect()
+    second = memory.aligned(size)
+    second[:] = 2.0
+    assert np.all(piece == 1.0)
+    del piece
+    gc.collect()
+    third = memory.aligned(size)
+    assert third.ctypes.data == address
+    third[:] = 3.0
+    assert np.all(second == 2.0)
+
+
+def test_no_more_memory_is_kept_than_allowed(monkeypatch: pytest.MonkeyPatch) -> None:
+    memory._free.clear()
+    size = memory._SMALLEST // 8 + 1
+    monkeypatch.setattr(memory, "_LARGEST_TOTAL", 2 * 8 * size + 200)
+    leases = [memory.aligned(size) for _ in range(5)]
+    del leases
+    gc.collect()
+    assert len(memory._free) == 2
+    memory._free.clear()

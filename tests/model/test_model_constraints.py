@@ -1,0 +1,278 @@
+"""Constraints: what they accept, which matter for what, which are broken, and where to start from."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+
+import kineverse as kv
+from kineverse.model.constraint import as_constraint
+
+a, b, c, d = (kv.position(n) for n in "abcd")
+INF = math.inf
+
+
+def constrained(**triples: Any) -> kv.Model:
+    model = kv.Model()
+    with model.edit() as edit:
+        for name, triple in triples.items():
+            edit.constrain(name, *triple)
+    return model
+
+
+# -- one constraint --------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("triple", "error", "words"),
+    [
+        ((0, np.array([a, b], dtype=object), 1), kv.ShapeError, "scalar"),
+        (([0, 1], a, 1), kv.ShapeError, "lower bound"),
+        ((0, a, np.ones((2, 2))), kv.ShapeError, "upper bound"),
+        ((0, 0.5, 1), kv.ValueRejectedError, "depends on no symbol"),
+        ((0, kv.Expression(1) * 2, a), kv.ValueRejectedError, "lower, expression, upper"),
+        ((1, a, 0), kv.ValueRejectedError, "No value lies between"),
+        ((INF, a, INF), kv.ValueRejectedError, "No value lies between"),
+        ((-INF, a, -INF), kv.ValueRejectedError, "No value lies between"),
+        ((float("nan"), a, 1), kv.ValueRejectedError, "NaN"),
+        ((0, a, float("nan")), kv.ValueRejectedError, "NaN"),
+        (("zero", a, 1), kv.KineverseError, ""),
+        ((None, a, 1), kv.KineverseError, ""),
+    ],
+)
+def test_what_is_no_constraint(triple: Any, error: type[Exception], words: str) -> None:
+    with pytest.raises(error, match=words):
+        kv.Constraint.of(*triple)
+    model = constrained(known=(0, a, 1))
+    before = model.snapshot()
+    with pytest.raises(error), model.edit() as edit:
+        edit.constrain("wrong", *triple)
+    assert model.snapshot() == before
+
+
+@pytest.mark.parametrize("value", [a, (0, a), (0, a, 1, 2), 3, None])
+def test_what_is_no_triple(value: Any) -> None:
+    with pytest.raises(kv.KineverseError):
+        as_constraint(value)
+
+
+def test_bounds_may_be_equal_infinite_or_expressions() -> None:
+    for triple in ((1, a, 1), (-INF, a, INF), (b, a, 0), (0, a, -b), (b, a, b)):
+        constraint = kv.Constraint.of(*triple)
+        assert as_constraint(constraint) is constraint
+        assert as_constraint(list(triple)) == constraint
+    assert kv.Constraint.of(b, a.derivative(), c).symbols == (a.derivative(), b, c)
+    assert kv.Constraint.of(0, a.derivative() + b, 1).order == 1
+
+
+def test_a_constraint_made_of_bare_numbers_is_made_whole() -> None:
+    class Bare(kv.Operation):
+        def apply(self, model: kv.Reader) -> kv.Effects:
+            return kv.Effects(constraints={"c": kv.Constraint(0, a, 1)})  # type: ignore[arg-type]
+
+    model = kv.Model()
+    with model.edit() as edit:
+        edit.apply(Bare())
+    assert model.constraints["c"] == kv.Constraint.of(0, a, 1)
+
+
+# -- relevance -------------------------------------------------------------------------------------------------
+
+LIMITS: dict[str, Any] = {
+    "a": (0, a, 1),
+    "a_speed": (-1, a.derivative(), 1),
+    "a_jerk": (-1, kv.symbol("a", 3), 1),
+    "b": (0, b, c),
+    "ab": (0, a + b, 1),
+    "c_lock": (-d, c.derivative(), d),
+    "d": (0, d, 1),
+}
+
+
+def names(model: kv.Model, subject: Any, **options: bool) -> list[str]:
+    return list(model.constraints_for(subject, **options))
+
+
+def test_coordinates_are_compared_whatever_their_order() -> None:
+    model = constrained(**LIMITS)
+    about_a = ["a", "a_jerk", "a_speed", "ab"]
+    assert names(model, a) == names(model, [a]) == names(model, a.derivative()) == names(model, 2 * np.sin(a)) == about_a
+    assert names(model, [b, kv.position("nobody")]) == ["ab", "b"]
+    assert names(model, kv.Expression(1.0)) == names(model, []) == []
+    assert names(model, d.augment({c.derivative(): 1})) == ["c_lock", "d"]
+    assert names(model, d.with_gradient({a.derivative(): 1})) == [*about_a, "d"]
+    found = model.constraints_for([a])
+    assert found == {name: model.constraints[name] for name in about_a}
+
+
+def test_the_formula_of_the_papers() -> None:
+    model = constrained(**LIMITS)
+    assert names(model, a, exact=True) == ["a", "ab"]
+    assert names(model, [a.derivative()], exact=True) == ["a_speed"]
+    assert names(model, d.augment({c.derivative(): 1}), exact=True) == ["d"]
+    assert names(model, d, exact=True, bounds=True) == ["c_lock", "d"]
+    assert names(model, a, exact=True, closure=True) == ["a", "ab", "b"]
+    assert names(model, d, exact=True, bounds=True, closure=True) == ["c_lock", "d"]
+
+
+def test_bounds_and_closures() -> None:
+    model = constrained(**LIMITS)
+    assert names(model, c) == ["c_lock"]
+    assert names(model, c, bounds=True) == ["b", "c_lock"]
+    assert names(model, a, closure=True) == ["a", "a_jerk", "a_speed", "ab", "b"]
+    assert names(model, d, bounds=True) == ["c_lock", "d"]
+    assert names(model, a, bounds=True, closure=True) == sorted(LIMITS)
+
+
+def test_wheels_from_a_gripper_and_a_lock_from_a_pose() -> None:
+    model = kv.Model()
+    with model.edit() as edit:
+        edit.apply(kv.DifferentialDrive(name="base", parent="world", child="base", radius=0.1, track=0.5, wheel_speed=4))
+        edit.apply(kv.Revolute(name="arm", parent="base", child="gripper", axis=(0, 1, 0), lower=-1, upper=1, velocity=2))
+        edit.apply(kv.Revolute(name="door", parent="world", child="door", axis=(0, 0, 1), lower=0, upper=1))
+        edit.constrain("lock", -b, kv.velocity("door"), b)
+    expected = ["arm/position", "arm/velocity", "base/left_wheel_speed", "base/right_wheel_speed"]
+    assert names(model, model.fk("gripper")) == expected
+    assert names(model, model.fk("gripper")[0, 3]) == expected
+    assert names(model, model.fk("gripper"), exact=True) == ["arm/position"]
+    assert names(model, model.fk("door")) == ["door/position", "lock"]
+
+
+def test_relevance_follows_edits() -> None:
+    model = constrained(**LIMITS)
+    names(model, a)
+    with model.edit() as edit:
+        edit.remove("constraint ab")
+        edit.replace("constraint b", model.history.entry("constraint a").operation)
+        with pytest.raises(kv.EditError):
+            names(model, b)  # two are called a now
+        edit.remove("constraint a")
+        assert names(model, b) == []
+    assert names(model, a) == ["a", "a_jerk", "a_speed"]
+    assert names(model, c, bounds=True) == ["c_lock"]
+    with pytest.raises(ZeroDivisionError), model.edit() as edit:
+        edit.constrain("more", 0, a, 2)
+        assert names(model, a) == ["a", "a_jerk", "a_speed", "more"]
+        raise ZeroDivisionError
+    assert names(model, a) == ["a", "a_jerk", "a_speed"]
+
+
+@pytest.mark.parametrize("subject", ["a", ["a"], [1.0], None, 3])
+def test_wrong_subjects(subject: Any) -> None:
+    with pytest.raises(kv.KineverseError):
+        constrained(**LIMITS).constraints_for(subject)
+
+
+# -- violations ------------------------------------------------------------------------------------------------
+
+
+def test_violations_say_what_is_broken_by_how_much_worst_first() -> None:
+    model = constrained(a=(0, a, 1), b=(-2, b, a), unbounded=(-INF, b, INF))
+    found = model.violations({"a": 1.25, "b": -7})
+    assert [tuple(v) for v in found] == [("b", -7, -2, 1.25, 5), ("a", 1.25, 0, 1, 0.25)]
+    assert found[0].name == "b"
+    assert found.unchecked == ()
+    assert "b: -2 <= -7 <= 1.25 is off by 5" in repr(found)
+    assert repr(model.violations({a: 0.5, b: 0})) == "none violated"
+    assert list(model.violations({a: 1 + 1e-12, b: 0})) == []
+    assert [v.name for v in model.violations({a: 1 + 1e-12, b: 0}, tolerance=0)] == ["a"]
+
+
+def test_a_missing_position_is_an_error_a_missing_speed_is_not() -> None:
+    model = constrained(ab=(0, a + b, 1), lock=(-b, a.derivative(), b), far=(0, d, 1), both=(0, a + c.derivative(), 1))
+    with pytest.raises(kv.UnknownNameError, match=r"No value for 'b', which constraint 'ab'"):
+        model.violations({"a": 0.5})
+    found = model.violations({"a": 0.5, "b": 2.0})
+    assert [v.name for v in found] == ["ab"]
+    assert found.unchecked == ("lock", "far", "both")
+    found = model.violations({"a": 0.5, "b": 0.25, "a:velocity": -1})
+    assert [tuple(v) for v in found] == [("lock", -1, -0.25, 0.25, 0.75)]
+
+
+def test_unknown_names_are_errors_in_mappings_and_not_in_states() -> None:
+    model = constrained(a=(0, a, 1))
+    with pytest.raises(kv.UnknownNameError, match="Did you mean|Available"):
+        model.violations({"aa": 3})
+    with pytest.raises(kv.UnknownNameError, match="default_state"):
+        model.violations({})
+    state = kv.State({"a": 3, "nobody": 1})
+    assert [v.excess for v in model.violations(state)] == [2]
+    assert model.violations(kv.State({"nobody": 1})).unchecked == ("a",)
+    with pytest.raises(kv.ValueRejectedError, match="NaN"):
+        model.violations({"a": float("nan")})
+    with pytest.raises(kv.ValueRejectedError, match="not a number"):
+        model.violations({"a": "much"})
+
+
+def test_parameters_have_their_own_values_unless_others_are_given() -> None:
+    width = kv.parameter("width", 0.5)
+    model = constrained(a=(0, a, width))
+    assert [v.excess for v in model.violations({"a": 0.75})] == [0.25]
+    assert list(model.violations({"a": 0.75, width: 1.0})) == []
+
+
+def test_a_value_that_is_none_is_a_violation() -> None:
+    model = constrained(root=(0, np.sqrt(a), 1))
+    assert [v.name for v in model.violations({"a": -1})] == ["root"]
+
+
+def test_violations_follow_edits_and_rates() -> None:
+    model = constrained(a=(0, a, 1))
+    assert len(model.violations({"a": 2})) == 1
+    with model.edit() as edit:
+        edit.constrain("tighter", 0, a, 0.5)
+        assert len(model.violations({"a": 2})) == 2
+        edit.remove("constraint a")
+    assert [v.name for v in model.violations({"a": 2})] == ["tighter"]
+
+
+# -- limits and the default state ------------------------------------------------------------------------------
+
+
+def test_limits_of_a_symbol_are_the_tightest() -> None:
+    model = constrained(one=(-1, a, 3), two=(-5, a, 2), speed=(-4, a.derivative(), 4), twice=(0, 2 * b, 1), dependent=(b, c, 1 + b))
+    assert model.limits("a") == model.limits(a) == (-1, 2)
+    assert model.limits("a:velocity") == (-4, 4)
+    assert model.limits(b) == (-INF, INF)
+    assert model.limits(c) == (0, 1)
+    assert model.limits(c, {"b": 0.5}) == (0.5, 1.5)
+    assert model.limits(c, kv.State({"b": 2.5, "z": 1})) == (2.5, 3.5)
+    assert model.limits(c, {"a": 0}) == (-INF, INF)
+    with pytest.raises(kv.UnknownNameError, match="no symbol"):
+        model.limits("aa")
+
+
+def test_the_default_state_is_zero_within_limits() -> None:
+    p = kv.parameter("p", 4.0)
+    model = constrained(a=(0.5, a, 2), b=(-3, b, -1), c=(-1, c, 1), p=(0, d, p))
+    state = model.default_state()
+    assert dict(state) == {a: 0.5, b: -1, c: 0, d: 0, p: 4}
+    assert not model.violations(state)
+
+
+def test_bounds_that_are_about_other_symbols_are_kept_too() -> None:
+    # in the order of names, every bound looks at one that is clipped later
+    model = constrained(a=(b + 1, a, 100), b=(c + 1, b, 100), c=(d, c, 100), d=(3, d, 9))
+    state = model.default_state()
+    assert dict(state) == {d: 3, c: 3, b: 4, a: 5}
+    assert not model.violations(state)
+    endless = constrained(a=(b + 1, a, 100), b=(a + 1, b, 100))
+    assert set(endless.default_state()) == {a, b}
+    unknown = constrained(a=(b.derivative(), a, 1))
+    assert dict(unknown.default_state()) == {a: 0}
+
+
+def test_home_of_articulations() -> None:
+    model = kv.Model()
+    with model.edit() as edit:
+        edit.apply(kv.Floating(name="free", parent="world", child="free"))
+        edit.apply(kv.Revolute(name="hinge", parent="free", child="hinge", lower=0.5, upper=1))
+    state = model.default_state()
+    assert {str(s): value for s, value in state.items()} == {
+        "free/x": 0, "free/y": 0, "free/z": 0, "free/qx": 0, "free/qy": 0, "free/qz": 0, "free/qw": 1, "hinge": 0.5,
+    }  # fmt: skip
+    assert np.isfinite(model.fk("hinge")(state)).all()
+    assert state.source == "default"
