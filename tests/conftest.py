@@ -1,15 +1,18 @@
-"""What holds for every test: where models are found, a cache of its own, and what becomes of browser tests.
+"""What holds for every test: where models are found, a cache of its own, and what is skipped where.
 
 A test that drives a browser carries the marker ``browser`` and asks for the fixture ``chromium``, the path of
 the system's Chromium. Without one it is skipped and the summary names it, or with
-``KINEVERSE_REQUIRE_BROWSER=1`` it fails.
+``KINEVERSE_REQUIRE_BROWSER=1`` it fails. A test that needs compiled code carries the marker ``compiler``;
+without a C compiler it is skipped and named as well, and so is one that is refused for that reason.
 """
 
 from __future__ import annotations
 
+import atexit
 import os
 import shutil
 import tempfile
+from collections.abc import Generator
 from pathlib import Path
 
 import pytest
@@ -18,11 +21,10 @@ from hypothesis import settings
 ROOT = Path(__file__).parents[1]
 SHARED = ROOT.parent / "shared" / "data"
 BROWSERS = ("chromium", "chromium-browser", "google-chrome")
+NO_COMPILER = " needs a C compiler, and there is none: install the package 'gcc'."
 
 settings.register_profile("kineverse", deadline=None, derandomize=bool(os.environ.get("CI")))
 settings.load_profile("kineverse")
-
-_cache = pytest.StashKey[str]()
 
 
 def pytest_configure(config: pytest.Config) -> None:
@@ -32,34 +34,46 @@ def pytest_configure(config: pytest.Config) -> None:
     places = os.environ.get("KINEVERSE_MODEL_PATH", "").split(os.pathsep)
     if SHARED.is_dir() and str(SHARED) not in places:
         os.environ["KINEVERSE_MODEL_PATH"] = os.pathsep.join([*filter(None, places), str(SHARED)])
-    folder = config.stash[_cache] = tempfile.mkdtemp(prefix="kineverse-tests-")
+    folder = tempfile.mkdtemp(prefix="kineverse-tests-")
     os.environ["KINEVERSE_CACHE_DIR"] = folder
-
-
-def pytest_unconfigure(config: pytest.Config) -> None:
-    """Remove the cache of this run."""
-    folder = config.stash.get(_cache, None)
-    if folder is not None:
-        shutil.rmtree(folder, ignore_errors=True)
+    # At the very end, when the compilers in the background are gone; they were started after this.
+    atexit.register(shutil.rmtree, folder, ignore_errors=True)
 
 
 def pytest_runtest_setup(item: pytest.Item) -> None:
-    """Skip, or fail, what needs a browser where there is none."""
-    if item.get_closest_marker("browser") is None or _browser() is not None:
-        return
-    message = f"{item.name} needs a Chromium, and there is none: install the package 'chromium'."
-    if os.environ.get("KINEVERSE_REQUIRE_BROWSER"):
-        pytest.fail(message, pytrace=False)
-    pytest.skip(message)
+    """Skip, or fail, what needs a browser or a compiler where there is none."""
+    if item.get_closest_marker("browser") and _browser() is None:
+        message = f"{item.name} needs a Chromium, and there is none: install the package 'chromium'."
+        if os.environ.get("KINEVERSE_REQUIRE_BROWSER"):
+            pytest.fail(message, pytrace=False)
+        pytest.skip(message)
+    if item.get_closest_marker("compiler") and not _has_compiler():
+        pytest.skip(f"{item.name}{NO_COMPILER}")
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_call(item: pytest.Item) -> Generator[None, object, object]:
+    """Skip what insists on compiled code where there can be none."""
+    from kineverse.errors import CompileError
+
+    try:
+        return (yield)
+    except CompileError as error:
+        if _has_compiler() or "no C compiler" not in str(error):
+            raise
+        pytest.skip(f"{item.name}{NO_COMPILER}")
 
 
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
-    """Say loudly which browser tests did not run."""
-    skipped = [r.nodeid for r in terminalreporter.stats.get("skipped", []) if "browser" in r.keywords]
-    if skipped:
-        terminalreporter.section("NOT TESTED, FOR WANT OF A CHROMIUM", sep="!", red=True, bold=True)
-        for name in sorted(skipped):
-            terminalreporter.line(name, red=True)
+    """Say loudly what did not run."""
+    skipped = terminalreporter.stats.get("skipped", [])
+    without_browser = [r.nodeid for r in skipped if "browser" in r.keywords]
+    without_compiler = [r.nodeid for r in skipped if NO_COMPILER in str(r.longrepr)]
+    for what, names in (("A CHROMIUM", without_browser), ("A C COMPILER", without_compiler)):
+        if names:
+            terminalreporter.section(f"NOT TESTED, FOR WANT OF {what}", sep="!", red=True, bold=True)
+            for name in sorted(names):
+                terminalreporter.line(name, red=True)
 
 
 @pytest.fixture(scope="session")
@@ -69,6 +83,10 @@ def chromium() -> str:
     if path is None:
         pytest.skip("There is no Chromium: install the package 'chromium'.")
     return path
+
+
+def _has_compiler() -> bool:
+    return any(shutil.which(name) for name in ("cc", "gcc", "clang"))
 
 
 def _browser() -> str | None:

@@ -14,12 +14,13 @@ from kineverse.expressions.expression import Expression, binary, unary
 UNARY = [
     ca.OP_NEG, ca.OP_SQ, ca.OP_TWICE, ca.OP_INV, ca.OP_SQRT, ca.OP_FABS, ca.OP_SIGN, ca.OP_FLOOR, ca.OP_CEIL,
     ca.OP_NOT, ca.OP_SIN, ca.OP_COS, ca.OP_TAN, ca.OP_ASIN, ca.OP_ACOS, ca.OP_ATAN, ca.OP_EXP, ca.OP_EXPM1,
-    ca.OP_LOG, ca.OP_LOG1P, ca.OP_SINH, ca.OP_COSH, ca.OP_TANH, ca.OP_ASINH, ca.OP_ACOSH, ca.OP_ATANH, ca.OP_ERF,
+    ca.OP_LOG, ca.OP_LOG1P, ca.OP_SINH, ca.OP_COSH, ca.OP_TANH, ca.OP_ASINH, ca.OP_ACOSH, ca.OP_ATANH,
+    ca.OP_ERF,
 ]  # fmt: skip
 BINARY = [
-    ca.OP_ADD, ca.OP_SUB, ca.OP_MUL, ca.OP_DIV, ca.OP_POW, ca.OP_FMOD, ca.OP_REMAINDER, ca.OP_HYPOT, ca.OP_ATAN2,
-    ca.OP_COPYSIGN, ca.OP_FMIN, ca.OP_FMAX, ca.OP_LT, ca.OP_LE, ca.OP_EQ, ca.OP_NE, ca.OP_AND, ca.OP_OR,
-    ca.OP_IF_ELSE_ZERO,
+    ca.OP_ADD, ca.OP_SUB, ca.OP_MUL, ca.OP_DIV, ca.OP_POW, ca.OP_FMOD, ca.OP_REMAINDER, ca.OP_HYPOT,
+    ca.OP_ATAN2, ca.OP_COPYSIGN, ca.OP_FMIN, ca.OP_FMAX, ca.OP_LT, ca.OP_LE, ca.OP_EQ, ca.OP_NE, ca.OP_AND,
+    ca.OP_OR, ca.OP_IF_ELSE_ZERO,
 ]  # fmt: skip
 # Computed by polynomials in batches; everything else is the same there to the last bit.
 APPROXIMATED = {
@@ -28,9 +29,9 @@ APPROXIMATED = {
 }  # fmt: skip
 
 SPECIAL = [
-    0.0, -0.0, 1.0, -1.0, 2.0, -2.0, 0.5, -0.5, np.inf, -np.inf, np.nan, 5e-324, -1e-320, 1e-300, 1e300, 1e308,
-    -1e308, np.pi, -np.pi, np.pi / 2, np.pi / 4, 709.5, -708.5, 745.0, -745.0, 1e10, -1e10, 1e22, 1.6e6, 1.7e6,
-    19.9, -20.0, 1 - 1e-16, 1 + 2e-16, 2.2250738585072014e-308, 3e5,
+    0.0, -0.0, 1.0, -1.0, 2.0, -2.0, 0.5, -0.5, np.inf, -np.inf, np.nan, 5e-324, -1e-320, 1e-300, 1e300,
+    1e308, -1e308, np.pi, -np.pi, np.pi / 2, np.pi / 4, 709.5, -708.5, 745.0, -745.0, 1e10, -1e10, 1e22,
+    1.6e6, 1.7e6, 19.9, -20.0, 1 - 1e-16, 1 + 2e-16, 2.2250738585072014e-308, 3e5,
 ]  # fmt: skip
 
 
@@ -64,7 +65,7 @@ def arm(prefix: str = "arm", joints: int = 7) -> Arm:
 
 @dataclass(frozen=True)
 class RandomProgram:
-    """Values computed from inputs and from each other: (operation, operands) for each value behind the inputs."""
+    """Values computed from inputs and from each other: (operation, operands) for each behind the inputs."""
 
     inputs: int
     steps: list[tuple[int, tuple[int, ...]]]

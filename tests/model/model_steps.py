@@ -234,7 +234,7 @@ def check(model: kv.Model, sequence: Sequence[Sequenced]) -> Fold:
         assert history.writers(path) == expected.writers.get(cell, []), path
         readers = [t for t, r in expected.reads.items() if cell in r.cells or cell[0] in r.listings]
         assert history.readers(path) == readers, path
-    assert {cell for cell in history.reading} <= cells
+    assert set(history.reading) <= cells
     return expected
 
 
@@ -250,7 +250,10 @@ def state_of(model: kv.Model) -> Any:
     return (
         model.snapshot(),
         model.version,
-        {kind: list(getattr(model, kind)) for kind in ("frames", "bodies", "articulations", "constraints", "data")},
+        {
+            kind: list(getattr(model, kind))
+            for kind in ("frames", "bodies", "articulations", "constraints", "data")
+        },
         {path: (history.writers(path), history.readers(path)) for path in paths},
         model.symbols,
         model.speeds,

@@ -9,7 +9,17 @@ from scipy.spatial.transform import Rotation
 import kineverse as kv
 
 Matrix = npt.NDArray[np.float64]
-KINDS = ("fixed", "revolute", "continuous", "prismatic", "planar", "floating", "omni", "differential", "mimic")
+KINDS = (
+    "fixed",
+    "revolute",
+    "continuous",
+    "prismatic",
+    "planar",
+    "floating",
+    "omni",
+    "differential",
+    "mimic",
+)
 
 
 def random_pose(rng: np.random.Generator) -> kv.Pose:
@@ -22,7 +32,9 @@ def random_pose(rng: np.random.Generator) -> kv.Pose:
 def joint(kind: str, name: str, parent: str, child: str, rng: np.random.Generator) -> kv.Operation:
     """Return a joint of a kind, placed and turned at random."""
     where = {"name": name, "parent": parent, "child": child, "origin": random_pose(rng)}
-    axis = tuple(rng.normal(size=3)) if rng.integers(2) else ((0, 0, 1), (0, -1, 0), (1, 0, 0))[rng.integers(3)]
+    axis = (
+        tuple(rng.normal(size=3)) if rng.integers(2) else ((0, 0, 1), (0, -1, 0), (1, 0, 0))[rng.integers(3)]
+    )
     if kind == "fixed":
         return kv.Fixed(**where)
     if kind == "revolute":
@@ -75,6 +87,6 @@ def random_speeds(model: kv.Model, seed: int) -> dict[kv.Symbol, float]:
 
 
 def twist_between(before: Matrix, after: Matrix, step: float) -> Matrix:
-    """Return velocity of the origin and angular velocity, both in axes of the frame that poses are given in."""
+    """Return velocity of the origin and angular velocity, in axes of the frame that poses are given in."""
     omega = Rotation.from_matrix(after[:3, :3] @ before[:3, :3].T).as_rotvec()
     return np.concatenate([after[:3, 3] - before[:3, 3], omega]) / step

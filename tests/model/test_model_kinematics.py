@@ -67,7 +67,12 @@ def test_jacobians_agree_with_the_gradient_of_the_pose_column_by_column(seed: in
     model = random_tree(seed, 10)
     values = random_state(model, seed + 50)
     names = list(model.frames)
-    for tip, base in ((names[-1], "world"), (names[-1], names[0]), (names[3], names[-2]), ("world", names[-1])):
+    for tip, base in (
+        (names[-1], "world"),
+        (names[-1], names[0]),
+        (names[3], names[-2]),
+        ("world", names[-1]),
+    ):
         fk = model.fk(tip, base)
         gradient = fk.gradient(heuristic=False)
         columns = model.speeds_of(tip, base)
@@ -94,9 +99,9 @@ def test_columns_may_be_chosen_by_position_or_speed() -> None:
     assert model.jacobian("f", symbols=[]).shape == (6, 0)
     assert model.jacobian("world").shape == (6, 0)
     with pytest.raises(kv.ExpressionError):
-        model.jacobian("f", symbols=["x"])  # type: ignore[list-item]
+        model.jacobian("f", symbols=["x"])
     with pytest.raises(kv.UnknownNameError, match="forms are"):
-        model.jacobian("f", form="sideways")  # type: ignore[arg-type]
+        model.jacobian("f", form="sideways")
 
 
 def test_heuristic_entries_only_count_when_asked_for() -> None:
@@ -118,7 +123,7 @@ def test_a_fact_that_is_overridden_shows_in_the_jacobian() -> None:
     np.testing.assert_allclose(expected, [0.5 * np.cos(0.5), 0.5 * np.sin(0.5)])
 
 
-# -- the tree of frames ----------------------------------------------------------------------------------------
+# -- the tree of frames --------------------------------------------------------------------------------
 
 
 def cupboard() -> kv.Model:

@@ -31,18 +31,29 @@ WHEELS = kv.DifferentialDrive(name="base", parent="world", child="base", radius=
 
 def random_expression(rng: np.random.Generator, symbols: list[kv.Symbol], depth: int = 4) -> kv.Expression:
     if depth == 0 or rng.random() < 0.1:
-        return symbols[rng.integers(len(symbols))] if rng.random() < 0.8 else kv.Expression(float(rng.normal()))
+        return (
+            symbols[rng.integers(len(symbols))] if rng.random() < 0.8 else kv.Expression(float(rng.normal()))
+        )
     a, b = (random_expression(rng, symbols, depth - 1) for _ in range(2))
-    return (lambda: a + b, lambda: a * b, lambda: np.sin(a) - b, lambda: a / (2 + b * b), lambda: np.exp(-a * a) * b)[
-        rng.integers(5)
-    ]()
+    return (
+        lambda: a + b,
+        lambda: a * b,
+        lambda: np.sin(a) - b,
+        lambda: a / (2 + b * b),
+        lambda: np.exp(-a * a) * b,
+    )[rng.integers(5)]()
 
 
 def path_of(model: kv.Model, start: dict[kv.Symbol, float], speeds: dict[kv.Symbol, float]) -> Any:
     """Return a function from time to values, by somebody else's integrator."""
     symbols = model.degrees_of_freedom
     rates = model.rates
-    rows = kv.array([sum((g * s for s, g in rates[c].items()), kv.Expression(0.0)) if c in rates else c.derivative() for c in symbols])
+    rows = kv.array(
+        [
+            sum((g * s for s, g in rates[c].items()), kv.Expression(0.0)) if c in rates else c.derivative()
+            for c in symbols
+        ]
+    )
     flow = kv.compile([plain(rows)], [*symbols, *model.speeds], tier="interpreter")
     constant = [speeds[s] for s in model.speeds]
 
@@ -64,10 +75,15 @@ def assert_motion_law(model: kv.Model, expressions: list[kv.Expression], seed: i
     for e in expressions:
         first = kv.total_derivative(e)
         gradient = first.gradient(heuristic=False)
-        second = sum((entry * key for key, entry in gradient.items() if key.order == 1), kv.Expression(np.zeros(e.shape)))
+        second = sum(
+            (entry * key for key, entry in gradient.items() if key.order == 1),
+            kv.Expression(np.zeros(e.shape)),
+        )
         for below, above in ((e, first), (first, second)):
             values = np.array([below(p) for p in points])
-            np.testing.assert_allclose(np.tensordot(weights, values, 1), above(points[2]), atol=2e-8, rtol=1e-6)
+            np.testing.assert_allclose(
+                np.tensordot(weights, values, 1), above(points[2]), atol=2e-8, rtol=1e-6
+            )
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -93,7 +109,9 @@ def test_rows_that_are_about_each_other_obey_the_law() -> None:
         edit.set_rate(x, {u: np.cos(y), w: x})
         edit.set_rate(y, {v: 2.0, u: x * z})
         edit.set_rate(z, {x.derivative(): y, w: 1.0})  # through the row of x
-        edit.add_frame("f", "world", [kv.rotation_z(x * y), kv.translation(z, np.sin(x), kv.position("free"))])
+        edit.add_frame(
+            "f", "world", [kv.rotation_z(x * y), kv.translation(z, np.sin(x), kv.position("free"))]
+        )
     assert model.speeds == (kv.velocity("free"), u, v, w)
     assert set(model.fk("f").gradient()) == set(model.speeds)
     for seed in range(3):
@@ -111,7 +129,9 @@ def test_wheels_as_in_the_paper() -> None:
             expected = [0.05 * np.cos(angle), 0.05 * np.sin(angle)]
             np.testing.assert_allclose(gradient[speed](at)[:2, 3], expected, atol=1e-15)
             turning = sign * 0.25
-            np.testing.assert_allclose(gradient[speed](at)[0, :2], [-turning * np.sin(angle), -turning * np.cos(angle)], atol=1e-15)
+            np.testing.assert_allclose(
+                gradient[speed](at)[0, :2], [-turning * np.sin(angle), -turning * np.cos(angle)], atol=1e-15
+            )
 
 
 def test_the_heading_turns_inside_the_rows() -> None:
@@ -163,7 +183,7 @@ def test_constraints_are_handed_out_in_coordinates_that_are_carried() -> None:
     assert not any("wheel" in str(k) for k in model.constraints["hand"].expression.gradient())
 
 
-# -- the table itself ------------------------------------------------------------------------------------------
+# -- the table itself ----------------------------------------------------------------------------------
 
 
 def table(**rows: dict[kv.Symbol, Any]) -> Rates:
@@ -188,7 +208,14 @@ def test_composition_with_carried_coordinates_is_the_chain_rule() -> None:
     b, c = kv.position("b"), kv.position("c")
     e = rates.carry(x * y + np.sin(x) * z)
     at = {"b": 0.3, "c": -0.4, "y": 0.7, "z": 1.1, "x": 0.2}
-    for substitution in ({z: b * c}, {x: 2 * b + c}, {y: b * b}, {x: b, z: b}, {x: y}, {y: kv.Expression(0.5)}):
+    for substitution in (
+        {z: b * c},
+        {x: 2 * b + c},
+        {y: b * b},
+        {x: b, z: b},
+        {x: y},
+        {y: kv.Expression(0.5)},
+    ):
         composed = e.substitute(substitution)
         plainly = (x * y + np.sin(x) * z).substitute(substitution)
         assert composed(at) == pytest.approx(plainly(at))
@@ -208,6 +235,22 @@ def test_rows_are_resolved_through_other_rows() -> None:
     assert {k: e({"z": 4.0}) for k, e in rates[z].items()} == {v: 30.0, u: 60.0}
 
 
+def test_a_long_chain_of_rows() -> None:
+    n = 1500
+    rows = {f"q{i}": {kv.velocity(f"q{i + 1}"): 1.0} for i in range(n)}
+    rates = table(**rows)
+    assert all(list(rates[kv.position(f"q{i}")]) == [kv.velocity(f"q{n}")] for i in range(n))
+    with pytest.raises(kv.ModelError, match="Cyclic rates"):
+        table(**rows, **{f"q{n}": {kv.velocity("q0"): 1.0}})
+
+
+def test_one_coordinate_among_many_is_carried_without_the_others() -> None:
+    rates = table(**{f"q{i}": {kv.velocity(f"v{i}"): np.cos(kv.position(f"q{i}"))} for i in range(50)})
+    carried = rates.carry(kv.position("q7") * 2)
+    assert list(rates._carried) == [kv.position("q7")]
+    assert list(carried.gradient()) == [kv.velocity("v7")]
+
+
 @pytest.mark.parametrize(
     "rows",
     [
@@ -221,11 +264,14 @@ def test_cyclic_rates_are_refused_and_the_model_is_what_it_was(rows: dict[str, A
         table(**rows)
     model = based(WHEELS)
     before = model.snapshot()
-    with pytest.raises(kv.ModelError, match="Cyclic rates.*x"), model.edit() as edit:
+    with pytest.raises(kv.ModelError, match=r"Cyclic rates.*x"), model.edit() as edit:
         for name, row in rows.items():
             edit.set_rate(kv.position(name), row)
     assert model.snapshot() == before
-    assert {str(k) for k in model.fk("base").gradient()} == {"base/left_wheel:velocity", "base/right_wheel:velocity"}
+    assert {str(k) for k in model.fk("base").gradient()} == {
+        "base/left_wheel:velocity",
+        "base/right_wheel:velocity",
+    }
     with model.edit() as edit:
         edit.set_rate(x, {u: 1.0})
     assert x in model.rates

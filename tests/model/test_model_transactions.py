@@ -37,7 +37,7 @@ def recorded(model: kv.Model, **filters: Any) -> list[kv.Diff]:
     return heard
 
 
-# -- transactions ----------------------------------------------------------------------------------------------
+# -- transactions --------------------------------------------------------------------------------------
 
 
 def test_an_edit_commits_whole_and_counts_a_version() -> None:
@@ -86,7 +86,11 @@ def test_an_edit_is_over_at_the_end_of_its_block() -> None:
     model = door()
     with model.edit() as edit:
         pass
-    for call in (lambda: edit.apply(Put("x")), lambda: edit.remove("data colour"), lambda: edit.replace("data colour", Put("x"))):
+    for call in (
+        lambda: edit.apply(Put("x")),
+        lambda: edit.remove("data colour"),
+        lambda: edit.replace("data colour", Put("x")),
+    ):
         with pytest.raises(kv.EditError, match="over"):
             call()
 
@@ -103,7 +107,7 @@ def test_one_edit_at_a_time() -> None:
         edit.apply(Put("x"))
 
 
-# -- diffs ---------------------------------------------------------------------------------------------------
+# -- diffs ---------------------------------------------------------------------------------------------
 
 
 def test_a_diff_is_exactly_what_changed_structurally() -> None:
@@ -123,9 +127,17 @@ def test_a_diff_is_exactly_what_changed_structurally() -> None:
     assert all(c.before is None for c in first.changes)
     assert first.added == ("put x", "next y", "put z", "place f")
     assert {c.path: (c.before, c.after) for c in second.changes} == {
-        "data/x": (1, 2), "data/y": (2, 3), "data/new": (None, 1), "data/z": (0, None),
-    }  # fmt: skip
-    assert (second.version, second.added, second.removed, second.replaced) == (2, ("put new",), ("put z",), ("put x",))
+        "data/x": (1, 2),
+        "data/y": (2, 3),
+        "data/new": (None, 1),
+        "data/z": (0, None),
+    }
+    assert (second.version, second.added, second.removed, second.replaced) == (
+        2,
+        ("put new",),
+        ("put z",),
+        ("put x",),
+    )
     assert second.runs == 3
 
 
@@ -155,7 +167,7 @@ def test_removing_and_adding_under_one_tag_is_a_replacement() -> None:
     assert [(c.path, c.before, c.after) for c in diff.changes] == [("data/colour", "red", "blue")]
 
 
-# -- listeners -------------------------------------------------------------------------------------------------
+# -- listeners -----------------------------------------------------------------------------------------
 
 
 def test_listeners_hear_of_what_they_asked_for_each_once() -> None:
@@ -261,10 +273,10 @@ def test_closing_a_listener() -> None:
 
 def test_wrong_filters() -> None:
     with pytest.raises(kv.ExpressionError):
-        kv.Model().listen(print, symbols=["a"])  # type: ignore[list-item]
+        kv.Model().listen(print, symbols=["a"])
 
 
-# -- snapshots and copies --------------------------------------------------------------------------------------
+# -- snapshots and copies ------------------------------------------------------------------------------
 
 
 def test_a_snapshot_never_changes_and_compares_by_value() -> None:
@@ -287,7 +299,9 @@ def test_a_snapshot_never_changes_and_compares_by_value() -> None:
     assert (kept == 3) is False
 
 
-@pytest.mark.parametrize("how", [copy.copy, copy.deepcopy, kv.Model.copy, lambda m: pickle.loads(pickle.dumps(m))])
+@pytest.mark.parametrize(
+    "how", [copy.copy, copy.deepcopy, kv.Model.copy, lambda m: pickle.loads(pickle.dumps(m))]
+)
 def test_copies_go_their_own_way(how: Any) -> None:
     model = door()
     heard = recorded(model)
@@ -352,7 +366,7 @@ with open({str(back)!r}, "wb") as file:
     assert other.fk("base").gradient() == model.fk("base").gradient()
 
 
-# -- threads ---------------------------------------------------------------------------------------------------
+# -- threads -------------------------------------------------------------------------------------------
 
 
 def test_readers_in_other_threads_see_before_or_after_and_never_between() -> None:

@@ -53,7 +53,7 @@ def rotation_factors(axis: Vector3, q: Expression) -> tuple[Pose | Expression, .
     """
     x, y, z = unit_axis(axis)
     for component, rotation in ((x, rotation_x), (y, rotation_y), (z, rotation_z)):
-        if abs(component) == 1.0:
+        if abs(component) == 1.0 and (x, y, z).count(0.0) == 2:
             return (rotation(q if component > 0 else -q),)
     turn = np.eye(4)
     a = np.array([x, y, z])

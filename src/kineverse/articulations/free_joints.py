@@ -98,10 +98,12 @@ def _from_z(axis: Vector3) -> np.ndarray[tuple[int, int], np.dtype[np.float64]]:
     """Return the smallest rotation that turns z into the axis, 4×4."""
     n = np.array(unit_axis(axis))
     turn = np.eye(4)
-    if n[2] == -1.0:
+    if n[2] < 0 and not n[:2].any():
         turn[1, 1] = turn[2, 2] = -1.0
         return turn
     v = np.array([-n[1], n[0], 0.0])  # z × n
     k = np.array([[0, -v[2], v[1]], [v[2], 0, -v[0]], [-v[1], v[0], 0]])
-    turn[:3, :3] = snapped(np.eye(3) + k + k @ k / (1 + n[2]))
+    # 1 / (1 + cos) of the angle; near a half turn by its sine, because nothing is left of the sum.
+    factor = 1 / (1 + n[2]) if n[2] > 0 else (1 - n[2]) / (v @ v)
+    turn[:3, :3] = snapped(np.eye(3) + k + k @ k * factor)
     return turn

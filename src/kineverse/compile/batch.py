@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ctypes
+import itertools
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -83,7 +84,7 @@ class Batch:
             results = self._allocated(rows)
         else:
             results = self._checked(out, rows)
-            if any(np.may_share_memory(points, result) for result in results):
+            if _overlap([points, *results]):
                 points = points.copy()
         code = self._code(rows)
         if code is None:
@@ -108,7 +109,7 @@ class Batch:
         ]
 
     def _checked(self, out: Any, rows: int) -> list[Array]:
-        given = [out] if isinstance(out, np.ndarray) else list(out)
+        given = list(out) if isinstance(out, (list, tuple)) else [out]
         if len(given) != len(self._shapes):
             raise ShapeError(f"out= takes {len(self._shapes)} arrays, one per output, not {len(given)}.")
         for i, (array, shape) in enumerate(zip(given, self._shapes, strict=True)):
@@ -122,8 +123,8 @@ class Batch:
                 )
             if not (array.flags.c_contiguous and array.flags.writeable and array.flags.aligned):
                 raise ShapeError(f"out= for output {i} must be C-contiguous, aligned and writeable.")
-            if any(np.may_share_memory(array, other) for other in given[:i]):
-                raise ShapeError(f"out= for output {i} shares memory with another output.")
+        if _overlap(given):
+            raise ShapeError("out= has arrays that share memory.")
         return given
 
     def _code(self, rows: int) -> Compiled | None:
@@ -148,7 +149,7 @@ class Batch:
         rows, size = points.shape
         sizes = self._program.sizes
         streaming = sum(result.nbytes for result in results) > _STREAMED_BYTES
-        begin, *begins = (array.__array_interface__["data"][0] for array in (points, *results))
+        begin, *begins = map(_address, (points, *results))
 
         def work(first: int, end: int) -> None:
             places = (ctypes.c_void_p * len(sizes))(
@@ -157,8 +158,8 @@ class Batch:
             if code(begin + 8 * first * size, ctypes.addressof(places), end - first, streaming):
                 raise MemoryError("There is no memory for a batch.")
 
-        # Half of what starting a thread takes.
-        over_rows(work, rows, 200_000 // (self._program.instructions + 20))
+        # Some 100 µs of work, twice of what it takes to wake a thread.
+        over_rows(work, rows, 2_000_000 // (self._program.instructions + 20))
 
     def _interpret(self, points: Array, results: list[Array], function: CasadiFunction) -> None:
         flat = [r.reshape(len(points), size) for r, size in zip(results, self._program.sizes, strict=True)]
@@ -178,7 +179,18 @@ class Batch:
                 for target, output in zip(flat, outputs, strict=True):
                     target[start:stop] = output[: stop - start]
 
-        over_rows(work, rows, 50 * _MAPPED, _MAPPED)
+        over_rows(work, rows, 200_000 // (self._program.instructions + 20), _MAPPED)
+
+
+def _overlap(arrays: Sequence[Array]) -> bool:
+    """Whether any of these contiguous arrays share memory."""
+    spans = sorted((_address(array), array.nbytes) for array in arrays if array.nbytes)
+    return any(start + size > following for (start, size), (following, _) in itertools.pairwise(spans))
+
+
+def _address(array: Array) -> int:
+    address: int = array.__array_interface__["data"][0]
+    return address
 
 
 def _load(path: str) -> Compiled:

@@ -85,68 +85,30 @@ def pooled(
         Whether the function can fail.
     """
     # Appending to and popping from a list are atomic.
-    pool: list[tuple[memoryview, Run, Any, Any]] = []
+    pool: list[tuple[memoryview, Run, Any, object]] = []
     take, give_back = pool.pop, pool.append
 
-    def new() -> tuple[memoryview, Run, Any, Any]:
+    def new() -> tuple[memoryview, Run, Any, object]:
         vector = np.zeros(size)
         outputs = tuple(np.zeros(shape) for shape in shapes)
         run, keep = bind(function, vector, outputs, checked)
-        copies = tuple(output.copy for output in outputs)
-        return vector.data, run, copies[0] if single else copies, keep
+        return vector.data, run, tuple(output.copy for output in outputs), keep
 
-    # Three times the same but for the copies: a loop over one or two of them takes a fifth of the whole call.
-    if single:
-
-        def evaluate(x: Any) -> Any:
-            try:
-                binding = take()
-            except IndexError:
-                binding = new()
-            vector, run, copy, _ = binding
-            try:
-                # This assignment refuses everything but doubles of the right number.
-                vector[:] = x
-            except (ValueError, TypeError):
-                vector[:] = convert(x)
-            run()
-            result = copy()
-            give_back(binding)
-            return result
-
-    elif len(shapes) == 2:
-
-        def evaluate(x: Any) -> Any:
-            try:
-                binding = take()
-            except IndexError:
-                binding = new()
-            vector, run, (first, second), _ = binding
-            try:
-                vector[:] = x
-            except (ValueError, TypeError):
-                vector[:] = convert(x)
-            run()
-            result = first(), second()
-            give_back(binding)
-            return result
-
-    else:
-
-        def evaluate(x: Any) -> Any:
-            try:
-                binding = take()
-            except IndexError:
-                binding = new()
-            vector, run, copies, _ = binding
-            try:
-                vector[:] = x
-            except (ValueError, TypeError):
-                vector[:] = convert(x)
-            run()
-            result = tuple(map(call, copies))
-            give_back(binding)
-            return result
+    def evaluate(x: Any) -> Any:
+        try:
+            binding = take()
+        except IndexError:
+            binding = new()
+        vector, run, copies, _ = binding
+        try:
+            # This assignment refuses everything but doubles of the right number.
+            vector[:] = x
+        except (ValueError, TypeError):
+            vector[:] = convert(x)
+        run()
+        results = tuple(map(call, copies))
+        give_back(binding)
+        return results[0] if single else results
 
     return evaluate
 

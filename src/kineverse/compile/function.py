@@ -31,8 +31,8 @@ logger = logging.getLogger("kineverse.compile")
 Tier: TypeAlias = Literal["interpreter", "c"]
 WantedTier: TypeAlias = Literal["auto", "interpreter", "c"]
 
-# Inputs and outputs count as operations too: below this there is nothing to compute. Everything else is worth it,
-# as the extension calls a compiled sum in a fifth of the time that CasADi's interpreter needs.
+# Inputs and outputs count as operations too: below this there is nothing to compute. Everything else is worth
+# it, as the extension calls a compiled sum in a fifth of the time that CasADi's interpreter needs.
 _WORTH_COMPILING = 4
 # So many operations take some microseconds: others may have the GIL meanwhile.
 _LENGTHY = 5000
@@ -212,7 +212,7 @@ class CompiledFunction:
         return self._batch(x, out, self._function)
 
     def bind(self) -> Evaluator:
-        """Return an evaluator of one's own: no checks and no new arrays, for one thread."""
+        """Return an evaluator of one's own, which writes its results in place, for one thread."""
         size, convert = self._signature.size, self._signature.vector
         with self._lock:
             if self._native:

@@ -23,7 +23,7 @@ from dataclasses import dataclass
 logger = logging.getLogger("kineverse.compile")
 
 # What makes C and interpreter agree to the last bit. No -ffast-math, which also deletes checks for NaN; no
-# contraction to fused operations; and no values of functions computed by the compiler (-frounding-math), which
+# contraction to fused operations; no values of functions computed by the compiler (-frounding-math), which
 # rounds them better than the C library.
 ARITHMETIC = ("-march=native", "-ffp-contract=off", "-fno-math-errno", "-frounding-math")
 # Undefined names shall fail when a function is linked and not when it is called.

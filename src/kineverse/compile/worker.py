@@ -86,7 +86,10 @@ class Build:
         for watcher in self.watchers:
             notify = watcher()
             if notify is not None:
-                notify(self)
+                try:
+                    notify(self)
+                except Exception:
+                    logger.exception("A compiled function could not be put to use.")
         self._done.set()
 
 
@@ -166,30 +169,29 @@ class _Worker:
 
     def _run(self) -> None:
         while not self._closing:
-            build = self._queue.get()[-1]
-            with self._lock:
-                # A build that somebody began to wait for is in the queue twice.
-                skip = build.started or build.done
-                abandoned = not build.urgent and all(watcher() is None for watcher in build.watchers)
-                build.started = True
-                if abandoned and not skip:
-                    del self._wanted[build.key]
-            if skip:
-                continue
-            if abandoned:
-                build.forgotten = True
-                build.finish()
-                continue
-            path, error = None, None
-            try:
-                path = self._compile(build)
-            except Exception as problem:
-                error = str(problem)
-                self._complain(error)
-            with self._lock:
-                self._wanted.pop(build.key, None)
-            build.finish(path, error)
-            del build
+            self._serve(self._queue.get()[-1])
+
+    def _serve(self, build: Build) -> None:
+        with self._lock:
+            # A build that somebody began to wait for is in the queue twice.
+            if build.started:
+                return
+            build.started = True
+            build.forgotten = not build.urgent and all(watcher() is None for watcher in build.watchers)
+            if build.forgotten:
+                # Who asks for it from now on gets a new one.
+                del self._wanted[build.key]
+        path, error = None, None
+        try:
+            # Another process may have been faster.
+            path = None if build.forgotten else build.cache.find(build.key) or self._compile(build)
+        except Exception as problem:
+            error = str(problem)
+            self._complain(error)
+        with self._lock:
+            if self._wanted.get(build.key) is build:
+                del self._wanted[build.key]
+        build.finish(path, error)
 
     def _compile(self, build: Build) -> str:
         source = build.source().encode()

@@ -20,7 +20,7 @@ from kineverse.errors import ExpressionError
 from . import layout
 from .expression import NO_NODES, Expression, make, union
 from .leaves import bottom_up, leaves
-from .substitution import apply, replace_nodes
+from .substitution import apply, renamed, replace_nodes, stand_ins
 
 if TYPE_CHECKING:
     from kineverse.symbols import Symbol
@@ -110,12 +110,12 @@ def jacobian(expression: Expression, symbols: Sequence[Symbol], heuristic: bool 
 
 def partial(expression: Expression, symbols: Sequence[Symbol]) -> Expression:
     """Return the plain partial derivatives, see :meth:`Expression.partial`."""
-    from kineverse.symbols import Symbol, check_symbols
+    from kineverse.symbols import check_symbols
 
     wanted = check_symbols(symbols)
     # Parameters do not move, so D has nothing to say about them; symbols that do move take their places.
-    moving = {s: Symbol(f"∂/{i}/{s.path}") for i, s in enumerate(wanted) if not s.has_derivative}
-    entries = gradient(apply(_without_augmentation(expression), moving), False)
+    moving = stand_ins(wanted)
+    entries = gradient(renamed(_without_augmentation(expression), moving), False)
     back = {stand_in: s for s, stand_in in moving.items()}
     columns = [entries.get(moving.get(s, s).derivative()) for s in wanted]
     return _side_by_side([c if c is None else apply(c, back) for c in columns], expression._shape)

@@ -11,7 +11,7 @@ from kineverse.errors import ExpressionError, ShapeError
 
 from .expression import NO_NODES, Expression, ExpressionLike, as_expression, make
 from .layout import SX
-from .leaves import bottom_up, leaves
+from .leaves import bottom_up, gradient_keys, leaves
 
 if TYPE_CHECKING:
     from kineverse.symbols import Symbol
@@ -67,7 +67,36 @@ def substitute(expression: Expression, values: Mapping[Symbol, ExpressionLike]) 
             )
         if replacement is not symbol:
             substitution[symbol] = replacement
+    moving = stand_ins(s for s, e in substitution.items() if not s.has_derivative and gradient_keys(e))
+    if moving:
+        # D of a parameter is empty; for a while it is a symbol that has one, which is then replaced.
+        expression = renamed(expression, moving)
+        substitution |= {stand_in: substitution[s] for s, stand_in in moving.items()}
     return apply(expression, substitution)
+
+
+def stand_ins(parameters: Iterable[Symbol]) -> dict[Symbol, Symbol]:
+    """Return symbols that move and occur nowhere else, for parameters to be differentiated by."""
+    from kineverse.symbols import Symbol
+
+    return {p: Symbol(f"∂/{i}/{p.path}") for i, p in enumerate(parameters) if not p.has_derivative}
+
+
+def renamed(expression: Expression, names: Mapping[Symbol, Symbol]) -> Expression:
+    """Return the expression with symbols exchanged for ones that occur nowhere in it."""
+    images: dict[Node, Expression] = {}
+
+    def rename(part: Expression) -> Expression:
+        chosen = [s for s in leaves(part)[0] if s in names]
+        inner = replace_nodes(part, images)
+        if not chosen:
+            return inner
+        (sx,) = ca.substitute([inner._sx], [s._sx for s in chosen], [names[s]._sx for s in chosen])
+        return make(sx, part._shape, inner._nodes)
+
+    for node in bottom_up(leaves(expression)[1], lambda n: n.arguments, images.__contains__):
+        images[node] = type(node).of(tuple(map(rename, node.arguments)), node.shape, node.options)
+    return rename(expression)
 
 
 def apply(expression: Expression, replacements: Mapping[Symbol, Expression]) -> Expression:

@@ -9,6 +9,7 @@ from kineverse.errors import FormatError
 from kineverse.model.model import Model
 from kineverse.model.operation import Operation
 from kineverse.shipped.bases import base_of
+
 from .sources import Source, locate_model
 
 

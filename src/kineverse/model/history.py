@@ -254,9 +254,10 @@ class History:
     def _check_free(self, entry: Entry) -> None:
         for kind, name in entry.writes:
             if kind == CONSTRAINTS:
-                others = [e.tag for e in self.cells.get((kind, name), ()) if e.tag != entry.tag]
-                if others:
-                    raise _taken(name, others[0])
+                # One that comes later may yet be called something else when it is run again.
+                for other in self.cells.get((kind, name), ()):
+                    if other.place < entry.place:
+                        raise _taken(name, other.tag)
 
     def _check_names(self, failures: dict[str, KineverseError]) -> None:
         """Look for constraints that have two makers."""
@@ -336,7 +337,7 @@ class History:
             own = self.sequence[-1].writes if self.sequence and self.sequence[-1].place == place else {}
             if not own:
                 return sorted(self.head[kind])
-        return sorted(n for (k, n) in self.cells if k == kind and self.value_at((k, n), place) is not ABSENT)
+        return sorted(n for (k, n), writers in self.cells.items() if k == kind and writers[0].place < place)
 
     def ordered(self, kind: str) -> dict[str, Any]:
         """Return the final values of a kind, in the order in which the sequence first writes them."""

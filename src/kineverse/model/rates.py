@@ -69,24 +69,36 @@ class Rates(Mapping[Symbol, Mapping[Symbol, Expression]]):
     def __init__(self, rows: Mapping[Symbol, Row]) -> None:
         self._given = dict(rows)
         self._rows: dict[Symbol, dict[Symbol, Expression]] = {}
+        self._carried: dict[Symbol, Expression] = {}
+        self._paths = {x.path for x in self._given}
         for coordinate in self._given:
-            self._resolve(coordinate, [])
+            self._resolve(coordinate)
 
-    def _resolve(self, coordinate: Symbol, path: list[Symbol]) -> Mapping[Symbol, Expression]:
-        if coordinate in self._rows:
-            return self._rows[coordinate]
-        if coordinate in path:
-            circle = " -> ".join(map(str, [*path[path.index(coordinate) :], coordinate]))
-            raise ModelError(f"Cyclic rates, which never end in a free speed: {circle}.")
+    def _resolve(self, coordinate: Symbol) -> None:
+        # A path through the rows, by hand: chains may be longer than Python's stack.
+        path = {coordinate: None}
+        while path:
+            x = next(reversed(path))
+            row = self._given[x]
+            through = [v.position for v, _ in row if v.path in self._paths and v.position in self._given]
+            waiting = next((y for y in through if y not in self._rows), None)
+            if waiting is None:
+                self._rows[x] = self._combined(row) if through else dict(row)
+                del path[x]
+            elif waiting in path:
+                names = [str(y) for y in path]
+                circle = " -> ".join([*names[names.index(str(waiting)) :], str(waiting)])
+                raise ModelError(f"Cyclic rates, which never end in a free speed: {circle}.")
+            else:
+                path[waiting] = None
+
+    def _combined(self, row: Row) -> dict[Symbol, Expression]:
         result: dict[Symbol, Expression] = {}
-        for speed, factor in self._given[coordinate]:
-            inner: Mapping[Symbol, ExpressionLike] = {speed: 1.0}
-            if speed.position in self._given:
-                inner = self._resolve(speed.position, [*path, coordinate])
+        for speed, factor in row:
+            inner: Mapping[Symbol, ExpressionLike] = self._rows.get(speed.position, {speed: 1.0})
             for free, rate in inner.items():
                 term = factor * rate
                 result[free] = result[free] + term if free in result else term
-        self._rows[coordinate] = result
         return result
 
     def __getitem__(self, coordinate: Symbol) -> Mapping[Symbol, Expression]:
@@ -129,17 +141,19 @@ class Rates(Mapping[Symbol, Mapping[Symbol, Expression]]):
                 found |= {speed, speed.position, *all_symbols(value)}
         return frozenset(found)
 
-    @cached_property
-    def carried(self) -> Mapping[Symbol, Expression]:
-        """The carried form of every coordinate in the table."""
-        return {x: Carried.of((x,), (), (self.closure(x),)) for x in self._rows}
+    def carried(self, coordinate: Symbol) -> Expression:
+        """Return the carried form of a coordinate in the table."""
+        known = self._carried.get(coordinate)
+        if known is None:
+            known = self._carried[coordinate] = Carried.of((coordinate,), (), (self.closure(coordinate),))
+        return known
 
     def carry(self, expression: Expression) -> Expression:
         """Return the expression in carried coordinates; carried twice is carried once."""
         if not self._rows:
             return expression
         expression = plain(expression)
-        wanted = {s: self.carried[s] for s in all_symbols(expression) if s in self._rows}
+        wanted = {s: self.carried(s) for s in all_symbols(expression) if s in self._rows}
         return apply(expression, wanted)
 
     def eliminate(self, expression: Expression) -> Expression:

@@ -21,6 +21,7 @@ from .rates import Rates, Row, all_symbols
 Cell = tuple[str, str]
 V = TypeVar("V")
 ABSENT: Any = object()
+_MANY = 100
 
 
 class Read(IntFlag):
@@ -148,4 +149,11 @@ def missing(kind: str, name: str, available: Any) -> UnknownNameError:
     noun = {BODIES: "body", RATES: "rate", DATA: "datum"}.get(kind, kind[:-1])
     if not isinstance(name, str):
         return UnknownNameError(f"A {noun} is asked for by its name, a text, not by {name!r}.")
-    return UnknownNameError(f"There is no {noun} {name!r}. {suggest(name, available, noun)}")
+    names = list(available)
+    if len(names) > _MANY:
+        # An edit may miss thousands of things at once, and comparing letters with every name takes long.
+        start, end = name[: len(name) // 2 + 1], name[-len(name) // 2 :]
+        names = [n for n in names if n.startswith(start) or n.endswith(end)][:_MANY]
+        if not names:
+            return UnknownNameError(f"There is no {noun} {name!r}, and none of a similar name.")
+    return UnknownNameError(f"There is no {noun} {name!r}. {suggest(name, names, noun)}")

@@ -56,7 +56,9 @@ class Relevance:
         closure: bool,
     ) -> list[str]:
         """Return the names of relevant constraints, sorted; see :meth:`Model.constraints_for`."""
-        expressions = [subject] if isinstance(subject, Expression) else list(subject)
+        if isinstance(subject, Expression) or not isinstance(subject, Iterable):
+            subject = [subject]
+        expressions = list(subject)
         for expression in expressions:
             if not isinstance(expression, Expression):
                 raise ExpressionError(

@@ -13,13 +13,15 @@ BELOW, ABOVE = (240, 243, 246), (196, 207, 219)
 def set_up(server: Any) -> None:
     """Light the page: a lamp with a shadow from above the left shoulder, and a sky without one.
 
-    viser's own lights wash out white furniture; these are those of :mod:`kineverse.view.light`.
+    viser's own lights wash out white furniture; these are those of :mod:`kineverse.view.light`. There is no
+    picture of surroundings to light the scene by, because a computer without a graphics card takes many
+    seconds to prepare one.
     """
     scene = server.scene
     scene.configure_default_lights(enabled=False)
-    scene.configure_environment_map(hdri="studio", environment_intensity=0.12)
+    scene.configure_environment_map(hdri=None)
     scene.add_light_hemisphere(
-        "/light/sky", sky_color=(226, 236, 255), ground_color=(206, 196, 184), intensity=1.45
+        "/light/sky", sky_color=(226, 236, 255), ground_color=(206, 196, 184), intensity=2.1
     )
     scene.add_light_directional(
         "/light/fill", color=(235, 240, 255), intensity=0.35, position=(-4.0, -3.0, 5.0)

@@ -160,8 +160,8 @@ class Viewer:
 
     def wait(self) -> None:
         """Keep the page up until :meth:`stop` or Ctrl-C."""
-        # A join that Ctrl-C interrupts takes the thread for finished (Python 3.11), and a wait without a limit
-        # cannot be interrupted on every platform.
+        # A join that Ctrl-C interrupts takes the thread for finished (Python 3.11), and a wait without a
+        # limit cannot be interrupted on every platform.
         while not self._ended.wait(timeout=0.5):
             pass
 

@@ -1,0 +1,55 @@
+"""The law of augmented gradients: random programs against dual numbers and finite differences."""
+
+from __future__ import annotations
+
+import law_checks as lc
+import law_programs as lp
+import numpy as np
+from hypothesis import assume
+from hypothesis import strategies as st
+
+from kineverse.expressions import array
+
+WORDS = lp.Vocabulary("law")
+
+
+def test_random_programs():
+    lc.law(lc.general(), WORDS, 160)()
+
+
+def test_augment_inside_augment():
+    lc.law(lc.nested(), WORDS, 120)()
+
+
+def test_composition():
+    lc.law(lc.compositions(), WORDS, 140)()
+
+
+def test_third_order():
+    lc.law(st.one_of(lp.programs(lp.S, 2), lp.nested(lp.S, 2)), WORDS, 30, order=3)()
+
+
+@lc.examples(60)
+@lc.given(lc.SHAPES.flatmap(lambda shape: lp.programs(shape, 3, lp.SMOOTH)))
+def test_finite_differences(program):
+    e = array(lp.build(program, WORDS))
+    step = 1e-5
+    points = [{**WORDS.values, s: WORDS.values[s] + sign * step} for s in WORDS.symbols for sign in (1, -1)]
+    values = [e(p) for p in points]
+    jacobian, partial = e.jacobian(WORDS.symbols[:5]), e.partial(WORDS.symbols)
+    at = WORDS.values
+    assume(max(np.abs(v).max() for v in [*values, jacobian(at)]) < 1e3)
+    assume(not _steps(program))
+    assert jacobian.shape == (*e.shape, 5)
+    assert partial.shape == (*e.shape, 6)
+    for i, (up, down) in enumerate(zip(values[::2], values[1::2], strict=True)):
+        slope = (up - down) / (2 * step)
+        np.testing.assert_allclose(partial(at)[..., i], slope, rtol=1e-4, atol=1e-4)
+        if i < 5:
+            np.testing.assert_allclose(jacobian(at)[..., i], slope, rtol=1e-4, atol=1e-4)
+
+
+def _steps(program):
+    """Whether a program has steps or kinks, where finite differences say little."""
+    kinks = {"floor", "ceil", "mod", "sign", "absolute", "copysign", "minimum", "maximum"}
+    return program[0] in kinks or any(_steps(p) for p in program[2:] if isinstance(p, tuple))
