@@ -12,7 +12,8 @@ import atexit
 import os
 import shutil
 import tempfile
-from collections.abc import Generator
+from collections.abc import Generator, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
@@ -40,7 +41,8 @@ def pytest_configure(config: pytest.Config) -> None:
     atexit.register(shutil.rmtree, folder, ignore_errors=True)
 
 
-def pytest_runtest_setup(item: pytest.Item) -> None:
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_setup(item: pytest.Item) -> Generator[None, object, object]:
     """Skip, or fail, what needs a browser or a compiler where there is none."""
     if item.get_closest_marker("browser") and _browser() is None:
         message = f"{item.name} needs a Chromium, and there is none: install the package 'chromium'."
@@ -49,19 +51,15 @@ def pytest_runtest_setup(item: pytest.Item) -> None:
         pytest.skip(message)
     if item.get_closest_marker("compiler") and not _has_compiler():
         pytest.skip(f"{item.name}{NO_COMPILER}")
+    with _refusals_skip(item):
+        return (yield)
 
 
 @pytest.hookimpl(wrapper=True)
 def pytest_runtest_call(item: pytest.Item) -> Generator[None, object, object]:
-    """Skip what insists on compiled code where there can be none."""
-    from kineverse.errors import CompileError
-
-    try:
+    """Skip what turns out to insist on compiled code where there can be none."""
+    with _refusals_skip(item):
         return (yield)
-    except CompileError as error:
-        if _has_compiler() or "no C compiler" not in str(error):
-            raise
-        pytest.skip(f"{item.name}{NO_COMPILER}")
 
 
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
@@ -83,6 +81,18 @@ def chromium() -> str:
     if path is None:
         pytest.skip("There is no Chromium: install the package 'chromium'.")
     return path
+
+
+@contextmanager
+def _refusals_skip(item: pytest.Item) -> Iterator[None]:
+    from kineverse.errors import CompileError
+
+    try:
+        yield
+    except CompileError as error:
+        if _has_compiler() or "no C compiler" not in str(error):
+            raise
+        pytest.skip(f"{item.name}{NO_COMPILER}")
 
 
 def _has_compiler() -> bool:

@@ -19,7 +19,7 @@ def load(source: str | os.PathLike[str], prefix: str | None = None) -> Model:
     Parameters
     ----------
     source
-        The path of a ``.urdf`` file, or a name such as ``kitchen`` or ``pr2``, see
+        The path of a ``.urdf`` or ``.kv.json`` file, or a name such as ``kitchen`` or ``pr2``, see
         :func:`kineverse.formats.sources.locate_model`.
     prefix
         Put in front of the names of all frames and degrees of freedom, with a slash. A model that ships has
@@ -44,6 +44,11 @@ def operations_of(
     found = locate_model(source)
     if prefix is None:
         prefix = found.shipped
+    if found.path.name.endswith(".kv.json"):
+        from .document import read_document
+
+        yield from read_document(found.path, prefix or None)
+        return
     for operation in _read(found, prefix or None):
         yield operation.default_tag(), operation
 
@@ -63,6 +68,6 @@ def _read(source: Source, prefix: str | None) -> Iterator[Operation]:
             yield from robot_operations(robot, prefix, parent=base.child)
         return
     raise FormatError(
-        f"{source.path}: this version reads URDF (.urdf, .xml), "
+        f"{source.path}: this version reads URDF (.urdf, .xml) and documents (.kv.json), "
         f"not '{''.join(source.path.suffixes) or name}'."
     )

@@ -14,6 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from kineverse.errors import ShapeError, ValueRejectedError
+from kineverse.expressions.expression import Expression
 
 _RIGID = 2e-5
 
@@ -44,8 +45,8 @@ class Pose:
             )
 
     @staticmethod
-    def of(matrix: npt.ArrayLike) -> Pose:
-        """Build a pose from a 4×4 homogeneous matrix.
+    def of(matrix: npt.ArrayLike | Expression) -> Pose:
+        """Build a pose from a 4×4 homogeneous matrix, of numbers or a constant expression.
 
         Raises
         ------
@@ -54,6 +55,11 @@ class Pose:
         """
         if np.shape(matrix) != (4, 4):
             raise ShapeError(f"A pose is made from a 4×4 matrix, not from one of shape {np.shape(matrix)}.")
+        if isinstance(matrix, Expression):
+            if not matrix.is_constant:
+                names = ", ".join(map(str, matrix.symbols))
+                raise ValueRejectedError(f"A pose is constant, and this transform moves with {names}.")
+            matrix = matrix({})
         numbers = np.asarray(matrix, dtype=float)
         x, y, z, w = numbers[3].tolist()
         if not max(abs(x), abs(y), abs(z), abs(w - 1)) < _RIGID:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import threading
 from collections.abc import ItemsView, Iterable, Iterator, Mapping, Sequence, ValuesView
 from typing import Any, Literal
@@ -489,6 +490,18 @@ class ModelView:
         with self._lock:
             coordinates, rates = self.degrees_of_freedom, self.rates
         return integrate(coordinates, rates, state, speeds, dt)
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write the model to a ``.kv.json`` document, see :mod:`kineverse.formats.document`.
+
+        Raises
+        ------
+        FormatError
+            If the name has another ending, or naming what a document cannot carry.
+        """
+        from kineverse.formats.document import write_document
+
+        write_document(self, path)
 
     # -- printing ------------------------------------------------------------------------------------------
 

@@ -1,0 +1,191 @@
+"""Reading a document: every part is checked, nothing in it is run, and a mistake is named with its place."""
+
+from __future__ import annotations
+
+import json
+import os
+from pathlib import Path
+from typing import Any, NoReturn
+
+from kineverse.errors import FormatError, KineverseError
+from kineverse.model.operation import FRAMES, KINDS, RATES
+from kineverse.model.reader import Cell, Read
+from kineverse.symbols import symbol_name
+
+from .checks import RefusedError, fields, listed, name, string
+from .graph import Graph
+from .recorded import Recorded
+from .values import Rename, as_read, frame_name
+from .writing import FORMAT, VERSION
+
+MAX_BYTES = 1 << 28
+
+
+def read_document(path: Path, prefix: str | None = None) -> list[tuple[str, Recorded]]:
+    """Return the operations of a document, each with its tag.
+
+    Parameters
+    ----------
+    path
+        A ``.kv.json`` file.
+    prefix
+        Put in front of all names, tags included, with a slash; the world stays the world.
+
+    Raises
+    ------
+    FormatError
+        With the file, the place in the document and the reason.
+    """
+    try:
+        with open(path, "rb") as file:
+            size = os.fstat(file.fileno()).st_size
+            content = file.read(MAX_BYTES + 1)
+    except OSError as error:
+        raise FormatError(f"{path} cannot be read: {error.strerror or error}.") from None
+    if len(content) > MAX_BYTES:
+        raise FormatError(
+            f"{path}: {max(size, len(content))} bytes are more than {MAX_BYTES}, the most a document has."
+        )
+    try:
+        text = content.decode()
+    except UnicodeDecodeError as error:
+        raise FormatError(f"{path}: byte {error.start} is not UTF-8; a document is UTF-8 text.") from None
+    return operations_from(text, str(path), prefix)
+
+
+def operations_from(
+    text: str, source: str = "document", prefix: str | None = None
+) -> list[tuple[str, Recorded]]:
+    """Return the operations of a document given as text; ``source`` is what errors call it."""
+    return _Document(source, prefix).read(text)
+
+
+class _Document:
+    def __init__(self, source: str, prefix: str | None) -> None:
+        self._source = source
+        self._place = ""
+        self._prefix = prefix
+        self._graph = Graph(prefix)
+        self._written: set[Cell] = set()
+
+    def read(self, text: str) -> list[tuple[str, Recorded]]:
+        try:
+            given = json.loads(text, object_pairs_hook=_object, parse_constant=_no_constant)
+            self._place = "the document"
+            if type(given) is not dict or given.get("format") != FORMAT:
+                raise RefusedError(
+                    f'it does not begin with {{"format": "{FORMAT}", and so is not one of Kineverse'
+                )
+            self._check_version(given.get("version"))
+            fields(given, ("format", "version", "nodes", "operations"))
+            self._read_nodes(listed(given["nodes"], "nodes"))
+            return self._read_operations(listed(given["operations"], "operations"))
+        except json.JSONDecodeError as error:
+            reason = f"{error.msg} at line {error.lineno}, column {error.colno}"
+            raise FormatError(f"{self._source} is not JSON: {reason} (of {len(text)} characters).") from None
+        except RefusedError as error:
+            self._refuse(str(error))
+        except RecursionError:
+            self._refuse("it is nested too deeply")
+        except ValueError as error:
+            # An integer of thousands of digits, which Python declines to read.
+            self._refuse(str(error))
+
+    def _refuse(self, reason: str) -> NoReturn:
+        place = f", {self._place}" if self._place else ""
+        raise FormatError(f"{self._source}{place}: {reason}.") from None
+
+    def _check_version(self, version: Any) -> None:
+        if type(version) is not int or version < 1:
+            raise RefusedError("its version is not a whole number from 1 on")
+        if version > VERSION:
+            raise RefusedError(
+                f"it is of version {version:.6g}, and this Kineverse reads up to {VERSION}; update Kineverse"
+            )
+
+    def _read_nodes(self, table: list[Any]) -> None:
+        try:
+            self._graph.read(table)
+        except (RefusedError, RecursionError):
+            self._place = f"nodes[{self._graph.place}]"
+            raise
+
+    def _read_operations(self, operations: list[Any]) -> list[tuple[str, Recorded]]:
+        result: dict[str, Recorded] = {}
+        for i, given in enumerate(operations):
+            self._place = f"operations[{i}]"
+            fields(given, ("tag", "kind", "reads", "writes"))
+            tag = string(given["tag"])
+            if not tag:
+                raise RefusedError("the tag is empty")
+            if tag in result:
+                raise RefusedError(f"the tag {tag[:60]!r} is taken by an earlier operation")
+            result[tag] = self._operation(given, f"operations[{i}] ({tag[:60]!r})")
+        before = f"{self._prefix}/" if self._prefix else ""
+        return [(before + tag, operation) for tag, operation in result.items()]
+
+    def _operation(self, given: dict[str, Any], place: str) -> Recorded:
+        self._place = f"{place}, reads"
+        reads = fields(given["reads"], (), ("existence", "value", "listing"))
+        cells: dict[Cell, Read] = {}
+        for key, how in (("existence", Read.EXISTENCE), ("value", Read.VALUE)):
+            for path in listed(reads.get(key, []), key):
+                cell = self._cell(*string(path).partition("/")[::2])
+                cells[cell] = cells.get(cell, Read(0)) | how
+        listings = tuple(map(_kind, listed(reads.get("listing", []), "listing")))
+        writes = []
+        for kind, values in fields(given["writes"], (), KINDS).items():
+            for key, value in _members(values).items():
+                self._place = f"{place}, writes {kind}/{key[:60]}"
+                cell = self._cell(kind, name(key))
+                try:
+                    read = as_read(kind, value, self._graph, self._rename)
+                except KineverseError as error:
+                    raise RefusedError(str(error)) from None
+                if kind == RATES and str(read[0]) != cell[1]:
+                    raise RefusedError(f"this is the rate of '{read[0]}'")
+                writes.append((cell, read))
+        required = frozenset(cell for cell in cells if cell in self._written)
+        self._written.update(cell for cell, _ in writes)
+        return Recorded(
+            string(given["kind"]), tuple(sorted(cells.items())), listings, required, tuple(writes)
+        )
+
+    def _cell(self, kind: str, given: str) -> Cell:
+        kind = _kind(kind)
+        if kind == RATES:
+            before = f"{symbol_name(self._prefix, 0)}/" if self._prefix else ""
+            return kind, before + name(given)
+        return kind, frame_name(given, self._rename) if kind == FRAMES else self._rename(name(given))
+
+    @property
+    def _rename(self) -> Rename:
+        before = f"{self._prefix}/" if self._prefix else ""
+        return lambda given: before + given
+
+
+def _object(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    result = dict(pairs)
+    if len(result) != len(pairs):
+        seen: set[str] = set()
+        for key, _ in pairs:
+            if key in seen:
+                raise RefusedError(f"the key {key[:60]!r} occurs twice in one object")
+            seen.add(key)
+    return result
+
+
+def _no_constant(literal: str) -> NoReturn:
+    raise RefusedError(f'{literal} is no number of JSON; infinite bounds are written "inf" and "-inf"')
+
+
+def _members(value: Any) -> dict[str, Any]:
+    if type(value) is not dict:
+        raise RefusedError("an object is expected, from names to values")
+    return value
+
+
+def _kind(value: Any) -> str:
+    if value not in KINDS:
+        raise RefusedError(f"{str(value)[:40]!r} is not a kind of data; kinds are {', '.join(KINDS)}")
+    return str(value)

@@ -1,0 +1,269 @@
+"""Expressions as one table of nodes, for writing.
+
+Every node is a list that begins with its type; ``ref`` is the place of an earlier node in the table.
+
+====================================================================  =====================================
+node                                                                  meaning
+====================================================================  =====================================
+``["constant", number]``                                              a number, ``"inf"`` or ``"-inf"``
+``["symbol", path, order, role]``                                     a symbol; a parameter has its value
+                                                                      behind the role
+``["elementary", name, ref, ...]``                                    a function of scalars
+                                                                      (:mod:`.elementary`)
+``["element", ref, index]``                                           an element of an array, in C order
+``["matrix", shape, [ref, ...]]``                                     an array, in C order; null is a zero
+                                                                      that is not stored
+``["augment", ref, replace, heuristic, [[symbol, ref], ...]]``        a value with given gradient entries
+``["less", ref, ref, contrast]``, ``["not", ref]``,                   continuous logic
+``["and", ref, ...]``, ``["or", ref, ...]``
+``["select", condition, ref, ref]``, ``["extremum", "min", ref, ref]``  choices, elementwise
+``["norm", ref]``                                                     the Euclidean norm of a vector
+``["carried", symbol, [[symbol, [[speed, ref], ...]], ...]]``         a coordinate with the rate table that
+                                                                      says how it moves
+``["composed", ref, [[symbol, ref], ...]]``                           a carried coordinate after a
+                                                                      substitution
+====================================================================  =====================================
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Iterable, Sequence
+
+import casadi as ca
+
+from kineverse.errors import FormatError
+from kineverse.expressions import layout
+from kineverse.expressions.expression import Expression
+from kineverse.expressions.functions import Extremum, Norm, Select
+from kineverse.expressions.leaves import bottom_up, leaves
+from kineverse.expressions.node import Augment, Node
+from kineverse.logic import And, Less, Not, Or
+from kineverse.model.rates import Carried, Composed
+from kineverse.symbols import Symbol
+
+from .elementary import NAMES
+
+_PLAIN = (Not, And, Or, Select, Norm)
+
+# A step of CasADi's program: a leaf (owner, element), a constant, or (name, steps ...).
+_Leaf = tuple["Symbol | Node", int]
+
+
+class Table:
+    """The nodes of expressions, each followed by what is made of it; :meth:`ref` says where one is.
+
+    Equal parts are one node, in the order in which the expressions need them: equal models have equal texts.
+
+    Raises
+    ------
+    FormatError
+        For NaN, and for nodes and functions that documents do not have.
+    """
+
+    def __init__(self, expressions: Iterable[Expression]) -> None:
+        self.lines: list[str] = []
+        self._symbols: dict[Symbol, int] = {}
+        self._nodes: dict[Node, int] = {}
+        self._made: dict[str, int] = {}
+        roots = list({id(e): e for e in expressions}.values())
+        inner = bottom_up({n: None for e in roots for n in leaves(e)[1]}, _parts, lambda _: False)
+        parts = [*roots, *(part for node in inner for part in _parts(node))]
+        self._program = _Program(list({id(e): e for e in parts}.values()))
+        self._steps: list[int] = [-1] * len(self._program.steps)
+        self._known: dict[int, int] = {}
+
+    def ref(self, expression: Expression) -> int:
+        """Return the place of an expression that was announced, or of any symbol."""
+        if isinstance(expression, Symbol):
+            return self._symbol(expression)
+        known = self._known.get(id(expression))
+        if known is None:
+            for node in bottom_up(leaves(expression)[1], _parts, self._nodes.__contains__):
+                self._nodes[node] = self._node(node)
+            known = self._known[id(expression)] = self._array(expression)
+        return known
+
+    def _array(self, expression: Expression) -> int:
+        places, steps = self._program.elements[id(expression)]
+        size = expression.size
+        if not expression.shape and steps:
+            return self._scalar(steps[0])
+        if len(steps) == size and size:
+            owner = self._program.steps[steps[0]]
+            if isinstance(owner, tuple) and isinstance(owner[0], Node) and owner[0].shape == expression.shape:
+                if [self._program.steps[s] for s in steps] == [(owner[0], i) for i in range(size)]:
+                    return self._nodes[owner[0]]
+        refs = ["null"] * size
+        for place, step in zip(places, steps, strict=True):
+            refs[place] = str(self._scalar(step))
+        return self._shared(f'["matrix",[{",".join(map(str, expression.shape))}],[{",".join(refs)}]]')
+
+    def _scalar(self, wanted: int) -> int:
+        places, steps = self._steps, self._program.steps
+        if places[wanted] >= 0:
+            return places[wanted]
+        stack = [wanted]
+        while stack:
+            step = stack[-1]
+            what = steps[step]
+            if places[step] >= 0:
+                stack.pop()
+            elif isinstance(what, float):
+                places[stack.pop()] = self._shared(f'["constant",{number(what)}]')
+            elif not isinstance(what[0], str):
+                places[stack.pop()] = self._leaf(what)
+            else:
+                missing = [a for a in what[1:] if places[a] < 0]
+                if missing:
+                    stack.extend(reversed(missing))
+                    continue
+                arguments = ",".join(str(places[a]) for a in what[1:])
+                places[stack.pop()] = self._shared(f'["elementary","{what[0]}",{arguments}]')
+        return places[wanted]
+
+    def _leaf(self, leaf: _Leaf) -> int:
+        owner, element = leaf
+        if isinstance(owner, Symbol):
+            return self._symbol(owner)
+        place = self._nodes[owner]
+        return self._shared(f'["element",{place},{element}]') if owner.shape else place
+
+    def _symbol(self, symbol: Symbol) -> int:
+        place = self._symbols.get(symbol)
+        if place is None:
+            value = "" if symbol.value is None else f",{number(symbol.value)}"
+            place = self._add(f'["symbol",{text(symbol.path)},{symbol.order},"{symbol.role}"{value}]')
+            self._symbols[symbol] = place
+        return place
+
+    def _node(self, node: Node) -> int:
+        if type(node) is Carried:
+            return self._add(f'["carried",{self.ref(node.coordinate)},{self._rates(node)}]')
+        refs = [self.ref(argument) for argument in node.arguments]
+        joined = ",".join(map(str, refs))
+        if type(node) is Augment:
+            entries = self._pairs(node.options[2:], refs[1:])
+            flags = f"{str(node.replace).lower()},{str(node.heuristic).lower()}"
+            return self._add(f'["augment",{refs[0]},{flags},{entries}]')
+        if type(node) is Less:
+            return self._add(f'["less",{joined},{number(node.options[0])}]')
+        if type(node) is Extremum:
+            return self._add(f'["extremum","{node.options[0]}",{joined}]')
+        if type(node) is Composed:
+            return self._add(f'["composed",{refs[0]},{self._pairs(node.options, refs[1:])}]')
+        if type(node) in _PLAIN:
+            return self._add(f'["{node.kind}",{joined}]')
+        raise FormatError(
+            f"A document of version 1 has no node '{node.kind}' ({type(node).__name__}); the model cannot be "
+            "saved with it."
+        )
+
+    def _rates(self, node: Carried) -> str:
+        rows = []
+        for coordinate in sorted(node.rates._given, key=lambda s: s.sort_key):
+            row = node.rates._given[coordinate]
+            pairs = self._pairs([speed for speed, _ in row], [self.ref(entry) for _, entry in row])
+            rows.append(f"[{self.ref(coordinate)},{pairs}]")
+        return f"[{','.join(rows)}]"
+
+    def _pairs(self, symbols: Sequence[Symbol], refs: Sequence[int]) -> str:
+        pairs = (f"[{self._symbol(s)},{ref}]" for s, ref in zip(symbols, refs, strict=True))
+        return f"[{','.join(pairs)}]"
+
+    def _shared(self, line: str) -> int:
+        place = self._made.get(line)
+        if place is None:
+            place = self._made[line] = self._add(line)
+        return place
+
+    def _add(self, line: str) -> int:
+        self.lines.append(line)
+        return len(self.lines) - 1
+
+
+class _Program:
+    """CasADi's own program for all elements of expressions, every shared part once.
+
+    Attributes
+    ----------
+    steps
+        What is computed: a number, a leaf (symbol or node, element), or (function, earlier steps ...).
+    elements
+        By ``id`` of an expression: the places of its stored elements in C order, and their steps.
+    """
+
+    def __init__(self, expressions: list[Expression]) -> None:
+        self._keep = expressions
+        self.steps: list[float | _Leaf | tuple[str, int] | tuple[str, int, int]] = []
+        self.elements: dict[int, tuple[list[int], list[int]]] = {}
+        if not expressions:
+            return
+        owners: dict[Symbol | Node, None] = {}
+        for expression in expressions:
+            symbols, nodes = leaves(expression)
+            owners.update(dict.fromkeys(symbols))
+            owners.update(dict.fromkeys(nodes))
+        inputs = []
+        leaf_of: list[_Leaf] = []
+        for owner in owners:
+            sx, shape = (owner._sx, ()) if isinstance(owner, Symbol) else (owner.sx, owner.shape)
+            inputs.append(layout.column(sx, shape))
+            leaf_of.extend((owner, i) for i in range(math.prod(shape)))
+        columns = [layout.column(e._sx, e._shape) for e in expressions]
+        given = ca.vertcat(*inputs) if inputs else ca.SX(0, 1)
+        outputs = self._run(ca.Function("document", [given], [ca.vertcat(*columns)]), leaf_of)
+        offset = 0
+        for expression, column in zip(expressions, columns, strict=True):
+            places = column.sparsity().row()
+            self.elements[id(expression)] = places, outputs[offset : offset + len(places)]
+            offset += len(places)
+
+    def _run(self, function: ca.Function, leaf_of: list[_Leaf]) -> list[int]:
+        """Follow the program, whose memory is used over and over, and return the steps of its outputs."""
+        operation, arguments = function.instruction_id, function.instruction_input
+        results = function.instruction_output
+        steps = self.steps
+        memory: dict[int, int] = {}
+        outputs = [-1] * function.nnz_out(0)
+        for k in range(function.n_instructions()):
+            code = operation(k)
+            if code == ca.OP_OUTPUT:
+                outputs[results(k)[1]] = memory[arguments(k)[0]]
+                continue
+            if code == ca.OP_CONST:
+                steps.append(function.instruction_constant(k))
+            elif code == ca.OP_INPUT:
+                steps.append(leaf_of[arguments(k)[1]])
+            elif code in NAMES:
+                steps.append((NAMES[code], *(memory[a] for a in arguments(k))))  # type: ignore[arg-type]
+            else:
+                raise FormatError(f"A document of version 1 has no function with CasADi's code {code}.")
+            memory[results(k)[0]] = len(steps) - 1
+        return outputs
+
+
+def _parts(node: Node) -> tuple[Expression, ...]:
+    """Return the expressions that a node is made of."""
+    if isinstance(node, Carried):
+        return tuple(entry for row in node.rates._given.values() for _, entry in row)
+    return node.arguments
+
+
+def number(value: float) -> str:
+    """Return a number as JSON that is read back as the same bits.
+
+    Raises
+    ------
+    FormatError
+        For NaN.
+    """
+    if value != value:
+        raise FormatError("NaN has no place in a document.")
+    if value in (math.inf, -math.inf):
+        return '"inf"' if value > 0 else '"-inf"'
+    return repr(float(value))
+
+
+text = json.JSONEncoder(ensure_ascii=False).encode

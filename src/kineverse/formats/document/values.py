@@ -1,0 +1,314 @@
+"""What operations write, as JSON values and back.
+
+A frame is ``{"parent": name, "factors": [...]}``, each factor a pose (its 12 numbers) or the place of an
+expression; a constraint the places of ``[lower, expression, upper]``; a rate
+``[coordinate, [[speed, ref], ...]]``. Data are texts, numbers, true, false, null and lists of these; an
+expression is ``{"expression": ref}``.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any, TypeAlias
+
+import numpy as np
+
+from kineverse.errors import FormatError
+from kineverse.expressions.expression import Expression
+from kineverse.model.articulation import Articulation
+from kineverse.model.body import (
+    Body,
+    Box,
+    Capsule,
+    Cylinder,
+    Geometry,
+    Inertia,
+    Mesh,
+    Pose,
+    Shape,
+    Sphere,
+)
+from kineverse.model.constraint import Constraint
+from kineverse.model.frame import WORLD, Frame
+from kineverse.model.operation import ARTICULATIONS, BODIES, CONSTRAINTS, DATA, FRAMES, RATES
+from kineverse.model.rates import Row, as_row
+from kineverse.symbols import Symbol
+
+from .checks import RefusedError, exactly, fields, listed, name, number, numbers, string
+from .graph import Graph
+
+Ref: TypeAlias = Callable[[Expression], int]
+Rename: TypeAlias = Callable[[str], str]
+
+INERTIA_NUMBERS = 6
+POSE_NUMBERS = 12
+
+
+# -- writing -------------------------------------------------------------------------------------------------
+
+
+def expressions_in(kind: str, value: Any) -> list[Expression]:
+    """Return the expressions of a written value, symbols of records left out."""
+    if kind == FRAMES:
+        return [factor for factor in value.factors if isinstance(factor, Expression)]
+    if kind == CONSTRAINTS:
+        return [value.lower, value.expression, value.upper]
+    if kind == RATES:
+        return [entry for _, entry in value[1]]
+    if kind == ARTICULATIONS:
+        return _expressions_below(value.dynamics)
+    return _expressions_below(value) if kind == DATA else []
+
+
+def _expressions_below(datum: Any) -> list[Expression]:
+    if isinstance(datum, Expression):
+        return [datum]
+    return [e for item in datum for e in _expressions_below(item)] if isinstance(datum, tuple) else []
+
+
+def written(kind: str, value: Any, ref: Ref) -> Any:
+    """Return a value as JSON has it.
+
+    Raises
+    ------
+    FormatError
+        For what a document has no place for.
+    """
+    if kind == FRAMES:
+        factors = [_pose(f) if isinstance(f, Pose) else ref(f) for f in value.factors]
+        return {"parent": value.parent, "factors": factors}
+    if kind == CONSTRAINTS:
+        return [ref(value.lower), ref(value.expression), ref(value.upper)]
+    if kind == RATES:
+        coordinate, row = value
+        return [ref(coordinate), [[ref(speed), ref(entry)] for speed, entry in row]]
+    if kind == BODIES:
+        return _body(value)
+    if kind == ARTICULATIONS:
+        return {
+            "kind": _text(value.kind),
+            "parent": _text(value.parent),
+            "child": _text(value.child),
+            "coordinates": [ref(s) for s in value.coordinates],
+            "home": _numbers(value.home),
+            "speeds": [ref(s) for s in value.speeds],
+            "dynamics": [[_text(item), _datum(datum, ref)] for item, datum in value.dynamics],
+        }
+    return _datum(value, ref)
+
+
+def _datum(value: Any, ref: Ref) -> Any:
+    if value is None or type(value) in (bool, int, str):
+        return value
+    if type(value) is float:
+        return value if math.isfinite(value) else {"float": _number(value)}
+    if type(value) is tuple:
+        return [_datum(item, ref) for item in value]
+    if isinstance(value, Expression):
+        return {"expression": ref(value)}
+    raise FormatError(
+        f"a {type(value).__name__} cannot be saved; write texts, numbers, true or false, None, expressions "
+        "and tuples of these"
+    )
+
+
+def _body(body: Body) -> dict[str, Any]:
+    result: dict[str, Any] = {
+        "visuals": [_shape(s) for s in body.visuals],
+        "collisions": [_shape(s) for s in body.collisions],
+    }
+    if body.inertia is not None:
+        inertia = body.inertia
+        result["inertia"] = {
+            "mass": _number(inertia.mass),
+            "tensor": _numbers(inertia.tensor),
+            "origin": _pose(inertia.origin),
+        }
+    return result
+
+
+def _shape(shape: Shape) -> dict[str, Any]:
+    result = {"geometry": _geometry(shape.geometry), "origin": _pose(shape.origin)}
+    if shape.name:
+        result["name"] = _text(shape.name)
+    if shape.color is not None:
+        result["color"] = _numbers(shape.color)
+    if shape.texture:
+        result["texture"] = _text(shape.texture)
+    return result
+
+
+def _geometry(geometry: Geometry) -> dict[str, Any]:
+    if type(geometry) is Box:
+        return {"box": {"size": _numbers(geometry.size)}}
+    if type(geometry) is Cylinder or type(geometry) is Capsule:
+        kind = "cylinder" if type(geometry) is Cylinder else "capsule"
+        return {kind: {"radius": _number(geometry.radius), "length": _number(geometry.length)}}
+    if type(geometry) is Sphere:
+        return {"sphere": {"radius": _number(geometry.radius)}}
+    if type(geometry) is Mesh:
+        scale = _numbers(geometry.scale)
+        return {"mesh": {"uri": _text(geometry.uri), "scale": scale, "folder": _text(geometry.folder)}}
+    raise FormatError(f"a {type(geometry).__name__} is no geometry that a document knows")
+
+
+def _pose(pose: Pose) -> list[float | str]:
+    return _numbers(pose.rows)
+
+
+def _numbers(values: Any) -> list[float | str]:
+    return [v if type(v) is float and -math.inf < v < math.inf else _number(v) for v in values]
+
+
+def _number(value: Any) -> float | str:
+    if isinstance(value, np.generic):
+        value = value.item()
+    if type(value) not in (float, int):
+        raise FormatError(f"a number is wanted, not {value!r}")
+    if value != value:
+        raise FormatError("NaN has no place in a document")
+    result: float = value
+    return result if abs(result) < math.inf else ("inf" if result > 0 else "-inf")
+
+
+def _text(value: Any) -> str:
+    if type(value) is not str:
+        raise FormatError(f"a text is wanted, not {value!r}")
+    return value
+
+
+# -- reading -------------------------------------------------------------------------------------------------
+
+
+def as_read(kind: str, value: Any, graph: Graph, rename: Rename) -> Any:
+    """Return what JSON has as the value of an operation.
+
+    Raises
+    ------
+    RefusedError
+        Where it is not what it should be.
+    """
+    return _READERS[kind](value, graph, rename)
+
+
+def frame_name(value: Any, rename: Rename) -> str:
+    """Return the name of a frame that may be the world."""
+    given = name(value)
+    return given if given == WORLD else rename(given)
+
+
+def _read_frame(value: Any, graph: Graph, rename: Rename) -> Frame:
+    given = fields(value, ("parent", "factors"))
+    factors: list[Pose | Expression] = []
+    for factor in listed(given["factors"], "factors"):
+        if type(factor) is list:
+            factors.append(_read_pose(factor))
+            continue
+        transform = graph.expression(factor)
+        if transform.shape != (4, 4):
+            raise RefusedError(f"a factor should be 4×4, not of shape {transform.shape}")
+        factors.append(transform)
+    return Frame(frame_name(given["parent"], rename), tuple(factors))
+
+
+def _read_constraint(value: Any, graph: Graph, rename: Rename) -> Constraint:
+    return Constraint(*map(graph.scalar, exactly(listed(value, "lower, expression, upper"), 3)))
+
+
+def _read_rate(value: Any, graph: Graph, rename: Rename) -> tuple[Symbol, Row]:
+    coordinate, row = exactly(listed(value, "coordinate and row"), 2)
+    symbol = graph.symbol(coordinate)
+    return symbol, as_row(symbol, dict(graph.pairs(row, 1)))
+
+
+def _read_body(value: Any, graph: Graph, rename: Rename) -> Body:
+    given = fields(value, ("visuals", "collisions"), ("inertia",))
+    return Body(
+        tuple(map(_read_shape, listed(given["visuals"], "visuals"))),
+        tuple(map(_read_shape, listed(given["collisions"], "collisions"))),
+        _read_inertia(given["inertia"]) if "inertia" in given else None,
+    )
+
+
+def _read_inertia(value: Any) -> Inertia:
+    given = fields(value, ("mass", "tensor", "origin"))
+    ixx, ixy, ixz, iyy, iyz, izz = numbers(given["tensor"], INERTIA_NUMBERS)
+    return Inertia(number(given["mass"]), (ixx, ixy, ixz, iyy, iyz, izz), _read_pose(given["origin"]))
+
+
+def _read_shape(value: Any) -> Shape:
+    given = fields(value, ("geometry", "origin"), ("name", "color", "texture"))
+    color = None
+    if "color" in given:
+        red, green, blue, alpha = numbers(given["color"], 4)
+        color = red, green, blue, alpha
+    return Shape(
+        _read_geometry(given["geometry"]),
+        _read_pose(given["origin"]),
+        string(given.get("name", "")),
+        color,
+        string(given.get("texture", "")),
+    )
+
+
+def _read_geometry(value: Any) -> Geometry:
+    given = fields(value, (), ("box", "cylinder", "capsule", "sphere", "mesh"))
+    if len(given) != 1:
+        raise RefusedError("a geometry is one of box, cylinder, capsule, sphere, mesh")
+    ((kind, inner),) = given.items()
+    if kind == "box":
+        return Box(_read_vector(fields(inner, ("size",))["size"]))
+    if kind == "sphere":
+        return Sphere(number(fields(inner, ("radius",))["radius"]))
+    if kind == "mesh":
+        fields(inner, ("uri", "scale", "folder"))
+        return Mesh(string(inner["uri"]), _read_vector(inner["scale"]), string(inner["folder"]))
+    fields(inner, ("radius", "length"))
+    return (Cylinder if kind == "cylinder" else Capsule)(number(inner["radius"]), number(inner["length"]))
+
+
+def _read_vector(value: Any) -> tuple[float, float, float]:
+    x, y, z = numbers(value, 3)
+    return x, y, z
+
+
+def _read_pose(value: Any) -> Pose:
+    return Pose(numbers(value, POSE_NUMBERS))
+
+
+def _read_articulation(value: Any, graph: Graph, rename: Rename) -> Articulation:
+    given = fields(value, ("kind", "parent", "child", "coordinates", "home", "speeds", "dynamics"))
+    dynamics = [exactly(listed(d, "name and value"), 2) for d in listed(given["dynamics"], "dynamics")]
+    return Articulation(
+        string(given["kind"]),
+        frame_name(given["parent"], rename),
+        frame_name(given["child"], rename),
+        tuple(map(graph.symbol, listed(given["coordinates"], "coordinates"))),
+        numbers(given["home"]),
+        tuple(graph.symbol(ref, 1) for ref in listed(given["speeds"], "speeds")),
+        tuple((string(item), _read_datum(datum, graph, rename)) for item, datum in dynamics),
+    )
+
+
+def _read_datum(value: Any, graph: Graph, rename: Rename) -> Any:
+    if type(value) is list:
+        return tuple(_read_datum(item, graph, rename) for item in value)
+    if type(value) is dict:
+        given = fields(value, (), ("expression", "float"))
+        if len(given) != 1 or given.get("float", "inf") not in ("inf", "-inf"):
+            raise RefusedError('an object among data is {"expression": ref} or {"float": "inf" or "-inf"}')
+        return number(given["float"]) if "float" in given else graph.expression(given["expression"])
+    if type(value) is str:
+        return string(value)
+    return number(value) if type(value) is float else value
+
+
+_READERS: dict[str, Callable[[Any, Graph, Rename], Any]] = {
+    FRAMES: _read_frame,
+    BODIES: _read_body,
+    ARTICULATIONS: _read_articulation,
+    CONSTRAINTS: _read_constraint,
+    RATES: _read_rate,
+    DATA: _read_datum,
+}

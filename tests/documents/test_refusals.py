@@ -1,0 +1,210 @@
+"""What is no document gives one error that names the place; nothing is half read or half written."""
+
+from __future__ import annotations
+
+import copy
+import json
+import os
+import stat
+
+import pytest
+from document_models import rich_model
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+import kineverse as kv
+from kineverse.formats.document import document_of, operations_from
+
+TEXT = document_of(rich_model())
+NODE = '{"format": "kineverse", "version": 1, "nodes": [%s], "operations": []}'
+WRITES = '{"format": "kineverse", "version": 1, "nodes": [["symbol", "a", 0, "dof"]], "operations": [%s]}'
+
+
+def outcome(text):
+    """Return what was read, or the message; anything but a FormatError fails the test."""
+    try:
+        return operations_from(text, "d.kv.json")
+    except kv.FormatError as error:
+        return str(error)
+
+
+def operation(kind="data", name="x", value="1", **others):
+    parts = {
+        "tag": '"t"',
+        "kind": '"k"',
+        "reads": "{}",
+        "writes": f'{{"{kind}": {{"{name}": {value}}}}}',
+        **others,
+    }
+    return WRITES % ("{" + ", ".join(f'"{k}": {v}' for k, v in parts.items()) + "}")
+
+
+def test_cut_off_anywhere():
+    text = document_of(kv.load("shelf_door"))
+    end = len(text.rstrip())
+    for length in range(end):
+        assert isinstance(outcome(text[:length]), str), length
+    assert isinstance(outcome(text[:end]), list)
+
+
+@pytest.mark.parametrize(
+    ("text", "reason"),
+    [
+        ("", "not JSON"),
+        ("[]", "does not begin with"),
+        ('{"format": "kineverse", "version": 2, "nodes": [], "operations": []}', "version 2, and this Kineverse reads up to 1"),
+        ('{"format": "kineverse", "version": true, "nodes": [], "operations": []}', "not a whole number"),
+        ('{"format": "kineverse", "version": 1, "nodes": []}', "'operations' is missing"),
+        ('{"format": "kineverse", "version": 1, "nodes": [], "operations": [], "more": 0}', "unknown key 'more'"),
+        ('{"format": "kineverse", "format": "kineverse"}', "occurs twice"),
+        (NODE % '["constant", NaN]', "NaN is no number"),
+        (NODE % '["constant", 1e999]', "too large"),
+        (NODE % '["constant", true]', "a number is expected"),
+        (NODE % f'["constant", {"9" * 5000}]', "limit"),
+        (NODE % '["surprise", 1]', "no node type 'surprise'"),
+        (NODE % '["element", 0, 0]', "not the place of an earlier node"),
+        (NODE % '["constant", 1], ["elementary", "add", 0, 1]', "nodes[1]: 1 is not the place"),
+        (NODE % '["constant", 1], ["elementary", "add", 0, -1]', "-1 is not the place"),
+        (NODE % '["constant", 1], ["elementary", "eval", 0]', "no elementary function 'eval'"),
+        (NODE % '["constant", -1], ["elementary", "sqrt", 0]', "NaN"),
+        (NODE % '["constant", 1], ["elementary", "sin", 0, 0]', "3 items are expected"),
+        (NODE % '["symbol", "a", 0, "king"]', "'king' is not a role"),
+        (NODE % '["symbol", "a//b", 0, "dof"]', "parts are not empty"),
+        (NODE % '["symbol", "a", -1, "dof"]', "from 0 to"),
+        (NODE % '["symbol", "a", 0, "parameter"]', "5 items are expected"),
+        (NODE % '["symbol", "\\ud800", 0, "dof"]', "surrogate"),
+        (NODE % '["matrix", [1000000000, 1000000000], []]', "whole number from 0 to"),
+        (NODE % '["matrix", [0, 16777216, 16777216], []]', "too large"),
+        (NODE % '["constant", 1], ["matrix", [2], [0]]', "do not fill"),
+        (NODE % '["constant", 1], ["less", 0, 0, -1]', "positive"),
+        (NODE % '["constant", 1], ["augment", 0, 1, false, []]', "true or false"),
+        (NODE % '["symbol", "a", 0, "dof"], ["augment", 0, false, false, [[0, 0]]]', "derivative of a symbol"),
+        (NODE % '["symbol", "a", 0, "dof"], ["carried", 0, []]', "no row for 'a'"),
+        (NODE % '["symbol", "a", 0, "dof"], ["composed", 0, []]', "carried coordinate"),
+        (operation(kind="soul"), "'soul'"),
+        (operation(kind="frames", value='{"parent": "world", "factors": [[1, 2]]}'), "12 items"),
+        (operation(kind="frames", value='{"parent": "world", "factors": [[' + "2," * 11 + "2]]}"), "not rigid"),
+        (operation(kind="frames", value='{"parent": "world", "factors": [0]}'), "4×4"),
+        (operation(kind="constraints", value="[0, 0]"), "3 items"),
+        (operation(kind="rates", value="[0, [[0, 0]]]"), "derivative of a symbol"),
+        (operation(kind="bodies", value='{"visuals": [{"geometry": {"box": {"size": [1, 1]}}, "origin": []}], "collisions": []}'), "3 items"),
+        (operation(tag='""'), "tag is empty"),
+        (operation(reads='{"value": ["nowhere"]}'), "'nowhere' is not a kind"),
+        (operation(value='{"expression": 7}'), "7 is not the place"),
+        ("[" * 200_000, "nested too deeply"),
+        (operation(value="[" * 900 + "]" * 900), None),
+    ],
+)  # fmt: skip
+def test_one_error_with_the_place(text, reason):
+    result = outcome(text)
+    if reason is None:
+        return
+    assert isinstance(result, str), result
+    assert result.startswith("d.kv.json")
+    assert reason in result
+    assert len(result) < 600
+
+
+def test_a_long_way_down():
+    """Nesting beyond what is followed is refused, and a long chain of plain sums is not nesting."""
+    deep = ['["symbol", "a", 0, "dof"]', *(f'["not", {i}]' for i in range(5000))]
+    assert "inside one another" in outcome(NODE % ",".join(deep))
+    long = ['["symbol", "a", 0, "dof"]', *(f'["elementary", "sin", {i}]' for i in range(100_000))]
+    assert outcome(NODE % ",".join(long)) == []
+
+
+@settings(max_examples=300, suppress_health_check=list(HealthCheck))
+@given(data=st.data())
+def test_anything_changed_is_read_or_refused(data):
+    """Replace, drop or double any part of a real document: a model or one error of our own comes out."""
+    given = json.loads(TEXT)
+    place, key = given, data.draw(st.sampled_from(["nodes", "operations"]))
+    while isinstance(place[key], (list, dict)) and place[key] and data.draw(st.integers(0, 5)):
+        place = place[key]
+        key = data.draw(st.sampled_from(range(len(place)) if isinstance(place, list) else sorted(place)))
+    what = data.draw(st.integers(0, 2))
+    if what == 0:
+        del place[key]
+    elif what == 1 and isinstance(place, list):
+        place.insert(key, copy.deepcopy(place[key]))
+    else:
+        place[key] = data.draw(
+            st.sampled_from([None, True, -1, 0, 3, 2.5, "", "a", "inf", [], [0], {}, {"a": 0}])
+        )
+    result = outcome(json.dumps(given))
+    if isinstance(result, list):
+        try:
+            with kv.Model().edit() as edit:
+                for tag, recorded in result:
+                    edit.apply(recorded, tag)
+        except kv.KineverseError:
+            pass
+
+
+@settings(max_examples=200)
+@given(place=st.integers(0, len(TEXT) - 1), what=st.characters())
+def test_any_character_changed_is_read_or_refused(place, what):
+    outcome(TEXT[:place] + what + TEXT[place + 1 :])
+
+
+def test_files_that_are_none(tmp_path):
+    path = tmp_path / "m.kv.json"
+    with pytest.raises(kv.UnknownNameError, match=r"m\.kv\.json"):
+        kv.load(path)
+    path.write_bytes(b"\xff\xfe{}")
+    with pytest.raises(kv.FormatError, match="UTF-8"):
+        kv.load(path)
+    path.unlink()
+    path.mkdir()
+    with pytest.raises(kv.UnknownNameError, match=r"m\.kv\.json"):
+        kv.load(path)
+
+
+def test_nothing_is_included_from_a_document_that_fails(tmp_path):
+    path = tmp_path / "m.kv.json"
+    kv.load("shelf_door").save(path)
+    content = json.loads(path.read_text())
+    content["operations"][-1]["writes"] = {"frames": {"late": {"parent": "nowhere", "factors": []}}}
+    path.write_text(json.dumps(content))
+    model = kv.load("kitchen")
+    before = model.snapshot()
+    with pytest.raises(kv.KineverseError):
+        model.include(path)
+    assert model.snapshot() == before
+
+
+class Odd:
+    """Nothing that a document knows."""
+
+
+def test_what_cannot_be_saved_is_named_and_the_file_stays(tmp_path):
+    path = tmp_path / "m.kv.json"
+    path.write_text("precious")
+    model = kv.load("shelf_door")
+    with model.edit() as edit:
+        edit.write("odd", (1, Odd()), tag="the odd one")
+    with pytest.raises(kv.FormatError, match=r"data/odd.*the odd one.*Odd cannot be saved"):
+        model.save(path)
+    assert path.read_text() == "precious"
+    assert os.listdir(tmp_path) == ["m.kv.json"]
+
+
+def test_the_ending_and_the_folder(tmp_path):
+    model = kv.load("shelf_door")
+    with pytest.raises(kv.FormatError, match=r"m\.kv\.json"):
+        model.save(tmp_path / "m.json")
+    with pytest.raises(kv.FormatError, match="No such file"):
+        model.save(tmp_path / "nowhere" / "m.kv.json")
+    assert os.listdir(tmp_path) == []
+
+
+def test_a_file_keeps_its_permissions_and_a_link_its_target(tmp_path):
+    target, link = tmp_path / "real.kv.json", tmp_path / "link.kv.json"
+    model = kv.load("shelf_door")
+    model.save(target)
+    target.chmod(0o640)
+    link.symlink_to(target)
+    model.save(link)
+    assert link.is_symlink()
+    assert stat.S_IMODE(target.stat().st_mode) == 0o640
+    assert kv.load(target).snapshot() == model.snapshot()
