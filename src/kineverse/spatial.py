@@ -8,7 +8,9 @@ part.
 
 from __future__ import annotations
 
-from typing import Any, TypeAlias
+import math
+from collections.abc import Iterable
+from typing import TypeAlias
 
 import casadi as ca
 import numpy as np
@@ -17,6 +19,7 @@ import numpy.typing as npt
 from .errors import ShapeError, ValueRejectedError
 from .expressions.expression import Expression, ExpressionLike, array, as_expression, make, union
 from .expressions.functions import arctan2, cos, norm, sin, sqrt, where
+from .motions import X, Y, Z, turn
 
 Vector: TypeAlias = ExpressionLike
 
@@ -37,40 +40,23 @@ def translation(x: ExpressionLike, y: ExpressionLike = 0.0, z: ExpressionLike = 
     return make(ca.SX(_TRANSLATION, column), (4, 4), union(parts))
 
 
+_ONE = ca.SX(1)
 _TRANSLATION = ca.Sparsity.triplet(4, 4, [0, 1, 2, 0, 1, 2, 3], [0, 1, 2, 3, 3, 3, 3])
 
 
 def rotation_x(angle: ExpressionLike) -> Expression:
     """Return the 4×4 rotation by ``angle`` [rad] about x."""
-    return _turn(angle, _ABOUT_X)
+    return turn(X, angle)
 
 
 def rotation_y(angle: ExpressionLike) -> Expression:
     """Return the 4×4 rotation by ``angle`` [rad] about y."""
-    return _turn(angle, _ABOUT_Y)
+    return turn(Y, angle)
 
 
 def rotation_z(angle: ExpressionLike) -> Expression:
     """Return the 4×4 rotation by ``angle`` [rad] about z."""
-    return _turn(angle, _ABOUT_Z)
-
-
-# Column by column, where a rotation about an axis has entries, and which: cos, sin, -sin or 1. Built sparse,
-# because a robot has dozens of these and each would cost ten times as much element by element.
-_ABOUT_X = ca.Sparsity.triplet(4, 4, [0, 1, 2, 1, 2, 3], [0, 1, 1, 2, 2, 3]), (3, 0, 1, 2, 0, 3)
-_ABOUT_Y = ca.Sparsity.triplet(4, 4, [0, 2, 1, 0, 2, 3], [0, 0, 1, 2, 2, 3]), (0, 2, 3, 1, 0, 3)
-_ABOUT_Z = ca.Sparsity.triplet(4, 4, [0, 1, 0, 1, 2, 3], [0, 0, 1, 1, 2, 3]), (0, 1, 2, 0, 3, 3)
-_ONE = ca.SX(1)
-
-
-def _turn(angle: ExpressionLike, pattern: tuple[Any, tuple[int, ...]]) -> Expression:
-    a = as_expression(angle)
-    if a.shape:
-        raise ShapeError(f"An angle is a scalar, not of shape {a.shape}.")
-    s = ca.SX.unary(ca.OP_SIN, a._sx)
-    entries = (ca.SX.unary(ca.OP_COS, a._sx), s, ca.SX.unary(ca.OP_NEG, s), _ONE)
-    sparsity, which = pattern
-    return make(ca.SX(sparsity, ca.vertcat(*(entries[i] for i in which))), (4, 4), a._nodes)
+    return turn(Z, angle)
 
 
 def axis_angle(axis: Vector, angle: ExpressionLike) -> Expression:
@@ -306,14 +292,22 @@ def unit(v: Vector, what: str = "The vector") -> Expression:
     return expression / norm(expression)
 
 
-def normalised(v: npt.ArrayLike) -> npt.NDArray[np.float64] | None:
+def normalised(v: Iterable[float]) -> tuple[float, ...] | None:
     """Return numbers divided by their length, entries within 1e-15 of 0 and ±1 exact; None if it is zero."""
-    numbers = np.asarray(v, dtype=float)
-    largest = np.abs(numbers).max()
-    if not 0 < largest < np.inf:
+    numbers = [float(c) for c in v]
+    largest = max(map(abs, numbers))
+    if not 0 < largest < math.inf:
         return None
-    scaled = numbers / largest  # or the square of something tiny is nothing
-    return snapped(scaled / np.linalg.norm(scaled))
+    scaled = [c / largest for c in numbers]  # or the square of something tiny is nothing
+    length = math.sqrt(sum(c * c for c in scaled))
+    result = tuple(_snapped(c / length) for c in scaled)
+    return None if any(math.isnan(c) for c in result) else result
+
+
+def _snapped(number: float) -> float:
+    nearest = float(round(number)) if math.isfinite(number) else number
+    # Adding 0.0 turns -0.0 into 0.0.
+    return (nearest if abs(number - nearest) < 1e-15 else number) + 0.0
 
 
 def snapped(numbers: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
@@ -321,8 +315,7 @@ def snapped(numbers: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
 
     cos(π/2) is 6e-17 in floating point; what was meant is 0, and zeros make expressions small.
     """
-    nearest = np.round(numbers)
-    return np.where(np.abs(numbers - nearest) < 1e-15, nearest, numbers) + 0.0
+    return np.reshape([_snapped(n) for n in numbers.ravel().tolist()], numbers.shape)
 
 
 def _three(v: Vector, what: str) -> Expression:

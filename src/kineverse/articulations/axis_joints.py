@@ -8,7 +8,8 @@ import numpy as np
 
 from kineverse.expressions.expression import Expression
 from kineverse.model.body import Pose, Vector3
-from kineverse.spatial import normalised, rotation_x, rotation_y, rotation_z, snapped, translation
+from kineverse.motions import X, Y, Z, slide, turn
+from kineverse.spatial import normalised, snapped
 
 from .joint import AxisJoint
 
@@ -33,15 +34,14 @@ class Prismatic(AxisJoint):
 
     def motion(self, q: Expression) -> tuple[Pose | Expression, ...]:
         """Return joint_T_child as factors."""
-        x, y, z = unit_axis(self.axis)
-        return (translation(x * q, y * q, z * q),)
+        return (slide(unit_axis(self.axis), q),)
 
 
 def unit_axis(axis: Vector3) -> tuple[float, float, float]:
     """Return the axis at length one."""
     numbers = normalised(axis)
     assert numbers is not None  # joints check their axis when they are made
-    x, y, z = numbers.tolist()
+    x, y, z = numbers
     return x, y, z
 
 
@@ -52,13 +52,13 @@ def rotation_factors(axis: Vector3, q: Expression) -> tuple[Pose | Expression, .
     column the axis.
     """
     x, y, z = unit_axis(axis)
-    for component, rotation in ((x, rotation_x), (y, rotation_y), (z, rotation_z)):
+    for component, about in ((x, X), (y, Y), (z, Z)):
         if abs(component) == 1.0 and (x, y, z).count(0.0) == 2:
-            return (rotation(q if component > 0 else -q),)
-    turn = np.eye(4)
+            return (turn(about, q if component > 0 else -q),)
+    to_axis = np.eye(4)
     a = np.array([x, y, z])
     helper = np.eye(3)[np.argmin(np.abs(a))]
     first = np.cross(helper, a)
     first /= np.linalg.norm(first)
-    turn[:3, :3] = snapped(np.column_stack([first, np.cross(a, first), a]))
-    return Pose.of(turn), rotation_z(q), Pose.of(turn.T)
+    to_axis[:3, :3] = snapped(np.column_stack([first, np.cross(a, first), a]))
+    return Pose.of(to_axis), turn(Z, q), Pose.of(to_axis.T)

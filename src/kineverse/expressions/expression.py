@@ -61,6 +61,10 @@ class Expression:
 
     def _set(self, sx: SX, shape: Shape, nodes: frozenset[Node]) -> None:
         self._sx = sx
+        self._describe(shape, nodes)
+
+    def _describe(self, shape: Shape, nodes: frozenset[Node]) -> None:
+        """Set all but the graph."""
         self._shape = shape
         self._nodes = nodes
         self._leaves: tuple[tuple[Symbol, ...], tuple[Node, ...]] | None = None
@@ -413,6 +417,8 @@ class Expression:
     def __reduce__(self) -> Any:
         from .structure import pack, unpack
 
+        if not self._shape and self._sx.is_constant():
+            return as_expression, (float(self._sx),)
         return unpack, pack(self)
 
     def __copy__(self) -> Expression:

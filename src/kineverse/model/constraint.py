@@ -40,13 +40,11 @@ class Constraint:
         ValueRejectedError
             If the expression is constant, or constant bounds leave nothing between them, or one is NaN.
         """
-        parts = []
-        for part, name in ((lower, "lower bound"), (expression, "expression"), (upper, "upper bound")):
-            checked = as_expression(part)
-            if checked.shape:
-                raise ShapeError(f"The {name} of a constraint is a scalar, not of shape {checked.shape}.")
-            parts.append(checked)
-        low, middle, high = parts
+        low, middle, high = as_expression(lower), as_expression(expression), as_expression(upper)
+        if low.shape or middle.shape or high.shape:
+            for part, name in ((low, "lower bound"), (middle, "expression"), (high, "upper bound")):
+                if part.shape:
+                    raise ShapeError(f"The {name} of a constraint is a scalar, not of shape {part.shape}.")
         if not middle.symbols:
             raise ValueRejectedError(
                 f"The constrained expression ({middle!r}) depends on no symbol. "

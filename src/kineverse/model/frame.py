@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Any, TypeAlias
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import casadi as ca
 import numpy as np
@@ -15,6 +15,9 @@ from kineverse.errors import ShapeError
 from kineverse.expressions.expression import Expression, as_expression
 
 from .body import Pose
+
+if TYPE_CHECKING:
+    from .kinematics import Placement
 
 WORLD = "world"
 
@@ -37,6 +40,11 @@ class Frame:
 
     parent: str
     factors: tuple[Pose | Expression, ...]
+    # Where this was last found to be in the world: shared by all models that share the frame.
+    placement: Placement | None = field(default=None, init=False, repr=False, compare=False)
+
+    def __reduce__(self) -> Any:
+        return Frame, (self.parent, self.factors)
 
     @staticmethod
     def of(parent: str, transform: TransformLike | Sequence[TransformLike]) -> Frame:

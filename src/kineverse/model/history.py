@@ -233,7 +233,7 @@ class History:
         except Exception as error:
             raise EditError(f"Operation {tag!r} raised {type(error).__name__}: {error}") from error
         for (kind, name), value in writes.items():
-            if not isinstance(name, str) or not name or any(not part for part in name.split("/")):
+            if not isinstance(name, str) or not name or "//" in f"/{name}/":
                 raise EditError(f"Operation {tag!r} writes {kind} under {name!r}, which is not a name.")
             if kind == FRAMES:
                 self._check_parent(name, value, reads, entry.place)
@@ -291,14 +291,18 @@ class History:
 
     def _touched(self, cell: Cell, old: Any, new: Any, place: int) -> None:
         """Note that a write at ``place`` changed, for those who read it."""
+        kind, name = cell
+        writers = self.cells.get(cell, ())
+        if old is ABSENT and len(writers) == 1 and cell not in self.reading and not self.listing[kind]:
+            # The first to write what nobody asked for: most of what loading a description does.
+            self._set_head(cell, new)
+            return
         if old is ABSENT or new is ABSENT:
             # What readers find instead is what was written before.
             earlier = self.value_at(cell, place)
             old, new = (earlier if value is ABSENT else value for value in (old, new))
         if old is new or (old is not ABSENT and new is not ABSENT and old == new):
             return
-        kind, name = cell
-        writers = self.cells.get(cell, ())
         index = bisect_right(writers, place, key=_PLACE)
         following = writers[index].place if index < len(writers) else None
         if following is None:

@@ -7,7 +7,7 @@ nothing.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
 import casadi as ca
@@ -18,6 +18,7 @@ from kineverse.errors import ModelError
 from kineverse.expressions.expression import NO_NODES, Expression, make
 from kineverse.expressions.layout import SX
 from kineverse.expressions.node import Node
+from kineverse.motions import AxisMotion
 from kineverse.symbols import Symbol
 
 from .body import Pose
@@ -48,8 +49,6 @@ class Placement:
     nodes: frozenset[Node]
     offset: npt.NDArray[np.float64]
     steps: tuple[Step, ...] = ()
-    # The chain this was composed from, to see whether it still holds.
-    frame: Frame | None = None
     parent: Placement | None = None
 
     def then(self, frame: Frame) -> Placement:
@@ -63,11 +62,17 @@ class Placement:
             rotation, position = _with_offset(rotation, position, offset)
             steps.append(Step(rotation, position, nodes, factor))
             nodes = nodes | factor._nodes if factor._nodes else nodes
-            sx = factor._sx
-            position = ca.mtimes(rotation, sx[:3, 3]) + position
-            rotation = ca.mtimes(rotation, sx[:3, :3])
+            if isinstance(factor, AxisMotion):
+                if factor.turns:
+                    rotation = ca.mtimes(rotation, factor.rotation)
+                else:
+                    position = ca.mtimes(rotation, factor.offset) + position
+            else:
+                sx = factor._sx
+                position = ca.mtimes(rotation, sx[:3, 3]) + position
+                rotation = ca.mtimes(rotation, sx[:3, :3])
             offset = IDENTITY
-        return Placement(rotation, position, nodes, offset, tuple(steps), frame, self)
+        return Placement(rotation, position, nodes, offset, tuple(steps), self)
 
     def parts(self) -> tuple[SX, SX]:
         """Return rotation and position."""
@@ -150,6 +155,20 @@ def place(chain: Sequence[str], lookup: FrameLookup, start: Placement = ROOT) ->
     return placement
 
 
+def place_in_world(name: str, lookup: FrameLookup) -> Placement:
+    """Return where a frame is in the world; what is composed on the way is kept with the frames."""
+    placement = ROOT
+    for link in reversed(ancestors(name, lookup)):
+        frame = lookup(link)
+        known = frame.placement
+        # Valid as long as it was composed from this very parent.
+        if known is None or known.parent is not placement:
+            known = placement.then(frame)
+            object.__setattr__(frame, "placement", known)
+        placement = known
+    return placement
+
+
 def relative(frame: str, relative_to: str, lookup: FrameLookup) -> Expression:
     """Return relative_to_T_frame in plain coordinates."""
     from kineverse.spatial import inverse
@@ -194,6 +213,40 @@ def twists(base: Placement, tip: Placement, heuristic: bool) -> tuple[SX, SX, di
 
 
 def _add_step(found: dict[Symbol, Twist], step: Step, tip: SX, sign: int, heuristic: bool) -> None:
+    """Add the twists that a moving factor makes at the tip, against them where the sign is negative."""
+    moves = _axis_twists if isinstance(step.factor, AxisMotion) else _twists
+    for key, velocity, omega, entry_nodes in moves(step, tip, heuristic):
+        if sign < 0:
+            velocity, omega = -velocity, -omega
+        nodes = entry_nodes | step.nodes
+        if key in found:
+            known = found[key]
+            known.linear, known.angular = known.linear + velocity, known.angular + omega
+            known.nodes = known.nodes | nodes
+        else:
+            found[key] = Twist(velocity, omega, nodes)
+
+
+def _axis_twists(step: Step, tip: SX, heuristic: bool) -> Iterator[tuple[Symbol, SX, SX, frozenset[Node]]]:
+    """Yield speed, linear and angular velocity and nodes of a motion about or along a direction."""
+    motion = step.factor
+    assert isinstance(motion, AxisMotion)
+    if sum(d != 0 for d in motion.direction) == 1:
+        index = next(i for i, d in enumerate(motion.direction) if d)
+        unit = step.rotation[:, index]
+        direction = unit if motion.direction[index] == 1 else -unit
+    else:
+        direction = ca.mtimes(step.rotation, ca.SX(ca.DM(motion.direction)))
+    for key, entry in motion.amount.gradient(heuristic).items():
+        along = direction * entry._sx
+        if motion.turns:
+            yield key, ca.cross(along, tip - step.position), along, entry._nodes
+        else:
+            yield key, along, ca.SX(3, 1), entry._nodes
+
+
+def _twists(step: Step, tip: SX, heuristic: bool) -> Iterator[tuple[Symbol, SX, SX, frozenset[Node]]]:
+    """Yield the same of any rigid motion."""
     factor = step.factor
     entries = factor.gradient(heuristic)
     if not entries:
@@ -212,12 +265,4 @@ def _add_step(found: dict[Symbol, Twist], step: Step, tip: SX, sign: int, heuris
                 linear = linear - ca.cross(local, factor_position)
         if linear.nnz():
             velocity = velocity + ca.mtimes(step.rotation, linear)
-        if sign < 0:
-            velocity, omega = -velocity, -omega
-        nodes = entry._nodes | step.nodes
-        if key in found:
-            known = found[key]
-            known.linear, known.angular = known.linear + velocity, known.angular + omega
-            known.nodes = known.nodes | nodes
-        else:
-            found[key] = Twist(velocity, omega, nodes)
+        yield key, velocity, omega, entry._nodes

@@ -49,22 +49,45 @@ class Reads:
 class Reader:
     """The model before an operation: the same names as on :class:`~kineverse.Model`, every read recorded.
 
-    Attributes
-    ----------
-    frames, bodies, articulations, constraints, data
-        Mappings by name, in plain coordinates.
+    Expressions are in plain coordinates, save those of :meth:`fk` and :meth:`carry`.
     """
 
     def __init__(
         self, value_at: Callable[[Cell], Any], names_at: Callable[[str], list[str]], reads: Reads
     ) -> None:
         self._value_at = value_at
+        self._names_at = names_at
         self._reads = reads
-        self.frames: Mapping[str, Frame] = _View(FRAMES, value_at, names_at, reads)
-        self.bodies: Mapping[str, Body] = _View(BODIES, value_at, names_at, reads)
-        self.articulations: Mapping[str, Articulation] = _View(ARTICULATIONS, value_at, names_at, reads)
-        self.constraints: Mapping[str, Constraint] = _View(CONSTRAINTS, value_at, names_at, reads)
-        self.data: Mapping[str, Any] = _View(DATA, value_at, names_at, reads)
+
+    # Made when asked for: most operations read little, and some read nothing at all.
+
+    @property
+    def frames(self) -> Mapping[str, Frame]:
+        """Frames by name."""
+        return self._view(FRAMES)
+
+    @property
+    def bodies(self) -> Mapping[str, Body]:
+        """Bodies by the frame they belong to."""
+        return self._view(BODIES)
+
+    @property
+    def articulations(self) -> Mapping[str, Articulation]:
+        """Articulations by name."""
+        return self._view(ARTICULATIONS)
+
+    @property
+    def constraints(self) -> Mapping[str, Constraint]:
+        """Constraints by name."""
+        return self._view(CONSTRAINTS)
+
+    @property
+    def data(self) -> Mapping[str, Any]:
+        """All other data by name."""
+        return self._view(DATA)
+
+    def _view(self, kind: str) -> _View[Any]:
+        return _View(kind, self._value_at, self._names_at, self._reads)
 
     def fk(self, frame: str, relative_to: str = WORLD) -> Expression:
         """Return relative_to_T_frame, 4×4, coordinates carried by the rates that hold here."""

@@ -12,6 +12,7 @@ import numpy as np
 
 from kineverse.errors import UnknownNameError, suggest
 from kineverse.expressions.expression import NO_NODES, Expression, as_expression, make
+from kineverse.motions import AxisMotion
 from kineverse.state import State
 from kineverse.symbols import Symbol, check_symbols, parse_symbol_name
 
@@ -21,7 +22,6 @@ from .body import Body
 from .constraint import Constraint
 from .frame import WORLD, Frame
 from .integration import integrate
-from .kinematics import Placement
 from .operation import ARTICULATIONS, BODIES, CONSTRAINTS, DATA, FRAMES, KINDS, RATES
 from .rates import Rates
 from .reader import ABSENT, Cell, missing
@@ -71,7 +71,6 @@ class ModelView:
         self._poses: dict[tuple[str, str], Expression] = {}
         self._jacobians: dict[Any, Expression] = {}
         self._carried_constraints: dict[str, Constraint] = {}
-        self._placements: dict[str, Placement] = {}
         self._all_symbols: tuple[Symbol, ...] | None = None
         self._checks: Checks | None = None
 
@@ -218,7 +217,7 @@ class ModelView:
             known = self._poses.get((frame, relative_to))
             if known is None:
                 if relative_to == WORLD:
-                    known = self._placement(frame).matrix()
+                    known = kinematics.place_in_world(frame, self._frame).matrix()
                 else:
                     known = kinematics.relative(frame, relative_to, self._frame)
                 known = self._poses[frame, relative_to] = self.rates.carry(known)
@@ -270,7 +269,7 @@ class ModelView:
     ) -> Expression:
         rates = self.rates
         if relative_to == WORLD:
-            base, tip = kinematics.ROOT, self._placement(frame)
+            base, tip = kinematics.ROOT, kinematics.place_in_world(frame, self._frame)
         else:
             to_base, to_tip = kinematics.branches(frame, relative_to, self._frame)
             base, tip = kinematics.place(to_base, self._frame), kinematics.place(to_tip, self._frame)
@@ -306,7 +305,9 @@ class ModelView:
             found: set[Symbol] = set()
             for name in (*base, *down):
                 for factor in self._frame(name).factors:
-                    if isinstance(factor, Expression):
+                    if isinstance(factor, AxisMotion):
+                        found.update(factor.amount.gradient(False))
+                    elif isinstance(factor, Expression):
                         found.update(factor.gradient(False))
             rates = self.rates
             free: set[Symbol] = set()
@@ -320,18 +321,6 @@ class ModelView:
         except (KeyError, TypeError):
             raise missing(FRAMES, name, (*self._head[FRAMES], WORLD)) from None
         return frame
-
-    def _placement(self, name: str) -> Placement:
-        chain = kinematics.ancestors(name, self._frame)
-        placement = kinematics.ROOT
-        for link in reversed(chain):
-            frame = self._frame(link)
-            known = self._placements.get(link)
-            # Valid as long as it was composed from this very frame and this very parent.
-            if known is None or known.frame is not frame or known.parent is not placement:
-                known = self._placements[link] = placement.then(frame)
-            placement = known
-        return placement
 
     # -- constraints ---------------------------------------------------------------------------------------
 
