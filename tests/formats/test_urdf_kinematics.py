@@ -1,98 +1,202 @@
-"""Where the links are, against pinocchio, for every URDF of the shared data that both can read."""
+"""Where links are and how they move, against pinocchio, for every robot at hand that both can read."""
 
 from __future__ import annotations
 
+import sysconfig
 from pathlib import Path
 
 import numpy as np
 import pytest
+from _pytest.mark import ParameterSet
+from pinocchio_oracle import FORMS, Reference, pin
 from robots import LIMIT, SHARED, robot
 from robots import joint as joint_text
+from scipy.spatial.transform import Rotation
 from verdicts import verdict
 
 import kineverse as kv
 from kineverse.formats.urdf import Robot, parse_urdf, read_urdf
 from kineverse.formats.urdf.operations import robot_operations
 
-pin = pytest.importorskip("pinocchio")
+DOCS = Path(__file__).parents[2] / "docs" / "urdf.md"
+INSTALLED = Path(sysconfig.get_path("purelib"), "cmeel.prefix/share/example-robot-data/robots")
+LEAVES = 5
+CONFIGURATIONS = 2
+TOLERANCE = 1e-12
 
-# Pinocchio refuses negative efforts and materials defined twice; docs/urdf.md says why they are read here.
-UNREADABLE = (
-    "oems__eveR3_halodi__eve_r3_description__urdf__eve_r3.urdf",
-    "random__robot-assets__halodi__eve_r3.urdf",
-    "duplicate_materials.urdf",
-)
-
-
-def readable() -> list[Path | None]:
-    """Return the files that are read here and by pinocchio, relative to the shared data."""
-    files = sorted(path.relative_to(SHARED) for path in SHARED.rglob("*.urdf"))
-    kept = [f for f in files if f.parts[0] != "urdf_conformance" or isinstance(verdict(f), int)]
-    return [f for f in kept if f.name not in UNREADABLE] or [None]
-
-
-def positions_of(robot: Robot, rng: np.random.Generator) -> tuple[dict[str, float], dict[str, list[float]]]:
-    """Return random values by coordinate, and for each moving joint pinocchio's numbers."""
-    values: dict[str, float] = {}
-    numbers: dict[str, list[float]] = {}
-    for joint in robot.joints:
-        if joint.kind == "floating":
-            xyz, q = rng.uniform(-1, 1, 3), rng.normal(size=4)
-            q /= np.linalg.norm(q)
-            values |= dict(zip((f"{joint.name}/{c}" for c in "xyz"), xyz, strict=True))
-            values |= dict(zip((f"{joint.name}/q{c}" for c in "xyzw"), q, strict=True))
-            numbers[joint.name] = [*xyz, *q]
-        elif joint.mimic is None and joint.kind in ("revolute", "continuous", "prismatic"):
-            values[joint.name] = rng.uniform(-2, 2)
-    for joint in robot.joints:
-        if joint.kind in ("revolute", "continuous", "prismatic"):
-            mimic = joint.mimic
-            value = (
-                values[joint.name] if mimic is None else mimic.multiplier * values[mimic.joint] + mimic.offset
-            )
-            numbers[joint.name] = [np.cos(value), np.sin(value)] if joint.kind == "continuous" else [value]
-    return values, numbers
+# Read here but not by pinocchio, with what that says. docs/urdf.md says why they are read.
+NOT_IN_PINOCCHIO = {
+    "oems__eveR3_halodi__eve_r3_description__urdf__eve_r3.urdf": "min_effort are greater than max_effort",
+    "random__robot-assets__halodi__eve_r3.urdf": "min_effort are greater than max_effort",
+    "duplicate_materials.urdf": "does not contain a valid URDF model",
+}
+# Files of example-robot-data that break the specification; verdicts.py is about the shared ones.
+REFUSED = {
+    "alex_description/urdf/alex_psyonic_hands.urdf": 'it mimics "index_q1", and there is no joint of that name',
+    "ur_description/urdf/ur3.urdf": "line 6, <robot>: has no name",
+}
 
 
-def compare(text: str, description: Robot, seed: int) -> None:
-    reference = pin.buildModelFromXML(text)
-    rng = np.random.default_rng(seed)
-    values, numbers = positions_of(description, rng)
-    configuration = np.concatenate([[]] + [numbers[name] for name in reference.names[1:]])
-    data = reference.createData()
-    pin.framesForwardKinematics(reference, data, configuration)
+def files() -> list[ParameterSet]:
+    """Return the files that are to be read, each with the folder and the name it is known by."""
+    found = []
+    for folder in (SHARED, INSTALLED):
+        below = [(folder / f, str(f)) for f in sorted(p.relative_to(folder) for p in folder.rglob("*.urdf"))]
+        found += [pytest.param(file, id=name) for file, name in below if is_readable(file, name)]
+        if not below:
+            reason = f"no {folder}"
+            found.append(pytest.param(folder, id=folder.name, marks=pytest.mark.skip(reason=reason)))
+    return found
+
+
+def is_readable(file: Path, name: str) -> bool:
+    if name.startswith("urdf_conformance"):
+        return isinstance(verdict(file), int) and file.name not in NOT_IN_PINOCCHIO
+    return name not in REFUSED
+
+
+def with_name(name: str) -> Path:
+    found = [
+        p for folder in (SHARED, INSTALLED) for p in folder.rglob("*.urdf") if p.as_posix().endswith(name)
+    ]
+    if not found:
+        pytest.skip(f"no {name} below {SHARED} or {INSTALLED}")
+    return found[0]
+
+
+def assert_close(result: np.ndarray, expected: np.ndarray, what: str) -> None:
+    size = max(1.0, np.abs(expected).max(initial=0))
+    np.testing.assert_allclose(result, expected, rtol=0, atol=TOLERANCE * size, err_msg=what)
+
+
+def assert_equal_to_pinocchio(reference: Reference, description: Robot, seed: int) -> None:
+    """Compare poses of all links, and Jacobians of some that carry nothing, at random configurations."""
     model = kv.Model()
     with model.edit() as edit:
         for operation in robot_operations(description, "robot"):
             edit.apply(operation)
     # Two robots call their links "/base_link"; the empty part is left out.
-    frames = ["robot/" + link.name.removeprefix("/") for link in description.links]
-    root = "robot/" + description.root.removeprefix("/")
-    poses = [model.fk(frame, root) for frame in frames]
-    symbols = sorted({str(s) for pose in poses for s in pose.symbols})
-    named = {symbol: values[symbol.removeprefix("robot/")] for symbol in symbols}
-    for link, pose in zip(description.links, poses, strict=True):
-        expected = data.oMf[reference.getFrameId(link.name, pin.FrameType.BODY)].homogeneous
-        result = pose({s: named[str(s)] for s in pose.symbols})
-        assert np.allclose(result, expected, rtol=0, atol=1e-12 * max(1.0, np.abs(expected).max())), link.name
+    frames = {link.name: "robot/" + link.name.removeprefix("/") for link in description.links}
+    root = frames[description.root]
+    parents = {joint.parent for joint in description.joints}
+    leaves = [link for link in frames if link not in parents]
+    leaves = leaves[:: max(1, len(leaves) // LEAVES)][:LEAVES]
+    jacobians = [(link, form) for link in leaves for form in FORMS]
+    poses = [model.fk(frame, root) for frame in frames.values()]
+    columns = [model.jacobian(frames[link], root, form) for link, form in jacobians]
+    symbols = [*model.degrees_of_freedom]
+    f = kv.compile([*poses, *columns], symbols, tier="interpreter")
+    rng = np.random.default_rng(seed)
+    for _ in range(CONFIGURATIONS):
+        values = reference.random_values(rng)
+        reference.place(values)
+        results = f({f"robot/{name}": value for name, value in values.items()})
+        for link, result in zip(frames, results, strict=False):
+            assert_close(result, reference.pose(link), link)
+        for (link, form), result in zip(jacobians, results[len(frames) :], strict=True):
+            # Ours has columns for what moves the link; all others have to be zero there.
+            whole = np.zeros((6, len(reference.speeds)))
+            own = [str(s).removeprefix("robot/") for s in model.speeds_of(frames[link], root)]
+            whole[:, [reference.speeds.index(s) for s in own]] = result
+            assert_close(whole, reference.jacobian(link, form), f"{form} Jacobian of {link}")
 
 
-@pytest.mark.parametrize("file", readable(), ids=str)
-def test_links_are_where_pinocchio_puts_them(file: Path | None):
-    if file is None:
-        pytest.skip(f"no {SHARED}")
-    compare((SHARED / file).read_text(), read_urdf(SHARED / file), seed=len(file.name))
+@pytest.mark.parametrize("file", files())
+def test_links_are_and_move_where_pinocchio_puts_them(file: Path) -> None:
+    assert_equal_to_pinocchio(Reference(file.read_text()), read_urdf(file), seed=len(file.name))
 
 
-def test_every_type_in_one_chain():
-    kinds = ["floating", "revolute", "prismatic", "continuous", "fixed", "revolute"]
-    origin = '<origin xyz="0.{i} 0 .5" rpy="{i} -1.5707963267948966 .3"/><axis xyz="{i} 1 -.5"/>'
+@pytest.mark.parametrize("name", NOT_IN_PINOCCHIO)
+def test_what_pinocchio_cannot_read_is_known_by_name(name: str) -> None:
+    file = with_name(name)
+    with pytest.raises(ValueError, match=NOT_IN_PINOCCHIO[name]):
+        Reference(file.read_text())
+    assert read_urdf(file).dof == verdict(file)
+
+
+@pytest.mark.parametrize("name", REFUSED)
+def test_robots_that_break_the_specification_are_refused_by_name(name: str) -> None:
+    with pytest.raises(kv.FormatError) as info:
+        read_urdf(with_name(name))
+    assert REFUSED[name] in str(info.value)
+
+
+@pytest.mark.parametrize("name", [*NOT_IN_PINOCCHIO, *REFUSED])
+def test_the_docs_name_what_cannot_be_compared(name: str) -> None:
+    rows = [row for row in DOCS.read_text().splitlines() if f"`{name.rsplit('__', 1)[-1]}`" in row]
+    message = {**NOT_IN_PINOCCHIO, **REFUSED}[name]
+    assert any(message in row for row in rows), rows
+
+
+ORIGIN = '<origin xyz="0.{i} 0 .5" rpy="{i} -1.5707963267948966 .3"/>'
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_every_type_in_one_chain(seed: int) -> None:
+    kinds = [
+        "floating",
+        "revolute",
+        "planar",
+        "prismatic",
+        "continuous",
+        "fixed",
+        "planar",
+        "floating",
+        "revolute",
+    ]
+    kinds = [str(kind) for kind in np.random.default_rng(seed).permutation(kinds)]
+    # Pinocchio leaves the axis of a planar joint out of account, so that one is z.
+    axes = ["0 0 1" if kind == "planar" else f"{i} 1 -.5" for i, kind in enumerate(kinds)]
     text = robot(
         *(
-            joint_text(f"j{i}", f"l{i}", f"l{i + 1}", kind, origin.format(i=i) + LIMIT)
-            for i, kind in enumerate(kinds)
+            joint_text(
+                f"j{i}", f"l{i}", f"l{i + 1}", kind, f'{ORIGIN.format(i=i)}<axis xyz="{axis}"/>{LIMIT}'
+            )
+            for i, (kind, axis) in enumerate(zip(kinds, axes, strict=True))
         ),
         links=len(kinds) + 1,
     )
-    for seed in range(5):
-        compare(text, parse_urdf(text), seed)
+    assert_equal_to_pinocchio(Reference(text), parse_urdf(text), seed)
+
+
+@pytest.mark.parametrize("normal", [(1, 0, 0), (0, -3, 0), (1, 2, -3), (0.3, -0.1, 2), (0, 0, -1)], ids=str)
+def test_a_plane_with_any_normal_is_one_with_z_turned(normal: tuple[float, ...]) -> None:
+    """The plane of the docs: A turns z into the normal, and the child is turned back by its transpose."""
+    angle = np.arctan2(np.hypot(*normal[:2]), normal[2])
+    about = np.array([-normal[1], normal[0], 0.0]) if any(normal[:2]) else np.array([1.0, 0, 0])
+    turn = Rotation.from_rotvec(angle * about / np.linalg.norm(about))
+
+    def fixed(name: str, parent: str, child: str, rotation: Rotation) -> str:
+        rpy = " ".join(map(repr, pin.rpy.matrixToRpy(rotation.as_matrix()).tolist()))
+        return joint_text(name, parent, child, "fixed", f'<origin rpy="{rpy}"/>')
+
+    arm = joint_text("arm", "l1", "l2", "revolute", f'<origin xyz="1 2 3"/><axis xyz="0 1 0"/>{LIMIT}')
+    axis = '<axis xyz="{} {} {}"/>'.format(*normal)
+    ours = robot(joint_text("puck", "l0", "l1", "planar", axis), arm, links=3)
+    theirs = robot(
+        fixed("there", "l0", "l3", turn),
+        joint_text("puck", "l3", "l4", "planar", '<axis xyz="0 0 1"/>'),
+        fixed("back", "l4", "l1", turn.inv()),
+        arm,
+        links=5,
+    )
+    assert_equal_to_pinocchio(Reference(theirs), parse_urdf(ours), seed=1)
+
+
+def test_mimicry_along_a_chain_and_between_kinds() -> None:
+    """A slide follows an axle that follows an axle; both columns add up in one speed."""
+
+    def follow(source: str, factor: float, offset: float) -> str:
+        return f'<axis xyz="0 1 1"/><mimic joint="{source}" multiplier="{factor}" offset="{offset}"/>{LIMIT}'
+
+    text = robot(
+        joint_text("slide", "l0", "l1", "prismatic", follow("axle", -0.3, 0.2)),
+        joint_text("axle", "l1", "l2", "continuous", follow("arm", 2, -1)),
+        joint_text("arm", "l2", "l3", "revolute", LIMIT),
+        joint_text("hand", "l3", "l4", "revolute", f'<origin xyz="1 0 0"/>{LIMIT}'),
+        links=5,
+    )
+    reference = Reference(text)
+    assert_equal_to_pinocchio(reference, parse_urdf(text), seed=2)
+    assert reference.speeds == ["arm:velocity", "hand:velocity"]
+    np.testing.assert_allclose(reference.speed_map[:, 0], [-0.6, 2, 1, 0])
