@@ -82,6 +82,11 @@ class Symbol(Expression):
         object.__setattr__(self, name, value)
 
     @property
+    def symbols(self) -> tuple[Symbol, ...]:
+        """The symbol itself."""
+        return (self,)
+
+    @property
     def has_derivative(self) -> bool:
         """Whether the symbol moves with time; parameters do not."""
         return self.role != "parameter"

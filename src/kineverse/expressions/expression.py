@@ -488,7 +488,7 @@ def as_expression(value: ExpressionLike) -> Expression:
         if value != value:
             raise ValueRejectedError("NaN is not accepted as a constant.")
         try:
-            return make(ca.SX(float(value)), (), NO_NODES)
+            return _constant(float(value))
         except OverflowError:
             raise ValueRejectedError("The number is too large for a 64-bit float.") from None
     if isinstance(value, (list, tuple)) or (isinstance(value, np.ndarray) and value.dtype == object):
@@ -509,6 +509,13 @@ def as_expression(value: ExpressionLike) -> Expression:
     if np.isnan(numbers).any():
         raise ValueRejectedError(f"NaN is not accepted as a constant (in an array of shape {numbers.shape}).")
     return make(layout.from_array(numbers), numbers.shape, NO_NODES)
+
+
+def _constant(number: float) -> Expression:
+    expression = object.__new__(Expression)
+    expression._set(ca.SX(number), (), NO_NODES)
+    expression._leaves = (), ()
+    return expression
 
 
 def array(values: Any) -> Expression:

@@ -18,7 +18,7 @@ import numpy as np
 from kineverse.errors import ExpressionError
 
 from . import layout
-from .expression import NO_NODES, Expression, make, union
+from .expression import NO_NODES, Expression, as_expression, make, union
 from .leaves import bottom_up, leaves
 from .substitution import apply, renamed, replace_nodes, stand_ins
 
@@ -40,6 +40,8 @@ def gradient(expression: Expression, heuristic: bool = True) -> Mapping[Symbol, 
 
 def _gradient(expression: Expression, heuristic: bool) -> dict[Symbol, Expression]:
     symbols, inner = leaves(expression)
+    if len(symbols) == 1 and symbols[0] is expression:
+        return {symbols[0].derivative(): as_expression(1.0)} if symbols[0].has_derivative else {}
     # Only leaves with a gradient take part: the partial derivative by a parameter in an exponent is NaN for a
     # negative base, and nobody asked for it.
     moving = [s for s in symbols if s.has_derivative]

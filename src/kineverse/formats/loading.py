@@ -2,15 +2,31 @@
 
 from __future__ import annotations
 
+import gc
+import hashlib
 import os
+from collections import OrderedDict
 from collections.abc import Iterator
+from contextlib import contextmanager
 
 from kineverse.errors import FormatError
-from kineverse.model.model import Model
+from kineverse.model.frame import WORLD
+from kineverse.model.model import Model, Snapshot
 from kineverse.model.operation import Operation
 from kineverse.shipped.bases import base_of
 
+from .document import operations_from
+from .files import read_file
 from .sources import Source, locate_model
+from .urdf.operations import robot_operations
+from .urdf.reader import parse_urdf
+
+MOST_REMEMBERED = 16
+LARGEST_REMEMBERED = 1 << 22
+"""Models whose files are larger than this [byte] are not remembered, they would take too much memory."""
+
+# Models loaded by this process, the latest last, by everything that they follow from.
+_REMEMBERED: OrderedDict[tuple[Source, str | None, bytes], Snapshot] = OrderedDict()
 
 
 def load(source: str | os.PathLike[str], prefix: str | None = None) -> Model:
@@ -32,8 +48,23 @@ def load(source: str | os.PathLike[str], prefix: str | None = None) -> Model:
     FormatError
         If the file is not what it should be, with file, line, element and reason.
     """
-    model = Model()
-    model.include(source, prefix)
+    found = locate_model(source)
+    content = read_file(found.path)
+    key = found, prefix, hashlib.blake2b(content).digest()
+    known = _REMEMBERED.pop(key, None)
+    if known is None:
+        model = Model()
+        with model.edit() as edit, no_collection():
+            for tag, operation in _operations(found, content, prefix):
+                edit.apply(operation, tag)
+        if len(content) > LARGEST_REMEMBERED:
+            return model
+        known = model.snapshot()
+    else:
+        model = known.model()
+    _REMEMBERED[key] = known
+    while len(_REMEMBERED) > MOST_REMEMBERED:
+        _REMEMBERED.popitem(last=False)
     return model
 
 
@@ -42,32 +73,37 @@ def operations_of(
 ) -> Iterator[tuple[str, Operation]]:
     """Yield the operations of a file or shipped model, each with its tag."""
     found = locate_model(source)
+    yield from _operations(found, read_file(found.path), prefix)
+
+
+def _operations(source: Source, content: bytes, prefix: str | None) -> Iterator[tuple[str, Operation]]:
+    path, name = source.path, source.path.name
     if prefix is None:
-        prefix = found.shipped
-    if found.path.name.endswith(".kv.json"):
-        from .document import read_document
-
-        yield from read_document(found.path, prefix or None)
-        return
-    for operation in _read(found, prefix or None):
-        yield operation.default_tag(), operation
-
-
-def _read(source: Source, prefix: str | None) -> Iterator[Operation]:
-    name = source.path.name
-    if name.endswith((".urdf", ".xml")):
-        from .urdf.operations import robot_operations
-        from .urdf.reader import read_urdf
-
-        robot = read_urdf(source.path)
+        prefix = source.shipped
+    prefix = prefix or None
+    if name.endswith(".kv.json"):
+        yield from operations_from(content, str(path), prefix)
+    elif name.endswith((".urdf", ".xml")):
+        robot = parse_urdf(content, source=name, folder=str(path.absolute().parent))
         base = base_of(source.shipped, prefix) if source.shipped else None
-        if base is None:
-            yield from robot_operations(robot, prefix)
-        else:
-            yield base
-            yield from robot_operations(robot, prefix, parent=base.child)
-        return
-    raise FormatError(
-        f"{source.path}: this version reads URDF (.urdf, .xml) and documents (.kv.json), "
-        f"not '{''.join(source.path.suffixes) or name}'."
-    )
+        if base is not None:
+            yield base.default_tag(), base
+        for operation in robot_operations(robot, prefix, parent=WORLD if base is None else base.child):
+            yield operation.default_tag(), operation
+    else:
+        raise FormatError(
+            f"{path}: this version reads URDF (.urdf, .xml) and documents (.kv.json), "
+            f"not '{''.join(path.suffixes) or name}'."
+        )
+
+
+@contextmanager
+def no_collection() -> Iterator[None]:
+    """Pause the collector: loading makes many objects and no garbage, all of which it would look at often."""
+    collecting = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if collecting:
+            gc.enable()

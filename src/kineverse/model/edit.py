@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import gc
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -229,16 +228,10 @@ class Edit:
 
     def include(self, source: Any, prefix: str | None = None) -> list[str]:
         """Append the operations of a file or shipped model, see :func:`kineverse.load`; return their tags."""
-        from kineverse.formats import operations_of
+        from kineverse.formats.loading import no_collection, operations_of
 
-        # Loading makes many objects and no garbage; the collector would look at all of them again and again.
-        collecting = gc.isenabled()
-        gc.disable()
-        try:
+        with no_collection():
             return [self.apply(operation, tag) for tag, operation in operations_of(source, prefix)]
-        finally:
-            if collecting:
-                gc.enable()
 
     # -- inside --------------------------------------------------------------------------------------------
 

@@ -9,8 +9,8 @@ A document is one JSON object::
 Reading one runs no code and imports no name.
 """
 
-from .reading import operations_from, read_document
+from .reading import operations_from
 from .recorded import Recorded
 from .writing import document_of, write_document
 
-__all__ = ["Recorded", "document_of", "operations_from", "read_document", "write_document"]
+__all__ = ["Recorded", "document_of", "operations_from", "write_document"]

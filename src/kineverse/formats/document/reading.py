@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import json
-import os
-from pathlib import Path
 from typing import Any, NoReturn
 
 from kineverse.errors import FormatError, KineverseError
+from kineverse.formats.files import MAX_BYTES
 from kineverse.model.operation import FRAMES, KINDS, RATES
 from kineverse.model.reader import Cell, Read
 from kineverse.symbols import symbol_name
@@ -18,45 +17,32 @@ from .recorded import Recorded
 from .values import Rename, as_read, frame_name
 from .writing import FORMAT, VERSION
 
-MAX_BYTES = 1 << 28
 
-
-def read_document(path: Path, prefix: str | None = None) -> list[tuple[str, Recorded]]:
+def operations_from(
+    content: str | bytes, source: str = "document", prefix: str | None = None
+) -> list[tuple[str, Recorded]]:
     """Return the operations of a document, each with its tag.
 
     Parameters
     ----------
-    path
-        A ``.kv.json`` file.
+    content
+        The document, as text or as bytes of UTF-8.
+    source
+        What errors call it.
     prefix
         Put in front of all names, tags included, with a slash; the world stays the world.
 
     Raises
     ------
     FormatError
-        With the file, the place in the document and the reason.
+        With the source, the place in the document and the reason.
     """
-    try:
-        with open(path, "rb") as file:
-            size = os.fstat(file.fileno()).st_size
-            content = file.read(MAX_BYTES + 1)
-    except OSError as error:
-        raise FormatError(f"{path} cannot be read: {error.strerror or error}.") from None
     if len(content) > MAX_BYTES:
-        raise FormatError(
-            f"{path}: {max(size, len(content))} bytes are more than {MAX_BYTES}, the most a document has."
-        )
+        raise FormatError(f"{source}: larger than {MAX_BYTES} bytes, the most a document has.")
     try:
-        text = content.decode()
+        text = content if isinstance(content, str) else content.decode()
     except UnicodeDecodeError as error:
-        raise FormatError(f"{path}: byte {error.start} is not UTF-8; a document is UTF-8 text.") from None
-    return operations_from(text, str(path), prefix)
-
-
-def operations_from(
-    text: str, source: str = "document", prefix: str | None = None
-) -> list[tuple[str, Recorded]]:
-    """Return the operations of a document given as text; ``source`` is what errors call it."""
+        raise FormatError(f"{source}: byte {error.start} is not UTF-8; a document is UTF-8 text.") from None
     return _Document(source, prefix).read(text)
 
 

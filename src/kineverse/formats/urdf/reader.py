@@ -11,7 +11,8 @@ from pathlib import Path
 from typing import TypeVar
 
 from kineverse.errors import FormatError
-from kineverse.formats.markup import Element, ElementError, Visit, label, load, parse, quote
+from kineverse.formats.files import read_file
+from kineverse.formats.markup import Element, ElementError, Visit, label, parse, quote
 from kineverse.formats.urdf.bodies import LinkReader
 from kineverse.formats.urdf.description import Joint, Link, Robot
 from kineverse.formats.urdf.joints import read_joint
@@ -40,7 +41,7 @@ def read_urdf(path: str | os.PathLike[str]) -> Robot:
         If the file cannot be read or is not a valid URDF; the message names file, line, element and reason.
     """
     path = Path(path)
-    return parse_urdf(load(path), source=path.name, folder=str(path.absolute().parent))
+    return parse_urdf(read_file(path), source=path.name, folder=str(path.absolute().parent))
 
 
 def parse_urdf(text: str | bytes, source: str = "<urdf>", folder: str = "") -> Robot:
