@@ -264,7 +264,7 @@ def programs(draw, shape=S, depth=3, kinds=EVERYTHING):
             return apply("where", truth(), inner(), fitting())
         return apply("clip", inner(), const(-0.513), const(0.467))
 
-    def truth(level=1):
+    def truth(level=2):
         kind = draw(
             st.sampled_from(
                 ["less", "less", "sharp", "logic_and", "logic_or", "logic_not", "logic_all", "logic_any"]
