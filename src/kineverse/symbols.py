@@ -42,12 +42,13 @@ class Symbol(Expression):
         The value a parameter has unless another is given; None for everything else.
     """
 
-    __slots__ = ("_text", "order", "path", "role", "sort_key", "value")
+    __slots__ = ("_hash", "_text", "order", "path", "role", "sort_key", "value")
 
     path: str
     order: int
     role: Role
     value: float | None
+    _hash: int
     _text: str
     sort_key: tuple[str, int, str, float]
 
@@ -65,6 +66,7 @@ class Symbol(Expression):
         self._leaves = ((self,), ())
         self.path, self.order, self.role, self.value = path, order, role, value
         self.sort_key = (path, order, role, 0.0 if value is None else value)  # from here on immutable
+        self._hash = hash(self.sort_key)
         with _INTERNING:
             known = _INTERNED.get(key)
             if known is None:
@@ -127,7 +129,7 @@ class Symbol(Expression):
         return self._text
 
     def __hash__(self) -> int:
-        return hash(self.sort_key)
+        return self._hash
 
     def __eq__(self, other: object) -> bool:
         if self is other:
