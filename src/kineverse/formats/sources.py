@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import difflib
 import os
 import sysconfig
-from collections.abc import Iterator
+from collections import Counter
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from importlib import resources
+from itertools import islice
 from pathlib import Path
 
 from kineverse.errors import UnknownNameError, suggest
@@ -14,6 +17,8 @@ from kineverse.errors import UnknownNameError, suggest
 SUFFIXES = (".urdf", ".sdf", ".xml", ".kv.json")
 MODEL_PATH = "KINEVERSE_MODEL_PATH"
 _DEPTH = 6
+_LISTED = 6
+_LONGEST = 200
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,41 +38,44 @@ def shipped_models() -> tuple[str, ...]:
 def locate_model(name: str | os.PathLike[str]) -> Source:
     """Return the file of a model given by path or by name.
 
-    A path to a file is taken as it is. A name is looked for among the shipped models, then below the folders
-    of ``KINEVERSE_MODEL_PATH``, then in installed packages that carry robots. It may have folders in front
-    (``urdf_obj/kitchen``) to tell files of the same name apart.
+    A shipped model is found under its name everywhere; a file of that name is ``./kitchen``. Then a path to a
+    file is taken as it is. Any other name is looked for below the folders of ``KINEVERSE_MODEL_PATH``, then
+    in installed packages that carry robots; the first place that has it counts, and there the file closest
+    to the top. It may have folders in front (``urdf_obj/kitchen``) to tell files of the same name apart, and
+    its suffix may be left out.
 
     Raises
     ------
     UnknownNameError
-        Listing what was searched and how to get more.
+        If there is none, with similar names, what was searched and how to get more; or if there are several.
     """
     text = os.fspath(name)
-    path = Path(text).expanduser()
-    if path.is_file():
-        return Source(path.resolve())
-    if path.name.endswith(SUFFIXES) and (path.is_absolute() or text.startswith(".")):
-        raise UnknownNameError(f"There is no file {text!r}.{_beside(path)}")
     if text in shipped_models():
         return Source(Path(str(resources.files("kineverse.shipped").joinpath(f"{text}.urdf"))), text)
-    searched = []
+    if text.lstrip().startswith("<"):
+        raise UnknownNameError(
+            "This looks like the text of a description, where the name or path of a model is expected. "
+            "Write it to a file; 'kineverse.formats.urdf.parse_urdf' reads text."
+        )
+    path = _expanded(text)
+    if _is(path, Path.is_file):
+        return Source(path.resolve())
+    if path.is_absolute() or text.startswith("."):
+        raise UnknownNameError(f"There is no file {_shown(text)}.{_beside(path)}")
+    searched: list[str] = []
+    seen: list[str] = []
     for place, folder in model_folders():
-        found = [p for p in _files(folder) if _matches(p, folder, text)]
-        searched.append(f"{place} ({folder})")
+        files = [p.relative_to(folder).as_posix() for p in _files(folder)]
+        found = [f for f in files if _is_called(f, text)]
         if found:
-            shallowest = min(len(p.parts) for p in found)
-            found = sorted(p for p in found if len(p.parts) == shallowest)
-            if len(found) > 1:
-                choices = ", ".join(repr(p.relative_to(folder).as_posix()) for p in found[:6])
-                raise UnknownNameError(
-                    f"{text!r} is ambiguous in {folder}: {choices}. Give one of these paths."
-                )
-            return Source(found[0].resolve())
+            return Source((folder / _only(found, text, folder)).resolve())
+        searched.append(f"{place} ({folder})")
+        seen += files
     raise UnknownNameError(
-        f"There is no model {text!r}.{_beside(path)} {suggest(text, shipped_models(), 'shipped model')} "
-        f"Searched after the shipped ones: {'; '.join(searched) or 'nothing else'}. Give the path of a file, "
-        f"or add its folder to the environment variable {MODEL_PATH}, or install robots with "
-        "'pip install example-robot-data'."
+        f"There is no model {_shown(text)}.{_beside(path) if text else ''} {_similar(text, seen)} "
+        f"Searched after the shipped ones: {'; '.join(searched) or 'nothing else'}.{_missing_places()} "
+        f"Give the path of a file, or add its folder to the environment variable {MODEL_PATH}"
+        f"{_more_robots(searched)}."
     )
 
 
@@ -85,10 +93,10 @@ def model_folders() -> Iterator[tuple[str, Path]]:
         yield "robot_descriptions", cache
 
 
-def _files(folder: Path) -> Iterator[Path]:
+def _files(folder: Path, depth: int = _DEPTH) -> Iterator[Path]:
     base = len(folder.parts)
     for root, folders, files in os.walk(folder):
-        if len(Path(root).parts) - base >= _DEPTH:
+        if len(Path(root).parts) - base >= depth:
             folders.clear()
         folders[:] = sorted(f for f in folders if not f.startswith("."))
         for file in sorted(files):
@@ -96,18 +104,90 @@ def _files(folder: Path) -> Iterator[Path]:
                 yield Path(root, file)
 
 
-def _matches(path: Path, folder: Path, name: str) -> bool:
-    relative = path.relative_to(folder).as_posix()
-    for suffix in ("", *SUFFIXES):
-        wanted = f"{name}{suffix}"
-        if relative == wanted or relative.endswith(f"/{wanted}"):
-            return True
-    return False
+def _is_called(file: str, name: str) -> bool:
+    return any(f"/{file}".endswith(f"/{name}{suffix}") for suffix in ("", *SUFFIXES))
+
+
+def _only(found: list[str], name: str, folder: Path) -> str:
+    """Return the file closest to the top, if there is one such file."""
+    top = min(f.count("/") for f in found)
+    found = sorted(f for f in found if f.count("/") == top)
+    if len(found) > 1:
+        more = f" and {len(found) - _LISTED} more" if len(found) > _LISTED else ""
+        choices = ", ".join(map(repr, found[:_LISTED]))
+        raise UnknownNameError(
+            f"{name!r} is ambiguous in {folder}: {choices}{more}. Give one of these paths."
+        )
+    return found[0]
+
+
+def _similar(name: str, files: list[str]) -> str:
+    """Return what could have been meant: models spelt alike, and those with the name in their path."""
+    wanted = name.casefold().strip("/ ")
+    paths = sorted({_stem(f) for f in files})
+    ends = Counter(_end(p) for p in paths)
+    # Where the last part is enough to find it, the folders in front are not shown.
+    shown = {p: _end(p) if ends[_end(p)] == 1 else p for p in paths} | {s: s for s in shipped_models()}
+    alike = difflib.get_close_matches(wanted, {_end(p).casefold() for p in shown}, n=_LISTED, cutoff=0.7)
+    close = [n for end in alike for p, n in shown.items() if _end(p).casefold() == end]
+    within = [n for p, n in shown.items() if wanted in p.casefold()]
+    found = list(dict.fromkeys(close + sorted(within, key=lambda n: (len(n), n))))[:_LISTED]
+    if not wanted or not found:
+        return f"Models that ship: {', '.join(shipped_models())}."
+    return f"Did you mean {' or '.join(map(repr, found))}?"
+
+
+def _end(path: str) -> str:
+    return path.rsplit("/", 1)[-1]
+
+
+def _stem(file: str) -> str:
+    return next((file.removesuffix(s) for s in SUFFIXES if file.endswith(s)), file)
+
+
+def _missing_places() -> str:
+    missing = [e for e in os.environ.get(MODEL_PATH, "").split(os.pathsep) if e and not Path(e).is_dir()]
+    return f" {MODEL_PATH} names folders that do not exist: {', '.join(missing)}." if missing else ""
+
+
+def _more_robots(searched: list[str]) -> str:
+    ways = (
+        ("example-robot-data", "install robots with 'pip install example-robot-data'"),
+        (
+            "robot_descriptions",
+            "fetch one with 'robot_descriptions pull NAME' (pip install robot_descriptions)",
+        ),
+    )
+    left = [way for place, way in ways if not any(entry.startswith(place) for entry in searched)]
+    return "".join(f", or {way}" for way in left)
 
 
 def _beside(path: Path) -> str:
+    """Return what is at a path that is no file, or next to it."""
+    if _is(path, Path.is_dir):
+        inside = [p.relative_to(path).as_posix() for p in islice(_files(path, 2), _LISTED)]
+        return f" It is a folder; models in it: {', '.join(inside) or 'none'}."
     if not path.name.endswith(SUFFIXES):
         return ""
-    if not path.parent.is_dir():
-        return f" The folder {str(path.parent)!r} does not exist."
-    return " " + suggest(path.name, (f.name for f in path.parent.iterdir()), "file")
+    if not _is(path.parent, Path.is_dir):
+        return f" The folder {_shown(str(path.parent))} does not exist."
+    beside = [p.name for p in _files(path.parent, 0)]
+    return f" {suggest(path.name, beside, 'model file in its folder')}"
+
+
+def _expanded(text: str) -> Path:
+    try:
+        return Path(text).expanduser()
+    except RuntimeError:  # "~name", and nobody has that name
+        return Path(text)
+
+
+def _is(path: Path, kind: Callable[[Path], bool]) -> bool:
+    try:
+        return kind(path)
+    except OSError:  # too long for a name, or not for us to see
+        return False
+
+
+def _shown(text: str) -> str:
+    return repr(text) if len(text) <= _LONGEST else f"{text[:_LONGEST]!r}..."
