@@ -12,7 +12,7 @@ from importlib import resources
 from itertools import islice
 from pathlib import Path
 
-from kineverse.errors import UnknownNameError, suggest
+from kineverse.errors import FormatError, UnknownNameError, suggest
 
 SUFFIXES = (".urdf", ".sdf", ".xml", ".kv.json")
 MODEL_PATH = "KINEVERSE_MODEL_PATH"
@@ -49,6 +49,8 @@ def locate_model(name: str | os.PathLike[str]) -> Source:
     UnknownNameError
         If there is none, with similar names, what was searched and how to get more; or if there are several.
     """
+    if not isinstance(name, (str, os.PathLike)):
+        raise FormatError(f"A model is loaded by its name or from the path of a file, not from {name!r}.")
     text = os.fspath(name)
     if text in shipped_models():
         return Source(Path(str(resources.files("kineverse.shipped").joinpath(f"{text}.urdf"))), text)

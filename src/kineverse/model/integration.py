@@ -26,7 +26,11 @@ _LONGEST = 0.5
 
 
 def integrate(
-    coordinates: tuple[Symbol, ...], rates: Rates, state: State, speeds: Mapping[Any, float], dt: float
+    coordinates: tuple[Symbol, ...],
+    rates: Rates,
+    state: Mapping[Any, float],
+    speeds: Mapping[Any, float],
+    dt: float,
 ) -> State:
     """Return the state after ``dt`` seconds at constant speeds.
 
@@ -39,7 +43,7 @@ def integrate(
     coordinates, rates
         What moves, and how.
     state
-        Values of at least all coordinates that move.
+        A state, or a mapping from symbols or names to numbers: values of at least all coordinates that move.
     speeds
         From free speeds or their names to numbers; those not given are 0.
     dt
@@ -54,6 +58,7 @@ def integrate(
     """
     if not math.isfinite(dt):
         raise ValueRejectedError(f"The time step is a finite number of seconds, not {dt!r}.")
+    state = state if isinstance(state, State) else State(state)
     free = {c.derivative(): c for c in coordinates if c not in rates}
     driven = sorted(rates, key=lambda s: s.sort_key)
     wheels = sorted({v for row in rates.values() for v in row}, key=lambda s: s.sort_key)

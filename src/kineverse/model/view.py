@@ -474,7 +474,7 @@ class ModelView:
             constraints = dict(self.constraints) if subject is None else self.constraints_for(subject)
             return velocity_rows(constraints, dt, rates=self.rates, speeds=speeds, gain=gain)
 
-    def integrate(self, state: State, speeds: Mapping[Any, float], dt: float) -> State:
+    def integrate(self, state: Mapping[Any, float], speeds: Mapping[Any, float], dt: float) -> State:
         """Return the state ``dt`` seconds later, at constant speeds: :mod:`kineverse.model.integration`."""
         with self._lock:
             coordinates, rates = self.degrees_of_freedom, self.rates
