@@ -1,16 +1,26 @@
-"""Layer 7: speed, measured beside the peers."""
+"""Layer 7: speed, measured beside the peers.
 
-from collections.abc import Sequence
+:func:`measure` yields a :class:`Result` for each benchmark. Nothing here decides whether a build passes: a
+benchmark measures, a test decides.
+"""
 
-from kineverse.errors import KineverseError
+from .agreement import DisagreementError
+from .machine import Machine, machine
+from .registry import BENCHMARKS, chosen, measure
+from .result import Bar, Comparison, Measurement, Result
+from .settings import QUICK, Settings
 
-
-def run(words: Sequence[str]) -> int:
-    """Run the named benchmarks.
-
-    Raises
-    ------
-    KineverseError
-        In this version, always: there are none yet.
-    """
-    raise KineverseError("This version has no benchmarks yet; they come with the next one.")
+__all__ = [
+    "BENCHMARKS",
+    "QUICK",
+    "Bar",
+    "Comparison",
+    "DisagreementError",
+    "Machine",
+    "Measurement",
+    "Result",
+    "Settings",
+    "chosen",
+    "machine",
+    "measure",
+]

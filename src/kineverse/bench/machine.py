@@ -1,0 +1,72 @@
+"""Where the measurements are taken, as numbers mean nothing without it."""
+
+from __future__ import annotations
+
+import platform
+import sys
+from dataclasses import dataclass
+from importlib import metadata
+
+from kineverse import position, rotation_z
+from kineverse._version import __version__
+from kineverse.compile import CompilerInformation, compile, compiler_information  # noqa: A004
+from kineverse.compile.native import native
+
+VERSIONS = ("casadi", "numpy", "pin", "mujoco")
+
+
+@dataclass(frozen=True, slots=True)
+class Machine:
+    """Where the measurements are taken.
+
+    Attributes
+    ----------
+    tier
+        What evaluates functions here: ``interpreter``, ``c``, or ``c extension``, which calls the C directly.
+    compiler
+        What compiles them, with the vector unit and the number of cores.
+    processor, system, python
+        In their own words.
+    versions
+        Of this package and the ones it is measured with, by distribution; None for those that are missing.
+    """
+
+    tier: str
+    compiler: CompilerInformation
+    processor: str
+    system: str
+    python: str
+    versions: dict[str, str | None]
+
+
+def machine() -> Machine:
+    """Return where this is."""
+    return Machine(
+        tier=_tier(),
+        compiler=compiler_information(),
+        processor=_processor(),
+        system=f"{platform.system()} {platform.release()} {platform.machine()}",
+        python=f"{platform.python_implementation()} {platform.python_version()}",
+        versions={"kineverse": __version__, **{name: _version(name) for name in VERSIONS}},
+    )
+
+
+def _tier() -> str:
+    function = compile(rotation_z(position("angle")), wait=True)
+    return "c extension" if function.tier == "c" and native.module is not None else function.tier
+
+
+def _processor() -> str:
+    if sys.platform == "linux":
+        with open("/proc/cpuinfo", encoding="utf-8") as file:
+            names = [line.partition(":")[2].strip() for line in file if line.startswith("model name")]
+        if names:
+            return names[0]
+    return platform.processor() or platform.machine()
+
+
+def _version(distribution: str) -> str | None:
+    try:
+        return metadata.version(distribution)
+    except metadata.PackageNotFoundError:
+        return None

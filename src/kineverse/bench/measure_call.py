@@ -1,0 +1,164 @@
+"""``call``: pose and Jacobian at one configuration, called from Python."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from functools import partial
+from time import perf_counter
+
+import numpy as np
+
+from kineverse.compile import CompiledFunction, Evaluator, compile  # noqa: A004
+
+from .agreement import Array
+from .peers import Field
+from .result import Result, faster
+from .robot import Robot, find_robot
+from .settings import Settings
+from .timing import Contender, race, timed
+
+BOUND, WRITTEN, PLAIN = "kineverse, bound call", "kineverse, bound call with input", "kineverse, plain call"
+REDUCED, PATH, WHOLE = (
+    "pinocchio, reduced to the chain",
+    "pinocchio, path to the frame",
+    "pinocchio, all joints",
+)
+MUJOCO = "mujoco, all joints"
+
+_CHECKED = 50
+_BOUND_AT_ONCE = 40
+
+
+def measure(settings: Settings) -> Result:
+    """Measure calls that take turns through the same configurations."""
+    robot = find_robot(settings)
+    configurations = robot.configurations(settings.configurations)
+    field = Field(list(_ours(robot, configurations)))
+    field.admit("pinocchio", lambda: _pinocchio(robot, configurations))
+    field.admit("mujoco", lambda: [_mujoco(robot, configurations)])
+    measured = race("call", field.contenders, settings.rounds, settings.progress)
+    return Result(
+        name="call",
+        work=(
+            f"pose 4x4 and Jacobian 6x{len(robot.chain)} of {robot.frame}, one configuration, from Python; "
+            f"inputs go through {len(configurations)} configurations"
+        ),
+        measurements=tuple(measured.values()),
+        comparisons=(
+            faster(measured, BOUND, REDUCED, 8.0),
+            faster(measured, WRITTEN, REDUCED, 3.0),
+            faster(measured, PLAIN, REDUCED, 1.3),
+            faster(measured, PLAIN, PATH),
+            faster(measured, PLAIN, WHOLE, 3.0),
+            faster(measured, PLAIN, MUJOCO),
+        ),
+        missing=tuple(field.missing),
+    )
+
+
+def pose_and_jacobian(robot: Robot) -> CompiledFunction:
+    """Return the function that is measured, compiled as far as it goes here."""
+    model = robot.model
+    return compile([model.fk(robot.frame), model.jacobian(robot.frame)], robot.chain, wait=True)
+
+
+def _ours(robot: Robot, configurations: Array) -> Iterator[Contender]:
+    function = pose_and_jacobian(robot)
+    points = list(robot.of_chain(configurations))
+    evaluator = function.bind()
+
+    # Inputs that change without being written in between are in evaluators of their own. More of them would
+    # not fit into the first cache, and memory would be measured.
+    evaluators = [function.bind() for _ in points[:_BOUND_AT_ONCE]]
+
+    def bound() -> float:
+        seconds = 0.0
+        for first in range(0, len(points), len(evaluators)):
+            for own, point in zip(evaluators, points[first:], strict=False):
+                own.input[:] = point
+            start = perf_counter()
+            for evaluate in evaluators:
+                evaluate()
+            seconds += perf_counter() - start
+        return seconds / (len(evaluators) * -(-len(points) // len(evaluators)))
+
+    def written() -> None:
+        for point in points:
+            evaluator(point)
+
+    def plain() -> None:
+        for point in points:
+            function(point)
+
+    def outputs(evaluate: Evaluator, point: Array, bound: bool) -> tuple[Array, ...]:
+        if bound:
+            evaluate.input[:] = point
+            evaluate()
+        else:
+            evaluate(point)
+        return tuple(output.copy() for output in evaluate.outputs)
+
+    def results(bound: bool) -> list[Array]:
+        return _stacked(outputs(evaluators[0], point, bound) for point in points[:_CHECKED])
+
+    yield Contender(PLAIN, timed(plain, len(points)), lambda: _stacked(map(function, points[:_CHECKED])))
+    yield Contender(WRITTEN, timed(written, len(points)), lambda: results(False))
+    yield Contender(BOUND, bound, lambda: results(True))
+
+
+def _pinocchio(robot: Robot, configurations: Array) -> Iterator[Contender]:
+    import pinocchio as pin
+
+    from .pinocchio_robot import PinocchioRobot
+
+    positions = robot.positions(configurations)
+    compute, aligned = pin.computeFrameJacobian, pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
+    reduced, whole = PinocchioRobot(robot, reduced=True), PinocchioRobot(robot)
+
+    def path(peer: PinocchioRobot, rows: list[Array]) -> None:
+        model, data, frame, pose = peer.model, peer.data, peer.frame, peer.pose
+        for row in rows:
+            compute(model, data, row, frame, aligned)
+            pose.homogeneous  # noqa: B018 - makes an array
+
+    def everything(peer: PinocchioRobot, rows: list[Array]) -> None:
+        model, data, frame, pose = peer.model, peer.data, peer.frame, peer.pose
+        for row in rows:
+            pin.computeJointJacobians(model, data, row)
+            pin.updateFramePlacement(model, data, frame)
+            pin.getFrameJacobian(model, data, frame, aligned)
+            pose.homogeneous  # noqa: B018 - makes an array
+
+    for name, peer, run in ((REDUCED, reduced, path), (PATH, whole, path), (WHOLE, whole, everything)):
+        rows = peer.rows(positions)
+        work, checked = partial(run, peer, rows), partial(map, peer.pose_and_jacobian, rows[:_CHECKED])
+        yield Contender(name, timed(work, len(rows)), lambda checked=checked: _stacked(checked()))  # type: ignore[misc]
+
+
+def _mujoco(robot: Robot, configurations: Array) -> Contender:
+    import mujoco
+
+    from .mujoco_robot import MujocoRobot
+
+    peer = MujocoRobot(robot)
+    rows = peer.rows(robot.positions(configurations))
+
+    def run() -> None:
+        # The pose is left where MuJoCo writes it.
+        kinematics, centres, jacobian = mujoco.mj_kinematics, mujoco.mj_comPos, mujoco.mj_jacBody
+        model, data, body, position = peer.model, peer.data, peer.body, peer.data.qpos
+        linear, angular = peer.jacobian[:3], peer.jacobian[3:]
+        for row in rows:
+            position[:] = row
+            kinematics(model, data)
+            centres(model, data)
+            jacobian(model, data, linear, angular, body)
+
+    return Contender(
+        MUJOCO, timed(run, len(rows)), lambda: _stacked(map(peer.pose_and_jacobian, rows[:_CHECKED]))
+    )
+
+
+def _stacked(results: Iterable[tuple[Array, ...]]) -> list[Array]:
+    poses, jacobians = zip(*results, strict=True)
+    return [np.array(poses), np.array(jacobians)]

@@ -1,0 +1,116 @@
+"""``frames``: the poses of all frames at one configuration."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from kineverse.compile import compile  # noqa: A004
+
+from .agreement import Array
+from .peers import Field
+from .result import Result, faster
+from .robot import Robot, find_robot
+from .settings import Settings
+from .timing import Contender, race, timed
+
+KINEVERSE, PINOCCHIO, MUJOCO = "kineverse, bound call with input", "pinocchio", "mujoco"
+
+_CHECKED = 10
+
+
+def measure(settings: Settings) -> Result:
+    """Measure all frames at once."""
+    robot = find_robot(settings)
+    frames = list(robot.model.frames)
+    configurations = robot.configurations(settings.configurations)
+    field = Field([_ours(robot, frames, configurations)])
+    field.admit("pinocchio", lambda: [_pinocchio(robot, frames, configurations)])
+    field.admit("mujoco", lambda: [_mujoco(robot, frames, configurations)])
+    measured = race("frames", field.contenders, settings.rounds, settings.progress)
+    return Result(
+        name="frames",
+        work=(
+            f"the poses of all {len(frames)} links of {robot.file.name}, one configuration, from Python; "
+            f"inputs go through {len(configurations)} configurations"
+        ),
+        measurements=tuple(measured.values()),
+        comparisons=(
+            faster(measured, KINEVERSE, PINOCCHIO, 2.5),
+            faster(measured, KINEVERSE, MUJOCO),
+        ),
+        missing=tuple(field.missing),
+    )
+
+
+def _ours(robot: Robot, frames: Sequence[str], configurations: Array) -> Contender:
+    function = compile([robot.model.fk(frame) for frame in frames], robot.coordinates, wait=True)
+    evaluator = function.bind()
+    points = list(configurations)
+
+    def run() -> None:
+        for point in points:
+            evaluator(point)
+
+    def results() -> list[Array]:
+        found = []
+        for point in points[:_CHECKED]:
+            evaluator(point)
+            found.append(np.array(evaluator.outputs))
+        return found
+
+    return Contender(KINEVERSE, timed(run, len(points)), results)
+
+
+def _pinocchio(robot: Robot, frames: Sequence[str], configurations: Array) -> Contender:
+    import pinocchio as pin
+
+    from .pinocchio_robot import PinocchioRobot
+
+    peer = PinocchioRobot(robot)
+    model, data = peer.model, peer.data
+    rows = peer.rows(robot.positions(configurations))
+    numbers = [model.getFrameId(frame, pin.FrameType.BODY) for frame in frames]
+
+    def run() -> None:
+        place = pin.framesForwardKinematics
+        for row in rows:
+            place(model, data, row)
+
+    def results() -> list[Array]:
+        found = []
+        for row in rows[:_CHECKED]:
+            pin.framesForwardKinematics(model, data, row)
+            found.append(np.array([data.oMf[k].homogeneous for k in numbers]))
+        return found
+
+    return Contender(PINOCCHIO, timed(run, len(rows)), results)
+
+
+def _mujoco(robot: Robot, frames: Sequence[str], configurations: Array) -> Contender:
+    import mujoco
+
+    from .mujoco_robot import MujocoRobot
+
+    peer = MujocoRobot(robot)
+    model, data = peer.model, peer.data
+    rows = peer.rows(robot.positions(configurations))
+    # The robot's root is MuJoCo's world.
+    numbers = [max(mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, frame), 0) for frame in frames]
+
+    def run() -> None:
+        place, position = mujoco.mj_kinematics, data.qpos
+        for row in rows:
+            position[:] = row
+            place(model, data)
+
+    def results() -> list[Array]:
+        found = []
+        for row in rows[:_CHECKED]:
+            data.qpos[:] = row
+            mujoco.mj_kinematics(model, data)
+            found.append(np.array([peer.pose(k) for k in numbers]))
+        return found
+
+    return Contender(MUJOCO, timed(run, len(rows)), results)

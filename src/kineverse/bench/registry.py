@@ -1,0 +1,66 @@
+"""The benchmarks by name."""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Iterator, Mapping, Sequence
+from types import MappingProxyType
+
+from kineverse.errors import UnknownNameError, suggest
+
+from .result import Result
+from .settings import Settings
+
+BENCHMARKS: Mapping[str, str] = MappingProxyType(
+    {
+        "load": "a robot's file to its first pose and Jacobian, in a fresh process",
+        "call": "pose and Jacobian of one frame at one configuration",
+        "frames": "the poses of all frames at one configuration",
+        "batch": "pose and Jacobian at 100 000 configurations",
+        "import": "importing the library, and how many packages that takes",
+        "memory": "the memory of a loaded robot",
+        "edit": "models of 10 000 operations, and a robot with one joint replaced",
+    }
+)
+"""What there is, in the order in which it is run; each name belongs to the module ``measure_NAME``."""
+
+
+def chosen(names: Sequence[str]) -> list[str]:
+    """Return the names of the benchmarks to run, each once and in their order; all if none is named.
+
+    Raises
+    ------
+    UnknownNameError
+        If there is no such benchmark, with similar names.
+    """
+    for name in names:
+        if name not in BENCHMARKS:
+            raise UnknownNameError(
+                f"There is no benchmark {name!r}. {suggest(name, BENCHMARKS, 'benchmark')} "
+                "'kineverse bench --list' says what each measures."
+            )
+    return [name for name in BENCHMARKS if name in names or not names]
+
+
+def measure(names: Sequence[str] = (), settings: Settings | None = None) -> Iterator[Result]:
+    """Run benchmarks, and yield each result when it is there.
+
+    Parameters
+    ----------
+    names
+        Which; all of them if empty.
+    settings
+        How much is measured, and on which robot.
+
+    Raises
+    ------
+    UnknownNameError
+        If there is no such benchmark, before any is run.
+    DisagreementError
+        If those who are compared do not compute the same.
+    """
+    for name in chosen(names):
+        # A benchmark is imported when it is run, as it brings its peers.
+        module = importlib.import_module(f"{__package__}.measure_{name}")
+        result: Result = module.measure(settings or Settings())
+        yield result
