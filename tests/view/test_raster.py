@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from kineverse.errors import ValueRejectedError
 from kineverse.model.body import Box, Sphere
 from kineverse.view.camera import Camera, framing
-from kineverse.view.primitives import triangles_of
+from kineverse.view.geometry import triangles_of
 from kineverse.view.raster import Projection, visible
 
 SEEDS = st.integers(0, 10_000)

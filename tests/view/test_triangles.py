@@ -6,7 +6,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from kineverse.model.body import Box, Capsule, Cylinder, Sphere
-from kineverse.view.primitives import placeholder, triangles_of
+from kineverse.view.geometry import triangles_of
+from kineverse.view.primitives import placeholder
 from kineverse.view.triangles import creased, join
 
 LENGTH = st.floats(0.01, 3.0)

@@ -8,8 +8,8 @@ import numpy as np
 
 from kineverse.model.body import Box
 from kineverse.model.view import ModelView
+from kineverse.view.geometry import triangles_of
 from kineverse.view.parts import Part
-from kineverse.view.primitives import triangles_of
 from kineverse.view.triangles import Floats
 
 COLORS = ((0.86, 0.16, 0.16, 1.0), (0.13, 0.62, 0.20, 1.0), (0.16, 0.33, 0.88, 1.0))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import importlib
 import logging
 import re
 from collections.abc import Iterator
@@ -15,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from kineverse.errors import KineverseError, MissingExtraError
+from kineverse.formats.packages import locate
 from kineverse.model.body import Mesh
 from kineverse.view.primitives import placeholder
 from kineverse.view.triangles import Floats, Triangles, creased, join
@@ -68,10 +68,7 @@ def _missing(mesh: Mesh, problem: str) -> Loaded:
 
 
 def _read(mesh: Mesh) -> Triangles:
-    # Imported late: the formats layer is not needed to draw a box.
-    packages = importlib.import_module("kineverse.formats.packages")
-
-    path = Path(packages.locate(mesh.uri, mesh.folder))
+    path = locate(mesh.uri, mesh.folder)
     size = path.stat().st_size
     if size > LARGEST:
         raise OSError(f"{path} has {size / 2**20:.0f} MiB, more than the {LARGEST / 2**20:.0f} MiB read here")

@@ -7,8 +7,8 @@ from typing import Literal
 
 from kineverse.model.body import Body, Mesh, Shape
 from kineverse.model.view import ModelView
+from kineverse.view.geometry import triangles_of
 from kineverse.view.meshes import load
-from kineverse.view.primitives import triangles_of
 from kineverse.view.triangles import Triangles
 
 Kind = Literal["visual", "collision"]

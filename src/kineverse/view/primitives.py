@@ -6,28 +6,16 @@ from functools import lru_cache
 
 import numpy as np
 
-from kineverse.model.body import Box, Capsule, Cylinder, Geometry, Mesh, Sphere
+from kineverse.model.body import Box, Capsule, Cylinder, Sphere
 from kineverse.view.triangles import Floats, Triangles, creased, join
 
 SEGMENTS = 40
 """Around a full turn: at this number a silhouette looks round at the sizes of rooms and robots."""
 
 
-def triangles_of(geometry: Geometry) -> Triangles:
-    """Return the surface of a piece of geometry, in its own frame [m].
-
-    Equal primitives share one surface. A mesh is read here, and only here; one that cannot be read becomes a
-    marked placeholder (see :mod:`kineverse.view.meshes`), so this never fails for a missing file.
-    """
-    if isinstance(geometry, Mesh):
-        from kineverse.view.meshes import load
-
-        return load(geometry).surface
-    return _primitive(geometry)
-
-
 @lru_cache(maxsize=4096)
-def _primitive(geometry: Box | Cylinder | Capsule | Sphere) -> Triangles:
+def primitive(geometry: Box | Cylinder | Capsule | Sphere) -> Triangles:
+    """Return the surface of a primitive, in its own frame [m]; equal ones share it."""
     if isinstance(geometry, Box):
         return _unit_box().scaled(geometry.size)
     if isinstance(geometry, Cylinder):
