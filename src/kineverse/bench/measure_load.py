@@ -1,4 +1,4 @@
-"""``load``: a robot's file to its first pose and Jacobian, in a fresh process that has imported the library."""
+"""``load``: a robot's file to its first pose and Jacobian, in a fresh process, after the import."""
 
 from __future__ import annotations
 

@@ -119,7 +119,7 @@ def find_robot(settings: Settings) -> Robot:
     for name, articulation in model.articulations.items():
         if articulation.kind not in _ONE_COORDINATE:
             raise ValueRejectedError(
-                f"Joint {name!r} is {articulation.kind}; a robot to measure has only joints with one coordinate."
+                f"Joint {name!r} is {articulation.kind}; robots to measure have joints with one coordinate."
             )
     robot = Robot(file, model, settings.frame or _default_frame(model))
     _check_chain(robot)

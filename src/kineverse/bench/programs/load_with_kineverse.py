@@ -1,6 +1,6 @@
 """Run in a fresh process: a file to its first pose and Jacobian, with Kineverse.
 
-``load_with_kineverse.py FILE FRAME [wait]``; with ``wait`` it also waits until everything is compiled and kept.
+``load_with_kineverse.py FILE FRAME [wait]``; with ``wait`` it also waits until it is compiled and kept.
 """
 
 import json

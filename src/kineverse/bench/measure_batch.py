@@ -1,0 +1,144 @@
+"""``batch``: pose and Jacobian at many configurations."""
+
+from __future__ import annotations
+
+import os
+import tempfile
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+
+from kineverse.compile import compile, compiler_information  # noqa: A004
+
+from .agreement import Array
+from .casadi_map import BoundMap, compiled_map, graph
+from .numpy_graph import NumpyGraph
+from .peers import Field
+from .result import Result, faster
+from .robot import Robot, find_robot
+from .settings import Settings
+from .timing import Contender, race, timed
+
+ONE_CORE, ALL_CORES, FRESH = (
+    "kineverse, one core",
+    "kineverse, all cores",
+    "kineverse, one core, fresh arrays",
+)
+CASADI, NUMPY, PINOCCHIO = "casadi, map in C", "numpy, same graph", "pinocchio, loop over the reduced robot"
+
+
+def measure(settings: Settings) -> Result:
+    """Measure batches; everybody but those who say otherwise on the same one core."""
+    robot = find_robot(settings)
+    configurations = robot.configurations(settings.rows)
+    points = robot.of_chain(configurations)
+    with tempfile.TemporaryDirectory(prefix="kineverse-bench-") as folder:
+        field = Field(list(_ours(robot, points)))
+        field.contenders += _of_the_graph(robot, points, Path(folder), field.missing)
+        field.admit("pinocchio", lambda: [_pinocchio(robot, configurations)])
+        measured = race("batch", field.contenders, settings.rounds, settings.progress)
+    return Result(
+        name="batch",
+        work=(
+            f"pose 4x4 and Jacobian 6x{len(robot.chain)} of {robot.frame} at {len(points)} configurations; "
+            "the time of one of them"
+        ),
+        measurements=tuple(measured.values()),
+        comparisons=(
+            faster(measured, ONE_CORE, PINOCCHIO, 40.0),
+            faster(measured, ONE_CORE, CASADI, 2.0),
+            faster(measured, ONE_CORE, NUMPY),
+            faster(measured, ALL_CORES, ONE_CORE),
+        ),
+        missing=tuple(field.missing),
+    )
+
+
+def _ours(robot: Robot, points: Array) -> Iterator[Contender]:
+    model = robot.model
+    tier = "c" if compiler_information().compiler else "auto"
+    function = compile([model.fk(robot.frame), model.jacobian(robot.frame)], robot.chain, tier=tier)  # type: ignore[arg-type]
+    outputs = function.batch(points)
+
+    def run() -> None:
+        function.batch(points, out=outputs)
+
+    def fresh() -> None:
+        function.batch(points)
+
+    def results() -> list[Array]:
+        return list(function.batch(points))
+
+    yield Contender(ONE_CORE, on_one_core(timed(run, len(points))), results)
+    yield Contender(FRESH, on_one_core(timed(fresh, len(points))))
+    yield Contender(ALL_CORES, timed(run, len(points)))
+
+
+def _of_the_graph(robot: Robot, points: Array, folder: Path, missing: list[str]) -> Iterator[Contender]:
+    """Yield those who evaluate the graph that Kineverse makes, in their own ways."""
+    rows, function = len(points), graph(robot)
+    by_numpy = NumpyGraph(function)
+    outputs = _outputs(robot, rows)
+    yield Contender(
+        NUMPY,
+        on_one_core(timed(lambda: by_numpy(points, outputs), rows)),
+        _results(lambda: by_numpy(points, outputs), outputs),
+    )
+    if compiler_information().compiler is None:
+        missing.append("casadi's map in C is missing: there is no C compiler")
+        return
+    written = _outputs(robot, rows)
+    mapped = BoundMap(compiled_map(function, rows, folder), points, written)
+    yield Contender(CASADI, on_one_core(timed(mapped, rows)), _results(mapped, written))
+
+
+def _pinocchio(robot: Robot, configurations: Array) -> Contender:
+    import pinocchio as pin
+
+    from .pinocchio_robot import PinocchioRobot
+
+    peer = PinocchioRobot(robot, reduced=True)
+    rows = peer.rows(robot.positions(configurations))
+    poses, jacobians = _outputs(robot, len(rows))
+
+    def run() -> None:
+        compute, aligned = pin.computeFrameJacobian, pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
+        model, data, frame, pose = peer.model, peer.data, peer.frame, peer.pose
+        for k, row in enumerate(rows):
+            jacobians[k] = compute(model, data, row, frame, aligned)
+            poses[k] = pose.homogeneous
+
+    def results() -> list[Array]:
+        run()
+        return [poses, jacobians[:, :, peer.columns]]
+
+    return Contender(PINOCCHIO, on_one_core(timed(run, len(rows))), results)
+
+
+def _outputs(robot: Robot, rows: int) -> tuple[Array, Array]:
+    return np.zeros((rows, 4, 4)), np.zeros((rows, 6, len(robot.chain)))
+
+
+def _results(run: Callable[[], object], outputs: tuple[Array, ...]) -> Callable[[], list[Array]]:
+    def results() -> list[Array]:
+        run()
+        return list(outputs)
+
+    return results
+
+
+def on_one_core(sample: Callable[[], float]) -> Callable[[], float]:
+    """Return a sample that is taken on one core, where the system lets a process choose."""
+    if not hasattr(os, "sched_setaffinity"):
+        return sample
+
+    def pinned() -> float:
+        before = os.sched_getaffinity(0)
+        os.sched_setaffinity(0, {max(before)})
+        try:
+            return sample()
+        finally:
+            os.sched_setaffinity(0, before)
+
+    return pinned
