@@ -16,9 +16,9 @@ import pytest
 
 from kineverse import logic
 from kineverse.errors import KineverseError
-from kineverse.expressions import array, gradient, leaves, substitution, total_derivative
+from kineverse.expressions import array, expression, gradient, leaves, numpy_protocol, substitution
 from kineverse.expressions.expression import as_expression, binary
-from kineverse.expressions.functions import Extremum, Norm, Select, maximum, norm, where
+from kineverse.expressions.functions import Extremum, Norm, Select, inverse, maximum, norm, where
 from kineverse.expressions.node import Augment, Node
 from kineverse.logic import And, Less, Not, Or, weighted_sum
 
@@ -55,13 +55,19 @@ def cases(vocabulary):
     def gradient_at(e, values=at, heuristic=True):
         return {k: float(entry(values)) for k, entry in e.gradient(heuristic).items()}
 
+    def column(e, key):
+        return e.gradient().get(key, 0 * e)(at)
+
     assert gradient_at(maximum(a, b)) == {da: 0.5, db: 0.5}
     assert gradient_at(norm(array([a, b])), {a: 0, b: 0}) == {da: 0, db: 0}
-    assert gradient_at(where(a, b, c), at)[db] == 1
+    assert gradient_at(where(a, b, c)).get(db) == 1
     assert gradient_at(where(a < b, np.sqrt(a), a * 3), {a: 0, b: -1}) == {da: 3}
     replaced = array(2.0).augment({da: 1, wheel: b}).substitute({a: b * 2, b: c})
     assert gradient_at(replaced) == pytest.approx({db: 2, wheel: at[c]})
     assert gradient_at(array(2.0).augment({da: 1}).substitute({a: b * 2})) == {db: 2}
+    moved = a.augment({wheel: 1}).substitute({a: b.augment({jerk: 1}, heuristic=True)})
+    assert gradient_at(moved) == {db: 1, wheel: 1, jerk: 1}
+    assert gradient_at(moved, heuristic=False) == {db: 1, wheel: 1}
     p = vocabulary.others[2]
     assert gradient_at((p * c).augment({wheel: p}).substitute({p: a * 3})) == pytest.approx(
         {da: 3 * at[c], vocabulary.keys[2]: 1.5, wheel: 1.5}
@@ -82,7 +88,13 @@ def cases(vocabulary):
     lc.close(e.partial([a])(at), np.array([1.0]))
     lc.close(a.augment({da: 3}).partial([a])(at), np.array([1.0]))
     speeds = {**at, da: 2.0, wheel: 3.0, jerk: 5.0}
-    lc.close(total_derivative(e)(speeds), np.array(2.0 + 5.0))
+    lc.close(gradient.total_derivative(e)(speeds), np.array(2.0 + 5.0))
+    lc.close(gradient.total_derivative(array(1.0).augment({wheel: 2}))(speeds), np.array(6.0))
+    m = array([[a.augment({da: 4}), b], [1.0, c.augment({wheel: 2})]])
+    slope = column(m, da)
+    lc.close(column(m @ m, da), slope @ m(at) + m(at) @ slope)
+    inverted = np.linalg.inv(m(at))
+    lc.close(column(np.linalg.inv(m), da), -inverted @ slope @ inverted)
     assert (a.augment({wheel: b}) - a.augment({wheel: b})).gradient() == {}
     assert (a.augment({wheel: b}) - a.augment({wheel: c})).gradient() != {}
 
@@ -221,6 +233,57 @@ def entries_lie_column_by_column(patch):
 def columns_come_in_another_order(patch):
     original = gradient._side_by_side
     patch(gradient, "_side_by_side", lambda columns, shape: original(columns[::-1], shape))
+
+
+@mutant
+def columns_are_one_order_too_low(patch):
+    def of(e, symbols, heuristic=True):
+        entries = e.gradient(heuristic)
+        return gradient._side_by_side([entries.get(s) for s in symbols], e.shape)
+
+    patch(gradient, "jacobian", of)
+
+
+@mutant
+def products_look_at_the_value_on_the_right(patch):
+    original = expression.matmul
+    patch(expression, "matmul", lambda x, y: original(x, gradient._without_augmentation(as_expression(y))))
+
+
+@mutant
+def products_look_at_the_value_on_the_left(patch):
+    original = expression.matmul
+    patch(expression, "matmul", lambda x, y: original(gradient._without_augmentation(as_expression(x)), y))
+
+
+def inverting(patch, instead):
+    patch(numpy_protocol, "_FUNCTIONS", {**numpy_protocol._FUNCTIONS, np.linalg.inv: instead})
+
+
+@mutant
+def inverses_look_at_the_value(patch):
+    inverting(patch, lambda m: inverse(gradient._without_augmentation(m)))
+
+
+@mutant
+def inverses_have_the_other_sign(patch):
+    def inverted(m):
+        result = inverse(m)
+        return result.with_gradient({k: -entry for k, entry in result.gradient().items()})
+
+    inverting(patch, inverted)
+
+
+@mutant
+def tangents_see_only_symbols_inside(patch):
+    def of(e, heuristic=False):
+        entries = e.gradient(heuristic)
+        return sum(
+            (entries[s.derivative()] * s.derivative() for s in e.symbols if s.derivative() in entries),
+            start=as_expression(np.zeros(e.shape)),
+        )
+
+    patch(gradient, "total_derivative", of)
 
 
 @mutant
@@ -392,6 +455,14 @@ def or_is_a_plain_sum(patch):
 @mutant
 def or_leaves_out_the_product(patch):
     joined(patch, Or, lambda v, self: v)
+
+
+@mutant
+def trends_of_one_key_overwrite(patch):
+    def overwriting(terms):
+        return {key: weight * entry for weight, entries in terms for key, entry in entries.items()}
+
+    patch(logic, "weighted_sum", overwriting)
 
 
 @mutant
