@@ -11,6 +11,7 @@ from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
 from kineverse.cli.assignments import add_set_option, parse_assignments
+from kineverse.cli.progress import progress
 
 if TYPE_CHECKING:
     from kineverse.view.viewer import Viewer
@@ -42,10 +43,13 @@ def run(arguments: argparse.Namespace) -> int:
     assigned = parse_assignments(arguments.assignments)
 
     import kineverse as kv
+    from kineverse.view import meshes
     from kineverse.view.viewer import Viewer
 
     label = os.path.basename(arguments.model)
     model = kv.load(arguments.model)
+    for mesh in progress(meshes.seen_in(model), "reading meshes", "file"):
+        meshes.load(mesh)  # and remembered: the page finds them read
     with until_interrupted(), Viewer(model, assigned, port=arguments.port, label=label) as page:
         note_problems(page.problems)
         announce(page, browser=not arguments.no_browser)

@@ -16,6 +16,7 @@ import numpy as np
 from kineverse.errors import KineverseError, MissingExtraError
 from kineverse.formats.packages import locate
 from kineverse.model.body import Mesh
+from kineverse.model.view import ModelView
 from kineverse.view.primitives import placeholder
 from kineverse.view.triangles import Floats, Triangles, creased, join
 
@@ -57,6 +58,12 @@ def load(mesh: Mesh) -> Loaded:
         except Exception as error:  # Parsers of other people's formats raise anything at all.
             _by_reference[mesh] = _missing(mesh, f"{type(error).__name__}: {error}")
     return _by_reference[mesh]
+
+
+def seen_in(model: ModelView) -> list[Mesh]:
+    """Return the meshes by which a model is seen, each once."""
+    shapes = (shape.geometry for body in model.bodies.values() for shape in body.visuals)
+    return list(dict.fromkeys(geometry for geometry in shapes if isinstance(geometry, Mesh)))
 
 
 def _missing(mesh: Mesh, problem: str) -> Loaded:
