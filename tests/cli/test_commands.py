@@ -199,9 +199,17 @@ def test_ctrl_c_is_130_and_one_empty_line(monkeypatch, run):
     assert run("info", "kitchen") == (130, "", "\n")
 
 
+@pytest.fixture
+def hears_ctrl_c():
+    """Have processes started here hear Ctrl-C, which they would not if this one was started with ``&``."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
 @pytest.mark.parametrize("stop", [signal.SIGINT, signal.SIGTERM])
 @pytest.mark.parametrize("words", [["view", "shelf_door", "--port", "0"], ["demo", "--port", "0"]])
-def test_pages_end_with_status_0(stop, words):
+def test_pages_end_with_status_0(stop, words, hears_ctrl_c):
     pytest.importorskip("viser")
     environment = {k: v for k, v in os.environ.items() if k not in ("DISPLAY", "WAYLAND_DISPLAY", "BROWSER")}
     with subprocess.Popen(
@@ -211,12 +219,15 @@ def test_pages_end_with_status_0(stop, words):
         text=True,
         env={**environment, "PYTHONUNBUFFERED": "1"},
     ) as process:
-        first = process.stdout.readline()
-        assert first.startswith("http://127.0.0.1:")
-        second = process.stdout.readline()
-        assert "DoF" in second
-        process.send_signal(stop)
-        out, err = process.communicate(timeout=60)
+        try:
+            first = process.stdout.readline()
+            assert first.startswith("http://127.0.0.1:")
+            second = process.stdout.readline()
+            assert "DoF" in second
+            process.send_signal(stop)
+            out, err = process.communicate(timeout=60)
+        finally:
+            process.kill()
     assert process.returncode == 0
     assert "Traceback" not in err
     assert "viser" not in out + err
