@@ -231,12 +231,3 @@ def test_pages_end_with_status_0(stop, words, hears_ctrl_c):
     assert process.returncode == 0
     assert "Traceback" not in err
     assert "viser" not in out + err
-
-
-def test_bench_hands_its_words_on(monkeypatch, run):
-    import kineverse.bench
-
-    heard = []
-    monkeypatch.setattr(kineverse.bench, "run", lambda words: heard.append(words) or 0, raising=False)
-    assert run("bench", "fk", "--json")[0] == 0
-    assert heard == [["fk", "--json"]]

@@ -140,23 +140,32 @@ def _file(name: str | None) -> Path:
 def _default_frame(model: Model) -> str:
     if GRIPPER in model.frames:
         return GRIPPER
-    return max(model.frames, key=lambda frame: (len(model.speeds_of(frame)), frame))
+    led = [frame for frame in model.frames if _follower(model, frame) is None]
+    return max(led, key=lambda frame: (len(model.speeds_of(frame)), frame))
 
 
 def _check_chain(robot: Robot) -> None:
-    above = {a.child: (name, a) for name, a in robot.model.articulations.items()}
-    frame = robot.frame
-    if frame not in robot.model.frames:
-        robot.model.fk(frame)  # raises, with similar names
-    while frame != WORLD:
-        name, articulation = above.get(frame, ("", None))
-        if articulation is not None and articulation.kind != "fixed" and not articulation.coordinates:
-            raise ValueRejectedError(
-                f"{robot.frame!r} is moved by {name!r}, which follows another joint; choose another --frame."
-            )
-        frame = robot.model.frames[frame].parent
+    if robot.frame not in robot.model.frames:
+        robot.model.fk(robot.frame)  # raises, with similar names
+    follower = _follower(robot.model, robot.frame)
+    if follower is not None:
+        raise ValueRejectedError(
+            f"{robot.frame!r} is moved by {follower!r}, which follows another joint; choose another --frame."
+        )
     if not robot.chain:
         raise ValueRejectedError(f"Nothing moves {robot.frame!r}; choose another --frame.")
+
+
+def _follower(model: Model, frame: str) -> str | None:
+    """Return a joint that moves the frame and follows another joint, if there is one."""
+    above = {a.child: (name, a) for name, a in model.articulations.items()}
+    while frame != WORLD:
+        if frame in above:
+            name, articulation = above[frame]
+            if articulation.kind != "fixed" and not articulation.coordinates:
+                return name
+        frame = model.frames[frame].parent
+    return None
 
 
 def bare_text(file: str | os.PathLike[str]) -> str:

@@ -1,0 +1,102 @@
+from __future__ import annotations
+
+import importlib.util
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import kineverse as kv
+from kineverse.bench import BENCHMARKS, DisagreementError, chosen, measure
+from kineverse.bench.large_model import READERS, large_model, runs_of_replacing
+from kineverse.bench.processes import ProgramError, run_program
+
+HAS_PEERS = all(importlib.util.find_spec(name) for name in ("pinocchio", "mujoco"))
+
+
+@pytest.mark.parametrize("name", BENCHMARKS)
+def test_a_benchmark_measures_everybody_who_is_there(name, tiny):
+    (result,) = measure([name], tiny)
+    assert result.name == name
+    assert result.work
+    names = [m.name for m in result.measurements]
+    assert len(names) == len(set(names)) >= 3
+    for measurement in result.measurements:
+        assert all(math.isfinite(sample) for sample in measurement.samples)
+        assert len(measurement.samples) in (1, tiny.rounds, tiny.processes)
+    assert result.comparisons
+    if HAS_PEERS:
+        assert any("pinocchio" in n or "pin" in n.split() for n in names)
+        assert all(c.value is not None for c in result.comparisons)
+        assert result.missing == ()
+
+
+@pytest.mark.parametrize("name", ["call", "frames", "batch", "edit"])
+def test_peers_that_are_not_installed_are_reported(name, tiny, without):
+    without("pinocchio", "mujoco")
+    (result,) = measure([name], tiny)
+    missing = [c for c in result.comparisons if c.status == "missing"]
+    assert missing
+    assert all("pinocchio" in c.name or "mujoco" in c.name for c in missing)
+    assert any("pip install 'kineverse-articulation[bench]'" in line for line in result.missing)
+    assert any("'pin'" in line for line in result.missing)
+    assert not any("pinocchio" in m.name for m in result.measurements)
+
+
+def test_a_peer_that_computes_something_else_ends_the_benchmark(tiny, monkeypatch):
+    pytest.importorskip("pinocchio")
+    from kineverse.bench.pinocchio_robot import PinocchioRobot
+
+    right = PinocchioRobot.pose_and_jacobian
+
+    def wrong(self, row):
+        pose, jacobian = right(self, row)
+        return pose, jacobian + 1e-7
+
+    monkeypatch.setattr(PinocchioRobot, "pose_and_jacobian", wrong)
+    with pytest.raises(DisagreementError, match="pinocchio, reduced to the chain"):
+        list(measure(["call"], tiny))
+
+
+def test_benchmarks_run_in_their_order_and_once():
+    assert chosen([]) == list(BENCHMARKS)
+    assert chosen(["batch", "load", "batch"]) == ["load", "batch"]
+
+
+def test_an_unknown_name_is_refused_before_anything_is_run(tiny):
+    with pytest.raises(kv.UnknownNameError, match=r"'bacth'\. Did you mean 'batch'\?"):
+        next(measure(["call", "bacth"], tiny))
+
+
+def test_a_program_that_fails_is_an_error_that_says_what_it_said(tmp_path):
+    with pytest.raises(ProgramError, match=r"'import_time' ended with status 1.*no_such_module"):
+        run_program("import_time", "no_such_module")
+
+
+def test_large_models_are_as_large_as_asked_for():
+    model = large_model(100)
+    assert len(model.constraints) == 100
+    assert len(model.history.tags) >= 100
+    assert runs_of_replacing(model) == 1 + READERS
+    assert model.constraints_for(model.fk("link 15")).keys() >= {f"joint {k}/position" for k in range(8, 16)}
+
+
+def test_a_joint_is_replaced_in_a_copy(tiny):
+    from kineverse.bench.edited_robot import joint_replaced
+    from kineverse.bench.robot import find_robot
+
+    robot = find_robot(tiny)
+    before = robot.model.snapshot()
+    values = dict.fromkeys(robot.chain, 0.3)
+    contender = joint_replaced(robot)
+    (moved,) = contender.results()
+    assert contender.sample() > 0.0
+    assert robot.model.snapshot() == before
+    assert 1e-3 < np.abs(moved - robot.model.fk(robot.frame)(values)).max() < 2e-2
+
+
+def test_the_frame_is_a_gripper_unless_one_is_given(tiny):
+    from kineverse.bench.robot import find_robot
+
+    assert find_robot(replace(tiny, frame=None)).frame == "left"  # the longest way
