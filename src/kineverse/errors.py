@@ -77,7 +77,8 @@ def suggest(name: str, available: Iterable[str], what: str = "name", limit: int 
     if not names:
         return f"There is no {what} at all."
     close = difflib.get_close_matches(name, names, n=4, cutoff=0.6) if len(names) <= 20_000 else []
-    close += [n for n in names if n.rsplit("/", 1)[-1] == name and n not in close][: limit - len(close)]
+    parts = (n for n in names if n.endswith(f"/{name}") or n.startswith((f"{name}/", f"{name}:")))
+    close += [n for n in parts if n not in close][: max(0, 4 - len(close))]
     if close:
         return f"Did you mean {' or '.join(repr(n) for n in close)}?"
     more = f" and {len(names) - limit} more" if len(names) > limit else ""

@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Callable, Mapping
 from typing import Any, TypeAlias
 
-import casadi as ca
 import numpy as np
 import numpy.typing as npt
 
+from kineverse.compile import compile  # noqa: A004
 from kineverse.errors import UnknownNameError, ValueRejectedError, suggest
 from kineverse.expressions.evaluation import assign
-from kineverse.expressions.lowering import lower
+from kineverse.expressions.expression import Expression, array
 from kineverse.state import State
 from kineverse.symbols import Symbol
 
@@ -23,6 +24,9 @@ Vector: TypeAlias = npt.NDArray[np.float64]
 # Substeps of the modified midpoint rule; the extrapolation over their squares is of order 12.
 _SUBSTEPS = (2, 4, 6, 8, 10, 12)
 _LONGEST = 0.5
+# What a step may be wrong by, relative to the coordinates, and its least part of the whole time.
+_ERROR = 1e-13
+_SHORTEST = 1e-9
 
 
 def integrate(
@@ -54,14 +58,14 @@ def integrate(
     UnknownNameError
         For a speed that moves nothing here.
     ValueRejectedError
-        For NaN or an infinite step.
+        For NaN or an infinite step, or if coordinates run to infinity on the way.
     """
     if not math.isfinite(dt):
         raise ValueRejectedError(f"The time step is a finite number of seconds, not {dt!r}.")
     state = state if isinstance(state, State) else State(state)
     free = {c.derivative(): c for c in coordinates if c not in rates}
-    driven = sorted(rates, key=lambda s: s.sort_key)
-    wheels = sorted({v for row in rates.values() for v in row}, key=lambda s: s.sort_key)
+    flow = flow_of(rates) if rates else None
+    wheels = flow.speeds if flow else ()
     by_name = {str(s): s for s in (*free, *wheels)}
     given: dict[Symbol, float] = {}
     for key, value in speeds.items():
@@ -71,56 +75,120 @@ def integrate(
         if not math.isfinite(given[by_name[str(key)]]):
             raise ValueRejectedError(f"The speed '{key}' is {value!r}; it must be finite.")
     result = {free[v]: state[free[v]] + dt * value for v, value in given.items() if v in free}
-    if driven and any(given.get(v) for v in wheels):
-        result.update(_driven(driven, wheels, rates, state, given, dt))
+    if flow and any(given.get(v) for v in wheels):
+        try:
+            after = flow.follow(state, given, dt)
+        except _StuckError as error:
+            raise ValueRejectedError(
+                f"{', '.join(map(str, flow.driven))} cannot be followed for {dt:g} s: their rates have no "
+                f"bound near {error.done:.6g} s. Take a shorter time, or look for a pole in their rows."
+            ) from None
+        result.update(zip(flow.driven, after.tolist(), strict=True))
     stamp = None if state.stamp is None else state.stamp + dt
     return state.updated(result, stamp=stamp)
 
 
-def _driven(
-    driven: list[Symbol],
-    wheels: list[Symbol],
-    rates: Rates,
-    state: State,
-    given: Mapping[Symbol, float],
-    dt: float,
-) -> dict[Symbol, float]:
-    """Integrate the coordinates that have rows, together with the free ones their rows look at."""
-    wanted = {s for x in driven for g in rates[x].values() for s in g.symbols}
-    beside = sorted((s for s in wanted if s not in rates and s.order == 0), key=lambda s: s.sort_key)
-    flow = []
-    for x in driven:
-        total = ca.SX(0)
-        for v, g in rates[x].items():
-            total = total + lower([g])[0] * given.get(v, 0.0)
-        flow.append(total)
-    flow += [ca.SX(given.get(s.derivative(), 0.0) if s.has_derivative else 0.0) for s in beside]
-    symbols = (*driven, *beside)
-    function = ca.Function("flow", [ca.vertcat(*(s._sx for s in symbols))], [ca.densify(ca.vertcat(*flow))])
-    start = assign(symbols, State({s: state[s] for s in symbols if s in state}))
+class Flow:
+    """What driven coordinates do at constant speeds: a compiled function of where they are.
 
-    def rate(q: Vector) -> Vector:
-        return np.array(function(q)).ravel()
+    Parameters
+    ----------
+    rates
+        The table.
 
-    # A row's scale of change: its rate where it starts, per radian or metre.
-    pace = max((abs(given.get(v, 0.0)) for v in wheels), default=0.0) * _gain(rates, driven, state, symbols)
-    steps = max(1, math.ceil(abs(dt) * pace / _LONGEST))
-    q = start
-    for _ in range(steps):
-        q = _extrapolated_step(rate, q, dt / steps)
-    return {x: float(q[i]) for i, x in enumerate(driven)}
+    Attributes
+    ----------
+    driven
+        The coordinates that have rows.
+    beside
+        The free coordinates and parameters that rows look at.
+    speeds
+        The speeds that rows have.
+    """
+
+    def __init__(self, rates: Rates) -> None:
+        self.driven = tuple(sorted(rates, key=lambda s: s.sort_key))
+        self.speeds = tuple(sorted({v for row in rates.values() for v in row}, key=lambda s: s.sort_key))
+        looked_at = {s for row in rates.values() for g in row.values() for s in g.symbols if s not in rates}
+        self.beside = tuple(sorted(looked_at, key=lambda s: s.sort_key))
+        zero = Expression(0.0)
+        rows = [sum((g * v for v, g in rates[x].items()), zero) for x in self.driven]
+        entries = [g for x in self.driven for g in rates[x].values()]
+        # Speeds that rows look at as well as go with: each is an input once.
+        inputs = dict.fromkeys((*self.driven, *self.beside, *self.speeds))
+        self._inputs = tuple(inputs)
+        self._function = compile([array(rows), array(entries)], self._inputs)
+
+    def follow(self, state: State, speeds: Mapping[Symbol, float], dt: float) -> Vector:
+        """Return the driven coordinates after ``dt``.
+
+        Raises
+        ------
+        _StuckError
+            If they run to infinity on the way.
+        """
+        known = {s: state[s] for s in self._inputs if s in state}
+        known.update({v: speeds.get(v, 0.0) for v in self.speeds})
+        evaluator = self._function.bind()
+        evaluator.input[:] = assign(self._inputs, State(known))
+        moving = len(self.driven)
+        pace = np.array([speeds.get(s.derivative(), 0.0) if s.has_derivative else 0.0 for s in self.beside])
+        start = evaluator.input[: moving + len(self.beside)].copy()
+        flow, gains = evaluator.outputs
+
+        def rate(q: Vector) -> Vector:
+            evaluator.input[: len(q)] = q
+            evaluator()
+            return np.concatenate([flow, pace])
+
+        # A row's scale of change: its rate where it starts, per radian or metre.
+        rate(start)
+        fastest = max((abs(speeds.get(v, 0.0)) for v in self.speeds), default=0.0)
+        scale = fastest * float(np.abs(gains).sum())
+        longest = dt / max(1, math.ceil(abs(dt) * scale / _LONGEST))
+        return _followed(rate, start, dt, longest)[:moving]
 
 
-def _gain(rates: Rates, driven: list[Symbol], state: State, symbols: tuple[Symbol, ...]) -> float:
-    """Return the largest magnitude of an entry of R at the state."""
-    entries = [g for x in driven for g in rates[x].values()]
-    function = ca.Function("gain", [ca.vertcat(*(s._sx for s in symbols))], [ca.vertcat(*lower(entries))])
-    values = np.abs(np.array(function(assign(symbols, State({s: state[s] for s in symbols if s in state})))))
-    return float(values.sum())
+@functools.lru_cache(maxsize=32)
+def flow_of(rates: Rates) -> Flow:
+    """Return the flow of a table; tables are immutable, and filters ask at every step."""
+    return Flow(rates)
 
 
-def _extrapolated_step(rate: Callable[[Vector], Vector], q: Vector, dt: float) -> Vector:
-    """Return q after dt: modified midpoint rules with more and more substeps, extrapolated to none."""
+class _StuckError(Exception):
+    """Steps became too short to get anywhere."""
+
+    def __init__(self, done: float) -> None:
+        self.done = done
+
+
+def _followed(rate: Callable[[Vector], Vector], q: Vector, dt: float, longest: float) -> Vector:
+    """Return q after dt, in steps of a length that the estimated error allows."""
+    done, step = 0.0, longest
+    while abs(done) < abs(dt):
+        left = dt - done
+        step = step if abs(step) < abs(left) else left
+        with np.errstate(all="ignore"):  # a step that is too long may lead anywhere; it is not taken
+            after, error = _extrapolated_step(rate, q, step)
+            size = max(1.0, float(np.abs([q, after]).max()))
+        close = math.isfinite(error) and error <= _ERROR * size
+        if close:
+            q = after
+            done = dt if step == left else done + step
+            step = 2 * step if abs(2 * step) < abs(longest) else longest
+        elif abs(step) > _SHORTEST * abs(dt):
+            step /= 2
+        else:
+            raise _StuckError(done)
+    return q
+
+
+def _extrapolated_step(rate: Callable[[Vector], Vector], q: Vector, dt: float) -> tuple[Vector, float]:
+    """Return q after dt, and an estimate of its error.
+
+    They are modified midpoint rules with more and more substeps, extrapolated to steps of no length. The last
+    two extrapolations differ by the error of the worse one.
+    """
     table: list[Vector] = []
     for k, n in enumerate(_SUBSTEPS):
         h = dt / n
@@ -133,4 +201,4 @@ def _extrapolated_step(rate: Callable[[Vector], Vector], q: Vector, dt: float) -
             ratio = (n / _SUBSTEPS[k - j - 1]) ** 2
             row.append(row[j] + (row[j] - table[j]) / (ratio - 1))
         table = row
-    return table[-1]
+    return table[-1], float(np.abs(table[-1] - table[-2]).max())

@@ -110,6 +110,12 @@ class Rates(Mapping[Symbol, Mapping[Symbol, Expression]]):
     def __len__(self) -> int:
         return len(self._rows)
 
+    def __eq__(self, other: object) -> bool:
+        return self.key == other.key if isinstance(other, Rates) else NotImplemented
+
+    def __hash__(self) -> int:
+        return hash(self.key)
+
     def closure(self, coordinate: Symbol) -> Rates:
         """Return the part of the table that the row of one coordinate is made of."""
         wanted, found = [coordinate], set[Symbol]()
