@@ -6,12 +6,12 @@ each other, round by round.
 
 from __future__ import annotations
 
-import gc
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from time import perf_counter
 from typing import Any
+
+from kineverse.collection import no_collection
 
 from .agreement import Array, check_agreement
 from .result import Measurement
@@ -96,18 +96,7 @@ def race(
         # Nobody always comes after the same neighbour, who may leave caches warm or the processor hot.
         first = number % len(contenders)
         for contender in (*contenders[first:], *contenders[:first]):
-            with _no_collection():
+            # The collector would charge everybody's garbage to whoever happens to run.
+            with no_collection():
                 samples[contender.name].append(contender.sample())
     return {c.name: Measurement(c.name, c.unit, tuple(samples[c.name])) for c in contenders}
-
-
-@contextmanager
-def _no_collection() -> Iterator[None]:
-    """Keep the collector out of a turn: it would charge everybody's garbage to whoever happens to run."""
-    collecting = gc.isenabled()
-    gc.disable()
-    try:
-        yield
-    finally:
-        if collecting:
-            gc.enable()

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import gc
 import hashlib
 import os
 from collections import OrderedDict
 from collections.abc import Iterator
-from contextlib import contextmanager
 
+from kineverse.collection import no_collection
 from kineverse.errors import FormatError
 from kineverse.model.frame import WORLD
 from kineverse.model.model import Model, Snapshot
@@ -95,15 +94,3 @@ def _operations(source: Source, content: bytes, prefix: str | None) -> Iterator[
             f"{path}: this version reads URDF (.urdf, .xml) and documents (.kv.json), "
             f"not '{''.join(path.suffixes) or name}'."
         )
-
-
-@contextmanager
-def no_collection() -> Iterator[None]:
-    """Pause the collector: loading makes many objects and no garbage, all of which it would look at often."""
-    collecting = gc.isenabled()
-    gc.disable()
-    try:
-        yield
-    finally:
-        if collecting:
-            gc.enable()

@@ -8,10 +8,10 @@ import sysconfig
 from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from importlib import resources
 from itertools import islice
 from pathlib import Path
 
+from kineverse import shipped
 from kineverse.errors import FormatError, UnknownNameError, suggest
 
 SUFFIXES = (".urdf", ".sdf", ".xml", ".kv.json")
@@ -31,8 +31,7 @@ class Source:
 
 def shipped_models() -> tuple[str, ...]:
     """Return the names of the models that come with the package."""
-    folder = resources.files("kineverse.shipped")
-    return tuple(sorted(f.name.removesuffix(".urdf") for f in folder.iterdir() if f.name.endswith(".urdf")))
+    return tuple(sorted(file.stem for file in shipped.FOLDER.glob("*.urdf")))
 
 
 def locate_model(name: str | os.PathLike[str]) -> Source:
@@ -53,7 +52,7 @@ def locate_model(name: str | os.PathLike[str]) -> Source:
         raise FormatError(f"A model is loaded by its name or from the path of a file, not from {name!r}.")
     text = os.fspath(name)
     if text in shipped_models():
-        return Source(Path(str(resources.files("kineverse.shipped").joinpath(f"{text}.urdf"))), text)
+        return Source(shipped.FOLDER / f"{text}.urdf", text)
     if text.lstrip().startswith("<"):
         raise UnknownNameError(
             "This looks like the text of a description, where the name or path of a model is expected. "

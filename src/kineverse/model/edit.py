@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from kineverse.collection import no_collection
 from kineverse.errors import EditError
 from kineverse.expressions.expression import ExpressionLike
 from kineverse.symbols import Symbol
@@ -228,7 +229,7 @@ class Edit:
 
     def include(self, source: Any, prefix: str | None = None) -> list[str]:
         """Append the operations of a file or shipped model, see :func:`kineverse.load`; return their tags."""
-        from kineverse.formats.loading import no_collection, operations_of
+        from kineverse.formats.loading import operations_of
 
         with no_collection():
             return [self.apply(operation, tag) for tag, operation in operations_of(source, prefix)]
