@@ -10,7 +10,6 @@ from .edited_robot import JOINT, MUJOCO, PINOCCHIO, compiled_again, joint_replac
 from .large_model import (
     READERS,
     RELEVANT,
-    RELEVANT_NEW,
     TO_EMPTY,
     TO_LARGE,
     large_model,
@@ -47,7 +46,6 @@ def measure(settings: Settings) -> Result:
             replace(ratio, bar=Bar(0.5, at_least=True)),
             Comparison(runs.name, runs.median, runs.unit, Bar(1 + READERS, at_least=False)),
             at_most(measured[RELEVANT], 50e-6),
-            at_most(measured[RELEVANT_NEW], 50e-6),
             at_most(edited[JOINT], 5e-3),
             faster(edited, JOINT, PINOCCHIO),
             faster(edited, JOINT, MUJOCO),
