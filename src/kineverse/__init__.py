@@ -28,6 +28,7 @@ from .errors import (
     NameTakenError,
     ShapeError,
     UnknownNameError,
+    UnsolvedError,
     ValueRejectedError,
 )
 from .expressions import Expression, array, total_derivative
@@ -103,6 +104,7 @@ __all__ = [
     "State",
     "Symbol",
     "UnknownNameError",
+    "UnsolvedError",
     "ValueRejectedError",
     "__version__",
     "array",

@@ -43,6 +43,10 @@ class CompileError(KineverseError, RuntimeError):
     """Expressions could not be turned into a function."""
 
 
+class UnsolvedError(KineverseError, ValueError):
+    """A closed loop, or another implicit function, has no solution at the values given."""
+
+
 class ModelError(KineverseError, ValueError):
     """The model would not be consistent: cyclic frames, cyclic rates, rows that end nowhere."""
 

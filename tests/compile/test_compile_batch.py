@@ -239,16 +239,6 @@ def test_large_batches_wait_for_the_compiler(monkeypatch: pytest.MonkeyPatch) ->
     assert f._batch._library.code is not None
 
 
-def test_a_solver_inside_stays_with_casadi() -> None:
-    x, p = ca.SX.sym("x"), ca.SX.sym("p")
-    solve = ca.rootfinder("secret_loop", "fast_newton", {"x": x, "p": p, "g": x * x - p})
-    root = make(solve(x0=1.0, p=a.casadi + 1.0)["x"], (), frozenset())
-    f = kv.compile([root, a], tier="c", wait=True)
-    assert "secret" not in f._program.source()
-    assert f([3.0])[0] == pytest.approx(2.0, abs=1e-12)
-    assert np.allclose(f.batch(np.arange(50.0).reshape(50, 1))[0], np.sqrt(np.arange(50) + 1.0))
-
-
 def test_many_threads_and_pieces(function: kv.CompiledFunction, monkeypatch: pytest.MonkeyPatch) -> None:
     x = np.random.default_rng(0).uniform(-3, 3, (5000, 7))
     wanted = [v.copy() for v in function.batch(x)]

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from kineverse.errors import CompileError, ShapeError
+from kineverse.errors import CompileError, ShapeError, UnsolvedError
 
 from .batch_source import KIND, batch_source, vectorisable
 from .binding import Array, Shape, bind
@@ -36,7 +36,7 @@ class Batch:
 
     The program is compiled for vectors when that pays: a call whose rows would keep the interpreter busy for
     longer than the compiler waits for it, smaller ones add up until it is compiled in the background. What
-    cannot be done on vectors (solvers inside of loops) stays with CasADi's map over the function of single
+    cannot be done on vectors stays with CasADi's map over the function of single
     calls.
 
     Parameters
@@ -91,7 +91,17 @@ class Batch:
             self._interpret(points, results, function)
         else:
             self._run(code, points, results)
+        if self._program.implicit:
+            self._check(points, results)
         return results[0] if self._single else tuple(results)
+
+    def _check(self, points: Array, results: Sequence[Array]) -> None:
+        rows = np.logical_or.reduce([np.isnan(r).reshape(len(points), -1).any(axis=1) for r in results])
+        for row in np.flatnonzero(rows):
+            try:
+                self._program.check(points[row], [r[row] for r in results])
+            except UnsolvedError as error:
+                raise UnsolvedError(f"Row {row}: {error}") from None
 
     def _points(self, x: npt.ArrayLike) -> Array:
         size = self._signature.size
@@ -170,7 +180,7 @@ class Batch:
             vectors = np.zeros((count, size))
             outputs = [np.zeros((count, s)) for s in self._program.sizes]
             several = function.map(count) if count > 1 else function
-            run, _keep = bind(several, vectors, outputs, self._program.calls_others)
+            run, _keep = bind(several, vectors, outputs, None)
             for start in range(first, end, count):
                 stop = min(start + count, end)
                 # Rows of an earlier round stay behind the last ones and are computed for nothing.

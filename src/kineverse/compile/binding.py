@@ -14,11 +14,8 @@ from typing import Any, TypeAlias
 import numpy as np
 import numpy.typing as npt
 
-from kineverse.errors import ValueRejectedError
+from .program import CasadiFunction, Check, Vector
 
-from .program import CasadiFunction
-
-Vector: TypeAlias = npt.NDArray[np.float64]
 Array: TypeAlias = npt.NDArray[np.float64]
 Run: TypeAlias = Callable[[], object]
 Call: TypeAlias = Callable[[Any], Any]
@@ -26,7 +23,7 @@ Shape: TypeAlias = tuple[int, ...]
 
 
 def bind(
-    function: CasadiFunction, vector: Vector, outputs: Sequence[Array], checked: bool
+    function: CasadiFunction, vector: Vector, outputs: Sequence[Array], check: Check | None
 ) -> tuple[Run, object]:
     """Bind a function of one vector to arrays.
 
@@ -38,8 +35,8 @@ def bind(
         Where it reads; contiguous.
     outputs
         Where it writes, an array per output; contiguous.
-    checked
-        Whether it can fail, as it can if it calls other functions.
+    check
+        What is done with vector and outputs after each evaluation; None for nothing.
 
     Returns
     -------
@@ -50,22 +47,23 @@ def bind(
     buffer.set_arg(0, vector.data)
     for i, output in enumerate(outputs):
         buffer.set_res(i, output.reshape(-1).data)
-    if not checked:
+    if check is None:
         return run, buffer
 
     def run_checked() -> None:
-        try:
-            run()
-        except RuntimeError as error:
-            raise ValueRejectedError(f"The function has no value here: {_last_line(error)}") from None
-        if buffer.ret():
-            raise ValueRejectedError("The function has no value here: a function inside of it failed.")
+        run()
+        check(vector, outputs)
 
     return run_checked, buffer
 
 
 def pooled(
-    function: CasadiFunction, size: int, shapes: Sequence[Shape], single: bool, convert: Call, checked: bool
+    function: CasadiFunction,
+    size: int,
+    shapes: Sequence[Shape],
+    single: bool,
+    convert: Call,
+    check: Check | None,
 ) -> Call:
     """Return a call that gives fresh arrays and can be used by any number of threads.
 
@@ -81,8 +79,8 @@ def pooled(
         Whether the one array is returned, rather than a tuple of them.
     convert
         Turns what is not a vector of doubles into one, or raises.
-    checked
-        Whether the function can fail.
+    check
+        As for :func:`bind`.
     """
     # Appending to and popping from a list are atomic.
     pool: list[tuple[memoryview, Run, Any, object]] = []
@@ -92,7 +90,7 @@ def pooled(
     def new() -> tuple[memoryview, Run, Any, object]:
         vector = np.zeros(size)
         outputs = tuple(np.zeros(shape) for shape in shapes)
-        run, keep = bind(function, vector, outputs, checked)
+        run, keep = bind(function, vector, outputs, check)
         return vector.data, run, tuple(output.copy for output in outputs), keep
 
     def evaluate(x: Any) -> Any:
@@ -119,7 +117,3 @@ def pooled(
         return results
 
     return evaluate
-
-
-def _last_line(error: Exception) -> str:
-    return str(error).strip().splitlines()[-1].rpartition(": ")[2]

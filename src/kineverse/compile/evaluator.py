@@ -8,7 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from .binding import Array, Run, Shape, Vector
+from .binding import Array, Run, Shape
+from .program import Vector
 
 
 class Evaluator(metaclass=ABCMeta):

@@ -19,11 +19,11 @@ from kineverse.expressions import Expression, ExpressionLike, array
 from kineverse.symbols import Symbol
 
 from .batch import Batch
-from .binding import Array, Shape, Vector, bind, pooled
+from .binding import Array, Shape, bind, pooled
 from .evaluator import Evaluator
 from .library import Library
 from .native import MOST_OUTPUTS, native
-from .program import NAME, CasadiFunction, Program
+from .program import NAME, CasadiFunction, Program, Vector
 from .signature import signature
 
 logger = logging.getLogger("kineverse.compile")
@@ -259,15 +259,14 @@ class CompiledFunction:
         address
             Where its C is, if it is compiled.
         """
-        shapes, checked, convert = self.shapes, self._program.calls_others, self._signature.vector
-        direct = (
-            address is not None and not checked and len(shapes) <= MOST_OUTPUTS and native.module is not None
-        )
+        shapes, check, convert = self.shapes, self._program.checked, self._signature.vector
+        direct = address is not None and len(shapes) <= MOST_OUTPUTS and native.module is not None
         if direct:
             lengthy = self._program.instructions > _LENGTHY
-            call = native.module.Call(address, self._signature.size, shapes, self._single, lengthy, convert)
+            size = self._signature.size
+            call = native.module.Call(address, size, shapes, self._single, lengthy, convert, check)
         else:
-            call = pooled(function, self._signature.size, shapes, self._single, convert, checked)
+            call = pooled(function, self._signature.size, shapes, self._single, convert, check)
         with self._lock:
             self._function = function
             self._native = address if direct else None
@@ -285,13 +284,13 @@ class CompiledFunction:
             run = self._native_evaluator(evaluator.input, evaluator.outputs)
             evaluator._evaluate_by(run, None)
         else:
-            checked = self._program.calls_others
-            evaluator._evaluate_by(*bind(self._function, evaluator.input, evaluator.outputs, checked))
+            check = self._program.checked
+            evaluator._evaluate_by(*bind(self._function, evaluator.input, evaluator.outputs, check))
 
     def _native_evaluator(self, vector: Vector, outputs: tuple[Array, ...]) -> Evaluator:
         lengthy = self._program.instructions > _LENGTHY
         evaluator: Evaluator = native.module.Evaluator(
-            self._native, vector, outputs, lengthy, self._signature.vector
+            self._native, vector, outputs, lengthy, self._signature.vector, self._program.checked
         )
         return evaluator
 

@@ -42,7 +42,26 @@ static const double *vector_of(PyObject *x, npy_intp n, PyObject *convert, PyObj
 
 static void *address_of(PyObject *number) { return PyLong_AsVoidPtr(number); }
 
-/* ---- Call(address, n, shapes, single, lengthy, convert): fresh arrays, any thread ---- */
+/* Where there is NaN in a tuple of arrays (or in one array), let check(vector, arrays) say what it thinks. */
+static int checked(PyObject *check, PyObject *vector, PyObject *arrays) {
+  if (check == Py_None) return 0;
+  const int many = PyTuple_CheckExact(arrays);
+  const Py_ssize_t count = many ? PyTuple_GET_SIZE(arrays) : 1;
+  for (Py_ssize_t i = 0; i < count; i++) {
+    PyArrayObject *array = (PyArrayObject *)(many ? PyTuple_GET_ITEM(arrays, i) : arrays);
+    const double *numbers = (const double *)PyArray_DATA(array);
+    const npy_intp size = PyArray_SIZE(array);
+    for (npy_intp k = 0; k < size; k++) {
+      if (numbers[k] == numbers[k]) continue;
+      PyObject *said = PyObject_CallFunctionObjArgs(check, vector, arrays, NULL);
+      Py_XDECREF(said);
+      return said ? 0 : -1;
+    }
+  }
+  return 0;
+}
+
+/* ---- Call(address, n, shapes, single, lengthy, convert, check): fresh arrays, any thread ---- */
 
 typedef struct {
   PyObject_HEAD
@@ -52,7 +71,7 @@ typedef struct {
   int outputs, single, lengthy;
   int *dimensions;
   npy_intp *shapes;
-  PyObject *convert;
+  PyObject *convert, *check;
 } Call;
 
 #define MOST_OUTPUTS 256
@@ -81,6 +100,7 @@ static PyObject *call_vectorcall(PyObject *object, PyObject *const *args, size_t
     shape += self->dimensions[i];
   }
   if (compute(self->function, x, results, self->lengthy)) goto failed;
+  if (checked(self->check, owner ? owner : args[0], result)) goto failed;
   Py_XDECREF(owner);
   return result;
 failed:
@@ -94,14 +114,16 @@ static void call_dealloc(PyObject *object) {
   PyMem_Free(self->dimensions);
   PyMem_Free(self->shapes);
   Py_XDECREF(self->convert);
+  Py_XDECREF(self->check);
   Py_TYPE(object)->tp_free(object);
 }
 
 static PyObject *call_new(PyTypeObject *type, PyObject *args, PyObject *names) {
-  PyObject *address, *shapes, *convert;
+  PyObject *address, *shapes, *convert, *check;
   Py_ssize_t n;
   int single, lengthy;
-  if (!PyArg_ParseTuple(args, "OnO!ppO", &address, &n, &PyTuple_Type, &shapes, &single, &lengthy, &convert))
+  if (!PyArg_ParseTuple(args, "OnO!ppOO", &address, &n, &PyTuple_Type, &shapes, &single, &lengthy, &convert,
+                        &check))
     return NULL;
   Py_ssize_t outputs = PyTuple_GET_SIZE(shapes), total = 0;
   if (outputs < 1 || outputs > MOST_OUTPUTS) {
@@ -118,6 +140,7 @@ static PyObject *call_new(PyTypeObject *type, PyObject *args, PyObject *names) {
   self->single = single;
   self->lengthy = lengthy;
   self->convert = Py_NewRef(convert);
+  self->check = Py_NewRef(check);
   self->dimensions = PyMem_Calloc(outputs, sizeof(int));
   self->shapes = PyMem_Calloc(total + 1, sizeof(npy_intp));
   if (!self->dimensions || !self->shapes) {
@@ -147,7 +170,7 @@ static PyTypeObject CallType = {
     .tp_new = call_new,
 };
 
-/* ---- Evaluator(address, input, outputs, lengthy, convert): in place, one thread ---- */
+/* ---- Evaluator(address, input, outputs, lengthy, convert, check): in place, one thread ---- */
 
 typedef struct {
   PyObject_HEAD
@@ -157,7 +180,7 @@ typedef struct {
   npy_intp n;
   int lengthy;
   double **results;
-  PyObject *input, *outputs, *convert;
+  PyObject *input, *outputs, *convert, *check;
 } Evaluator;
 
 static PyObject *evaluator_vectorcall(PyObject *object, PyObject *const *args, size_t count,
@@ -176,6 +199,7 @@ static PyObject *evaluator_vectorcall(PyObject *object, PyObject *const *args, s
     Py_XDECREF(owner);
   }
   if (compute(self->function, self->x, self->results, self->lengthy)) return NULL;
+  if (checked(self->check, self->input, self->outputs)) return NULL;
   Py_RETURN_NONE;
 }
 
@@ -185,14 +209,15 @@ static void evaluator_dealloc(PyObject *object) {
   Py_XDECREF(self->input);
   Py_XDECREF(self->outputs);
   Py_XDECREF(self->convert);
+  Py_XDECREF(self->check);
   Py_TYPE(object)->tp_free(object);
 }
 
 static PyObject *evaluator_new(PyTypeObject *type, PyObject *args, PyObject *names) {
-  PyObject *address, *input, *outputs, *convert;
+  PyObject *address, *input, *outputs, *convert, *check;
   int lengthy;
-  if (!PyArg_ParseTuple(args, "OO!O!pO", &address, &PyArray_Type, &input, &PyTuple_Type, &outputs, &lengthy,
-                        &convert))
+  if (!PyArg_ParseTuple(args, "OO!O!pOO", &address, &PyArray_Type, &input, &PyTuple_Type, &outputs, &lengthy,
+                        &convert, &check))
     return NULL;
   Evaluator *self = (Evaluator *)type->tp_alloc(type, 0);
   if (!self) return NULL;
@@ -204,6 +229,7 @@ static PyObject *evaluator_new(PyTypeObject *type, PyObject *args, PyObject *nam
   self->input = Py_NewRef(input);
   self->outputs = Py_NewRef(outputs);
   self->convert = Py_NewRef(convert);
+  self->check = Py_NewRef(check);
   const Py_ssize_t count = PyTuple_GET_SIZE(outputs);
   self->results = PyMem_Calloc(count + 1, sizeof(double *));
   if (!self->results) {

@@ -8,16 +8,21 @@ from __future__ import annotations
 
 import hashlib
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, TypeAlias
 
 import casadi as ca
+import numpy as np
+import numpy.typing as npt
 
 from kineverse.errors import CompileError
 from kineverse.expressions import Expression, layout
+from kineverse.expressions.implicit import explain, implicit_nodes
 from kineverse.symbols import Symbol
 
 CasadiFunction: TypeAlias = Any
+Vector: TypeAlias = npt.NDArray[np.float64]
+Check: TypeAlias = Callable[[Vector, Sequence[Vector]], None]
 
 NAME = "kineverse_function"
 
@@ -54,8 +59,9 @@ class Program:
         # Common parts are not shared yet: for a library that exists already, that would be time lost.
         graph = ca.Function(NAME, [self._vector], self._columns)
         self.instructions: int = graph.n_instructions()
-        # Such as the solver inside of a closed loop.
-        self.calls_others = bool(graph.find_functions(1))
+        # Closed loops, which have no solution everywhere.
+        self.implicit = implicit_nodes(outputs)
+        self._symbols = tuple(inputs)
         text = f"{_PRELUDE} {ca.CasadiMeta.version()} {graph.serialize()}"
         self.digest = hashlib.sha256(text.encode())
 
@@ -70,6 +76,31 @@ class Program:
         digest = self.digest.copy()
         digest.update(repr(details).encode())
         return digest.hexdigest()[:40]
+
+    def check(self, vector: Vector, results: Sequence[Vector]) -> None:
+        """Raise an error if results are NaN because an implicit function has no solution.
+
+        Parameters
+        ----------
+        vector
+            What was evaluated at, shape (n,).
+        results
+            What came out, of any shape.
+
+        Raises
+        ------
+        UnsolvedError
+            Naming the function, and where it was asked for.
+        """
+        if any(np.isnan(result).any() for result in results):
+            error = explain(self.implicit, self._symbols, vector)
+            if error is not None:
+                raise error
+
+    @property
+    def checked(self) -> Check | None:
+        """:meth:`check` if there is anything to check."""
+        return self.check if self.implicit else None
 
     @property
     def function(self) -> CasadiFunction:

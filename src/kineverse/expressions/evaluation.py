@@ -30,6 +30,12 @@ def evaluate(
     (column,) = lower([expression])
     inputs = ca.vertcat(*(s._sx for s in symbols)) if symbols else ca.SX(0, 1)
     result = np.array(ca.Function("e", [inputs], [column])(vector)).reshape(expression.shape)
+    if np.isnan(result).any():
+        from .implicit import explain, implicit_nodes
+
+        error = explain(implicit_nodes([expression]), symbols, vector)
+        if error is not None:
+            raise error
     return result[()]
 
 

@@ -1,0 +1,228 @@
+"""Implicit functions: unknowns x(u) that make a residual r(x, u) zero.
+
+An :class:`Implicit` node is worth what a few Newton steps lead to from a *seed*, which is a function of the
+inputs: so the value, and which of several solutions it is, follows from the inputs alone and never from
+earlier calls. Derivatives come from the implicit function theorem and not from the steps,
+
+    ∂x/∂u = -(∂r/∂x)⁻¹ ∂r/∂u,
+
+and again from it where these are differentiated, so they are exact to every order. Where the steps do not
+arrive, because there is no solution or it is singular, the value is NaN inside the graph; whoever evaluates
+asks :func:`explain` and raises.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING, Any
+
+import casadi as ca
+import numpy as np
+import numpy.typing as npt
+
+from kineverse.errors import ShapeError, UnsolvedError, ValueRejectedError
+
+from .expression import Expression, make, union
+from .layout import SX
+from .leaves import bottom_up, leaves
+from .lowering import lowered
+from .node import Node
+from .substitution import apply
+
+if TYPE_CHECKING:
+    from kineverse.symbols import Symbol
+
+TOLERANCE = 1e-10
+"""What a residual may be, in its own unit [m] or [rad]."""
+
+
+@dataclass(frozen=True, eq=False)
+class ImplicitFunction:
+    """What defines unknowns as a function of inputs.
+
+    Attributes
+    ----------
+    name
+        What errors call it.
+    unknowns, inputs
+        The symbols x, of shape (n,), and u, of shape (k,), that the expressions below are about. They are the
+        function's own: where it is used, other expressions take the places of u.
+    residual
+        r(x, u), of shape (m,) with m at least n; all of it is zero at a solution.
+    rows
+        Which n rows of the residual Newton's method uses; a closed loop has more equations than unknowns.
+    seed
+        The first guess of x, of shape (n,), a function of u alone.
+    steps
+        How many Newton steps.
+
+    Raises
+    ------
+    ShapeError
+        If the parts do not fit together.
+    ValueRejectedError
+        If residual or seed are about other symbols.
+    """
+
+    name: str
+    unknowns: tuple[Symbol, ...]
+    inputs: tuple[Symbol, ...]
+    residual: Expression
+    rows: tuple[int, ...]
+    seed: Expression
+    steps: int
+
+    def __post_init__(self) -> None:
+        n = len(self.unknowns)
+        if not n or self.seed.shape != (n,) or len(self.rows) != n or self.residual.ndim != 1:
+            raise ShapeError(
+                f"'{self.name}' has {n} unknowns; seed and rows are as many, and the residual is a vector, "
+                f"not {self.seed.shape}, ({len(self.rows)},) and {self.residual.shape}."
+            )
+        if not all(0 <= row < self.residual.shape[0] for row in self.rows) or len(set(self.rows)) < n:
+            raise ShapeError(f"'{self.name}': rows are {n} different ones of {self.residual.shape[0]}.")
+        known = {*self.unknowns, *self.inputs}
+        if len(known) < n + len(self.inputs):
+            raise ValueRejectedError(f"'{self.name}': a symbol is given twice.")
+        for what, part, allowed in (
+            ("residual", self.residual, known),
+            ("seed", self.seed, set(self.inputs)),
+        ):
+            strange = sorted(str(s) for s in part.symbols if s not in allowed)
+            if strange:
+                raise ValueRejectedError(f"'{self.name}': the {what} is about {', '.join(strange)}, too.")
+
+    @cached_property
+    def key(self) -> bytes:
+        """A digest of the content, the same in every process."""
+        digest = hashlib.blake2b(digest_size=16)
+        symbols = [[s.sort_key for s in group] for group in (self.unknowns, self.inputs)]
+        digest.update(repr((self.name, symbols, self.rows, self.steps)).encode())
+        digest.update(self.residual.key + self.seed.key)
+        return digest.digest()
+
+    @cached_property
+    def chosen(self) -> Expression:
+        """The rows of the residual that are solved, shape (n,)."""
+        return self.residual[np.array(self.rows)]
+
+    @cached_property
+    def by_unknowns(self) -> Expression:
+        """∂r/∂x of the chosen rows, n×n."""
+        return self.chosen.partial(self.unknowns)
+
+    @cached_property
+    def by_inputs(self) -> Expression:
+        """∂r/∂u of the chosen rows, n×k."""
+        return self.chosen.partial(self.inputs)
+
+    def of(self, arguments: Sequence[Expression]) -> Expression:
+        """Return the unknowns at other inputs than the function's own, shape (n,)."""
+        return Implicit.of(tuple(arguments), (len(self.unknowns),), (self,))
+
+    def at(self, part: Expression, x: Sequence[Expression], u: Sequence[Expression]) -> Expression:
+        """Return a part of the definition with unknowns and inputs put in."""
+        return apply(part, dict(zip((*self.unknowns, *self.inputs), (*x, *u), strict=True)))
+
+    def __reduce__(self) -> Any:
+        return ImplicitFunction, (
+            self.name, self.unknowns, self.inputs, self.residual, self.rows, self.seed, self.steps,
+        )  # fmt: skip
+
+
+class Implicit(Node):
+    """The unknowns of an :class:`ImplicitFunction` at some inputs, its arguments."""
+
+    __slots__ = ()
+    kind = "implicit"
+    own_partials = True
+
+    @property
+    def function(self) -> ImplicitFunction:
+        """What defines it."""
+        function: ImplicitFunction = self.options[0]
+        return function
+
+    @property
+    def label(self) -> str:
+        """The name of the function."""
+        return self.function.name
+
+    @classmethod
+    def _options_key(cls, options: tuple[ImplicitFunction, ...]) -> str:
+        return options[0].key.hex()
+
+    def _value(self) -> Expression:
+        f, u = self.function, self.arguments
+        n = len(f.unknowns)
+        x = f.at(f.seed, f.unknowns, u)
+        for _ in range(f.steps):
+            point = [x[i] for i in range(n)]
+            matrix, residual = f.at(f.by_unknowns, point, u), f.at(f.chosen, point, u)
+            x = x - _solved(matrix, residual)
+        error = f.at(f.residual, [x[i] for i in range(n)], u)
+        fits = ca.sumsqr(error._sx) <= TOLERANCE**2
+        return make(ca.if_else(fits, x._sx, ca.SX.nan(n, 1)), (n,), union((x, error)))
+
+    def _gradient(self, heuristic: bool) -> Mapping[Symbol, Expression]:
+        f, u = self.function, self.arguments
+        gradients = [a.gradient(heuristic) for a in u]
+        keys = sorted(set().union(*gradients), key=lambda s: s.sort_key)
+        if not keys:
+            return {}
+        itself = make(self.sx, self.shape, frozenset((self,)))
+        x = [itself[i] for i in range(len(f.unknowns))]
+        matrix, by_inputs = f.at(f.by_unknowns, x, u), f.at(f.by_inputs, x, u)
+        columns = []
+        for key in keys:
+            entries = [g.get(key) for g in gradients]
+            parts = [by_inputs[:, j] * e for j, e in enumerate(entries) if e is not None]
+            columns.append(sum(parts[1:], parts[0]))
+        moved = make(
+            ca.horzcat(*(ca.densify(c._sx) for c in columns)), (len(x), len(keys)), union(tuple(columns))
+        )
+        solved = _solved(matrix, moved)
+        return {key: -solved[:, i] for i, key in enumerate(keys)}
+
+
+def _solved(matrix: Expression, right: Expression) -> Expression:
+    """Return matrix⁻¹ right, which has one or two dimensions."""
+    a, b = matrix._sx, right._sx
+    sx: SX = b / a if a.numel() == 1 else ca.solve(ca.densify(a), ca.densify(b))
+    return make(sx, right.shape, union((matrix, right)))
+
+
+def implicit_nodes(expressions: Sequence[Expression]) -> tuple[Implicit, ...]:
+    """Return the implicit functions inside of values, those first that others need."""
+    found = [
+        node
+        for node in bottom_up(
+            (n for e in expressions for n in leaves(e)[1]), lambda n: (n.value, *n.arguments), lambda _: False
+        )
+        if isinstance(node, Implicit)
+    ]
+    return tuple(dict.fromkeys(found))
+
+
+def explain(
+    nodes: Sequence[Implicit], symbols: Sequence[Symbol], numbers: npt.NDArray[np.float64]
+) -> UnsolvedError | None:
+    """Return why values are NaN: the first function that has no solution here, None if all have one."""
+    if not nodes or np.isnan(numbers).any():
+        return None
+    vector = ca.vertcat(*(s._sx for s in symbols)) if symbols else ca.SX(0, 1)
+    for node in nodes:
+        arguments = [ca.densify(lowered(a)) for a in node.arguments]
+        found = ca.Function("at", [vector], [ca.densify(lowered(node.value)), ca.vertcat(*arguments)])
+        value, inputs = (np.array(part).ravel() for part in found(numbers))
+        if np.isnan(value).any():
+            names = node.function.inputs
+            where = ", ".join(f"{s} = {x:.6g}" for s, x in zip(names, inputs, strict=True))
+            return UnsolvedError(
+                f"'{node.label}' has no solution at {where}. Stay within the limits it was made for, "
+                "or away from configurations in which it is singular."
+            )
+    return None
