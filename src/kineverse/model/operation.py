@@ -20,7 +20,7 @@ from .articulation import Articulation
 from .body import Body, Pose
 from .constraint import Constraint, ConstraintLike, as_constraint
 from .frame import Frame, TransformLike
-from .rates import as_row, plain
+from .rates import as_entry, plain
 
 if TYPE_CHECKING:
     from .reader import Reader
@@ -47,7 +47,8 @@ class Effects:
         :class:`Constraint` values or triples (lower, expression, upper). They live and die with the
         operation.
     rates
-        From coordinates to rows ``{speed: expression}``, see :mod:`kineverse.model.rates`.
+        From coordinates to rows ``{speed: expression}``, or to the expression that a coordinate is which
+        depends on others, see :mod:`kineverse.model.rates`.
     bodies, articulations
         What the frames carry, and records for people and exporters.
     data
@@ -58,7 +59,7 @@ class Effects:
         default_factory=dict
     )
     constraints: Mapping[str, ConstraintLike] = field(default_factory=dict)
-    rates: Mapping[Symbol, Mapping[Symbol, ExpressionLike]] = field(default_factory=dict)
+    rates: Mapping[Symbol, Mapping[Symbol, ExpressionLike] | ExpressionLike] = field(default_factory=dict)
     bodies: Mapping[str, Body] = field(default_factory=dict)
     articulations: Mapping[str, Articulation] = field(default_factory=dict)
     data: Mapping[str, Any] = field(default_factory=dict)
@@ -79,7 +80,7 @@ class Effects:
                 c = Constraint(plain(c.lower), plain(c.expression), plain(c.upper))
             result[CONSTRAINTS, name] = c
         for coordinate, row in self.rates.items():
-            result[RATES, str(coordinate)] = (coordinate, as_row(coordinate, row))
+            result[RATES, str(coordinate)] = (coordinate, as_entry(coordinate, row))
         others: tuple[tuple[str, Mapping[str, Any]], ...] = (
             (BODIES, self.bodies),
             (ARTICULATIONS, self.articulations),

@@ -5,6 +5,9 @@ wheels of a differential drive, the angular velocity of a quaternion. What a mod
 coordinates *carried*: each is an opaque node whose value is x and whose gradient is its row, so every
 gradient shows the wheels.
 
+A coordinate may also *depend* on others, as the angles of a closed loop do on its crank: then its entry is an
+expression. What the model hands out has that expression in its place, and moves with its gradient.
+
 Rows use the carried coordinates themselves (the heading in a wheel's row turns, or accelerations are wrong),
 which may well be circular: a quaternion's rate is made of the quaternion. A carried coordinate therefore
 refers to its table and unfolds one derivative at a time.
@@ -13,9 +16,9 @@ refers to its table and unfolds one derivative at a time.
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from functools import cached_property
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeAlias
 
 from kineverse.errors import ModelError, ValueRejectedError
 from kineverse.expressions.expression import Expression, ExpressionLike, as_expression
@@ -27,7 +30,35 @@ from kineverse.symbols import Symbol
 if TYPE_CHECKING:
     from kineverse.expressions.substitution import Substitution
 
-Row = tuple[tuple[Symbol, Expression], ...]
+Row: TypeAlias = tuple[tuple[Symbol, Expression], ...]
+Entry: TypeAlias = Row | Expression
+
+
+def as_entry(coordinate: Symbol, value: Mapping[Symbol, ExpressionLike] | ExpressionLike) -> Entry:
+    """Return a row, or what a dependent coordinate is, in plain coordinates.
+
+    Raises
+    ------
+    ModelError
+        If the coordinate is not a position, or a key of the row not a velocity.
+    ValueRejectedError
+        If the expression is no scalar, or is about speeds.
+    """
+    if isinstance(value, Mapping):
+        return as_row(coordinate, value)
+    _check_coordinate(coordinate)
+    expression = plain(as_expression(value))
+    if expression.shape:
+        raise ValueRejectedError(f"'{coordinate}' is a scalar, and not of shape {expression.shape}.")
+    moving = [str(s) for s in expression.symbols if s.order]
+    if moving:
+        raise ValueRejectedError(f"'{coordinate}' depends on positions, and not on {', '.join(moving)}.")
+    return expression
+
+
+def _check_coordinate(coordinate: Symbol) -> None:
+    if not isinstance(coordinate, Symbol) or coordinate.order or not coordinate.has_derivative:
+        raise ModelError(f"Only positions have a rate, and '{coordinate}' is none.")
 
 
 def as_row(coordinate: Symbol, row: Mapping[Symbol, ExpressionLike]) -> Row:
@@ -38,8 +69,7 @@ def as_row(coordinate: Symbol, row: Mapping[Symbol, ExpressionLike]) -> Row:
     ModelError
         If the coordinate is not a position, or a key not a velocity.
     """
-    if not isinstance(coordinate, Symbol) or coordinate.order or not coordinate.has_derivative:
-        raise ModelError(f"Only positions have a rate, and '{coordinate}' is none.")
+    _check_coordinate(coordinate)
     if not isinstance(row, Mapping):
         raise ModelError(f"The rate of '{coordinate}' is a mapping {{speed: expression}}, not {row!r}.")
     entries = []
@@ -56,50 +86,74 @@ def as_row(coordinate: Symbol, row: Mapping[Symbol, ExpressionLike]) -> Row:
 
 
 class Rates(Mapping[Symbol, Mapping[Symbol, Expression]]):
-    """An immutable rate table: from coordinates to rows over free speeds, in plain coordinates.
+    """An immutable rate table: from driven coordinates to rows over free speeds, in plain coordinates.
 
-    Rows that name the speed of a coordinate which has a row itself are resolved through it.
+    Rows that name the speed of a coordinate with an entry of its own are resolved through it. What depends on
+    others is no part of the mapping; :meth:`row` knows how that moves, too.
+
+    Attributes
+    ----------
+    dependent
+        What coordinates are that depend on others, in plain coordinates that do not.
 
     Raises
     ------
     ModelError
-        For rows that never end in free speeds, with the circle of coordinates.
+        For rows that never end in free speeds, and coordinates that depend on themselves, with the circle.
     """
 
-    def __init__(self, rows: Mapping[Symbol, Row]) -> None:
-        self._given = dict(rows)
+    dependent: Mapping[Symbol, Expression]
+
+    def __init__(self, entries: Mapping[Symbol, Entry]) -> None:
+        self._given = dict(entries)
         self._rows: dict[Symbol, dict[Symbol, Expression]] = {}
         self._carried: dict[Symbol, Expression] = {}
-        self._paths = {x.path for x in self._given}
-        for coordinate in self._given:
-            self._resolve(coordinate)
+        expressions = {x: e for x, e in self._given.items() if isinstance(e, Expression)}
+        self.dependent = dict[Symbol, Expression]()
+        for x in _in_order(
+            expressions, lambda x: [s for s in expressions[x].symbols if s in expressions], _DEPENDING
+        ):
+            self.dependent[x] = apply(expressions[x], self.dependent)
+        rows = {x: self._expanded(e) for x, e in self._given.items() if not isinstance(e, Expression)}
+        paths = {x.path for x in rows}
 
-    def _resolve(self, coordinate: Symbol) -> None:
-        # A path through the rows, by hand: chains may be longer than Python's stack.
-        path = {coordinate: None}
-        while path:
-            x = next(reversed(path))
-            row = self._given[x]
-            through = [v.position for v, _ in row if v.path in self._paths and v.position in self._given]
-            waiting = next((y for y in through if y not in self._rows), None)
-            if waiting is None:
-                self._rows[x] = self._combined(row) if through else dict(row)
-                del path[x]
-            elif waiting in path:
-                names = [str(y) for y in path]
-                circle = " -> ".join([*names[names.index(str(waiting)) :], str(waiting)])
-                raise ModelError(f"Cyclic rates, which never end in a free speed: {circle}.")
-            else:
-                path[waiting] = None
+        def through(x: Symbol) -> list[Symbol]:
+            return [v.position for v, _ in rows[x] if v.path in paths and v.position in rows]
 
-    def _combined(self, row: Row) -> dict[Symbol, Expression]:
+        for x in _in_order(rows, through, _CYCLIC):
+            self._rows[x] = self._combined(rows[x])
+
+    def _expanded(self, row: Row) -> Row:
+        """Return a row with everything about dependent coordinates put in terms of others."""
+        if not self.dependent:
+            return row
+        result: dict[Symbol, Expression] = {}
+        for speed, factor in row:
+            factor = apply(factor, {s: self.dependent[s] for s in all_symbols(factor) if s in self.dependent})
+            itself = self.dependent.get(speed.position)
+            gradient = {speed: as_expression(1.0)} if itself is None else itself.gradient(False)
+            _add(result, {v: factor * g for v, g in gradient.items()})
+        return tuple(result.items())
+
+    def _combined(self, row: Iterable[tuple[Symbol, Expression]]) -> dict[Symbol, Expression]:
+        """Return a row over free speeds."""
         result: dict[Symbol, Expression] = {}
         for speed, factor in row:
             inner: Mapping[Symbol, ExpressionLike] = self._rows.get(speed.position, {speed: 1.0})
-            for free, rate in inner.items():
-                term = factor * rate
-                result[free] = result[free] + term if free in result else term
+            _add(result, {free: factor * rate for free, rate in inner.items()})
         return result
+
+    def row(self, coordinate: Symbol) -> Mapping[Symbol, Expression] | None:
+        """Return how a coordinate moves with free speeds, in plain coordinates; None if it is free itself."""
+        itself = self.dependent.get(coordinate)
+        if itself is not None:
+            return self._combined(itself.gradient(False).items())
+        return self._rows.get(coordinate)
+
+    @property
+    def is_empty(self) -> bool:
+        """Whether all coordinates are free."""
+        return not self._given
 
     def __getitem__(self, coordinate: Symbol) -> Mapping[Symbol, Expression]:
         return self._rows[coordinate]
@@ -124,9 +178,9 @@ class Rates(Mapping[Symbol, Mapping[Symbol, Expression]]):
             if x in found:
                 continue
             found.add(x)
-            for speed, value in self._given[x]:
-                wanted += [s for s in (*all_symbols(value), speed.position) if s in self._given]
-        return Rates({x: self._given[x] for x in sorted(found, key=lambda s: s.sort_key)})
+            for value in self._rows[x].values():
+                wanted += [s for s in all_symbols(value) if s in self._rows]
+        return Rates({x: tuple(self._rows[x].items()) for x in sorted(found, key=lambda s: s.sort_key)})
 
     @cached_property
     def key(self) -> bytes:
@@ -134,13 +188,17 @@ class Rates(Mapping[Symbol, Mapping[Symbol, Expression]]):
         digest = hashlib.blake2b(digest_size=16)
         for x in sorted(self._given, key=lambda s: s.sort_key):
             digest.update(repr(x.sort_key).encode())
-            for speed, value in self._given[x]:
+            entry = self._given[x]
+            if isinstance(entry, Expression):
+                digest.update(entry.key)
+                continue
+            for speed, value in entry:
                 digest.update(repr(speed.sort_key).encode() + value.key)
         return digest.digest()
 
     @cached_property
     def symbols(self) -> frozenset[Symbol]:
-        """Every coordinate, every symbol of a row, and the coordinates of the speeds."""
+        """Every driven coordinate, every symbol of a row, and the coordinates of the speeds."""
         found = set(self._rows)
         for row in self._rows.values():
             for speed, value in row.items():
@@ -151,28 +209,66 @@ class Rates(Mapping[Symbol, Mapping[Symbol, Expression]]):
         """Return the carried form of a coordinate in the table."""
         known = self._carried.get(coordinate)
         if known is None:
-            known = self._carried[coordinate] = Carried.of((coordinate,), (), (self.closure(coordinate),))
+            if coordinate in self._rows:
+                known = Carried.of((coordinate,), (), (self.closure(coordinate),))
+            else:
+                known = Dependent.of((self.carry(self.dependent[coordinate]),), (), (coordinate,))
+            self._carried[coordinate] = known
         return known
 
     def carry(self, expression: Expression) -> Expression:
         """Return the expression in carried coordinates; carried twice is carried once."""
-        if not self._rows:
+        if not self._given:
             return expression
         expression = plain(expression)
-        wanted = {s: self.carried(s) for s in all_symbols(expression) if s in self._rows}
+        wanted = {
+            s: self.carried(s) for s in all_symbols(expression) if s in self._rows or s in self.dependent
+        }
         return apply(expression, wanted)
 
     def eliminate(self, expression: Expression) -> Expression:
         """Return the expression with every left-over ẋ replaced by ``Σ R[x][v]·v``."""
-        wanted = {
-            s: sum((self.carry(g) * v for v, g in self._rows[s.position].items()), as_expression(0.0))
-            for s in expression.symbols
-            if s.order == 1 and s.position in self._rows
-        }
+        wanted = {}
+        for s in expression.symbols:
+            row = self.row(s.position) if s.order == 1 else None
+            if row is not None:
+                wanted[s] = sum((self.carry(g) * v for v, g in row.items()), as_expression(0.0))
         return apply(expression, wanted)
 
-    def __reduce__(self) -> tuple[type[Rates], tuple[dict[Symbol, Row]]]:
+    def __reduce__(self) -> tuple[type[Rates], tuple[dict[Symbol, Entry]]]:
         return Rates, (self._given,)
+
+
+_CYCLIC = "Cyclic rates, which never end in a free speed"
+_DEPENDING = "Coordinates that depend on themselves"
+
+
+def _in_order(
+    coordinates: Iterable[Symbol], through: Callable[[Symbol], list[Symbol]], problem: str
+) -> Iterator[Symbol]:
+    """Yield coordinates, and before each of them those it leads to; a circle is a problem."""
+    done: set[Symbol] = set()
+    for coordinate in coordinates:
+        # A path by hand: chains may be longer than Python's stack.
+        path = {} if coordinate in done else {coordinate: None}
+        while path:
+            x = next(reversed(path))
+            waiting = next((y for y in through(x) if y not in done), None)
+            if waiting is None:
+                yield x
+                done.add(x)
+                del path[x]
+            elif waiting in path:
+                names = [str(y) for y in path]
+                circle = " -> ".join([*names[names.index(str(waiting)) :], str(waiting)])
+                raise ModelError(f"{problem}: {circle}.")
+            else:
+                path[waiting] = None
+
+
+def _add(row: dict[Symbol, Expression], terms: Mapping[Symbol, Expression]) -> None:
+    for speed, term in terms.items():
+        row[speed] = row[speed] + term if speed in row else term
 
 
 class Carried(Node):
@@ -224,6 +320,38 @@ class Carried(Node):
         return Composed.of((itself, *relevant.values()), (), tuple(relevant))
 
 
+class Dependent(Node):
+    """A coordinate that depends on others: its value and gradient are those of an expression."""
+
+    __slots__ = ()
+    kind = "dependent"
+
+    @property
+    def coordinate(self) -> Symbol:
+        """The plain coordinate."""
+        symbol: Symbol = self.options[0]
+        return symbol
+
+    @property
+    def label(self) -> str:
+        """The coordinate's name."""
+        return str(self.coordinate)
+
+    @classmethod
+    def _options_key(cls, options: tuple[Symbol, ...]) -> str:
+        return repr(options[0].sort_key)
+
+    def _value(self) -> Expression:
+        return self.arguments[0]
+
+    def _gradient(self, heuristic: bool) -> Mapping[Symbol, Expression]:
+        return self.arguments[0].gradient(heuristic)
+
+    def substitute(self, substitution: Substitution) -> Expression:
+        """Return the expression after a substitution, which is the coordinate of this model no more."""
+        return apply(self.arguments[0], substitution)
+
+
 class Composed(Node):
     """A carried coordinate after a substitution, unfolded one derivative at a time."""
 
@@ -264,7 +392,11 @@ class Composed(Node):
 
 def plain(expression: Expression) -> Expression:
     """Return the expression with carried coordinates put back to plain ones, looking into nodes."""
-    return _rebuilt(expression, lambda node: node.coordinate if isinstance(node, Carried) else None)
+    return _rebuilt(expression, _coordinate_of)
+
+
+def _coordinate_of(node: Node) -> Symbol | None:
+    return node.coordinate if isinstance(node, Carried | Dependent) else None
 
 
 def _rebuilt(expression: Expression, exchange: Callable[[Node], Expression | None]) -> Expression:

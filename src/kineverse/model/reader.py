@@ -16,7 +16,7 @@ from .constraint import Constraint
 from .frame import WORLD, Frame
 from .kinematics import branches, relative
 from .operation import ARTICULATIONS, BODIES, CONSTRAINTS, DATA, FRAMES, RATES
-from .rates import Rates, Row, all_symbols
+from .rates import Entry, Rates, all_symbols
 
 Cell = tuple[str, str]
 V = TypeVar("V")
@@ -111,20 +111,23 @@ class Reader:
 
     def carry(self, expression: Expression) -> Expression:
         """Return an expression with its coordinates carried by the rates that hold here."""
-        rows: dict[Symbol, Row] = {}
+        entries: dict[Symbol, Entry] = {}
         wanted = list(all_symbols(expression))
         while wanted:
             x = wanted.pop()
-            if x.order or x in rows or not x.has_derivative:
+            if x.order or x in entries or not x.has_derivative:
                 continue
             cell = (RATES, str(x))
             self._reads.add(cell, Read.VALUE)
             found = self._value_at(cell)
             if found is not ABSENT:
-                rows[x] = found[1]
-                for speed, value in found[1]:
+                entry = entries[x] = found[1]
+                if isinstance(entry, Expression):
+                    wanted += all_symbols(entry)
+                    continue
+                for speed, value in entry:
                     wanted += [speed.position, *all_symbols(value)]
-        return Rates(rows).carry(expression) if rows else expression
+        return Rates(entries).carry(expression) if entries else expression
 
 
 class _View(Mapping[str, V], Generic[V]):

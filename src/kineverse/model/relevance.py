@@ -17,16 +17,24 @@ from .constraint import Constraint, coordinates
 
 
 class Relevance:
-    """Constraints by the coordinates in their expressions and in their bounds."""
+    """Constraints by the coordinates in their expressions and in their bounds.
 
-    def __init__(self) -> None:
+    Parameters
+    ----------
+    dependent
+        What coordinates are that depend on others.
+    """
+
+    def __init__(self, dependent: Mapping[Symbol, Expression]) -> None:
+        # A limit on what depends on other coordinates is a limit on these.
+        self._behind = {x.path: {s.path for s in e.symbols} for x, e in dependent.items()}
         self._by_expression: defaultdict[str, dict[str, None]] = defaultdict(dict)
         self._by_bounds: defaultdict[str, dict[str, None]] = defaultdict(dict)
         self._alone: dict[Symbol, dict[str, None]] = {}
 
     def add(self, name: str, constraint: Constraint) -> None:
         """Take a constraint into the index."""
-        for path in {s.path for s in constraint.expression.symbols}:
+        for path in self._paths(constraint):
             self._by_expression[path][name] = None
         for path in _bounds(constraint):
             self._by_bounds[path][name] = None
@@ -35,12 +43,16 @@ class Relevance:
 
     def remove(self, name: str, constraint: Constraint) -> None:
         """Take a constraint out."""
-        for path in {s.path for s in constraint.expression.symbols}:
+        for path in self._paths(constraint):
             self._by_expression[path].pop(name, None)
         for path in _bounds(constraint):
             self._by_bounds[path].pop(name, None)
         if isinstance(constraint.expression, Symbol):
             self._alone.get(constraint.expression, {}).pop(name, None)
+
+    def _paths(self, constraint: Constraint) -> set[str]:
+        paths = {s.path for s in constraint.expression.symbols}
+        return paths.union(*(self._behind.get(path, ()) for path in paths)) if self._behind else paths
 
     def on(self, symbol: Symbol) -> list[str]:
         """Return the names of the constraints whose expression is just this symbol."""

@@ -195,7 +195,7 @@ def _over_free_speeds(gradient: Mapping[Symbol, Expression], rates: Rates) -> di
     """Return a gradient with the speeds of coordinates that others move replaced by their rows."""
     result: dict[Symbol, Expression] = {}
     for key, entry in gradient.items():
-        row = rates.get(key.position) if key.order == 1 else None
+        row = rates.row(key.position) if key.order == 1 else None
         terms = {key: entry} if row is None else {v: entry * rates.carry(g) for v, g in row.items()}
         for speed, term in terms.items():
             result[speed] = result[speed] + term if speed in result else term

@@ -22,7 +22,7 @@ from .body import Body
 from .constraint import Constraint
 from .frame import WORLD, Frame
 from .integration import integrate
-from .operation import ARTICULATIONS, BODIES, CONSTRAINTS, DATA, FRAMES, KINDS, RATES
+from .operation import ARTICULATIONS, BODIES, CONSTRAINTS, DATA, FRAMES, RATES
 from .rates import Rates
 from .reader import ABSENT, Cell, missing
 from .relevance import Relevance
@@ -59,12 +59,18 @@ class ModelView:
         self._head = head
         self._version = version
         self._lock = threading.RLock()
-        self._relevance = Relevance()
+        self._forget_index({})
+        self._forget_all()
+
+    def _forget_index(self, dependent: Mapping[Symbol, Expression]) -> None:
+        self._dependent = dependent
+        self._relevance = Relevance(dependent)
         self._index = SymbolIndex()
         self._pending: list[tuple[Cell, Any, Any]] = [
-            ((kind, name), ABSENT, value) for kind in KINDS for name, value in head[kind].items()
+            ((kind, name), ABSENT, value)
+            for kind in (FRAMES, CONSTRAINTS)
+            for name, value in self._head[kind].items()
         ]
-        self._forget_all()
 
     def _forget_all(self) -> None:
         self._rates: Rates | None = None
@@ -102,6 +108,8 @@ class ModelView:
 
     def _catch_up(self) -> None:
         self._settle()
+        if self.rates.dependent != self._dependent:
+            self._forget_index(self.rates.dependent)
         pending, self._pending = self._pending, []
         for (kind, name), before, after in pending:
             if kind not in (FRAMES, CONSTRAINTS):
@@ -152,7 +160,7 @@ class ModelView:
 
     def _carried(self, name: str, constraint: Constraint) -> Constraint:
         rates = self.rates
-        if not rates:
+        if rates.is_empty:
             return constraint
         known = self._carried_constraints.get(name)
         if known is None:
@@ -163,6 +171,14 @@ class ModelView:
             )
             self._carried_constraints[name] = known
         return known
+
+    def _followed(self, constraint: Constraint) -> Constraint:
+        """Return a constraint in terms of what does not depend on anything, speeds included."""
+        rates = self.rates
+        if not any(s.position in rates.dependent for s in constraint.symbols):
+            return constraint
+        parts = (constraint.lower, constraint.expression, constraint.upper)
+        return Constraint(*(rates.eliminate(rates.carry(part)) for part in parts))
 
     @property
     def rates(self) -> Rates:
@@ -184,6 +200,9 @@ class ModelView:
                 for coordinate, row in self.rates.items():
                     found.add(coordinate)
                     found.update(s for value in row.values() for s in value.symbols if s.order == 0)
+                for itself in self.rates.dependent.values():
+                    found.update(itself.symbols)
+                found -= self.rates.dependent.keys()
                 self._all_symbols = tuple(sorted(found, key=lambda s: s.sort_key))
             return self._all_symbols
 
@@ -283,7 +302,7 @@ class ModelView:
             elif form == "body":
                 v, w = ca.mtimes(rotation.T, v), ca.mtimes(rotation.T, w)
             column = rates.carry(make(ca.densify(ca.vertcat(v, w)), (6,), twist.nodes | tip_nodes))
-            row = rates.get(key.position) if key.order == 1 else None
+            row = rates.row(key.position) if key.order == 1 else None
             for speed, rate in row.items() if row is not None else ((key, as_expression(1.0)),):
                 term = column if row is None else column * rates.carry(rate)
                 by_speed[speed] = by_speed[speed] + term if speed in by_speed else term
@@ -312,7 +331,8 @@ class ModelView:
             rates = self.rates
             free: set[Symbol] = set()
             for key in found:
-                free.update(rates[key.position] if key.order == 1 and key.position in rates else (key,))
+                row = rates.row(key.position) if key.order == 1 else None
+                free.update((key,) if row is None else row)
             return tuple(sorted(free, key=lambda s: s.sort_key))
 
     def _frame(self, name: str) -> Frame:
@@ -374,7 +394,9 @@ class ModelView:
         with self._lock:
             self._catch_up()
             if self._checks is None:
-                self._checks = Checks(self._head[CONSTRAINTS])
+                self._checks = Checks(
+                    {name: self._followed(c) for name, c in self._head[CONSTRAINTS].items()}
+                )
             known = self._index.sorted() if not isinstance(values, State) else ()
             return find_violations(self._checks, values, (*known, *self.rates, *self.speeds), tolerance)
 

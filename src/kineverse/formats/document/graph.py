@@ -12,17 +12,20 @@ from kineverse.errors import KineverseError
 from kineverse.expressions import layout
 from kineverse.expressions.expression import NO_NODES, Expression, make
 from kineverse.expressions.functions import Extremum, Norm, Select
+from kineverse.expressions.implicit import Implicit, ImplicitFunction
 from kineverse.expressions.node import Augment, Node
+from kineverse.expressions.piecewise import Piecewise, piecewise
 from kineverse.logic import And, Less, Not, Or
-from kineverse.model.rates import Carried, Composed, Rates, as_row
+from kineverse.model.rates import Carried, Composed, Dependent, Rates, as_row
 from kineverse.symbols import ROLES, Symbol
 
-from .checks import RefusedError, exactly, listed, name, number, the, whole
+from .checks import RefusedError, exactly, listed, name, number, numbers, the, whole
 from .elementary import BINARY, UNARY
 
 MAX_ORDER = 1000
 MAX_DIMENSIONS = 16
 MAX_LENGTH = 1 << 24
+MAX_STEPS = 100
 MAX_NESTING = 400
 """Nodes with a gradient of their own inside one another; what works on them follows them down."""
 
@@ -67,8 +70,11 @@ class Graph:
             "select": self._select,
             "extremum": self._extremum,
             "norm": self._norm,
+            "piecewise": self._piecewise,
             "carried": self._carried,
             "composed": self._composed,
+            "dependent": self._dependent,
+            "implicit": self._implicit,
         }
         for self.place, node in enumerate(table):
             if type(node) is not list or not node or type(node[0]) is not str:
@@ -253,6 +259,14 @@ class Graph:
             raise RefusedError(f"the norm is that of a vector, not of shape {shape}")
         self._node(Norm, [ref], (), ())
 
+    def _piecewise(self, node: list[Any]) -> None:
+        _, ref, periodic, knots, pieces = exactly(node, 5)
+        repeats, at = the(bool, periodic, "true or false"), numbers(knots)
+        table = [numbers(piece) for piece in listed(pieces, "pieces")]
+        # What is made here only checks and sorts the numbers; the node below is over the real argument.
+        (checked,) = piecewise(0.0, repeats, at, table)._nodes
+        self._opaque(Piecewise, [ref], checked.options)
+
     def _carried(self, node: list[Any]) -> None:
         _, ref, table = exactly(node, 3)
         coordinate = self.symbol(ref)
@@ -279,6 +293,26 @@ class Graph:
             raise RefusedError("a symbol is replaced by a scalar")
         refs = [ref, *(entry for _, entry in replacements)]
         self._node(Composed, refs, (), tuple(key for key, _ in pairs))
+
+    def _dependent(self, node: list[Any]) -> None:
+        _, ref, coordinate = exactly(node, 3)
+        self._node(Dependent, [self._scalar_at(ref)], (), (self.symbol(coordinate),))
+
+    def _implicit(self, node: list[Any]) -> None:
+        _, label, unknowns, inputs, residual, rows, seed, steps, arguments = exactly(node, 9)
+        function = ImplicitFunction(
+            name=name(label),
+            unknowns=tuple(self.symbol(ref) for ref in listed(unknowns, "the unknowns")),
+            inputs=tuple(self.symbol(ref) for ref in listed(inputs, "the inputs")),
+            residual=self.expression(residual),
+            rows=tuple(whole(row, MAX_LENGTH) for row in listed(rows, "the rows that are solved")),
+            seed=self.expression(seed),
+            steps=whole(steps, MAX_STEPS),
+        )
+        if len(listed(arguments, "the arguments")) != len(function.inputs):
+            raise RefusedError(f"{len(arguments)} arguments for {len(function.inputs)} inputs")
+        refs = [self._scalar_at(ref) for ref in arguments]
+        self._node(Implicit, refs, (len(function.unknowns),), (function,), (residual, seed))
 
 
 def _short(value: Any) -> str:

@@ -8,6 +8,7 @@ from functools import cached_property
 from typing import Any
 
 from kineverse.errors import UnknownNameError
+from kineverse.expressions.expression import Expression
 from kineverse.model.operation import (
     ARTICULATIONS,
     BODIES,
@@ -73,8 +74,9 @@ class Recorded(Operation):
         kinds: dict[str, dict[Any, Any]] = {}
         for (kind, name), value in self.writes:
             if kind == RATES:
-                coordinate, row = value
-                kinds.setdefault(kind, {})[coordinate] = dict(row)
+                coordinate, entry = value
+                row = entry if isinstance(entry, Expression) else dict(entry)
+                kinds.setdefault(kind, {})[coordinate] = row
             else:
                 kinds.setdefault(kind, {})[name] = value
 

@@ -18,10 +18,16 @@ node                                                                  meaning
 ``["and", ref, ...]``, ``["or", ref, ...]``
 ``["select", condition, ref, ref]``, ``["extremum", "min", ref, ref]``  choices, elementwise
 ``["norm", ref]``                                                     the Euclidean norm of a vector
+``["piecewise", ref, periodic, [knot, ...], [[c0, c1, ...], ...]]``   a piecewise polynomial, elementwise
 ``["carried", symbol, [[symbol, [[speed, ref], ...]], ...]]``         a coordinate with the rate table that
                                                                       says how it moves
 ``["composed", ref, [[symbol, ref], ...]]``                           a carried coordinate after a
                                                                       substitution
+``["dependent", ref, symbol]``                                        a coordinate that is an expression of
+                                                                      others
+``["implicit", name, [symbol, ...], [symbol, ...], ref, [row, ...],   unknowns as a function of inputs:
+ref, steps, [ref, ...]]``                                             residual, its rows that are solved,
+                                                                      seed, Newton steps, and the inputs here
 ====================================================================  =====================================
 """
 
@@ -37,10 +43,12 @@ from kineverse.errors import FormatError
 from kineverse.expressions import layout
 from kineverse.expressions.expression import Expression
 from kineverse.expressions.functions import Extremum, Norm, Select
+from kineverse.expressions.implicit import Implicit, ImplicitFunction
 from kineverse.expressions.leaves import bottom_up, leaves
 from kineverse.expressions.node import Augment, Node
+from kineverse.expressions.piecewise import Piecewise
 from kineverse.logic import And, Less, Not, Or
-from kineverse.model.rates import Carried, Composed
+from kineverse.model.rates import Carried, Composed, Dependent
 from kineverse.symbols import Symbol
 
 from .elementary import NAMES
@@ -151,8 +159,16 @@ class Table:
             return self._add(f'["less",{joined},{number(node.options[0])}]')
         if type(node) is Extremum:
             return self._add(f'["extremum","{node.options[0]}",{joined}]')
+        if type(node) is Piecewise:
+            pieces = ",".join(_numbers(piece) for piece in node.pieces)
+            knots = _numbers(node.knots)
+            return self._add(f'["piecewise",{joined},{str(node.periodic).lower()},{knots},[{pieces}]]')
         if type(node) is Composed:
             return self._add(f'["composed",{refs[0]},{self._pairs(node.options, refs[1:])}]')
+        if type(node) is Dependent:
+            return self._add(f'["dependent",{joined},{self.ref(node.coordinate)}]')
+        if type(node) is Implicit:
+            return self._add(f'["implicit",{self._function(node.function)},[{joined}]]')
         if type(node) in _PLAIN:
             return self._add(f'["{node.kind}",{joined}]')
         raise FormatError(
@@ -162,11 +178,19 @@ class Table:
 
     def _rates(self, node: Carried) -> str:
         rows = []
-        for coordinate in sorted(node.rates._given, key=lambda s: s.sort_key):
-            row = node.rates._given[coordinate]
-            pairs = self._pairs([speed for speed, _ in row], [self.ref(entry) for _, entry in row])
+        for coordinate, row in sorted(node.rates.items(), key=lambda item: item[0].sort_key):
+            pairs = self._pairs(list(row), [self.ref(entry) for entry in row.values()])
             rows.append(f"[{self.ref(coordinate)},{pairs}]")
         return f"[{','.join(rows)}]"
+
+    def _function(self, f: ImplicitFunction) -> str:
+        unknowns, inputs = (
+            "[" + ",".join(str(self.ref(s)) for s in symbols) + "]" for symbols in (f.unknowns, f.inputs)
+        )
+        rows = "[" + ",".join(map(str, f.rows)) + "]"
+        return (
+            f"{text(f.name)},{unknowns},{inputs},{self.ref(f.residual)},{rows},{self.ref(f.seed)},{f.steps}"
+        )
 
     def _pairs(self, symbols: Sequence[Symbol], refs: Sequence[int]) -> str:
         pairs = (f"[{self._symbol(s)},{ref}]" for s, ref in zip(symbols, refs, strict=True))
@@ -247,8 +271,14 @@ class _Program:
 def _parts(node: Node) -> tuple[Expression, ...]:
     """Return the expressions that a node is made of."""
     if isinstance(node, Carried):
-        return tuple(entry for row in node.rates._given.values() for _, entry in row)
+        return tuple(entry for row in node.rates.values() for entry in row.values())
+    if isinstance(node, Implicit):
+        return (*node.arguments, node.function.residual, node.function.seed)
     return node.arguments
+
+
+def _numbers(values: Sequence[float]) -> str:
+    return f"[{','.join(map(number, values))}]"
 
 
 def number(value: float) -> str:

@@ -32,7 +32,7 @@ from kineverse.model.body import (
 from kineverse.model.constraint import Constraint
 from kineverse.model.frame import WORLD, Frame
 from kineverse.model.operation import ARTICULATIONS, BODIES, CONSTRAINTS, DATA, FRAMES, RATES
-from kineverse.model.rates import Row, as_row
+from kineverse.model.rates import Entry, as_entry
 from kineverse.symbols import Symbol
 
 from .checks import RefusedError, exactly, fields, listed, name, number, numbers, string
@@ -55,7 +55,8 @@ def expressions_in(kind: str, value: Any) -> list[Expression]:
     if kind == CONSTRAINTS:
         return [value.lower, value.expression, value.upper]
     if kind == RATES:
-        return [entry for _, entry in value[1]]
+        entry = value[1]
+        return [entry] if isinstance(entry, Expression) else [factor for _, factor in entry]
     if kind == ARTICULATIONS:
         return _expressions_below(value.dynamics)
     return _expressions_below(value) if kind == DATA else []
@@ -82,6 +83,8 @@ def written(kind: str, value: Any, ref: Ref) -> Any:
         return [ref(value.lower), ref(value.expression), ref(value.upper)]
     if kind == RATES:
         coordinate, row = value
+        if isinstance(row, Expression):
+            return [ref(coordinate), ref(row)]
         return [ref(coordinate), [[ref(speed), ref(entry)] for speed, entry in row]]
     if kind == BODIES:
         return _body(value)
@@ -216,10 +219,12 @@ def _read_constraint(value: Any, graph: Graph, rename: Rename) -> Constraint:
     return Constraint(*map(graph.scalar, exactly(listed(value, "lower, expression, upper"), 3)))
 
 
-def _read_rate(value: Any, graph: Graph, rename: Rename) -> tuple[Symbol, Row]:
-    coordinate, row = exactly(listed(value, "coordinate and row"), 2)
+def _read_rate(value: Any, graph: Graph, rename: Rename) -> tuple[Symbol, Entry]:
+    coordinate, entry = exactly(listed(value, "a coordinate, and its row or what it depends on"), 2)
     symbol = graph.symbol(coordinate)
-    return symbol, as_row(symbol, dict(graph.pairs(row, 1)))
+    if type(entry) is int:
+        return symbol, as_entry(symbol, graph.scalar(entry))
+    return symbol, as_entry(symbol, dict(graph.pairs(entry, 1)))
 
 
 def _read_body(value: Any, graph: Graph, rename: Rename) -> Body:
