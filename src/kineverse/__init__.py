@@ -33,6 +33,7 @@ from .errors import (
 )
 from .expressions import Expression, array, total_derivative
 from .expressions.functions import clip, maximum, minimum, norm, where
+from .expressions.piecewise import spline
 from .formats import load, shipped_models
 from .logic import less, logic_and, logic_not, logic_or
 from .model import (
@@ -132,6 +133,7 @@ __all__ = [
     "rpy",
     "shipped_models",
     "spatial",
+    "spline",
     "symbol",
     "total_derivative",
     "transform",

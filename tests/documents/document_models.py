@@ -62,6 +62,7 @@ def rich_model() -> kv.Model:
             transform=kv.translation(bent, kv.minimum(a, p), kv.norm(kv.array([a, b, c]))),
         )
         edit.constrain("lock", -closed, a.derivative(), closed)
+        edit.constrain("profile", -1, kv.spline(a * b, (-0.3, 0.1, 0.2), (0.5, 1 / 3, 0.5), periodic=True), p)
         edit.constrain("choice", -np.inf, kv.where(a < b, bent, kv.maximum(b, c)), np.inf)
     seen = model.fk("arm")[0, 3] * model.fk("arm")[0, 0]  # over coordinates that carry rates
     with model.edit() as edit:

@@ -14,7 +14,7 @@ from kineverse.expressions.expression import NO_NODES, Expression, make
 from kineverse.expressions.functions import Extremum, Norm, Select
 from kineverse.expressions.implicit import Implicit, ImplicitFunction
 from kineverse.expressions.node import Augment, Node
-from kineverse.expressions.piecewise import Piecewise, piecewise
+from kineverse.expressions.piecewise import Piecewise, checked_pieces
 from kineverse.logic import And, Less, Not, Or
 from kineverse.model.rates import Carried, Composed, Dependent, Rates, as_row
 from kineverse.symbols import ROLES, Symbol
@@ -261,11 +261,9 @@ class Graph:
 
     def _piecewise(self, node: list[Any]) -> None:
         _, ref, periodic, knots, pieces = exactly(node, 5)
-        repeats, at = the(bool, periodic, "true or false"), numbers(knots)
         table = [numbers(piece) for piece in listed(pieces, "pieces")]
-        # What is made here only checks and sorts the numbers; the node below is over the real argument.
-        (checked,) = piecewise(0.0, repeats, at, table)._nodes
-        self._opaque(Piecewise, [ref], checked.options)
+        options = checked_pieces(the(bool, periodic, "true or false"), numbers(knots), table)
+        self._opaque(Piecewise, [ref], options)
 
     def _carried(self, node: list[Any]) -> None:
         _, ref, table = exactly(node, 3)
