@@ -3,7 +3,7 @@
 A test that drives a browser carries the marker ``browser`` and asks for the fixture ``chromium``, the path of
 the system's Chromium. Without one it is skipped and the summary names it, or with
 ``KINEVERSE_REQUIRE_BROWSER=1`` it fails. A test that needs compiled code carries the marker ``compiler``;
-without a C compiler it is skipped and named as well, and so is one that is refused for that reason.
+without a C compiler it is skipped and named as well.
 """
 
 from __future__ import annotations
@@ -12,8 +12,6 @@ import atexit
 import os
 import shutil
 import tempfile
-from collections.abc import Generator, Iterator
-from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
@@ -22,7 +20,6 @@ from hypothesis import settings
 ROOT = Path(__file__).parents[1]
 SHARED = ROOT.parent / "shared" / "data"
 BROWSERS = ("chromium", "chromium-browser", "google-chrome")
-NO_COMPILER = " needs a C compiler, and there is none: install the package 'gcc'."
 
 settings.register_profile("kineverse", deadline=None, derandomize=bool(os.environ.get("CI")))
 settings.load_profile("kineverse")
@@ -41,8 +38,7 @@ def pytest_configure(config: pytest.Config) -> None:
     atexit.register(shutil.rmtree, folder, ignore_errors=True)
 
 
-@pytest.hookimpl(wrapper=True)
-def pytest_runtest_setup(item: pytest.Item) -> Generator[None, object, object]:
+def pytest_runtest_setup(item: pytest.Item) -> None:
     """Skip, or fail, what needs a browser or a compiler where there is none."""
     if item.get_closest_marker("browser") and _browser() is None:
         message = f"{item.name} needs a Chromium, and there is none: install the package 'chromium'."
@@ -50,25 +46,18 @@ def pytest_runtest_setup(item: pytest.Item) -> Generator[None, object, object]:
             pytest.fail(message, pytrace=False)
         pytest.skip(message)
     if item.get_closest_marker("compiler") and not _has_compiler():
-        pytest.skip(f"{item.name}{NO_COMPILER}")
-    with _refusals_skip(item):
-        return (yield)
-
-
-@pytest.hookimpl(wrapper=True)
-def pytest_runtest_call(item: pytest.Item) -> Generator[None, object, object]:
-    """Skip what turns out to insist on compiled code where there can be none."""
-    with _refusals_skip(item):
-        return (yield)
+        pytest.skip(f"{item.name} needs a C compiler, and there is none: install the package 'gcc'.")
 
 
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
     """Say loudly what did not run."""
     skipped = terminalreporter.stats.get("skipped", [])
-    without_browser = [r.nodeid for r in skipped if "browser" in r.keywords]
-    without_compiler = [r.nodeid for r in skipped if NO_COMPILER in str(r.longrepr)]
-    for what, names in (("A CHROMIUM", without_browser), ("A C COMPILER", without_compiler)):
-        if names:
+    for marker, what, there in (
+        ("browser", "A CHROMIUM", _browser() is not None),
+        ("compiler", "A C COMPILER", _has_compiler()),
+    ):
+        names = [report.nodeid for report in skipped if marker in report.keywords]
+        if names and not there:
             terminalreporter.section(f"NOT TESTED, FOR WANT OF {what}", sep="!", red=True, bold=True)
             for name in sorted(names):
                 terminalreporter.line(name, red=True)
@@ -83,20 +72,10 @@ def chromium() -> str:
     return path
 
 
-@contextmanager
-def _refusals_skip(item: pytest.Item) -> Iterator[None]:
-    from kineverse.errors import CompileError
-
-    try:
-        yield
-    except CompileError as error:
-        if _has_compiler() or "no C compiler" not in str(error):
-            raise
-        pytest.skip(f"{item.name}{NO_COMPILER}")
-
-
 def _has_compiler() -> bool:
-    return any(shutil.which(name) for name in ("cc", "gcc", "clang"))
+    from kineverse.compile.toolchain import toolchain
+
+    return toolchain() is not None
 
 
 def _browser() -> str | None:

@@ -191,6 +191,28 @@ def test_a_closed_pipe_is_quiet():
     assert done.stderr == ""
 
 
+@pytest.mark.parametrize("words", [("info", "kitchen"), ("fk", "kitchen", "kitchen/fridge_door")])
+def test_without_a_compiler_commands_answer_the_same(run, monkeypatch, tmp_path, words):
+    expected = run(*words)
+    monkeypatch.delenv("CC", raising=False)
+    monkeypatch.setenv("PATH", str(tmp_path))
+    assert run(*words) == expected
+    assert (expected[0], expected[2]) == (0, "")
+
+
+def test_a_missing_compiler_is_said_only_when_asked(run, monkeypatch, tmp_path):
+    monkeypatch.delenv("CC", raising=False)
+    words = ("demo", "--headless", "--picture", tmp_path / "picture.png")
+    # What was not found on one path is logged once, so there are two.
+    monkeypatch.setenv("PATH", str(tmp_path / "first"))
+    status, _, err = run(*words)
+    assert (status, err) == (0, "")
+    monkeypatch.setenv("PATH", str(tmp_path / "second"))
+    status, _, err = run("--verbose", *words)
+    assert status == 0
+    assert "No C compiler" in err
+
+
 def test_ctrl_c_is_130_and_one_empty_line(monkeypatch, run):
     def interrupted(*_, **__):
         raise KeyboardInterrupt

@@ -27,12 +27,14 @@ from kineverse.expressions.expression import make
 a, b = kv.position("door/a"), kv.position("door/b")
 
 
-@pytest.fixture(scope="module")
-def function() -> kv.CompiledFunction:
+@pytest.fixture(scope="module", params=["interpreter", pytest.param("c", marks=pytest.mark.compiler)])
+def function(request: pytest.FixtureRequest) -> kv.CompiledFunction:
     """Outputs whose rows are whole vectors, odd, single and shorter than a vector; the last is constant."""
     mechanism = arm()
     p = mechanism.pose[:3, 3]
-    return kv.compile([mechanism.pose, mechanism.jacobian, p @ p, p, np.eye(2)], tier="c", wait=True)
+    return kv.compile(
+        [mechanism.pose, mechanism.jacobian, p @ p, p, np.eye(2)], tier=request.param, wait=True
+    )
 
 
 def one_by_one(f: kv.CompiledFunction, x: np.ndarray) -> list[np.ndarray]:
@@ -71,8 +73,9 @@ def test_results_written_past_the_caches(
     assert all(np.all(fence == 7.0) for pair in fences for fence in pair)
 
 
-def test_one_output_gives_an_array() -> None:
-    f = kv.compile(a * b, tier="c")
+@pytest.mark.parametrize("tier", ["interpreter", pytest.param("c", marks=pytest.mark.compiler)])
+def test_one_output_gives_an_array(tier: str) -> None:
+    f = kv.compile(a * b, tier=tier)
     assert f.batch([[1, 2], [3, 4]]).tolist() == [2.0, 12.0]
     out = np.empty(2)
     assert f.batch([[1, 2], [3, 4]], out=out) is out
@@ -190,16 +193,19 @@ def collect(element: ca.SX, elements: dict[int, ca.SX]) -> None:
         elements[element.element_hash()] = element
 
 
+@pytest.mark.compiler
 def test_every_operation() -> None:
     check_every_value(every_operation(depth=4), points(4003, 5))
 
 
+@pytest.mark.compiler
 @settings(max_examples=5, suppress_health_check=[HealthCheck.too_slow])
 @given(random_programs())
 def test_random_programs(program: RandomProgram) -> None:
     check_every_value(program, points(1003, 5))
 
 
+@pytest.mark.compiler
 def test_programs_longer_than_one_c_function(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(batch_source, "_PART_LENGTH", 7)
     # A constant of its own, for a library of its own.
@@ -219,6 +225,7 @@ def test_the_interpreter_does_batches_too(count: int) -> None:
     assert f._batch._library is None
 
 
+@pytest.mark.compiler
 def test_small_batches_are_interpreted_and_add_up() -> None:
     f = kv.compile([a * b * 3.375, kv.array([a, b])])
     x = np.ones((10, 2))
@@ -231,6 +238,7 @@ def test_small_batches_are_interpreted_and_add_up() -> None:
     assert f.batch(x)[0].tolist() == [3.375] * 10
 
 
+@pytest.mark.compiler
 def test_large_batches_wait_for_the_compiler(monkeypatch: pytest.MonkeyPatch) -> None:
     f = kv.compile([kv.array([np.sin(a * 1.4375), b])])
     x = np.random.default_rng(0).uniform(-3, 3, (100, 2))

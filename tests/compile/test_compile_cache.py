@@ -45,10 +45,19 @@ def compiled() -> None:
     assert f([2.0, 3.0])[0] == 7.75
 
 
+def store_a_file() -> None:
+    store = library_cache()
+    path = Path(store.workplace(), "library.so")
+    path.write_text("some code")
+    store.store("stored", str(path))
+    path.parent.rmdir()
+
+
 def libraries(folder: Path) -> list[Path]:
     return sorted(folder.glob("*.so"))
 
 
+@pytest.mark.compiler
 def test_a_library_is_made_once(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     compiled()
     found = libraries(folder)
@@ -60,6 +69,7 @@ def test_a_library_is_made_once(folder: Path, monkeypatch: pytest.MonkeyPatch) -
     assert libraries(folder) == found
 
 
+@pytest.mark.compiler
 @pytest.mark.parametrize("damage", ["changed", "truncated", "empty", "text"])
 def test_a_damaged_library_is_made_anew(
     folder: Path, elsewhere: Path, damage: str, caplog: pytest.LogCaptureFixture
@@ -83,6 +93,7 @@ def test_a_damaged_library_is_made_anew(
     assert path.stat().st_size > 1000
 
 
+@pytest.mark.compiler
 def test_a_library_that_cannot_be_loaded_is_made_anew(folder: Path, elsewhere: Path) -> None:
     shutil.copytree(elsewhere, folder)
     path = next(p for p in libraries(folder) if p.stem == kv.compile(outputs(), tier="c")._library._key)
@@ -113,17 +124,18 @@ def run(constant: float, **environment: str) -> subprocess.Popen[str]:
     )
 
 
+@pytest.mark.compiler
 def test_processes_share_a_folder(tmp_path: Path) -> None:
     processes = [run(3.0 + i % 2, KINEVERSE_CACHE_DIR=str(tmp_path / "shared")) for i in range(4)]
-    for process in processes:
-        _, complaints = process.communicate(timeout=120)
-        assert (process.returncode, complaints) == (0, "")
+    complaints = [process.communicate(timeout=120)[1] for process in processes]
+    assert [(p.returncode, said) for p, said in zip(processes, complaints, strict=True)] == [(0, "")] * 4
     stored = list((tmp_path / "shared").iterdir())
     assert all(p.suffix == ".so" for p in stored)
     assert len(stored) in (2, 3)  # the extension is one, where Python's headers are installed
     assert all(LibraryCache(tmp_path / "shared").find(p.stem) for p in stored)
 
 
+@pytest.mark.compiler
 @pytest.mark.parametrize("where", ["KINEVERSE_CACHE_DIR", "XDG_CACHE_HOME", "HOME"])
 def test_a_folder_that_cannot_be_made_is_replaced_by_a_private_one(tmp_path: Path, where: str) -> None:
     # Not by permissions: they do not bind root, who may run this.
@@ -149,7 +161,7 @@ def test_a_folder_that_others_can_write_to_is_refused(folder: Path, caplog: pyte
             assert library_cache().folder.stat().st_mode & 0o777 == 0o700
         assert "can be written by others" in caplog.text
         caplog.clear()
-    compiled()
+    store_a_file()
     assert list(folder.iterdir()) == []
     folder.chmod(0o755)
     cache._open.cache_clear()
@@ -186,7 +198,7 @@ def test_remains_of_killed_processes_are_removed(folder: Path) -> None:
     old, new = Path(store.workplace()), Path(store.workplace())
     (old / "library.so").write_text("half")
     os.utime(old, (1000, 1000))
-    compiled()
+    store_a_file()
     assert not old.exists()
     assert new.exists()
 
@@ -209,6 +221,7 @@ while not (alive.exists() and alive.read_text().strip()):
     assert list((tmp_path / "folder").iterdir()) == []
 
 
+@pytest.mark.compiler
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="there is no fork")
 def test_a_forked_process_compiles_for_itself(tmp_path: Path) -> None:
     program = """

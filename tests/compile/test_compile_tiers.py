@@ -27,6 +27,7 @@ def agree(first: kv.CompiledFunction, second: kv.CompiledFunction, rows: np.ndar
             assert same_bits(v, w)
 
 
+@pytest.mark.compiler
 def test_tiers_agree_to_the_bit_on_an_arm() -> None:
     mechanism = arm()
     outputs = [mechanism.pose, mechanism.jacobian]
@@ -35,6 +36,7 @@ def test_tiers_agree_to_the_bit_on_an_arm() -> None:
     agree(slow, fast, np.random.default_rng(0).uniform(-7, 7, (4000, 7)))
 
 
+@pytest.mark.compiler
 def test_tiers_agree_to_the_bit_on_every_operation() -> None:
     symbols, values = every_operation(depth=6).expressions()
     slow = kv.compile([kv.array(values)], symbols, tier="interpreter")
@@ -42,6 +44,7 @@ def test_tiers_agree_to_the_bit_on_every_operation() -> None:
     agree(slow, fast, points(3000, 5))
 
 
+@pytest.mark.compiler
 @settings(max_examples=5, suppress_health_check=[HealthCheck.too_slow])
 @given(random_programs())
 def test_tiers_agree_to_the_bit_on_random_programs(program) -> None:
@@ -51,6 +54,7 @@ def test_tiers_agree_to_the_bit_on_random_programs(program) -> None:
     agree(slow, fast, points(300, 5))
 
 
+@pytest.mark.compiler
 def test_calls_through_casadi_and_through_the_extension_agree(monkeypatch: pytest.MonkeyPatch) -> None:
     mechanism = arm()
     direct = kv.compile([mechanism.pose, mechanism.jacobian], tier="c", wait=True)
@@ -83,6 +87,7 @@ def test_no_name_reaches_generated_code() -> None:
         assert not any(word in source for word in ("secret", "house", "system(", "evil", "unicode", "a\\nb"))
 
 
+@pytest.mark.compiler
 def test_c_takes_over_in_the_background_under_calls_from_many_threads() -> None:
     mechanism = arm("busy", joints=6)
     outputs = [mechanism.pose, mechanism.jacobian]
@@ -120,6 +125,7 @@ def test_c_takes_over_in_the_background_under_calls_from_many_threads() -> None:
     assert same_bits(evaluator.outputs[0], wanted[3][0])
 
 
+@pytest.mark.compiler
 def test_evaluators_change_with_their_function() -> None:
     f = kv.compile([a * 3.25 + b, b / a])
     evaluator = f.bind()

@@ -15,6 +15,7 @@ from kineverse.compile import Evaluator
 
 a, b, c = kv.position("door/a"), kv.position("door/b"), kv.velocity("door/a")
 length = kv.parameter("door/length", 2.0)
+in_each_tier = pytest.mark.parametrize("tier", ["interpreter", pytest.param("c", marks=pytest.mark.compiler)])
 
 
 def test_one_output_gives_an_array_and_a_list_a_tuple() -> None:
@@ -56,7 +57,7 @@ def test_a_function_of_nothing() -> None:
         f([1.0])
 
 
-@pytest.mark.parametrize("tier", ["interpreter", "c"])
+@in_each_tier
 @pytest.mark.parametrize("outputs", [1, 2, 3])
 def test_calls_share_no_memory(tier: str, outputs: int) -> None:
     f = kv.compile([kv.array([a + i, b]) for i in range(outputs)], tier=tier, wait=tier == "c")
@@ -68,7 +69,7 @@ def test_calls_share_no_memory(tier: str, outputs: int) -> None:
     assert all(v.flags.writeable and v.flags.owndata for v in first)
 
 
-@pytest.mark.parametrize("tier", ["interpreter", "c"])
+@in_each_tier
 def test_vectors_of_every_kind_are_the_same_vector(tier: str) -> None:
     f = kv.compile(kv.array([a, b, a * b]), tier=tier, wait=tier == "c")
     wanted = [1.0, -3.0, -3.0]
@@ -115,7 +116,7 @@ def test_values_that_are_no_numbers_are_refused_by_name(value: object) -> None:
         f({"door/a": value, "door/b": 1.0})
 
 
-@pytest.mark.parametrize("tier", ["interpreter", "c"])
+@in_each_tier
 @pytest.mark.parametrize(
     "x",
     [
@@ -134,7 +135,7 @@ def test_what_is_no_vector_of_that_length_is_refused(tier: str, x: object) -> No
     assert f([1.0, 2.0])[1] == 3.0
 
 
-@pytest.mark.parametrize("tier", ["interpreter", "c"])
+@in_each_tier
 def test_nan_in_a_vector_goes_through(tier: str) -> None:
     f = kv.compile(kv.array([a + 1, b + 1]), tier=tier, wait=tier == "c")
     first, second = f([np.nan, 1.0])
@@ -186,7 +187,7 @@ def test_text_is_bounded() -> None:
     assert "4 inputs" in repr(kv.compile(kv.array(symbols[:4])))
 
 
-@pytest.mark.parametrize("tier", ["interpreter", "c"])
+@in_each_tier
 def test_evaluators_write_in_place(tier: str) -> None:
     f = kv.compile([a + b, kv.array([a, b])], tier=tier, wait=tier == "c")
     evaluator, other = f.bind(), f.bind()
@@ -212,7 +213,7 @@ def test_evaluators_write_in_place(tier: str) -> None:
         evaluator([1.0, 2.0], [1.0, 2.0])  # type: ignore[call-arg]
 
 
-@pytest.mark.parametrize("tier", ["interpreter", "c"])
+@in_each_tier
 def test_an_evaluator_outlives_its_function(tier: str) -> None:
     evaluator = kv.compile(a * b, tier=tier, wait=tier == "c").bind()
     for i in range(100):

@@ -17,6 +17,9 @@ from kineverse.errors import KineverseError
 WRONG, INTERRUPTED, PIPE_CLOSED = 2, 130, 141
 """Exit statuses: what was asked for cannot be done; Ctrl-C; nobody reads on (128 and the signal's number)."""
 
+# Meshes that are missing are counted by the commands, and without a compiler they answer the same.
+QUIET = ("kineverse.view.meshes", "kineverse.compile.toolchain")
+
 EXAMPLES = """\
 A MODEL is the name of a shipped model (kitchen, pr2 ...) or the path of a file.
 
@@ -96,20 +99,21 @@ def one_line(error: BaseException) -> str:
 
 @contextmanager
 def _warnings_on(stream: TextIO, verbose: bool) -> Iterator[None]:
-    """Show what the library logs, on a line each; meshes that are missing are counted by the commands."""
+    """Show what the library logs, on a line each, but for what commands leave to ``--verbose``."""
     handler = logging.StreamHandler(stream)
     handler.setFormatter(logging.Formatter("kineverse: %(message)s"))
-    log, meshes = logging.getLogger("kineverse"), logging.getLogger("kineverse.view.meshes")
-    levels = log.level, meshes.level
+    log, quiet = logging.getLogger("kineverse"), [logging.getLogger(name) for name in QUIET]
+    levels = [(logger, logger.level) for logger in (log, *quiet)]
     log.addHandler(handler)
     log.setLevel(logging.INFO if verbose else logging.WARNING)
-    meshes.setLevel(logging.INFO if verbose else logging.ERROR)
+    for logger in quiet:
+        logger.setLevel(logging.INFO if verbose else logging.ERROR)
     try:
         yield
     finally:
         log.removeHandler(handler)
-        log.setLevel(levels[0])
-        meshes.setLevel(levels[1])
+        for logger, level in levels:
+            logger.setLevel(level)
 
 
 def _forget_stdout() -> None:

@@ -20,7 +20,7 @@ import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-logger = logging.getLogger("kineverse.compile")
+logger = logging.getLogger(__name__)
 
 # What makes C and interpreter agree to the last bit. No -ffast-math, which also deletes checks for NaN; no
 # contraction to fused operations; no values of functions computed by the compiler (-frounding-math), which
