@@ -13,9 +13,11 @@ from kineverse.bench.large_model import READERS, large_model, runs_of_replacing
 from kineverse.bench.processes import ProgramError, run_program
 
 HAS_PEERS = all(importlib.util.find_spec(name) for name in ("pinocchio", "mujoco"))
+# One of those it compares is casadi's map in C.
+BATCH = pytest.param("batch", marks=pytest.mark.compiler)
 
 
-@pytest.mark.parametrize("name", BENCHMARKS)
+@pytest.mark.parametrize("name", [BATCH if name == "batch" else name for name in BENCHMARKS])
 def test_a_benchmark_measures_everybody_who_is_there(name, tiny):
     (result,) = measure([name], tiny)
     assert result.name == name
@@ -32,7 +34,7 @@ def test_a_benchmark_measures_everybody_who_is_there(name, tiny):
         assert result.missing == ()
 
 
-@pytest.mark.parametrize("name", ["call", "frames", "batch", "edit"])
+@pytest.mark.parametrize("name", ["call", "frames", BATCH, "edit"])
 def test_peers_that_are_not_installed_are_reported(name, tiny, without):
     without("pinocchio", "mujoco")
     (result,) = measure([name], tiny)
@@ -42,6 +44,16 @@ def test_peers_that_are_not_installed_are_reported(name, tiny, without):
     assert any("pip install 'kineverse-articulation[bench]'" in line for line in result.missing)
     assert any("'pin'" in line for line in result.missing)
     assert not any("pinocchio" in m.name for m in result.measurements)
+
+
+def test_a_missing_compiler_is_reported(tiny, monkeypatch, tmp_path):
+    monkeypatch.delenv("CC", raising=False)
+    monkeypatch.setenv("PATH", str(tmp_path))
+    (result,) = measure(["batch"], tiny)
+    assert any("no C compiler" in line for line in result.missing)
+    assert not any("casadi" in m.name for m in result.measurements)
+    assert any("casadi" in c.name for c in result.comparisons if c.status == "missing")
+    assert any(m.name == "numpy, same graph" for m in result.measurements)
 
 
 def test_a_peer_that_computes_something_else_ends_the_benchmark(tiny, monkeypatch):
