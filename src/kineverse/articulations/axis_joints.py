@@ -1,17 +1,23 @@
-"""Joints with one coordinate: revolute, continuous, prismatic."""
+"""Joints along or about one axis: revolute, continuous, prismatic, screw, cylindrical."""
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
 
+from kineverse.errors import ValueRejectedError
 from kineverse.expressions.expression import Expression
 from kineverse.model.body import Pose, Vector3
+from kineverse.model.operation import Effects
+from kineverse.model.reader import Reader
 from kineverse.motions import X, Y, Z, slide, turn
 from kineverse.spatial import normalised, snapped
+from kineverse.symbols import position
 
-from .joint import AxisJoint
+from .joint import AxisJoint, Joint, checked_axis, checked_number
+from .limits import FREE, Limits, check_limits
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -35,6 +41,90 @@ class Prismatic(AxisJoint):
     def motion(self, q: Expression) -> tuple[Pose | Expression, ...]:
         """Return joint_T_child as factors."""
         return (slide(unit_axis(self.axis), q),)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Screw(AxisJoint):
+    """A thread: parent_T_child = origin · translation(axis · p q/2π) · rotation(axis, q), q in [rad].
+
+    Attributes
+    ----------
+    pitch
+        How far it moves in one revolution, p [m]: along the axis for a right-handed thread, which is
+        positive, and against it for a left-handed one, which is negative.
+
+    Raises
+    ------
+    ValueRejectedError
+        For a pitch of 0 or NaN.
+    NameTakenError
+        For an articulation or a frame that exists.
+    """
+
+    pitch: float
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not checked_number(self.pitch, f"The pitch of the screw '{self.name}'"):
+            raise ValueRejectedError(
+                f"The pitch of the screw '{self.name}' is 0, so it does not move along its axis; "
+                "that is a kv.Revolute."
+            )
+
+    def motion(self, q: Expression) -> tuple[Pose | Expression, ...]:
+        """Return joint_T_child as factors."""
+        return slide(unit_axis(self.axis), self.pitch / math.tau * q), *rotation_factors(self.axis, q)
+
+    def apply(self, model: Reader) -> Effects:
+        """Write the child frame and the limits."""
+        self.check_free(model)
+        return super().apply(model)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Cylindrical(Joint):
+    """A rod in a sleeve: parent_T_child = origin · translation(axis · s) · rotation(axis, φ).
+
+    Coordinates ``name/slide``, s [m], and ``name/turn``, φ [rad], independent of each other.
+
+    Attributes
+    ----------
+    axis
+        Direction in the joint's frame, of any length but zero.
+    slide, turn
+        Limits of s and of φ.
+
+    Raises
+    ------
+    NameTakenError
+        For an articulation or a frame that exists.
+    """
+
+    axis: Vector3 = (1.0, 0.0, 0.0)
+    slide: Limits = FREE
+    turn: Limits = FREE
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        object.__setattr__(self, "axis", checked_axis(self.axis, self.name))
+        for what in ("slide", "turn"):
+            check_limits(getattr(self, what), f"'{what}' of the cylindrical joint '{self.name}'")
+
+    def apply(self, model: Reader) -> Effects:
+        """Write the child frame and the limits."""
+        self.check_free(model)
+        s, angle = position(f"{self.name}/slide"), position(f"{self.name}/turn")
+        motion = (slide(unit_axis(self.axis), s), *rotation_factors(self.axis, angle))
+        return Effects(
+            frames={self.child: (self.parent, (self.origin, *motion))},
+            constraints={
+                **dict(self.slide.on(f"{self.name}/slide", s)),
+                **dict(self.turn.on(f"{self.name}/turn", angle)),
+            },
+            articulations={
+                self.name: self.record((s, angle), (0.0, 0.0), (s.derivative(), angle.derivative()))
+            },
+        )
 
 
 def unit_axis(axis: Vector3) -> tuple[float, float, float]:

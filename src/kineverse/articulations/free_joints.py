@@ -1,20 +1,30 @@
-"""Joints with several coordinates: planar and floating."""
+"""Joints with several coordinates: planar, universal, ball, floating."""
 
 from __future__ import annotations
 
+import math
+from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
+from kineverse.errors import ValueRejectedError
+from kineverse.expressions.expression import Expression, array
+from kineverse.expressions.functions import norm
 from kineverse.model.body import Pose, Vector3
 from kineverse.model.constraint import Constraint
 from kineverse.model.operation import Effects
 from kineverse.model.reader import Reader
 from kineverse.spatial import quaternion, rotation_z, snapped, translation
-from kineverse.symbols import position, velocity
+from kineverse.symbols import Symbol, position, velocity
 
-from .axis_joints import unit_axis
-from .joint import Joint, checked_axis, limits
+from .axis_joints import rotation_factors, unit_axis
+from .joint import Joint, checked_axis, checked_number
+from .limits import FREE, Limits, check_limits, checked_limit, limits
+
+# How far from perpendicular axes may be: the cosine between them.
+_PERPENDICULAR = 1e-6
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -65,6 +75,143 @@ class Planar(Joint):
 
 
 @dataclass(frozen=True, kw_only=True)
+class Universal(Joint):
+    """A Cardan joint: parent_T_child = origin · rotation(first, α) · rotation(second, β).
+
+    Coordinates ``name/first``, α, and ``name/second``, β [rad]. The first axis stands still in the parent,
+    the second in the child.
+
+    Attributes
+    ----------
+    first, second
+        The axes in the joint's frame at rest, perpendicular to each other.
+    first_limits, second_limits
+        Limits of α and of β.
+
+    Raises
+    ------
+    ValueRejectedError
+        For axes that are not perpendicular, with the angle between them.
+    NameTakenError
+        For an articulation or a frame that exists.
+    """
+
+    first: Vector3 = (1.0, 0.0, 0.0)
+    second: Vector3 = (0.0, 1.0, 0.0)
+    first_limits: Limits = FREE
+    second_limits: Limits = FREE
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        for what in ("first", "second"):
+            object.__setattr__(self, what, checked_axis(getattr(self, what), self.name))
+            check_limits(
+                getattr(self, f"{what}_limits"), f"'{what}_limits' of the universal joint '{self.name}'"
+            )
+        cosine = float(np.dot(unit_axis(self.first), unit_axis(self.second)))
+        if abs(cosine) > _PERPENDICULAR:
+            angle = math.acos(max(-1.0, min(cosine, 1.0)))
+            raise ValueRejectedError(
+                f"The axes of the universal joint '{self.name}' are perpendicular, and not {angle:.6g} rad "
+                "apart."
+            )
+
+    def apply(self, model: Reader) -> Effects:
+        """Write the child frame and the limits."""
+        self.check_free(model)
+        angles = a, b = position(f"{self.name}/first"), position(f"{self.name}/second")
+        motion = (*rotation_factors(self.first, a), *rotation_factors(self.second, b))
+        return Effects(
+            frames={self.child: (self.parent, (self.origin, *motion))},
+            constraints={
+                **dict(self.first_limits.on(f"{self.name}/first", a)),
+                **dict(self.second_limits.on(f"{self.name}/second", b)),
+            },
+            articulations={self.name: self.record(angles, (0.0, 0.0), (a.derivative(), b.derivative()))},
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
+class Ball(Joint):
+    """A ball in a socket: parent_T_child = origin · rotation(quaternion).
+
+    Four coordinates ``name/qx|qy|qz|qw`` and three speeds, the angular velocity ω of the child in its own
+    axes, ``name/wx|wy|wz`` [rad/s], with q̇ = ½ q ⊗ (ω, 0) as for :class:`Floating`.
+
+    Limits are written so that they are smooth at rest. With the quaternion q = (v, w), its part p = v·a along
+    the axis and its part v - pa across it:
+
+    - the axis leaves its direction at rest by an angle γ with 1 - cos γ = 2|v - pa|²/|q|², which the cone
+      bounds by 1 - cos(cone);
+    - the turn τ that remains about the axis has tan(τ/2) = p/w, so |τ| <= twist is
+      (p² cos²(twist/2) - w² sin²(twist/2))/|q|² <= 0.
+
+    Both grow with the square of the angle near rest, so a row in speeds that keeps them to first order lets a
+    step of Δt pass them by (|ω|Δt)²/2 at most.
+
+    Attributes
+    ----------
+    axis
+        The child's axis that cone and twist are about, in the joint's frame at rest.
+    cone
+        The largest angle between the axis and its direction at rest, in (0, π] [rad]; None for no limit.
+    twist
+        The largest turn about the axis, either way, in (0, π] [rad]; None for no limit.
+    velocity
+        Limit of |ω|, whatever its direction [rad/s]; None for no limit.
+
+    Raises
+    ------
+    ValueRejectedError
+        For a cone or a twist outside (0, π], or a negative limit of the speed.
+    NameTakenError
+        For an articulation or a frame that exists.
+    """
+
+    axis: Vector3 = (0.0, 0.0, 1.0)
+    cone: float | None = None
+    twist: float | None = None
+    velocity: float | None = None
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        object.__setattr__(self, "axis", checked_axis(self.axis, self.name))
+        for what in ("cone", "twist"):
+            angle = getattr(self, what)
+            text = f"The {what} of the ball joint '{self.name}'"
+            if angle is not None and not 0 < checked_number(angle, text) <= math.pi:
+                raise ValueRejectedError(f"{text} lies in (0, π] rad, and is not {angle!r}.")
+        checked_limit(self.velocity, f"The velocity limit of the ball joint '{self.name}'")
+
+    def apply(self, model: Reader) -> Effects:
+        """Write the child frame, the rates of the quaternion and the limits."""
+        self.check_free(model)
+        q, omega, rows = _orientation(self.name)
+        whole = array(q)
+        along = np.array(unit_axis(self.axis))
+        p, w = whole[:3] @ along, q[3]
+        across = np.cross(whole[:3], along)
+        size = whole @ whole
+        constraints = {}
+        if self.cone is not None:
+            bound = 2 * math.sin(self.cone / 2) ** 2
+            constraints[f"{self.name}/cone"] = Constraint.of(-math.inf, 2 * (across @ across) / size, bound)
+        if self.twist is not None:
+            c, s = math.cos(self.twist / 2), math.sin(self.twist / 2)
+            excess = ((c * p) ** 2 - (s * w) ** 2) / size
+            constraints[f"{self.name}/twist"] = Constraint.of(-math.inf, excess, 0)
+        most = checked_limit(self.velocity, "")
+        if most is not None:
+            constraints[f"{self.name}/velocity"] = Constraint.of(0, norm(array(omega)), most)
+        return Effects(
+            frames={self.child: (self.parent, (self.origin, quaternion(*q)))},
+            constraints=constraints,
+            rates=rows,
+            articulations={self.name: self.record(q, (0.0, 0.0, 0.0, 1.0), omega)},
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
 class Floating(Joint):
     """Free motion: parent_T_child = origin · translation(x, y, z) · rotation(quaternion).
 
@@ -77,21 +224,33 @@ class Floating(Joint):
     def apply(self, model: Reader) -> Effects:
         """Write the child frame and the rates of the quaternion."""
         xyz = tuple(position(f"{self.name}/{c}") for c in "xyz")
-        q = tuple(position(f"{self.name}/q{c}") for c in "xyzw")
-        wx, wy, wz = (velocity(f"{self.name}/w{c}") for c in "xyz")
-        x, y, z, w = q
-        rows = {
-            x: {wx: w / 2, wy: -z / 2, wz: y / 2},
-            y: {wx: z / 2, wy: w / 2, wz: -x / 2},
-            z: {wx: -y / 2, wy: x / 2, wz: w / 2},
-            w: {wx: -x / 2, wy: -y / 2, wz: -z / 2},
-        }
-        speeds = (*(c.derivative() for c in xyz), wx, wy, wz)
+        q, omega, rows = _orientation(self.name)
+        speeds = (*(c.derivative() for c in xyz), *omega)
         return Effects(
             frames={self.child: (self.parent, (self.origin, translation(*xyz), quaternion(*q)))},
             rates=rows,
             articulations={self.name: self.record((*xyz, *q), (0, 0, 0, 0, 0, 0, 1.0), speeds)},
         )
+
+
+class _Orientation(NamedTuple):
+    """A quaternion (x, y, z, w), the angular velocity in the child's axes, and q̇ = ½ q ⊗ (ω, 0) by rows."""
+
+    coordinates: tuple[Symbol, ...]
+    speeds: tuple[Symbol, ...]
+    rates: Mapping[Symbol, Mapping[Symbol, Expression]]
+
+
+def _orientation(name: str) -> _Orientation:
+    x, y, z, w = q = tuple(position(f"{name}/q{c}") for c in "xyzw")
+    wx, wy, wz = omega = tuple(velocity(f"{name}/w{c}") for c in "xyz")
+    rows = {
+        x: {wx: w / 2, wy: -z / 2, wz: y / 2},
+        y: {wx: z / 2, wy: w / 2, wz: -x / 2},
+        z: {wx: -y / 2, wy: x / 2, wz: w / 2},
+        w: {wx: -x / 2, wy: -y / 2, wz: -z / 2},
+    }
+    return _Orientation(q, omega, rows)
 
 
 def _from_z(axis: Vector3) -> np.ndarray[tuple[int, int], np.dtype[np.float64]]:

@@ -2,21 +2,21 @@
 
 from __future__ import annotations
 
+import math
 from abc import abstractmethod
-from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
-from kineverse.errors import ValueRejectedError
+from kineverse.errors import NameTakenError, ValueRejectedError
 from kineverse.expressions.expression import Expression, ExpressionLike
-from kineverse.expressions.gradient import total_derivative
 from kineverse.model.articulation import Articulation
 from kineverse.model.body import Pose, Vector3
-from kineverse.model.constraint import Constraint
 from kineverse.model.operation import Effects, Operation
 from kineverse.model.reader import Reader
 from kineverse.spatial import normalised
 from kineverse.symbols import Symbol, position
+
+from .limits import limits
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -59,9 +59,30 @@ class Joint(Operation):
         coordinates: tuple[Symbol, ...] = (),
         home: tuple[float, ...] = (),
         speeds: tuple[Symbol, ...] = (),
+        follows: Expression | None = None,
     ) -> Articulation:
         """Return the record of this joint."""
-        return Articulation(self.kind, self.parent, self.child, coordinates, home, speeds, self.dynamics)
+        return Articulation(
+            self.kind, self.parent, self.child, coordinates, home, speeds, self.dynamics, follows
+        )
+
+    def check_free(self, model: Reader) -> None:
+        """Look whether the names of the articulation and of its child are free.
+
+        Raises
+        ------
+        NameTakenError
+            If they are not.
+        """
+        for what, name, names in (
+            ("an articulation", self.name, model.articulations),
+            ("a frame", self.child, model.frames),
+        ):
+            if name in names:
+                raise NameTakenError(
+                    f"There is {what} '{name}' already, so the {self.kind} '{self.name}' cannot create it. "
+                    "Choose another name, or replace the operation that wrote it."
+                )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -76,8 +97,8 @@ class Fixed(Joint):
 
 
 @dataclass(frozen=True, kw_only=True)
-class AxisJoint(Joint):
-    """Base of the joints with one coordinate q along or about an axis.
+class AxialJoint(Joint):
+    """Base of what moves by one number q along or about an axis, whatever that number is.
 
     Attributes
     ----------
@@ -87,42 +108,58 @@ class AxisJoint(Joint):
         Limits of q [m] or [rad], numbers or expressions; None leaves that side open.
     velocity
         Limit of the speed, either way [m/s] or [rad/s]; None for no limit.
-    position
-        The expression to use for q instead of a degree of freedom of its own: a mimic joint, linear or not.
     """
 
     axis: Vector3 = (1.0, 0.0, 0.0)
     lower: ExpressionLike | None = None
     upper: ExpressionLike | None = None
     velocity: float | None = None
-    position: Expression | None = None
 
     def __post_init__(self) -> None:
         super().__post_init__()
         object.__setattr__(self, "axis", checked_axis(self.axis, self.name))
+
+    @abstractmethod
+    def motion(self, q: Expression) -> tuple[Pose | Expression, ...]:
+        """Return joint_T_child as factors."""
+
+    def moved_by(self, q: Expression) -> Effects:
+        """Return the child frame, the limits and the record for a coordinate of its own or another number."""
+        own = (q,) if isinstance(q, Symbol) and q == position(self.name) else ()
+        record = self.record(own, (0.0,) * len(own), tuple(s.derivative() for s in own), None if own else q)
+        return Effects(
+            frames={self.child: (self.parent, (self.origin, *self.motion(q)))},
+            constraints=dict(limits(self.name, q, self.lower, self.upper, self.velocity)),
+            articulations={self.name: record},
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
+class AxisJoint(AxialJoint):
+    """Base of the joints with one coordinate q along or about an axis.
+
+    Attributes
+    ----------
+    position
+        The expression to use for q instead of a degree of freedom of its own, about any coordinates: a mimic
+        joint, linear or not. Its limits are constraints on that expression.
+    """
+
+    position: Expression | None = None
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.position is not None:
+            checked_position(self.position, f"The position of the {self.kind} '{self.name}'")
 
     @property
     def q(self) -> Expression:
         """The coordinate, or the expression that stands for it."""
         return position(self.name) if self.position is None else self.position
 
-    @abstractmethod
-    def motion(self, q: Expression) -> tuple[Pose | Expression, ...]:
-        """Return joint_T_child as factors."""
-
     def apply(self, model: Reader) -> Effects:
         """Write the child frame and the limits."""
-        own = isinstance(self.q, Symbol) and self.position is None
-        coordinates = (self.q,) if own and isinstance(self.q, Symbol) else ()
-        return Effects(
-            frames={self.child: (self.parent, (self.origin, *self.motion(self.q)))},
-            constraints=dict(limits(self.name, self.q, self.lower, self.upper, self.velocity)),
-            articulations={
-                self.name: self.record(
-                    coordinates, (0.0,) * len(coordinates), tuple(c.derivative() for c in coordinates)
-                )
-            },
-        )
+        return self.moved_by(self.q)
 
 
 def checked_axis(axis: Vector3, name: str) -> Vector3:
@@ -143,25 +180,37 @@ def checked_axis(axis: Vector3, name: str) -> Vector3:
     return x, y, z
 
 
-def limits(
-    name: str,
-    q: Expression,
-    lower: ExpressionLike | None,
-    upper: ExpressionLike | None,
-    velocity: float | None,
-) -> Iterator[tuple[str, Constraint]]:
-    """Yield the constraints ``name/position`` and ``name/velocity``, as far as there are any."""
-    inf = float("inf")
-    if (lower is not None or upper is not None) and q.symbols:
-        yield (
-            f"{name}/position",
-            Constraint.of(-inf if lower is None else lower, q, inf if upper is None else upper),
-        )
-    if velocity is not None and velocity != inf:
-        rate = total_derivative(q)
-        if rate.symbols:
-            if not velocity >= 0:
-                raise ValueRejectedError(
-                    f"The velocity limit of '{name}' is {velocity!r}; it cannot be negative."
-                )
-            yield f"{name}/velocity", Constraint.of(-velocity, rate, velocity)
+def checked_position(expression: object, what: str) -> Expression:
+    """Return a scalar expression of positions.
+
+    Raises
+    ------
+    ValueRejectedError
+        If it is something else.
+    """
+    if not isinstance(expression, Expression):
+        raise ValueRejectedError(f"{what} is an expression, not {expression!r}.")
+    if expression.shape:
+        raise ValueRejectedError(f"{what} is a scalar, not of shape {expression.shape}.")
+    moving = [str(s) for s in expression.symbols if s.order]
+    if moving:
+        raise ValueRejectedError(f"{what} is about positions, and not about {', '.join(moving)}.")
+    return expression
+
+
+def checked_number(number: object, what: str, *, positive: bool = False) -> float:
+    """Return a finite number.
+
+    Raises
+    ------
+    ValueRejectedError
+        If it is none, or not positive where it has to be.
+    """
+    try:
+        value = float(number)  # type: ignore[arg-type]
+    except (TypeError, ValueError):
+        raise ValueRejectedError(f"{what} is a number, not {number!r}.") from None
+    if not math.isfinite(value) or (positive and value <= 0):
+        kind = "a positive, finite number" if positive else "a finite number"
+        raise ValueRejectedError(f"{what} is {kind}, not {number!r}.")
+    return value

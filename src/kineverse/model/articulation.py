@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
+from kineverse.expressions.expression import Expression
 from kineverse.symbols import Symbol
 
 
@@ -24,6 +25,9 @@ class Articulation:
         The free speeds that move it.
     dynamics
         What is known beside kinematics, as (name, value) pairs: effort [N] or [N m], damping, friction ...
+    follows
+        What its position is, if it has one but no coordinate of its own, as a mimic joint or a gearbox [m],
+        [rad].
     """
 
     kind: str
@@ -33,3 +37,9 @@ class Articulation:
     home: tuple[float, ...] = ()
     speeds: tuple[Symbol, ...] = ()
     dynamics: tuple[tuple[str, Any], ...] = ()
+    follows: Expression | None = None
+
+    @property
+    def position(self) -> Expression | None:
+        """How far it has moved: its one coordinate, or what it follows; None if it is not one number."""
+        return self.coordinates[0] if len(self.coordinates) == 1 else self.follows

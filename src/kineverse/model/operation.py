@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
 from kineverse.errors import ValueRejectedError
@@ -89,6 +89,8 @@ class Effects:
         for kind, values in others:
             for name, datum in values.items():
                 _check_value(kind, name, datum)
+                if isinstance(datum, Articulation) and datum.follows is not None and datum.follows._nodes:
+                    datum = replace(datum, follows=plain(datum.follows))
                 result[kind, name] = datum
         return result
 

@@ -58,7 +58,7 @@ def expressions_in(kind: str, value: Any) -> list[Expression]:
         entry = value[1]
         return [entry] if isinstance(entry, Expression) else [factor for _, factor in entry]
     if kind == ARTICULATIONS:
-        return _expressions_below(value.dynamics)
+        return [*_expressions_below(value.dynamics), *_expressions_below(value.follows)]
     return _expressions_below(value) if kind == DATA else []
 
 
@@ -89,7 +89,7 @@ def written(kind: str, value: Any, ref: Ref) -> Any:
     if kind == BODIES:
         return _body(value)
     if kind == ARTICULATIONS:
-        return {
+        record = {
             "kind": _text(value.kind),
             "parent": _text(value.parent),
             "child": _text(value.child),
@@ -98,6 +98,7 @@ def written(kind: str, value: Any, ref: Ref) -> Any:
             "speeds": [ref(s) for s in value.speeds],
             "dynamics": [[_text(item), _datum(datum, ref)] for item, datum in value.dynamics],
         }
+        return record if value.follows is None else {**record, "follows": ref(value.follows)}
     return _datum(value, ref)
 
 
@@ -283,7 +284,8 @@ def _read_pose(value: Any) -> Pose:
 
 
 def _read_articulation(value: Any, graph: Graph, rename: Rename) -> Articulation:
-    given = fields(value, ("kind", "parent", "child", "coordinates", "home", "speeds", "dynamics"))
+    required = ("kind", "parent", "child", "coordinates", "home", "speeds", "dynamics")
+    given = fields(value, required, ("follows",))
     dynamics = [exactly(listed(d, "name and value"), 2) for d in listed(given["dynamics"], "dynamics")]
     return Articulation(
         string(given["kind"]),
@@ -293,6 +295,7 @@ def _read_articulation(value: Any, graph: Graph, rename: Rename) -> Articulation
         numbers(given["home"]),
         tuple(graph.symbol(ref, 1) for ref in listed(given["speeds"], "speeds")),
         tuple((string(item), _read_datum(datum, graph, rename)) for item, datum in dynamics),
+        graph.scalar(given["follows"]) if "follows" in given else None,
     )
 
 

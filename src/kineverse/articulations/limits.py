@@ -1,0 +1,97 @@
+"""Limits of coordinates and of their speeds, as constraints."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+from kineverse.errors import KineverseError, ValueRejectedError
+from kineverse.expressions.expression import Expression, ExpressionLike
+from kineverse.expressions.gradient import total_derivative
+from kineverse.model.constraint import Constraint
+
+
+@dataclass(frozen=True)
+class Limits:
+    """Limits of one coordinate of a joint that has several.
+
+    Attributes
+    ----------
+    lower, upper
+        Of the coordinate [m] or [rad], numbers or expressions; None leaves that side open.
+    velocity
+        Of its speed, either way [m/s] or [rad/s]; None for no limit.
+    """
+
+    lower: ExpressionLike | None = None
+    upper: ExpressionLike | None = None
+    velocity: float | None = None
+
+    def on(self, name: str, q: Expression) -> Iterator[tuple[str, Constraint]]:
+        """Yield the constraints ``name/position`` and ``name/velocity``, as far as there are any."""
+        return limits(name, q, self.lower, self.upper, self.velocity)
+
+
+FREE = Limits()
+"""No limits."""
+
+
+def check_limits(given: object, what: str) -> None:
+    """Look whether limits are given as such.
+
+    Raises
+    ------
+    ValueRejectedError
+        If they are something else.
+    """
+    if not isinstance(given, Limits):
+        raise ValueRejectedError(f"{what} is kv.Limits(lower, upper, velocity), not {given!r}.")
+
+
+def limits(
+    name: str,
+    q: Expression,
+    lower: ExpressionLike | None,
+    upper: ExpressionLike | None,
+    velocity: float | None,
+) -> Iterator[tuple[str, Constraint]]:
+    """Yield the constraints ``name/position`` and ``name/velocity``, as far as there are any.
+
+    Raises
+    ------
+    ValueRejectedError
+        Naming the limits that leave nothing between them, are NaN, or a negative speed.
+    """
+    if (lower is not None or upper is not None) and q.symbols:
+        try:
+            range_of = Constraint.of(
+                -math.inf if lower is None else lower, q, math.inf if upper is None else upper
+            )
+        except KineverseError as error:
+            raise ValueRejectedError(f"The limits of '{name}' are no range. {error}") from None
+        yield f"{name}/position", range_of
+    bound = checked_limit(velocity, f"The velocity limit of '{name}'")
+    if bound is not None:
+        rate = total_derivative(q)
+        if rate.symbols:
+            yield f"{name}/velocity", Constraint.of(-bound, rate, bound)
+
+
+def checked_limit(limit: object, what: str) -> float | None:
+    """Return a limit of a speed, None where there is none.
+
+    Raises
+    ------
+    ValueRejectedError
+        If it is negative, NaN, or no number.
+    """
+    if limit is None:
+        return None
+    try:
+        value = float(limit)  # type: ignore[arg-type]
+    except (TypeError, ValueError):
+        raise ValueRejectedError(f"{what} is a number or None, not {limit!r}.") from None
+    if not value >= 0:
+        raise ValueRejectedError(f"{what} is {limit!r}; it cannot be negative.")
+    return value if math.isfinite(value) else None
