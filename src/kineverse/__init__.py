@@ -46,6 +46,7 @@ from .expressions.functions import clip, maximum, minimum, norm, where
 from .expressions.piecewise import spline
 from .formats import load, shipped_models
 from .logic import less, logic_and, logic_not, logic_or
+from .loops import CloseLoop
 from .model import (
     Articulation,
     Body,
@@ -84,6 +85,7 @@ __all__ = [
     "Ball",
     "Body",
     "Cam",
+    "CloseLoop",
     "CompileError",
     "CompiledFunction",
     "Constraint",

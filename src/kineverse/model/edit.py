@@ -13,7 +13,7 @@ from kineverse.symbols import Symbol
 
 from .body import Body
 from .constraint import Constraint
-from .frame import Frame, TransformLike
+from .frame import WORLD, Frame, TransformLike
 from .history import History
 from .operation import Effects, Operation
 from .rates import Row, as_row
@@ -206,6 +206,21 @@ class Edit:
     ) -> str:
         """Require ``lower <= expression <= upper``: three scalars; bounds may be expressions or ±inf."""
         return self.apply(Constrain(name, Constraint.of(lower, expression, upper)), tag)
+
+    def close_loop(
+        self,
+        frame: str,
+        to: str = WORLD,
+        mask: Sequence[str] = ("x", "y", "z"),
+        name: str | None = None,
+        tag: str | None = None,
+        **options: Any,
+    ) -> str:
+        """Let two frames coincide, see :class:`kineverse.CloseLoop`, which also says what the options are."""
+        from kineverse.loops import CloseLoop
+
+        loop = CloseLoop(name=name or f"{frame} to {to}", frame=frame, to=to, mask=tuple(mask), **options)
+        return self.apply(loop, tag)
 
     def set_rate(
         self, coordinate: Symbol, row: Mapping[Symbol, ExpressionLike], tag: str | None = None

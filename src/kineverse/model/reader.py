@@ -8,6 +8,7 @@ from typing import Any, Generic, TypeVar
 
 from kineverse.errors import KineverseError, UnknownNameError, suggest
 from kineverse.expressions.expression import Expression
+from kineverse.expressions.substitution import apply
 from kineverse.symbols import Symbol
 
 from .articulation import Articulation
@@ -16,7 +17,7 @@ from .constraint import Constraint
 from .frame import WORLD, Frame
 from .kinematics import branches, relative
 from .operation import ARTICULATIONS, BODIES, CONSTRAINTS, DATA, FRAMES, RATES
-from .rates import Entry, Rates, all_symbols
+from .rates import Entry, Rates, all_symbols, plain
 
 Cell = tuple[str, str]
 V = TypeVar("V")
@@ -109,8 +110,30 @@ class Reader:
             raise KeyError(name)
         return value
 
+    def coordinates_between(self, frame: str, relative_to: str = WORLD) -> tuple[Symbol, ...]:
+        """Return the coordinates that move a frame relative to another: from the last common ancestor down.
+
+        Those on the way to ``frame`` come first.
+        """
+        base, down = branches(frame, relative_to, self.frames.__getitem__)
+        found: dict[Symbol, None] = {}
+        for name in (*down, *base):
+            for factor in self._peek(name).factors:
+                if isinstance(factor, Expression):
+                    found.update(dict.fromkeys(s for s in factor.symbols if s.has_derivative))
+        return tuple(found)
+
+    def resolve(self, expression: Expression) -> Expression:
+        """Return an expression in plain coordinates that do not depend on others."""
+        expression = plain(expression)
+        dependent = self._rates_for(expression).dependent
+        return apply(expression, {s: dependent[s] for s in all_symbols(expression) if s in dependent})
+
     def carry(self, expression: Expression) -> Expression:
         """Return an expression with its coordinates carried by the rates that hold here."""
+        return self._rates_for(expression).carry(expression)
+
+    def _rates_for(self, expression: Expression) -> Rates:
         entries: dict[Symbol, Entry] = {}
         wanted = list(all_symbols(expression))
         while wanted:
@@ -127,7 +150,7 @@ class Reader:
                     continue
                 for speed, value in entry:
                     wanted += [speed.position, *all_symbols(value)]
-        return Rates(entries).carry(expression) if entries else expression
+        return Rates(entries)
 
 
 class _View(Mapping[str, V], Generic[V]):

@@ -1,0 +1,6 @@
+"""Closed loops: coordinates that follow others so that two frames stay together."""
+
+from .closing import Closed, close
+from .operation import CloseLoop
+
+__all__ = ["CloseLoop", "Closed", "close"]

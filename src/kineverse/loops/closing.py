@@ -1,0 +1,372 @@
+"""From the equations of a loop to an implicit function: which unknowns, which branch, from which seed."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from kineverse.errors import UnsolvedError, ValueRejectedError
+from kineverse.expressions.expression import Expression
+from kineverse.expressions.implicit import ImplicitFunction
+from kineverse.symbols import Symbol
+
+from .branches import find_branches, nearest_closed
+from .continuation import follow
+from .equations import CLOSED, Array, Equations, periodic
+from .seed import Interval, Seed
+
+RANK = 1e-7
+"""What a singular value is, relative to the largest, below which a direction counts as free."""
+
+_SAMPLES = {1: 65, 2: 17, 3: 9}
+_TRIED = 200
+_DEGREES = (2, 3, 4, 6, 8, 10, 12, 16, 20, 24, 32)
+_STEPS = (1, 2, 3, 4, 5, 6, 8, 10)
+
+
+@dataclass(frozen=True)
+class Closed:
+    """A loop that was closed.
+
+    Attributes
+    ----------
+    function
+        The unknowns as a function of the inputs.
+    free, dependent
+        The coordinates that move by themselves, and those that follow.
+    mobility
+        How many coordinates are free in the configurations that were looked at.
+    branches, branch
+        How many solutions there are at home, and which of them this is, 0 the nearest to the guess.
+    condition
+        The smallest singular value of ∂r/∂x over the largest one, where it is worst; 0 is singular.
+    worst
+        The free coordinates there.
+    """
+
+    function: ImplicitFunction
+    free: tuple[Symbol, ...]
+    dependent: tuple[Symbol, ...]
+    mobility: int
+    branches: int
+    branch: int
+    condition: float
+    worst: tuple[float, ...]
+
+
+def close(
+    name: str,
+    residual: Expression,
+    coordinates: Sequence[Symbol],
+    home: Mapping[Symbol, float],
+    limits: Mapping[Symbol, tuple[float, float]],
+    *,
+    dependent: Sequence[Symbol] | None = None,
+    branch: int = 0,
+) -> Closed:
+    """Close a loop.
+
+    Parameters
+    ----------
+    name
+        What errors call it.
+    residual
+        Of shape (m,); all of it is zero where the loop is closed [m], [rad].
+    coordinates
+        Those of the residual, the first to be free first.
+    home
+        A configuration near the one to begin with, which need not be closed; and the values of parameters.
+    limits
+        Of coordinates that have some. Free coordinates have them, or are angles that go round.
+    dependent
+        The coordinates that follow; chosen if None.
+    branch
+        Which solution at home, 0 the one nearest to ``home``.
+
+    Raises
+    ------
+    UnsolvedError
+        If it does not close at home, or not within all of the limits; if there is no such branch.
+    ValueRejectedError
+        If the choice of coordinates does not fit the mobility, or limits are missing.
+    """
+    parameters = tuple(s for s in residual.symbols if not s.has_derivative)
+    values = np.array([home[s] for s in coordinates])
+    given = np.array([home[s] for s in parameters])
+    unknown = Equations(residual, coordinates, parameters)
+    start, gap = nearest_closed(unknown, values, given)
+    if gap > CLOSED:
+        raise UnsolvedError(f"Loop '{name}' does not close: at best {gap:.6g} is left between its ends.")
+    rank = _rank(unknown, start, given)
+    if not rank:
+        raise ValueRejectedError(f"Loop '{name}' is closed whatever its coordinates are.")
+    followers = _followers(name, unknown, start, given, rank, dependent)
+    free = tuple(s for s in coordinates if s not in followers)
+    inputs = (*free, *parameters)
+    equations = Equations(residual, followers, inputs)
+
+    u = np.array([home[s] for s in inputs])
+    x = np.array([home[s] for s in followers])
+    angles, goes_round = periodic(equations, x, u)
+    spans = np.array([max(map(abs, limits.get(s, (np.pi,)))) for s in followers])
+    reach = np.where(angles, np.pi, np.where(np.isfinite(spans), spans, np.pi) + 1.0)
+    found, gap = find_branches(equations, x, u, angles, reach)
+    where = ", ".join(f"{s} = {home[s]:.6g}" for s in free) or "all configurations"
+    if not found:
+        raise UnsolvedError(
+            f"Loop '{name}' does not close at {where}: {gap:.6g} is left between its ends. "
+            "Begin where it does, with home={...}."
+        )
+    if not 0 <= branch < len(found):
+        raise UnsolvedError(
+            f"Loop '{name}' has {len(found)} branches at {where}, numbered from 0, and none is {branch}."
+        )
+    intervals = [
+        _interval(name, s, limits.get(s), bool(turns)) for s, turns in zip(free, goes_round, strict=False)
+    ]
+    x = found[branch]
+    sampled = _Samples(name, equations, intervals, x, u, angles)
+    seed, steps, rows = _chosen_seed(name, sampled)
+    function = ImplicitFunction(name, followers, inputs, residual, rows, seed.expression(free), steps)
+    return Closed(
+        function, free, followers, len(coordinates) - rank, len(found), branch,
+        sampled.condition, tuple(sampled.worst.tolist()),
+    )  # fmt: skip
+
+
+def _rank(equations: Equations, x: Array, given: Array) -> int:
+    """Return the rank of ∂r/∂q in general: the largest near a closed configuration, which may be singular."""
+    generator = np.random.default_rng(0)
+    most = 0
+    for scale in (0.0, 0.0, 1e-3, 1e-2, 0.05, 0.1, 0.2):
+        near, gap = equations.close(x + scale * generator.uniform(-1, 1, len(x)), given, 60)
+        if gap < CLOSED:
+            values = np.linalg.svd(equations(near, given)[1], compute_uv=False)
+            most = max(most, int((values > RANK * max(values.max(initial=0.0), 1e-12)).sum()))
+    return most
+
+
+def _followers(
+    name: str,
+    equations: Equations,
+    x: Array,
+    given: Array,
+    rank: int,
+    dependent: Sequence[Symbol] | None,
+) -> tuple[Symbol, ...]:
+    """Return the coordinates that follow: those given, or the last ones that can."""
+    by_q = equations(x, given)[1]
+    coordinates = equations.unknowns
+    if dependent is not None:
+        strange = [str(s) for s in dependent if s not in coordinates]
+        if strange:
+            raise ValueRejectedError(
+                f"Loop '{name}' is about {', '.join(map(str, coordinates))}, not about {', '.join(strange)}."
+            )
+        if len(set(dependent)) != rank:
+            raise ValueRejectedError(
+                f"Loop '{name}' makes {rank} of {len(coordinates)} coordinates follow the others "
+                f"(its mobility is {len(coordinates) - rank}), and {len(set(dependent))} are given."
+            )
+        return tuple(s for s in coordinates if s in set(dependent))
+    chosen: list[int] = []
+    largest = float(np.linalg.norm(by_q, 2))
+    # First such that all can be told apart well, then, if need be, whatever is not singular.
+    for enough in (0.02, RANK):
+        for i in reversed(range(len(coordinates))):
+            if i in chosen or len(chosen) == rank:
+                continue
+            values = np.linalg.svd(by_q[:, [*chosen, i]], compute_uv=False)
+            if values[-1] > enough * largest:
+                chosen.append(i)
+    if len(chosen) < rank:
+        raise ValueRejectedError(
+            f"Loop '{name}' is singular where it begins. Begin elsewhere, with home={{...}}, or say which "
+            "coordinates are dependent."
+        )
+    return tuple(coordinates[i] for i in sorted(chosen))
+
+
+def _interval(name: str, symbol: Symbol, limits: tuple[float, float] | None, angle: bool) -> Interval:
+    lower, upper = limits if limits is not None else (-np.inf, np.inf)
+    if angle and not upper - lower < 2 * np.pi:
+        return Interval(-np.pi, np.pi, whole=True)
+    if not (np.isfinite(lower) and np.isfinite(upper)):
+        raise ValueRejectedError(
+            f"Loop '{name}' has to know how far '{symbol}' goes: give it limits, or the loop within={{...}}."
+        )
+    return Interval(float(lower), float(upper))
+
+
+class _Samples:
+    """One branch of solutions all over the domain.
+
+    Attributes
+    ----------
+    inputs, solutions
+        Where fits look, (N, k) and (N, n).
+    tried, wanted
+        Where seeds are tried out.
+    winding
+        How unknowns grow with whole turns, (k, n).
+    condition, worst
+        See :class:`Closed`.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        equations: Equations,
+        intervals: Sequence[Interval],
+        x: Array,
+        u: Array,
+        angles: npt.NDArray[np.bool_],
+    ) -> None:
+        self.name, self.equations, self.intervals = name, equations, intervals
+        self._given = u[len(intervals) :]
+        self._angles = angles
+        k = len(intervals)
+        generator = np.random.default_rng(1)
+        lower = np.array([i.lower for i in intervals])
+        upper = np.array([i.upper for i in intervals])
+        home = np.clip(u[:k], lower, upper)
+        x = self._followed(x, u[:k], home)
+        grids = [i.samples(_SAMPLES.get(k, 5)) for i in intervals]
+        grid = np.array(list(itertools.product(*grids))).reshape(-1, k)
+        corners = np.array(list(itertools.product(*zip(lower, upper, strict=True)))).reshape(-1, k)
+        tried = np.vstack([corners, generator.uniform(lower, upper, (_TRIED, k))])
+        everywhere = np.vstack([home, grid, tried])
+        solutions = self._everywhere(x, everywhere)
+        self.inputs, self.solutions = everywhere[: len(grid) + 1], solutions[: len(grid) + 1]
+        self.tried, self.wanted = everywhere[len(grid) + 1 :], solutions[len(grid) + 1 :]
+        self.winding = self._winding(x, home)
+        values = np.array([self._singular_values(q, s) for q, s in zip(everywhere, solutions, strict=True)])
+        ratios = values[:, -1] / np.maximum(values[:, 0], 1e-30)
+        self.condition = float(ratios.min())
+        self.worst = everywhere[int(ratios.argmin())]
+
+    def all_inputs(self, q: Array) -> Array:
+        """Return free coordinates with the parameters behind them."""
+        return np.concatenate([q, self._given])
+
+    def _followed(self, x: Array, start: Array, end: Array) -> Array:
+        reached = follow(self.equations, x, self.all_inputs(start), self.all_inputs(end))
+        if reached.part < 1.0:
+            there = start + reached.part * (end - start)
+            names = [str(s) for s in self.equations.inputs]
+            at = ", ".join(f"{s} = {v:.6g}" for s, v in zip(names, there, strict=False))
+            to = ", ".join(f"{v:.6g}" for v in end)
+            raise UnsolvedError(
+                f"Loop '{self.name}' does not close on the way to {to}: it ends, or is singular, at {at}. "
+                "Narrow the limits, or the loop's within={...}, so that it closes everywhere."
+            )
+        return reached.solution
+
+    def _everywhere(self, x: Array, points: Array) -> Array:
+        """Return the solutions at points, each followed from the nearest one that is known."""
+        scale = np.array([max(i.upper - i.lower, 1e-12) for i in self.intervals])
+        solutions = np.zeros((len(points), len(x)))
+        solutions[0] = self._followed(x, points[0], points[0])
+        left = np.arange(1, len(points))
+        nearest = np.zeros(len(points), dtype=int)
+        distance = np.abs((points - points[0]) / scale).max(axis=1, initial=0.0)
+        while len(left):
+            position = int(distance[left].argmin())
+            i, left = left[position], np.delete(left, position)
+            solutions[i] = self._followed(solutions[nearest[i]], points[nearest[i]], points[i])
+            closer = np.abs((points - points[i]) / scale).max(axis=1, initial=0.0)
+            better = closer < distance
+            nearest[better], distance[better] = i, closer[better]
+        return solutions
+
+    def _winding(self, x: Array, home: Array) -> Array:
+        """Return how much the unknowns grow in a whole turn of each input that goes round, per radian."""
+        winding = np.zeros((len(home), len(x)))
+        for k, interval in enumerate(self.intervals):
+            if not interval.whole:
+                continue
+            end = home.copy()
+            end[k] += 2 * np.pi
+            grown = (self._followed(x, home, end) - x) / (2 * np.pi)
+            whole = np.abs(grown - np.round(grown)) < 1e-6
+            if not np.all(whole | ~self._angles):
+                raise UnsolvedError(
+                    f"Loop '{self.name}' is on another branch after a turn of '{self.equations.inputs[k]}': "
+                    "it goes through a singular configuration. Limit that coordinate."
+                )
+            winding[k] = np.where(self._angles, np.round(grown), grown)
+        return winding
+
+    def _singular_values(self, q: Array, x: Array) -> Array:
+        by_x = self.equations(x, self.all_inputs(q))[1]
+        return np.linalg.svd(by_x, compute_uv=False).astype(np.float64)
+
+
+def _chosen_seed(name: str, samples: _Samples) -> tuple[Seed, int, tuple[int, ...]]:
+    """Return the cheapest seed and number of steps that always lead to the branch, and the rows used."""
+    rows = _rows(samples)
+    n = len(samples.equations.unknowns)
+    best: tuple[float, Seed, int] | None = None
+    count = len(samples.inputs)
+    for degree in _DEGREES:
+        terms = int(np.prod([2 * degree + 1 if i.whole else degree + 1 for i in samples.intervals]))
+        if terms > count:
+            break
+        seed = Seed.fit(samples.intervals, degree, samples.inputs, samples.solutions, samples.winding)
+        steps = _steps(samples, seed, rows)
+        if steps is None:
+            continue
+        cost = seed.terms + steps * (20 * n + n**3)
+        if best is None or cost < best[0]:
+            best = cost, seed, steps
+    if best is None:
+        at = ", ".join(f"{v:.6g}" for v in samples.worst)
+        raise UnsolvedError(
+            f"Loop '{name}' is too close to singular at {at} (condition {samples.condition:.2g}) for "
+            "Newton's method to be sure of its branch. Narrow the limits, or the loop's within={...}."
+        )
+    return best[1], best[2], rows
+
+
+def _rows(samples: _Samples) -> tuple[int, ...]:
+    """Return as many equations as there are unknowns, the best ones where it matters most."""
+    equations = samples.equations
+    n = len(equations.unknowns)
+    every = max(1, len(samples.inputs) // 40)
+    matrices = [
+        equations(x, samples.all_inputs(q))[1]
+        for q, x in zip(samples.inputs[::every], samples.solutions[::every], strict=True)
+    ]
+    m = matrices[0].shape[0]
+    if m == n:
+        return tuple(range(n))
+    best, chosen = -1.0, tuple(range(n))
+    for rows in itertools.islice(itertools.combinations(range(m), n), 5000):
+        worst = min(np.linalg.svd(matrix[list(rows)], compute_uv=False)[-1] for matrix in matrices)
+        if worst > best * 1.01:
+            best, chosen = worst, rows
+    return chosen
+
+
+def _steps(samples: _Samples, seed: Seed, rows: tuple[int, ...]) -> int | None:
+    """Return how many Newton steps lead from the seed to the branch everywhere; None if some never arrive."""
+    needed = 0
+    chosen = list(rows)
+    for q, x, wanted in zip(samples.tried, seed.at(samples.tried), samples.wanted, strict=True):
+        u = samples.all_inputs(q)
+        for step in range(_STEPS[-1] + 1):  # noqa: B007 - how many it took
+            residual, by_x, _ = samples.equations(x, u)
+            if np.linalg.norm(residual) < 1e-12 and np.abs(x - wanted).max(initial=0.0) < 1e-5:
+                break
+            try:
+                x = x - np.linalg.solve(by_x[chosen], residual[chosen])
+            except np.linalg.LinAlgError:
+                return None
+        else:
+            return None
+        needed = max(needed, step)
+    return next(s for s in _STEPS if s >= needed)

@@ -1,0 +1,185 @@
+"""The operation that closes a loop."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass
+from typing import Any, TypeVar
+
+from kineverse.errors import ModelError, UnsolvedError, ValueRejectedError
+from kineverse.expressions.expression import Expression, array
+from kineverse.model.articulation import Articulation
+from kineverse.model.frame import WORLD
+from kineverse.model.operation import Effects, Operation
+from kineverse.model.reader import Reader
+from kineverse.symbols import Symbol
+
+from .closing import Closed, close
+
+Item = TypeVar("Item", bound=tuple[Any, ...])
+
+AXES = ("x", "y", "z", "rx", "ry", "rz")
+
+
+@dataclass(frozen=True, kw_only=True)
+class CloseLoop(Operation):
+    """Two frames coincide: the coordinates of the loop between them follow the free ones.
+
+    With ``to_T_frame = (R, p)``, the residual consists of the elements of p [m] and of the axis of R times
+    the sine of its angle, ½(R - Rᵀ)^∨ [rad], that ``mask`` names, in axes of ``to``. Where they are zero, the
+    dependent coordinates x are a function of the free ones u,
+
+        r(x(u), u) = 0,   ∂x/∂u = -(∂r/∂x)⁻¹ ∂r/∂u,
+
+    and everything that the model hands out is about u alone. Which solution it is follows from u, by a guess
+    that was fitted to one branch within the limits; outside of what closes, evaluation is an error.
+
+    Attributes
+    ----------
+    name
+        Of the loop.
+    frame, to
+        The frames, which must be connected by other operations already.
+    more
+        Further pairs (frame, to) that coincide in the same way, for loops that determine their coordinates
+        only together, as the three arms of a delta robot do.
+    mask
+        What coincides, names out of ``x y z rx ry rz``: a pin ``("x", "y", "z")``, which is the default.
+    dependent
+        The coordinates that follow, by name; by default the last ones along both chains that can.
+    home
+        Pairs of coordinate and value, near which the loop closes at first; by default 0, or the limit
+        next to it.
+    branch
+        Which solution there: 0 is the nearest to ``home``, 1 the next.
+    within
+        Triples of free coordinate, lower and upper limit, in which the loop is used; by default the
+        coordinate's own position limits. An angle without any goes round.
+
+    Raises
+    ------
+    UnsolvedError
+        If the loop does not close, or not within the limits, with what is left between its ends, or where it
+        stops; if there is no such branch.
+    ValueRejectedError
+        If mask, coordinates or limits do not fit.
+    ModelError
+        If the frames are connected rigidly.
+    """
+
+    name: str
+    frame: str
+    to: str = WORLD
+    mask: tuple[str, ...] = ("x", "y", "z")
+    more: tuple[tuple[str, str], ...] = ()
+    dependent: tuple[str, ...] | None = None
+    home: tuple[tuple[str, float], ...] = ()
+    branch: int = 0
+    within: tuple[tuple[str, float, float], ...] = ()
+
+    def __post_init__(self) -> None:
+        strange = [a for a in self.mask if a not in AXES]
+        if strange or not self.mask or len(set(self.mask)) < len(self.mask):
+            raise ValueRejectedError(
+                f"The mask of loop '{self.name}' has names out of {', '.join(AXES)}, not {self.mask!r}."
+            )
+        if isinstance(self.home, Mapping):
+            object.__setattr__(self, "home", tuple((str(k), float(v)) for k, v in self.home.items()))
+        if isinstance(self.within, Mapping):
+            pairs = self.within.items()
+            object.__setattr__(self, "within", tuple((str(k), float(a), float(b)) for k, (a, b) in pairs))
+
+    def default_tag(self) -> str:
+        """Return ``loop`` and the name."""
+        return f"loop {self.name}"
+
+    def apply(self, model: Reader) -> Effects:
+        """Write what the dependent coordinates are."""
+        residual = array([row for frame, to in self._ends for row in self._rows(model, frame, to)])
+        moving = {s for s in residual.symbols if s.has_derivative}
+        on_the_way = [s for frame, to in self._ends for s in model.coordinates_between(frame, to)]
+        coordinates = list(dict.fromkeys([s for s in on_the_way if s in moving] + sorted(moving, key=str)))
+        by_name = {str(s): s for s in coordinates}
+        limits = {s: found for s in coordinates if (found := self._limits(model, s)) is not None}
+        limits.update({by_name[n]: (a, b) for n, a, b in self._known(self.within, by_name)})
+        home = {s: s.value or 0.0 for s in residual.symbols}
+        for s, (a, b) in limits.items():
+            home[s] = min(max(0.0, a), b)
+        home.update({by_name[n]: v for n, v in self._known(self.home, by_name)})
+        closed = close(
+            self.name,
+            residual,
+            coordinates,
+            home,
+            limits,
+            dependent=None
+            if self.dependent is None
+            else [by_name[n] for (n,) in self._known([(n,) for n in self.dependent], by_name)],
+            branch=self.branch,
+        )
+        solution = closed.function.of(closed.function.inputs)
+        return Effects(
+            rates={x: solution[i] for i, x in enumerate(closed.dependent)},
+            articulations={self.name: self._record(closed)},
+        )
+
+    @property
+    def _ends(self) -> tuple[tuple[str, str], ...]:
+        return ((self.frame, self.to), *self.more)
+
+    def _rows(self, model: Reader, frame: str, to: str) -> list[Expression]:
+        """Return the rows of the mask that are not zero anyway."""
+        pose = model.resolve(model.fk(frame, to))
+        if not any(s.has_derivative for s in pose.symbols):
+            raise ModelError(f"Loop '{self.name}' cannot move: '{frame}' and '{to}' are rigidly connected.")
+        p, r = pose[:3, 3], pose[:3, :3]
+        axis = [(r[2, 1] - r[1, 2]) / 2, (r[0, 2] - r[2, 0]) / 2, (r[1, 0] - r[0, 1]) / 2]
+        rows = dict(zip(AXES, [p[0], p[1], p[2], *axis], strict=True))
+        kept = []
+        for axis_name in self.mask:
+            row = rows[axis_name]
+            if row.symbols:
+                kept.append(row)
+            elif abs(float(row)) > 1e-9:
+                raise UnsolvedError(
+                    f"Loop '{self.name}' does not close: '{frame}' and '{to}' are {float(row):.6g} apart "
+                    f"along '{axis_name}', whatever moves."
+                )
+        if not kept:
+            raise ModelError(
+                f"Loop '{self.name}' is closed already: nothing of '{frame}' that its mask names moves."
+            )
+        return kept
+
+    def _limits(self, model: Reader, symbol: Symbol) -> tuple[float, float] | None:
+        """Return the position limits that the joint of a coordinate wrote, if they are numbers."""
+        constraint = model.constraints.get(f"{symbol}/position")
+        if constraint is None or constraint.expression is not symbol:
+            return None
+        if constraint.lower.symbols or constraint.upper.symbols:
+            return None
+        return float(constraint.lower), float(constraint.upper)
+
+    def _known(self, items: Iterable[Item], by_name: Mapping[str, Symbol]) -> Iterator[Item]:
+        for item in items:
+            if item[0] not in by_name:
+                raise ValueRejectedError(
+                    f"Loop '{self.name}' is not about '{item[0]}', only about {', '.join(by_name)}."
+                )
+            yield item
+
+    def _record(self, closed: Closed) -> Articulation:
+        return Articulation(
+            "closedloop",
+            self.to,
+            self.frame,
+            dynamics=(
+                ("free", tuple(map(str, closed.free))),
+                ("dependent", tuple(map(str, closed.dependent))),
+                ("mobility", closed.mobility),
+                ("branches", closed.branches),
+                ("branch", closed.branch),
+                ("condition", closed.condition),
+                ("worst at", closed.worst),
+            ),
+        )
