@@ -9,6 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from kineverse.compile import compile  # noqa: A004
+from kineverse.errors import UnsolvedError
 from kineverse.expressions.expression import Expression
 from kineverse.symbols import Symbol
 
@@ -39,11 +40,16 @@ class Equations:
         self._evaluate = function.bind()
 
     def __call__(self, x: Array, u: Array) -> tuple[Array, Array, Array]:
-        """Return r, ∂r/∂x and ∂r/∂u."""
+        """Return r, ∂r/∂x and ∂r/∂u; r is infinite where they are not defined."""
         n = len(self.unknowns)
         self._evaluate.input[:n] = x
         self._evaluate.input[n:] = u
-        self._evaluate()
+        try:
+            self._evaluate()
+        except UnsolvedError:
+            # A loop that this one is built on does not close there.
+            m, n_all = self._evaluate.outputs[1].shape
+            return np.full(m, np.inf), np.zeros((m, n)), np.zeros((m, n_all - n))
         residual, derivative = self._evaluate.outputs
         return residual.copy(), derivative[:, :n].copy(), derivative[:, n:].copy()
 
@@ -61,7 +67,7 @@ class Equations:
         residual, by_x, _ = self(x, u)
         gap = float(np.linalg.norm(residual))
         for _ in range(steps):
-            if gap < 1e-15:
+            if gap < 1e-15 or gap == np.inf:
                 break
             matrix = by_x.T @ by_x
             scale = max(float(np.trace(matrix)) / len(x), 1e-30)

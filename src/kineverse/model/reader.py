@@ -113,14 +113,16 @@ class Reader:
     def coordinates_between(self, frame: str, relative_to: str = WORLD) -> tuple[Symbol, ...]:
         """Return the coordinates that move a frame relative to another: from the last common ancestor down.
 
-        Those on the way to ``frame`` come first.
+        Those on the way to ``frame`` come first. In place of one that depends on others are these.
         """
         base, down = branches(frame, relative_to, self.frames.__getitem__)
         found: dict[Symbol, None] = {}
         for name in (*down, *base):
             for factor in self._peek(name).factors:
                 if isinstance(factor, Expression):
-                    found.update(dict.fromkeys(s for s in factor.symbols if s.has_derivative))
+                    for symbol in factor.symbols:
+                        behind = self.resolve(symbol).symbols if symbol.has_derivative else ()
+                        found.update(dict.fromkeys(s for s in behind if s.has_derivative))
         return tuple(found)
 
     def resolve(self, expression: Expression) -> Expression:
