@@ -257,10 +257,10 @@ BROKEN: list[tuple[type[Joint], dict[str, Any], str]] = [
     (kv.Fixed, {"origin": np.diag([2.0, 2, 2, 1])}, "rigid"),
     (kv.Fixed, {"origin": np.eye(3)}, "4×4"),
     (kv.Planar, {"lower": 1, "upper": 0}, "No value lies between"),
-    (kv.OmniBase, {"speed": -1.0}, "'speed' of the omnibase 'j' is -1.0; it cannot be negative"),
+    (kv.OmniBase, {"speed": -1.0}, "'speed' of the omni base 'j' is -1.0; it cannot be negative"),
     (kv.OmniBase, {"turn": -1.0}, "negative"),
     (kv.OmniBase, {"turn": float("nan")}, "is nan; it cannot be negative"),
-    (kv.DifferentialDrive, {"radius": 0, "track": 1}, "radius of the differentialdrive 'j' is a positive"),
+    (kv.DifferentialDrive, {"radius": 0, "track": 1}, "radius of the differential drive 'j' is a positive"),
     (
         kv.DifferentialDrive,
         {"radius": 1, "track": float("nan")},

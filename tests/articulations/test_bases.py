@@ -213,8 +213,8 @@ BROKEN: list[tuple[type[Any], dict[str, Any], str]] = [
     (kv.Mecanum, {**SIZES, "wheel_speed": -3}, "'wheel_speed' of the mecanum 'j' is -3"),
     (kv.Mecanum, {**SIZES, "speed": -3}, "'speed' of the mecanum 'j' is -3"),
     (kv.Mecanum, {**SIZES, "child": "old"}, "There is a frame 'old' already"),
-    (kv.DifferentialDrive, {"radius": 1, "track": 1, "speed": -1}, "'speed' of the differentialdrive 'j' is -1"),
-    (kv.DifferentialDrive, {"radius": 1, "track": 1, "turn": nan}, "'turn' of the differentialdrive 'j' is nan"),
+    (kv.DifferentialDrive, {"radius": 1, "track": 1, "speed": -1}, "'speed' of the differential drive 'j' is -1"),
+    (kv.DifferentialDrive, {"radius": 1, "track": 1, "turn": nan}, "'turn' of the differential drive 'j' is nan"),
 ]  # fmt: skip
 
 

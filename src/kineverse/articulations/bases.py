@@ -49,7 +49,7 @@ class Base(Joint):
 
     def limit(self, field: str) -> float | None:
         """Return a limit among the fields, None if there is none."""
-        return checked_limit(getattr(self, field), f"'{field}' of the {self.kind} '{self.name}'")
+        return checked_limit(getattr(self, field), f"'{field}' of the {self.noun} '{self.name}'")
 
     def within(self, field: str, speed: Expression, name: str = "") -> dict[str, Constraint]:
         """Return the constraint that keeps a speed within a limit either way, if there is one."""
@@ -73,7 +73,7 @@ class Base(Joint):
         """
         for field in fields:
             checked_number(
-                getattr(self, field), f"The {field} of the {self.kind} '{self.name}'", positive=True
+                getattr(self, field), f"The {field} of the {self.noun} '{self.name}'", positive=True
             )
 
 
@@ -202,7 +202,7 @@ class Ackermann(Base):
     def __post_init__(self) -> None:
         super().__post_init__()
         self.lengths("wheelbase")
-        text = f"The steering angle of the {self.kind} '{self.name}'"
+        text = f"The steering angle of the {self.noun} '{self.name}'"
         if not 0 < checked_number(self.steering, text) < math.pi / 2:
             raise ValueRejectedError(
                 f"{text} is limited to something in (0, π/2) rad, not {self.steering!r}."
@@ -287,7 +287,7 @@ class Mecanum(Base):
         object.__setattr__(self, "wheels", tuple(self.wheels))
         if len(set(self.wheels)) not in (0, 4) or len(self.wheels) not in (0, 4):
             raise ValueRejectedError(
-                f"The wheels of the {self.kind} '{self.name}' are four different ones, not {self.wheels!r}."
+                f"The wheels of the {self.noun} '{self.name}' are four different ones, not {self.wheels!r}."
             )
 
     def apply(self, model: Reader) -> Effects:

@@ -65,7 +65,7 @@ class Coupling(AxialJoint):
 
     @property
     def _its_driver(self) -> str:
-        return f"The driver of the {self.kind} '{self.name}'"
+        return f"The driver of the {self.noun} '{self.name}'"
 
     def _driver_in(self, model: Reader) -> Expression:
         if isinstance(self.driver, Expression):

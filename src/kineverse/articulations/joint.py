@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from abc import abstractmethod
 from dataclasses import dataclass
 from typing import Any
@@ -54,6 +55,11 @@ class Joint(Operation):
         """The name of the class in lower case."""
         return type(self).__name__.lower()
 
+    @property
+    def noun(self) -> str:
+        """What errors call it: the name of the class in words."""
+        return re.sub("(?<=.)(?=[A-Z])", " ", type(self).__name__).lower()
+
     def record(
         self,
         coordinates: tuple[Symbol, ...] = (),
@@ -80,7 +86,7 @@ class Joint(Operation):
         ):
             if name in names:
                 raise NameTakenError(
-                    f"There is {what} '{name}' already, so the {self.kind} '{self.name}' cannot create it. "
+                    f"There is {what} '{name}' already, so the {self.noun} '{self.name}' cannot create it. "
                     "Choose another name, or replace the operation that wrote it."
                 )
 
@@ -150,7 +156,7 @@ class AxisJoint(AxialJoint):
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.position is not None:
-            checked_position(self.position, f"The position of the {self.kind} '{self.name}'")
+            checked_position(self.position, f"The position of the {self.noun} '{self.name}'")
 
     @property
     def q(self) -> Expression:
