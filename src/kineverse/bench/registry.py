@@ -17,6 +17,7 @@ BENCHMARKS: Mapping[str, str] = MappingProxyType(
         "call": "pose and Jacobian of one frame at one configuration",
         "frames": "the poses of all frames at one configuration",
         "batch": "pose and Jacobian at 100 000 configurations",
+        "loop": "a closed loop and its derivative at one configuration",
         "import": "importing the library, and how many packages that takes",
         "memory": "the memory of a loaded robot",
         "edit": "models of 10 000 operations, and a robot with one joint replaced",
