@@ -25,6 +25,7 @@ RANK = 1e-7
 _SAMPLES = {1: 65, 2: 17, 3: 9}
 _TRIED = 200
 _DEGREES = (2, 3, 4, 6, 8, 10, 12, 16, 20, 24, 32)
+_MORE_STEPS = 4
 _STEPS = (1, 2, 3, 4, 5, 6, 8, 10)
 
 
@@ -131,6 +132,9 @@ def close(
     x = found[branch]
     sampled = _Samples(name, equations, intervals, x, u, angles)
     seed, steps, rows = _chosen_seed(name, sampled)
+    if parameters:
+        # The seed knows one value of them only; from there it is further to others.
+        steps += _MORE_STEPS
     function = ImplicitFunction(name, followers, inputs, residual, rows, seed.expression(free), steps)
     return Closed(
         function, free, followers, len(coordinates) - rank, len(found), branch,
