@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING, TypeAlias
 
 from kineverse.errors import ModelError, ValueRejectedError
 from kineverse.expressions.expression import Expression, ExpressionLike, as_expression
-from kineverse.expressions.leaves import leaves
+from kineverse.expressions.leaves import bottom_up, leaves
 from kineverse.expressions.node import Node
 from kineverse.expressions.substitution import apply, compose_gradient, replace_nodes
 from kineverse.symbols import Symbol
@@ -392,50 +392,59 @@ class Composed(Node):
 
 def plain(expression: Expression) -> Expression:
     """Return the expression with carried coordinates put back to plain ones, looking into nodes."""
-    return _rebuilt(expression, _coordinate_of)
-
-
-def _coordinate_of(node: Node) -> Symbol | None:
-    return node.coordinate if isinstance(node, Carried | Dependent) else None
-
-
-def _rebuilt(expression: Expression, exchange: Callable[[Node], Expression | None]) -> Expression:
     if not expression._nodes:
         return expression
-    replacements = {}
-    for node in leaves(expression)[1]:
-        replacement = exchange(node)
-        if isinstance(node, Composed):
-            replacement = _recomposed(node)
-        elif replacement is None:
-            arguments = tuple(_rebuilt(a, exchange) for a in node.arguments)
-            if any(new is not old for new, old in zip(arguments, node.arguments, strict=True)):
-                replacement = type(node).of(arguments, node.shape, node.options)
-        if replacement is not None:
-            replacements[node] = replacement
-    return replace_nodes(expression, replacements)
+    images: dict[Node, Expression] = {}
+    for node in bottom_up(leaves(expression)[1], _parts, images.__contains__):
+        image = _plain_image(node, lambda part: replace_nodes(part, images))
+        if image is not None:
+            images[node] = image
+    return replace_nodes(expression, images)
 
 
-def _recomposed(node: Composed) -> Expression | None:
+def _parts(node: Node) -> tuple[Expression, ...]:
+    """Return what has to be plain before a node can be."""
+    return () if isinstance(node, Carried | Dependent) else node.arguments
+
+
+def _plain_image(node: Node, plain_part: Callable[[Expression], Expression]) -> Expression | None:
+    """Return what a node becomes, None if it stays what it is."""
+    if isinstance(node, Carried | Dependent):
+        return node.coordinate
+    if isinstance(node, Composed):
+        return _recomposed(node, plain_part)
+    arguments = tuple(map(plain_part, node.arguments))
+    if all(new is old for new, old in zip(arguments, node.arguments, strict=True)):
+        return None
+    return type(node).of(arguments, node.shape, node.options)
+
+
+def _recomposed(node: Composed, plain_part: Callable[[Expression], Expression]) -> Expression | None:
     """Return a composition over plain replacements, None if they are plain already."""
     given = node.substitution
     inner = node.arguments[0]
-    (inside,) = inner._nodes
-    source = inner if isinstance(inside, Carried) else plain(inner)
-    replacements = {s: p for s, e in given.items() if (p := plain(e)) != s}
+    source = inner if isinstance(node._inner(), Carried) else plain_part(inner)
+    replacements = {s: p for s, e in given.items() if (p := plain_part(e)) != s}
     if source is inner and all(replacements.get(s) is e for s, e in given.items()):
         return None
     if not replacements:
-        return plain(inner)
+        return plain_part(inner)
     return apply(source, replacements)
 
 
 def all_symbols(expression: Expression) -> set[Symbol]:
     """Return the symbols of values and of given gradients."""
     symbols, nodes = leaves(expression)
+    found = set(symbols)
+    for node in bottom_up(nodes, _subjects, lambda _: False):
+        found.update(s for part in _subjects(node) for s in leaves(part)[0])
+    return found
+
+
+def _subjects(node: Node) -> tuple[Expression, ...]:
+    """Return what a node is about."""
     # What was replaced in a composition is inside it, but it is not about that any more.
-    parts = (a for node in nodes for a in node.arguments[isinstance(node, Composed) :])
-    return set(symbols).union(*map(all_symbols, parts))
+    return node.arguments[isinstance(node, Composed) :]
 
 
 def _expression_of(node: Node) -> Expression:
