@@ -11,7 +11,7 @@ from contextlib import contextmanager
 from typing import TextIO
 
 from kineverse._version import __version__
-from kineverse.cli import bench, demo, fk, info, view
+from kineverse.cli import bench, demo, fk, info, reproduce, view
 from kineverse.errors import KineverseError
 
 WRONG, INTERRUPTED, PIPE_CLOSED = 2, 130, 141
@@ -21,7 +21,7 @@ WRONG, INTERRUPTED, PIPE_CLOSED = 2, 130, 141
 QUIET = ("kineverse.view.meshes", "kineverse.compile.toolchain")
 
 EXAMPLES = """\
-A MODEL is the name of a shipped model (kitchen, pr2 ...) or the path of a file.
+A MODEL is the name of a shipped model (kitchen, pr2, articulations/screw ...) or the path of a file.
 
 examples:
   kineverse info kitchen                              what it consists of
@@ -75,7 +75,7 @@ def parser() -> argparse.ArgumentParser:
     top.add_argument("--version", action="version", version=f"kineverse {__version__}")
     top.add_argument("-v", "--verbose", action="store_true", help="say more on standard error")
     commands = top.add_subparsers(title="commands", metavar="COMMAND", required=True)
-    for command in (info, fk, view, demo, bench):
+    for command in (info, fk, view, demo, bench, reproduce):
         name = command.__name__.rpartition(".")[2]
         summary, _, description = command.HELP.partition("\n")
         sub = commands.add_parser(

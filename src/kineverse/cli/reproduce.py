@@ -1,0 +1,72 @@
+"""``kineverse reproduce``: the papers' experiments, made again."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from kineverse.cli.progress import progress
+from kineverse.cli.table import figure, table
+from kineverse.errors import UnknownNameError
+
+if TYPE_CHECKING:
+    from kineverse.experiments import Report, Table
+
+HELP = """make an experiment of the papers again: a table here, a figure in a file
+
+examples:
+  kineverse reproduce --list
+  kineverse reproduce fig3
+  kineverse reproduce fig3 --figure door.svg
+  kineverse reproduce fig3 --json --no-figure"""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the options."""
+    parser.add_argument("name", metavar="NAME", nargs="?", help="which experiment, see --list")
+    parser.add_argument("--list", action="store_true", help="say what each experiment is about, and end")
+    parser.add_argument("--figure", metavar="FILE", type=Path, help="where the figure goes (NAME.png)")
+    parser.add_argument("--no-figure", action="store_true", help="draw nothing")
+    parser.add_argument("--json", action="store_true", help="one JSON object on standard output")
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Run the experiment, print its tables, write its figure."""
+    from kineverse.experiments import EXPERIMENTS, reproduce
+
+    if arguments.list:
+        listing = dict(EXPERIMENTS)
+        print(json.dumps(listing, indent=2) if arguments.json else table(("name", "about"), listing.items()))
+        return 0
+    if arguments.name is None:
+        raise UnknownNameError(f"Which experiment? There are: {', '.join(EXPERIMENTS)}.")
+    report = reproduce(arguments.name, progress)
+    drawn = None
+    if not arguments.no_figure:
+        drawn = arguments.figure or Path(f"{report.name}.png")
+        report.figure.save(drawn)
+    if arguments.json:
+        answer = {
+            "name": report.name,
+            "title": report.title,
+            "figure": drawn and str(drawn),
+            **report.numbers,
+        }
+        print(json.dumps(answer, indent=2, allow_nan=False))
+        return 0
+    print(as_text(report))
+    if drawn:
+        print(f"\nThe figure is in {drawn}.")
+    return 0
+
+
+def as_text(report: Report) -> str:
+    """Return a report as tables."""
+    return "\n\n".join([report.title, *map(_table, report.tables)])
+
+
+def _table(part: Table) -> str:
+    rows = [[cell if isinstance(cell, str) else figure(cell) for cell in row] for row in part.rows]
+    return f"{part.title}\n{table(part.head, rows, '>' * len(part.head))}"

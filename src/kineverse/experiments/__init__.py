@@ -1,0 +1,6 @@
+"""The papers' experiments, made again: each measures, says beside it what the papers report, and draws."""
+
+from .registry import EXPERIMENTS, reproduce
+from .report import Figure, Report, Table
+
+__all__ = ["EXPERIMENTS", "Figure", "Report", "Table", "reproduce"]

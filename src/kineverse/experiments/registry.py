@@ -1,0 +1,48 @@
+"""The experiments by name."""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Callable, Iterable, Mapping
+from types import MappingProxyType
+from typing import Any, TypeAlias
+
+from kineverse.errors import UnknownNameError, suggest
+
+from .report import Report
+
+Progress: TypeAlias = Callable[[Iterable[Any], str, str], Iterable[Any]]
+
+EXPERIMENTS: Mapping[str, str] = MappingProxyType(
+    {"fig3": "the garage door and its lock (2022 paper, Fig. 3 and Eqs. 11-13)"}
+)
+"""What there is; each name is that of a module of this package."""
+
+
+def reproduce(name: str, progress: Progress | None = None) -> Report:
+    """Run an experiment.
+
+    Parameters
+    ----------
+    name
+        One of :data:`EXPERIMENTS`.
+    progress
+        Wraps what is worked on, like :func:`kineverse.cli.progress.progress`; None for silence.
+
+    Raises
+    ------
+    UnknownNameError
+        If there is no such experiment, with similar names.
+    """
+    if name not in EXPERIMENTS:
+        raise UnknownNameError(
+            f"There is no experiment {name!r}. {suggest(name, EXPERIMENTS, 'experiment')} "
+            "'kineverse reproduce --list' says what each is about."
+        )
+    module = importlib.import_module(f"{__package__}.{name}")
+    report: Report = module.run(progress or _silent)
+    return report
+
+
+def _silent(items: Iterable[Any], what: str, unit: str) -> Iterable[Any]:
+    return items

@@ -1,0 +1,120 @@
+"""Fig. 3 of the 2022 paper: the garage door's way, and its lock."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+
+from kineverse.cli import main
+from kineverse.errors import MissingExtraError, UnknownNameError
+from kineverse.experiments import EXPERIMENTS, reproduce
+
+
+@pytest.fixture(scope="module")
+def fig3():
+    return reproduce("fig3")
+
+
+def test_the_door_moves_as_equation_12_says(fig3):
+    a = np.linspace(0, 2, 20)
+    assert fig3.numbers["a"] == pytest.approx(a)
+    angle = np.arccos(a / 2)
+    for name, part in (("A", 0.0), ("25 %", 0.25), ("50 %", 0.5), ("75 %", 0.75), ("B", 1.0)):
+        expected = np.column_stack([2 * part * np.sin(angle), 2 - a + 2 * part * np.cos(angle)])
+        np.testing.assert_allclose(fig3.numbers["paths"][name], expected, atol=1e-12)
+
+
+def test_it_is_closed_at_l_and_open_at_0(fig3):
+    paths = fig3.numbers["paths"]
+    np.testing.assert_allclose([paths["A"][-1], paths["B"][-1]], [[0, 0], [0, 2]], atol=1e-12)
+    np.testing.assert_allclose([paths["A"][0], paths["B"][0]], [[0, 2], [2, 2]], atol=1e-12)
+
+
+def test_the_lock_of_equation_13_steps_where_it_is_closed(fig3):
+    b = np.linspace(0, 0.6, 50)
+    assert fig3.numbers["unlocked"]["a=1"] == pytest.approx(np.ones(50))
+    assert fig3.numbers["unlocked"]["a=2"] == pytest.approx(np.where(b > 0.3, 1.0, 0.0))
+
+
+def test_both_forms_are_one_door(fig3):
+    assert fig3.numbers["forms_apart"] < 1e-12
+
+
+def test_the_regular_form_has_a_slope_where_the_published_one_has_none(fig3):
+    before = np.array(fig3.numbers["before_closed"])
+    # The derivative of 2 sin(arccos(a/2)) by a.
+    assert fig3.numbers["slope_published"] == pytest.approx(
+        (2 - before) / np.sqrt(before * (4 - before)), rel=1e-6
+    )
+    assert fig3.numbers["slope_regular"] == pytest.approx(2 - before, rel=1e-6)
+    assert fig3.numbers["slope_regular_closed"] == pytest.approx(2)
+
+
+@pytest.mark.parametrize("suffix", ["png", "svg", "pdf"])
+def test_the_figure_is_drawn(fig3, tmp_path, suffix):
+    pytest.importorskip("matplotlib")
+    file = tmp_path / f"door.{suffix}"
+    fig3.figure.save(file)
+    content = file.read_bytes()
+    assert len(content) > 5000
+    assert content.startswith({"png": b"\x89PNG", "svg": b"<?xml", "pdf": b"%PDF"}[suffix])
+
+
+def test_without_matplotlib_the_extra_is_named(fig3, tmp_path, monkeypatch):
+    monkeypatch.setitem(__import__("sys").modules, "matplotlib.figure", None)
+    with pytest.raises(MissingExtraError, match=r"kineverse-articulation\[figures\]"):
+        fig3.figure.save(tmp_path / "door.png")
+
+
+def test_numbers_are_those_of_json(fig3):
+    assert json.loads(json.dumps(dict(fig3.numbers), allow_nan=False)) == fig3.numbers
+
+
+def test_unknown_experiments_are_named():
+    with pytest.raises(UnknownNameError, match="Did you mean 'fig3'"):
+        reproduce("fig33")
+
+
+def test_the_command_prints_tables_and_writes_the_figure(tmp_path, monkeypatch, capsys):
+    pytest.importorskip("matplotlib")
+    monkeypatch.chdir(tmp_path)
+    assert main(["reproduce", "fig3"]) == 0
+    out = capsys.readouterr().out
+    assert "no bound" in out
+    assert "fig3.png" in out
+    assert (tmp_path / "fig3.png").stat().st_size > 5000
+
+
+def test_the_command_answers_with_one_object(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    assert main(["reproduce", "fig3", "--json", "--no-figure"]) == 0
+    answer = json.loads(capsys.readouterr().out)
+    assert answer["figure"] is None
+    assert answer["length"] == 2
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("words", "says"),
+    [
+        (["reproduce"], "There are: fig3"),
+        (["reproduce", "fig"], "Did you mean 'fig3'"),
+        (["reproduce", "fig3", "--figure", "nowhere/door.png"], "cannot be written to 'nowhere/door.png'"),
+        (["reproduce", "fig3", "--figure", "door.what"], "cannot be written to 'door.what'"),
+    ],
+    ids=lambda value: " ".join(value) if isinstance(value, list) else "",
+)
+def test_nonsense_is_answered_in_a_line(words, says, tmp_path, monkeypatch, capsys):
+    pytest.importorskip("matplotlib")
+    monkeypatch.chdir(tmp_path)
+    assert main(words) == 2
+    error = capsys.readouterr().err
+    assert says in error
+    assert error.count("\n") == 1
+
+
+def test_all_experiments_are_listed(capsys):
+    assert main(["reproduce", "--list", "--json"]) == 0
+    assert json.loads(capsys.readouterr().out) == dict(EXPERIMENTS)
