@@ -10,6 +10,7 @@ from small_models import cabinet, dependent, with_mesh
 
 import kineverse as kv
 from kineverse.errors import MissingExtraError, UnknownNameError, ValueRejectedError
+from kineverse.model.body import Body, Box, Shape
 from kineverse.view import view
 
 pytest.importorskip("viser", reason="the page needs the extra 'view'")
@@ -166,3 +167,24 @@ def test_without_viser_the_extra_is_named(monkeypatch):
 def test_an_unknown_name_in_the_state_leaves_no_server_behind():
     with pytest.raises(UnknownNameError):
         view(cabinet(), {"nothing": 1.0}, port=0)
+
+
+def test_what_is_not_finite_is_hidden_and_named():
+    model, q = kv.Model(), kv.position("q")
+    cube = Body(visuals=(Shape(Box((1.0, 1.0, 1.0))),))
+    with model.edit() as edit:
+        edit.add_frame("hook", "world", kv.translation(1 / q, 0, 0), cube)
+        edit.add_frame("post", "world", kv.translation(0, 0, 1), cube)
+    with view(model, port=0) as page:
+        assert page.settled()
+        hook, post = (page._scene._nodes[name] for name in ("hook", "post"))
+        assert (page.unplaced, hook.visible, post.visible) == (["hook"], False, True)
+        assert "Not finite, and hidden: hook" in page._panel._status.content
+        page.move({"q": 0.5})
+        assert page.settled()
+        assert (page.unplaced, hook.visible) == ([], True)
+        np.testing.assert_allclose(page.pose("hook")[:3, 3], [2, 0, 0])
+        page.move({"q": 0.0})
+        assert page.settled()
+        assert (page.unplaced, hook.visible) == (["hook"], False)
+        np.testing.assert_allclose(page.pose("hook")[:3, 3], [2, 0, 0])

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 
 from kineverse.cli.assignments import add_set_option, parse_assignments
 from kineverse.cli.table import figure
+from kineverse.errors import ValueRejectedError
 
 if TYPE_CHECKING:
     import kineverse as kv
@@ -48,9 +49,16 @@ def run(arguments: argparse.Namespace) -> int:
     expression = model.fk(arguments.frame, arguments.relative_to)
     values = complete(model, assigned)
     pose = np.asarray(expression(kv.State(values)), dtype=float)
+    used = {str(s): values[str(s)] for s in expression.symbols if str(s) in values}
+    if not np.isfinite(pose).all():
+        _warn_of_violations(model, kv.State(values))
+        where = ", ".join(f"{name}={figure(value, 6)}" for name, value in used.items()) or "all values"
+        raise ValueRejectedError(
+            f"The pose of '{arguments.frame}' in '{arguments.relative_to}' is not finite at {where}; "
+            "set other positions with --set."
+        )
     position, rpy = pose[:3, 3], roll_pitch_yaw(pose)
     xyzw = np.roll(quaternions(pose[None])[0], -1)
-    used = {str(s): values[str(s)] for s in expression.symbols if str(s) in values}
     if arguments.json:
         answer = {
             "frame": arguments.frame,
@@ -73,11 +81,11 @@ def run(arguments: argparse.Namespace) -> int:
             print(f"  {name:<16}" + "".join(f"{figure(x, 6):>12}" for x in numbers) + f"  {unit}".rstrip())
         if used:
             print("  at " + ", ".join(f"{name}={figure(value, 6)}" for name, value in used.items()))
-    _warn_of_violations(model, values)
+    _warn_of_violations(model, kv.State(values))
     return 0
 
 
-def _warn_of_violations(model: kv.Model, values: Mapping[str, float]) -> None:
+def _warn_of_violations(model: kv.Model, values: kv.State) -> None:
     for violation in model.violations(values):
         print(
             f"kineverse: note: {violation.name} is violated: {figure(violation.value)} is not in "

@@ -51,6 +51,8 @@ def sections(summary: Summary, frames: bool = False, constraints: bool = False) 
         f"  {extent} m, {summary.mass:.4g} kg, {summary.shapes} shape{'' if summary.shapes == 1 else 's'}"
         + (f", {len(summary.problems)} of them not loaded" if summary.problems else ""),
     ]
+    if summary.unplaced:
+        lines.append(f"  not finite at the default state: {', '.join(summary.unplaced)}")
     found = ["\n".join(lines)]
     if summary.freedoms:
         rows = [
@@ -94,7 +96,7 @@ def as_json(summary: Summary) -> dict[str, Any]:
                 "unit": f.unit or None,
                 "lower": finite(f.lower),
                 "upper": finite(f.upper),
-                "default": f.default,
+                "default": finite(f.default),
                 "speed": finite(f.speed),
             }
             for f in summary.freedoms
@@ -104,6 +106,7 @@ def as_json(summary: Summary) -> dict[str, Any]:
             for c in summary.constraints
         ],
         "not_loaded": summary.problems,
+        "not_finite": summary.unplaced,
     }
 
 

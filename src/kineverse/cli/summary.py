@@ -42,7 +42,8 @@ class Summary:
     """What a model consists of.
 
     ``frames`` are the parents by name; ``low``, ``high`` and ``extent`` the box around all shapes at the
-    default state [m]; ``mass`` that of all bodies [kg]; ``problems`` what could not be loaded.
+    default state [m]; ``mass`` that of all bodies [kg]; ``problems`` what could not be loaded; ``unplaced``
+    the frames whose pose there is not finite, which the box leaves out.
     """
 
     name: str
@@ -55,15 +56,20 @@ class Summary:
     mass: float
     shapes: int
     problems: list[str]
+    unplaced: list[str]
 
 
 def summarise(name: str, model: ModelView) -> Summary:
     """Return the summary of a model; reads its meshes for the size."""
     values = complete(model)
     poses = Poses(model)
-    at = dict(zip(poses.names, poses.at(values), strict=True))
+    places = poses.at(values)
+    unplaced = poses.unplaced(places)
+    at = dict(zip(poses.names, places, strict=True))
+    for frame in unplaced:
+        del at[frame]
     shown = parts(model)
-    loaded = [part for part in shown if not part.placeholder]
+    loaded = [part for part in shown if not part.placeholder and part.frame in at]
     corners = Surfaces.of(loaded, at).corners.reshape(-1, 3)
     if not len(corners):
         corners = np.array([pose[:3, 3] for pose in at.values()])
@@ -82,6 +88,7 @@ def summarise(name: str, model: ModelView) -> Summary:
         mass=float(sum(masses)),
         shapes=len(shown),
         problems=sorted(part.frame for part in shown if part.problem),
+        unplaced=unplaced,
     )
 
 

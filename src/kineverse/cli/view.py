@@ -52,6 +52,9 @@ def run(arguments: argparse.Namespace) -> int:
         meshes.load(mesh)  # and remembered: the page finds them read
     with until_interrupted(), Viewer(model, assigned, port=arguments.port, label=label) as page:
         note_problems(page.problems)
+        if page.unplaced:
+            names = ", ".join(page.unplaced)
+            print(f"kineverse: note: not finite at this state, and hidden: {names}", file=sys.stderr)
         announce(page, browser=not arguments.no_browser)
         print(model, flush=True)
         page.wait()

@@ -58,6 +58,10 @@ class Poses:
         """Return, for each frame but the world, the (K, 4, 4) poses at K rows of values of ``inputs``."""
         return [] if self._function is None else list(self._function.batch(rows))
 
+    def unplaced(self, poses: Floats) -> list[str]:
+        """Return the frames of :attr:`names` that are nowhere: their poses have NaN or infinities in them."""
+        return [self.names[k] for k in np.flatnonzero(~np.isfinite(poses).all(axis=(1, 2)))]
+
     def index(self, name: str) -> int:
         """Return the place of a frame in the results."""
         if name not in self._index:

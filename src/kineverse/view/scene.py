@@ -46,6 +46,8 @@ class Scene:
         (N, 4, 4): where the frames of :attr:`names` were put last.
     problems
         What could not be loaded, one line each.
+    unplaced
+        The frames whose pose is not finite at the present values; what is attached to them is hidden.
     """
 
     def __init__(
@@ -65,7 +67,7 @@ class Scene:
             self._model = model
             self._kinematics = Poses(model)
             self.names = self._kinematics.names
-            self.poses = self._kinematics.at(values)
+            self.poses = self._placed(self._kinematics.at(values), np.eye(4))
             visuals = parts(model)
             self.problems = sorted({f"{part.frame}: {part.problem}" for part in visuals if part.problem})
             with self._server.atomic():
@@ -84,7 +86,11 @@ class Scene:
     def update(self, values: Mapping[str, float]) -> int:
         """Move everything to where it is at given values of all symbols; return how many frames moved."""
         with self._lock:
-            poses = self._kinematics.at(values)
+            hidden = set(self.unplaced)
+            poses = self._placed(self._kinematics.at(values), self.poses)
+            for frame in hidden.symmetric_difference(self.unplaced):
+                if frame in self._nodes:
+                    self._nodes[frame].visible = frame in hidden
             moved = np.flatnonzero(np.abs(poses - self.poses).max(axis=(1, 2)) > 1e-9)
             self.poses = poses
             if not len(moved):
@@ -97,6 +103,11 @@ class Scene:
                         node.position, node.wxyz = poses[k, :3, 3], wxyz
                 self._move_frames()
             return len(moved)
+
+    def _placed(self, poses: Floats, instead: Floats) -> Floats:
+        """Return poses, with others instead of those that are not finite; note whose these are."""
+        self.unplaced = self._kinematics.unplaced(poses)
+        return np.where(np.isfinite(poses).all(axis=(1, 2), keepdims=True), poses, instead)
 
     def pose(self, frame: str) -> Floats:
         """Return where a frame was put last, 4×4."""
@@ -178,6 +189,7 @@ class Scene:
             self._nodes[frame] = self._server.scene.add_frame(
                 f"{ROOT}/{frame.replace('/', '∕')}",
                 show_axes=False,
+                visible=frame not in self.unplaced,
                 position=self.poses[k, :3, 3],
                 wxyz=quaternions(self.poses[k : k + 1])[0],
             )
@@ -191,10 +203,17 @@ class Scene:
             label.position = self.poses[k, :3, 3]
 
     def _place_camera(self, visuals: list[Part]) -> None:
-        at = dict(zip(self.names, self.poses, strict=True))
+        at = {
+            name: pose for name, pose in zip(self.names, self.poses, strict=True) if name not in self.unplaced
+        }
+        visuals = [part for part in visuals if part.frame in at]
         surfaces = Surfaces.of(visuals, at)
         self._length = axis_length(surfaces.corners, at)
-        points = surfaces.corners.reshape(-1, 3) if len(surfaces.corners) else self.poses[:, :3, 3]
+        points = (
+            surfaces.corners.reshape(-1, 3)
+            if len(surfaces.corners)
+            else np.array([pose[:3, 3] for pose in at.values()])
+        )
         low, high = points.min(axis=0), points.max(axis=0)
         self._floor, self._extent = float(low[2]), float(np.linalg.norm(high - low))
         camera = self._camera

@@ -57,6 +57,11 @@ def units(model: ModelView, values: Mapping[str, float], names: Iterable[str]) -
 
 def _rates(before: Floats, after: Floats) -> tuple[Floats, Floats]:
     """Return the (N,) rates of turning [rad] and shifting [m] a unit, from poses two steps apart."""
+    with np.errstate(invalid="ignore"):  # A frame that is nowhere does not turn or shift by one a unit.
+        return _differences(before, after)
+
+
+def _differences(before: Floats, after: Floats) -> tuple[Floats, Floats]:
     # The part of R_before' R_after that is antisymmetric is the sine of the angle between them.
     change = np.einsum("nji,njk->nik", before[:, :3, :3], after[:, :3, :3])
     sine = np.stack([change[:, 2, 1], change[:, 0, 2], change[:, 1, 0]], axis=1)

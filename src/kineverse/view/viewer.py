@@ -107,6 +107,11 @@ class Viewer:
         """What could not be loaded, one line each."""
         return list(self._scene.problems)
 
+    @property
+    def unplaced(self) -> list[str]:
+        """The frames whose pose is not finite at the values drawn last; nothing of them is shown."""
+        return list(self._scene.unplaced)
+
     def pose(self, frame: str) -> Floats:
         """Return where a frame was drawn last, as a 4×4 transform to the world."""
         return self._scene.pose(frame)
@@ -252,6 +257,9 @@ class Viewer:
         try:
             self._scene.update(values)
             self._panel.update(values, driven)
+            if self.unplaced:
+                self._panel.show(failure(f"Not finite, and hidden: {', '.join(self.unplaced)}."))
+                return
             violated = self.model.violations(values)
             self._panel.show(report(violated, violated.unchecked))
         except KineverseError as error:
