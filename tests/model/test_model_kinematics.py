@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 import pytest
 from model_trees import random_pose, random_speeds, random_state, random_tree, twist_between
@@ -249,3 +251,47 @@ def test_editing_one_joint_changes_what_is_below_and_nothing_else() -> None:
     assert model.fk("box/lid") != lid
     assert model.fk("box/lid")({"lid": 0.5})[1, 3] == 0.5
     assert model.jacobian("box/lid")({"lid": 0.5}).T.tolist() == [[0, 1, 0, 0, 0, 0]]
+
+
+# -- operations with several frames --------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Chain(kv.Operation):
+    """Frames one below the other, in any order."""
+
+    parents: tuple[tuple[str, str], ...]
+
+    def apply(self, model: kv.Reader) -> kv.Effects:
+        return kv.Effects(frames={name: (above, kv.translation(1, 0, 0)) for name, above in self.parents})
+
+
+def test_an_operation_may_write_frames_below_its_own() -> None:
+    model = kv.Model()
+    with model.edit() as edit:
+        edit.apply(Chain((("c", "b"), ("b", "a"), ("a", "world"))), tag="chain")
+        edit.add_frame("d", parent="c", transform=kv.translation(0, 1, 0))
+    assert model.fk("d")()[:3, 3].tolist() == [3, 1, 0]
+    with model.edit() as edit:
+        edit.attach("b", parent="world", transform=kv.translation(0, 0, 5))
+    assert model.fk("d")()[:3, 3].tolist() == [1, 1, 5]
+    with model.edit() as edit:
+        edit.remove("attach b to world")
+        edit.replace("chain", Chain((("c", "world"),)))
+    assert sorted(model.frames) == ["c", "d"]
+
+
+@pytest.mark.parametrize(
+    ("parents", "words"),
+    [
+        ((("a", "b"), ("b", "a")), "Cyclic frames: 'a' would be its own parent"),
+        ((("a", "a"),), "Cyclic frames: 'a' would be its own parent"),
+        ((("a", "b"), ("b", "c"), ("c", "b")), "Cyclic frames: 'b' would be its own parent"),
+        ((("a", "b"), ("b", "nowhere")), "parent of frame 'b' is missing. There is no frame 'nowhere'"),
+    ],
+)
+def test_what_hangs_nowhere_is_refused(parents: tuple[tuple[str, str], ...], words: str) -> None:
+    model = kv.Model()
+    with pytest.raises(kv.KineverseError, match=words), model.edit() as edit:
+        edit.apply(Chain(parents))
+    assert not model.frames

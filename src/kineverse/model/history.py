@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import heapq
 from bisect import bisect_left, bisect_right, insort
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from operator import attrgetter
 from typing import Any
@@ -236,19 +236,29 @@ class History:
             if not isinstance(name, str) or not name or "//" in f"/{name}/":
                 raise EditError(f"Operation {tag!r} writes {kind} under {name!r}, which is not a name.")
             if kind == FRAMES:
-                self._check_parent(name, value, reads, entry.place)
+                self._check_parent(name, value, writes, reads, entry.place)
         return Entry(tag, entry.operation, entry.place, reads, writes)
 
-    def _check_parent(self, name: str, frame: Frame, reads: Reads, place: int) -> None:
+    def _check_parent(
+        self, name: str, frame: Frame, writes: Mapping[Cell, Any], reads: Reads, place: int
+    ) -> None:
         if name == WORLD:
             raise EditError(f"The frame '{WORLD}' is the root of everything and cannot be written.")
-        if frame.parent == WORLD:
+        parent = frame.parent
+        if parent == WORLD:
             return
-        reads.add((FRAMES, frame.parent), Read.EXISTENCE)
-        if frame.parent == name or self.value_at((FRAMES, frame.parent), place) is ABSENT:
-            if frame.parent == name:
-                raise ModelError(f"Cyclic frames: '{name}' would be its own parent.")
-            error = missing(FRAMES, frame.parent, self.names_at(FRAMES, place))
+        # An operation may write several frames, one below the other.
+        above, chain = parent, {name}
+        while (FRAMES, above) in writes and above not in chain:
+            chain.add(above)
+            above = writes[FRAMES, above].parent
+        if above == name:
+            raise ModelError(f"Cyclic frames: '{name}' would be its own parent.")
+        if parent in chain:
+            return
+        reads.add((FRAMES, parent), Read.EXISTENCE)
+        if self.value_at((FRAMES, parent), place) is ABSENT:
+            error = missing(FRAMES, parent, self.names_at(FRAMES, place))
             raise UnknownNameError(f"The parent of frame '{name}' is missing. {error}")
 
     def _check_free(self, entry: Entry) -> None:
