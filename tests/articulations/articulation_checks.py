@@ -55,8 +55,12 @@ def random_state(model: kv.Model, seed: int, reach: float = 1.0) -> dict[kv.Symb
 
 
 def assert_jacobian(model: kv.Model, frame: str, seed: int, reach: float = 1.0) -> None:
+    """Each column is the twist that its speed makes, at a random place."""
+    assert_jacobian_at(model, frame, random_state(model, seed, reach))
+
+
+def assert_jacobian_at(model: kv.Model, frame: str, at: State) -> None:
     """Each column is the twist that its speed makes, found by moving there and back."""
-    at = random_state(model, seed, reach)
     pose, speeds, h = model.fk(frame), model.speeds_of(frame), 1e-5
     jacobian = model.jacobian(frame)(at)
     assert jacobian.shape == (6, len(speeds))

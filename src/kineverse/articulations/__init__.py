@@ -6,6 +6,21 @@ from .couplings import Cam, Coupling, Gearbox, RackAndPinion
 from .free_joints import Ball, Floating, Planar, Universal
 from .joint import AxialJoint, AxisJoint, Fixed, Joint
 from .limits import Limits
+from .mechanisms import (
+    DeskLamp,
+    DoorWithHandle,
+    Faucet,
+    FoldingDoor,
+    GarageDoor,
+    Latch,
+    Mechanism,
+    Microwave,
+    PedalBin,
+    PistonAndRod,
+    Ratchet,
+    ScissorLift,
+    ScrewAndNut,
+)
 
 __all__ = [
     "Ackermann",
@@ -17,18 +32,31 @@ __all__ = [
     "Continuous",
     "Coupling",
     "Cylindrical",
+    "DeskLamp",
     "DifferentialDrive",
+    "DoorWithHandle",
+    "Faucet",
     "Fixed",
     "Floating",
+    "FoldingDoor",
+    "GarageDoor",
     "Gearbox",
     "Joint",
+    "Latch",
     "Limits",
     "Mecanum",
+    "Mechanism",
+    "Microwave",
     "OmniBase",
+    "PedalBin",
+    "PistonAndRod",
     "Planar",
     "Prismatic",
     "RackAndPinion",
+    "Ratchet",
     "Revolute",
+    "ScissorLift",
     "Screw",
+    "ScrewAndNut",
     "Universal",
 ]

@@ -63,19 +63,6 @@ class Base(Joint):
             {} if most is None else {f"{self.name}/{field}": Constraint.of(0, norm(array(components)), most)}
         )
 
-    def lengths(self, *fields: str) -> None:
-        """Look whether fields are lengths [m].
-
-        Raises
-        ------
-        ValueRejectedError
-            If one is not positive.
-        """
-        for field in fields:
-            checked_number(
-                getattr(self, field), f"The {field} of the {self.noun} '{self.name}'", positive=True
-            )
-
 
 @dataclass(frozen=True, kw_only=True)
 class OmniBase(Base):

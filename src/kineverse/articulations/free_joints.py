@@ -57,7 +57,7 @@ class Planar(Joint):
     def apply(self, model: Reader) -> Effects:
         """Write the child frame and the limits."""
         x, y, angle = (position(f"{self.name}/{c}") for c in ("x", "y", "angle"))
-        turn = _from_z(self.axis)
+        turn = from_z(self.axis)
         motion = (Pose.of(turn), translation(x, y, 0), rotation_z(angle), Pose.of(turn.T))
         constraints: dict[str, Constraint] = {}
         for q in (x, y):
@@ -253,7 +253,7 @@ def _orientation(name: str) -> _Orientation:
     return _Orientation(q, omega, rows)
 
 
-def _from_z(axis: Vector3) -> np.ndarray[tuple[int, int], np.dtype[np.float64]]:
+def from_z(axis: Vector3) -> np.ndarray[tuple[int, int], np.dtype[np.float64]]:
     """Return the smallest rotation that turns z into the axis, 4×4."""
     n = np.array(unit_axis(axis))
     turn = np.eye(4)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import re
 from abc import abstractmethod
+from collections.abc import Container, Iterable
 from dataclasses import dataclass
 from typing import Any
 
@@ -21,34 +22,26 @@ from .limits import limits
 
 
 @dataclass(frozen=True, kw_only=True)
-class Joint(Operation):
-    """Base of the joints that connect a child frame to a parent frame.
+class Placed(Operation):
+    """Base of what has a name and a place in a parent frame.
 
     Attributes
     ----------
     name
         Name of the articulation and, where it has one coordinate, of its degree of freedom.
-    parent, child
-        Frames; the child is created.
+    parent
+        The frame it stands in.
     origin
-        parent_T_joint, the place of the child at coordinate 0.
-    dynamics
-        What is known beside kinematics, as (name, value) pairs: effort [N] or [N m], damping, friction ...
+        Where it is in there.
     """
 
     name: str
     parent: str
-    child: str
     origin: Pose = Pose()
-    dynamics: tuple[tuple[str, Any], ...] = ()
 
     def __post_init__(self) -> None:
         if not isinstance(self.origin, (Pose, Expression)):
             object.__setattr__(self, "origin", Pose.of(self.origin))
-
-    def default_tag(self) -> str:
-        """Return ``joint`` and the name."""
-        return f"joint {self.name}"
 
     @property
     def kind(self) -> str:
@@ -59,6 +52,58 @@ class Joint(Operation):
     def noun(self) -> str:
         """What errors call it: the name of the class in words."""
         return re.sub("(?<=.)(?=[A-Z])", " ", type(self).__name__).lower()
+
+    def lengths(self, *fields: str) -> None:
+        """Look whether fields are lengths [m].
+
+        Raises
+        ------
+        ValueRejectedError
+            If one is not positive.
+        """
+        for field in fields:
+            checked_number(
+                getattr(self, field), f"The {field} of the {self.noun} '{self.name}'", positive=True
+            )
+
+    def check_names(self, model: Reader, frames: Iterable[str]) -> None:
+        """Look whether the names of the articulation and of its frames are free.
+
+        Raises
+        ------
+        NameTakenError
+            If they are not.
+        """
+        wanted: list[tuple[str, str, Container[str]]] = [("an articulation", self.name, model.articulations)]
+        wanted += [("a frame", frame, model.frames) for frame in frames]
+        for what, name, names in wanted:
+            if name in names:
+                raise NameTakenError(
+                    f"There is {what} '{name}' already, so the {self.noun} '{self.name}' cannot create it. "
+                    "Choose another name, or replace the operation that wrote it."
+                )
+
+
+@dataclass(frozen=True, kw_only=True)
+class Joint(Placed):
+    """Base of the joints that connect a child frame to a parent frame.
+
+    Attributes
+    ----------
+    child
+        The frame that is created.
+    origin
+        parent_T_joint, the place of the child at coordinate 0.
+    dynamics
+        What is known beside kinematics, as (name, value) pairs: effort [N] or [N m], damping, friction ...
+    """
+
+    child: str
+    dynamics: tuple[tuple[str, Any], ...] = ()
+
+    def default_tag(self) -> str:
+        """Return ``joint`` and the name."""
+        return f"joint {self.name}"
 
     def record(
         self,
@@ -80,15 +125,7 @@ class Joint(Operation):
         NameTakenError
             If they are not.
         """
-        for what, name, names in (
-            ("an articulation", self.name, model.articulations),
-            ("a frame", self.child, model.frames),
-        ):
-            if name in names:
-                raise NameTakenError(
-                    f"There is {what} '{name}' already, so the {self.noun} '{self.name}' cannot create it. "
-                    "Choose another name, or replace the operation that wrote it."
-                )
+        self.check_names(model, [self.child])
 
 
 @dataclass(frozen=True, kw_only=True)

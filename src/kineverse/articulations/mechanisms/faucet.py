@@ -1,0 +1,94 @@
+"""A mixer tap with one lever."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import ClassVar
+
+from kineverse.articulations.limits import Limits
+from kineverse.expressions.expression import Expression
+from kineverse.motions import Y, Z, turn
+
+from .mechanism import Mechanism, Part
+from .solids import STEEL, rod, shift
+
+
+@dataclass(frozen=True, kw_only=True)
+class Faucet(Mechanism):
+    """A tap whose lever is lifted for more water and turned for warmer water.
+
+        base_T_lever = translation(0, 0, height) · rotation_z(t) · rotation_y(l)
+
+    ================  ======================================================================
+    ``name/lift``     l [rad], shut at its lower end; raises the lever, which points to -x
+    ``name/turn``     t [rad], cold at its lower end and hot at its upper one
+    frames            ``base``, ``lever``, ``outlet`` (z up, where the water falls from)
+    data              ``name/flow``, flow·(l - l₀)/(l₁ - l₀) [m³/s], and ``name/hot``, the share of hot water
+                      (t - t₀)/(t₁ - t₀): expressions
+    ================  ======================================================================
+
+    Attributes
+    ----------
+    height, reach
+        Of the tap, and of its spout [m].
+    lift
+        Limits of l, numbers from l₀ to l₁ within ±π/2.
+    turn
+        Limits of t, numbers from t₀ to t₁ within ±π.
+    flow
+        Of the open tap [m³/s].
+
+    Raises
+    ------
+    ValueRejectedError
+        For lengths or a flow that are not positive, or ranges that are missing or empty.
+    """
+
+    main: ClassVar[str] = "lever"
+
+    height: float = 0.16
+    reach: float = 0.18
+    lift: Limits = Limits(0.0, 0.5, 1.5)
+    turn: Limits = Limits(-0.8, 0.8, 2.0)
+    flow: float = 1.5e-4
+
+    def __post_init__(self) -> None:
+        self.lengths("height", "reach", "flow")
+        self.range_of("lift", -math.pi / 2, math.pi / 2)
+        self.range_of("turn", -math.pi, math.pi)
+        super().__post_init__()
+
+    @property
+    def limits(self) -> Mapping[str, Limits]:
+        """Those of both."""
+        return {self.path("lift"): self.lift, self.path("turn"): self.turn}
+
+    def data(self) -> Mapping[str, Expression]:
+        """Return how much flows, and how much of it is hot."""
+        return {"flow": self.flow * self._share("lift"), "hot": self._share("turn")}
+
+    def _share(self, name: str) -> Expression:
+        lower, upper = self.range_of(name, -math.pi, math.pi)
+        return (self.q(name) - lower) / (upper - lower)
+
+    def parts(self) -> Mapping[str, Part]:
+        """Return the tap, its lever and where the water comes out."""
+        spout = 0.6 * self.height
+        mouth = (-self.reach, 0.0, 0.75 * self.height)
+        return {
+            "base": self.base(
+                rod((0.0, 0.0, 0.0), (0.0, 0.0, self.height), 0.024, STEEL),
+                rod((0.0, 0.0, spout), mouth, 0.012, STEEL),
+            ),
+            "outlet": Part("base", (shift(*mouth),)),
+            "lever": Part(
+                "base",
+                (shift(z=self.height), turn(Z, self.q("turn")), turn(Y, self.q("lift"))),
+                (
+                    rod((0.0, 0.0, 0.0), (0.0, 0.0, 0.03), 0.022, STEEL),
+                    rod((0.0, 0.0, 0.022), (-0.12, 0.0, 0.035), 0.007, STEEL),
+                ),
+            ),
+        }

@@ -1,0 +1,179 @@
+"""The folding door of a cupboard: two panels and an arm, a planar four-bar."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import ClassVar, TypeAlias
+
+from kineverse.articulations.joint import checked_number
+from kineverse.articulations.limits import Limits
+from kineverse.errors import ValueRejectedError
+from kineverse.expressions.expression import Expression
+from kineverse.expressions.functions import arctan2, cos, sin, sqrt
+from kineverse.model.body import Pose, Vector3
+from kineverse.motions import Y, turn
+
+from .mechanism import Mechanism, Part
+from .solids import PALE, STEEL, WOOD, box, case, rod, shift
+
+Point: TypeAlias = tuple[float, float]
+
+
+@dataclass(frozen=True, kw_only=True)
+class FoldingDoor(Mechanism):
+    """A cupboard's door of two panels that fold while they rise; an arm guides the lower one.
+
+    Everything moves in the (x, z) plane of the base, which is the middle of the cupboard; it opens towards
+    -x. The upper panel turns about A by the coordinate ``name``, q [rad], 0 when shut. Along and outward of
+    it are e1 = (-sin q, -cos q) and e2 = (-cos q, sin q), and of the lower panel f1 and f2 = (f1z, -f1x). A
+    point (u, v) of a panel is u along and v outward. With points of the upper panel from A, and of the lower
+    one from the hinge B between them,
+
+        B = A + (e1, e2)·panel_hinge,      C = B + (f1, f2)·arm_end,      |C - D| = arm
+
+    In the triangle of B, C and D, with c = |arm_end|, d = |D - B| and w = (D - B)/d, a circle meets another:
+
+        C - B = m w + h (w_z, -w_x),       m = (c² + d² - arm²)/2d,       h = √(c² - m²)
+
+    which gives f1 = (u r + v (-r_z, r_x))/c² for r = C - B and (u, v) = arm_end. The arm reaches the lower
+    panel from inside, so h is positive, and the panels hang one below the other at q = 0.
+
+    Frames are ``base``, ``upper_panel`` and ``lower_panel`` (in their middles), ``panel_hinge`` (B, on the
+    upper panel), ``arm`` (at D, z towards C), ``arm_end`` (C, on the lower panel) and ``handle``. All of them
+    but the base, the arm and its end have x inward, y to the side and z up when shut.
+
+    Attributes
+    ----------
+    size, wall
+        Depth, width and height of the cupboard, and how thick its walls are [m].
+    panel
+        Width, height and thickness of the panels [m].
+    top_hinge, arm_pivot
+        A and D in the cupboard, (x, z) [m].
+    upper_middle, panel_hinge
+        Points of the upper panel (u, v) from A [m].
+    lower_middle, arm_end
+        Points of the lower panel (u, v) from B [m].
+    handle
+        Point of the lower panel (u, v) from its middle [m].
+    handle_size
+        Width, depth and thickness of the handle [m].
+    arm
+        Length of the arm [m].
+    opening
+        Limits of q and of its speed; numbers.
+
+    Raises
+    ------
+    ValueRejectedError
+        For lengths that are not positive, or with which the arm does not reach at some angle.
+    """
+
+    main: ClassVar[str] = "lower_panel"
+
+    size: Vector3 = (0.35, 0.6, 0.72)
+    wall: float = 0.016
+    panel: Vector3 = (0.595, 0.357, 0.016)
+    top_hinge: Point = (-0.18562, 0.34566)
+    arm_pivot: Point = (-0.085, 0.168)
+    upper_middle: Point = (0.16637, -0.00229)
+    panel_hinge: Point = (0.37012, 0.00039)
+    lower_middle: Point = (0.15621, -0.0031)
+    arm_end: Point = (0.17871, -0.0671)
+    handle: Point = (0.0985, 0.008)
+    handle_size: Vector3 = (0.16, 0.05, 0.012)
+    arm: float = 0.372
+    opening: Limits = Limits(0.0, 1.84, 0.25)
+
+    def __post_init__(self) -> None:
+        self.lengths("wall", "arm")
+        for field, count, positive in (
+            *((field, 3, True) for field in ("size", "panel", "handle_size")),
+            *((field, 2, False) for field in ("top_hinge", "arm_pivot", "upper_middle", "panel_hinge")),
+            *((field, 2, False) for field in ("lower_middle", "arm_end", "handle")),
+        ):
+            object.__setattr__(self, field, self._numbers(field, count, positive))
+        super().__post_init__()
+        self._check_reach()
+
+    @property
+    def limits(self) -> Mapping[str, Limits]:
+        """That of q."""
+        return {self.path(): self.opening}
+
+    def parts(self) -> Mapping[str, Part]:
+        """Return the cupboard, the panels, the arm and the handle."""
+        q = self.q()
+        (ax, az), (dx, dz), (ux, uv) = self.top_hinge, self.arm_pivot, self.panel_hinge
+        bx = ax - ux * sin(q) - uv * cos(q)
+        bz = az - ux * cos(q) + uv * sin(q)
+        x, z = self._arm_end_from(bx, bz)
+        u, v = self.arm_end
+        # Of f1 = (-sin θ, -cos θ), like e1 of q; the division by c² does not turn it.
+        lower = arctan2(v * z - u * x, -u * z - v * x)
+        width, height, thickness = self.panel
+        leaf = box((thickness, width, height), (0.0, 0.0, 0.0), WOOD)
+        grip_width, grip_depth, grip_thickness = self.handle_size
+        grip = box((grip_depth, grip_width, grip_thickness), (-grip_depth / 2, 0.0, 0.0), STEEL)
+        side = self.size[1] / 2 - 2 * self.wall
+        bar = rod((0.0, side, 0.0), (0.0, side, self.arm), 0.008, STEEL)
+        return {
+            "base": self.base(*case(self.size, self.wall, PALE)),
+            "upper_panel": Part("base", (shift(ax, 0, az), turn(Y, q), _on(self.upper_middle)), (leaf,)),
+            "panel_hinge": Part("base", (shift(ax, 0, az), turn(Y, q), _on(self.panel_hinge))),
+            "lower_panel": Part("panel_hinge", (turn(Y, lower - q), _on(self.lower_middle)), (leaf,)),
+            "arm_end": Part("panel_hinge", (turn(Y, lower - q), _on(self.arm_end))),
+            "handle": Part("lower_panel", (_on(self.handle),), (grip,)),
+            "arm": Part("base", (shift(dx, 0, dz), turn(Y, arctan2(bx + x - dx, bz + z - dz))), (bar,)),
+        }
+
+    def _arm_end_from(self, bx: Expression, bz: Expression) -> tuple[Expression, Expression]:
+        """Return C - B."""
+        c = math.hypot(*self.arm_end)
+        to_x, to_z = self.arm_pivot[0] - bx, self.arm_pivot[1] - bz
+        square = to_x**2 + to_z**2
+        along = (c**2 + square - self.arm**2) / 2 / square
+        across = sqrt(c**2 / square - along**2)
+        return along * to_x + across * to_z, along * to_z - across * to_x
+
+    def _numbers(self, field: str, count: int, positive: bool) -> tuple[float, ...]:
+        given = getattr(self, field)
+        try:
+            numbers = tuple(given)
+        except TypeError:
+            numbers = ()
+        if len(numbers) != count:
+            raise ValueRejectedError(f"{self.its(field)} has {count} numbers, which {given!r} has not.")
+        return tuple(checked_number(n, f"{self.its(field)}, each of it,", positive=positive) for n in numbers)
+
+    def _check_reach(self) -> None:
+        """Look whether the triangle of B, C and D closes at all angles, and never flattens."""
+        lower, upper = self.range_of("opening", -math.pi, math.pi)
+        r, c = math.hypot(*self.panel_hinge), math.hypot(*self.arm_end)
+        across, up = (d - a for a, d in zip(self.top_hinge, self.arm_pivot, strict=True))
+        for what, length in (("panel hinge", r), ("arm end", c)):
+            if not length:
+                raise ValueRejectedError(
+                    f"{self.its(what)} is at (0, 0), which is no place for another hinge."
+                )
+        # B is nearest to D, or farthest from it, where the upper panel points along the line from A to D.
+        u, v = self.panel_hinge
+        straight = math.atan2(-across, -up) - math.atan2(v, u)
+        angles = [lower, upper, *(straight + k * math.pi for k in range(-3, 4))]
+        for q in (a for a in angles if lower <= a <= upper):
+            x = -u * math.sin(q) - v * math.cos(q) - across
+            z = -u * math.cos(q) + v * math.sin(q) - up
+            d = math.hypot(x, z)
+            if not abs(c - self.arm) < d < c + self.arm:
+                raise ValueRejectedError(
+                    f"{self.its('arm')}, {self.arm:g}, does not reach at {q:.6g} rad: its pivot is "
+                    f"{d:.6g} from the hinge between the panels there, and its other end {c:.6g}."
+                )
+
+
+def _on(point: Point) -> Pose:
+    """Return the place of a point in the axes of a panel, which hangs along -z and looks along -x."""
+    along, outward = point
+    return shift(-outward, 0.0, -along)

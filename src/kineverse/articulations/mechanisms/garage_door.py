@@ -1,0 +1,124 @@
+"""The garage door of the papers."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import ClassVar, Literal
+
+from kineverse.articulations.limits import Limits
+from kineverse.errors import ValueRejectedError
+from kineverse.expressions.expression import Expression
+from kineverse.expressions.functions import arccos, cos
+from kineverse.locks import Triple, unlocked_while
+from kineverse.motions import X, Y, Z, slide, turn
+
+from .mechanism import Mechanism, Part
+from .solids import DARK, STEEL, WOOD, box, rod, shift
+
+
+@dataclass(frozen=True, kw_only=True)
+class GarageDoor(Mechanism):
+    """A door whose lower edge rises along a vertical rail, and its upper edge along one under the ceiling.
+
+    2022 paper, Eqs. 11-13. With its length l and its angle α, 0 when closed,
+
+        base_T_door = translation(0, 0, l (1 - cos α)) · rotation_y(α)
+
+    Surprise first: its coordinate is α, and not the papers' position a = l cos α, which is l when closed and
+    0 when open. There α = arccos(a/l) has an infinite slope at a = l, exactly where the door is locked. With
+    ``form="published"`` it is the coordinate all the same; the height is l - a then, because the a that
+    Eq. 12 prints is not 0 at the floor when closed.
+
+    =================  ==================================================================
+    ``name/door``      q = α in [0, π/2] [rad], or as published q = a in [0, l] [m]
+    ``name/bolt``      b, the lock's handle [rad]
+    frames             ``base``, ``door`` (lower edge, z along the door), ``upper_edge``, ``bolt``
+    ``name/lock``      -speed·unlocked <= q̇ <= speed·unlocked
+    unlocked           ~((b < catch) & closed), closed where a > l - play
+    =================  ==================================================================
+
+    Attributes
+    ----------
+    length, width, thickness
+        Of the door [m].
+    form
+        ``"regular"``, or ``"published"`` with the coordinate of the papers.
+    bolt
+        Limits of b.
+    catch
+        Below which b locks [rad].
+    play
+        How far a may be from l for the bolt still to catch [m].
+    speed
+        Limit of |q̇| while it is unlocked [rad/s], or as published [m/s].
+
+    Raises
+    ------
+    ValueRejectedError
+        For lengths that are not positive, a play that is not below the length, or a catch beyond the bolt's
+        limits.
+    """
+
+    main: ClassVar[str] = "door"
+
+    length: float = 2.0
+    width: float = 2.5
+    thickness: float = 0.04
+    form: Literal["regular", "published"] = "regular"
+    bolt: Limits = Limits(0.0, 0.6)
+    catch: float = 0.3
+    play: float = 0.01
+    speed: float = 1.0
+
+    def __post_init__(self) -> None:
+        self.lengths("length", "width", "thickness", "play", "speed")
+        if self.form not in ("regular", "published"):
+            raise ValueRejectedError(f"{self.its('form')} is 'regular' or 'published', not {self.form!r}.")
+        if not self.play < self.length:
+            raise ValueRejectedError(
+                f"{self.its('play')} is less than its length {self.length:g}, and not {self.play:g}."
+            )
+        super().__post_init__()
+        self.check_within("catch", self.bolt)
+
+    @property
+    def limits(self) -> Mapping[str, Limits]:
+        """Those of the door and of the bolt."""
+        most = self.length if self.form == "published" else math.pi / 2
+        return {self.path("door"): Limits(0.0, most), self.path("bolt"): self.bolt}
+
+    @property
+    def closed(self) -> Expression:
+        """The truth of a > l - play."""
+        if self.form == "published":
+            return self.q("door") > self.length - self.play
+        return self.q("door") < math.acos(1 - self.play / self.length)
+
+    def locks(self) -> Mapping[str, Triple]:
+        """Return the lock, c2 of Eq. 13."""
+        raised = self.q("bolt") > self.catch
+        return {"lock": unlocked_while(self.q("door"), raised, at=self.closed, speed=self.speed)}
+
+    def parts(self) -> Mapping[str, Part]:
+        """Return rails, door and bolt."""
+        q, length, side = self.q("door"), self.length, self.width / 2 + 0.03
+        if self.form == "published":
+            height, angle = length - q, arccos(q / length)
+        else:
+            height, angle = length * (1 - cos(q)), q
+        rails = [box((0.05, 0.05, length), (0.0, y, length / 2), STEEL) for y in (-side, side)]
+        rails += [box((length, 0.05, 0.05), (length / 2, y, length), STEEL) for y in (-side, side)]
+        leaf = box((self.thickness, self.width, length), (0.0, 0.0, length / 2), WOOD)
+        grip = -self.thickness / 2 - 0.04
+        return {
+            "base": self.base(*rails),
+            "door": Part("base", (slide(Z, height), turn(Y, angle)), (leaf,)),
+            "upper_edge": Part("door", (shift(z=length),)),
+            "bolt": Part(
+                "door",
+                (shift(grip, 0.0, 0.15 * length), turn(X, self.q("bolt"))),
+                (rod((0.0, 0.0, 0.0), (0.04, 0.0, 0.0), 0.01, DARK), box((0.02, 0.2, 0.02), (0, 0, 0), DARK)),
+            ),
+        }

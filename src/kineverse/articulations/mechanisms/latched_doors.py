@@ -1,0 +1,278 @@
+"""Hinged doors that something holds: a handle, a sprung bolt, a button."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+from kineverse.articulations.limits import Limits
+from kineverse.errors import ValueRejectedError
+from kineverse.locks import Triple, blocked_unless, unlocked_while
+from kineverse.model.body import Rgba, Shape
+from kineverse.motions import X, Z, slide, turn
+
+from .mechanism import Mechanism, Part, number_in
+from .solids import DARK, PALE, RED, STEEL, WOOD, box, case, panel, rod, shift
+
+
+@dataclass(frozen=True, kw_only=True)
+class HingedDoor(Mechanism):
+    """Base of doors about a vertical hinge at the base: base_T_door = rotation_z(q), q in [rad].
+
+    The door stands in the (y, z) plane when it is shut, q = 0, from the hinge to y = width, and opens towards
+    -x.
+
+    Attributes
+    ----------
+    width, height, thickness
+        Of the door [m].
+    door
+        Limits of q.
+    """
+
+    main: ClassVar[str] = "door"
+
+    width: float = 0.8
+    height: float = 2.0
+    thickness: float = 0.04
+    door: Limits = Limits(0.0, 1.9, 1.5)
+
+    def __post_init__(self) -> None:
+        self.lengths("width", "height", "thickness")
+        super().__post_init__()
+        if number_in(self.door.lower) not in (None, 0.0) or self.door.lower is None:
+            raise ValueRejectedError(f"{self.its('door')} is shut at 0, and not at {self.door.lower!r}.")
+
+    def leaf(self, color: Rgba = WOOD, *shapes: Shape) -> Part:
+        """Return the door."""
+        return Part(
+            "base",
+            (turn(Z, self.q("door")),),
+            (panel(self.width, self.height, self.thickness, color), *shapes),
+        )
+
+    def posts(self) -> tuple[Shape, Shape]:
+        """Return what stands on both sides of it."""
+        size = (self.thickness, 0.06, self.height)
+        first, second = (box(size, (0.0, y, self.height / 2), PALE) for y in (-0.035, self.width + 0.035))
+        return first, second
+
+
+@dataclass(frozen=True, kw_only=True)
+class DoorWithHandle(HingedDoor):
+    """A room's door: shut, it opens only while the handle is pressed; once open, it moves freely.
+
+    ================  ======================================================================
+    ``name/door``     q [rad], see :class:`HingedDoor`
+    ``name/handle``   h [rad]: door_T_handle = translation(…) · rotation_x(h), 0 at rest
+    frames            ``base``, ``door``, ``handle``
+    ``name/lock``     -speed <= q̇ <= speed·unlocked: closing is always free
+    unlocked          (h > threshold) | ~(q < shut)
+    ================  ======================================================================
+
+    Attributes
+    ----------
+    handle
+        Limits of h.
+    threshold
+        How far the handle has to be pressed [rad].
+    shut
+        Up to which q the latch catches [rad].
+    speed
+        How fast the door may turn [rad/s].
+    handle_height
+        Of the handle above the floor [m].
+
+    Raises
+    ------
+    ValueRejectedError
+        For lengths that are not positive, a door that is not shut at 0, a threshold that the handle does not
+        reach, or a handle above the door.
+    """
+
+    handle: Limits = Limits(0.0, 0.9, 3.0)
+    threshold: float = 0.6
+    shut: float = 0.01
+    speed: float = 1.5
+    handle_height: float = 1.0
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self.lengths("shut", "speed", "handle_height")
+        self.check_within("threshold", self.handle)
+        if not self.handle_height < self.height:
+            raise ValueRejectedError(
+                f"{self.its('handle_height')} is below its height {self.height:g}, and not "
+                f"{self.handle_height:g}."
+            )
+
+    @property
+    def limits(self) -> Mapping[str, Limits]:
+        """Those of door and handle."""
+        return {self.path("door"): self.door, self.path("handle"): self.handle}
+
+    def locks(self) -> Mapping[str, Triple]:
+        """Return the lock."""
+        q = self.q("door")
+        pressed = self.q("handle") > self.threshold
+        return {"lock": unlocked_while(q, pressed, at=q < self.shut, speed=self.speed, blocks="forward")}
+
+    def parts(self) -> Mapping[str, Part]:
+        """Return posts, door and handle."""
+        out = 0.05
+        lever = box((0.02, 0.12, 0.02), (0.0, -0.05, 0.0), STEEL)
+        stem = rod((0.0, 0.0, 0.0), (out, 0.0, 0.0), 0.008, STEEL)
+        place = shift(-self.thickness / 2 - out, 0.93 * self.width, self.handle_height)
+        return {
+            "base": self.base(*self.posts()),
+            "door": self.leaf(),
+            "handle": Part("door", (place, turn(X, self.q("handle"))), (lever, stem)),
+        }
+
+
+@dataclass(frozen=True, kw_only=True)
+class SprungDoor(HingedDoor):
+    """Base of doors that something on a spring holds: shut, they stay so unless it is moved away.
+
+    The lock is a block of the position (:func:`kineverse.blocked_unless`): an open door is free, and so is
+    shutting it, because the bolt gives way.
+
+    Attributes
+    ----------
+    catch
+        How far the bolt or the button has to be moved [m].
+    play
+        How far open the door still counts as shut [rad].
+    stiffness, rest
+        Of the spring [N/m], [m]: its force on a coordinate b is stiffness·(rest - b).
+
+    Raises
+    ------
+    ValueRejectedError
+        For lengths that are not positive, a door that is not shut at 0, a catch beyond the limits of what is
+        sprung, or a spring that does not push it back to 0.
+    """
+
+    sprung: ClassVar[str]
+    """Which of its parts the spring pushes."""
+
+    catch: float
+    play: float = 0.003
+    stiffness: float = 300.0
+    rest: float = -0.01
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self.lengths("play")
+        self.check_within("catch", getattr(self, self.sprung))
+        self.number("stiffness", positive=True)
+        if self.number("rest") > 0:
+            raise ValueRejectedError(
+                f"{self.its('rest')} is at 0 or before it, where the spring pushes to, and not at "
+                f"{self.rest:g}."
+            )
+
+    @property
+    def limits(self) -> Mapping[str, Limits]:
+        """Those of the door and of what is sprung."""
+        return {self.path("door"): self.door, self.path(self.sprung): getattr(self, self.sprung)}
+
+    def locks(self) -> Mapping[str, Triple]:
+        """Return what the spring's end does."""
+        away = self.q(self.sprung) > self.catch
+        return {"latch": blocked_unless(self.q("door"), away, upper=0.0, margin=self.play)}
+
+    def known(self) -> tuple[tuple[str, Any], ...]:
+        """Return the spring."""
+        return ((f"{self.sprung}/stiffness", self.stiffness), (f"{self.sprung}/rest", self.rest))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Latch(SprungDoor):
+    """A door that a sprung bolt holds.
+
+    ================  ======================================================================
+    ``name/door``     q [rad]: base_T_door = rotation_z(q)
+    ``name/bolt``     b [m]: door_T_bolt = translation(0, width - b, height/2), 0 where the spring pushes it
+    frames            ``base``, ``door``, ``bolt``
+    ``name/latch``    q <= 0 unless b > catch or q >= play
+    record            ``bolt/stiffness`` [N/m], ``bolt/rest`` [m]
+    ================  ======================================================================
+
+    Attributes
+    ----------
+    bolt
+        Limits of b.
+    """
+
+    sprung: ClassVar[str] = "bolt"
+
+    bolt: Limits = Limits(0.0, 0.012, 0.2)
+    catch: float = 0.008
+
+    def parts(self) -> Mapping[str, Part]:
+        """Return posts, door and bolt."""
+        tongue = box((0.4 * self.thickness, 0.04, 0.03), (0.0, -0.01, 0.0), STEEL)
+        place = shift(0.0, self.width, self.height / 2)
+        return {
+            "base": self.base(*self.posts()),
+            "door": self.leaf(),
+            "bolt": Part("door", (place, slide((0.0, -1.0, 0.0), self.q("bolt"))), (tongue,)),
+        }
+
+
+@dataclass(frozen=True, kw_only=True)
+class Microwave(SprungDoor):
+    """An oven whose door stays shut unless its button is pressed; the button comes back by a spring.
+
+    ================  ======================================================================
+    ``name/door``     q [rad]: base_T_door = rotation_z(q)
+    ``name/button``   b [m]: base_T_button = translation(b, …), 0 where the spring pushes it
+    frames            ``base`` (at the hinge, on the floor of the oven), ``door``, ``button``
+    ``name/latch``    q <= 0 unless b > catch or q >= play
+    record            ``button/stiffness`` [N/m], ``button/rest`` [m]
+    ================  ======================================================================
+
+    Attributes
+    ----------
+    depth
+        Of the oven behind its door [m].
+    button
+        Limits of b.
+    """
+
+    sprung: ClassVar[str] = "button"
+
+    width: float = 0.36
+    height: float = 0.28
+    thickness: float = 0.03
+    depth: float = 0.34
+    door: Limits = Limits(0.0, 1.9, 2.0)
+    button: Limits = Limits(0.0, 0.006, 0.1)
+    catch: float = 0.004
+    stiffness: float = 500.0
+    rest: float = -0.004
+
+    def __post_init__(self) -> None:
+        self.lengths("depth")
+        super().__post_init__()
+
+    def parts(self) -> Mapping[str, Part]:
+        """Return the oven, its door and its button."""
+        w, h, t, depth = self.width, self.height, self.thickness, self.depth
+        controls = 0.3 * w
+        behind = (t / 2 + depth / 2, w / 2, h / 2)
+        grip = rod((-t / 2 - 0.025, 0.92 * w, 0.15 * h), (-t / 2 - 0.025, 0.92 * w, 0.85 * h), 0.008, STEEL)
+        return {
+            "base": self.base(
+                *case((depth, w, h), 0.02, PALE, behind),
+                box((depth + t, controls, h), (depth / 2, w + controls / 2, h / 2), DARK),
+            ),
+            "door": self.leaf(DARK, grip),
+            "button": Part(
+                "base",
+                (shift(-t / 2, w + controls / 2, 0.2 * h), slide(X, self.q("button"))),
+                (box((0.02, 0.6 * controls, 0.12 * h), (0.0, 0.0, 0.0), RED),),
+            ),
+        }

@@ -1,0 +1,192 @@
+"""Mechanisms of parallelograms and rhombi, whose last part keeps its orientation."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import ClassVar
+
+from kineverse.articulations.limits import Limits
+from kineverse.errors import ValueRejectedError
+from kineverse.expressions.functions import cos, sin
+from kineverse.model.body import Pose
+from kineverse.motions import X, Y, Z, slide, turn
+
+from .mechanism import Mechanism, Part
+from .solids import BLUE, DARK, PALE, RED, STEEL, YELLOW, box, rod, shift
+
+MOST_STAGES = 64
+HALF_TURN = Pose((1.0, 0.0, 0.0, 0.0, 0.0, -1.0, 0.0, 0.0, 0.0, 0.0, -1.0, 0.0))  # about x
+
+
+@dataclass(frozen=True, kw_only=True)
+class ScissorLift(Mechanism):
+    """A platform on n pairs of crossed arms, one on top of the other.
+
+    Its coordinate ``name`` is the angle q of the arms above the horizontal [rad]. With arms of length L,
+
+        slider at L cos q,      crossing i = 1 … n at (L/2 cos q, L (i - ½) sin q),      height n L sin q
+
+    Surprise first: the coordinate is not the height h. As functions of the angle all of these are smooth at
+    every angle. As functions of the height they have infinite slopes where the arms stand upright,
+    dq/dh = 1/(n L cos q); there the slider is at its end as well. So limits of the height are limits of the
+    angle, arcsin(h/(n L)).
+
+    Frames are ``base``, ``arm_1a``, ``arm_1b`` … (at the crossings, x along the arm), ``slider`` (the lower
+    end of the first arm b, in the base) and ``platform`` (above the fixed pivots).
+
+    Attributes
+    ----------
+    stages
+        n, from 1 to 64.
+    arm, width
+        Length of the arms, and of the platform across [m].
+    angle
+        Limits of q, numbers in [0, π/2].
+
+    Raises
+    ------
+    ValueRejectedError
+        For lengths that are not positive, stages that are no such number, or limits beyond flat and upright.
+    """
+
+    main: ClassVar[str] = "platform"
+
+    stages: int = 3
+    arm: float = 1.0
+    width: float = 0.6
+    angle: Limits = Limits(0.1, 1.2, 0.2)
+
+    def __post_init__(self) -> None:
+        self.lengths("arm", "width")
+        if (
+            isinstance(self.stages, bool)
+            or not isinstance(self.stages, int)
+            or not 1 <= self.stages <= MOST_STAGES
+        ):
+            raise ValueRejectedError(
+                f"{self.its('stages')} are a whole number from 1 to {MOST_STAGES}, not {self.stages!r}."
+            )
+        self.range_of("angle", 0.0, math.pi / 2)
+        super().__post_init__()
+
+    @property
+    def limits(self) -> Mapping[str, Limits]:
+        """That of q."""
+        return {self.path(): self.angle}
+
+    def parts(self) -> Mapping[str, Part]:
+        """Return base, arms, slider and platform."""
+        q, length, width = self.q(), self.arm, self.width
+        rise, reach = length * sin(q), length * cos(q)
+        thick = 0.04 * length
+        deck = (1.06 * length, width, thick)
+        parts = {"base": self.base(box(deck, (length / 2, 0.0, -1.5 * thick), DARK))}
+        for i in range(self.stages):
+            middle = (slide(X, reach / 2), slide(Z, (i + 0.5) * rise))
+            for letter, sign, inset, color in (("a", -1, 0.5, BLUE), ("b", 1, 0.4, STEEL)):
+                bars = tuple(
+                    box((length, 0.5 * thick, thick), (0.0, side * inset * width, 0.0), color)
+                    for side in (-1, 1)
+                )
+                parts[f"arm_{i + 1}{letter}"] = Part("base", (*middle, turn(Y, sign * q)), bars)
+        axle = rod((0.0, -width / 2, 0.0), (0.0, width / 2, 0.0), 0.6 * thick, RED)
+        parts["slider"] = Part("base", (slide(X, reach),), (axle,))
+        top = box(deck, (length / 2, 0.0, 1.5 * thick), YELLOW)
+        parts["platform"] = Part("base", (slide(Z, self.stages * rise),), (top,))
+        return parts
+
+
+@dataclass(frozen=True, kw_only=True)
+class DeskLamp(Mechanism):
+    """A lamp on two parallelograms: wherever it is put, its head keeps its orientation.
+
+    The lower arm leans by α from the vertical and the upper one rises by β from the horizontal. Beside each
+    there is a bar of the same length, so elbow and head do not turn:
+
+        base_T_elbow = translation(L₁ sin α, 0, L₁ cos α)
+        base_T_head  = base_T_elbow · translation(L₂ cos β, 0, L₂ sin β)
+
+    The pivots of the lower parallelogram are side by side, and those of the upper one above each other, so
+    they fall flat at α = ±π/2 and β = ±π/2, which is out of reach.
+
+    ================  ======================================================================
+    ``name/lower``    α [rad]
+    ``name/upper``    β [rad]
+    frames            ``base``, ``lower_arm``, ``lower_bar``, ``elbow``, ``upper_arm``, ``upper_bar``,
+                      ``head``, ``light`` (z along the light, downward)
+    ================  ======================================================================
+
+    Attributes
+    ----------
+    lower_arm, upper_arm
+        L₁ and L₂ [m].
+    offset
+        Between an arm and its bar [m].
+    lower, upper
+        Limits of α and β, numbers within ±π/2.
+
+    Raises
+    ------
+    ValueRejectedError
+        For lengths that are not positive, or limits at which a parallelogram falls flat.
+    """
+
+    main: ClassVar[str] = "head"
+
+    lower_arm: float = 0.4
+    upper_arm: float = 0.38
+    offset: float = 0.04
+    lower: Limits = Limits(-0.8, 0.8, 1.0)
+    upper: Limits = Limits(-0.9, 0.9, 1.0)
+
+    def __post_init__(self) -> None:
+        self.lengths("lower_arm", "upper_arm", "offset")
+        for field in ("lower", "upper"):
+            if max(map(abs, self.range_of(field, -math.pi / 2, math.pi / 2))) >= math.pi / 2:
+                raise ValueRejectedError(
+                    f"{self.its(field)} ends before ±π/2, where its parallelogram falls flat."
+                )
+        super().__post_init__()
+
+    @property
+    def limits(self) -> Mapping[str, Limits]:
+        """Those of both angles."""
+        return {self.path("lower"): self.lower, self.path("upper"): self.upper}
+
+    def parts(self) -> Mapping[str, Part]:
+        """Return foot, arms, bars, elbow and head."""
+        lean, rise = self.q("lower"), self.q("upper")
+        first, second, off = self.lower_arm, self.upper_arm, self.offset
+        foot = 0.05
+        upright = (rod((0.0, 0.0, 0.0), (0.0, 0.0, first), 0.006, STEEL),)
+        level = (rod((0.0, 0.0, 0.0), (second, 0.0, 0.0), 0.006, STEEL),)
+        up, out = turn(Y, lean), turn(Y, -rise)
+        return {
+            "base": self.base(
+                rod((0.0, 0.0, -foot), (0.0, 0.0, -foot / 2), 0.1, DARK),
+                box((0.02 + off, 0.02, foot), (off / 2, 0.0, -foot / 4), DARK),
+            ),
+            "lower_arm": Part("base", (up,), upright),
+            "lower_bar": Part("base", (shift(off), up), upright),
+            "elbow": Part(
+                "lower_arm",
+                (shift(z=first), turn(Y, -lean)),
+                (
+                    box((0.02 + off, 0.012, 0.02), (off / 2, 0.0, 0.0), RED),
+                    box((0.02, 0.012, 0.02 + off), (0.0, 0.0, off / 2), RED),
+                ),
+            ),
+            "upper_arm": Part("elbow", (out,), level),
+            "upper_bar": Part("elbow", (shift(z=off), out), level),
+            "head": Part(
+                "upper_arm",
+                (shift(second), turn(Y, rise)),
+                (
+                    box((0.02, 0.012, 0.02 + off), (0.0, 0.0, off / 2), RED),
+                    rod((0.0, 0.0, 0.0), (0.0, 0.0, -0.05), 0.05, PALE),
+                ),
+            ),
+            "light": Part("head", (shift(z=-0.05), HALF_TURN)),
+        }

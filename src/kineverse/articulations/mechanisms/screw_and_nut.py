@@ -1,0 +1,88 @@
+"""A screw that moves a nut."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import ClassVar
+
+from kineverse.articulations.limits import Limits, checked_limit
+from kineverse.errors import ValueRejectedError
+from kineverse.motions import Z, slide, turn
+
+from .mechanism import Mechanism, Part
+from .solids import DARK, STEEL, YELLOW, box, rod
+
+
+@dataclass(frozen=True, kw_only=True)
+class ScrewAndNut(Mechanism):
+    """A screw that turns in its place, and a nut that cannot turn and so slides along it.
+
+    By the screw's angle ``name``, q [rad], with its pitch p and the nut's travel t:
+
+        base_T_screw = rotation_z(q),       base_T_nut = translation(0, 0, s)
+        s = t - p q/2π  for p > 0,          s = -p q/2π  for p < 0
+
+    both from q = 0 to 2πt/|p|. Surprise first: turned to the left, as seen from its end at +z, a right-handed
+    screw pulls the nut *towards* z = 0. So the nut of a right-handed one starts at the far end.
+
+    Frames are ``base``, ``screw`` and ``nut``.
+
+    Attributes
+    ----------
+    pitch
+        p, how far the nut goes in one revolution [m]; negative for a left-handed thread.
+    travel
+        t, from one end of the nut's way to the other [m].
+    radius
+        Of the screw [m].
+    velocity
+        Limit of |q̇| [rad/s]; None for no limit.
+
+    Raises
+    ------
+    ValueRejectedError
+        For a pitch of 0, lengths that are not positive, or a negative velocity.
+    """
+
+    main: ClassVar[str] = "nut"
+
+    pitch: float = 0.004
+    travel: float = 0.2
+    radius: float = 0.01
+    velocity: float | None = 20.0
+
+    def __post_init__(self) -> None:
+        self.lengths("travel", "radius")
+        if not self.number("pitch"):
+            raise ValueRejectedError(f"{self.its('pitch')} is 0, so nothing would move the nut.")
+        checked_limit(self.velocity, self.its("velocity"))
+        super().__post_init__()
+
+    @property
+    def limits(self) -> Mapping[str, Limits]:
+        """That of q."""
+        return {self.path(): Limits(0.0, math.tau * self.travel / abs(self.pitch), self.velocity)}
+
+    def parts(self) -> Mapping[str, Part]:
+        """Return bearings, screw and nut."""
+        q, r, end = self.q(), self.radius, 2.5 * self.radius
+        start = self.travel if self.pitch > 0 else 0.0
+        bearing = (4 * r, 4 * r, r)
+        return {
+            "base": self.base(*(box(bearing, (0.0, 0.0, z), DARK) for z in (-end, self.travel + end))),
+            "screw": Part(
+                "base",
+                (turn(Z, q),),
+                (
+                    rod((0.0, 0.0, -end), (0.0, 0.0, self.travel + end), r, STEEL),
+                    box((3 * r, 0.5 * r, 0.5 * r), (0.0, 0.0, self.travel + 1.6 * end), STEEL),
+                ),
+            ),
+            "nut": Part(
+                "base",
+                (slide(Z, start - self.pitch / math.tau * q),),
+                (box((4 * r, 4 * r, 2 * r), (0, 0, 0), YELLOW),),
+            ),
+        }
