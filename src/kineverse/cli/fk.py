@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import json
 import sys
-from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
 from kineverse.cli.assignments import add_set_option, parse_assignments

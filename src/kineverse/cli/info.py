@@ -6,6 +6,7 @@ import argparse
 import json
 from typing import TYPE_CHECKING, Any
 
+from kineverse.cli.listing import asked_for, print_articulations
 from kineverse.cli.table import figure, table
 
 if TYPE_CHECKING:
@@ -16,7 +17,8 @@ HELP = """print what a model consists of: frames, degrees of freedom, constraint
 examples:
   kineverse info kitchen
   kineverse info my_robot.urdf --frames
-  kineverse info pr2 --json"""
+  kineverse info pr2 --json
+  kineverse info articulations        the list of those in the gallery"""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -29,6 +31,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Load, count and print."""
+    if asked_for(arguments.model):
+        return print_articulations(arguments.json)
+
     import kineverse as kv
     from kineverse.cli.summary import summarise
 

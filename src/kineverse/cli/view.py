@@ -11,6 +11,7 @@ from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
 from kineverse.cli.assignments import add_set_option, parse_assignments
+from kineverse.cli.listing import asked_for, print_articulations
 from kineverse.cli.progress import progress
 
 if TYPE_CHECKING:
@@ -22,6 +23,8 @@ The page is served to this computer only, until Ctrl-C.
 
 examples:
   kineverse view kitchen
+  kineverse view articulations/folding_door      any articulation of the library
+  kineverse view articulations                   the list of them
   kineverse view my_robot.urdf --set elbow=45deg --port 8090"""
 
 
@@ -41,6 +44,8 @@ def add_page_options(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Serve the page until interrupted."""
     assigned = parse_assignments(arguments.assignments)
+    if asked_for(arguments.model):
+        return print_articulations()
 
     import kineverse as kv
     from kineverse.view import meshes

@@ -34,11 +34,12 @@ def load(source: str | os.PathLike[str], prefix: str | None = None) -> Model:
     Parameters
     ----------
     source
-        The path of a ``.urdf`` or ``.kv.json`` file, or a name such as ``kitchen`` or ``pr2``, see
-        :func:`kineverse.formats.sources.locate_model`.
+        The path of a ``.urdf`` or ``.kv.json`` file, or a name such as ``kitchen``, ``pr2`` or
+        ``articulations/screw``, see :func:`kineverse.formats.sources.locate_model`.
     prefix
         Put in front of the names of all frames and degrees of freedom, with a slash. A model that ships has
-        its own name as prefix unless another is given; ``""`` means none.
+        its own name as prefix unless another is given (``screw`` for ``articulations/screw``); ``""`` means
+        none.
 
     Raises
     ------
@@ -48,7 +49,7 @@ def load(source: str | os.PathLike[str], prefix: str | None = None) -> Model:
         If the file is not what it should be, with file, line, element and reason.
     """
     found = locate_model(source)
-    content = read_file(found.path)
+    content = _content(found)
     key = found, prefix, hashlib.blake2b(content).digest()
     known = _REMEMBERED.pop(key, None)
     if known is None:
@@ -72,7 +73,11 @@ def operations_of(
 ) -> Iterator[tuple[str, Operation]]:
     """Yield the operations of a file or shipped model, each with its tag."""
     found = locate_model(source)
-    yield from _operations(found, read_file(found.path), prefix)
+    yield from _operations(found, _content(found), prefix)
+
+
+def _content(source: Source) -> bytes:
+    return b"" if source.scene else read_file(source.path)
 
 
 def _operations(source: Source, content: bytes, prefix: str | None) -> Iterator[tuple[str, Operation]]:
@@ -80,7 +85,12 @@ def _operations(source: Source, content: bytes, prefix: str | None) -> Iterator[
     if prefix is None:
         prefix = source.shipped
     prefix = prefix or None
-    if name.endswith(".kv.json"):
+    if source.scene:
+        from kineverse import gallery  # when it is asked for
+
+        for operation in gallery.operations(name, prefix):
+            yield operation.default_tag(), operation
+    elif name.endswith(".kv.json"):
         yield from operations_from(content, str(path), prefix)
     elif name.endswith((".urdf", ".xml")):
         robot = parse_urdf(content, source=name, folder=str(path.absolute().parent))

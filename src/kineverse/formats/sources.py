@@ -21,12 +21,17 @@ _LISTED = 6
 _LONGEST = 200
 
 
+GALLERY = "articulations"
+"""The folder, which is none, whose models are the scenes of :mod:`kineverse.gallery`."""
+
+
 @dataclass(frozen=True, slots=True)
 class Source:
-    """A file, and the name it ships under if it does."""
+    """A file, and the name it ships under if it does; or a scene of the gallery, which has no file."""
 
     path: Path
     shipped: str | None = None
+    scene: bool = False
 
 
 def shipped_models() -> tuple[str, ...]:
@@ -37,11 +42,12 @@ def shipped_models() -> tuple[str, ...]:
 def locate_model(name: str | os.PathLike[str]) -> Source:
     """Return the file of a model given by path or by name.
 
-    A shipped model is found under its name everywhere; a file of that name is ``./kitchen``. Then a path to a
-    file is taken as it is. Any other name is looked for below the folders of ``KINEVERSE_MODEL_PATH``, then
-    in installed packages that carry robots; the first place that has it counts, and there the file closest
-    to the top. It may have folders in front (``urdf_obj/kitchen``) to tell files of the same name apart, and
-    its suffix may be left out.
+    A shipped model is found under its name everywhere, and so is a scene of the gallery,
+    ``articulations/screw``; a file of that name is ``./kitchen``. Then a path to a file is taken as it is.
+    Any other name is looked for below the folders of ``KINEVERSE_MODEL_PATH``, then in installed packages
+    that carry robots; the first place that has it counts, and there the file closest to the top. It may have
+    folders in front (``urdf_obj/kitchen``) to tell files of the same name apart, and its suffix may be left
+    out.
 
     Raises
     ------
@@ -53,6 +59,9 @@ def locate_model(name: str | os.PathLike[str]) -> Source:
     text = os.fspath(name)
     if text in shipped_models():
         return Source(shipped.FOLDER / f"{text}.urdf", text)
+    gallery, _, scene = text.partition("/")
+    if gallery == GALLERY and scene in _scenes():
+        return Source(Path(text), scene, scene=True)
     if text.lstrip().startswith("<"):
         raise UnknownNameError(
             "This looks like the text of a description, where the name or path of a model is expected. "
@@ -72,12 +81,30 @@ def locate_model(name: str | os.PathLike[str]) -> Source:
             return Source((folder / _only(found, text, folder)).resolve())
         searched.append(f"{place} ({folder})")
         seen += files
+    if gallery == GALLERY:
+        raise UnknownNameError(_no_scene(scene))
     raise UnknownNameError(
         f"There is no model {_shown(text)}.{_beside(path) if text else ''} {_similar(text, seen)} "
         f"Searched after the shipped ones: {'; '.join(searched) or 'nothing else'}.{_missing_places()} "
         f"Give the path of a file, or add its folder to the environment variable {MODEL_PATH}"
         f"{_more_robots(searched)}."
     )
+
+
+def _scenes() -> tuple[str, ...]:
+    from kineverse import gallery  # when it is asked for
+
+    return gallery.names()
+
+
+def _no_scene(name: str) -> str:
+    scenes = _scenes()
+    if not name:
+        return (
+            f"'{GALLERY}' is many models, one for each articulation: {', '.join(scenes)}. "
+            f"Load one as '{GALLERY}/{scenes[0]}'."
+        )
+    return f"There is no model '{GALLERY}/{name}'. {suggest(name, scenes, 'articulation')}"
 
 
 def model_folders() -> Iterator[tuple[str, Path]]:
@@ -129,6 +156,7 @@ def _similar(name: str, files: list[str]) -> str:
     ends = Counter(_end(p) for p in paths)
     # Where the last part is enough to find it, the folders in front are not shown.
     shown = {p: _end(p) if ends[_end(p)] == 1 else p for p in paths} | {s: s for s in shipped_models()}
+    shown |= {f"{GALLERY}/{scene}": f"{GALLERY}/{scene}" for scene in _scenes()}
     alike = difflib.get_close_matches(wanted, {_end(p).casefold() for p in shown}, n=_LISTED, cutoff=0.7)
     close = [n for end in alike for p, n in shown.items() if _end(p).casefold() == end]
     within = [n for p, n in shown.items() if wanted in p.casefold()]

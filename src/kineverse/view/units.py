@@ -8,10 +8,12 @@ is a length, and of the others (a door lifted by a rope, a screw) nothing is cla
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
+from contextlib import suppress
 
 import numpy as np
 
 import kineverse as kv
+from kineverse.errors import UnsolvedError
 from kineverse.model.view import ModelView
 from kineverse.view.triangles import Floats
 
@@ -19,6 +21,9 @@ STEP = 1e-4
 """Step of the differences; their error is its square [unit of the coordinate]."""
 
 TOLERANCE = 1e-5
+
+DISTANCES = (0.0, 1.0, -1.0, 0.1, -0.1)
+"""Where to look, from the given values on; the later ones are for where nothing is found in the others."""
 
 
 def units(model: ModelView, values: Mapping[str, float], names: Iterable[str]) -> dict[str, str]:
@@ -34,23 +39,36 @@ def units(model: ModelView, values: Mapping[str, float], names: Iterable[str]) -
         The symbols wanted.
     """
     wanted = list(names)
-    moving = [frame.transform for frame in model.frames.values() if len(frame.transform.symbols)]
+    # In terms of what is free: the angles of a closed loop follow its crank.
+    moving = [t for frame in model.frames.values() if (t := model.rates.carry(frame.transform)).symbols]
     if not moving:
         return dict.fromkeys(wanted, "")
     function = kv.compile(moving)
     inputs = [str(symbol) for symbol in function.inputs]
     base = np.array([values[name] for name in inputs])
-    # A second place, a little off: what is one radian a unit only by chance is not so there.
-    places = (base, base + 0.1 + 0.01 * np.arange(len(base)))
+
+    def rates(place: Floats, index: int) -> tuple[Floats, Floats]:
+        offset = np.zeros(len(inputs))
+        offset[index] = STEP
+        return _rates(np.array(function(place - offset)), np.array(function(place + offset)))
+
     found = dict.fromkeys(wanted, "")
+    # A second place, a little off: what is one radian a unit only by chance is not so there.
+    off = 0.1 + 0.01 * np.arange(len(base))
     for name in wanted:
         if name not in inputs:
             continue
-        offset = np.zeros(len(inputs))
-        offset[inputs.index(name)] = STEP
-        rates = [_rates(np.array(function(x - offset)), np.array(function(x + offset))) for x in places]
-        turning = np.all([np.abs(turn - 1.0) < TOLERANCE for turn, _ in rates], axis=0)
-        shifting = np.all([(turn < TOLERANCE) & (np.abs(s - 1.0) < TOLERANCE) for turn, s in rates], axis=0)
+        seen = []
+        for distance in DISTANCES:
+            # Where a loop does not close there is nothing to look at; two places are enough.
+            with suppress(UnsolvedError):
+                seen.append(rates(base + distance * off, inputs.index(name)))
+            if len(seen) == 2:
+                break
+        if len(seen) < 2:
+            continue
+        turning = np.all([np.abs(turn - 1.0) < TOLERANCE for turn, _ in seen], axis=0)
+        shifting = np.all([(turn < TOLERANCE) & (np.abs(s - 1.0) < TOLERANCE) for turn, s in seen], axis=0)
         found[name] = "rad" if turning.any() else "m" if shifting.any() else ""
     return found
 

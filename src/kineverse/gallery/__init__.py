@@ -1,0 +1,71 @@
+"""Every articulation of the library as a small scene that can be opened by name and moved.
+
+>>> import kineverse as kv
+>>> model = kv.load("articulations/screw")
+>>> model.degrees_of_freedom
+(screw/bolt,)
+
+``kineverse view articulations/screw`` shows it. Each module has scenes of one family: functions of a
+:class:`~kineverse.gallery.scene.Scene` that put joints and bodies into it, and whose docstring says in one
+line what it shows.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from functools import cache
+
+from kineverse.errors import UnknownNameError, suggest
+from kineverse.model.operation import Operation
+
+from . import axes, bases, couplings, freedoms, linkages
+from .scene import Build, Scene
+
+__all__ = ["names", "operations", "summary"]
+
+_FAMILIES = (axes, freedoms, couplings, bases, linkages)
+
+
+def names() -> tuple[str, ...]:
+    """Return the names of all scenes, family by family."""
+    return tuple(_builds())
+
+
+def summary(name: str) -> str:
+    """Return one line that says what a scene shows."""
+    shown = (_build(name).__doc__ or "").partition("\n")[0].removeprefix("Show ").rstrip(".")
+    return shown[:1].upper() + shown[1:]
+
+
+def operations(name: str, prefix: str | None = None) -> Iterator[Operation]:
+    """Yield the operations of a scene.
+
+    Parameters
+    ----------
+    name
+        Of the scene.
+    prefix
+        Put in front of the names of frames, articulations and coordinates, with a slash.
+
+    Raises
+    ------
+    UnknownNameError
+        If there is no such scene, with similar names.
+    """
+    scene = Scene(prefix)
+    _build(name)(scene)
+    yield from scene.operations
+
+
+@cache
+def _builds() -> dict[str, Build]:
+    return {build.__name__: build for family in _FAMILIES for build in family.SCENES}
+
+
+def _build(name: str) -> Build:
+    try:
+        return _builds()[name]
+    except KeyError:
+        raise UnknownNameError(
+            f"There is no articulation {name!r} in the gallery. {suggest(name, _builds(), 'articulation')}"
+        ) from None

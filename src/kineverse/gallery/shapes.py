@@ -1,0 +1,151 @@
+"""What the bodies of the gallery are made of: bars, discs, gears, in a few colours.
+
+Everything is in the frame of the body it is for [m] and returns a tuple of shapes, so that a body is a sum.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import TypeAlias
+
+import numpy as np
+import numpy.typing as npt
+
+from kineverse.model.body import Box, Capsule, Cylinder, Geometry, Pose, Rgba, Shape, Sphere
+
+Shapes: TypeAlias = tuple[Shape, ...]
+Point: TypeAlias = Sequence[float] | npt.NDArray[np.float64]
+
+STEEL: Rgba = (0.66, 0.70, 0.74, 1.0)
+DARK: Rgba = (0.27, 0.30, 0.34, 1.0)
+WOOD: Rgba = (0.80, 0.64, 0.44, 1.0)
+WHITE: Rgba = (0.92, 0.92, 0.89, 1.0)
+BLUE: Rgba = (0.20, 0.47, 0.75, 1.0)
+ORANGE: Rgba = (0.93, 0.56, 0.17, 1.0)
+GREEN: Rgba = (0.35, 0.62, 0.38, 1.0)
+RED: Rgba = (0.84, 0.20, 0.18, 1.0)
+"""The colour of marks, by which one sees what turns."""
+
+X, Y, Z = (1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)
+ORIGIN = (0.0, 0.0, 0.0)
+
+
+def box(
+    size: Point, at: Point = ORIGIN, color: Rgba = STEEL, *, axis: Point = Z, turn: float = 0.0
+) -> Shapes:
+    """Return a box with its z along an axis, turned about that [rad]."""
+    x, y, z = map(float, size)
+    return (_placed(Box((x, y, z)), at, axis, color, turn),)
+
+
+def disc(radius: float, length: float, at: Point = ORIGIN, axis: Point = Z, color: Rgba = STEEL) -> Shapes:
+    """Return a cylinder around an axis, in the middle of which is the point."""
+    return (_placed(Cylinder(radius, length), at, axis, color),)
+
+
+def ball(radius: float, at: Point = ORIGIN, color: Rgba = STEEL) -> Shapes:
+    """Return a sphere."""
+    return (_placed(Sphere(radius), at, Z, color),)
+
+
+def rod(start: Point, end: Point, radius: float, color: Rgba = STEEL) -> Shapes:
+    """Return a cylinder from one point to another."""
+    way, middle = np.subtract(end, start), np.add(start, end) / 2
+    return (_placed(Cylinder(radius, float(np.linalg.norm(way))), middle, way, color),)
+
+
+def bone(start: Point, end: Point, radius: float, color: Rgba = STEEL) -> Shapes:
+    """Return a capsule whose ends are round about two points."""
+    way, middle = np.subtract(end, start), np.add(start, end) / 2
+    return (_placed(Capsule(radius, float(np.linalg.norm(way))), middle, way, color),)
+
+
+def link(
+    start: Point,
+    end: Point,
+    axis: Point = Z,
+    color: Rgba = STEEL,
+    width: float = 0.04,
+    thickness: float = 0.02,
+) -> Shapes:
+    """Return a flat bar with round ends between two pins that are along an axis, and the pins."""
+    way, middle = np.subtract(end, start), np.add(start, end) / 2
+    along, normal = way / np.linalg.norm(way), np.asarray(axis) / np.linalg.norm(axis)
+    turn = np.column_stack([along, np.cross(normal, along), normal])
+    plate = Box((float(np.linalg.norm(way)), width, thickness))
+    return (
+        Shape(plate, _pose(turn, middle), color=color),
+        *disc(width / 2, thickness, start, axis, color),
+        *disc(width / 2, thickness, end, axis, color),
+        *disc(width / 4, 1.4 * thickness, start, axis, DARK),
+        *disc(width / 4, 1.4 * thickness, end, axis, DARK),
+    )
+
+
+def gear(
+    radius: float, teeth: int, thickness: float, at: Point = ORIGIN, axis: Point = Z, color: Rgba = STEEL
+) -> Shapes:
+    """Return a gear of a pitch radius; the first tooth, which has a mark, is where :func:`across` points."""
+    size = math.pi * radius / teeth
+    turn = _frame(axis)
+    shapes = disc(radius - 0.5 * size, thickness, at, axis, color)
+    shapes += disc(0.22 * radius, 1.5 * thickness, at, axis, DARK)
+    for k in range(teeth):
+        angle = math.tau * k / teeth
+        out = turn @ [math.cos(angle), math.sin(angle), 0.0]
+        tooth = box(
+            (1.3 * size, 0.9 * size, thickness), np.add(at, radius * out), color, axis=axis, turn=angle
+        )
+        shapes += tooth
+    mark = np.add(at, turn @ [0.68 * radius, 0.0, 0.5 * thickness])
+    return shapes + disc(0.12 * radius, 0.2 * thickness, mark, axis, RED)
+
+
+def wheel(radius: float, width: float, axis: Point = Y, at: Point = ORIGIN) -> Shapes:
+    """Return a wheel with a hub and a red spoke on either side."""
+    turn = _frame(axis)
+    shapes = disc(radius, width, at, axis, DARK) + disc(0.62 * radius, 1.06 * width, at, axis, WHITE)
+    spoke = np.add(at, turn @ [0.31 * radius, 0.0, 0.0])
+    return shapes + box((0.62 * radius, 0.14 * radius, 1.14 * width), spoke, RED, axis=axis)
+
+
+def arrow(length: float, height: float, at: Point = ORIGIN, color: Rgba = RED) -> Shapes:
+    """Return a flat arrow along x, the middle of which is at a point."""
+    x, y, z = at
+    shaft = box((0.7 * length, 0.14 * length, height), (x - 0.1 * length, y, z), color)
+    tips: Shapes = ()
+    for side in (1, -1):
+        tip = (x + 0.33 * length, y + side * 0.12 * length, z)
+        tips += box((0.42 * length, 0.14 * length, height), tip, color, turn=-side * 0.8)
+    return shaft + tips
+
+
+def across(axis: Point) -> tuple[float, float, float]:
+    """Return the direction from which turning about an axis is counted in this module."""
+    x, y, z = _frame(axis)[:, 0].tolist()
+    return x, y, z
+
+
+def _placed(geometry: Geometry, at: Point, axis: Point, color: Rgba, turn: float = 0.0) -> Shape:
+    c, s = math.cos(turn), math.sin(turn)
+    about = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+    return Shape(geometry, _pose(_frame(axis) @ about, at), color=color)
+
+
+def _frame(axis: Point) -> npt.NDArray[np.float64]:
+    """Return a rotation whose last column is along an axis: turning the axes round for x, y and z."""
+    n = np.asarray(axis, dtype=float) / np.linalg.norm(axis)
+    if abs(n[2]) > 0.9 or abs(n[1]) > 0.9:
+        first = np.array([1.0, 0.0, 0.0])
+    else:
+        first = np.array([0.0, 1.0, 0.0])
+    first = first - (first @ n) * n
+    first /= np.linalg.norm(first)
+    return np.column_stack([first, np.cross(n, first), n])
+
+
+def _pose(rotation: npt.NDArray[np.float64], at: Point) -> Pose:
+    matrix = np.eye(4)
+    matrix[:3, :3], matrix[:3, 3] = rotation, at
+    return Pose.of(matrix)

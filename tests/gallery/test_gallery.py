@@ -1,0 +1,196 @@
+"""Every articulation that can be opened by name: it loads, shows something, and all of it moves within its limits."""
+
+from __future__ import annotations
+
+import json
+from functools import cache
+
+import numpy as np
+import pytest
+
+import kineverse as kv
+from kineverse import gallery
+from kineverse.cli import main
+from kineverse.errors import UnknownNameError
+from kineverse.view.poses import Poses, complete
+from kineverse.view.ranges import Ranges, offered
+
+NAMES = gallery.names()
+SAMPLES = 41
+
+every = pytest.mark.parametrize("name", NAMES)
+
+
+@cache
+def opened(name):
+    return kv.load(f"articulations/{name}")
+
+
+def shown(model):
+    """The poses of what has a body."""
+    return Poses(model, [frame for frame in model.frames if frame in model.bodies])
+
+
+def paths(model):
+    """Each degree of freedom with values over all of its range, as a slider offers them."""
+    values, ranges = complete(model), Ranges(model)
+    for name, limits in ranges.at(values).items():
+        path = np.clip(np.linspace(*offered(limits, values[name], "rad"), SAMPLES), *limits)
+        # A quaternion that turns over by one of its elements would be none half-way.
+        yield name, path if not name.endswith("qw") else np.linspace(0.1, 1.0, SAMPLES)
+
+
+@every
+def test_it_has_bodies_and_breaks_no_constraint_at_first(name):
+    model = opened(name)
+    assert model.bodies
+    assert all(body.visuals for body in model.bodies.values())
+    assert not model.violations(model.default_state())
+    assert gallery.summary(name)
+
+
+@every
+def test_it_moves_over_the_whole_range_of_every_slider(name):
+    model = opened(name)
+    values, poses = complete(model), shown(model)
+    base = np.array([values[symbol] for symbol in poses.inputs])
+    for freedom, path in paths(model):
+        rows = np.tile(base, (len(path), 1))
+        if freedom in poses.inputs:
+            rows[:, poses.inputs.index(freedom)] = path
+        results = poses.batch(rows)
+        moved = 0.0
+        for pose in results:
+            assert np.isfinite(pose).all()
+            rotation = pose[:, :3, :3]
+            np.testing.assert_allclose(
+                rotation @ np.swapaxes(rotation, 1, 2), np.tile(np.eye(3), (len(path), 1, 1)), atol=1e-9
+            )
+            moved = max(moved, float(np.abs(pose - pose[0]).max()))
+        # One element of a quaternion is its length only.
+        assert moved > 1e-3 or freedom.endswith("/qw"), f"nothing that is seen moves with {freedom}"
+
+
+@every
+def test_loops_stay_closed_while_it_moves(name):
+    model = opened(name)
+    loops = [record for record in model.articulations.values() if record.kind == "closedloop"]
+    values = complete(model)
+    for record in loops:
+        gap = kv.compile(model.fk(record.child, record.parent)[:3, 3])
+        inputs = [str(symbol) for symbol in gap.inputs]
+        for freedom, path in paths(model):
+            for value in path[::8] if freedom in inputs else ():
+                at = [value if symbol == freedom else values[symbol] for symbol in inputs]
+                # Flat loops are closed in their plane; out of it nothing is apart anyway.
+                assert np.abs(gap(np.array(at))).max() < 1e-10
+
+
+@every
+def test_the_commands_take_its_name(name, capsys):
+    model = opened(name)
+    assert main(["info", f"articulations/{name}", "--json"]) == 0
+    told = json.loads(capsys.readouterr().out)
+    assert told["counts"]["dof"] == len(model.degrees_of_freedom)
+    assert told["counts"]["shapes"] == sum(len(body.visuals) for body in model.bodies.values())
+    frame = next(iter(model.bodies))
+    assert main(["fk", f"articulations/{name}", frame, "--json"]) == 0
+    assert np.shape(json.loads(capsys.readouterr().out)["transform"]) == (4, 4)
+
+
+@every
+def test_all_its_names_are_below_a_prefix_and_it_can_be_included_twice(name):
+    model = kv.Model()
+    model.include(f"articulations/{name}", prefix="left")
+    model.include(f"articulations/{name}", prefix="right")
+    single, bare = opened(name), kv.load(f"articulations/{name}", prefix="")
+    for what in ("frames", "bodies", "articulations", "constraints"):
+        names = list(getattr(single, what))
+        assert all(n.startswith(f"{name}/") for n in names)
+        below = [n.removeprefix(f"{name}/") for n in names]
+        assert list(getattr(bare, what)) == below
+        assert sorted(getattr(model, what)) == sorted(
+            f"{side}/{n}" for side in ("left", "right") for n in below
+        )
+    below = [str(s).removeprefix(f"{name}/") for s in single.degrees_of_freedom]
+    assert sorted(map(str, model.degrees_of_freedom)) == sorted(
+        f"{s}/{n}" for s in ("left", "right") for n in below
+    )
+
+
+@every
+def test_a_document_of_it_needs_no_code(name, tmp_path):
+    model = opened(name)
+    model.save(tmp_path / "scene.kv.json")
+    again = kv.load(tmp_path / "scene.kv.json")
+    assert dict(again.bodies) == dict(model.bodies)
+    assert dict(again.constraints) == dict(model.constraints)
+    state = model.default_state()
+    for frame in model.frames:
+        np.testing.assert_array_equal(again.fk(frame)(state), model.fk(frame)(state))
+
+
+def test_what_was_loaded_is_remembered():
+    first, second = kv.load("articulations/jansen_leg"), kv.load("articulations/jansen_leg")
+    assert first is not second
+    assert first.snapshot() == second.snapshot()
+    assert first.frames["jansen_leg/crank"] is second.frames["jansen_leg/crank"]
+
+
+def test_every_kind_of_joint_is_there():
+    from kineverse import articulations
+
+    abstract = {
+        "AxialJoint",
+        "AxisJoint",
+        "Base",
+        "Coupling",
+        "HingedDoor",
+        "Joint",
+        "Mechanism",
+        "Part",
+        "Limits",
+    }
+    kinds = {kind.lower() for kind in articulations.__all__ if kind not in abstract}
+    found = {record.kind for name in NAMES for record in opened(name).articulations.values()}
+    assert kinds - found == set()
+
+
+def test_a_wrong_name_is_told_the_right_ones():
+    with pytest.raises(UnknownNameError, match=r"no model 'articulations/skrew'\. Did you mean 'screw'"):
+        kv.load("articulations/skrew")
+    for name in ("articulations", "articulations/"):
+        with pytest.raises(UnknownNameError, match=r"one for each articulation: fixed, .*jansen_leg"):
+            kv.load(name)
+    with pytest.raises(UnknownNameError, match="Did you mean 'articulations/mecanum'"):
+        kv.load("mecanum")
+    with pytest.raises(UnknownNameError, match="gallery"):
+        list(gallery.operations("nothing"))
+
+
+def test_a_file_of_ones_own_is_not_hidden(tmp_path, monkeypatch):
+    folder = tmp_path / "articulations"
+    folder.mkdir()
+    (folder / "arm.urdf").write_text('<robot name="arm"><link name="base"/></robot>')
+    monkeypatch.chdir(tmp_path)
+    assert list(kv.load("articulations/arm.urdf").frames) == ["base"]
+
+
+@pytest.mark.parametrize("command", ["info", "view"])
+def test_the_list(command, capsys):
+    assert main([command, "articulations"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    for name in NAMES:
+        (line,) = [line for line in lines if line.split(" ")[0] == f"articulations/{name}"]
+        assert line.endswith(gallery.summary(name))
+    assert main(["info", "articulations", "--json"]) == 0
+    assert len(json.loads(capsys.readouterr().out)["models"]) == len(NAMES)
+
+
+def test_it_is_imported_when_it_is_asked_for():
+    import subprocess
+    import sys
+
+    program = "import sys, kineverse as kv; kv.load('kitchen'); print('kineverse.gallery' in sys.modules)"
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "False"

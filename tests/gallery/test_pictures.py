@@ -1,0 +1,32 @@
+"""The pictures in the docs: one of every scene, small, and none of anything else."""
+
+from __future__ import annotations
+
+import re
+import struct
+from pathlib import Path
+
+import pytest
+
+from kineverse import gallery
+
+DOCS = Path(__file__).parents[2] / "docs"
+PICTURES = DOCS / "pictures"
+
+
+def test_every_scene_has_its_picture_in_the_docs_and_the_other_way_round():
+    page = (DOCS / "articulations.md").read_text(encoding="utf-8")
+    shown = re.findall(r"!\[[^\]]+\]\(pictures/(\w+)\.png\)", page)
+    assert sorted(shown) == sorted(gallery.names())
+    assert sorted(path.name for path in PICTURES.iterdir()) == sorted(
+        f"{name}.png" for name in gallery.names()
+    )
+
+
+@pytest.mark.parametrize("name", gallery.names())
+def test_a_picture_is_small(name):
+    data = (PICTURES / f"{name}.png").read_bytes()
+    width, _, _, kind = struct.unpack(">IIBB", data[16:26])
+    assert width <= 480
+    assert kind == 3  # with a palette
+    assert len(data) < 25_000
