@@ -76,8 +76,9 @@ def test_the_model_shows_the_edit_so_far_to_who_makes_it() -> None:
         assert model.limits("x:velocity") == (0, 1)
         edit.replace("frame slider", Place("slider", "world", 5.0, moving=False))
         assert model.fk("slider")()[1, 3] == 5
-        assert model.symbols == (a,)
+        assert model.symbols == (a, x)
         edit.remove("constraint lock")
+        assert model.symbols == (a,)
         assert len(model.constraints) == 1
     assert model.version == 2
 

@@ -191,15 +191,24 @@ class ModelView:
 
     @property
     def symbols(self) -> tuple[Symbol, ...]:
-        """The coordinates and parameters of all frames and constraints, sorted: what a configuration is."""
+        """The coordinates and parameters of all frames and constraints, sorted: what a configuration is.
+
+        A coordinate of which only the speed occurs is among them, unless that speed is one of those that move
+        other coordinates: the wheels of a base, the angular velocity of a ball joint.
+        """
         with self._lock:
             self._settle()
             if self._all_symbols is None or self._pending:
                 self._catch_up()
-                found = {s for s in self._index.sorted() if s.order == 0}
+                mentioned = self._index.sorted()
+                found = {s for s in mentioned if s.order == 0}
+                wheels: set[Symbol] = set()
                 for coordinate, row in self.rates.items():
                     found.add(coordinate)
                     found.update(s for value in row.values() for s in value.symbols if s.order == 0)
+                    wheels.update(speed.position for speed in row)
+                # What only has its speed limited is somewhere, too; a wheel that drives others need not be.
+                found.update({s.position for s in mentioned if s.order} - wheels)
                 for itself in self.rates.dependent.values():
                     found.update(itself.symbols)
                 found -= self.rates.dependent.keys()
