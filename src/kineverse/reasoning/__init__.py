@@ -1,0 +1,19 @@
+"""Reasoning about models (layer 5): what locks what, and when."""
+
+from .boxes import Box, Interval
+from .check import contradictions
+from .finding import interlocks
+from .interlock import Hold, Interlock, Interlocks, Undecided
+from .order import opening_order
+
+__all__ = [
+    "Box",
+    "Hold",
+    "Interlock",
+    "Interlocks",
+    "Interval",
+    "Undecided",
+    "contradictions",
+    "interlocks",
+    "opening_order",
+]

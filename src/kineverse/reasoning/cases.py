@@ -1,0 +1,343 @@
+"""Distinguishing cases until a question has an answer: which signs decide, and where they change."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from fractions import Fraction
+from typing import TypeVar
+
+import casadi as ca
+
+from kineverse.expressions.expression import Expression, as_expression
+from kineverse.symbols import Symbol
+
+from . import polynomial as exact
+from . import ranges, zeros
+from .boxes import Box, Interval
+from .polynomial import Axis, Polynomial
+from .terms import Term, reachable
+from .values import Value, constant, evaluate, live_arguments
+
+T = TypeVar("T")
+
+CASES_AT_MOST = 2000
+NEGLIGIBLE = 1e-12
+"""Constants up to this are what rounding left of 0."""
+_SAME = 1e-12
+_NEAR = 1e-9
+
+
+@dataclass(frozen=True)
+class Unclear:
+    """No answer yet: which terms' signs would help, and what can be said if they stay unknown."""
+
+    about: tuple[Term, ...]
+    otherwise: object = None
+
+
+@dataclass(frozen=True)
+class Unknown:
+    """No answer, and why."""
+
+    reason: str
+
+
+class Case:
+    """Intervals of coordinates and sums of them, and signs of terms that hold there.
+
+    Parameters
+    ----------
+    roots
+        What is evaluated.
+    limits
+        Of symbols, constant.
+    """
+
+    def __init__(
+        self,
+        roots: tuple[Term, ...],
+        limits: Mapping[Symbol, Interval],
+        axes: Mapping[Axis, Interval] | None = None,
+        signs: Mapping[int, int] | None = None,
+        order: list[Term] | None = None,
+    ) -> None:
+        self._limits = limits
+        self._axes = dict(axes or {})
+        self._signs = dict(signs or {})
+        self._found: dict[int, int | None] = {}
+        self._roots = roots
+        self._order = reachable(roots) if order is None else order
+        self._values: dict[int, Value] = {}
+        for term in self._order:
+            self._values[term.index] = self._evaluated(term)
+
+    # -- what holds ----------------------------------------------------------------------------------------
+
+    def value(self, term: Term) -> Value:
+        """Return what is known about a term."""
+        return self._values[term.index]
+
+    def sign(self, term: Term) -> int | None:
+        """Return the sign of a term if it is the same everywhere in this case."""
+        if term.op == ca.OP_NEG:
+            inner = self.sign(term.args[0])
+            return None if inner is None else -inner
+        if term.index in self._signs:
+            return self._signs[term.index]
+        if term.index not in self._found:
+            self._found[term.index] = self._sign(self._values[term.index], term)
+        return self._found[term.index]
+
+    def interval(self, axis: Axis) -> Interval:
+        """Return where a symbol, or a sum of several, is."""
+        known = self._axes.get(axis)
+        if len(axis) == 1:
+            return known if known is not None else self._limits.get(axis[0][0], Interval())
+        total = self._sum({((s, 1),): f for s, f in axis})
+        return total if known is None else total.intersection(known)
+
+    @property
+    def is_empty(self) -> bool:
+        """Whether the conditions contradict each other, as far as can be told from each by itself."""
+        return any(self.interval(axis).is_empty for axis in self._axes)
+
+    def box(self) -> Box:
+        """Return the conditions, without those that limits make anyway."""
+        sides = {}
+        for axis, side in self._axes.items():
+            limit = self._sum({((s, 1),): f for s, f in axis}) if len(axis) > 1 else None
+            if limit is None:
+                limit = self._limits.get(axis[0][0], Interval())
+            low = side.lower == limit.lower and side.lower_closed == limit.lower_closed
+            high = side.upper == limit.upper and side.upper_closed == limit.upper_closed
+            sides[axis_expression(axis)] = Interval(
+                -math.inf if low else side.lower,
+                math.inf if high else side.upper,
+                side.lower_closed and not low,
+                side.upper_closed and not high,
+            )
+        return Box(sides)
+
+    @property
+    def is_at_equality(self) -> bool:
+        """Whether a comparison is half true in this case."""
+        steps = (t.deciders[0] for t in self._order if t.op == "less" and len(t.deciders) == 1)
+        return any(self.sign(excess) == 0 for excess in steps)
+
+    def _evaluated(self, term: Term) -> Value:
+        if term.op != ca.OP_PARAMETER:
+            value = evaluate(term, self._values, self.sign)
+        else:
+            value = Value(polynomial=Polynomial.symbol(term.data), live=frozenset((term.data,)))
+        p = value.polynomial
+        if p is None or value.void or p.degree != 1:
+            return value
+        side = self._sum(p.terms) if len(p.symbols) == 1 else self._line(p)
+        if side.lower == side.upper and not math.isinf(side.lower):
+            fixed = constant(side.lower)
+            return Value(fixed.range, fixed.polynomial, doubtful=value.doubtful)
+        (low, _), (_, high) = ranges.enclosing(side.lower), ranges.enclosing(side.upper)
+        span = (max(low, value.range[0]), min(high, value.range[1]))
+        return Value(span, p, value.live, value.doubtful)
+
+    def _line(self, p: Polynomial) -> Interval:
+        axis, scale = p.axis()
+        return _scaled(self.interval(axis), scale, p.offset)
+
+    def _sum(self, terms: Mapping[exact.Monomial, Fraction]) -> Interval:
+        low: float | Fraction = Fraction(0)
+        high: float | Fraction = Fraction(0)
+        low_closed = high_closed = True
+        for monomial, factor in terms.items():
+            if not monomial:
+                low, high = low + factor, high + factor
+                continue
+            part = _scaled(self.interval(((monomial[0][0], Fraction(1)),)), factor, Fraction(0))
+            low, high = low + part.lower, high + part.upper
+            low_closed, high_closed = low_closed and part.lower_closed, high_closed and part.upper_closed
+        return Interval(low, high, low_closed, high_closed)
+
+    def _sign(self, value: Value, term: Term) -> int | None:
+        if value.doubtful:
+            return None
+        p = value.polynomial
+        if p is not None:
+            if not p.symbols:
+                return 0 if abs(p.offset) <= NEGLIGIBLE else 1 if p.offset > 0 else -1
+            if p.degree == 1:
+                side = self._sum(p.terms) if len(p.symbols) == 1 else self._line(p)
+                return _sign_within(side)
+            if len(p.symbols) == 1:
+                (symbol,) = p.symbols
+                side, coefficients = self.interval(((symbol, Fraction(1)),)), p.coefficients()
+                if not exact.roots(coefficients, side):
+                    return _sign_of(exact.value_at(coefficients, _inside(side)))
+        low, high = value.range
+        if low > 0 or (term.op == ca.OP_EXP and high > 0):
+            return 1
+        return -1 if high < 0 else 0 if low == high == 0 else None
+
+    # -- what does not -------------------------------------------------------------------------------------
+
+    def doubts(self, roots: tuple[Term, ...]) -> list[Term]:
+        """Return the terms whose signs are unknown and would tell more about others, inner ones first."""
+        found: dict[int, Term] = {}
+        seen: set[int] = set()
+        stack = list(roots)
+        while stack:
+            term = stack.pop()
+            value = self._values[term.index]
+            if term.index in seen or (value.polynomial is not None and not value.doubtful):
+                continue
+            seen.add(term.index)
+            for decider in term.deciders:
+                if self.sign(decider) is None:
+                    found[decider.index] = decider
+                stack.append(decider)
+            stack += live_arguments(term, self._values, self.sign)
+        return [found[index] for index in sorted(found)]
+
+    def split(self, term: Term) -> list[Case] | str:
+        """Return the cases in which a term has a sign, or why they cannot be told apart."""
+        while term.op == ca.OP_NEG:
+            (term,) = term.args
+        value = self._values[term.index]
+        p = value.polynomial
+        names = " and ".join(sorted(map(str, value.live)))
+        if value.void:
+            return "a condition is not a number"
+        if value.doubtful:
+            return f"a condition on {names} may be no number"
+        if p is not None and p.degree == 1:
+            axis, scale = p.axis()
+            return self._divided(term, axis, [-p.offset / scale], _SAME, lambda x: scale * x + p.offset)
+        if len(value.live) != 1:
+            solved = any(part.op == "implicit" for part in reachable((term,)))
+            what = "implicit functions" if solved else "a condition that is not linear"
+            return f"{names} occur together in {what}" if len(value.live) > 1 else f"{what} of {names}"
+        (symbol,) = value.live
+        axis = ((symbol, Fraction(1)),)
+        side = self.interval(axis)
+        if p is not None:
+            coefficients = p.coefficients()
+            found = exact.roots(coefficients, side)
+            return self._divided(term, axis, found, _NEAR, lambda x: exact.value_at(coefficients, x))
+        order = reachable((term,))
+
+        def look(low: float, high: float) -> tuple[ranges.Range, ranges.Range | None]:
+            span = Interval(_exact(low), _exact(high), not math.isinf(low), not math.isinf(high))
+            inner = Case((term,), self._limits, {**self._axes, axis: span}, self._signs, order)
+            rates = zeros.slopes(order, inner._values, inner.sign, symbol)
+            return inner.value(term).range, rates[term.index]
+
+        crossings = zeros.zeros(look, float(side.lower), float(side.upper))
+        if crossings is None:
+            return f"where a condition on {names} changes cannot be made certain"
+        signs = lambda x: sum(look(float(x), float(x))[0])  # noqa: E731
+        return self._divided(term, axis, list(map(Fraction, crossings)), _NEAR, signs)
+
+    def _divided(
+        self,
+        term: Term,
+        axis: Axis,
+        thresholds: list[Fraction],
+        same: float,
+        at: Callable[[Fraction], Fraction | float],
+    ) -> list[Case]:
+        whole = self.interval(axis)
+        cuts: list[Fraction] = []
+        for cut in thresholds:
+            for end in (whole.lower, whole.upper):
+                cut = Fraction(end) if exact.are_close(cut, end, same) else cut
+            if cut in whole and cut not in cuts:
+                cuts.append(cut)
+        pieces: list[tuple[Interval, int]] = []
+        start, closed = whole.lower, whole.lower_closed
+        for cut in sorted(cuts):
+            pieces += [(Interval(start, cut, closed, False), 2), (Interval(cut, cut, True, True), 0)]
+            start, closed = cut, False
+        pieces.append((Interval(start, whole.upper, closed, whole.upper_closed), 2))
+        cases = []
+        for side, sign in pieces:
+            if not side.is_empty:
+                known = sign if sign == 0 else _sign_of(at(_inside(side)))
+                signs = {**self._signs, term.index: known}
+                cases.append(Case(self._roots, self._limits, {**self._axes, axis: side}, signs, self._order))
+        return [case for case in cases if not case.is_empty]
+
+
+def distinguish(start: Case, question: Callable[[Case], T | Unclear]) -> Iterator[tuple[Case, T | Unknown]]:
+    """Yield cases that cover everything, each with its answer."""
+    stack, done = [start], 0
+    while stack:
+        case = stack.pop()
+        done += 1
+        answer = question(case)
+        if not isinstance(answer, Unclear):
+            yield case, answer
+            continue
+        if done + len(stack) > CASES_AT_MOST:
+            yield case, Unknown(f"there are more than {CASES_AT_MOST} cases to distinguish")
+            continue
+        reason: str | None = None
+        for term in answer.about:
+            parts = case.split(term)
+            if not isinstance(parts, str):
+                stack += parts
+                break
+            reason = reason or parts
+        else:
+            if answer.otherwise is not None:
+                yield case, answer.otherwise  # type: ignore[misc]
+            else:
+                yield case, Unknown(reason or "nothing decides it")
+
+
+def axis_expression(axis: Axis) -> Expression:
+    """Return a symbol, or a sum of several with their weights."""
+    total = as_expression(0.0)
+    for symbol, weight in axis:
+        term = symbol if weight == 1 else float(weight) * symbol
+        if len(axis) == 1:
+            return term
+        total = total + term
+    return total
+
+
+def _scaled(side: Interval, scale: Fraction, offset: Fraction) -> Interval:
+    low, high = _line_at(side.lower, scale, offset), _line_at(side.upper, scale, offset)
+    if scale > 0:
+        return Interval(low, high, side.lower_closed, side.upper_closed)
+    return Interval(high, low, side.upper_closed, side.lower_closed)
+
+
+def _line_at(x: float | Fraction, scale: Fraction, offset: Fraction) -> float | Fraction:
+    return (math.inf if (x > 0) == (scale > 0) else -math.inf) if math.isinf(x) else x * scale + offset
+
+
+def _sign_within(side: Interval) -> int | None:
+    if side.lower > 0 or (side.lower == 0 and not side.lower_closed):
+        return 1
+    if side.upper < 0 or (side.upper == 0 and not side.upper_closed):
+        return -1
+    return 0 if side.lower == side.upper == 0 else None
+
+
+def _sign_of(number: Fraction | float) -> int:
+    return (number > 0) - (number < 0)
+
+
+def _inside(side: Interval) -> Fraction:
+    if math.isinf(side.lower) and math.isinf(side.upper):
+        return Fraction(0)
+    if math.isinf(side.lower):
+        return Fraction(side.upper) - 1
+    if math.isinf(side.upper):
+        return Fraction(side.lower) + 1
+    return (Fraction(side.lower) + Fraction(side.upper)) / 2
+
+
+def _exact(number: float) -> float | Fraction:
+    return number if math.isinf(number) else Fraction(number)

@@ -1,0 +1,124 @@
+"""An independent check of interlocks, by evaluation at points; it shares no code with what finds them."""
+
+import math
+import random
+from collections.abc import Iterator
+from functools import lru_cache
+from typing import TypeAlias
+
+from kineverse.compile import CompiledFunction, compile  # noqa: A004
+from kineverse.errors import UnsolvedError
+from kineverse.expressions.expression import Expression
+from kineverse.model.constraint import Constraint
+from kineverse.model.rates import plain
+from kineverse.model.view import ModelView
+from kineverse.symbols import Symbol
+
+from .boxes import Box
+from .interlock import Interlock, Interlocks
+
+Point: TypeAlias = dict[Symbol, float]
+Room: TypeAlias = tuple[float, float]
+ANY: Room = (-math.inf, math.inf)
+
+
+def contradictions(model: ModelView, found: Interlocks, points: int = 20, seed: int = 0) -> list[str]:
+    """Return claims that are wrong at one of many points, and locks there that nobody claimed."""
+    parts = {n: tuple(map(plain, (c.lower, c.expression, c.upper))) for n, c in model.constraints.items()}
+    rows = {n: Constraint(*triple) for n, triple in parts.items()}
+    limits: dict[Expression, Room] = {}
+    for c in rows.values():
+        if not c.lower.symbols and not c.upper.symbols:
+            low, high = limits.get(c.expression, ANY)
+            limits[c.expression] = (max(low, float(c.lower)), min(high, float(c.upper)))
+    symbols = {s for c in rows.values() for s in c.symbols} | {*model.symbols}
+    chance, wrong = random.Random(seed), dict[str, None]()
+    told = [box for item in found for box in item.when] + [box for u in found.undecided for box in u.where]
+    for box in [Box({})] * 5 + list(dict.fromkeys(told)):
+        for _ in range(points):
+            point = _point(sorted(symbols, key=str), box, limits, chance)
+            try:
+                point |= {x: _at(e, point) for x, e in model.rates.dependent.items()}
+            except UnsolvedError:
+                continue
+            wrong |= dict.fromkeys(_compared(rows, found, limits, point))
+    return list(wrong)
+
+
+def _compared(
+    rows: dict[str, Constraint], found: Interlocks, limits: dict[Expression, Room], point: Point
+) -> Iterator[str]:
+    unknown = {u.constraint for u in found.undecided if any(_inside(box, point) for box in u.where)}
+    rooms: dict[Expression, dict[str, Room]] = {}
+    for name, c in rows.items():
+        moving = {s for s in c.expression.symbols if s.order == c.order}
+        claimed = {k.held for k in found if name in k.constraints}
+        whole = c.expression in claimed or (c.order > 0 and len(moving) > 1)
+        for held in {c.expression} if whole else moving | claimed:
+            rooms.setdefault(held, {})[name] = ANY if name in unknown else _room(c, held, point)
+    for held, of in rooms.items():
+        claims = [k for k in found if k.held == held and any(_inside(box, point) for box in k.when)]
+        if max(s.order for s in held.symbols):
+            ends = {"decrease": -max(r[0] for r in of.values()), "increase": min(r[1] for r in of.values())}
+            for way, end in {} if unknown & of.keys() else ends.items():
+                said = any(k.hold in (f"cannot {way}", "stands still", "has no value") for k in claims)
+                if said != (end <= 1e-9):
+                    yield f"{held} {'can' if said else 'cannot'} {way}"
+            continue
+        limit = limits.get(held, ANY)
+        for names in ({k.constraints for k in claims} | {(n,) for n in of}) - {(n,) for n in unknown}:
+            room = max(limit[0], *(of[n][0] for n in names)), min(limit[1], *(of[n][1] for n in names))
+            own = [k for k in claims if k.constraints == names]
+            if not all(_fits(k, limit, room, point) for k in own) or not (own or _same(limit, room, True)):
+                yield f"{held} is kept in {room} by {', '.join(names)}"
+
+
+def _room(c: Constraint, held: Expression, point: Point) -> Room:
+    low, here, high = (_at(e, point) for e in (c.lower, c.expression, c.upper))
+    if isinstance(held, Symbol):
+        zero, one = (_at(c.expression, {**point, held: x}) for x in (0.0, 1.0))
+        if one == zero:
+            return ANY
+        low, high = (low - zero) / (one - zero), (high - zero) / (one - zero)
+        return (low, high) if one > zero else (high, low)
+    back = _at(c.expression, {s: -x if s.order else x for s, x in point.items()})
+    return (max(low, 0.0) if c.order and min(here, back) >= 0 >= high else low), high
+
+
+def _fits(lock: Interlock, limit: Room, room: Room, point: Point) -> bool:
+    if lock.lower is None or lock.upper is None:
+        return room[0] > room[1]
+    low, high = _at(lock.lower, point), _at(lock.upper, point)
+    return _same((max(low, limit[0]), min(high, limit[1])), room)
+
+
+def _same(a: Room, b: Room, finite: bool = False) -> bool:
+    ends = zip(a, b, strict=True)
+    return all(x == y or abs(x - y) <= 1e-6 * (1 + abs(x)) or (finite and math.isinf(x)) for x, y in ends)
+
+
+def _inside(box: Box, point: Point) -> bool:
+    return all(_at(axis, point) in side for axis, side in box.items())
+
+
+def _point(symbols: list[Symbol], box: Box, limits: dict[Expression, Room], chance: random.Random) -> Point:
+    """Return a random point: in a box, or close to some of its faces on either side."""
+    ends = {s: limits.get(s, ANY) for s in symbols}
+    point = {s: s.value or chance.uniform(max(low, -9.0), min(high, 9.0)) for s, (low, high) in ends.items()}
+    for axis, side in box.items():
+        symbol, faces = axis.symbols[0], [float(x) for x in (side.lower, side.upper) if math.isfinite(x)]
+        near = [x + e * (1 + abs(x)) for x in faces for e in (-0.5, -1e-4, 1e-4, 0.5)]
+        near.append(chance.uniform(max(float(side.lower), -9.0), min(float(side.upper), 9.0)))
+        zero, one = (_at(axis, {**point, symbol: x}) for x in (0.0, 1.0))
+        low, high = ends.get(symbol, ANY)
+        point[symbol] = min(max((chance.choice(near) - zero) / (one - zero), low), high)
+    return point
+
+
+@lru_cache(4096)
+def _function(expression: Expression) -> CompiledFunction:
+    return compile(expression, tier="interpreter")
+
+
+def _at(expression: Expression, point: Point) -> float:
+    return float(_function(expression)({s: point[s] for s in expression.symbols}))

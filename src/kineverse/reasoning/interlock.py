@@ -1,0 +1,184 @@
+"""What locks what: records of interlocks, and of what could not be decided."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal, overload
+
+from kineverse.expressions.expression import Expression
+from kineverse.symbols import Symbol
+
+from .boxes import Box, axis_name
+
+Hold = Literal["stands still", "cannot increase", "cannot decrease", "stays within", "has no value"]
+
+
+@dataclass(frozen=True)
+class Interlock:
+    """What holds a coordinate or a speed, how, by which constraints, and when.
+
+    Attributes
+    ----------
+    held
+        A symbol as the constraints limit it: a position, a speed (or a higher derivative), or where they
+        limit a combination of several, that expression.
+    hold
+        ``stands still``: a speed is 0, a position has one value left. ``cannot increase``,
+        ``cannot decrease``: a speed is at most, or at least, 0. ``stays within``: a position is kept between
+        ``lower`` and ``upper``. ``has no value``: the bounds contradict each other.
+    constraints
+        Names of the constraints that do it together.
+    when
+        Boxes; it holds in each of them.
+    lower, upper
+        Of a position: between what it is kept, or where it stands. Both may depend on other coordinates.
+    """
+
+    held: Expression
+    hold: Hold
+    constraints: tuple[str, ...]
+    when: tuple[Box, ...]
+    lower: Expression | None = None
+    upper: Expression | None = None
+
+    @property
+    def is_permanent(self) -> bool:
+        """Whether it holds everywhere."""
+        return Box({}) in self.when
+
+    @property
+    def keys(self) -> tuple[Symbol, ...]:
+        """The coordinates, speeds and parameters that the conditions are about; sorted."""
+        found = {s for box in self.when for axis in box for s in axis.symbols}
+        return tuple(sorted(found, key=lambda s: s.sort_key))
+
+    def __str__(self) -> str:
+        how = f"{axis_name(self.held)} {self.hold}"
+        if self.hold == "stays within":
+            how += f" [{_bound(self.lower)}, {_bound(self.upper)}]"
+        elif self.lower is not None and self.hold == "stands still":
+            how += f" at {_bound(self.lower)}"
+        return f"{how}: {_either(self.when)} ({', '.join(self.constraints)})"
+
+
+@dataclass(frozen=True)
+class Undecided:
+    """A constraint about which it is not known whether it holds something, why, and where."""
+
+    constraint: str
+    reason: str
+    where: tuple[Box, ...] = (Box({}),)
+
+    def __str__(self) -> str:
+        return f"{self.constraint}: unknown, as {self.reason}: {_either(self.where)}"
+
+
+class Interlocks(Sequence[Interlock]):
+    """All interlocks of a model, in the order of its constraints, and what is ``undecided``."""
+
+    def __init__(self, found: Sequence[Interlock], undecided: Sequence[Undecided] = ()) -> None:
+        self._found = tuple(found)
+        self.undecided = tuple(undecided)
+
+    @overload
+    def __getitem__(self, index: int) -> Interlock: ...
+    @overload
+    def __getitem__(self, index: slice) -> Sequence[Interlock]: ...
+    def __getitem__(self, index: int | slice) -> Interlock | Sequence[Interlock]:
+        return self._found[index]
+
+    def __len__(self) -> int:
+        return len(self._found)
+
+    def __iter__(self) -> Iterator[Interlock]:
+        return iter(self._found)
+
+    def __eq__(self, other: object) -> bool:
+        if not isinstance(other, Interlocks):
+            return NotImplemented
+        return self._found == other._found and self.undecided == other.undecided
+
+    def __hash__(self) -> int:
+        return hash((self._found, self.undecided))
+
+    def of(self, coordinate: Symbol | str) -> tuple[Interlock, ...]:
+        """Return what holds a coordinate, or its speed; by symbol or by path."""
+        path = coordinate.path if isinstance(coordinate, Symbol) else coordinate
+        return tuple(found for found in self if any(s.path == path for s in found.held.symbols))
+
+    def keys(self, coordinate: Symbol | str) -> tuple[Symbol, ...]:
+        """Return what others the locks on a coordinate depend on, as positions; sorted."""
+        path = coordinate.path if isinstance(coordinate, Symbol) else coordinate
+        found = {_position(key) for lock in self.of(coordinate) for key in lock.keys}
+        found |= {
+            _position(s)
+            for lock in self.of(coordinate)
+            for bound in (lock.lower, lock.upper)
+            if bound is not None
+            for s in bound.symbols
+        }
+        return tuple(sorted((s for s in found if s.path != path), key=lambda s: s.sort_key))
+
+    def as_data(self) -> dict[str, Any]:
+        """Return all of it as lists, mappings, texts and numbers, as JSON can say them."""
+        return {
+            "interlocks": [
+                {
+                    "held": axis_name(lock.held),
+                    "hold": lock.hold,
+                    "constraints": list(lock.constraints),
+                    "when": [_box(box) for box in lock.when],
+                    "lower": _number_or_text(lock.lower),
+                    "upper": _number_or_text(lock.upper),
+                }
+                for lock in self
+            ],
+            "undecided": [
+                {"constraint": u.constraint, "reason": u.reason, "where": [_box(b) for b in u.where]}
+                for u in self.undecided
+            ],
+        }
+
+    def __str__(self) -> str:
+        return "\n".join(map(str, (*self, *self.undecided))) or "no interlocks"
+
+    def __repr__(self) -> str:
+        return f"<Interlocks: {len(self)} found, {len(self.undecided)} undecided>"
+
+
+def _position(symbol: Symbol) -> Symbol:
+    return symbol.position if symbol.order else symbol
+
+
+def _either(boxes: tuple[Box, ...]) -> str:
+    if len(boxes) == 1:
+        return f"when {boxes[0]}" if boxes[0] else "always"
+    return "when " + " or ".join(f"({box})" if len(box) > 1 else str(box) for box in boxes)
+
+
+def _bound(bound: Expression | None) -> str:
+    if bound is None or bound.symbols:
+        return str(bound)
+    return f"{float(bound):.12g}"
+
+
+def _box(box: Box) -> dict[str, dict[str, Any]]:
+    return {
+        axis_name(axis): {
+            "lower": None if math.isinf(side.lower) else float(side.lower),
+            "upper": None if math.isinf(side.upper) else float(side.upper),
+            "lower_closed": side.lower_closed,
+            "upper_closed": side.upper_closed,
+        }
+        for axis, side in box.items()
+    }
+
+
+def _number_or_text(bound: Expression | None) -> float | str | None:
+    if bound is None:
+        return None
+    if bound.symbols:
+        return str(bound)
+    return None if math.isinf(float(bound)) else float(bound)

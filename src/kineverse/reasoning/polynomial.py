@@ -1,0 +1,208 @@
+"""Polynomials with rational coefficients: what arithmetic of symbols and floats is, without rounding."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from fractions import Fraction
+from functools import cached_property
+from typing import TypeAlias
+
+from kineverse.symbols import Symbol
+
+from .boxes import Interval, Number
+
+Monomial: TypeAlias = tuple[tuple[Symbol, int], ...]
+Axis: TypeAlias = tuple[tuple[Symbol, Fraction], ...]
+
+_DEGREE_AT_MOST = 8
+_MONOMIALS_AT_MOST = 40
+_DIGITS_AT_MOST = 4000
+
+
+@dataclass(frozen=True)
+class Polynomial:
+    """A sum of coefficients times products of powers of symbols."""
+
+    terms: Mapping[Monomial, Fraction]
+
+    @staticmethod
+    def constant(number: Number) -> Polynomial:
+        """Return a number, which is finite."""
+        return Polynomial({(): Fraction(number)} if number else {})
+
+    @staticmethod
+    def symbol(symbol: Symbol) -> Polynomial:
+        """Return a symbol."""
+        return Polynomial({((symbol, 1),): Fraction(1)})
+
+    @cached_property
+    def symbols(self) -> frozenset[Symbol]:
+        """The symbols that occur."""
+        return frozenset(s for monomial in self.terms for s, _ in monomial)
+
+    @cached_property
+    def degree(self) -> int:
+        """The highest sum of powers."""
+        return max((sum(power for _, power in monomial) for monomial in self.terms), default=0)
+
+    @property
+    def offset(self) -> Fraction:
+        """The constant term."""
+        return self.terms.get((), Fraction(0))
+
+    def __add__(self, other: Polynomial) -> Polynomial:
+        total = dict(self.terms)
+        for monomial, factor in other.terms.items():
+            total[monomial] = total.get(monomial, Fraction(0)) + factor
+        return Polynomial({m: f for m, f in total.items() if f})
+
+    def scaled(self, factor: Number) -> Polynomial:
+        """Return a multiple."""
+        exact = Fraction(factor)
+        return Polynomial({m: f * exact for m, f in self.terms.items()} if exact else {})
+
+    def __sub__(self, other: Polynomial) -> Polynomial:
+        return self + other.scaled(-1)
+
+    def times(self, other: Polynomial) -> Polynomial | None:
+        """Return the product, None if it is too large to be worth it."""
+        if self.degree + other.degree > _DEGREE_AT_MOST:
+            return None
+        total: dict[Monomial, Fraction] = {}
+        for m, f in self.terms.items():
+            for n, g in other.terms.items():
+                powers = dict(m)
+                for symbol, power in n:
+                    powers[symbol] = powers.get(symbol, 0) + power
+                product = tuple(sorted(powers.items(), key=lambda item: item[0].sort_key))
+                total[product] = total.get(product, Fraction(0)) + f * g
+        if len(total) > _MONOMIALS_AT_MOST:
+            return None
+        if any(f.denominator.bit_length() > _DIGITS_AT_MOST for f in total.values()):
+            return None
+        return Polynomial({m: f for m, f in total.items() if f})
+
+    def axis(self) -> tuple[Axis, Fraction]:
+        """Return a polynomial of degree 1 as ``scale·axis + offset``: the axis and its scale.
+
+        The axis is normalised: its largest weight is ±1, its first is positive.
+        """
+        weights = sorted(((m[0][0], f) for m, f in self.terms.items() if m), key=lambda w: w[0].sort_key)
+        scale = max(abs(f) for _, f in weights) * (1 if weights[0][1] > 0 else -1)
+        return tuple((s, f / scale) for s, f in weights), scale
+
+    def coefficients(self) -> list[Fraction]:
+        """Return those of a polynomial in one symbol, constant first."""
+        result = [Fraction(0)] * (self.degree + 1)
+        for monomial, factor in self.terms.items():
+            result[monomial[0][1] if monomial else 0] = factor
+        return result
+
+
+def value_at(coefficients: list[Fraction], x: Fraction) -> Fraction:
+    """Return the value of a polynomial in one symbol."""
+    result = Fraction(0)
+    for coefficient in reversed(coefficients):
+        result = result * x + coefficient
+    return result
+
+
+def are_close(a: Number, b: Number, share: float) -> bool:
+    """Whether two numbers differ by no more than a share of them, or by that much; not if one is infinite."""
+    if math.isinf(a) or math.isinf(b):
+        return False
+    x, y = Fraction(a), Fraction(b)
+    return abs(x - y) <= max(Fraction(1), abs(x), abs(y)) * Fraction(share)
+
+
+def roots(coefficients: list[Fraction], within: Interval) -> list[Fraction]:
+    """Return all roots in an interval, each once, in order; rational ones of low degree exactly.
+
+    Sturm's theorem says how many there are in between; they are then halved down to one part in 2⁶⁰.
+    """
+    if len(coefficients) == 2:
+        found = [-coefficients[0] / coefficients[1]]
+    else:
+        chain = _sturm(coefficients)
+        bound = 1 + max(abs(c / coefficients[-1]) for c in coefficients[:-1])
+        low = max(-bound, _as_fraction(within.lower, -bound))
+        high = min(bound, _as_fraction(within.upper, bound))
+        found = []
+        if low <= high:
+            margin = (high - low) / 2**20 + Fraction(1, 2**40)
+            found = sorted(_isolated(chain, low - margin, high + margin))
+    return [root for root in found if root in within or _is_near_closed_end(root, within)]
+
+
+def _is_near_closed_end(root: Fraction, within: Interval) -> bool:
+    ends = ((within.lower, within.lower_closed), (within.upper, within.upper_closed))
+    return any(closed and are_close(root, end, 1e-12) for end, closed in ends)
+
+
+def _as_fraction(number: Number, otherwise: Fraction) -> Fraction:
+    return otherwise if math.isinf(number) else Fraction(number)
+
+
+def _isolated(chain: list[list[Fraction]], low: Fraction, high: Fraction) -> Iterable[Fraction]:
+    stack = [(low, high)]
+    while stack:
+        a, b = stack.pop()
+        count = _changes(chain, a) - _changes(chain, b)  # the roots in (a, b]
+        if not count:
+            continue
+        if not value_at(chain[0], b):
+            yield b
+            if count > 1:
+                middle = (a + b) / 2
+                stack.append((a, middle))
+                # Of (middle, b) the end is a root already; what is left of it lies before some number.
+                stack.append((middle, b - (b - a) / 2**70))
+        elif are_close(a, b, 2.0**-60):
+            yield (a + b) / 2
+        else:
+            # A number with few digits in the middle finds roots such as 0.5 exactly.
+            middle = (a + b) / 2
+            short = Fraction(float(middle))
+            middle = short if a < short < b else middle
+            stack += [(a, middle), (middle, b)]
+
+
+def _sturm(coefficients: list[Fraction]) -> list[list[Fraction]]:
+    """Return Sturm's chain of the polynomial with the same roots, each of them simple."""
+    chain = [coefficients, [k * c for k, c in enumerate(coefficients) if k]]
+    while len(chain[-1]) > 1:
+        rest = _remainder(chain[-2], chain[-1])
+        if not rest:
+            break
+        chain.append([-c for c in rest])
+    return chain if len(chain[-1]) == 1 else _sturm(_quotient(coefficients, chain[-1]))
+
+
+def _quotient(a: list[Fraction], b: list[Fraction]) -> list[Fraction]:
+    rest, quotient = list(a), list[Fraction]()
+    while len(rest) >= len(b):
+        factor = rest.pop() / b[-1]
+        quotient.append(factor)
+        for k in range(len(b) - 1):
+            rest[len(rest) + 1 - len(b) + k] -= factor * b[k]
+    return quotient[::-1]
+
+
+def _remainder(a: list[Fraction], b: list[Fraction]) -> list[Fraction]:
+    rest = list(a)
+    while len(rest) >= len(b):
+        factor = rest[-1] / b[-1]
+        for k in range(len(b)):
+            rest[len(rest) - len(b) + k] -= factor * b[k]
+        rest.pop()
+        while rest and not rest[-1]:
+            rest.pop()
+    return rest
+
+
+def _changes(chain: list[list[Fraction]], x: Fraction) -> int:
+    signs = [s for s in (value_at(p, x) for p in chain) if s]
+    return sum((a > 0) != (b > 0) for a, b in itertools.pairwise(signs))

@@ -1,0 +1,199 @@
+"""Between what a constraint on positions keeps them, and where."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+
+from kineverse.expressions.expression import Expression, as_expression
+from kineverse.model.constraint import Constraint
+from kineverse.symbols import Symbol
+
+from .boxes import Box, Interval
+from .cases import Case, Unclear, Unknown, distinguish
+from .expressing import expressed
+from .interlock import Hold
+from .regions import merged
+from .terms import Term, Terms
+
+_SAME = 1e-9
+
+
+@dataclass(frozen=True)
+class Kept:
+    """How something is kept, where; ``range`` if that is by numbers."""
+
+    held: Expression
+    hold: Hold
+    where: tuple[Box, ...]
+    lower: Expression | None
+    upper: Expression | None
+    range: tuple[float, float] | None
+
+
+@dataclass(frozen=True)
+class _Leaf:
+    box: Box
+    hold: Hold
+    lower: Expression
+    upper: Expression
+    tighter: tuple[bool, bool]
+    telling: bool
+
+
+def on_position(
+    constraint: Constraint,
+    given: Mapping[Symbol, float],
+    limits: Mapping[Symbol, Interval],
+    unknown: list[tuple[str, Box]],
+) -> list[Kept]:
+    """Return how a constraint of order 0 keeps what it is about, in plain coordinates."""
+    terms = Terms(given)
+    expression = terms.of(constraint.expression)
+    lower, upper = terms.of(constraint.lower), terms.of(constraint.upper)
+    form = Case((expression,), limits).value(expression).polynomial
+    moves = bool(constraint.lower.symbols or constraint.upper.symbols)
+    found: list[Kept] = []
+    if form is not None and form.degree == 1 and all(s.has_derivative for s in form.symbols):
+        for symbol in sorted(form.symbols, key=lambda s: s.sort_key):
+            weight = form.terms[((symbol, 1),)]
+            rest = as_expression(float(form.offset))
+            for monomial, factor in form.terms.items():
+                if monomial and monomial[0][0] != symbol:
+                    rest = rest + float(factor) * monomial[0][0]
+            other, scale = terms.of(rest), terms.constant(float(weight))
+            low, high = (terms.over(terms.minus(end, other), scale) for end in (lower, upper))
+            if weight < 0:
+                low, high = high, low
+            found += _kept(terms, symbol, low, high, limits, unknown)
+    elif moves:
+        found += _kept(terms, constraint.expression, lower, upper, limits, unknown)
+    elif len(constraint.expression.symbols) > 1:
+        unknown.append(("it limits several coordinates at once, and they are not just added", Box({})))
+    return found
+
+
+def _kept(
+    terms: Terms,
+    held: Expression,
+    low: Term,
+    high: Term,
+    limits: Mapping[Symbol, Interval],
+    unknown: list[tuple[str, Box]],
+) -> list[Kept]:
+    limit = limits.get(held, Interval()) if isinstance(held, Symbol) else Interval()
+    leaves = list(_leaves(terms, low, high, limit, limits, unknown))
+    free = _free_range(leaves, limit)
+    groups: dict[tuple[Hold, Expression, Expression], list[_Leaf]] = {}
+    for leaf in leaves:
+        if leaf.hold != "stays within" or _is_narrower(leaf, free):
+            groups.setdefault((leaf.hold, leaf.lower, leaf.upper), []).append(leaf)
+    empty = _where([leaf for leaf in leaves if leaf.hold == "has no value"])
+    found = [Kept(held, "has no value", empty, None, None, None)] if empty else []
+    _join_points(groups)
+    for (hold, lower, upper), group in groups.items():
+        where = _where(group)
+        if hold == "has no value" or not where:
+            continue
+        # A side that never matters is told as the limit it is.
+        if not any(leaf.tighter[0] for leaf in group) and not math.isinf(limit.lower):
+            lower = as_expression(float(limit.lower))
+        if not any(leaf.tighter[1] for leaf in group) and not math.isinf(limit.upper):
+            upper = as_expression(float(limit.upper))
+        fixed = None if lower.symbols or upper.symbols else (float(lower), float(upper))
+        found.append(Kept(held, hold, where, lower, upper, fixed))
+    return found
+
+
+def _where(leaves: list[_Leaf]) -> tuple[Box, ...]:
+    return merged([leaf.box for leaf in leaves], [leaf.box for leaf in leaves if leaf.telling])
+
+
+def _join_points(groups: dict[tuple[Hold, Expression, Expression], list[_Leaf]]) -> None:
+    """Put what holds at single values into the group of bounds that are the same there."""
+    for (hold, lower, upper), leaves in list(groups.items()):
+        for leaf in [] if hold != "stays within" else list(leaves):
+            at = {
+                s: float(i.lower) for s, i in leaf.box.items() if isinstance(s, Symbol) and i.lower == i.upper
+            }
+            for other in groups if at else ():
+                bounds = zip((lower, upper), other[1:], strict=True)
+                if other[0] == hold and other[1:] != (lower, upper) and all(_agree(*b, at) for b in bounds):
+                    leaves.remove(leaf)
+                    groups[other].append(leaf)
+                    break
+
+
+def _agree(bound: Expression, other: Expression, at: dict[Symbol, float]) -> bool:
+    there = other.substitute({s: x for s, x in at.items() if s in other.symbols})
+    if bound.symbols or there.symbols:
+        return bound == there
+    a, b = float(bound), float(there)
+    return a == b or abs(a - b) <= _SAME * max(1.0, abs(a))
+
+
+def _leaves(
+    terms: Terms,
+    low: Term,
+    high: Term,
+    limit: Interval,
+    limits: Mapping[Symbol, Interval],
+    unknown: list[tuple[str, Box]],
+) -> Iterator[_Leaf]:
+    compared = {"room": terms.minus(high, low)}
+    if not math.isinf(limit.lower):
+        end = terms.constant(float(limit.lower))
+        compared |= {"high above": terms.minus(high, end), "low above": terms.minus(low, end)}
+    if not math.isinf(limit.upper):
+        end = terms.constant(float(limit.upper))
+        compared |= {"high below": terms.minus(end, high), "low below": terms.minus(end, low)}
+    bounds = (low, high)
+
+    def ask(case: Case) -> dict[str, int] | str | Unclear:
+        if any(case.value(bound).void for bound in bounds):
+            return "a bound is not a number"
+        inner = case.doubts(bounds)
+        if inner:
+            return Unclear(tuple(inner))
+        signs = {}
+        for name, term in compared.items():
+            sign = case.sign(term)
+            if sign is None:
+                return Unclear((*case.doubts((term,)), term))
+            signs[name] = sign
+        return signs
+
+    start = Case((*bounds, *compared.values()), limits)
+    for case, answer in distinguish(start, ask):
+        if not isinstance(answer, dict):
+            unknown.append((answer.reason if isinstance(answer, Unknown) else str(answer), case.box()))
+            continue
+        lower, upper = expressed(case, low), expressed(case, high)
+        tighter = (answer.get("low above", 1) > 0, answer.get("high below", 1) > 0)
+        rooms = [answer[n] for n in ("room", "high above", "low below") if n in answer]
+        hold: Hold = "stays within"
+        if min(rooms) < 0:
+            hold = "has no value"
+        elif min(rooms) == 0:
+            if answer.get("high above") == 0:
+                upper = lower = as_expression(float(limit.lower))
+            elif answer.get("low below") == 0:
+                upper = lower = as_expression(float(limit.upper))
+            hold = "stands still" if not lower.symbols else "stays within"
+            if lower.symbols:
+                upper = lower
+        yield _Leaf(case.box(), hold, lower, upper, tighter, not case.is_at_equality)
+
+
+def _free_range(leaves: list[_Leaf], limit: Interval) -> tuple[float, float]:
+    """Return what range is no restriction: the limits, and what the constraint leaves at most."""
+    lows = [-math.inf if leaf.lower.symbols else float(leaf.lower) for leaf in leaves]
+    highs = [math.inf if leaf.upper.symbols else float(leaf.upper) for leaf in leaves]
+    low, high = min(lows, default=-math.inf), max(highs, default=math.inf)
+    return max(low, float(limit.lower)), min(high, float(limit.upper))
+
+
+def _is_narrower(leaf: _Leaf, free: tuple[float, float]) -> bool:
+    low = leaf.tighter[0] and (bool(leaf.lower.symbols) or float(leaf.lower) > free[0])
+    return low or (leaf.tighter[1] and (bool(leaf.upper.symbols) or float(leaf.upper) < free[1]))

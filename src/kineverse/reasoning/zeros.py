@@ -1,0 +1,156 @@
+"""Where a function of one symbol changes its sign: certain, by interval arithmetic and monotony."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+
+import casadi as ca
+
+from kineverse.symbols import Symbol
+
+from . import ranges
+from .ranges import ZERO, Range
+from .terms import Term
+from .values import Signs, Value, live_arguments
+
+Look = Callable[[float, float], tuple[Range, Range | None]]
+"""Between which numbers a function, and its slope, are on an interval."""
+
+_LOOKS_AT_MOST = 3000
+_WIDTH = 1e-13
+_CLOSE = 1e-9
+
+
+def slopes(
+    order: Sequence[Term], values: dict[int, Value], sign: Signs, symbol: Symbol
+) -> dict[int, Range | None]:
+    """Return between which numbers the derivatives of terms lie, None where there may be jumps."""
+    found: dict[int, Range | None] = {}
+    for term in order:
+        if symbol not in values[term.index].live:
+            found[term.index] = ZERO
+        elif term.op == ca.OP_PARAMETER:
+            found[term.index] = (1.0, 1.0)
+        else:
+            found[term.index] = _slope(term, values, sign, found)
+    return found
+
+
+def _slope(term: Term, values: dict[int, Value], sign: Signs, found: dict[int, Range | None]) -> Range | None:
+    chosen = live_arguments(term, values, sign)
+    inner = []
+    for argument in chosen:
+        rate = found[argument.index]
+        if rate is None:
+            return None
+        inner.append(rate)
+    spans = [values[a.index].range for a in term.args]
+    op = term.op
+    if op in ("select", ca.OP_IF_ELSE_ZERO, ca.OP_FMIN, ca.OP_FMAX):
+        if len(inner) == 1 and sign(term.deciders[0]) is not None:
+            return inner[0]
+        return ranges.hull(*inner) if op in (ca.OP_FMIN, ca.OP_FMAX) else None
+    if op in (ca.OP_ADD, ca.OP_SUB):
+        return ranges.add(inner[0], inner[1] if op == ca.OP_ADD else ranges.negative(inner[1]))
+    if op == ca.OP_MUL:
+        return ranges.add(ranges.multiply(inner[0], spans[1]), ranges.multiply(spans[0], inner[1]))
+    if op == ca.OP_DIV:
+        inverse = ranges.reciprocal(spans[1])
+        over = ranges.multiply(ranges.multiply(spans[0], inner[1]), ranges.square(inverse))
+        return ranges.add(ranges.multiply(inner[0], inverse), ranges.negative(over))
+    if op == ca.OP_POW and inner[1] == ZERO and spans[1][0] == spans[1][1]:
+        n = spans[1][0]
+        rate = ranges.power(spans[0], (n - 1, n - 1))
+        return ranges.multiply(ranges.multiply((n, n), rate), inner[0])
+    if op == ca.OP_NEG:
+        return ranges.negative(inner[0])
+    if op == ca.OP_FABS:
+        return ranges.hull(inner[0], ranges.negative(inner[0]))
+    if len(term.args) == 1 and isinstance(op, int):
+        outer = ranges.slope(op, spans[0])
+        return None if outer is None else ranges.multiply(outer, inner[0])
+    return None
+
+
+def zeros(look: Look, low: float, high: float) -> list[float] | None:
+    """Return the isolated zeros in an interval, up to 1e-9; None if that cannot be made certain.
+
+    Between them, and up to the ends, the sign is one and the same.
+    """
+    if math.isinf(low) or math.isinf(high):
+        span, rate = look(low, high)
+        if not (_has_sign(span) or _is_monotone(rate)):
+            return None
+    stack, found, looks = [(low, high)], list[float](), 0
+    while stack:
+        a, b = stack.pop()
+        looks += 1
+        span, rate = look(a, b)
+        if _has_sign(span):
+            continue
+        if _is_monotone(rate):
+            zero = _crossing(look, a, b)
+            if zero is None:
+                return None
+            found += zero
+            continue
+        if looks > _LOOKS_AT_MOST or b - a < _CLOSE * max(1.0, abs(a), abs(b)):
+            return None
+        middle = _middle(a, b)
+        stack += [(a, middle), (middle, b)]
+    found.sort()
+    return [z for k, z in enumerate(found) if not k or z - found[k - 1] > _CLOSE * max(1.0, abs(z))]
+
+
+def _crossing(look: Look, low: float, high: float) -> list[float] | None:
+    """Return the zero of a monotone function if there is one; None if it may be zero on an interval."""
+    first, last = _sign_at(look, low), _sign_at(look, high)
+    if first and first == last:
+        return []
+    if (math.isinf(low) and not first) or (math.isinf(high) and not last):
+        return None
+    a, b = low, high
+    if not first and not last:
+        return None
+    while b - a > _WIDTH * max(1.0, abs(a), abs(b)):
+        middle = _middle(a, b)
+        if not a < middle < b:
+            break
+        here = _sign_at(look, middle)
+        if not here:
+            # So close to zero that rounding hides the sign; is it one a little further on each side?
+            a = b = middle
+        elif first:
+            a, b = (middle, b) if here == first else (a, middle)
+        else:
+            a, b = (a, middle) if here == last else (middle, b)
+    zero = a if not first and a == low else b if not last and b == high else _middle(a, b)
+    near = _CLOSE * max(1.0, abs(zero))
+    for side, end in ((zero - near, low), (zero + near, high)):
+        if (side > end if end == low else side < end) and not _sign_at(look, side):
+            return None
+    return [zero]
+
+
+def _sign_at(look: Look, x: float) -> int:
+    span, _ = look(x, x)
+    return 1 if span[0] > 0 else -1 if span[1] < 0 else 0
+
+
+def _has_sign(span: Range) -> bool:
+    return span[0] > 0 or span[1] < 0
+
+
+def _is_monotone(rate: Range | None) -> bool:
+    return rate is not None and (rate[0] >= 0 or rate[1] <= 0)
+
+
+def _middle(a: float, b: float) -> float:
+    if math.isinf(a) and math.isinf(b):
+        return 0.0
+    if math.isinf(a):
+        return b * 2 - 1 if b <= 0 else -1.0
+    if math.isinf(b):
+        return a * 2 + 1 if a >= 0 else 1.0
+    return a / 2 + b / 2
