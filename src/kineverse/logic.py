@@ -23,8 +23,10 @@ ones to use for locks.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from functools import reduce
+from numbers import Real
 from typing import ClassVar
 
 import casadi as ca
@@ -48,7 +50,7 @@ def less(a: ExpressionLike, b: ExpressionLike, contrast: float = CONTRAST) -> Ex
     contrast
         R, per unit: the value changes within about 1/R around equality.
     """
-    if not contrast > 0 or contrast == float("inf"):
+    if not isinstance(contrast, Real) or not 0 < contrast < math.inf:
         raise ValueRejectedError(f"The contrast is a positive number, not {contrast!r}.")
     x, y = broadcast(as_expression(a), as_expression(b))
     return Less.of((x, y), x.shape, (float(contrast),))
