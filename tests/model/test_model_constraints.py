@@ -205,6 +205,36 @@ def test_a_missing_position_is_an_error_a_missing_speed_is_not() -> None:
     assert [tuple(v) for v in found] == [("lock", -1, -0.25, 0.25, 0.75)]
 
 
+def test_who_lacks_a_position_and_a_speed_lacks_a_position() -> None:
+    model = constrained(lock=(-b, a.derivative(), b), sum=(0, a + c.derivative(), 1), far=(0, d, 1))
+    with pytest.raises(kv.UnknownNameError, match="No value for 'a', which constraint 'sum'"):
+        model.violations({"b": 1.0, "c:velocity": 0.5})
+    with pytest.raises(kv.UnknownNameError, match="No value for 'b', which constraint 'lock'"):
+        model.violations(kv.State({"a": 1.0, "a:velocity": 0.5}))
+    assert model.violations({"d": 0.5}).unchecked == ("lock", "sum")
+    assert model.violations(model.default_state()).unchecked == ("lock", "sum")
+
+
+def test_two_values_for_one_symbol_are_refused() -> None:
+    width, narrow = kv.parameter("width", 0.5), kv.parameter("width", 0.25)
+    model = constrained(a=(0, a, width))
+    with pytest.raises(kv.NameTakenError, match="two values for 'a'"):
+        model.violations({a: 0.5, "a": 0.75})
+    with pytest.raises(kv.UnknownNameError, match="'width'"):
+        model.violations({a: 0.5, narrow: 1.0})
+    with model.edit() as edit:
+        edit.constrain("narrow", 0, a, narrow)
+    assert [v.excess for v in model.violations({a: 0.5, width: 1.0})] == [0.25]
+    with pytest.raises(kv.NameTakenError, match="Several symbols have the name 'width'"):
+        model.violations({a: 0.5, "width": 1.0})
+
+
+@pytest.mark.parametrize("values", [None, 3, [0.5], "a", {("a", 1)}])
+def test_what_is_no_mapping_has_no_violations(values: Any) -> None:
+    with pytest.raises(kv.ExpressionError, match="mapping"):
+        constrained(a=(0, a, 1)).violations(values)
+
+
 def test_unknown_names_are_errors_in_mappings_and_not_in_states() -> None:
     model = constrained(a=(0, a, 1))
     with pytest.raises(kv.UnknownNameError, match=r"Did you mean|Available"):

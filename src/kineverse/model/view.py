@@ -398,7 +398,9 @@ class ModelView:
         Raises
         ------
         UnknownNameError
-            If a constraint is about a given position and another one that is missing, or a name is unknown.
+            If a constraint is about a given symbol and a position that is missing, or a name is unknown.
+        NameTakenError
+            If a symbol has two values, by name and as such, or a name is that of several symbols.
         """
         with self._lock:
             self._catch_up()

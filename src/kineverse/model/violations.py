@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import casadi as ca
 import numpy as np
 
-from kineverse.errors import UnknownNameError, suggest
+from kineverse.errors import ExpressionError, NameTakenError, UnknownNameError, suggest
 from kineverse.expressions.evaluation import assign
 from kineverse.expressions.lowering import lower
 from kineverse.state import State
@@ -70,11 +70,7 @@ def find_violations(
     checks: Checks, values: Mapping[Any, float], known: Iterable[Symbol], tolerance: float
 ) -> Violations:
     """Return the violations at ``values``, see :meth:`ModelView.violations`."""
-    state = (
-        values
-        if isinstance(values, State)
-        else _checked(values, {str(s): s for s in (*known, *checks.symbols)})
-    )
+    state = values if isinstance(values, State) else _checked(values, (*known, *checks.symbols))
     vector = np.zeros(len(checks.symbols))
     given = [s for s in checks.symbols if s in state]
     vector_of = dict(zip(given, assign(tuple(given), State({s: state[s] for s in given})), strict=True))
@@ -86,10 +82,10 @@ def find_violations(
         if not missing:
             checked.append(i)
             continue
-        untouched = not any(s in vector_of for s in need)
-        if not untouched and all(s.order == 0 for s in missing):
+        nowhere = [s for s in missing if s.order == 0]
+        if nowhere and any(s in vector_of for s in need):
             raise UnknownNameError(
-                f"No value for '{missing[0]}', which constraint '{checks.names[i]}' needs. Start from "
+                f"No value for '{nowhere[0]}', which constraint '{checks.names[i]}' needs. Start from "
                 "model.default_state().updated({...}) to have a value for everything."
             )
         unchecked.append(checks.names[i])
@@ -104,14 +100,31 @@ def find_violations(
     return Violations(broken, unchecked)
 
 
-def _checked(values: Mapping[Any, float], known: Mapping[str, Symbol]) -> State:
+def _checked(values: Mapping[Any, float], known: Iterable[Symbol]) -> State:
     """Return the values as a state, refusing names the model does not know."""
+    if not isinstance(values, Mapping):
+        raise ExpressionError(
+            f"Values are given as a mapping {{name: number}} or a state, not as {type(values).__name__}."
+        )
+    by_name: dict[str, set[Symbol]] = {}
+    for symbol in known:
+        by_name.setdefault(str(symbol), set()).add(symbol)
     result: dict[Symbol, float] = {}
     for key, value in values.items():
         name = str(key)
-        if name not in known:
-            raise UnknownNameError(f"Unknown symbol {name!r}. {suggest(name, known, 'symbol')}")
-        result[known[name]] = value
+        meant = by_name.get(name, set())
+        if isinstance(key, Symbol):
+            meant = meant & {key}
+        if not meant:
+            raise UnknownNameError(f"Unknown symbol {name!r}. {suggest(name, by_name, 'symbol')}")
+        if len(meant) > 1:
+            raise NameTakenError(
+                f"Several symbols have the name {name!r}; give their values by symbol, not by name."
+            )
+        (symbol,) = meant
+        if symbol in result:
+            raise NameTakenError(f"There are two values for '{symbol}', by symbol and by name.")
+        result[symbol] = value
     if not result:
         raise UnknownNameError("No values given; model.default_state() has one for everything.")
     return State(result)
