@@ -71,3 +71,17 @@ def with_mesh(uri: str, folder: str, **options: object) -> kv.Model:
         body = Body(visuals=(Shape(Mesh(uri, folder=folder, **options)),))  # type: ignore[arg-type]
         edit.add_frame("part", parent="world", transform=kv.translation(0, 0, 0), body=body)
     return model
+
+
+def held_door() -> kv.Model:
+    """A door that opens as far as its bolt lets it, and a lid that is locked until the door is open."""
+    model = kv.Model()
+    door, bolt, lid = (kv.position(name) for name in ("door", "bolt", "lid"))
+    with model.edit() as edit:
+        edit.add_frame("door", parent="world", transform=kv.rotation_z(door))
+        edit.add_frame("bolt", parent="world", transform=kv.translation(bolt, 0, 0))
+        edit.add_frame("lid", parent="world", transform=kv.rotation_x(lid))
+        edit.constrain("bolt/range", 0, bolt, 0.1)
+        edit.constrain("door/range", 0, door, kv.where(bolt > 0.05, 1.5, 0.001))
+        edit.constrain("lid/lock", -(door > 1), lid.derivative(), door > 1)
+    return model

@@ -6,7 +6,7 @@ import io
 
 import numpy as np
 import pytest
-from small_models import cabinet
+from small_models import cabinet, held_door
 
 from kineverse.view import Camera, view
 
@@ -160,3 +160,27 @@ def test_a_second_browser_sees_what_the_first_one_moved(opened, browser):
     until(other, lambda: slider(other, viewer, "cabinet/drawer").get_attribute("aria-valuenow") == "0.4")
     until(page, lambda: slider(page, viewer, "cabinet/drawer").get_attribute("aria-valuenow") == "0.4")
     other.close()
+
+
+def test_the_range_of_a_slider_follows_another_one(browser):
+    """The latch of a door: while its bolt is in, the door's slider goes nowhere; drawn, all the way."""
+    with view(held_door(), port=0) as viewer:
+        page = browser.new_page(viewport={"width": 900, "height": 560})
+        page.set_default_timeout(PATIENCE)
+        page.goto(viewer.address)
+        page.wait_for_selector("[role=slider]")
+        door, bolt = slider(page, viewer, "door"), slider(page, viewer, "bolt")
+        until(page, lambda: float(door.get_attribute("aria-valuemax")) < 0.01)
+        bolt.focus()
+        page.keyboard.press("End")
+        until(page, lambda: door.get_attribute("aria-valuemax") == "1.5")
+        door.focus()
+        page.keyboard.press("End")
+        until(page, lambda: viewer.values["door"] == 1.5)
+        page.get_by_text("All constraints hold.").wait_for()
+        # A lid whose speed is locked until the door is open: its slider is dead, and says so.
+        row(page, "lid [rad]").wait_for()
+        door.focus()
+        page.keyboard.press("Home")
+        row(page, "lid [rad] · locked").wait_for()
+        page.close()

@@ -25,8 +25,6 @@ examples:
   kineverse view kitchen
   kineverse view articulations/folding_door      any articulation of the library
   kineverse view articulations                   the list of them
-  kineverse view articulations/ball      any articulation of the library
-  kineverse view articulations           the list of them
   kineverse view my_robot.urdf --set elbow=45deg --port 8090"""
 
 

@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
+from kineverse.view.driving import Driving
+from kineverse.view.orientations import Orientations
 from kineverse.view.ranges import Ranges, offered, step
 from kineverse.view.scene import Scene
 from kineverse.view.violations import number, report
@@ -27,12 +29,18 @@ class Panel:
         What is switched on and off.
     ranges
         The limits of the degrees of freedom.
+    orientations
+        The quaternions among them, in whose place there are sliders of angles.
+    driving
+        The speeds that have sliders.
     units
         Their units, by name.
     values
         Their values at first, by name.
     moved
         Called with the name and value of a slider that somebody moved.
+    driven
+        Called with the name and value of a speed that somebody set.
     reset, play
         Called when somebody wants the initial state, or starts (True) and stops (False) the show.
     """
@@ -42,16 +50,21 @@ class Panel:
         gui: Any,
         scene: Scene,
         ranges: Ranges,
+        orientations: Orientations,
+        driving: Driving,
         units: Mapping[str, str],
         values: Mapping[str, float],
         *,
         moved: Callable[[str, float], None],
+        driven: Callable[[str, float], None],
         reset: Callable[[], None],
         play: Callable[[bool], None],
     ) -> None:
         self._gui, self._ranges, self._units, self._moved = gui, ranges, units, moved
-        self._limits = ranges.at(values)
+        self._orientations, self._driving = orientations, driving
+        self._limits = {**ranges.at(values), **orientations.limits}
         self._sliders: dict[str, Any] = {}
+        self._speeds: dict[str, Any] = {}
         self._folders: dict[str, Any] = {}
         self._root = gui.add_folder(None)
         with self._root:
@@ -59,7 +72,10 @@ class Panel:
             tabs = gui.add_tab_group()
             with tabs.add_tab("Move"):
                 self._add_controls(reset, play)
-                self._add_sliders(values)
+                self._add_sliders({**values, **orientations.angles})
+                if driving.speeds:
+                    self._add_speeds(driven)
+                self._lock(values)
             with tabs.add_tab("Show"):
                 self._add_switches(scene)
 
@@ -82,16 +98,26 @@ class Panel:
         driven
             The names of those that were set by a program.
         """
-        for name in driven:
+        shown = {**values, **self._orientations.angles}
+        for name in self._orientations.in_place(driven):
             slider = self._sliders.get(name)
             if slider is not None:
-                if not slider.min <= values[name] <= slider.max:
-                    self._fit(name, values[name])
-                slider.value = float(values[name])
+                if not slider.min <= shown[name] <= slider.max:
+                    self._fit(name, shown[name])
+                slider.value = float(shown[name])
         if self._ranges.varying:
-            self._limits = self._ranges.at(values)
+            self._limits.update(self._ranges.at(values))
             for name in self._ranges.varying:
                 self._fit(name, float(self._sliders[name].value))
+        self._lock(values)
+        for name, speed in self._driving.speeds.items():
+            if self._speeds[name].value != speed:
+                self._speeds[name].value = speed
+
+    @property
+    def beyond(self) -> bool:
+        """Whether limits and locks may be crossed."""
+        return bool(self._beyond.value)
 
     def _add_controls(self, reset: Callable[[], None], play: Callable[[bool], None]) -> None:
         gui = self._gui
@@ -99,7 +125,9 @@ class Panel:
         find.on_update(lambda event: self._find(event.target.value))
         gui.add_button("Reset", hint="Back to the state at the start.").on_click(lambda _: reset())
         self._beyond = gui.add_checkbox(
-            "beyond limits", False, hint=f"Widen all sliders by {BEYOND:.0%} to see limits violated."
+            "beyond limits",
+            False,
+            hint=f"Widen all sliders by {BEYOND:.0%}, and ignore locks, to see limits violated.",
         )
         self._beyond.on_update(lambda _: self._widen())
         self.playing = gui.add_checkbox("play", False, hint="Move everything through its range.")
@@ -107,7 +135,7 @@ class Panel:
 
     def _add_sliders(self, values: Mapping[str, float]) -> None:
         groups: dict[str, list[str]] = {}
-        for name in self._ranges.names:
+        for name in self._orientations.in_place(self._ranges.names):
             groups.setdefault(name.rpartition("/")[0], []).append(name)
         few = len(self._ranges.names) <= OPEN
         for number_, (group, names) in enumerate(groups.items()):
@@ -117,13 +145,36 @@ class Panel:
                 for name in names:
                     self._sliders[name] = self._slider(name, values[name])
 
+    def _add_speeds(self, driven: Callable[[str, float], None]) -> None:
+        """Add a slider for each speed: what it moves goes on until it is 0 again."""
+        gui, limits = self._gui, self._driving.limits
+        with gui.add_folder("drive"):
+            for name in self._driving.speeds:
+                low, high = limits[name]
+                slider = gui.add_slider(
+                    name.rpartition("/")[2].removesuffix(":velocity"),
+                    min=low,
+                    max=high,
+                    step=step((low, high)),
+                    initial_value=0.0,
+                    hint=f"{name}, from {number(low)} to {number(high)}; it goes on until this is 0",
+                )
+                slider.precision = _digits(low, high)
+                slider.on_update(lambda event, name=name: self._set(driven, name, event))
+                self._speeds[name] = slider
+
+            def stop(_: Any) -> None:
+                for name in self._speeds:
+                    driven(name, 0.0)
+
+            gui.add_button("Stop", hint="Set all speeds to 0.").on_click(stop)
+
     def _slider(self, name: str, value: float) -> Any:
-        unit = self._units.get(name, "")
         lower, upper = self._limits[name]
         low, high = self._range(name, value)
-        label = name.rpartition("/")[2] + (f" [{unit}]" if unit else "")
+        unit = self._units.get(name, "")
         slider = self._gui.add_slider(
-            label,
+            self._label(name),
             min=low,
             max=high,
             step=step((low, high)),
@@ -131,16 +182,30 @@ class Panel:
             hint=f"{name}, limits {number(lower)} to {number(upper)} {unit}".rstrip(),
         )
         slider.precision = _digits(low, high)
-        slider.on_update(lambda event: self._slid(name, event))
+        slider.on_update(lambda event: self._set(self._moved, name, event))
         return slider
 
-    def _slid(self, name: str, event: Any) -> None:
+    def _label(self, name: str, locked: bool = False) -> str:
+        unit = self._units.get(name, "")
+        return name.rpartition("/")[2] + (f" [{unit}]" if unit else "") + (" · locked" if locked else "")
+
+    @staticmethod
+    def _set(call: Callable[[str, float], None], name: str, event: Any) -> None:
         # Values that this program has set come back without a client.
         if event.client is not None:
-            self._moved(name, float(event.target.value))
+            call(name, float(event.target.value))
+
+    def _lock(self, values: Mapping[str, float]) -> None:
+        """Show what cannot move at these values, and keep its slider from being moved."""
+        for name, held in self._ranges.held(values).items():
+            locked, slider = all(held), self._sliders[name]
+            if slider.label != self._label(name, locked):
+                slider.label = self._label(name, locked)
+            if slider.disabled != (locked and not self.beyond):
+                slider.disabled = locked and not self.beyond
 
     def _range(self, name: str, value: float) -> tuple[float, float]:
-        beyond = BEYOND if self._beyond.value else 0.0
+        beyond = BEYOND if self.beyond else 0.0
         return offered(self._limits[name], value, self._units.get(name, ""), beyond)
 
     def _fit(self, name: str, value: float) -> None:
@@ -153,6 +218,8 @@ class Panel:
     def _widen(self) -> None:
         for name, slider in self._sliders.items():
             self._fit(name, float(slider.value))
+            if self.beyond:
+                slider.disabled = False
 
     def _find(self, text: str) -> None:
         shown = {name: text.lower() in name.lower() for name in self._sliders}

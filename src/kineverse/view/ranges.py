@@ -13,6 +13,10 @@ UNLIMITED = {"rad": np.pi, "m": 2.0, "": 2.0}
 """Half of the range offered where the model sets no limit [rad], [m]."""
 
 
+STILL = 1e-6
+"""What is slower than this does not move [rad/s], [m/s]: a lock is as sharp as its logic is."""
+
+
 class Ranges:
     """The limits of all degrees of freedom of a model, evaluated at states.
 
@@ -37,11 +41,34 @@ class Ranges:
             and (constraint.lower.symbols or constraint.upper.symbols)
         }
         self._dependent = [symbol for symbol in free if symbol in bounded]
+        one_way = {symbol for symbol in free if 0.0 in model.limits(symbol.derivative())}
+        self._locked = [s for s in free if s in one_way or s.derivative() in bounded]
 
     @property
     def varying(self) -> list[str]:
         """The degrees of freedom whose limits may depend on the state."""
         return [str(symbol) for symbol in self._dependent]
+
+    @property
+    def lockable(self) -> list[str]:
+        """The degrees of freedom that the state may keep from moving one way or both."""
+        return [str(symbol) for symbol in self._locked]
+
+    def held(self, values: Mapping[str, float]) -> dict[str, tuple[bool, bool]]:
+        """Return, for each that is lockable, whether it cannot go down, and whether it cannot go up.
+
+        Locks are limits of speeds. At a limit of its own it cannot go on either, which counts if it is locked
+        the other way.
+        """
+        found = {}
+        state = State(values) if self._locked else None
+        for symbol in self._locked:
+            slowest, fastest = self._model.limits(symbol.derivative(), state)
+            lower, upper = self._model.limits(symbol, state)
+            value, down, up = values[str(symbol)], slowest > -STILL, fastest < STILL
+            at_end = down and value >= upper - STILL, up and value <= lower + STILL
+            found[str(symbol)] = (down or at_end[1], up or at_end[0])
+        return found
 
     def at(self, values: Mapping[str, float]) -> dict[str, tuple[float, float]]:
         """Return lower and upper limit of each degree of freedom, -inf and inf where there is none."""

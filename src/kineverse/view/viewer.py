@@ -8,14 +8,17 @@ import time
 from collections.abc import Iterable, Mapping
 from typing import Any
 
-from kineverse.errors import KineverseError
+from kineverse.errors import KineverseError, UnknownNameError, suggest
 from kineverse.model.view import ModelView
+from kineverse.state import State
 from kineverse.view import server as web
 from kineverse.view.camera import Camera
+from kineverse.view.driving import Driving
 from kineverse.view.motion import Show
+from kineverse.view.orientations import Orientations
 from kineverse.view.panel import Panel
 from kineverse.view.poses import complete
-from kineverse.view.ranges import Ranges
+from kineverse.view.ranges import Ranges, offered
 from kineverse.view.scene import Scene
 from kineverse.view.triangles import Floats
 from kineverse.view.units import units
@@ -74,6 +77,7 @@ class Viewer:
         self._driven: set[str] = set()
         self._ended = threading.Event()
         self._show: Show | None = None
+        self._drawn = 0.0
         self._server = web.start(port, label)
         try:
             self._server.gui.configure_theme(
@@ -126,26 +130,43 @@ class Viewer:
         """
         with self._change:
             self._values = complete(self.model, {**self._values, **{str(k): v for k, v in values.items()}})
+            self._orientations.read(self._values)
             self._ask(str(name) for name in values)
 
+    def drive(self, speeds: Mapping[Any, float]) -> None:
+        """Let the model move at speeds, by symbol or name, until they are 0 or break a constraint.
+
+        These are the speeds by which coordinates with rates move, as the wheels of a base do.
+
+        Raises
+        ------
+        UnknownNameError
+            For other speeds; nothing has changed then.
+        """
+        with self._change:
+            for name in map(str, speeds):
+                if name not in self._driving.speeds:
+                    known = suggest(name, self._driving.speeds, "speed")
+                    raise UnknownNameError(f"Nothing is driven by '{name}'. {known}")
+            self._driving.speeds.update({str(k): float(v) for k, v in speeds.items()})
+            self._drawn = time.monotonic()
+            self._ask()
+
     def reset(self) -> None:
-        """Go back to the state of the start."""
+        """Go back to the state of the start, and stop."""
         with self._change:
             self._show = None
+            self._driving.stop()
             self._values = dict(self._initial)
+            self._orientations.read(self._values)
             self._ask(self._values)
         self._panel.playing.value = False
 
     def play(self, running: bool = True) -> None:
         """Start or stop moving everything through its range."""
         with self._change:
-            # What has no limits has no range to be moved through, and a robot would drive off the page.
-            limits = {
-                name: (low, high)
-                for name, (low, high) in self._ranges.at(self._values).items()
-                if high - low < 1e6
-            }
-            self._show = Show(self._values, limits, time.monotonic()) if running else None
+            start = {**self._values, **self._orientations.angles}
+            self._show = Show(start, self._to_be_played(), time.monotonic()) if running else None
             self._ask()
         self._panel.playing.value = running
 
@@ -191,22 +212,54 @@ class Viewer:
 
     def _build_panel(self) -> Panel:
         self._ranges = Ranges(self.model)
+        self._orientations = Orientations(self.model, self._values)
+        self._driving = Driving(self.model)
+        self._units = units(self.model, self._values, self._ranges.names)
+        self._units.update(dict.fromkeys(self._orientations.angles, "rad"))
         return Panel(
             self._server.gui,
             self._scene,
             self._ranges,
-            units(self.model, self._values, self._ranges.names),
+            self._orientations,
+            self._driving,
+            self._units,
             self._values,
             moved=self._moved,
+            driven=lambda name, speed: self.drive({name: speed}),
             reset=self.reset,
             play=self.play,
         )
 
+    def _to_be_played(self) -> dict[str, tuple[float, float]]:
+        """Return what the show moves, and how far.
+
+        What has no limits has no range to be moved through, and a robot would drive off the page; but where
+        nothing else moves, it is what there is to see.
+        """
+        limits = self._ranges.at(self._values)
+        found = {name: (low, high) for name, (low, high) in limits.items() if high - low < 1e6}
+        if found:
+            return found
+        rates = {str(symbol) for symbol in self.model.rates}
+        found = dict.fromkeys(self._orientations.angles, (-0.5, 0.5))
+        for name in limits.keys() - rates:
+            found[name] = offered(limits[name], self._values[name], self._units[name])
+        return found
+
     def _moved(self, name: str, value: float) -> None:
+        """Take the value of a slider that somebody moved; what is locked stays and its slider goes back."""
         with self._change:
-            if name in self._values:
-                self._values[name] = value
+            if name in self._orientations.angles:
+                self._values.update(self._orientations.turned(name, value))
                 self._ask()
+            elif name in self._values:
+                down, up = (False, False)
+                if name in self._ranges.lockable and not self._panel.beyond:
+                    down, up = self._ranges.held(self._values)[name]
+                stays = (down and value < self._values[name]) or (up and value > self._values[name])
+                if not stays:
+                    self._values[name] = value
+                self._ask([name] if stays else ())
 
     def _ask(self, set_by_program: Iterable[str] = ()) -> None:
         """Have the page updated; to be called with the lock held.
@@ -222,23 +275,36 @@ class Viewer:
         """Draw what was asked for, newest first, until told to stop."""
         while True:
             with self._change:
-                wanted = lambda: self._stopping or self._asked > self._done or self._show  # noqa: E731
-                self._change.wait_for(wanted)
+                self._change.wait_for(self._has_work)
                 if self._stopping:
                     return
-                if self._show is not None:
-                    shown = self._show.at(time.monotonic())
-                    self._values.update(shown)
-                    self._driven.update(shown)
+                self._animate(time.monotonic())
                 asked, edited, self._edited = self._asked, self._edited, False
                 values, driven, self._driven = dict(self._values), self._driven, set()
-            if edited:
-                values = self._rebuild(values)
-            self._draw(values, driven)
+            self._draw(values, driven, edited)
             with self._change:
                 self._done = max(self._done, asked)
                 self._change.notify_all()
                 self._change.wait_for(lambda: self._stopping, timeout=PERIOD)
+
+    def _has_work(self) -> bool:
+        running = self._show is not None or self._driving.running
+        return self._stopping or self._asked > self._done or running
+
+    def _animate(self, now: float) -> None:
+        """Put values where the show and the speeds that are set have them at a time [s]."""
+        if self._show is not None:
+            for name, value in self._show.at(now).items():
+                turns = name in self._orientations.angles
+                changed = self._orientations.turned(name, value) if turns else {name: value}
+                self._values.update(changed)
+                self._driven.update(changed)
+        if self._driving.running:
+            moved = self._driving.after(self._values, now - self._drawn)
+            self._values.update(moved)
+            self._driven.update(moved)
+            self._orientations.read(self._values)
+        self._drawn = now
 
     def _rebuild(self, values: Mapping[str, float]) -> dict[str, float]:
         """Build the page anew for a model that was edited, and return the values of its symbols."""
@@ -248,19 +314,23 @@ class Viewer:
             self._initial = complete(self.model, {k: v for k, v in self._initial.items() if k in known})
             self._values = dict(current)
             self._show = None
-        self._panel.remove()
         self._scene.refresh(self.model, current)
+        self._panel.remove()
         self._panel = self._build_panel()
         return current
 
-    def _draw(self, values: Mapping[str, float], driven: Iterable[str]) -> None:
+    def _draw(self, values: Mapping[str, float], driven: Iterable[str], edited: bool) -> None:
+        """Show values, or why they cannot be shown; then everything stays where it was drawn last."""
         try:
-            self._scene.update(values)
+            if edited:
+                values = self._rebuild(values)
             self._panel.update(values, driven)
+            self._scene.update(values)
             if self.unplaced:
                 self._panel.show(failure(f"Not finite, and hidden: {', '.join(self.unplaced)}."))
                 return
-            violated = self.model.violations(values)
+            # A mapping of nothing says nothing, a state of nothing is that of a model that cannot move.
+            violated = self.model.violations(values or State())
             self._panel.show(report(violated, violated.unchecked))
         except KineverseError as error:
             self._panel.show(failure(str(error)))
