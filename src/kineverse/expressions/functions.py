@@ -192,6 +192,8 @@ def norm(x: ExpressionLike) -> Expression:
 def hypot(a: ExpressionLike, b: ExpressionLike) -> Expression:
     """Return √(a² + b²), elementwise; its gradient at the origin is 0."""
     x, y = broadcast(as_expression(a), as_expression(b))
+    if not x.shape:
+        return norm(array([x, y]))
     squares = square(x) + square(y)
     return where(
         make(ca.SX.binary(ca.OP_LT, 0, squares._sx), squares.shape, squares._nodes), sqrt(squares), 0
