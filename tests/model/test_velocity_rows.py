@@ -220,8 +220,10 @@ def test_the_way_back_is_as_fast_as_limits_allow() -> None:
     followed = rows_of(SINGLE["speed of what follows"])
     assert followed.lower({"a": -9.0})[followed.names.index("a")] == 0.5
     norm = rows_of(SINGLE["norm, then single"])
-    inner = 0.5 * math.cos(math.pi / 16) / math.sqrt(2)
-    assert norm.upper({"a": 9.0, "b": 0.0})[norm.names.index("a")] == pytest.approx(-inner)
+    inner = 0.5 * math.cos(math.pi / 16)
+    row = norm.names.index("a")
+    assert norm.upper({"a": 9.0, "b": 0.0})[row] == pytest.approx(-inner)
+    assert norm.upper({"a": 9.0, "b": 9.0})[row] == pytest.approx(-inner / math.sqrt(2))  # both come back
     # Who may stand still only does that.
     locked = rows_of({"a": (-1, a, 2), "lock": (-(b > 0), va, b > 0)})
     assert locked.upper({"a": 9.0, "b": -1.0})[locked.names.index("a")] == 0

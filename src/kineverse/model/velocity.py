@@ -5,10 +5,10 @@ For a constraint on positions, ``l <= φ <= u``, at rate γ <= 1/Δt and without
     (D(φ) - D(u))·v <= γ (u - φ)        (D(φ) - D(l))·v >= γ (l - φ)
 
 so one step of Δt never crosses a bound. Outside a bound the right side asks for the way back, as fast as γ
-says but never faster than the speed limits allow, those on several speeds included, so the row stays
-feasible. Only two constraints about the same speeds, both violated and pulling apart, can contradict each
-other. Where accelerations are limited, the speed towards a bound stays below what can be braked within the
-distance left.
+says but never faster than one motion can go that keeps all other rows as well: :mod:`.way_back`. So all rows
+together can always be obeyed, from anywhere, where speeds may be zero; limits on speeds that exclude zero are
+kept as they are, and may then leave no way. Where accelerations are limited, the speed towards a bound stays
+below what can be braked within the distance left, on the way back as well.
 
 A constraint that is affine in speeds is the row itself. A limited norm of two speeds becomes the 16 sides of
 the polygon inscribed in the circle, which gives away 1.9 % at most and never exceeds the limit; one of three
@@ -18,17 +18,18 @@ becomes the 128 faces of a polyhedron inscribed in the sphere, which gives away 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 
 from kineverse.errors import ValueRejectedError
-from kineverse.expressions.expression import Expression, array, as_expression
-from kineverse.expressions.functions import maximum, minimum, sqrt
+from kineverse.expressions.expression import Expression, array
+from kineverse.expressions.functions import sqrt
 from kineverse.symbols import Symbol
 
 from .constraint import Constraint
 from .rates import Rates
-from .speed_limits import INFINITE, Box, Row, SpeedLimits, is_infinite, least
+from .speed_limits import INFINITE, ZERO, Limits, Row, SpeedLimits, is_infinite, larger, only, smaller
+from .way_back import Side, Sides, within_reach
 
 
 @dataclass(frozen=True)
@@ -62,6 +63,7 @@ def velocity_rows(
     rates: Rates | None = None,
     speeds: Sequence[Symbol] | None = None,
     gain: float | None = None,
+    speed_limits: Mapping[str, Constraint] | None = None,
 ) -> VelocityRows:
     """Return the rows that keep constraints over the next step, see the module.
 
@@ -77,6 +79,9 @@ def velocity_rows(
         Columns; by default the speeds that occur, sorted. Others count as standing still.
     gain
         γ [1/s], at most 1/Δt, which is the default.
+    speed_limits
+        More constraints, of which those on speeds and accelerations of columns are kept as well, and so are
+        those of the columns that these bring in. Others are passed over.
 
     Raises
     ------
@@ -91,37 +96,40 @@ def velocity_rows(
     table = rates if rates is not None else Rates({})
     limits = SpeedLimits(table)
     skipped: list[tuple[str, str]] = []
-    accelerations: dict[Symbol, Expression] = {}
-    on_positions: list[tuple[str, Constraint]] = []
+    brakes: dict[Symbol, Expression] = {}
     for name, constraint in constraints.items():
-        reason: str | None = None
+        if constraint.order:
+            skipped += _about_speeds(name, constraint, limits, brakes)
+    gaps: dict[str, list[_Gap]] = {}
+    for name, constraint in constraints.items():
         if constraint.order == 0:
-            on_positions.append((name, constraint))
-        elif constraint.order == 1:
-            reason = limits.add(name, constraint)
-        else:
-            reason = _note_acceleration(constraint, accelerations)
-        if reason is not None:
-            skipped.append((name, reason))
-    rows, box = limits.rows, limits.box()
-    for name, constraint in on_positions:
-        sides = [
-            _side(sign, constraint, gamma, dt, table, box, accelerations)
-            for sign, bound in ((-1, constraint.lower), (1, constraint.upper))
-            if not is_infinite(bound)
-        ]
-        moving = [side for side in sides if side.weights]
-        if any(s.order > 1 for side in moving for s in side.weights):
-            skipped.append((name, "its gradient is about derivatives beyond speeds"))
-        elif moving:
-            rows += _joined(name, moving)
-        else:
-            skipped.append((name, "nothing that moves changes it" if sides else "it has no bounds"))
-    found = {s for row in rows for s in row.weights}
-    columns = tuple(speeds) if speeds is not None else tuple(sorted(found, key=lambda s: s.sort_key))
+            found = [gap for gap in _gaps(constraint, table) if gap.away]
+            bounded = not (is_infinite(constraint.lower) and is_infinite(constraint.upper))
+            if any(s.order > 1 for gap in found for s in gap.away):
+                skipped.append((name, "its gradient is about derivatives beyond speeds"))
+            elif found:
+                gaps[name] = found
+            else:
+                skipped.append((name, "nothing that moves changes it" if bounded else "it has no bounds"))
+    moving = {s for found in gaps.values() for gap in found for s in gap.away}
+    moving.update(s for row in limits.rows for s in row.weights)
+    if speeds is not None:
+        moving = set(speeds)
+    waiting = {
+        name: (constraint, _speeds_of(constraint, table))
+        for name, constraint in (speed_limits or {}).items()
+        if name not in constraints and constraint.order in (1, 2)
+    }
+    while named := [name for name, (_, about) in waiting.items() if not moving.isdisjoint(about)]:
+        known = len(limits.rows)
+        for name in named:
+            skipped += _about_speeds(name, waiting.pop(name)[0], limits, brakes)
+        if speeds is None:
+            moving.update(s for row in limits.rows[known:] for s in row.weights)
+    columns = tuple(speeds) if speeds is not None else tuple(sorted(moving, key=lambda s: s.sort_key))
+    rows = limits.rows + _position_rows(constraints, gaps, limits.of(moving), moving, gamma, dt, brakes)
     rows = [row for row in rows if any(s in row.weights for s in columns)]
-    zero = as_expression(0.0)
-    weights = [row.weights.get(s, zero) for row in rows for s in columns]
+    weights = [row.weights.get(s, ZERO) for row in rows for s in columns]
     return VelocityRows(
         columns,
         array(weights).reshape(len(rows), len(columns)),
@@ -132,7 +140,15 @@ def velocity_rows(
     )
 
 
-def _note_acceleration(constraint: Constraint, accelerations: dict[Symbol, Expression]) -> str | None:
+def _about_speeds(
+    name: str, constraint: Constraint, limits: SpeedLimits, brakes: dict[Symbol, Expression]
+) -> list[tuple[str, str]]:
+    """Take in a constraint of order 1 or more; return the reason if it cannot be."""
+    reason = limits.add(name, constraint) if constraint.order == 1 else _note_brake(constraint, brakes)
+    return [] if reason is None else [(name, reason)]
+
+
+def _note_brake(constraint: Constraint, brakes: dict[Symbol, Expression]) -> str | None:
     """Keep what one speed can be braked with; return why not, if it is something else."""
     expression, lower, upper = constraint.expression, constraint.lower, constraint.upper
     if not isinstance(expression, Symbol) or expression.order != 2:
@@ -140,55 +156,84 @@ def _note_acceleration(constraint: Constraint, accelerations: dict[Symbol, Expre
     if is_infinite(lower) and is_infinite(upper):
         return "it has no bounds"
     # The weaker side is what can be relied on for braking in either direction.
-    deceleration = minimum(-lower, upper)
+    deceleration = smaller(-lower, upper)
     speed = expression.integral()
-    accelerations[speed] = (
-        minimum(accelerations[speed], deceleration) if speed in accelerations else deceleration
-    )
+    brakes[speed] = smaller(brakes[speed], deceleration) if speed in brakes else deceleration
     return None
 
 
+def _speeds_of(constraint: Constraint, rates: Rates) -> set[Symbol]:
+    """Return the free speeds that a constraint on speeds or on accelerations is about."""
+    found: set[Symbol] = set()
+    for s in constraint.expression.symbols:
+        if s.order:
+            row = rates.row(s.position)
+            found.update([s.position.derivative()] if row is None else row)
+    return found
+
+
 @dataclass(frozen=True)
-class _Side:
-    """One bound on positions, as ``weights·v <= bound`` (sign 1) or ``>=`` (sign -1)."""
+class _Gap:
+    """The distance to one bound on positions, an upper one if the sign is 1, and how speeds widen it."""
 
     sign: int
-    weights: Mapping[Symbol, Expression]
-    bound: Expression
+    distance: Expression
+    away: Mapping[Symbol, Expression]
 
 
-def _side(
-    sign: int,
-    constraint: Constraint,
+def _gaps(constraint: Constraint, rates: Rates) -> list[_Gap]:
+    found = []
+    for sign, bound in ((-1, constraint.lower), (1, constraint.upper)):
+        if not is_infinite(bound):
+            distance = sign * (bound - constraint.expression)
+            away = _over_free_speeds(distance.gradient(heuristic=False), rates)
+            found.append(_Gap(sign, distance, only(away, away)))
+    return found
+
+
+def _position_rows(
+    constraints: Mapping[str, Constraint],
+    gaps: Mapping[str, list[_Gap]],
+    limits: Limits,
+    moving: Collection[Symbol],
     gamma: float,
     dt: float,
-    rates: Rates,
-    box: Box,
-    accelerations: Mapping[Symbol, Expression],
-) -> _Side:
-    # Written for an upper bound; a lower one is the same for -φ <= -l.
-    bound = constraint.upper if sign > 0 else constraint.lower
-    room = sign * (bound - constraint.expression)
-    away = _over_free_speeds(room.gradient(heuristic=False), rates)
-    towards = {speed: -weight for speed, weight in away.items()}
-    allowed = gamma * room
-    deceleration = _total(towards, accelerations)
-    if deceleration is not None:
-        # Of a step at speed s, with s - a·dt in the next one and so on, s²/2a + s·dt is left to go at most.
-        step = deceleration * dt
-        allowed = minimum(allowed, sqrt(step * step + 2 * deceleration * maximum(room, 0)) - step)
-    slowest = least(towards, box)
-    if slowest is not None:
-        allowed = maximum(allowed, minimum(slowest, 0))
-    return _Side(sign, {s: sign * w for s, w in towards.items()}, sign * allowed)
-
-
-def _joined(name: str, sides: list[_Side]) -> list[Row]:
-    """Return one row for both sides, or two where bounds move and the left sides differ."""
-    ends = [(-INFINITE, side.bound) if side.sign > 0 else (side.bound, INFINITE) for side in sides]
-    if len(sides) == 2 and sides[0].weights == sides[1].weights:
-        return [Row(name, sides[0].weights, sides[0].bound, sides[1].bound)]
-    return [Row(name, side.weights, *end) for side, end in zip(sides, ends, strict=True)]
+    brakes: Mapping[Symbol, Expression],
+) -> list[Row]:
+    """Return the rows of constraints on positions; who is no column stands still and brakes nothing."""
+    named: list[tuple[str, list[int]]] = []
+    bounds = []
+    for name, found in gaps.items():
+        sides, signs, braked = [], [], False
+        for gap in found:
+            away = only(gap.away, moving)
+            if not away:
+                continue
+            room = gamma * gap.distance
+            deceleration = _total(away, brakes)
+            if deceleration is not None:
+                braked = True
+                # Of a step at speed s, with s - a·dt in the next one and so on, s²/2a + s·dt is left to go.
+                step = deceleration * dt
+                left = 2 * deceleration * larger(gap.distance, ZERO)
+                room = smaller(room, sqrt(step * step + left) - step)
+            sides.append(Side(away, room))
+            signs.append(gap.sign)
+        if sides:
+            constant = not constraints[name].lower.symbols and not constraints[name].upper.symbols
+            named.append((name, signs))
+            bounds.append(Sides(tuple(sides), apart=constant and not braked))
+    rows = []
+    for (name, signs), both, rooms in zip(named, bounds, within_reach(bounds, limits), strict=True):
+        ends = []
+        for sign, side, room in zip(signs, both.sides, rooms, strict=True):
+            weights = side.away if sign < 0 else {s: -w for s, w in side.away.items()}
+            low, high = (-room, INFINITE) if sign < 0 else (-INFINITE, room)
+            ends.append(Row(name, weights, low, high))
+        if len(ends) == 2 and ends[0].weights == ends[1].weights:
+            ends = [Row(name, ends[0].weights, ends[0].lower, ends[1].upper)]
+        rows += ends
+    return rows
 
 
 def _over_free_speeds(gradient: Mapping[Symbol, Expression], rates: Rates) -> dict[Symbol, Expression]:
@@ -203,11 +248,11 @@ def _over_free_speeds(gradient: Mapping[Symbol, Expression], rates: Rates) -> di
 
 
 def _total(
-    towards: Mapping[Symbol, Expression], magnitudes: Mapping[Symbol, Expression]
+    weights: Mapping[Symbol, Expression], magnitudes: Mapping[Symbol, Expression]
 ) -> Expression | None:
-    total = as_expression(0.0)
-    for speed, weight in towards.items():
+    total = ZERO
+    for speed, weight in weights.items():
         if speed not in magnitudes:
             return None
         total = total + abs(weight) * magnitudes[speed]
-    return total if towards else None
+    return total

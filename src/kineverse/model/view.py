@@ -501,11 +501,15 @@ class ModelView:
     ) -> VelocityRows:
         """Return the linear rows in speeds that keep the constraints over a step of ``dt`` seconds.
 
-        Of the constraints relevant for ``subject``, or of all; see :mod:`kineverse.model.velocity`.
+        Of the constraints relevant for ``subject`` and of the speed limits of whatever they let move, or of
+        all; see :mod:`kineverse.model.velocity`.
         """
         with self._lock:
-            constraints = dict(self.constraints) if subject is None else self.constraints_for(subject)
-            return velocity_rows(constraints, dt, rates=self.rates, speeds=speeds, gain=gain)
+            every = dict(self.constraints)
+            constraints = every if subject is None else self.constraints_for(subject)
+            return velocity_rows(
+                constraints, dt, rates=self.rates, speeds=speeds, gain=gain, speed_limits=every
+            )
 
     def integrate(self, state: Mapping[Any, float], speeds: Mapping[Any, float], dt: float) -> State:
         """Return the state ``dt`` seconds later, at constant speeds: :mod:`kineverse.model.integration`."""

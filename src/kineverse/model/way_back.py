@@ -1,0 +1,216 @@
+"""How far rows on positions can ask for the way back, so that all rows together can be obeyed.
+
+Rows are seen from inside: ``a·v >= -r``, where r is the room left, negative outside. What a row outside asks
+for has to be within reach. So one motion v* is built that everything allows, and no row asks for more than v*
+gives it; then v* obeys all rows at once, wherever the state is, if only speeds may be zero:
+
+1. *Wish.* Each speed goes for each row outside as fast as this row would need it if there were no others,
+   within the speed's own limits; p upwards, n downwards.
+2. *Harm.* What these wishes take of the room of a row is at most ``h = Σ max(a·n, -a·p)``. A norm of speeds
+   grows by at most the norm of its components' largest values.
+3. *Share.* Speeds that do a row harm get the share r/h of their wishes, the least over all rows. Who helps is
+   not slowed down, and is not counted on. A row outside has no room at all, so no one does it any harm.
+
+A speed that two rows outside want to go different ways stands still in v*, and so does one that would use up
+another row where no room is left: a row that depends on these asks for nothing until there is some.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import reduce
+
+import casadi as ca
+
+from kineverse.expressions.expression import Expression, as_expression, binary
+from kineverse.expressions.functions import norm
+from kineverse.symbols import Symbol
+
+from .speed_limits import INFINITE, ZERO, Ball, Box, Limits, Weights, is_infinite, larger, smaller
+
+_ONE = as_expression(1.0)
+_ROUNDING = as_expression(1e-12)
+"""Harm that is none: coefficients like cos(π/2) are not 0."""
+_FLAT = as_expression(1e-8)
+"""Square of the coefficient below which a speed is wished for in proportion to it, no longer inversely."""
+
+
+@dataclass(frozen=True)
+class Side:
+    """One bound of a constraint on positions: ``away·v >= -room`` keeps it.
+
+    Attributes
+    ----------
+    away
+        How fast each speed leads away from the bound, to the inside.
+    room
+        How fast one may come nearer, negative outside.
+    """
+
+    away: Weights
+    room: Expression
+
+
+@dataclass(frozen=True)
+class Sides:
+    """The bounds of one constraint; ``apart`` says that there is always room at one of them."""
+
+    sides: tuple[Side, ...]
+    apart: bool
+
+
+def within_reach(constraints: Sequence[Sides], limits: Limits) -> list[list[Expression]]:
+    """Return the rooms of the sides of constraints, made so large that one motion keeps them all."""
+    users = Counter(s for c in constraints for s in {s for side in c.sides for s in side.away})
+    users.update(s for row in limits.coupled for s in row.weights)
+    users.update(s for ball in limits.balls for component in ball.components for s in component)
+    alone = [_is_alone(c, users) for c in constraints]
+    rest = [side for c, own in zip(constraints, alone, strict=True) if not own for side in c.sides]
+    motion = _common(rest, limits)
+    return [
+        _clipped(c, limits.box) if own else [larger(s.room, -_along(s.away, motion)) for s in c.sides]
+        for c, own in zip(constraints, alone, strict=True)
+    ]
+
+
+def _is_alone(constraint: Sides, users: Mapping[Symbol, int]) -> bool:
+    """Return whether a constraint is about one speed that nothing else is about, its own limits aside."""
+    moving = [(s, w) for side in constraint.sides for s, w in side.away.items()]
+    if len(moving) > len(constraint.sides) or any(w.symbols for _, w in moving):
+        return False
+    weights = [float(w) for _, w in moving]
+    return users[moving[0][0]] == 1 and weights in ([weights[0]], [weights[0], -weights[0]])
+
+
+def _clipped(constraint: Sides, box: Box) -> list[Expression]:
+    """Return the rooms of a constraint on one speed: its limits and the other side are all that counts."""
+    rooms = [side.room for side in constraint.sides]
+    result = []
+    for k, side in enumerate(constraint.sides):
+        ((speed, weight),) = side.away.items()
+        reach = INFINITE
+        if speed in box:
+            low, high = box[speed]
+            factor = abs(float(weight))
+            end = high if float(weight) > 0 else -low
+            reach = end if is_infinite(end) else factor * end
+        if len(rooms) == 2 and not constraint.apart:
+            beyond = larger(rooms[1 - k], ZERO)
+            reach = beyond if is_infinite(reach) else smaller(reach, beyond)
+        result.append(side.room if is_infinite(reach) else larger(side.room, -reach))
+    return result
+
+
+def _common(sides: Sequence[Side], limits: Limits) -> dict[Symbol, Expression]:
+    """Return v*, the speeds that are not always zero."""
+    up, down = _wishes(sides, limits.box)
+    shares = _Shares(up, down)
+    for side in sides:
+        shares.keep(side.away, side.room)
+    for row in limits.coupled:
+        if not is_infinite(row.lower):
+            shares.keep(row.weights, -row.lower)
+        if not is_infinite(row.upper):
+            shares.keep({s: -w for s, w in row.weights.items()}, row.upper)
+    for ball in limits.balls:
+        shares.keep_ball(ball)
+    motion: dict[Symbol, Expression] = {}
+    for wishes, least, sign in ((up, shares.up, 1), (down, shares.down, -1)):
+        for speed, wish in wishes.items():
+            share = reduce(smaller, least.get(speed, []), _ONE)
+            motion[speed] = motion.get(speed, ZERO) + sign * wish * share
+    return motion
+
+
+def _wishes(sides: Sequence[Side], box: Box) -> tuple[dict[Symbol, Expression], dict[Symbol, Expression]]:
+    """Return how fast speeds would go up, and how fast down, if each side had its way."""
+    up: dict[Symbol, list[Expression]] = {}
+    down: dict[Symbol, list[Expression]] = {}
+    for side in sides:
+        need = larger(-side.room, ZERO)
+        for speed, weight in side.away.items():
+            if not weight.symbols:
+                (up if float(weight) > 0 else down).setdefault(speed, []).append(need / abs(float(weight)))
+                continue
+            wish = need * weight / larger(weight * weight, _FLAT)
+            up.setdefault(speed, []).append(larger(wish, ZERO))
+            down.setdefault(speed, []).append(larger(-wish, ZERO))
+    return (
+        {s: _within(reduce(larger, w), box[s][1] if s in box else INFINITE) for s, w in up.items()},
+        {s: _within(reduce(larger, w), -box[s][0] if s in box else INFINITE) for s, w in down.items()},
+    )
+
+
+class _Shares:
+    """What share of its wishes each speed may have, upwards and downwards: the least of several."""
+
+    def __init__(self, up: Mapping[Symbol, Expression], down: Mapping[Symbol, Expression]) -> None:
+        self.up: dict[Symbol, list[Expression]] = {}
+        self.down: dict[Symbol, list[Expression]] = {}
+        self._wishes = up, down
+
+    def keep(self, away: Weights, room: Expression) -> None:
+        """Take care that speeds keep ``away·v >= -room``."""
+        up, down = self._wishes
+        harm = []
+        for speed, weight in away.items():
+            if not weight.symbols:
+                wishes = down if float(weight) > 0 else up
+                harm += [abs(float(weight)) * wishes[speed]] if speed in wishes else []
+            elif speed in up and speed in down:
+                harm.append(larger(weight * down[speed], -weight * up[speed]))
+            elif speed in down:
+                harm.append(larger(weight * down[speed], ZERO))
+            elif speed in up:
+                harm.append(larger(-weight * up[speed], ZERO))
+        if not harm:
+            return
+        share = _share(room, sum(harm, ZERO))
+        for speed, weight in away.items():
+            if not weight.symbols:
+                wanted, shares = (down, self.down) if float(weight) > 0 else (up, self.up)
+                if speed in wanted:
+                    shares.setdefault(speed, []).append(share)
+                continue
+            # Only speeds that do harm: a comparison that holds is 1.
+            if speed in up:
+                share_up = larger(share, binary(ca.OP_LE, 0, weight))
+                self.up.setdefault(speed, []).append(share_up)
+            if speed in down:
+                share_down = larger(share, binary(ca.OP_LE, weight, 0))
+                self.down.setdefault(speed, []).append(share_down)
+
+    def keep_ball(self, ball: Ball) -> None:
+        """Take care that speeds stay within a norm."""
+        up, down = self._wishes
+        sizes = []
+        for component in ball.components:
+            terms = []
+            for speed, weight in component.items():
+                wishes = [w[speed] for w in (up, down) if speed in w]
+                if wishes:
+                    terms.append(abs(weight) * reduce(larger, wishes))
+            sizes += [sum(terms, ZERO)] if terms else []
+        if not sizes:
+            return
+        share = _share(ball.radius, norm(sizes))
+        for speed in {s for component in ball.components for s in component}:
+            for wishes_of, shares in ((up, self.up), (down, self.down)):
+                if speed in wishes_of:
+                    shares.setdefault(speed, []).append(share)
+
+
+def _share(room: Expression, harm: Expression) -> Expression:
+    """Return room over harm, 1 or more where there is no harm to speak of; never 0/0."""
+    harmless = binary(ca.OP_LT, harm, _ROUNDING)
+    return (larger(room, ZERO) + harmless) / larger(harm, _ROUNDING)
+
+
+def _within(wish: Expression, limit: Expression) -> Expression:
+    return wish if is_infinite(limit) else smaller(wish, limit)
+
+
+def _along(weights: Weights, motion: Mapping[Symbol, Expression]) -> Expression:
+    return sum((w * motion[s] for s, w in weights.items() if s in motion), ZERO)
