@@ -71,9 +71,11 @@ def assert_jacobian_at(model: kv.Model, frame: str, at: State) -> None:
         np.testing.assert_allclose(column, twist, atol=2e-9 * max(1.0, float(np.abs(column).max())))
 
 
-def assert_motion_law(model: kv.Model, expressions: list[kv.Expression], seed: int) -> None:
+def assert_motion_law(
+    model: kv.Model, expressions: list[kv.Expression], seed: int, start: State | None = None
+) -> None:
     """Along q̇ = R(q)u, differences of values are ė, and those of ė are ë."""
-    start = random_state(model, seed)
+    start = random_state(model, seed) if start is None else start
     rng = np.random.default_rng(seed + 1)
     speeds = {s: float(rng.uniform(-1, 1)) for s in model.speeds}
     h = 2e-3

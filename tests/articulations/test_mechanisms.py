@@ -55,10 +55,8 @@ def test_it_stands_where_its_origin_is(mechanism: Mechanism) -> None:
 def test_jacobians_are_differences_over_the_whole_range(mechanism: Mechanism) -> None:
     model = model_of(mechanism)
     for at in across(mechanism):
-        if getattr(mechanism, "form", "") == "published" and at[kv.position("m/door")] == mechanism.length:
-            continue  # there it has none: see the test of the garage door
-        if getattr(mechanism, "form", "") == "published":
-            at[kv.position("m/door")] = min(max(at[kv.position("m/door")], 0.1), 1.9)
+        if mechanism is EVERY["published garage door"] and at[kv.position("m/door")] > 2.0:
+            continue  # Towards 2.2 its slope is infinite, see the tests of the garage door.
         for frame in model.frames:
             if model.speeds_of(frame):
                 assert_jacobian_at(model, frame, at)
@@ -66,16 +64,14 @@ def test_jacobians_are_differences_over_the_whole_range(mechanism: Mechanism) ->
 
 @each
 @pytest.mark.parametrize("seed", range(2))
-def test_it_moves_as_gradients_say(mechanism: Mechanism, seed: int, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_it_moves_as_gradients_say(mechanism: Mechanism, seed: int) -> None:
     model = model_of(mechanism)
     rng = np.random.default_rng(seed)
     inside = {}
     for q in model.degrees_of_freedom:
         lower, upper = np.clip(ends(mechanism, q), -7.0, 7.0)
         inside[q] = float(rng.uniform(lower + 0.3 * (upper - lower), upper - 0.3 * (upper - lower)))
-    monkeypatch.setattr("articulation_checks.random_state", lambda *_: inside)
-    slow = [model.fk(mechanism.child)]
-    assert_motion_law(model, slow, seed)
+    assert_motion_law(model, [model.fk(mechanism.child)], seed, inside)
 
 
 @each
@@ -122,6 +118,9 @@ def test_it_is_a_value_and_a_document(mechanism: Mechanism, tmp_path: Path) -> N
         for frame in model.frames:
             ours, theirs = model.fk(frame)(at), read.fk(f"new/{frame}")(there)
             assert np.array_equal(ours, theirs, equal_nan=True)
+    there = {f"new/{s}": v for s, v in {**model.default_state(), **dict.fromkeys(model.speeds, 0.5)}.items()}
+    broken = model.violations({k.removeprefix("new/"): v for k, v in there.items()})
+    assert [(f"new/{v.name}", *v[1:]) for v in broken] == [tuple(v) for v in read.violations(there)]
     assert set(read.bodies) == {f"new/{name}" for name in model.bodies}
 
 

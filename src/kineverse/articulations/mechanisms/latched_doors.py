@@ -91,6 +91,7 @@ class DoorWithHandle(HingedDoor):
         reach, or a handle above the door.
     """
 
+    door: Limits = Limits(0.0, 1.9)
     handle: Limits = Limits(0.0, 0.9, 3.0)
     threshold: float = 0.6
     shut: float = 0.01
