@@ -64,7 +64,7 @@ class ImplicitFunction:
     ShapeError
         If the parts do not fit together.
     ValueRejectedError
-        If residual or seed are about other symbols.
+        If residual or seed are about other symbols, or steps are negative.
     """
 
     name: str
@@ -84,6 +84,8 @@ class ImplicitFunction:
             )
         if not all(0 <= row < self.residual.shape[0] for row in self.rows) or len(set(self.rows)) < n:
             raise ShapeError(f"'{self.name}': rows are {n} different ones of {self.residual.shape[0]}.")
+        if self.steps < 0:
+            raise ValueRejectedError(f"'{self.name}' cannot make {self.steps} steps.")
         known = {*self.unknowns, *self.inputs}
         if len(known) < n + len(self.inputs):
             raise ValueRejectedError(f"'{self.name}': a symbol is given twice.")
@@ -120,7 +122,20 @@ class ImplicitFunction:
         return self.chosen.partial(self.inputs)
 
     def of(self, arguments: Sequence[Expression]) -> Expression:
-        """Return the unknowns at other inputs than the function's own, shape (n,)."""
+        """Return the unknowns at other inputs than the function's own, shape (n,).
+
+        Raises
+        ------
+        ShapeError
+            If these are not as many scalars as there are inputs.
+        """
+        if len(arguments) != len(self.inputs):
+            raise ShapeError(
+                f"'{self.name}' is a function of {len(self.inputs)} inputs, not of {len(arguments)}."
+            )
+        shapes = [a.shape for a in arguments if a.shape]
+        if shapes:
+            raise ShapeError(f"'{self.name}' is a function of scalars, not of arrays of shape {shapes[0]}.")
         return Implicit.of(tuple(arguments), (len(self.unknowns),), (self,))
 
     def at(self, part: Expression, x: Sequence[Expression], u: Sequence[Expression]) -> Expression:
@@ -211,14 +226,15 @@ def explain(
     nodes: Sequence[Implicit], symbols: Sequence[Symbol], numbers: npt.NDArray[np.float64]
 ) -> UnsolvedError | None:
     """Return why values are NaN: the first function that has no solution here, None if all have one."""
-    if not nodes or np.isnan(numbers).any():
+    if not nodes:
         return None
     vector = ca.vertcat(*(s._sx for s in symbols)) if symbols else ca.SX(0, 1)
     for node in nodes:
         arguments = [ca.densify(lowered(a)) for a in node.arguments]
         found = ca.Function("at", [vector], [ca.densify(lowered(node.value)), ca.vertcat(*arguments)])
         value, inputs = (np.array(part).ravel() for part in found(numbers))
-        if np.isnan(value).any():
+        # What was asked for at NaN owes no answer; if another function is to blame for it, that came first.
+        if np.isnan(value).any() and not np.isnan(inputs).any():
             names = node.function.inputs
             where = ", ".join(f"{s} = {x:.6g}" for s, x in zip(names, inputs, strict=True))
             return UnsolvedError(
