@@ -22,7 +22,7 @@ from kineverse.symbols import Symbol
 
 CasadiFunction: TypeAlias = Any
 Vector: TypeAlias = npt.NDArray[np.float64]
-Check: TypeAlias = Callable[[Vector, Sequence[Vector]], None]
+Check: TypeAlias = Callable[[Vector, Vector | Sequence[Vector]], None]
 
 NAME = "kineverse_function"
 
@@ -77,7 +77,7 @@ class Program:
         digest.update(repr(details).encode())
         return digest.hexdigest()[:40]
 
-    def check(self, vector: Vector, results: Sequence[Vector]) -> None:
+    def check(self, vector: Vector, results: Vector | Sequence[Vector]) -> None:
         """Raise an error if results are NaN because an implicit function has no solution.
 
         Parameters
@@ -85,14 +85,15 @@ class Program:
         vector
             What was evaluated at, shape (n,).
         results
-            What came out, of any shape.
+            What came out: arrays of any shape, or a single one.
 
         Raises
         ------
         UnsolvedError
             Naming the function, and where it was asked for.
         """
-        if any(np.isnan(result).any() for result in results):
+        arrays = (results,) if isinstance(results, np.ndarray) else results
+        if any(np.isnan(array).any() for array in arrays):
             error = explain(self.implicit, self._symbols, vector)
             if error is not None:
                 raise error
