@@ -104,6 +104,18 @@ def test_a_block_holds_who_is_inside_and_nobody_else() -> None:
     assert [v.name for v in model.violations({"door": 5e-4, "bolt": 0.0})] == ["lock"]
 
 
+def test_both_bounds_have_a_margin() -> None:
+    model = model_with(kv.blocked_unless(door, BACK, lower=0.5, upper=0.7, margin=0.01))
+    for q, left in (
+        (0.495, (0.05, 2.05)),
+        (0.705, (-2.05, -0.05)),
+        (0.6, (-1.0, 1.0)),
+        (0.48, (-inf, inf)),
+        (0.72, (-inf, inf)),
+    ):
+        assert row(model, {"door": q, "bolt": 0.0}) == pytest.approx(left)
+
+
 @pytest.mark.parametrize("q", [0.0, 1e-12, 5e-4, 9.99e-4, 1e-3, 0.2, 1.5, 2.0])
 @pytest.mark.parametrize("b", [0.0, 0.005, 0.01, 0.02])
 def test_rows_are_feasible_wherever_the_part_is(q: float, b: float) -> None:
