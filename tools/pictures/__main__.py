@@ -58,13 +58,12 @@ def drawn(name: str, take: Take) -> np.ndarray:
     count = len(states)
     alone = WIDTH if take.together else WIDTH // 2
     size = ((WIDTH - GAP * (count - 1)) // count if count > 1 else alone, take.height)
-    eye = camera(model, states, take, size[0] / size[1])
-    panels = []
     for state in states:
         violated = model.violations(kv.State(state))
         if violated:
             raise ValueError(f"{name} at {state}: {violated}")
-        panels.append(picture(model, state, size, eye))
+    eye = camera(model, states, take, size[0] / size[1])
+    panels = [picture(model, state, size, eye) for state in states]
     gap = np.full((take.height, GAP, 3), 255, dtype=np.uint8)
     return np.concatenate([part for panel in panels for part in (panel, gap)][:-1], axis=1)
 

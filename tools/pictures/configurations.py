@@ -44,6 +44,9 @@ def through(name: str, *values: float) -> tuple[dict[str, float], ...]:
 BOARD = -math.pi / 2 + 0.35
 """From where what is drawn on an upright board is looked at."""
 
+USER = math.pi + 0.5
+"""From where one looks who uses a mechanism."""
+
 DRIVEN = {"azimuth": 0.3, "elevation": 0.65, "height": 220, "together": True}
 """How bases are looked at: all places that they were at, in one picture."""
 
@@ -123,6 +126,65 @@ TAKES = {
         ),
         **DRIVEN,
     ),
+    "garage_door": Take(
+        (
+            {"garage/door": 0.0, "garage/bolt": 0.0},
+            {"garage/door": 0.6, "garage/bolt": 0.5},
+            {"garage/door": 1.3, "garage/bolt": 0.5},
+        ),
+        azimuth=USER,
+    ),
+    "garage_door_as_published": Take(through("garage/door", 2.0, 1.6, 0.4), azimuth=USER),
+    "folding_door": Take(through("door", 0.0, 0.5, 1.1, 1.84), azimuth=USER, elevation=0.15),
+    "door_with_handle": Take(
+        (
+            {"room/door": 0.0, "room/handle": 0.0},
+            {"room/door": 0.0, "room/handle": 0.8},
+            {"room/door": 1.0, "room/handle": 0.0},
+        ),
+        azimuth=USER,
+        elevation=0.25,
+    ),
+    "latch": Take(
+        (
+            {"gate/door": 0.0, "gate/bolt": 0.0},
+            {"gate/door": 0.4, "gate/bolt": 0.012},
+            {"gate/door": 1.2, "gate/bolt": 0.0},
+        ),
+        azimuth=math.pi - 0.7,
+        elevation=0.25,
+    ),
+    "microwave": Take(
+        (
+            {"oven/door": 0.0, "oven/button": 0.0},
+            {"oven/door": 0.3, "oven/button": 0.006},
+            {"oven/door": 1.6, "oven/button": 0.0},
+        ),
+        azimuth=USER,
+        height=150,
+    ),
+    "faucet": Take(
+        (
+            {"tap/lift": 0.0, "tap/turn": 0.0},
+            {"tap/lift": 0.4, "tap/turn": -0.7},
+            {"tap/lift": 0.4, "tap/turn": 0.7},
+        ),
+        azimuth=USER + 0.6,
+    ),
+    "piston": Take(through("engine", 0.3, 1.8, 3.1), azimuth=BOARD, elevation=0.15),
+    "pedal_bin": Take(through("bin", 0.0, 0.1, 0.17), azimuth=USER, elevation=0.35),
+    "screw_and_nut": Take(through("vise", 0.4, 10.0, 24.0), azimuth=BOARD, elevation=0.2),
+    "scissor_lift": Take(through("lift", 0.15, 0.6, 1.1), azimuth=BOARD, elevation=0.2),
+    "desk_lamp": Take(
+        (
+            {"lamp/lower": -0.3, "lamp/upper": -0.2},
+            {"lamp/lower": 0.3, "lamp/upper": 0.4},
+            {"lamp/lower": 0.6, "lamp/upper": -0.4},
+        ),
+        azimuth=BOARD,
+        elevation=0.15,
+    ),
+    "ratchet": Take(through("winch", 0.0, 0.5, 1.0), azimuth=BOARD, elevation=0.2),
     "four_bar": Take(through("crank", 0.6, 2.4, 4.4), azimuth=BOARD, elevation=0.15),
     "slider_crank": Take(through("crank", 0.4, 1.8, 3.1), azimuth=BOARD, elevation=0.15, height=110),
     "spatial_four_bar": Take(through("drive", 0.0, 2.0, 4.0), azimuth=-0.7),

@@ -18,12 +18,12 @@ from functools import cache
 from kineverse.errors import UnknownNameError, suggest
 from kineverse.model.operation import Operation
 
-from . import axes, bases, couplings, freedoms, linkages
+from . import axes, bases, couplings, freedoms, linkages, mechanisms
 from .scene import Build, Scene
 
 __all__ = ["names", "operations", "summary"]
 
-_FAMILIES = (axes, freedoms, couplings, bases, linkages)
+_FAMILIES = (axes, freedoms, couplings, bases, mechanisms, linkages)
 
 
 def names() -> tuple[str, ...]:

@@ -6,6 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any, TypeAlias
 
 from kineverse.articulations import Joint
+from kineverse.articulations.mechanisms import Mechanism
 from kineverse.expressions.expression import Expression
 from kineverse.formats.urdf.operations import SetBody
 from kineverse.loops import CloseLoop
@@ -63,6 +64,10 @@ class Scene:
         )
         if shapes:
             self.operations.append(SetBody(full, Body(visuals=sum(shapes, ()))))
+
+    def mechanism(self, kind: type[Mechanism], name: str, **fields: Any) -> None:
+        """Put a mechanism into the scene, which brings its frames and bodies."""
+        self.operations.append(kind(name=self.named(name), parent=WORLD, **fields))
 
     def frame(
         self,

@@ -12,19 +12,43 @@ from typing import TypeAlias
 import numpy as np
 import numpy.typing as npt
 
-from kineverse.model.body import Box, Capsule, Cylinder, Geometry, Pose, Rgba, Shape, Sphere
+from kineverse.articulations.mechanisms import solids
+from kineverse.articulations.mechanisms.solids import BLUE, DARK, STEEL, WOOD
+from kineverse.model.body import Box, Capsule, Cylinder, Geometry, Pose, Rgba, Shape, Sphere, Vector3
+
+__all__ = [
+    "BLUE",
+    "DARK",
+    "GREEN",
+    "ORANGE",
+    "RED",
+    "STEEL",
+    "WHITE",
+    "WOOD",
+    "Point",
+    "Shapes",
+    "X",
+    "Y",
+    "Z",
+    "across",
+    "arrow",
+    "ball",
+    "bone",
+    "box",
+    "disc",
+    "gear",
+    "link",
+    "rod",
+    "wheel",
+]
 
 Shapes: TypeAlias = tuple[Shape, ...]
 Point: TypeAlias = Sequence[float] | npt.NDArray[np.float64]
 
-STEEL: Rgba = (0.66, 0.70, 0.74, 1.0)
-DARK: Rgba = (0.27, 0.30, 0.34, 1.0)
-WOOD: Rgba = (0.80, 0.64, 0.44, 1.0)
-WHITE: Rgba = (0.92, 0.92, 0.89, 1.0)
-BLUE: Rgba = (0.20, 0.47, 0.75, 1.0)
 ORANGE: Rgba = (0.93, 0.56, 0.17, 1.0)
 GREEN: Rgba = (0.35, 0.62, 0.38, 1.0)
-RED: Rgba = (0.84, 0.20, 0.18, 1.0)
+WHITE = solids.PALE
+RED = solids.RED
 """The colour of marks, by which one sees what turns."""
 
 X, Y, Z = (1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)
@@ -35,8 +59,7 @@ def box(
     size: Point, at: Point = ORIGIN, color: Rgba = STEEL, *, axis: Point = Z, turn: float = 0.0
 ) -> Shapes:
     """Return a box with its z along an axis, turned about that [rad]."""
-    x, y, z = map(float, size)
-    return (_placed(Box((x, y, z)), at, axis, color, turn),)
+    return (_placed(Box(_triple(size)), at, axis, color, turn),)
 
 
 def disc(radius: float, length: float, at: Point = ORIGIN, axis: Point = Z, color: Rgba = STEEL) -> Shapes:
@@ -51,8 +74,7 @@ def ball(radius: float, at: Point = ORIGIN, color: Rgba = STEEL) -> Shapes:
 
 def rod(start: Point, end: Point, radius: float, color: Rgba = STEEL) -> Shapes:
     """Return a cylinder from one point to another."""
-    way, middle = np.subtract(end, start), np.add(start, end) / 2
-    return (_placed(Cylinder(radius, float(np.linalg.norm(way))), middle, way, color),)
+    return (solids.rod(_triple(start), _triple(end), radius, color),)
 
 
 def bone(start: Point, end: Point, radius: float, color: Rgba = STEEL) -> Shapes:
@@ -124,6 +146,11 @@ def arrow(length: float, height: float, at: Point = ORIGIN, color: Rgba = RED) -
 def across(axis: Point) -> tuple[float, float, float]:
     """Return the direction from which turning about an axis is counted in this module."""
     x, y, z = _frame(axis)[:, 0].tolist()
+    return x, y, z
+
+
+def _triple(point: Point) -> Vector3:
+    x, y, z = map(float, point)
     return x, y, z
 
 
