@@ -24,17 +24,23 @@ from .motions import X, Y, Z, turn
 Vector: TypeAlias = ExpressionLike
 
 
-def translation(x: ExpressionLike, y: ExpressionLike = 0.0, z: ExpressionLike = 0.0) -> Expression:
-    """Return the 4×4 transform that moves by (x, y, z) [m]; a single vector of three is taken apart."""
+def translation(
+    x: ExpressionLike, y: ExpressionLike | None = None, z: ExpressionLike | None = None
+) -> Expression:
+    """Return the 4×4 transform that moves by (x, y, z) [m]; a single vector of three is taken apart.
+
+    What is not given is 0.
+    """
     first = as_expression(x)
-    if first.shape == (3,):
+    if first.shape == (3,) and y is None and z is None:
         parts = tuple(first)
     else:
-        parts = (first, as_expression(y), as_expression(z))
+        parts = (first, as_expression(0.0 if y is None else y), as_expression(0.0 if z is None else z))
     for part in parts:
         if part.shape:
             raise ShapeError(
-                f"A translation is given as x, y, z or as one vector of shape (3,), not {part.shape}."
+                "A translation is given as three numbers x, y, z or as one vector of shape (3,) alone, "
+                f"not by something of shape {part.shape}."
             )
     column = ca.vertcat(_ONE, _ONE, _ONE, *(p._sx for p in parts), _ONE)
     return make(ca.SX(_TRANSLATION, column), (4, 4), union(parts))
@@ -88,14 +94,18 @@ def rpy(roll: ExpressionLike, pitch: ExpressionLike, yaw: ExpressionLike) -> Exp
 def rpy_of(a_R_b: ExpressionLike) -> Expression:
     """Return roll, pitch and yaw [rad], shape (3,), of a rotation or transform; pitch in [-π/2, π/2].
 
-    At pitch ±π/2 roll and yaw are not defined apart, and the derivative does not exist.
+    At pitch ±π/2 roll and yaw are not defined apart: any yaw is given, and the roll that goes with it. The
+    derivative does not exist there.
     """
     r = rotation_of(a_R_b)
+    yaw = arctan2(r[1, 0], r[0, 0])
+    c, s = cos(yaw), sin(yaw)
     return array(
         [
-            arctan2(r[2, 1], r[2, 2]),
+            # Not arctan2(r21, r22), which knows nothing of that yaw and is noise at pitch ±π/2.
+            arctan2(s * r[0, 2] - c * r[1, 2], c * r[1, 1] - s * r[0, 1]),
             arctan2(-r[2, 0], norm(array([r[0, 0], r[1, 0]]))),
-            arctan2(r[1, 0], r[0, 0]),
+            yaw,
         ]
     )
 
@@ -106,11 +116,17 @@ def quaternion(x: ExpressionLike, y: ExpressionLike, z: ExpressionLike, w: Expre
     Raises
     ------
     ValueRejectedError
-        For a constant quaternion of length zero.
+        For a constant quaternion of length zero, or infinite.
     """
     q = array([x, y, z, w])
-    if q.is_constant and not np.any(q()):
-        raise ValueRejectedError("A quaternion of length zero has no direction.")
+    if not q.symbols:
+        largest = float(np.abs(q()).max())
+        if not 0 < largest < math.inf:
+            raise ValueRejectedError(
+                f"A quaternion of length {'zero' if not largest else 'infinity'} has no direction."
+            )
+        # By a power of two, which changes no digit, or the square of something tiny is nothing.
+        q = q * math.ldexp(1.0, min(-math.frexp(largest)[1], 1000))
     scale = 2 / (q @ q)
     x, y, z, w = q
     return array(
