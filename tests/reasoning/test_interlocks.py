@@ -6,21 +6,13 @@ import math
 
 import numpy as np
 import pytest
+from constraints import model
 
 import kineverse as kv
 from kineverse import reasoning
 from kineverse.reasoning import Box, Interlock, Interlocks, Interval, interlocks
 
 A, B, C, D, E, F = (kv.position(name) for name in "abcdef")
-
-
-def model(**constraints) -> kv.Model:
-    """Return a model with nothing but constraints; of a symbol's name, its position's limits."""
-    result = kv.Model()
-    with result.edit() as edit:
-        for name, (lower, expression, upper) in constraints.items():
-            edit.constrain(name, lower, expression, upper)
-    return result
 
 
 def found(*, decided: bool = True, **constraints) -> Interlocks:

@@ -22,7 +22,7 @@ from .values import Value, constant, evaluate, live_arguments
 
 T = TypeVar("T")
 
-CASES_AT_MOST = 2000
+CASES_AT_MOST = 1000
 NEGLIGIBLE = 1e-12
 """Constants up to this are what rounding left of 0."""
 _SAME = 1e-12
@@ -71,7 +71,9 @@ class Case:
         self._order = reachable(roots) if order is None else order
         self._values: dict[int, Value] = {}
         for term in self._order:
-            self._values[term.index] = self._evaluated(term)
+            value = self._values[term.index] = self._evaluated(term)
+            if value.polynomial is None:
+                self.sign(term)  # from the bottom up, as graphs may be deeper than Python's stack
 
     # -- what holds ----------------------------------------------------------------------------------------
 
@@ -107,9 +109,7 @@ class Case:
         """Return the conditions, without those that limits make anyway."""
         sides = {}
         for axis, side in self._axes.items():
-            limit = self._sum({((s, 1),): f for s, f in axis}) if len(axis) > 1 else None
-            if limit is None:
-                limit = self._limits.get(axis[0][0], Interval())
+            limit = self._limits.get(axis[0][0], Interval()) if len(axis) == 1 else Interval()
             low = side.lower == limit.lower and side.lower_closed == limit.lower_closed
             high = side.upper == limit.upper and side.upper_closed == limit.upper_closed
             sides[axis_expression(axis)] = Interval(
@@ -174,6 +174,10 @@ class Case:
                 side, coefficients = self.interval(((symbol, Fraction(1)),)), p.coefficients()
                 if not exact.roots(coefficients, side):
                     return _sign_of(exact.value_at(coefficients, _inside(side)))
+        if term.op in (ca.OP_MUL, ca.OP_DIV) and not p:
+            signs = [self.sign(argument) for argument in term.args]
+            if 0 in signs or None not in signs:
+                return 0 if 0 in signs else 1 if signs[0] == signs[1] else -1
         low, high = value.range
         if low > 0 or (term.op == ca.OP_EXP and high > 0):
             return 1
@@ -213,10 +217,10 @@ class Case:
         if p is not None and p.degree == 1:
             axis, scale = p.axis()
             return self._divided(term, axis, [-p.offset / scale], _SAME, lambda x: scale * x + p.offset)
+        if any(part.op == "implicit" for part in reachable((term,))):
+            return f"a condition contains an implicit function of {names}"
         if len(value.live) != 1:
-            solved = any(part.op == "implicit" for part in reachable((term,)))
-            what = "implicit functions" if solved else "a condition that is not linear"
-            return f"{names} occur together in {what}" if len(value.live) > 1 else f"{what} of {names}"
+            return f"{names} occur together in a condition that is not linear"
         (symbol,) = value.live
         axis = ((symbol, Fraction(1)),)
         side = self.interval(axis)
@@ -254,6 +258,9 @@ class Case:
             if cut in whole and cut not in cuts:
                 cuts.append(cut)
         pieces: list[tuple[Interval, int]] = []
+        inner = whole
+        if len(axis) > 1:  # what is known of its parts anyway is no condition on a sum
+            whole = self._axes.get(axis, Interval())
         start, closed = whole.lower, whole.lower_closed
         for cut in sorted(cuts):
             pieces += [(Interval(start, cut, closed, False), 2), (Interval(cut, cut, True, True), 0)]
@@ -262,7 +269,7 @@ class Case:
         cases = []
         for side, sign in pieces:
             if not side.is_empty:
-                known = sign if sign == 0 else _sign_of(at(_inside(side)))
+                known = sign if sign == 0 else _sign_of(at(_inside(side.intersection(inner))))
                 signs = {**self._signs, term.index: known}
                 cases.append(Case(self._roots, self._limits, {**self._axes, axis: side}, signs, self._order))
         return [case for case in cases if not case.is_empty]

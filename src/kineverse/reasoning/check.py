@@ -3,10 +3,7 @@
 import math
 import random
 from collections.abc import Iterator
-from functools import lru_cache
-from typing import TypeAlias
 
-from kineverse.compile import CompiledFunction, compile  # noqa: A004
 from kineverse.errors import UnsolvedError
 from kineverse.expressions.expression import Expression
 from kineverse.model.constraint import Constraint
@@ -17,21 +14,22 @@ from kineverse.symbols import Symbol
 from .boxes import Box
 from .interlock import Interlock, Interlocks
 
-Point: TypeAlias = dict[Symbol, float]
-Room: TypeAlias = tuple[float, float]
+Point = dict[Symbol, float]
+Room = tuple[float, float]
+Limits = dict[Expression, Room]
 ANY: Room = (-math.inf, math.inf)
 
 
 def contradictions(model: ModelView, found: Interlocks, points: int = 20, seed: int = 0) -> list[str]:
-    """Return claims that are wrong at one of many points, and locks there that nobody claimed."""
-    parts = {n: tuple(map(plain, (c.lower, c.expression, c.upper))) for n, c in model.constraints.items()}
-    rows = {n: Constraint(*triple) for n, triple in parts.items()}
-    limits: dict[Expression, Room] = {}
+    """Return claims that are wrong at one of many points, in boxes and beside them, and locks not claimed."""
+    given = model.constraints.items()
+    rows = {n: Constraint(*map(plain, (c.lower, c.expression, c.upper))) for n, c in given}
+    limits: Limits = {}
     for c in rows.values():
         if not c.lower.symbols and not c.upper.symbols:
             low, high = limits.get(c.expression, ANY)
             limits[c.expression] = (max(low, float(c.lower)), min(high, float(c.upper)))
-    symbols = {s for c in rows.values() for s in c.symbols} | {*model.symbols}
+    symbols = {s for c in rows.values() for s in c.symbols} | {*model.symbols, *model.rates.dependent}
     chance, wrong = random.Random(seed), dict[str, None]()
     told = [box for item in found for box in item.when] + [box for u in found.undecided for box in u.where]
     for box in [Box({})] * 5 + list(dict.fromkeys(told)):
@@ -45,9 +43,7 @@ def contradictions(model: ModelView, found: Interlocks, points: int = 20, seed: 
     return list(wrong)
 
 
-def _compared(
-    rows: dict[str, Constraint], found: Interlocks, limits: dict[Expression, Room], point: Point
-) -> Iterator[str]:
+def _compared(rows: dict[str, Constraint], found: Interlocks, limits: Limits, point: Point) -> Iterator[str]:
     unknown = {u.constraint for u in found.undecided if any(_inside(box, point) for box in u.where)}
     rooms: dict[Expression, dict[str, Room]] = {}
     for name, c in rows.items():
@@ -82,7 +78,9 @@ def _room(c: Constraint, held: Expression, point: Point) -> Room:
         low, high = (low - zero) / (one - zero), (high - zero) / (one - zero)
         return (low, high) if one > zero else (high, low)
     back = _at(c.expression, {s: -x if s.order else x for s, x in point.items()})
-    return (max(low, 0.0) if c.order and min(here, back) >= 0 >= high else low), high
+    if c.order and min(here, back) >= 0 >= low:
+        low = 0.0 if high <= 0 else -math.inf
+    return low, high
 
 
 def _fits(lock: Interlock, limit: Room, room: Room, point: Point) -> bool:
@@ -101,24 +99,21 @@ def _inside(box: Box, point: Point) -> bool:
     return all(_at(axis, point) in side for axis, side in box.items())
 
 
-def _point(symbols: list[Symbol], box: Box, limits: dict[Expression, Room], chance: random.Random) -> Point:
-    """Return a random point: in a box, or close to some of its faces on either side."""
-    ends = {s: limits.get(s, ANY) for s in symbols}
-    point = {s: s.value or chance.uniform(max(low, -9.0), min(high, 9.0)) for s, (low, high) in ends.items()}
+def _point(symbols: list[Symbol], box: Box, limits: Limits, chance: random.Random) -> Point:
+    point, ends = dict[Symbol, float](), dict[Symbol, Room]()
+    for s in symbols:
+        low, high = limits.get(s, ANY)
+        low, high = ends[s] = (low + 1e-5, high - 1e-5) if high - low > 1e-4 else (low, high)
+        a, b = max(low, -9.0), min(high, 9.0)
+        point[s] = s.value or chance.choice((a, b, chance.uniform(a, b), chance.uniform(a, b)))
     for axis, side in box.items():
         symbol, faces = axis.symbols[0], [float(x) for x in (side.lower, side.upper) if math.isfinite(x)]
-        near = [x + e * (1 + abs(x)) for x in faces for e in (-0.5, -1e-4, 1e-4, 0.5)]
-        near.append(chance.uniform(max(float(side.lower), -9.0), min(float(side.upper), 9.0)))
+        near = [chance.uniform(max(float(side.lower), -9.0), min(float(side.upper), 9.0))]
+        near += [x + e * (1 + abs(x)) for x in faces for e in (-0.5, -1e-4, 1e-4, 0.5)]
         zero, one = (_at(axis, {**point, symbol: x}) for x in (0.0, 1.0))
-        low, high = ends.get(symbol, ANY)
-        point[symbol] = min(max((chance.choice(near) - zero) / (one - zero), low), high)
+        point[symbol] = sorted([*ends[symbol], (chance.choice(near) - zero) / (one - zero)])[1]
     return point
 
 
-@lru_cache(4096)
-def _function(expression: Expression) -> CompiledFunction:
-    return compile(expression, tier="interpreter")
-
-
 def _at(expression: Expression, point: Point) -> float:
-    return float(_function(expression)({s: point[s] for s in expression.symbols}))
+    return float(expression({s: point[s] for s in expression.symbols}))

@@ -72,7 +72,8 @@ def square(a: Range) -> Range:
 def reciprocal(a: Range) -> Range:
     """Return the range of 1/x for x of one sign, which may come close to 0."""
     if a[0] >= 0:
-        return outwards(1 / a[1] if a[1] else math.inf, 1 / a[0] if a[0] else math.inf)
+        low, high = outwards(1 / a[1] if a[1] else math.inf, 1 / a[0] if a[0] else math.inf)
+        return max(0.0, low), high
     if a[1] <= 0:
         return negative(reciprocal(negative(a)))
     return ALL

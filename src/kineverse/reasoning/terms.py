@@ -147,7 +147,7 @@ class Terms:
         if op == ca.OP_TWICE:
             return self._step(ca.OP_MUL, (args[0], self.constant(2.0)))
         if op == ca.OP_INV:
-            return self._step(ca.OP_DIV, (self.constant(1.0), args[0]))
+            return self._operation(ca.OP_DIV, (self.constant(1.0), args[0]))
         if op == ca.OP_SQ:
             return self._step(ca.OP_MUL, (args[0], args[0]))
         if op in _COMPARISONS or op in (ca.OP_FMIN, ca.OP_FMAX):
@@ -190,7 +190,7 @@ class Terms:
             ends = () if node.periodic else tuple(self.minus(args[0], self.constant(t)) for t in node.knots)
             return self._step("piecewise", args, (node.periodic, node.knots, node.pieces), ends)
         op = ca.OP_FMIN if node.options[0] == "min" else ca.OP_FMAX
-        return self._operation(op, args)
+        return reduce(lambda a, b: self._operation(op, (a, b)), args)
 
 
 def _parts(node: Node) -> tuple[Expression, ...]:

@@ -113,7 +113,7 @@ def _crossing(look: Look, low: float, high: float) -> list[float] | None:
     a, b = low, high
     if not first and not last:
         return None
-    while b - a > _WIDTH * max(1.0, abs(a), abs(b)):
+    while math.isinf(b - a) or b - a > _WIDTH * max(1.0, abs(a), abs(b)):
         middle = _middle(a, b)
         if not a < middle < b:
             break
@@ -127,9 +127,11 @@ def _crossing(look: Look, low: float, high: float) -> list[float] | None:
             a, b = (a, middle) if here == last else (middle, b)
     zero = a if not first and a == low else b if not last and b == high else _middle(a, b)
     near = _CLOSE * max(1.0, abs(zero))
-    for side, end in ((zero - near, low), (zero + near, high)):
-        if (side > end if end == low else side < end) and not _sign_at(look, side):
-            return None
+    below, above = _sign_at(look, max(low, zero - near)), _sign_at(look, min(high, zero + near))
+    if (zero > low and (not below or (first and below != first))) or (
+        zero < high and (not above or (last and above != last))
+    ):
+        return None
     return [zero]
 
 

@@ -1,0 +1,84 @@
+"""The checker fails where it has to: wrong claims, missing claims, boxes that are too large or too small."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from constraints import model
+
+import kineverse as kv
+from kineverse import reasoning
+from kineverse.reasoning import Box, Interlock, Interlocks, Interval, Undecided, interlocks
+
+A, B = kv.position("a"), kv.position("b")
+SPEED = A.derivative()
+SHUT = Box({A: Interval(lower=1.99), B: Interval(upper=0.3)})
+
+
+def garage() -> kv.Model:
+    unlocked = ~((B < 0.3) & (A > 1.99))
+    return model(
+        range=(0, A, 2), bolt=(0, B, 0.6), free=(-1, B.derivative(), 1), lock=(-unlocked, SPEED, unlocked)
+    )
+
+
+def lock(*boxes: Box, hold: str = "stands still", held: kv.Symbol = SPEED) -> Interlock:
+    return Interlock(held, hold, ("lock",), boxes)  # type: ignore[arg-type]
+
+
+def test_the_right_answer_passes() -> None:
+    assert reasoning.contradictions(garage(), Interlocks([lock(SHUT)])) == []
+    assert interlocks(garage()) == Interlocks([lock(SHUT)])
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        [],
+        [lock(Box({}))],
+        [lock(SHUT, hold="cannot increase")],
+        [lock(SHUT, hold="cannot decrease")],
+        [lock(Box({A: Interval(lower=1.99)}))],
+        [lock(Box({B: Interval(upper=0.3)}))],
+        [lock(Box({A: Interval(lower=1.98), B: Interval(upper=0.3)}))],
+        [lock(Box({A: Interval(lower=1.995), B: Interval(upper=0.3)}))],
+        [lock(Box({A: Interval(lower=1.99), B: Interval(upper=0.31)}))],
+        [lock(Box({A: Interval(lower=1.99), B: Interval(upper=0.29)}))],
+        [lock(Box({A: Interval(lower=1.99), B: Interval(0.1, 0.3)}))],
+        [lock(Box({A: Interval(upper=1.99), B: Interval(upper=0.3)}))],
+        [lock(SHUT, Box({B: Interval(lower=0.5)}))],
+        [lock(SHUT), lock(Box({A: Interval(lower=1)}), held=B.derivative())],
+    ],
+)
+def test_wrong_answers_do_not(wrong: list[Interlock]) -> None:
+    assert reasoning.contradictions(garage(), Interlocks(wrong))
+
+
+def test_what_is_unknown_is_not_held_against_anybody() -> None:
+    assert reasoning.contradictions(garage(), Interlocks([], [Undecided("lock", "of tiredness")])) == []
+    elsewhere = Undecided("lock", "of tiredness", (Box({B: Interval(lower=0.3)}),))
+    assert reasoning.contradictions(garage(), Interlocks([], [elsewhere]))
+
+
+def kept(lower: kv.Expression | float, upper: kv.Expression | float, *boxes: Box) -> Interlock:
+    bounds = (kv.array(lower), kv.array(upper))
+    return Interlock(A, "stays within", ("lock",), boxes or (Box({}),), *bounds)
+
+
+def test_ranges() -> None:
+    subject = model(range=(0, A, 2), other=(0, B, 1), lock=(0, A, 0.5 + B))
+    assert reasoning.contradictions(subject, Interlocks([kept(0, B + 0.5)])) == []
+    assert reasoning.contradictions(subject, Interlocks([kept(0, B + 0.51)]))
+    assert reasoning.contradictions(subject, Interlocks([kept(0, 0.5)]))
+    assert reasoning.contradictions(subject, Interlocks([kept(0, B + 0.5, Box({B: Interval(upper=0.5)}))]))
+    assert reasoning.contradictions(subject, Interlocks([]))
+    nothing = Interlock(A, "has no value", ("lock",), (Box({B: Interval(upper=0.1)}),))
+    assert reasoning.contradictions(subject, Interlocks([kept(0, B + 0.5), nothing]))
+
+
+def test_it_is_short_and_shares_nothing_with_what_it_checks() -> None:
+    text = Path(reasoning.check.__file__).read_text(encoding="utf-8")
+    assert len([line for line in text.splitlines() if line.strip()]) < 100
+    own = {line.split()[1] for line in text.splitlines() if line.startswith("from .")}
+    assert own == {".boxes", ".interlock"}

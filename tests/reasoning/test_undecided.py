@@ -1,0 +1,97 @@
+"""What cannot be decided is said, with the constraint, the reason and where."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from constraints import model
+
+import kineverse as kv
+from kineverse import reasoning
+from kineverse.reasoning import Box, Interval, interlocks
+from kineverse.reasoning.cases import CASES_AT_MOST
+
+A, B, C = (kv.position(name) for name in "abc")
+SPEED = A.derivative()
+
+
+def undecided(lower, upper, **others) -> tuple[reasoning.Undecided, ...]:
+    subject = model(b=(-1, B, 1), c=(-1, C, 1), lock=(lower, SPEED, upper), **others)
+    result = interlocks(subject)
+    assert reasoning.contradictions(subject, result) == []
+    assert {u.constraint for u in result.undecided} <= {"lock"}
+    return result.undecided
+
+
+def test_two_coordinates_in_what_is_not_linear() -> None:
+    (unknown,) = undecided(-1, B * C < 0.3)
+    assert unknown.reason == "b and c occur together in a condition that is not linear"
+    assert unknown.where == (Box({}),)
+    assert str(unknown).startswith("lock: unknown, as b and c occur together")
+
+
+def test_only_where_it_matters() -> None:
+    (unknown,) = undecided(-1, (np.sin(B * C) < 0.3) & (B < 0.5))
+    assert unknown.where == (Box({B: Interval(upper=0.5)}),)
+
+
+def test_what_limits_decide_is_decided() -> None:
+    assert undecided(-1, B * C < 1.5) == ()
+    assert undecided(-1, kv.norm([B, C]) < 2) == ()
+    assert undecided(-1, 2 + np.sin(B * C)) == ()
+
+
+def test_no_numbers() -> None:
+    (unknown,) = undecided(-1, np.sqrt(B) + 0.1)
+    assert (unknown.reason, unknown.where) == ("a bound is not a number", (Box({B: Interval(upper=0)}),))
+    (unknown,) = undecided(-1, np.arccos(2 * B) < 1)
+    assert unknown.where == (Box({B: Interval(upper=-0.5)}), Box({B: Interval(lower=0.5)}))
+    (unknown,) = undecided(-1, 1 / B**2)
+    assert unknown.where[0][B] == Interval(0, 0, True, True)
+    # In the branch that is not taken NaN does no harm.
+    assert undecided(-1, kv.where(B > 0, np.sqrt(B), 0.0)) == ()
+
+
+def test_no_limits_and_many_thresholds() -> None:
+    angle = kv.position("angle")
+    (unknown,) = undecided(-1, np.sin(angle) < 0.3)
+    assert unknown.reason == "where a condition on angle changes cannot be made certain"
+    assert undecided(-1, np.arctan(angle) < 0.3) == ()
+
+
+def test_thresholds_that_are_only_touched() -> None:
+    assert undecided(-1, (B - 0.25) ** 2 > 0) == ()  # a polynomial: exact
+    (unknown,) = undecided(-1, np.cos(B) < 1)
+    assert "cannot be made certain" in unknown.reason
+
+
+def test_ramps() -> None:
+    (unknown,) = undecided(-1, kv.less(B, 0.1, contrast=100))
+    assert unknown.reason == "a comparison of contrast 100 is on its ramp, 0.4 wide"
+    side = unknown.where[0][B]
+    assert (side.lower, side.upper) == pytest.approx((-0.1, 0.3))
+
+
+def test_too_many_cases() -> None:
+    many = [kv.position(f"x{i}") for i in range(9)]
+    parity = kv.less(many[0], 0.5)
+    for x in many[1:]:
+        other = kv.less(x, 0.5)
+        parity = (parity & ~other) | (~parity & other)
+    unknown = undecided(-1, parity)
+    assert f"there are more than {CASES_AT_MOST} cases to distinguish" in {u.reason for u in unknown}
+
+
+def test_several_coordinates_at_once() -> None:
+    subject = model(both=(0, A * A + B * B, 1))
+    (unknown,) = interlocks(subject).undecided
+    assert unknown.reason == "it limits several coordinates at once, and they are not just added"
+
+
+def test_implicit_functions() -> None:
+    four_bar = kv.load("articulations/four_bar")
+    angle = next(iter(four_bar.rates.dependent.values()))
+    with four_bar.edit() as edit:
+        edit.constrain("lock", -1, SPEED, angle < 0.1)
+    (unknown,) = interlocks(four_bar).undecided
+    assert "implicit function" in unknown.reason
