@@ -59,10 +59,10 @@ class Driving:
             moved = self._model.integrate(values, self.speeds, min(seconds, LONGEST))
             changed = {name: moved[name] for name in values if moved[name] != values[name]}
             broken = {v.name for v in self._model.violations({**values, **changed})}
-            if broken and broken - {v.name for v in self._model.violations(values)}:
-                changed = {}
+            stuck = bool(broken) and not broken <= {v.name for v in self._model.violations(values)}
         except KineverseError:
-            changed = {}
-        if not changed:
+            stuck = True
+        if stuck:
             self.stop()
+            return {}
         return changed

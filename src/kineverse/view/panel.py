@@ -151,8 +151,10 @@ class Panel:
         with gui.add_folder("drive"):
             for name in self._driving.speeds:
                 low, high = limits[name]
+                path = name.removesuffix(":velocity")
+                unit = f" [{self._units[path]}/s]" if self._units.get(path) else ""
                 slider = gui.add_slider(
-                    name.rpartition("/")[2].removesuffix(":velocity"),
+                    path.rpartition("/")[2] + unit,
                     min=low,
                     max=high,
                     step=step((low, high)),
