@@ -7,7 +7,7 @@ never multiply the branch that was not taken, and a norm has gradient 0 at the o
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
 import casadi as ca
@@ -165,15 +165,38 @@ def where(condition: ExpressionLike, if_true: ExpressionLike, if_false: Expressi
 
 
 def minimum(a: ExpressionLike, b: ExpressionLike) -> Expression:
-    """Return the smaller, elementwise; the gradient is that of the smaller one, the mean of both at a tie."""
+    """Return the smaller, elementwise; the gradient is that of the smaller one, the mean of both at a tie.
+
+    NaN if one of them is NaN, and so is the gradient then; ``np.fmin`` returns the other one.
+    """
     x, y = broadcast(as_expression(a), as_expression(b))
     return Extremum.of((x, y), x.shape, ("min",))
 
 
 def maximum(a: ExpressionLike, b: ExpressionLike) -> Expression:
-    """Return the larger, elementwise; the gradient is that of the larger one, the mean of both at a tie."""
+    """Return the larger, elementwise; the gradient is that of the larger one, the mean of both at a tie.
+
+    NaN if one of them is NaN, and so is the gradient then; ``np.fmax`` returns the other one.
+    """
     x, y = broadcast(as_expression(a), as_expression(b))
     return Extremum.of((x, y), x.shape, ("max",))
+
+
+def fmin(a: ExpressionLike, b: ExpressionLike) -> Expression:
+    """Return the smaller, elementwise, and of a number and NaN the number."""
+    x, y = broadcast(as_expression(a), as_expression(b))
+    return where(_is_number(x), where(_is_number(y), minimum(x, y), x), y)
+
+
+def fmax(a: ExpressionLike, b: ExpressionLike) -> Expression:
+    """Return the larger, elementwise, and of a number and NaN the number."""
+    x, y = broadcast(as_expression(a), as_expression(b))
+    return where(_is_number(x), where(_is_number(y), maximum(x, y), x), y)
+
+
+def _is_number(x: Expression) -> Expression:
+    """Return 0 where x is NaN and 1 elsewhere, infinities included."""
+    return binary(ca.OP_LE, absolute(x), math.inf)
 
 
 def clip(x: ExpressionLike, lower: ExpressionLike, upper: ExpressionLike) -> Expression:
@@ -206,37 +229,43 @@ def sum_along(x: ExpressionLike, axis: int | tuple[int, ...] | None = None) -> E
     return make(ca.sum1(rows._sx).T, (rows.shape[1],), rows._nodes).reshape(rest)
 
 
+def product_along(x: ExpressionLike, axis: int | tuple[int, ...] | None = None) -> Expression:
+    """Return the product of all elements, or along one axis or several; 1 of none."""
+    rows, rest = _axis_first(x, axis)
+    result = as_expression(np.ones(rows.shape[1]))
+    for row in rows:
+        result = result * row
+    return result.reshape(rest)
+
+
 def smallest(x: ExpressionLike, axis: int | tuple[int, ...] | None = None) -> Expression:
-    """Return the smallest of all elements, or along one axis or several; see :func:`minimum`."""
-    return _knocked_out(minimum, x, axis)
+    """Return the smallest of all elements, or along one axis or several.
+
+    The gradient is the mean of those of all the elements that are the smallest; see :func:`minimum`.
+    """
+    return _among(x, axis, "min")
 
 
 def largest(x: ExpressionLike, axis: int | tuple[int, ...] | None = None) -> Expression:
-    """Return the largest of all elements, or along one axis or several; see :func:`maximum`."""
-    return _knocked_out(maximum, x, axis)
+    """Return the largest of all elements, or along one axis or several.
+
+    The gradient is the mean of those of all the elements that are the largest; see :func:`maximum`.
+    """
+    return _among(x, axis, "max")
 
 
-def _knocked_out(
-    winner: Callable[[Expression, Expression], Expression],
-    x: ExpressionLike,
-    axis: int | tuple[int, ...] | None,
-) -> Expression:
-    """Return who wins against all others, in rounds, so that depth grows as the logarithm of their number."""
+def _among(x: ExpressionLike, axis: int | tuple[int, ...] | None, which: str) -> Expression:
     rows, rest = _axis_first(x, axis)
     if not rows.shape[0]:
         raise ShapeError("Nothing has no smallest or largest element.")
-    columns = [list(column) for column in rows.T]
-    for elements in columns:
-        while len(elements) > 1:
-            odd = elements[-1:] if len(elements) % 2 else []
-            elements[:] = [winner(a, b) for a, b in zip(elements[:-1:2], elements[1::2], strict=False)] + odd
-    return array([elements[0] for elements in columns]).reshape(rest)
+    columns = (tuple(column) for column in rows.T)
+    return array([c[0] if len(c) == 1 else Extremum.of(c, (), (which,)) for c in columns]).reshape(rest)
 
 
 def _axis_first(x: ExpressionLike, axis: int | tuple[int, ...] | None) -> tuple[Expression, tuple[int, ...]]:
     """Return a matrix with the wanted axes as its rows and all others as its columns; the others' shape."""
     operand = as_expression(x)
-    axes = tuple(range(operand.ndim)) if axis is None else (axis,) if isinstance(axis, int) else tuple(axis)
+    axes = tuple(range(operand.ndim)) if axis is None else axis if isinstance(axis, tuple) else (axis,)
     try:
         index = np.moveaxis(layout.indices(operand.shape), axes, range(len(axes)))
     except (ValueError, TypeError):
@@ -306,7 +335,7 @@ def _selected(holds: Expression, if_true: Expression, if_false: Expression) -> E
 
 
 class Extremum(Node):
-    """``minimum`` and ``maximum`` of two arguments of the node's shape."""
+    """``minimum`` and ``maximum`` of two or more arguments of the node's shape."""
 
     __slots__ = ()
     kind = "extremum"
@@ -318,21 +347,34 @@ class Extremum(Node):
         return f"{self.options[0]}imum"
 
     def _value(self) -> Expression:
-        return binary(ca.OP_FMIN if self.options[0] == "min" else ca.OP_FMAX, *self.arguments)
+        number = _in_rounds(ca.OP_FMIN if self.options[0] == "min" else ca.OP_FMAX, self.arguments)
+        # Where an argument is NaN this is NaN, and else a number or infinite. CasADi takes x == x for true,
+        # and 0 <= sqrt(x) too.
+        size = _in_rounds(ca.OP_ADD, tuple(map(absolute, self.arguments)))
+        unordered = unary(ca.OP_NOT, binary(ca.OP_LE, size, math.inf))
+        # Subtracted, because -0 + 0 would be another zero.
+        return number - binary(ca.OP_IF_ELSE_ZERO, unordered, size)
 
     def _gradient(self, heuristic: bool) -> Mapping[Symbol, Expression]:
-        x, y = self.arguments
-        first, second = (x, y) if self.options[0] == "min" else (y, x)
-        share = (
-            1 + binary(ca.OP_LT, first, second) - binary(ca.OP_LT, second, first)
-        ) / 2  # 1, 0, at a tie 0.5
+        won = [binary(ca.OP_EQ, argument, self.value) for argument in self.arguments]
+        each = 1 / _in_rounds(ca.OP_ADD, won)
         result: dict[Symbol, Expression] = {}
-        for part, gradient in ((share, x.gradient(heuristic)), (1 - share, y.gradient(heuristic))):
-            for key, entry in gradient.items():
+        for argument, wins in zip(self.arguments, won, strict=True):
+            share = wins * each  # 1, 0, at a tie 1/n; of NaN 0/0, NaN as well
+            for key, entry in argument.gradient(heuristic).items():
                 # Zero times NaN would be NaN; what has no share is not looked at.
-                term = binary(ca.OP_IF_ELSE_ZERO, part, part * entry)
+                term = binary(ca.OP_IF_ELSE_ZERO, share, share * entry)
                 result[key] = result[key] + term if key in result else term
         return result
+
+
+def _in_rounds(op: int, operands: Sequence[Expression]) -> Expression:
+    """Return operands joined in pairs, these again in pairs, and so on: a thousand are ten deep."""
+    joined = list(operands)
+    while len(joined) > 1:
+        odd = joined[-1:] if len(joined) % 2 else []
+        joined = [binary(op, x, y) for x, y in zip(joined[:-1:2], joined[1::2], strict=False)] + odd
+    return joined[0]
 
 
 class Norm(Node):

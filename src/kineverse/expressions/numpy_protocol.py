@@ -39,9 +39,9 @@ _UFUNCS: dict[Any, Callable[..., Any]] = {
     np.floor_divide: floor_divide,
     np.remainder: lambda a, b: as_expression(a) % b,
     np.minimum: f.minimum,
-    np.fmin: f.minimum,
+    np.fmin: f.fmin,
     np.maximum: f.maximum,
-    np.fmax: f.maximum,
+    np.fmax: f.fmax,
     np.hypot: f.hypot,
     np.matmul: matmul,
     np.reciprocal: lambda a: 1 / as_expression(a),
@@ -64,6 +64,11 @@ _UFUNCS: dict[Any, Callable[..., Any]] = {
 }
 
 
+_REDUCTIONS = {
+    np.add: f.sum_along, np.multiply: f.product_along, np.minimum: f.smallest, np.maximum: f.largest,
+}  # fmt: skip
+
+
 def apply_ufunc(ufunc: Any, method: str, inputs: tuple[Any, ...], options: Mapping[str, Any]) -> Any:
     """Carry out a numpy ufunc on expressions.
 
@@ -72,8 +77,8 @@ def apply_ufunc(ufunc: Any, method: str, inputs: tuple[Any, ...], options: Mappi
     ExpressionError
         For ufuncs, methods or options that have no counterpart.
     """
-    if method == "reduce" and ufunc is np.add and not set(options) - {"axis"}:
-        return f.sum_along(inputs[0], options.get("axis", 0))
+    if method == "reduce" and ufunc in _REDUCTIONS and not set(options) - {"axis"}:
+        return _REDUCTIONS[ufunc](inputs[0], options.get("axis", 0))
     if options.get("out") is not None:
         raise ExpressionError(
             f"np.{ufunc.__name__} cannot write expressions into an existing array of numbers."
@@ -185,13 +190,6 @@ def _norm(x: Any, ord: Any = None, axis: int | None = None) -> Expression:  # no
     return f.norm(x)
 
 
-def _product(a: Any, axis: None = None) -> Expression:
-    result = as_expression(1.0)
-    for element in as_expression(a).ravel():
-        result = result * element
-    return result
-
-
 _FUNCTIONS: dict[Any, Callable[..., Any]] = {
     np.where: f.where,
     np.clip: _clip,
@@ -199,7 +197,7 @@ _FUNCTIONS: dict[Any, Callable[..., Any]] = {
     np.mean: _mean,
     np.min: lambda a, axis=None: f.smallest(a, axis),
     np.max: lambda a, axis=None: f.largest(a, axis),
-    np.prod: _product,
+    np.prod: lambda a, axis=None: f.product_along(a, axis),
     np.trace: _trace,
     np.dot: _dot,
     np.inner: lambda a, b: _dot(a, as_expression(b).T),

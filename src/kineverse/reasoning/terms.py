@@ -190,7 +190,10 @@ class Terms:
             ends = () if node.periodic else tuple(self.minus(args[0], self.constant(t)) for t in node.knots)
             return self._step("piecewise", args, (node.periodic, node.knots, node.pieces), ends)
         op = ca.OP_FMIN if node.options[0] == "min" else ca.OP_FMAX
-        return reduce(lambda a, b: self._operation(op, (a, b)), args)
+        result = args[0]
+        for other in args[1:]:
+            result = self._operation(op, (result, other))
+        return result
 
 
 def _parts(node: Node) -> tuple[Expression, ...]:

@@ -247,10 +247,12 @@ class Graph:
         self._opaque(Select, exactly(node, 4)[1:])
 
     def _extremum(self, node: list[Any]) -> None:
-        _, which, a, b = exactly(node, 4)
+        if len(node) < 4:
+            raise RefusedError("an extremum is one of at least two expressions")
+        _, which, *refs = node
         if which not in ("min", "max"):
             raise RefusedError(f"an extremum is 'min' or 'max', not {_short(which)}")
-        self._opaque(Extremum, [a, b], (which,))
+        self._opaque(Extremum, refs, (which,))
 
     def _norm(self, node: list[Any]) -> None:
         (ref,) = exactly(node, 2)[1:]

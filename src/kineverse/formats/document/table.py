@@ -16,7 +16,8 @@ node                                                                  meaning
 ``["augment", ref, replace, heuristic, [[symbol, ref], ...]]``        a value with given gradient entries
 ``["less", ref, ref, contrast]``, ``["not", ref]``,                   continuous logic
 ``["and", ref, ...]``, ``["or", ref, ...]``
-``["select", condition, ref, ref]``, ``["extremum", "min", ref, ref]``  choices, elementwise
+``["select", condition, ref, ref]``,                                  choices, elementwise
+``["extremum", "min", ref, ref, ...]``
 ``["norm", ref]``                                                     the Euclidean norm of a vector
 ``["piecewise", ref, periodic, [knot, ...], [[c0, c1, ...], ...]]``   a piecewise polynomial, elementwise
 ``["carried", symbol, [[symbol, [[speed, ref], ...]], ...]]``         a coordinate with the rate table that
