@@ -15,15 +15,13 @@ from kineverse.expressions.implicit import ImplicitFunction
 from kineverse.symbols import Symbol
 
 from .branches import find_branches, nearest_closed
-from .continuation import follow
 from .equations import CLOSED, Array, Equations, periodic
+from .samples import Samples
 from .seed import Interval, Seed
 
 RANK = 1e-7
 """What a singular value is, relative to the largest, below which a direction counts as free."""
 
-_SAMPLES = {1: 65, 2: 17, 3: 9}
-_TRIED = 200
 _DEGREES = (2, 3, 4, 6, 8, 10, 12, 16, 20, 24, 32)
 _MORE_STEPS = 4
 _STEPS = (1, 2, 3, 4, 5, 6, 8, 10)
@@ -129,9 +127,7 @@ def close(
     intervals = [
         _interval(name, s, limits.get(s), bool(turns)) for s, turns in zip(free, goes_round, strict=False)
     ]
-    x = found[branch]
-    sampled = _Samples(name, equations, intervals, x, u, angles)
-    seed, steps, rows = _chosen_seed(name, sampled)
+    sampled, seed, steps, rows = _fitted(name, equations, intervals, found[branch], u, angles)
     if parameters:
         # The seed knows one value of them only; from there it is further to others.
         steps += _MORE_STEPS
@@ -206,111 +202,30 @@ def _interval(name: str, symbol: Symbol, limits: tuple[float, float] | None, ang
     return Interval(float(lower), float(upper))
 
 
-class _Samples:
-    """One branch of solutions all over the domain.
+def _fitted(
+    name: str,
+    equations: Equations,
+    intervals: Sequence[Interval],
+    x: Array,
+    u: Array,
+    angles: npt.NDArray[np.bool_],
+) -> tuple[Samples, Seed, int, tuple[int, ...]]:
+    """Return what was sampled, and the seed for it with its steps and rows.
 
-    Attributes
-    ----------
-    inputs, solutions
-        Where fits look, (N, k) and (N, n).
-    tried, wanted
-        Where seeds are tried out.
-    winding
-        How unknowns grow with whole turns, (k, n).
-    condition, worst
-        See :class:`Closed`.
+    If possible it is good for a little more than the limits: estimates and controllers overstep them.
     """
-
-    def __init__(
-        self,
-        name: str,
-        equations: Equations,
-        intervals: Sequence[Interval],
-        x: Array,
-        u: Array,
-        angles: npt.NDArray[np.bool_],
-    ) -> None:
-        self.name, self.equations, self.intervals = name, equations, intervals
-        self._given = u[len(intervals) :]
-        self._angles = angles
-        k = len(intervals)
-        generator = np.random.default_rng(1)
-        lower = np.array([i.lower for i in intervals])
-        upper = np.array([i.upper for i in intervals])
-        home = np.clip(u[:k], lower, upper)
-        x = self._followed(x, u[:k], home)
-        grids = [i.samples(_SAMPLES.get(k, 5)) for i in intervals]
-        grid = np.array(list(itertools.product(*grids))).reshape(-1, k)
-        corners = np.array(list(itertools.product(*zip(lower, upper, strict=True)))).reshape(-1, k)
-        tried = np.vstack([corners, generator.uniform(lower, upper, (_TRIED, k))])
-        everywhere = np.vstack([home, grid, tried])
-        solutions = self._everywhere(x, everywhere)
-        self.inputs, self.solutions = everywhere[: len(grid) + 1], solutions[: len(grid) + 1]
-        self.tried, self.wanted = everywhere[len(grid) + 1 :], solutions[len(grid) + 1 :]
-        self.winding = self._winding(x, home)
-        values = np.array([self._singular_values(q, s) for q, s in zip(everywhere, solutions, strict=True)])
-        ratios = values[:, -1] / np.maximum(values[:, 0], 1e-30)
-        self.condition = float(ratios.min())
-        self.worst = everywhere[int(ratios.argmin())]
-
-    def all_inputs(self, q: Array) -> Array:
-        """Return free coordinates with the parameters behind them."""
-        return np.concatenate([q, self._given])
-
-    def _followed(self, x: Array, start: Array, end: Array) -> Array:
-        reached = follow(self.equations, x, self.all_inputs(start), self.all_inputs(end))
-        if reached.part < 1.0:
-            there = start + reached.part * (end - start)
-            names = [str(s) for s in self.equations.inputs]
-            at = ", ".join(f"{s} = {v:.6g}" for s, v in zip(names, there, strict=False))
-            to = ", ".join(f"{v:.6g}" for v in end)
-            raise UnsolvedError(
-                f"Loop '{self.name}' does not close on the way to {to}: it ends, or is singular, at {at}. "
-                "Narrow the limits, or the loop's within={...}, so that it closes everywhere."
-            )
-        return reached.solution
-
-    def _everywhere(self, x: Array, points: Array) -> Array:
-        """Return the solutions at points, each followed from the nearest one that is known."""
-        scale = np.array([max(i.upper - i.lower, 1e-12) for i in self.intervals])
-        solutions = np.zeros((len(points), len(x)))
-        solutions[0] = self._followed(x, points[0], points[0])
-        left = np.arange(1, len(points))
-        nearest = np.zeros(len(points), dtype=int)
-        distance = np.abs((points - points[0]) / scale).max(axis=1, initial=0.0)
-        while len(left):
-            position = int(distance[left].argmin())
-            i, left = left[position], np.delete(left, position)
-            solutions[i] = self._followed(solutions[nearest[i]], points[nearest[i]], points[i])
-            closer = np.abs((points - points[i]) / scale).max(axis=1, initial=0.0)
-            better = closer < distance
-            nearest[better], distance[better] = i, closer[better]
-        return solutions
-
-    def _winding(self, x: Array, home: Array) -> Array:
-        """Return how much the unknowns grow in a whole turn of each input that goes round, per radian."""
-        winding = np.zeros((len(home), len(x)))
-        for k, interval in enumerate(self.intervals):
-            if not interval.whole:
-                continue
-            end = home.copy()
-            end[k] += 2 * np.pi
-            grown = (self._followed(x, home, end) - x) / (2 * np.pi)
-            whole = np.abs(grown - np.round(grown)) < 1e-6
-            if not np.all(whole | ~self._angles):
-                raise UnsolvedError(
-                    f"Loop '{self.name}' is on another branch after a turn of '{self.equations.inputs[k]}': "
-                    "it goes through a singular configuration. Limit that coordinate."
-                )
-            winding[k] = np.where(self._angles, np.round(grown), grown)
-        return winding
-
-    def _singular_values(self, q: Array, x: Array) -> Array:
-        by_x = self.equations(x, self.all_inputs(q))[1]
-        return np.linalg.svd(by_x, compute_uv=False).astype(np.float64)
+    wider = [i.wider() for i in intervals]
+    if wider != intervals:
+        try:
+            samples = Samples(name, equations, intervals, wider, x, u, angles)
+            return samples, *_chosen_seed(name, samples)
+        except UnsolvedError:
+            pass
+    samples = Samples(name, equations, intervals, intervals, x, u, angles)
+    return samples, *_chosen_seed(name, samples)
 
 
-def _chosen_seed(name: str, samples: _Samples) -> tuple[Seed, int, tuple[int, ...]]:
+def _chosen_seed(name: str, samples: Samples) -> tuple[Seed, int, tuple[int, ...]]:
     """Return the cheapest seed and number of steps that always lead to the branch, and the rows used."""
     rows = _rows(samples)
     n = len(samples.equations.unknowns)
@@ -336,7 +251,7 @@ def _chosen_seed(name: str, samples: _Samples) -> tuple[Seed, int, tuple[int, ..
     return best[1], best[2], rows
 
 
-def _rows(samples: _Samples) -> tuple[int, ...]:
+def _rows(samples: Samples) -> tuple[int, ...]:
     """Return as many equations as there are unknowns, the best ones where it matters most."""
     equations = samples.equations
     n = len(equations.unknowns)
@@ -356,7 +271,7 @@ def _rows(samples: _Samples) -> tuple[int, ...]:
     return chosen
 
 
-def _steps(samples: _Samples, seed: Seed, rows: tuple[int, ...]) -> int | None:
+def _steps(samples: Samples, seed: Seed, rows: tuple[int, ...]) -> int | None:
     """Return how many Newton steps lead from the seed to the branch everywhere; None if some never arrive."""
     needed = 0
     chosen = list(rows)

@@ -19,6 +19,9 @@ from kineverse.symbols import Symbol
 
 from .equations import Array
 
+_MARGIN = 0.05
+"""How much further than its limits a loop is to be evaluated on each side, of their distance."""
+
 
 @dataclass(frozen=True)
 class Interval:
@@ -35,6 +38,11 @@ class Interval:
     lower: float
     upper: float
     whole: bool = False
+
+    def wider(self) -> Interval:
+        """Return limits with a margin around them; whole turns have none."""
+        margin = 0.0 if self.whole else _MARGIN * (self.upper - self.lower)
+        return Interval(self.lower - margin, self.upper + margin, self.whole)
 
     def samples(self, count: int) -> Array:
         """Return points at which fits are well behaved, in order."""
