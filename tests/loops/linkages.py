@@ -20,7 +20,9 @@ def bar(edit: kv.Edit, name: str, parent: str, origin: kv.Pose, axis: Any = Z, *
     edit.apply(kv.Revolute(name=name, parent=parent, child=name, origin=origin, axis=axis, **limits))
 
 
-def four_bar(crank=0.4, coupler=1.1, rocker=0.9, ground=1.0, *, limits=None, close=True, **options) -> kv.Model:
+def four_bar(
+    crank=0.4, coupler=1.1, rocker=0.9, ground=1.0, *, limits=None, close=True, **options
+) -> kv.Model:
     """Return crank and rocker on the ground, with a coupler between them."""
     model = kv.Model()
     with model.edit() as edit:
@@ -98,11 +100,15 @@ def scissor_lift(stages: int = 3, length: float = 0.5) -> kv.Model:
     model = kv.Model()
     with model.edit() as edit:
         bar(edit, "bar_a0", "world", at(0), (0, -1, 0), lower=0.15, upper=1.3)
-        edit.apply(kv.Prismatic(name="slide", parent="world", child="slide", axis=X, lower=0.05, upper=length))
+        edit.apply(
+            kv.Prismatic(name="slide", parent="world", child="slide", axis=X, lower=0.05, upper=length)
+        )
         bar(edit, "bar_b0", "slide", at(0), Y)
         edit.add_frame("cross_a0", "bar_a0", kv.translation(length / 2, 0, 0))
         edit.add_frame("cross_b0", "bar_b0", kv.translation(-length / 2, 0, 0))
-        edit.close_loop("cross_a0", "cross_b0", ("x", "z"), home={"bar_a0": 0.5, "bar_b0": 0.5, "slide": 0.44})
+        edit.close_loop(
+            "cross_a0", "cross_b0", ("x", "z"), home={"bar_a0": 0.5, "bar_b0": 0.5, "slide": 0.44}
+        )
         for i in range(1, stages):
             # Where a bar ends, one of the other direction begins.
             bar(edit, f"bar_a{i}", f"bar_b{i - 1}", at(-length), (0, -1, 0))
@@ -110,7 +116,10 @@ def scissor_lift(stages: int = 3, length: float = 0.5) -> kv.Model:
             edit.add_frame(f"cross_a{i}", f"bar_a{i}", kv.translation(length / 2, 0, 0))
             edit.add_frame(f"cross_b{i}", f"bar_b{i}", kv.translation(-length / 2, 0, 0))
             edit.close_loop(
-                f"cross_a{i}", f"cross_b{i}", ("x", "z"), home={f"bar_a{i}": 1.0, f"bar_b{i}": 1.0, "bar_a0": 0.5}
+                f"cross_a{i}",
+                f"cross_b{i}",
+                ("x", "z"),
+                home={f"bar_a{i}": 1.0, f"bar_b{i}": 1.0, "bar_a0": 0.5},
             )
         edit.add_frame("platform", f"bar_a{stages - 1}", kv.translation(length, 0, 0))
     return model
@@ -197,7 +206,9 @@ def delta_by_spheres(motors: np.ndarray) -> np.ndarray:
 
 
 # Theo Jansen's numbers for the leg of a beach animal.
-JANSEN = dict(a=38.0, b=41.5, c=39.3, d=40.1, e=55.8, f=39.4, g=36.7, h=65.7, i=49.0, j=50.0, k=61.9, l=7.8, m=15.0)
+JANSEN = dict(  # noqa: C408
+    a=38.0, b=41.5, c=39.3, d=40.1, e=55.8, f=39.4, g=36.7, h=65.7, i=49.0, j=50.0, k=61.9, l=7.8, m=15.0
+)
 
 
 def jansen_leg() -> kv.Model:
