@@ -9,7 +9,7 @@ from constraints import model
 import kineverse as kv
 from kineverse import reasoning
 from kineverse.reasoning import Box, Interval, interlocks
-from kineverse.reasoning.cases import CASES_AT_MOST
+from kineverse.reasoning.distinguishing import CASES_AT_MOST
 
 A, B, C = (kv.position(name) for name in "abc")
 SPEED = A.derivative()

@@ -1,12 +1,10 @@
-"""Distinguishing cases until a question has an answer: which signs decide, and where they change."""
+"""Cases: intervals of coordinates with the signs that terms have there, and how to divide them."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
 from fractions import Fraction
-from typing import TypeVar
 
 import casadi as ca
 
@@ -20,28 +18,10 @@ from .polynomial import Axis, Polynomial
 from .terms import Term, reachable
 from .values import Value, constant, evaluate, live_arguments
 
-T = TypeVar("T")
-
-CASES_AT_MOST = 1000
 NEGLIGIBLE = 1e-12
 """Constants up to this are what rounding left of 0."""
 _SAME = 1e-12
 _NEAR = 1e-9
-
-
-@dataclass(frozen=True)
-class Unclear:
-    """No answer yet: which terms' signs would help, and what can be said if they stay unknown."""
-
-    about: tuple[Term, ...]
-    otherwise: object = None
-
-
-@dataclass(frozen=True)
-class Unknown:
-    """No answer, and why."""
-
-    reason: str
 
 
 class Case:
@@ -53,6 +33,12 @@ class Case:
         What is evaluated.
     limits
         Of symbols, constant.
+    axes, signs
+        What is known beyond them.
+    order
+        All terms that the roots are made of.
+    before, narrowed
+        Values in a larger case, and the symbols by which this one is smaller.
     """
 
     def __init__(
@@ -62,6 +48,8 @@ class Case:
         axes: Mapping[Axis, Interval] | None = None,
         signs: Mapping[int, int] | None = None,
         order: list[Term] | None = None,
+        before: Mapping[int, Value] | None = None,
+        narrowed: frozenset[Symbol] = frozenset(),
     ) -> None:
         self._limits = limits
         self._axes = dict(axes or {})
@@ -71,6 +59,10 @@ class Case:
         self._order = reachable(roots) if order is None else order
         self._values: dict[int, Value] = {}
         for term in self._order:
+            known = None if before is None else before[term.index]
+            if known is not None and known.live.isdisjoint(narrowed):
+                self._values[term.index] = known
+                continue
             value = self._values[term.index] = self._evaluated(term)
             if value.polynomial is None:
                 self.sign(term)  # from the bottom up, as graphs may be deeper than Python's stack
@@ -271,35 +263,11 @@ class Case:
             if not side.is_empty:
                 known = sign if sign == 0 else _sign_of(at(_inside(side.intersection(inner))))
                 signs = {**self._signs, term.index: known}
-                cases.append(Case(self._roots, self._limits, {**self._axes, axis: side}, signs, self._order))
+                axes, narrowed = {**self._axes, axis: side}, frozenset(s for s, _ in axis)
+                cases.append(
+                    Case(self._roots, self._limits, axes, signs, self._order, self._values, narrowed)
+                )
         return [case for case in cases if not case.is_empty]
-
-
-def distinguish(start: Case, question: Callable[[Case], T | Unclear]) -> Iterator[tuple[Case, T | Unknown]]:
-    """Yield cases that cover everything, each with its answer."""
-    stack, done = [start], 0
-    while stack:
-        case = stack.pop()
-        done += 1
-        answer = question(case)
-        if not isinstance(answer, Unclear):
-            yield case, answer
-            continue
-        if done + len(stack) > CASES_AT_MOST:
-            yield case, Unknown(f"there are more than {CASES_AT_MOST} cases to distinguish")
-            continue
-        reason: str | None = None
-        for term in answer.about:
-            parts = case.split(term)
-            if not isinstance(parts, str):
-                stack += parts
-                break
-            reason = reason or parts
-        else:
-            if answer.otherwise is not None:
-                yield case, answer.otherwise  # type: ignore[misc]
-            else:
-                yield case, Unknown(reason or "nothing decides it")
 
 
 def axis_expression(axis: Axis) -> Expression:

@@ -11,7 +11,8 @@ from kineverse.model.constraint import Constraint
 from kineverse.symbols import Symbol
 
 from .boxes import Box, Interval
-from .cases import Case, Unclear, Unknown, distinguish
+from .cases import Case
+from .distinguishing import Unclear, Unknown, distinguish
 from .expressing import expressed
 from .interlock import Hold
 from .regions import merged
