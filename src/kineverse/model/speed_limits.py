@@ -84,7 +84,7 @@ class SpeedLimits:
         if affine is None:
             return "it is neither affine in the speeds nor a norm of speeds"
         weights, offset = affine
-        row = Row(name, weights, _less(lower, offset), _less(upper, offset))
+        row = Row(name, weights, less(lower, offset), less(upper, offset))
         self.rows.append(row)
         self._affine.append(row)
         return None
@@ -137,7 +137,7 @@ class SpeedLimits:
                 for speed, weight in own.items():
                     term = factor * weight
                     weights[speed] = weights[speed] + term if speed in weights else term
-            self.rows.append(Row(name, weights, -INFINITE, _less(inner, offset)))
+            self.rows.append(Row(name, weights, -INFINITE, less(inner, offset)))
         offsets = [constant for _, constant in parts if constant != ZERO]
         radius = inner - norm(offsets) if offsets else inner
         self._balls.append(Ball(tuple(own for own, _ in parts), radius))
@@ -176,7 +176,8 @@ def _over(bound: Expression, factor: float) -> Expression:
     return bound if factor == 1 else bound / factor
 
 
-def _less(bound: Expression, offset: Expression) -> Expression:
+def less(bound: Expression, offset: Expression) -> Expression:
+    """Return a bound less an offset; what is infinite stays a plain infinity."""
     return bound if is_infinite(bound) else bound - offset
 
 

@@ -21,6 +21,7 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import reduce
+from typing import TypeAlias
 
 import casadi as ca
 
@@ -28,13 +29,28 @@ from kineverse.expressions.expression import Expression, as_expression, binary
 from kineverse.expressions.functions import norm
 from kineverse.symbols import Symbol
 
-from .speed_limits import INFINITE, ZERO, Ball, Box, Limits, Weights, is_infinite, larger, smaller
+from .speed_limits import (
+    INFINITE,
+    ZERO,
+    Ball,
+    Box,
+    Limits,
+    Row,
+    Weights,
+    is_infinite,
+    larger,
+    less,
+    smaller,
+)
 
 _ONE = as_expression(1.0)
 _ROUNDING = as_expression(1e-12)
 """Harm that is none: coefficients like cos(π/2) are not 0."""
 _FLAT = as_expression(1e-8)
 """Square of the coefficient below which a speed is wished for in proportion to it, no longer inversely."""
+
+
+Wishes: TypeAlias = tuple[Mapping[Symbol, Expression], Mapping[Symbol, Expression]]
 
 
 @dataclass(frozen=True)
@@ -105,8 +121,26 @@ def _clipped(constraint: Sides, box: Box) -> list[Expression]:
 
 def _common(sides: Sequence[Side], limits: Limits) -> dict[Symbol, Expression]:
     """Return v*, the speeds that are not always zero."""
-    up, down = _wishes(sides, limits.box)
-    shares = _Shares(up, down)
+    wishes = _wishes([(side.away, larger(-side.room, ZERO)) for side in sides], limits.box)
+    missing = []
+    for side in sides:
+        # One of a single speed has nobody to help it.
+        harm = _harm(side.away, wishes) if len(side.away) > 1 else []
+        if harm:
+            missing.append((side.away, larger(sum(harm, ZERO) - larger(side.room, ZERO), ZERO)))
+    if not missing:
+        return _motion(wishes, sides, limits)
+    first = _motion(_wishes(missing, limits.box), sides, limits)
+    sides = [Side(side.away, side.room + _along(side.away, first)) for side in sides]
+    limits = _after(first, limits)
+    wishes = _wishes([(side.away, larger(-side.room, ZERO)) for side in sides], limits.box)
+    second = _motion(wishes, sides, limits)
+    return {s: first.get(s, ZERO) + second.get(s, ZERO) for s in {**first, **second}}
+
+
+def _motion(wishes: Wishes, sides: Sequence[Side], limits: Limits) -> dict[Symbol, Expression]:
+    """Return wishes up and down as far as everything allows."""
+    shares = _Shares(wishes)
     for side in sides:
         shares.keep(side.away, side.room)
     for row in limits.coupled:
@@ -117,20 +151,37 @@ def _common(sides: Sequence[Side], limits: Limits) -> dict[Symbol, Expression]:
     for ball in limits.balls:
         shares.keep_ball(ball)
     motion: dict[Symbol, Expression] = {}
-    for wishes, least, sign in ((up, shares.up, 1), (down, shares.down, -1)):
-        for speed, wish in wishes.items():
+    for wished, least, sign in zip(wishes, (shares.up, shares.down), (1, -1), strict=True):
+        for speed, wish in wished.items():
             share = reduce(smaller, least.get(speed, []), _ONE)
             motion[speed] = motion.get(speed, ZERO) + sign * wish * share
     return motion
 
 
-def _wishes(sides: Sequence[Side], box: Box) -> tuple[dict[Symbol, Expression], dict[Symbol, Expression]]:
-    """Return how fast speeds would go up, and how fast down, if each side had its way."""
+def _after(motion: Mapping[Symbol, Expression], limits: Limits) -> Limits:
+    """Return what limits leave to be added to a motion within them."""
+    box = dict(limits.box)
+    for speed, done in motion.items():
+        if speed in box:
+            low, high = box[speed]
+            box[speed] = (less(low, done), less(high, done))
+    coupled = []
+    for row in limits.coupled:
+        done = _along(row.weights, motion)
+        coupled.append(Row(row.name, row.weights, less(row.lower, done), less(row.upper, done)))
+    balls = []
+    for ball in limits.balls:
+        parts = [_along(component, motion) for component in ball.components]
+        balls.append(Ball(ball.components, ball.radius - norm(parts)))
+    return Limits(box, coupled, balls)
+
+
+def _wishes(needs: Sequence[tuple[Weights, Expression]], box: Box) -> Wishes:
+    """Return how fast speeds would go up, and how fast down, if each need were met by each of its speeds."""
     up: dict[Symbol, list[Expression]] = {}
     down: dict[Symbol, list[Expression]] = {}
-    for side in sides:
-        need = larger(-side.room, ZERO)
-        for speed, weight in side.away.items():
+    for away, need in needs:
+        for speed, weight in away.items():
             if not weight.symbols:
                 (up if float(weight) > 0 else down).setdefault(speed, []).append(need / abs(float(weight)))
                 continue
@@ -143,28 +194,32 @@ def _wishes(sides: Sequence[Side], box: Box) -> tuple[dict[Symbol, Expression], 
     )
 
 
+def _harm(away: Weights, wishes: Wishes) -> list[Expression]:
+    """Return how fast wishes lead to a bound at most, by speed."""
+    up, down = wishes
+    harm = []
+    for speed, weight in away.items():
+        if not weight.symbols:
+            wished = down if float(weight) > 0 else up
+            harm += [abs(float(weight)) * wished[speed]] if speed in wished else []
+        elif speed in up or speed in down:
+            forth = weight * down[speed] if speed in down else ZERO
+            harm.append(larger(forth, -weight * up[speed] if speed in up else ZERO))
+    return harm
+
+
 class _Shares:
     """What share of its wishes each speed may have, upwards and downwards: the least of several."""
 
-    def __init__(self, up: Mapping[Symbol, Expression], down: Mapping[Symbol, Expression]) -> None:
+    def __init__(self, wishes: Wishes) -> None:
         self.up: dict[Symbol, list[Expression]] = {}
         self.down: dict[Symbol, list[Expression]] = {}
-        self._wishes = up, down
+        self._wishes = wishes
 
     def keep(self, away: Weights, room: Expression) -> None:
         """Take care that speeds keep ``away·v >= -room``."""
         up, down = self._wishes
-        harm = []
-        for speed, weight in away.items():
-            if not weight.symbols:
-                wishes = down if float(weight) > 0 else up
-                harm += [abs(float(weight)) * wishes[speed]] if speed in wishes else []
-            elif speed in up and speed in down:
-                harm.append(larger(weight * down[speed], -weight * up[speed]))
-            elif speed in down:
-                harm.append(larger(weight * down[speed], ZERO))
-            elif speed in up:
-                harm.append(larger(-weight * up[speed], ZERO))
+        harm = _harm(away, self._wishes)
         if not harm:
             return
         share = _share(room, sum(harm, ZERO))
