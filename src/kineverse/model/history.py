@@ -380,6 +380,9 @@ class History:
         self.begin()
 
     def _undo_to(self, mark: int) -> None:
+        if len(self._undo) > mark:
+            # Who looked in between has the values in the order that is now undone.
+            self._disordered.update(KINDS)
         while len(self._undo) > mark:
             function, arguments = self._undo.pop()
             function(*arguments)
@@ -465,6 +468,8 @@ class History:
         old = self.entries[new.tag]
         self._unlink(old)
         self._link(new)
+        if list(old.writes) != list(new.writes):
+            self._disordered.update(kind for kind, _ in (*old.writes, *new.writes))
 
     def _renumber(self) -> None:
         entries = self.sequence
