@@ -104,7 +104,7 @@ def _no_scene(name: str) -> str:
             f"'{GALLERY}' is many models, one for each articulation: {', '.join(scenes)}. "
             f"Load one as '{GALLERY}/{scenes[0]}'."
         )
-    return f"There is no model '{GALLERY}/{name}'. {suggest(name, scenes, 'articulation')}"
+    return f"There is no model {_shown(f'{GALLERY}/{name}')}. {suggest(name, scenes, 'articulation')}"
 
 
 def model_folders() -> Iterator[tuple[str, Path]]:

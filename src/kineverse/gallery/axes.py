@@ -19,10 +19,10 @@ from .shapes import (
     X,
     Y,
     Z,
-    ball,
     box,
     disc,
     rod,
+    sphere,
     wheel,
 )
 
@@ -38,8 +38,8 @@ def revolute(scene: Scene) -> None:
     """Show a door that turns about its hinges and stops at both ends."""
     frame = box((0.08, 0.06, 1.1), (0, -0.05, 0.55), WOOD) + box((0.08, 0.06, 1.1), (0, 0.65, 0.55), WOOD)
     scene.frame("frame", frame + box((0.08, 0.76, 0.08), (0, 0.3, 1.14), WOOD))
-    leaf = box((0.03, 0.58, 1.06), (0, 0.30, 0.55), WHITE) + ball(0.03, (0.045, 0.53, 0.55), ORANGE)
-    leaf += ball(0.03, (-0.045, 0.53, 0.55), ORANGE)
+    leaf = box((0.03, 0.58, 1.06), (0, 0.30, 0.55), WHITE) + sphere(0.03, (0.045, 0.53, 0.55), ORANGE)
+    leaf += sphere(0.03, (-0.045, 0.53, 0.55), ORANGE)
     for z in (0.2, 0.9):
         leaf += disc(0.02, 0.12, (0, 0, z), Z, DARK)
     scene.joint(Revolute, "door", leaf, axis=(0, 0, -1), lower=0.0, upper=2.0, velocity=1.0)
@@ -78,10 +78,10 @@ def screw(scene: Scene) -> None:
         block += box((0.04, 0.04, 0.2), (x, y, -0.08), WOOD)
     scene.frame("block", block, at=(0, 0, 0.18))
     bolt = disc(0.035, 0.3, (0, 0, -0.15)) + disc(0.09, 0.06, (0, 0, 0.03), Z, STEEL)
-    bolt += box((0.15, 0.03, 0.02), (0.0, 0, 0.06), RED) + ball(0.02, (0.075, 0, 0.06), RED)
+    bolt += box((0.15, 0.03, 0.02), (0.0, 0, 0.06), RED) + sphere(0.02, (0.075, 0, 0.06), RED)
     for k in range(84):
         angle = math.tau * k / 14
-        bolt += ball(
+        bolt += sphere(
             0.011, (0.036 * math.cos(angle), 0.036 * math.sin(angle), -0.02 - pitch * k / 14), ORANGE
         )
     scene.joint(
@@ -104,8 +104,8 @@ def cylindrical(scene: Scene) -> None:
         stand += box((0.04, 0.12, 0.2), (x, 0, 0.1), DARK)
     scene.frame("sleeve", stand + disc(0.055, 0.26, (0, 0, 0.2), X, BLUE))
     shaft = disc(0.03, 0.9, axis=X) + rod((0.42, 0, -0.12), (0.42, 0, 0.12), 0.016, RED)
-    shaft += ball(0.028, (0.42, 0, 0.12), RED) + disc(0.045, 0.03, (-0.44, 0, 0), X, GREEN)
-    shaft += ball(0.028, (0.42, 0, -0.12), DARK)
+    shaft += sphere(0.028, (0.42, 0, 0.12), RED) + disc(0.045, 0.03, (-0.44, 0, 0), X, GREEN)
+    shaft += sphere(0.028, (0.42, 0, -0.12), DARK)
     scene.joint(
         Cylindrical, "rod", shaft, parent="sleeve", at=(0, 0, 0.2), axis=X, slide=Limits(-0.24, 0.24, 0.5)
     )

@@ -21,11 +21,11 @@ from .shapes import (
     Y,
     Z,
     arrow,
-    ball,
     bone,
     box,
     disc,
     rod,
+    sphere,
     wheel,
 )
 
@@ -43,7 +43,7 @@ def omni_base(scene: Scene) -> None:
             turn = math.tau * j / 8
             side = np.cross(out, (0, 0, 1))
             rim = np.add(at, 0.055 * (math.cos(turn) * side + math.sin(turn) * np.array((0, 0, 1))))
-            base += ball(0.016, rim, ORANGE)
+            base += sphere(0.016, rim, ORANGE)
     scene.joint(OmniBase, "base", base)
 
 
@@ -52,7 +52,7 @@ def differential_drive(scene: Scene) -> None:
     _floor(scene)
     radius, track = 0.08, 0.34
     base = disc(0.2, 0.09, (-0.03, 0, 0.11), color=GREEN) + arrow(0.28, 0.02, (0, 0, 0.165), WHITE)
-    base += ball(0.03, (-0.17, 0, 0.03), DARK) + rod((-0.17, 0, 0.05), (-0.17, 0, 0.08), 0.02)
+    base += sphere(0.03, (-0.17, 0, 0.03), DARK) + rod((-0.17, 0, 0.05), (-0.17, 0, 0.08), 0.02)
     left, right = "base/left_wheel", "base/right_wheel"
     scene.joint(
         DifferentialDrive, "base", base, radius=radius, track=track, left=left, right=right, wheel_speed=6.0

@@ -17,11 +17,11 @@ from .shapes import (
     X,
     Y,
     arrow,
-    ball,
     bone,
     box,
     disc,
     rod,
+    sphere,
 )
 
 
@@ -51,13 +51,13 @@ def universal(scene: Scene) -> None:
     )
 
 
-def ball_joint(scene: Scene) -> None:
+def ball(scene: Scene) -> None:
     """Show a stick in a socket: it leans by 0.7 rad at most, whatever the direction, and twists by 1 rad."""
     scene.frame(
         "socket", box((0.36, 0.36, 0.06), (0, 0, 0.03), DARK) + disc(0.12, 0.06, (0, 0, 0.09), color=BLUE)
     )
-    stick = ball(0.085) + rod((0, 0, 0), (0, 0, 0.4), 0.022) + ball(0.06, (0, 0, 0.42), ORANGE)
-    stick += rod((0, 0, 0.3), (0.13, 0, 0.3), 0.014, RED) + ball(0.022, (0.13, 0, 0.3), RED)
+    stick = sphere(0.085) + rod((0, 0, 0), (0, 0, 0.4), 0.022) + sphere(0.06, (0, 0, 0.42), ORANGE)
+    stick += rod((0, 0, 0.3), (0.13, 0, 0.3), 0.014, RED) + sphere(0.022, (0.13, 0, 0.3), RED)
     scene.joint(Ball, "stick", stick, parent="socket", at=(0, 0, 0.12), cone=0.7, twist=1.0, velocity=3.0)
 
 
@@ -73,7 +73,7 @@ def planar(scene: Scene) -> None:
 def floating(scene: Scene) -> None:
     """Show a toy aeroplane, which goes anywhere and turns any way."""
     scene.frame("field", disc(0.6, 0.02, (0, 0, -0.41), color=GREEN))
-    plane = bone((-0.25, 0, 0), (0.2, 0, 0), 0.05, WHITE) + ball(0.045, (0.06, 0, 0.035), BLUE)
+    plane = bone((-0.25, 0, 0), (0.2, 0, 0), 0.05, WHITE) + sphere(0.045, (0.06, 0, 0.035), BLUE)
     plane += box((0.13, 0.7, 0.016), (0.03, 0, 0.0), RED) + box((0.08, 0.26, 0.012), (-0.27, 0, 0.02), RED)
     plane += box((0.09, 0.012, 0.13), (-0.27, 0, 0.08), RED) + disc(0.012, 0.05, (0.26, 0, 0), X, DARK)
     plane += box((0.012, 0.2, 0.024), (0.275, 0, 0), ORANGE) + disc(0.03, 0.03, (0.06, 0.09, -0.09), Y, DARK)
@@ -83,6 +83,4 @@ def floating(scene: Scene) -> None:
     scene.joint(Floating, "plane", plane)
 
 
-ball_joint.__name__ = "ball"
-
-SCENES = (universal, ball_joint, planar, floating)
+SCENES = (universal, ball, planar, floating)

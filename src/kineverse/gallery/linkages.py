@@ -27,11 +27,11 @@ from .shapes import (
     X,
     Y,
     Z,
-    ball,
     box,
     disc,
     link,
     rod,
+    sphere,
 )
 
 
@@ -72,14 +72,14 @@ def spatial_four_bar(scene: Scene) -> None:
     drive = (
         disc(0.13, 0.025, color=BLUE)
         + box((0.1, 0.03, 0.01), (0.05, 0, 0.015), RED)
-        + ball(0.022, (0.1, 0, 0.03), DARK)
+        + sphere(0.022, (0.1, 0, 0.03), DARK)
     )
     scene.joint(Revolute, "drive", drive, parent="ground", axis=Z)
     scene.frame("drive_ball", parent="drive", at=(0.1, 0, 0.03))
     scene.joint(Revolute, "rod_turn", parent="drive_ball", axis=Z)
     scene.joint(Revolute, "rod", rod((0, 0, 0), (0.55, 0, 0), 0.012, ORANGE), parent="rod_turn", axis=Y)
     scene.frame("rod_end", parent="rod", at=(0.55, 0, 0))
-    driven = link((0, 0, 0), (0, 0.25, 0), X, GREEN, 0.04, 0.025) + ball(0.022, (0, 0.25, 0), DARK)
+    driven = link((0, 0, 0), (0, 0.25, 0), X, GREEN, 0.04, 0.025) + sphere(0.022, (0, 0.25, 0), DARK)
     driven += rod((-0.08, 0, 0), (0.08, 0, 0), 0.012, DARK)
     scene.joint(Revolute, "driven", driven, parent="ground", at=(0.4, 0.3, 0), axis=X)
     scene.frame("driven_ball", parent="driven", at=(0, 0.25, 0))
@@ -129,7 +129,7 @@ def scissor_linkage(scene: Scene) -> None:
         _cross(scene, f"b{k}", f"bar_a{k - 1}", (length, 0), -length, BLUE, 2)
         home = {f"bar_a{k}": 1.0, f"bar_b{k}": -1.0, "bar_a0": 0.5}
         scene.loop(f"stage_{k}", f"cross_a{k}", f"cross_b{k}", ("x", "y"), home=home)
-    scene.frame("tip", ball(0.03, color=RED), parent=f"bar_a{stages - 1}", at=(length, 0, 0.03))
+    scene.frame("tip", sphere(0.03, color=RED), parent=f"bar_a{stages - 1}", at=(length, 0, 0.03))
 
 
 def delta_robot(scene: Scene) -> None:
@@ -152,9 +152,9 @@ def delta_robot(scene: Scene) -> None:
         place = turn @ translation(base, 0, 0)
         scene.joint(Revolute, f"motor_{k}", arm, parent="frame", at=place, axis=Y, lower=-0.2, upper=0.8)
         scene.joint(
-            Revolute, f"swing_{k}", ball(0.02, color=DARK), parent=f"motor_{k}", at=(upper, 0, 0), axis=Y
+            Revolute, f"swing_{k}", sphere(0.02, color=DARK), parent=f"motor_{k}", at=(upper, 0, 0), axis=Y
         )
-        shapes = rod((0, 0, 0), (forearm, 0, 0), 0.012, ORANGE) + ball(0.02, (forearm, 0, 0), DARK)
+        shapes = rod((0, 0, 0), (forearm, 0, 0), 0.012, ORANGE) + sphere(0.02, (forearm, 0, 0), DARK)
         scene.joint(Revolute, f"tilt_{k}", shapes, parent=f"swing_{k}", axis=Z)
         scene.frame(f"end_{k}", parent=f"tilt_{k}", at=(forearm, 0, 0))
         scene.frame(f"joint_{k}", parent="platform", at=turn @ translation(platform, 0, 0))

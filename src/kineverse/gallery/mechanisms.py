@@ -18,7 +18,7 @@ from kineverse.articulations.mechanisms import (
 )
 
 from .scene import Scene
-from .shapes import RED, STEEL, ball, box, rod
+from .shapes import RED, STEEL, box, rod, sphere
 
 
 def garage_door(scene: Scene) -> None:
@@ -70,7 +70,7 @@ def screw_and_nut(scene: Scene) -> None:
     """Show a screw that turns in its place, and a nut that slides along it."""
     scene.mechanism(ScrewAndNut, "vise", pitch=0.04, travel=0.16, radius=0.015)
     grip = rod((0, 0, 0.19), (0, 0, 0.22), 0.012, STEEL) + rod((0, 0, 0.22), (0.05, 0, 0.22), 0.006, RED)
-    scene.frame("grip", grip + ball(0.01, (0.05, 0, 0.22), RED), parent="vise/screw")
+    scene.frame("grip", grip + sphere(0.01, (0.05, 0, 0.22), RED), parent="vise/screw")
 
 
 def scissor_lift(scene: Scene) -> None:

@@ -32,13 +32,13 @@ __all__ = [
     "Z",
     "across",
     "arrow",
-    "ball",
     "bone",
     "box",
     "disc",
     "gear",
     "link",
     "rod",
+    "sphere",
     "wheel",
 ]
 
@@ -67,7 +67,7 @@ def disc(radius: float, length: float, at: Point = ORIGIN, axis: Point = Z, colo
     return (_placed(Cylinder(radius, length), at, axis, color),)
 
 
-def ball(radius: float, at: Point = ORIGIN, color: Rgba = STEEL) -> Shapes:
+def sphere(radius: float, at: Point = ORIGIN, color: Rgba = STEEL) -> Shapes:
     """Return a sphere."""
     return (_placed(Sphere(radius), at, Z, color),)
 
