@@ -1,8 +1,11 @@
 """Kineverse: articulation models as symbolic expressions and constraints.
 
 ``import kineverse as kv`` gives the whole public face: symbols and expressions (layer 1), :func:`compile`
-(layer 2), models, operations and :func:`load` (layer 3). Articulations are in :mod:`kineverse.articulations`.
+(layer 2), models, operations and :func:`load` (layer 3). Articulations are in :mod:`kineverse.articulations`;
+:mod:`kineverse.reasoning` (layer 5) is imported when it is used.
 """
+
+from typing import TYPE_CHECKING
 
 from . import articulations, logic, spatial
 from ._version import __version__
@@ -92,6 +95,9 @@ from .spatial import (
 from .state import State
 from .symbols import Symbol, parameter, position, symbol, velocity
 
+if TYPE_CHECKING:
+    from . import reasoning
+
 __all__ = [
     "Ackermann",
     "Articulation",
@@ -176,6 +182,7 @@ __all__ = [
     "point",
     "position",
     "quaternion",
+    "reasoning",
     "rotation_x",
     "rotation_y",
     "rotation_z",
@@ -192,3 +199,11 @@ __all__ = [
     "velocity",
     "where",
 ]
+
+
+def __getattr__(name: str) -> object:
+    if name == "reasoning":
+        import importlib
+
+        return importlib.import_module("kineverse.reasoning")
+    raise AttributeError(f"module 'kineverse' has no attribute {name!r}")
