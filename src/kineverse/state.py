@@ -6,6 +6,7 @@ from collections.abc import Iterator, Mapping
 from typing import Any
 
 from .errors import ExpressionError, NameTakenError, UnknownNameError, ValueRejectedError, suggest
+from .number import real_number
 from .symbols import Symbol, parse_symbol_name
 
 
@@ -112,9 +113,7 @@ def _symbol(key: object) -> Symbol:
 
 def _number(symbol: Symbol, value: Any) -> float:
     try:
-        if isinstance(value, (str, bytes)):
-            raise TypeError
-        number = float(value)
+        number = real_number(value)
     except (TypeError, ValueError, OverflowError):
         raise ValueRejectedError(f"The value of '{symbol}' is not a number: {value!r}.") from None
     if number != number:

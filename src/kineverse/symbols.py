@@ -16,6 +16,7 @@ import casadi as ca
 
 from .errors import ExpressionError, ValueRejectedError
 from .expressions.expression import NO_NODES, SYMBOLS, Expression
+from .number import real_number
 
 Role: TypeAlias = Literal["dof", "parameter", "contact", "location"]
 
@@ -184,10 +185,10 @@ def parameter(path: str, value: float) -> Symbol:
 
     ``D`` of a parameter is empty. Two parameters of one path and different values are different symbols.
     """
-    if isinstance(value, (str, bytes, bool)):
+    if isinstance(value, bool):
         raise ValueRejectedError(f"Parameter '{path}' needs a number as its value, not {value!r}.")
     try:
-        number = float(value)
+        number = real_number(value)
     except (TypeError, ValueError, OverflowError):
         raise ValueRejectedError(f"Parameter '{path}' needs a number as its value, not {value!r}.") from None
     return Symbol(path, 0, "parameter", number)

@@ -17,6 +17,7 @@ from kineverse.errors import (
     suggest,
 )
 from kineverse.expressions import Expression
+from kineverse.number import real_number
 from kineverse.state import State
 from kineverse.symbols import Symbol
 
@@ -100,11 +101,11 @@ class Signature:
 
     def _number(self, position: int, value: Any) -> float:
         try:
-            number = float(value) if not isinstance(value, (str, bytes)) else None
+            number = real_number(value)
         except (TypeError, ValueError, OverflowError, ExpressionError):
-            number = None
-        if number is None:
-            raise ValueRejectedError(f"The value of '{self.names[position]}' is not a number: {value!r}.")
+            raise ValueRejectedError(
+                f"The value of '{self.names[position]}' is not a number: {value!r}."
+            ) from None
         if number != number:
             raise ValueRejectedError(f"The value of '{self.names[position]}' is NaN.")
         return number

@@ -14,6 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from kineverse.errors import ExpressionError, NameTakenError, UnknownNameError, ValueRejectedError, suggest
+from kineverse.number import real_number
 
 from .expression import Expression
 from .lowering import lower
@@ -96,9 +97,7 @@ def assign(
                 f"The value of '{name}' is an expression; use substitute({{symbol: expression}})."
             )
         try:
-            if value is None or isinstance(value, (str, bytes)):
-                raise TypeError
-            vector[i] = value
+            vector[i] = real_number(value)
         except (TypeError, ValueError, OverflowError):
             raise ValueRejectedError(f"The value of '{name}' is not a number: {value!r}.") from None
         if vector[i] != vector[i]:

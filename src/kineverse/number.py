@@ -1,0 +1,25 @@
+"""One real number, from whatever stands for one."""
+
+from __future__ import annotations
+
+from typing import Any
+
+
+def real_number(value: Any) -> float:
+    """Return a value as a float, NaN and infinities included.
+
+    Text is none, though ``float`` reads it, and nothing is cut off: no imaginary parts, no further elements.
+
+    Raises
+    ------
+    TypeError, ValueError, OverflowError
+        For what is no number.
+    """
+    if type(value) is float:
+        return value
+    dtype = getattr(value, "dtype", None)
+    if isinstance(value, (str, bytes, bytearray, complex)) or (
+        dtype is not None and (getattr(dtype, "kind", "") not in "fiub" or value.ndim)
+    ):
+        raise TypeError(f"{value!r} is not a real number")
+    return float(value)
