@@ -12,6 +12,7 @@ from kineverse.model.view import ModelView
 from kineverse.symbols import Symbol
 
 from .boxes import Box
+from .evaluating import value_at
 from .interlock import Interlock, Interlocks
 
 Point = dict[Symbol, float]
@@ -36,7 +37,7 @@ def contradictions(model: ModelView, found: Interlocks, points: int = 20, seed: 
         for _ in range(points):
             point = _point(sorted(symbols, key=str), box, limits, chance)
             try:
-                point |= {x: _at(e, point) for x, e in model.rates.dependent.items()}
+                point |= {x: value_at(e, point) for x, e in model.rates.dependent.items()}
             except UnsolvedError:
                 continue
             wrong |= dict.fromkeys(_compared(rows, found, limits, point))
@@ -70,14 +71,14 @@ def _compared(rows: dict[str, Constraint], found: Interlocks, limits: Limits, po
 
 
 def _room(c: Constraint, held: Expression, point: Point) -> Room:
-    low, here, high = (_at(e, point) for e in (c.lower, c.expression, c.upper))
+    low, here, high = (value_at(e, point) for e in (c.lower, c.expression, c.upper))
     if isinstance(held, Symbol):
-        zero, one = (_at(c.expression, {**point, held: x}) for x in (0.0, 1.0))
+        zero, one = (value_at(c.expression, {**point, held: x}) for x in (0.0, 1.0))
         if one == zero:
             return ANY
         low, high = (low - zero) / (one - zero), (high - zero) / (one - zero)
         return (low, high) if one > zero else (high, low)
-    back = _at(c.expression, {s: -x if s.order else x for s, x in point.items()})
+    back = value_at(c.expression, {s: -x if s.order else x for s, x in point.items()})
     if c.order and min(here, back) >= 0 >= low:
         low = 0.0 if high <= 0 else -math.inf
     return low, high
@@ -86,7 +87,7 @@ def _room(c: Constraint, held: Expression, point: Point) -> Room:
 def _fits(lock: Interlock, limit: Room, room: Room, point: Point) -> bool:
     if lock.lower is None or lock.upper is None:
         return room[0] > room[1]
-    low, high = _at(lock.lower, point), _at(lock.upper, point)
+    low, high = value_at(lock.lower, point), value_at(lock.upper, point)
     return _same((max(low, limit[0]), min(high, limit[1])), room)
 
 
@@ -96,7 +97,7 @@ def _same(a: Room, b: Room, finite: bool = False) -> bool:
 
 
 def _inside(box: Box, point: Point) -> bool:
-    return all(_at(axis, point) in side for axis, side in box.items())
+    return all(value_at(axis, point) in side for axis, side in box.items())
 
 
 def _point(symbols: list[Symbol], box: Box, limits: Limits, chance: random.Random) -> Point:
@@ -110,10 +111,6 @@ def _point(symbols: list[Symbol], box: Box, limits: Limits, chance: random.Rando
         symbol, faces = axis.symbols[0], [float(x) for x in (side.lower, side.upper) if math.isfinite(x)]
         near = [chance.uniform(max(float(side.lower), -9.0), min(float(side.upper), 9.0))]
         near += [x + e * (1 + abs(x)) for x in faces for e in (-0.5, -1e-4, 1e-4, 0.5)]
-        zero, one = (_at(axis, {**point, symbol: x}) for x in (0.0, 1.0))
+        zero, one = (value_at(axis, {**point, symbol: x}) for x in (0.0, 1.0))
         point[symbol] = sorted([*ends[symbol], (chance.choice(near) - zero) / (one - zero)])[1]
     return point
-
-
-def _at(expression: Expression, point: Point) -> float:
-    return float(expression({s: point[s] for s in expression.symbols}))
