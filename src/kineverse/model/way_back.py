@@ -8,11 +8,16 @@ gives it; then v* obeys all rows at once, wherever the state is, if only speeds 
    within the speed's own limits; p upwards, n downwards.
 2. *Harm.* What these wishes take of the room of a row is at most ``h = Σ max(a·n, -a·p)``. A norm of speeds
    grows by at most the norm of its components' largest values.
-3. *Share.* Speeds that do a row harm get the share r/h of their wishes, the least over all rows. Who helps is
-   not slowed down, and is not counted on. A row outside has no room at all, so no one does it any harm.
+3. *Share.* Speeds that do a row harm get the share r/h of their wishes, the least over all rows. A row
+   outside has no room, so no one does it any harm. Who does good is not slowed down, and is not counted on.
 
-A speed that two rows outside want to go different ways stands still in v*, and so does one that would use up
-another row where no room is left: a row that depends on these asks for nothing until there is some.
+This is done twice. First those move who make room where wishes want more than there is; then, with the room
+and the limits that this leaves, the wishes themselves.
+
+v* is not the fastest of all motions, but safe and cheap: sums, products and comparisons of the rows' own
+coefficients. It is the fastest for a row outside if only limits of single speeds are in its way. A speed that
+rows outside want to go different ways stands still in v*, and so does one that needs room which others could
+make only by turns; a row that depends on these asks for nothing until something has changed.
 """
 
 from __future__ import annotations
@@ -185,9 +190,9 @@ def _wishes(needs: Sequence[tuple[Weights, Expression]], box: Box) -> Wishes:
             if not weight.symbols:
                 (up if float(weight) > 0 else down).setdefault(speed, []).append(need / abs(float(weight)))
                 continue
-            wish = need * weight / larger(weight * weight, _FLAT)
-            up.setdefault(speed, []).append(larger(wish, ZERO))
-            down.setdefault(speed, []).append(larger(-wish, ZERO))
+            inverse = _ONE / larger(weight * weight, _FLAT)
+            up.setdefault(speed, []).append(inverse * larger(weight, ZERO) * need)
+            down.setdefault(speed, []).append(inverse * larger(-weight, ZERO) * need)
     return (
         {s: _within(reduce(larger, w), box[s][1] if s in box else INFINITE) for s, w in up.items()},
         {s: _within(reduce(larger, w), -box[s][0] if s in box else INFINITE) for s, w in down.items()},
@@ -202,9 +207,9 @@ def _harm(away: Weights, wishes: Wishes) -> list[Expression]:
         if not weight.symbols:
             wished = down if float(weight) > 0 else up
             harm += [abs(float(weight)) * wished[speed]] if speed in wished else []
-        elif speed in up or speed in down:
-            forth = weight * down[speed] if speed in down else ZERO
-            harm.append(larger(forth, -weight * up[speed] if speed in up else ZERO))
+            continue
+        harm += [larger(weight, ZERO) * down[speed]] if speed in down else []
+        harm += [larger(-weight, ZERO) * up[speed]] if speed in up else []
     return harm
 
 
