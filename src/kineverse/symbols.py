@@ -22,6 +22,7 @@ Role: TypeAlias = Literal["dof", "parameter", "contact", "location"]
 
 ROLES: tuple[Role, ...] = get_args(Role)
 _UNPRINTABLE = re.compile("[\x00-\x1f\ud800-\udfff]")
+_ORDER = re.compile("0|[1-9][0-9]{0,8}")
 ORDER_NAMES = ("position", "velocity", "acceleration", "jerk", "snap")
 
 _INTERNED: dict[tuple[str, int, str, float | None], Symbol] = {}
@@ -214,12 +215,17 @@ def parse_symbol_name(name: str) -> tuple[str, int]:
     path = re.sub("%(25|3A)", lambda m: {"25": "%", "3A": ":"}[m[1]], escaped)
     if not colon:
         return path, 0
-    if suffix in ORDER_NAMES:
+    if suffix in ORDER_NAMES[1:]:
         return path, ORDER_NAMES.index(suffix)
-    if suffix.isdecimal():
-        return path, int(suffix)
+    order = int(suffix) if _ORDER.fullmatch(suffix) else -1
+    if order >= len(ORDER_NAMES):
+        return path, order
+    if order >= 0 or suffix == ORDER_NAMES[0]:
+        meant = symbol_name(path, max(order, 0))
+        raise ExpressionError(f"{name!r}: write {meant!r}; every symbol has one name.")
     raise ExpressionError(
-        f"{name!r}: ':{suffix}' is not an order; write {', '.join(ORDER_NAMES[1:])} or a number."
+        f"{name[:200]!r}: ':{suffix[:40]}' is not an order; write {', '.join(ORDER_NAMES[1:])} or, from "
+        f"{len(ORDER_NAMES)} on, a number."
     )
 
 

@@ -24,6 +24,7 @@ from dataclasses import dataclass
 from kineverse.errors import ValueRejectedError
 from kineverse.expressions.expression import Expression, array
 from kineverse.expressions.functions import sqrt
+from kineverse.number import real_number
 from kineverse.symbols import Symbol
 
 from .constraint import Constraint
@@ -88,6 +89,7 @@ def velocity_rows(
     ValueRejectedError
         For a Δt that is not positive or a gain outside (0, 1/Δt].
     """
+    dt, gain = _checked(dt, "The step dt"), None if gain is None else _checked(gain, "The gain")
     if not 0 < dt < math.inf:
         raise ValueRejectedError(f"The step dt is a positive time in seconds, not {dt!r}.")
     gamma = 1 / dt if gain is None else gain
@@ -138,6 +140,13 @@ def velocity_rows(
         tuple(row.name for row in rows),
         tuple(skipped),
     )
+
+
+def _checked(value: float, what: str) -> float:
+    try:
+        return real_number(value)
+    except (TypeError, ValueError, OverflowError):
+        raise ValueRejectedError(f"{what} is a number, not {value!r}.") from None
 
 
 def _about_speeds(

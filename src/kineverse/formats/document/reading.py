@@ -85,8 +85,9 @@ class _Document:
         if type(version) is not int or version < 1:
             raise RefusedError("its version is not a whole number from 1 on")
         if version > VERSION:
+            shown = version if version < 1_000_000 else "a million or more"
             raise RefusedError(
-                f"it is of version {version:.6g}, and this Kineverse reads up to {VERSION}; update Kineverse"
+                f"it is of version {shown}, and this Kineverse reads up to {VERSION}; update Kineverse"
             )
 
     def _read_nodes(self, table: list[Any]) -> None:

@@ -43,6 +43,8 @@ Rename: TypeAlias = Callable[[str], str]
 
 INERTIA_NUMBERS = 6
 POSE_NUMBERS = 12
+MAX_BITS = 10_000
+"""The longest integer: Python reads no more than 4300 digits."""
 
 
 # -- writing -------------------------------------------------------------------------------------------------
@@ -103,10 +105,13 @@ def written(kind: str, value: Any, ref: Ref) -> Any:
 
 
 def _datum(value: Any, ref: Ref) -> Any:
+    if type(value) is int and value.bit_length() > MAX_BITS:
+        raise FormatError(f"an integer of {value.bit_length()} bits is too long, of more than {MAX_BITS}")
     if value is None or type(value) in (bool, int, str):
         return value
-    if type(value) is float:
-        return value if math.isfinite(value) else {"float": _number(value)}
+    if isinstance(value, float):  # numpy's is one, too
+        number = float(value)
+        return number if math.isfinite(number) else {"float": _number(number)}
     if type(value) is tuple:
         return [_datum(item, ref) for item in value]
     if isinstance(value, Expression):

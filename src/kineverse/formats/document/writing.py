@@ -38,7 +38,10 @@ def write_document(model: ModelView, path: str | os.PathLike[str]) -> None:
         If the name has another ending, the file cannot be written, or the model contains what a document
         cannot carry; the file is then what it was before.
     """
-    target = Path(path).expanduser()
+    try:
+        target = Path(os.fsdecode(path)).expanduser()
+    except (TypeError, RuntimeError):  # "~name", and nobody has that name
+        raise FormatError(f"A model is saved to the path of a file, not to {path!r}.") from None
     if not target.name.endswith(SUFFIX):
         raise FormatError(f"{target}: a document has the ending {SUFFIX}, as in {target.stem + SUFFIX!r}.")
     try:
