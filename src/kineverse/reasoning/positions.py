@@ -188,11 +188,14 @@ def _leaves(
 
 
 def _free_range(leaves: list[_Leaf], limit: Interval) -> tuple[float, float]:
-    """Return what range is no restriction: the limits, and what the constraint leaves at most."""
+    """Return what range is no restriction: the limits, else the most that the constraint leaves."""
     lows = [-math.inf if leaf.lower.symbols else float(leaf.lower) for leaf in leaves]
     highs = [math.inf if leaf.upper.symbols else float(leaf.upper) for leaf in leaves]
-    low, high = min(lows, default=-math.inf), max(highs, default=math.inf)
-    return max(low, float(limit.lower)), min(high, float(limit.upper))
+    low, high = float(limit.lower), float(limit.upper)
+    return (
+        min(lows, default=low) if math.isinf(low) else low,
+        max(highs, default=high) if math.isinf(high) else high,
+    )
 
 
 def _is_narrower(leaf: _Leaf, free: tuple[float, float]) -> bool:

@@ -36,11 +36,19 @@ class Region:
         return Region(self.boxes + other.boxes, self.telling + other.telling)
 
     def __sub__(self, other: Region) -> Region:
-        return Region(difference(self.boxes, other.boxes), difference(self.telling, other.boxes))
+        left = ((box, part) for box in self.telling for part in difference([box], other.boxes))
+        telling = [part for box, part in left if not _is_sliver(part, box)]
+        return Region(difference(self.boxes, other.boxes), telling)
 
     def short(self) -> tuple[Box, ...]:
         """Return few large boxes that are the region, none if nothing of it is worth telling."""
         return merged(self.boxes, self.telling)
+
+
+def _is_sliver(part: Box, box: Box) -> bool:
+    """Whether a part has a single value where the box has an interval: at the edge of what was taken away."""
+    flat = (axis for axis, side in part.items() if side.lower == side.upper)
+    return any(box.get(axis, EVERYTHING).lower != box.get(axis, EVERYTHING).upper for axis in flat)
 
 
 def difference(boxes: Iterable[Box], others: Iterable[Box]) -> list[Box]:
