@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from kineverse.cli.assignments import parse_assignments, parse_value
-from kineverse.errors import ValueRejectedError
+from kineverse.errors import NameTakenError, ValueRejectedError
 
 
 @pytest.mark.parametrize(
@@ -77,8 +77,8 @@ def test_what_is_no_finite_number_is_refused(text):
         parse_value(text)
 
 
-def test_assignments_take_the_last_and_leave_names_alone():
-    texts = ["kitchen/fridge_door=30deg", "a=b=0.1", "kitchen/fridge_door=1", "x:velocity=2"]
+def test_assignments_leave_names_alone():
+    texts = ["kitchen/fridge_door=1", "a=b=0.1", "x:velocity=2"]
     assert parse_assignments(texts) == {"kitchen/fridge_door": 1.0, "a=b": 0.1, "x:velocity": 2.0}
 
 
@@ -86,3 +86,8 @@ def test_assignments_take_the_last_and_leave_names_alone():
 def test_what_is_no_assignment_is_refused(text):
     with pytest.raises(ValueRejectedError):
         parse_assignments([text])
+
+
+def test_a_name_is_given_once():
+    with pytest.raises(NameTakenError, match="--set a is given twice"):
+        parse_assignments(["a=1", "b=2", " a =1"])

@@ -253,3 +253,11 @@ def test_pages_end_with_status_0(stop, words, hears_ctrl_c):
     assert process.returncode == 0
     assert "Traceback" not in err
     assert "viser" not in out + err
+
+
+def test_fk_takes_positions_and_no_speeds(run):
+    words = ("fk", "kitchen", "kitchen/fridge_door", "--set", "kitchen/fridge_door:velocity=1")
+    status, out, err = run(*words)
+    assert (status, out) == (2, "")
+    assert "'kitchen/fridge_door:velocity' is a speed" in err
+    assert "positions only" in err

@@ -302,6 +302,50 @@ def test_the_default_state_is_zero_within_limits() -> None:
     assert not model.violations(state)
 
 
+def test_the_default_state_keeps_limits_on_lines_over_one_symbol() -> None:
+    # a joint that a follows backwards, one that is turned around, and one that has several such limits
+    model = constrained(
+        mimic=(-1, -2 * a + 3, 1),
+        back=(1, -b, 2),
+        one=(0.5, 4 * c, 9),
+        two=(-INF, 2 - c, 1.5),
+        free=(-INF, 3 * d, INF),
+    )
+    state = model.default_state()
+    assert dict(state) == {a: 1, b: -1, c: 0.5, d: 0}
+    assert not model.violations(state)
+    about_others = constrained(a=(b, 2 * a - 1, 100), b=(3, -2 * b, 4))
+    state = about_others.default_state()
+    assert dict(state) == {a: 0, b: -1.5}
+    assert constrained(a=(b, 2 * a, 100), b=(3, b, 4)).default_state()[a] == 1.5
+    with about_others.edit() as edit:
+        edit.remove("constraint b")
+    assert dict(about_others.default_state()) == {a: 0.5, b: 0}
+
+
+def test_other_limits_are_not_looked_at_by_the_default_state() -> None:
+    p = kv.parameter("p", 2.0)
+    model = constrained(
+        sum=(1, a + b, 2), square=(1, c * c, 4), scaled=(1, p * d, 2), root=(1, np.sqrt(d + 1), 2)
+    )
+    assert dict(model.default_state()) == {a: 0, b: 0, c: 0, d: 0, p: 2}
+    assert {v.name for v in model.violations(model.default_state())} == {"sum", "square", "scaled"}
+
+
+def test_a_joint_that_follows_another_starts_within_its_limits(tmp_path: Any) -> None:
+    limit = '<limit lower="{}" upper="{}" effort="1" velocity="1"/>'
+    (tmp_path / "mimic.urdf").write_text(
+        '<robot name="r"><link name="x"/><link name="y"/><link name="z"/>'
+        '<joint name="j" type="revolute"><parent link="x"/><child link="y"/>'
+        + limit.format(0, 2)
+        + '</joint><joint name="k" type="revolute"><parent link="y"/><child link="z"/>'
+        '<mimic joint="j" multiplier="-2" offset="3"/>' + limit.format(-1, 1) + "</joint></robot>"
+    )
+    model = kv.load(tmp_path / "mimic.urdf")
+    assert model.default_state()["j"] == 1
+    assert not model.violations(model.default_state())
+
+
 def test_bounds_that_are_about_other_symbols_are_kept_too() -> None:
     # in the order of names, every bound looks at one that is clipped later
     model = constrained(a=(b + 1, a, 100), b=(c + 1, b, 100), c=(d, c, 100), d=(3, d, 9))

@@ -7,7 +7,7 @@ import math
 import re
 from collections.abc import Iterable
 
-from kineverse.errors import ValueRejectedError
+from kineverse.errors import NameTakenError, ValueRejectedError
 
 _NUMBER = r"(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][-+]?[0-9]+)?"
 _VALUE = re.compile(
@@ -39,19 +39,23 @@ def add_set_option(parser: argparse.ArgumentParser) -> None:
 
 
 def parse_assignments(texts: Iterable[str]) -> dict[str, float]:
-    """Return values by name from texts like ``kitchen/fridge_door=30deg``; the last of several counts.
+    """Return values by name from texts like ``kitchen/fridge_door=30deg``.
 
     Raises
     ------
     ValueRejectedError
         If a text is no assignment, or the value no finite number.
+    NameTakenError
+        If there are two values for a name.
     """
-    values = {}
+    values: dict[str, float] = {}
     for text in texts:
         # A value has no equals sign in it; a name may.
         name, equals, value = text.rpartition("=")
         if not equals or not name.strip():
             raise ValueRejectedError(f"--set {text!r}: write NAME=VALUE, such as kitchen/fridge_door=0.3")
+        if name.strip() in values:
+            raise NameTakenError(f"--set {name.strip()} is given twice.")
         values[name.strip()] = parse_value(value)
     return values
 

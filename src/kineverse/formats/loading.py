@@ -8,11 +8,12 @@ from collections import OrderedDict
 from collections.abc import Iterator
 
 from kineverse.collection import no_collection
-from kineverse.errors import FormatError
+from kineverse.errors import ExpressionError, FormatError
 from kineverse.model.frame import WORLD
 from kineverse.model.model import Model, Snapshot
 from kineverse.model.operation import Operation
 from kineverse.shipped.bases import base_of
+from kineverse.symbols import position
 
 from .document import operations_from
 from .files import read_file
@@ -46,8 +47,9 @@ def load(source: str | os.PathLike[str], prefix: str | None = None) -> Model:
     UnknownNameError
         If there is no such model.
     FormatError
-        If the file is not what it should be, with file, line, element and reason.
+        If the file is not what it should be, with file, line, element and reason; or if the prefix is not.
     """
+    _check_prefix(prefix)
     found = locate_model(source)
     content = _content(found)
     key = found, prefix, hashlib.blake2b(content).digest()
@@ -72,8 +74,23 @@ def operations_of(
     source: str | os.PathLike[str], prefix: str | None = None
 ) -> Iterator[tuple[str, Operation]]:
     """Yield the operations of a file or shipped model, each with its tag."""
+    _check_prefix(prefix)
     found = locate_model(source)
     yield from _operations(found, _content(found), prefix)
+
+
+def _check_prefix(prefix: object) -> None:
+    if prefix is None or prefix == "":
+        return
+    if not isinstance(prefix, str):
+        raise FormatError(f"A prefix is a text that is put in front of names, not {prefix!r}.")
+    try:
+        position(prefix)
+    except ExpressionError:
+        raise FormatError(
+            f"The prefix {prefix!r} has an empty part, a control character or half of a surrogate pair. The "
+            "slash behind it comes by itself."
+        ) from None
 
 
 def _content(source: Source) -> bytes:

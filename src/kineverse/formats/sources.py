@@ -70,6 +70,11 @@ def locate_model(name: str | os.PathLike[str]) -> Source:
     path = _expanded(text)
     if _is(path, Path.is_file):
         return Source(path.resolve())
+    explicit = path.is_absolute() or text.startswith(".") or text.endswith(SUFFIXES)
+    if explicit and not _is(path, Path.is_dir) and _is(path, os.path.lexists):
+        raise FormatError(
+            f"{_shown(text)} is no regular file, but a pipe, a device, or a link that leads nowhere."
+        )
     if path.is_absolute() or text.startswith("."):
         raise UnknownNameError(f"There is no file {_shown(text)}.{_beside(path)}")
     searched: list[str] = []

@@ -6,14 +6,12 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, TypeAlias
+from typing import TypeAlias
 
 from kineverse.errors import ShapeError, ValueRejectedError
 from kineverse.expressions.expression import Expression, ExpressionLike, as_expression
 from kineverse.expressions.leaves import gradient_keys
-
-if TYPE_CHECKING:
-    from kineverse.symbols import Symbol
+from kineverse.symbols import Symbol
 
 ConstraintLike: TypeAlias = "Constraint | Sequence[ExpressionLike]"
 
@@ -63,6 +61,25 @@ class Constraint:
         """All free symbols, those of the bounds included; sorted."""
         found = {*self.lower.symbols, *self.expression.symbols, *self.upper.symbols}
         return tuple(sorted(found, key=lambda s: s.sort_key))
+
+    @cached_property
+    def line(self) -> tuple[float, float] | None:
+        """Slope and offset of an expression that is a straight line over one symbol; None for any other."""
+        if isinstance(self.expression, Symbol):
+            return 1.0, 0.0
+        if not self.expression._nodes and len(self.expression.symbols) == 1:
+            (symbol,) = self.expression.symbols
+            slope = self.expression.partial([symbol])[0]
+            if not slope.symbols:
+                found = float(slope), float(self.expression({symbol: 0.0}))
+                return found if found[0] and all(map(math.isfinite, found)) else None
+        return None
+
+    def nearest(self, value: float, lower: float, upper: float) -> float:
+        """Return the value of the one symbol nearest to a given one at which the bounds hold."""
+        slope, offset = self.line or (1.0, 0.0)
+        low, high = sorted(((lower - offset) / slope, (upper - offset) / slope))
+        return min(max(value, low), high)
 
     @property
     def order(self) -> int:

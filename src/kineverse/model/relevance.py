@@ -31,6 +31,7 @@ class Relevance:
         self._by_expression: defaultdict[str, dict[str, None]] = defaultdict(dict)
         self._by_bounds: defaultdict[str, dict[str, None]] = defaultdict(dict)
         self._alone: dict[Symbol, dict[str, None]] = {}
+        self._lines: dict[Symbol, dict[str, None]] = {}
 
     def add(self, name: str, constraint: Constraint) -> None:
         """Take a constraint into the index."""
@@ -40,6 +41,8 @@ class Relevance:
             self._by_bounds[path][name] = None
         if isinstance(constraint.expression, Symbol):
             self._alone.setdefault(constraint.expression, {})[name] = None
+        elif len(constraint.expression.symbols) == 1:
+            self._lines.setdefault(constraint.expression.symbols[0], {})[name] = None
 
     def remove(self, name: str, constraint: Constraint) -> None:
         """Take a constraint out."""
@@ -49,6 +52,8 @@ class Relevance:
             self._by_bounds[path].pop(name, None)
         if isinstance(constraint.expression, Symbol):
             self._alone.get(constraint.expression, {}).pop(name, None)
+        elif len(constraint.expression.symbols) == 1:
+            self._lines.get(constraint.expression.symbols[0], {}).pop(name, None)
 
     def _paths(self, constraint: Constraint) -> set[str]:
         paths = {s.path for s in constraint.expression.symbols}
@@ -57,6 +62,10 @@ class Relevance:
     def on(self, symbol: Symbol) -> list[str]:
         """Return the names of the constraints whose expression is just this symbol."""
         return list(self._alone.get(symbol, ()))
+
+    def about(self, symbol: Symbol) -> list[str]:
+        """Return the names of the constraints whose expression has this symbol in it and no other."""
+        return [*self._alone.get(symbol, ()), *self._lines.get(symbol, ())]
 
     def of(
         self,

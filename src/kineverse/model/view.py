@@ -464,7 +464,11 @@ class ModelView:
         )
 
     def default_state(self) -> State:
-        """Return a value for every symbol: 0, or its home, clipped into limits; parameters keep theirs."""
+        """Return a value for every symbol: 0, or its home, clipped into limits; parameters keep theirs.
+
+        Limits are constraints on a straight line over one symbol, such as those of a joint and of what
+        follows it. Others, as on the sum of two, are not looked at: :meth:`violations` says which hold.
+        """
         with self._lock:
             symbols = self.symbols
             values: dict[Symbol, float] = {s: s.value or 0.0 for s in symbols}
@@ -474,19 +478,22 @@ class ModelView:
                         values[symbol] = home
             later = []
             for symbol in symbols:
-                for name in self._relevance.on(symbol):
+                for name in self._relevance.about(symbol):
                     c = self._head[CONSTRAINTS][name]
+                    if c.line is None:
+                        continue
                     if c.lower.symbols or c.upper.symbols:
                         later.append((symbol, c))
                     else:
-                        values[symbol] = min(max(values[symbol], float(c.lower)), float(c.upper))
+                        values[symbol] = c.nearest(values[symbol], float(c.lower), float(c.upper))
             # Bounds may be about symbols that have such bounds too: at most so many rounds until all fit.
             for _ in later:
                 before = dict(values)
                 for symbol, c in later:
                     known = State(values)
                     if all(s in known or s.value is not None for s in (*c.lower.symbols, *c.upper.symbols)):
-                        values[symbol] = float(min(max(values[symbol], c.lower(known)), c.upper(known)))
+                        low, high = float(c.lower(known)), float(c.upper(known))
+                        values[symbol] = c.nearest(values[symbol], low, high)
                 if values == before:
                     break
             return State(values, source="default")

@@ -11,6 +11,7 @@ import numpy.typing as npt
 import kineverse as kv
 from kineverse.errors import UnknownNameError, suggest
 from kineverse.model.view import ModelView
+from kineverse.symbols import parse_symbol_name
 from kineverse.view.triangles import Floats
 
 ROOT = "world"
@@ -92,5 +93,7 @@ def complete(model: ModelView, state: Mapping[Any, float] | None = None) -> dict
         if name in known:
             values[name] = float(value)
         elif isinstance(key, str):
+            if parse_symbol_name(name)[1] and name.partition(":")[0] in known:
+                raise UnknownNameError(f"'{name}' is a speed; where things are depends on positions only.")
             raise UnknownNameError(f"The model has no symbol '{name}'. {suggest(name, known, 'symbol')}")
     return values
