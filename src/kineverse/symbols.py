@@ -56,10 +56,19 @@ class Symbol(Expression):
 
     def __new__(cls, path: str, order: int = 0, role: Role = "dof", value: float | None = None) -> Symbol:
         """Return the one symbol of this path, order, role and value."""
+        if value is not None and type(value) is not float:
+            if isinstance(value, bool) or not isinstance(value, int | float):
+                _check(path, order, role, value)
+            value = float(value)  # its repr is part of the name below, and numpy's numbers have another one
         key = (path, order, role, value)
-        if type(path) is str and type(order) is int and key in _INTERNED:
-            return _INTERNED[key]
+        try:
+            if type(path) is str and type(order) is int and key in _INTERNED:
+                return _INTERNED[key]
+        except TypeError:
+            pass  # what is no path or role need not be hashable; it is refused by name
         _check(path, order, role, value)
+        if value is not None:
+            value += 0.0  # -0.0 is the same symbol as 0.0, so it must not be told apart by its name
         self = object.__new__(cls)
         self._text = symbol_name(path, order)
         # The name is part of what CasADi serialises, so symbols that differ have names that differ.
