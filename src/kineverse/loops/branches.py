@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 import numpy.typing as npt
 
@@ -12,7 +14,12 @@ _SAME = 1e-4
 
 
 def find_branches(
-    equations: Equations, near: Array, u: Array, angles: npt.NDArray[np.bool_], reach: Array
+    equations: Equations,
+    near: Array,
+    u: Array,
+    angles: npt.NDArray[np.bool_],
+    reach: Array,
+    upright: Callable[[Array], Array] | None = None,
 ) -> tuple[list[Array], float]:
     """Return the solutions that were found, the nearest first, and the smallest gap of all attempts.
 
@@ -28,6 +35,9 @@ def find_branches(
         Which unknowns are angles; solutions that differ by whole turns are one, the nearest to ``near``.
     reach
         How far from ``near`` to look, for each unknown.
+    upright
+        Numbers at unknowns and inputs that are positive in a solution that counts; elsewhere the ends are
+        half a turn apart.
     """
     # The same attempts in every process: which branch is which has to be the same everywhere.
     generator = np.random.default_rng(0)
@@ -36,6 +46,8 @@ def find_branches(
     smallest = np.inf
     for start in starts:
         x, gap = equations.close(start, u, 60)
+        if gap <= CLOSED and upright is not None and not np.all(upright(np.concatenate([x, u])) > 0):
+            gap = np.pi
         smallest = min(smallest, gap)
         if gap > CLOSED:
             continue

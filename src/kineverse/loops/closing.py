@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from kineverse.compile import compile  # noqa: A004
 from kineverse.errors import UnsolvedError, ValueRejectedError
 from kineverse.expressions.expression import Expression
 from kineverse.expressions.implicit import ImplicitFunction
@@ -21,6 +22,9 @@ from .seed import Interval, Seed
 
 RANK = 1e-7
 """What a singular value is, relative to the largest, below which a direction counts as free."""
+
+_SMALL = 1e-3
+"""The size of bars [m] down to which derivatives can be told from rounding."""
 
 _DEGREES = (2, 3, 4, 6, 8, 10, 12, 16, 20, 24, 32)
 _MORE_STEPS = 4
@@ -66,6 +70,7 @@ def close(
     *,
     dependent: Sequence[Symbol] | None = None,
     branch: int = 0,
+    upright: Expression | None = None,
 ) -> Closed:
     """Close a loop.
 
@@ -85,6 +90,9 @@ def close(
         The coordinates that follow; chosen if None.
     branch
         Which solution at home, 0 the one nearest to ``home``.
+    upright
+        Numbers that are positive in a solution that counts: rows about the sine of an angle are zero where it
+        is half a turn, too.
 
     Raises
     ------
@@ -97,6 +105,9 @@ def close(
     values = np.array([home[s] for s in coordinates])
     given = np.array([home[s] for s in parameters])
     unknown = Equations(residual, coordinates, parameters)
+    if not np.isfinite(unknown.gap(values, given)):
+        at = ", ".join(f"{s} = {v:.6g}" for s, v in zip(coordinates, values, strict=True))
+        raise UnsolvedError(f"Loop '{name}' is not defined at {at}. Begin elsewhere, with home={{...}}.")
     start, gap = nearest_closed(unknown, values, given)
     if gap > CLOSED:
         raise UnsolvedError(f"Loop '{name}' does not close: at best {gap:.6g} is left between its ends.")
@@ -113,7 +124,8 @@ def close(
     angles, goes_round = periodic(equations, x, u)
     spans = np.array([max(map(abs, limits.get(s, (np.pi,)))) for s in followers])
     reach = np.where(angles, np.pi, np.where(np.isfinite(spans), spans, np.pi) + 1.0)
-    found, gap = find_branches(equations, x, u, angles, reach)
+    stands = None if upright is None else compile(upright, [*followers, *inputs], tier="interpreter")
+    found, gap = find_branches(equations, x, u, angles, reach, stands)
     where = ", ".join(f"{s} = {home[s]:.6g}" for s in free) or "all configurations"
     if not found:
         raise UnsolvedError(
@@ -146,7 +158,7 @@ def _rank(equations: Equations, x: Array, given: Array) -> int:
         near, gap = equations.close(x + scale * generator.uniform(-1, 1, len(x)), given, 60)
         if gap < CLOSED:
             values = np.linalg.svd(equations(near, given)[1], compute_uv=False)
-            most = max(most, int((values > RANK * max(values.max(initial=0.0), 1e-12)).sum()))
+            most = max(most, int((values > RANK * max(values.max(initial=0.0), _SMALL)).sum()))
     return most
 
 

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any, TypeVar
 
-from kineverse.errors import ModelError, UnsolvedError, ValueRejectedError
+from kineverse.errors import ModelError, NameTakenError, UnsolvedError, ValueRejectedError
 from kineverse.expressions.expression import Expression, array
 from kineverse.model.articulation import Articulation
 from kineverse.model.frame import WORLD
@@ -83,11 +84,32 @@ class CloseLoop(Operation):
             raise ValueRejectedError(
                 f"The mask of loop '{self.name}' has names out of {', '.join(AXES)}, not {self.mask!r}."
             )
-        if isinstance(self.home, Mapping):
-            object.__setattr__(self, "home", tuple((str(k), float(v)) for k, v in self.home.items()))
-        if isinstance(self.within, Mapping):
-            pairs = self.within.items()
-            object.__setattr__(self, "within", tuple((str(k), float(a), float(b)) for k, (a, b) in pairs))
+        if isinstance(self.branch, bool) or not isinstance(self.branch, int):
+            raise ValueRejectedError(
+                f"The branch of loop '{self.name}' is a number from 0, not {self.branch!r}."
+            )
+        if isinstance(self.dependent, str):
+            object.__setattr__(self, "dependent", (self.dependent,))
+        try:
+            home = self.home.items() if isinstance(self.home, Mapping) else self.home
+            object.__setattr__(self, "home", tuple((str(k), float(v)) for k, v in home))
+            within: Iterable[Any] = self.within
+            if isinstance(self.within, Mapping):
+                within = [(k, a, b) for k, (a, b) in self.within.items()]
+            object.__setattr__(self, "within", tuple((str(k), float(a), float(b)) for k, a, b in within))
+        except (TypeError, ValueError):
+            raise ValueRejectedError(
+                f"Loop '{self.name}' takes home={{name: value}} and within={{name: (lower, upper)}}, "
+                f"not home={self.home!r} and within={self.within!r}."
+            ) from None
+        for k, v in self.home:
+            if not math.isfinite(v):
+                raise ValueRejectedError(f"Loop '{self.name}' cannot begin at {k} = {v}.")
+        for k, a, b in self.within:
+            if not a <= b:
+                raise ValueRejectedError(
+                    f"Loop '{self.name}' cannot be used within {a} <= {k} <= {b}: no value lies there."
+                )
 
     def default_tag(self) -> str:
         """Return ``loop`` and the name."""
@@ -95,7 +117,12 @@ class CloseLoop(Operation):
 
     def apply(self, model: Reader) -> Effects:
         """Write what the dependent coordinates are."""
+        if self.name in model.articulations:
+            raise NameTakenError(
+                f"There is an articulation '{self.name}' already; give loop '{self.name}' another name."
+            )
         residual = array([row for frame, to in self._ends for row in self._rows(model, frame, to)])
+        signs = [sign for frame, to in self._ends for sign in self._upright(model, frame, to)]
         moving = {s for s in residual.symbols if s.has_derivative}
         on_the_way = [s for frame, to in self._ends for s in model.coordinates_between(frame, to)]
         coordinates = list(dict.fromkeys([s for s in on_the_way if s in moving] + sorted(moving, key=str)))
@@ -116,12 +143,29 @@ class CloseLoop(Operation):
             if self.dependent is None
             else [by_name[n] for (n,) in self._known([(n,) for n in self.dependent], by_name)],
             branch=self.branch,
+            upright=array(signs) if signs else None,
         )
+        self._check(model, closed)
         solution = closed.function.of(closed.function.inputs)
         return Effects(
             rates={x: solution[i] for i, x in enumerate(closed.dependent)},
             articulations={self.name: self._record(closed)},
         )
+
+    def _check(self, model: Reader, closed: Closed) -> None:
+        """Look whether what follows is free to do so, and what has limits here is free."""
+        for s in closed.dependent:
+            if model.carry(s) is not s:
+                raise ValueRejectedError(
+                    f"Loop '{self.name}' cannot make '{s}' follow: it is moved by speeds of its own. "
+                    "Say what follows, with dependent=(...)."
+                )
+        for name, _, _ in self.within:
+            if name in map(str, closed.dependent):
+                raise ValueRejectedError(
+                    f"Loop '{self.name}' has within={{...}} for what is free, and '{name}' follows "
+                    f"{', '.join(map(str, closed.free)) or 'nothing'}."
+                )
 
     @property
     def _ends(self) -> tuple[tuple[str, str], ...]:
@@ -150,6 +194,20 @@ class CloseLoop(Operation):
                 f"Loop '{self.name}' is closed already: nothing of '{frame}' that its mask names moves."
             )
         return kept
+
+    def _upright(self, model: Reader, frame: str, to: str) -> list[Expression]:
+        """Return what is positive where angles that the mask makes zero are not half a turn."""
+        turning = [axis for axis in "xyz" if f"r{axis}" in self.mask]
+        if not turning:
+            return []
+        r = model.resolve(model.fk(frame, to))[:3, :3]
+        x, y, z = r[0, 0], r[1, 1], r[2, 2]
+        if len(turning) == 3:
+            return [x + y + z]
+        diagonal = dict(zip("xyz", (x, y, z), strict=True))
+        if len(turning) == 2:
+            return [diagonal[axis] for axis in "xyz" if axis not in turning]
+        return [sum((diagonal[axis] for axis in "xyz" if axis not in turning), array(0.0))]
 
     def _limits(self, model: Reader, symbol: Symbol) -> tuple[float, float] | None:
         """Return the position limits that the joint of a coordinate wrote, if they are numbers."""

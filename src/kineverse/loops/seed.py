@@ -108,7 +108,7 @@ class Seed:
         intervals: Sequence[Interval], degree: int, inputs: Array, solutions: Array, winding: Array
     ) -> Seed:
         """Fit a seed to solutions (N, n) at inputs (N, k)."""
-        basis = _products([i.numbers(inputs[:, k], degree) for k, i in enumerate(intervals)])
+        basis = _products(inputs, intervals, degree)
         coefficients = np.linalg.lstsq(basis, solutions - inputs @ winding, rcond=None)[0].astype(np.float64)
         # What is far below the error of the fit is noise, and costs as much as any other term.
         coefficients[np.abs(coefficients) < 1e-14 * np.abs(coefficients).max(initial=0.0)] = 0.0
@@ -116,7 +116,7 @@ class Seed:
 
     def at(self, inputs: Array) -> Array:
         """Return the guesses at inputs (N, k), shape (N, n)."""
-        basis = _products([i.numbers(inputs[:, k], self.degree) for k, i in enumerate(self.intervals)])
+        basis = _products(inputs, self.intervals, self.degree)
         return basis @ self.coefficients + inputs @ self.winding
 
     @property
@@ -129,8 +129,8 @@ class Seed:
         bases = [i.functions(u, self.degree) for i, u in zip(self.intervals, inputs, strict=True)]
         products = []
         for factors in itertools.product(*bases):
-            product = factors[0]
-            for factor in factors[1:]:
+            product = array(1.0)
+            for factor in factors:
                 product = product * factor
             products.append(product)
         guesses = []
@@ -144,9 +144,10 @@ class Seed:
         return array(guesses)
 
 
-def _products(columns: Sequence[Array]) -> Array:
+def _products(inputs: Array, intervals: Sequence[Interval], degree: int) -> Array:
     """Return all products of basis functions, one of each input, in the order of itertools.product."""
-    result = columns[0]
-    for other in columns[1:]:
+    result = np.ones((len(inputs), 1))
+    for column, interval in zip(inputs.T, intervals, strict=True):
+        other = interval.numbers(column, degree)
         result = (result[:, :, None] * other[:, None, :]).reshape(len(result), -1)
     return result
