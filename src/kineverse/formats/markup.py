@@ -2,7 +2,8 @@
 
 An element is a plain tuple ``(tag, attributes, children, line)``: a file of 10^5 links becomes as many tuples
 in linear time. Document types, and with them all declarations of entities, are refused, so nothing expands
-and nothing is fetched. Nesting and size are bounded. Text between elements is dropped.
+and nothing is fetched. Nesting and size are bounded. Text between elements is dropped, and that inside of an
+element, too, unless it is asked for.
 """
 
 from __future__ import annotations
@@ -21,6 +22,9 @@ MAX_DEPTH = 200
 Element: TypeAlias = "tuple[str, dict[str, str], list[Element], int]"
 """Tag, attributes, children, line."""
 
+TEXT = ""
+"""The attribute that has the text of an element without children: no attribute of XML has an empty name."""
+
 Visit: TypeAlias = Callable[[Element], None]
 Begin: TypeAlias = Callable[[Element], Visit]
 
@@ -35,7 +39,11 @@ class ElementError(Exception):
 
 
 def parse(
-    data: str | bytes, source: str, skipped: frozenset[str] = frozenset(), begin: Begin | None = None
+    data: str | bytes,
+    source: str,
+    skipped: frozenset[str] = frozenset(),
+    begin: Begin | None = None,
+    texts: bool = False,
 ) -> Element:
     """Parse a document and return its root element.
 
@@ -51,6 +59,8 @@ def parse(
         Called with the root as soon as it opens; what it returns is called with each child of the root as
         soon as that is complete. The children are then not kept: a long document takes no more memory than
         its longest part.
+    texts
+        Whether to keep the text of elements that have any, as their attribute ``TEXT``.
 
     Raises
     ------
@@ -65,6 +75,7 @@ def parse(
     open_lists = [document]
     skipped_depth = 0
     visit: Visit | None = None
+    pieces: list[str] = []
 
     def start_root(tag: str, attributes: dict[str, str]) -> None:
         nonlocal visit
@@ -82,11 +93,18 @@ def parse(
         children: list[Element] = []
         open_lists[-1].append((tag, attributes, children, parser.CurrentLineNumber))
         open_lists.append(children)
+        pieces.clear()
         if len(open_lists) > MAX_DEPTH:
             refuse_depth(tag)
 
     def end(tag: str) -> None:
         open_lists.pop()
+
+    def end_with_text(tag: str) -> None:
+        children = open_lists.pop()
+        if pieces and not children:
+            open_lists[-1][-1][1][TEXT] = "".join(pieces)
+        pieces.clear()
 
     def end_visiting(tag: str) -> None:
         open_lists.pop()
@@ -120,7 +138,10 @@ def parse(
             "declaration and write out what its entities stand for."
         )
 
-    parser.StartElementHandler, parser.EndElementHandler = start_root, end
+    parser.StartElementHandler, parser.EndElementHandler = start_root, end_with_text if texts else end
+    if texts:
+        parser.buffer_text = True
+        parser.CharacterDataHandler = pieces.append
     parser.StartDoctypeDeclHandler = refuse_doctype
     try:
         parser.Parse(data, True)
@@ -132,6 +153,24 @@ def parse(
         # An encoding that expat cannot have, or a str with lone surrogates.
         raise FormatError(f"{source}, line 1: cannot be decoded: {error}. Save it as UTF-8.") from None
     return document[0]
+
+
+def name_of(element: Element) -> str:
+    """Return the name of an element, which must have one."""
+    name = element[1].get("name")
+    if not name:
+        raise ElementError(
+            element, "has no name; names are required." if name is None else "has an empty name."
+        )
+    return name
+
+
+def child(element: Element, tag: str) -> Element | None:
+    """Return the first child with that tag, or None."""
+    for candidate in element[2]:
+        if candidate[0] == tag:
+            return candidate
+    return None
 
 
 def label(element: Element) -> str:

@@ -8,7 +8,7 @@ from typing import Any, TypeAlias
 from kineverse.articulations import Joint
 from kineverse.articulations.mechanisms import Mechanism
 from kineverse.expressions.expression import Expression
-from kineverse.formats.urdf.operations import SetBody
+from kineverse.formats.set_body import SetBody
 from kineverse.loops import CloseLoop
 from kineverse.model.body import Body, Pose
 from kineverse.model.edit import AddFrame

@@ -9,23 +9,13 @@ from typing import TypeVar
 
 from kineverse.formats import numerals, rpy
 from kineverse.formats.markup import Element, ElementError, abbreviate
-from kineverse.formats.urdf.remarks import Remarks
+from kineverse.formats.remarks import Remarks
 from kineverse.model.body import Pose, Vector3
 
 T = TypeVar("T")
 
 _ZERO = (0.0, 0.0, 0.0)
 _IDENTITY = Pose()
-
-
-def name_of(element: Element) -> str:
-    """Return the name of an element, which must have one."""
-    name = element[1].get("name")
-    if not name:
-        raise ElementError(
-            element, "has no name; names are required." if name is None else "has an empty name."
-        )
-    return name
 
 
 def number(element: Element, key: str, default: float | None = None) -> float:
@@ -80,11 +70,3 @@ def pose(origin: Element | None, owner: Element, version: tuple[int, int], remar
         return rpy.pose_of_quaternion(xyz, numerals.numbers(quaternion, 4))
     except ValueError as error:
         raise ElementError(origin, f'quat_xyzw="{abbreviate(quaternion)}" {error}.') from None
-
-
-def child(element: Element, tag: str) -> Element | None:
-    """Return the first child with that tag, or None."""
-    for candidate in element[2]:
-        if candidate[0] == tag:
-            return candidate
-    return None

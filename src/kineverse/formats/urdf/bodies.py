@@ -9,11 +9,11 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from kineverse.formats.markup import Element, ElementError, label
-from kineverse.formats.urdf.attributes import child, name_of, number, pose, vector
+from kineverse.formats.markup import Element, ElementError, child, label, name_of
+from kineverse.formats.remarks import Remarks
+from kineverse.formats.urdf.attributes import number, pose, vector
 from kineverse.formats.urdf.description import Link
 from kineverse.formats.urdf.materials import Materials
-from kineverse.formats.urdf.remarks import Remarks
 from kineverse.model.body import Body, Box, Capsule, Cylinder, Geometry, Inertia, Mesh, Shape, Sphere
 
 _UNSCALED = (1.0, 1.0, 1.0)

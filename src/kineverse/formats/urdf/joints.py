@@ -9,9 +9,10 @@ from __future__ import annotations
 import math
 
 from kineverse.errors import suggest
-from kineverse.formats.markup import Element, ElementError, abbreviate
+from kineverse.formats.markup import Element, ElementError, abbreviate, name_of
+from kineverse.formats.remarks import Remarks
 from kineverse.formats.rpy import snap
-from kineverse.formats.urdf.attributes import name_of, number, pose, vector
+from kineverse.formats.urdf.attributes import number, pose, vector
 from kineverse.formats.urdf.description import (
     FREEDOM,
     FRICTIONLESS,
@@ -23,7 +24,6 @@ from kineverse.formats.urdf.description import (
     Mimic,
     Safety,
 )
-from kineverse.formats.urdf.remarks import Remarks
 from kineverse.model.body import Vector3
 
 _X = (1.0, 0.0, 0.0)

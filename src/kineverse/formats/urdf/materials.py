@@ -8,10 +8,9 @@ from __future__ import annotations
 
 from typing import TypeAlias
 
-from kineverse.formats.markup import Element, ElementError, quote
+from kineverse.formats.markup import Element, ElementError, child, quote
 from kineverse.formats.numerals import numbers
-from kineverse.formats.urdf.attributes import child
-from kineverse.formats.urdf.remarks import Remarks
+from kineverse.formats.remarks import Remarks
 from kineverse.model.body import Rgba
 
 Appearance: TypeAlias = tuple[Rgba | None, str]

@@ -15,8 +15,9 @@ from kineverse.articulations import Joint as JointOperation
 from kineverse.errors import FormatError
 from kineverse.expressions.expression import Expression
 from kineverse.formats.markup import quote
+from kineverse.formats.set_body import SetBody, is_empty
 from kineverse.formats.urdf.description import Joint, Link, Robot
-from kineverse.model.body import Body, Pose
+from kineverse.model.body import Pose
 from kineverse.model.edit import AddFrame
 from kineverse.model.frame import WORLD, Frame
 from kineverse.model.operation import Effects, Operation
@@ -33,24 +34,6 @@ _SUFFIXES = {
     "floating": ("x", "y", "z", "qx", "qy", "qz", "qw", "wx", "wy", "wz"),
 }
 _ROOT = Pose()
-
-
-@dataclass(frozen=True)
-class SetBody(Operation):
-    """Gives a frame its body: what of it is seen and touched, and its inertia."""
-
-    name: str
-    body: Body
-
-    def apply(self, model: Reader) -> Effects:
-        """Write the body."""
-        if self.name != WORLD and self.name not in model.frames:
-            model.frames[self.name]  # raises, with similar names
-        return Effects(bodies={self.name: self.body})
-
-    def default_tag(self) -> str:
-        """Return ``body`` and the name of the frame."""
-        return f"body {self.name}"
 
 
 @dataclass(frozen=True)
@@ -110,7 +93,7 @@ def robot_operations(robot: Robot, prefix: str | None = None, parent: str = WORL
         return f"{prefix}/{_plain(name)}" if prefix else _plain(name)
 
     root = named(robot.root)
-    bodies = {link.name: link.body for link in robot.links if not _is_empty(link.body)}
+    bodies = {link.name: link.body for link in robot.links if not is_empty(link.body)}
     if root != WORLD:
         yield AddFrame(root, Frame(parent, (_ROOT,)))
     elif parent != WORLD:
@@ -124,10 +107,6 @@ def robot_operations(robot: Robot, prefix: str | None = None, parent: str = WORL
         yield from _joint_operations(joint, named)
         if joint.child in bodies:
             yield SetBody(named(joint.child), bodies[joint.child])
-
-
-def _is_empty(body: Body) -> bool:
-    return not body.visuals and not body.collisions and body.inertia is None
 
 
 def _joint_operations(joint: Joint, named: Callable[[str], str]) -> Iterator[Operation]:

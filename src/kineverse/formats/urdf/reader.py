@@ -13,11 +13,11 @@ from typing import TypeVar
 from kineverse.errors import FormatError
 from kineverse.formats.files import read_file
 from kineverse.formats.markup import Element, ElementError, Visit, label, parse, quote
+from kineverse.formats.remarks import Remarks
 from kineverse.formats.urdf.bodies import LinkReader
 from kineverse.formats.urdf.description import Joint, Link, Robot
 from kineverse.formats.urdf.joints import read_joint
 from kineverse.formats.urdf.mimicry import resolve
-from kineverse.formats.urdf.remarks import Remarks
 from kineverse.formats.urdf.tree import root_outwards
 
 _VERSIONS = {"1.0": (1, 0), "1.1": (1, 1), "1.2": (1, 2)}

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 
 from kineverse.formats.markup import Element, label
 
-_log = logging.getLogger("kineverse.formats.urdf")
+_log = logging.getLogger("kineverse.formats")
 
 
 @dataclass(slots=True)

@@ -1,0 +1,71 @@
+"""Positions that follow others, resolved to the ones that move by themselves.
+
+Of a chain ``c = m2 b + o2``, ``b = m1 a + o1`` remains ``c = (m2 m1) a + (m2 o1 + o2)``. Each follower is
+resolved once, so that chains of any length take linear time.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Hashable, Mapping
+from dataclasses import dataclass
+from typing import Generic, NoReturn, TypeVar
+
+from kineverse.formats.markup import quote
+
+K = TypeVar("K", bound=Hashable)
+
+
+@dataclass(frozen=True, slots=True)
+class Following(Generic[K]):
+    """A position that is ``multiplier * leader + offset``."""
+
+    leader: K
+    multiplier: float = 1.0
+    offset: float = 0.0
+
+
+def resolve_chains(
+    following: Mapping[K, Following[K]],
+    refuse: Callable[[K, str], NoReturn],
+    shown: Callable[[K], str] = str,
+    check: Callable[[K, K], None] | None = None,
+) -> dict[K, Following[K]]:
+    """Return for each follower what it follows in the end, with the factors of its chain composed.
+
+    Parameters
+    ----------
+    following
+        What each follower follows; who is not in there moves by itself.
+    refuse
+        Called with a follower and the reason why it cannot be resolved; raises.
+    shown
+        The name of a follower in that reason.
+    check
+        Called with each follower and its leader; may raise.
+    """
+    resolved: dict[K, Following[K]] = {}
+    for start in following:
+        chain: dict[K, Following[K]] = {}
+        last = start
+        while last in following and last not in resolved:
+            step = chain[last] = following[last]
+            if step.leader in chain:
+                circle = " -> ".join(quote(shown(name)) for name in list(chain)[:8])
+                refuse(
+                    last,
+                    "it mimics itself"
+                    + (f", by way of {circle}" if len(chain) > 1 else "")
+                    + ". One of them has to move by itself: remove its <mimic>.",
+                )
+            if check is not None:
+                check(last, step.leader)
+            last = step.leader
+        end = resolved.get(last, Following(last))
+        for follower in reversed(chain):
+            step = chain[follower]
+            multiplier, offset = step.multiplier * end.multiplier, step.multiplier * end.offset + step.offset
+            if not (math.isfinite(multiplier) and math.isfinite(offset)):
+                refuse(follower, "the factors along its chain of <mimic> overflow.")
+            end = resolved[follower] = Following(end.leader, multiplier, offset)
+    return resolved
