@@ -18,13 +18,21 @@ from kineverse.reasoning.regions import common, difference, merged
 SYMBOLS = [kv.position(name) for name in "abcd"]
 NUMBERS = st.integers(-8, 8).map(lambda k: k / 8)
 
-atoms = st.builds(
-    lambda x, f, t, turned: kv.less(t, f(x)) if turned else kv.less(f(x), t),
-    st.sampled_from(SYMBOLS),
-    st.sampled_from([lambda x: x, lambda x: 2 * x + 0.25, lambda x: x * x, np.sin, lambda x: -x, abs]),
-    NUMBERS,
-    st.booleans(),
-)
+POLYNOMIALS = [lambda x: x, lambda x: 2 * x + 0.25, lambda x: x * x, lambda x: -x, abs]
+
+
+def comparisons(functions) -> st.SearchStrategy[kv.Expression]:
+    """Return comparisons of a function of one coordinate with a number."""
+    return st.builds(
+        lambda x, f, t, turned: kv.less(t, f(x)) if turned else kv.less(f(x), t),
+        st.sampled_from(SYMBOLS),
+        st.sampled_from(functions),
+        NUMBERS,
+        st.booleans(),
+    )
+
+
+atoms = comparisons([*POLYNOMIALS, np.sin])
 sums = st.builds(lambda x, y, t: kv.less(x + 2 * y, t), *[st.sampled_from(SYMBOLS)] * 2, NUMBERS)
 
 
@@ -70,7 +78,7 @@ def test_ranges_of_positions(truth: kv.Expression, low: float, high: float) -> N
 
 
 @settings(max_examples=30)
-@given(logic(atoms), logic(atoms))
+@given(logic(comparisons(POLYNOMIALS)), logic(comparisons(POLYNOMIALS)))
 def test_de_morgan(one: kv.Expression, other: kv.Expression) -> None:
     left, right = (
         interlocks(model(**LIMITS, lock=(-1, kv.velocity("x"), e))) for e in (~(one & other), ~one | ~other)

@@ -128,22 +128,14 @@ def roots(coefficients: list[Fraction], within: Interval) -> list[Fraction]:
     else:
         chain = _sturm(coefficients)
         bound = 1 + max(abs(c / coefficients[-1]) for c in coefficients[:-1])
-        low = max(-bound, _as_fraction(within.lower, -bound))
-        high = min(bound, _as_fraction(within.upper, bound))
-        found = []
-        if low <= high:
-            margin = (high - low) / 2**20 + Fraction(1, 2**40)
-            found = sorted(_isolated(chain, low - margin, high + margin))
+        # Always from the same ends, so that a root is the same number whichever interval it is wanted in.
+        found = sorted(_isolated(chain, -bound, bound))
     return [root for root in found if root in within or _is_near_closed_end(root, within)]
 
 
 def _is_near_closed_end(root: Fraction, within: Interval) -> bool:
     ends = ((within.lower, within.lower_closed), (within.upper, within.upper_closed))
     return any(closed and are_close(root, end, 1e-12) for end, closed in ends)
-
-
-def _as_fraction(number: Number, otherwise: Fraction) -> Fraction:
-    return otherwise if math.isinf(number) else Fraction(number)
 
 
 def _isolated(chain: list[list[Fraction]], low: Fraction, high: Fraction) -> Iterable[Fraction]:
