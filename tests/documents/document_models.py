@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 import kineverse as kv
-from kineverse.model.body import Box, Capsule, Cylinder, Mesh, Sphere
+from kineverse.model.body import Box, Capsule, Cone, Cylinder, Ellipsoid, Mesh, Sphere
 from kineverse.model.reader import Reader
 
 
@@ -35,6 +35,8 @@ class Dressed(kv.Operation):
             kv.Shape(Box((1, 2, 0.3)), origin, "a box", (1, 0, 0.5, 1)),
             kv.Shape(Cylinder(0.1, 1 / 3)),
             kv.Shape(Capsule(0.1, 0.2)),
+            kv.Shape(Ellipsoid((0.1, 0.2, 0.3))),
+            kv.Shape(Cone(0.1, 0.2)),
             kv.Shape(Sphere(1e-3), texture="wood.png"),
             kv.Shape(Mesh("package://cups/cup.stl", (0.001, 0.001, 0.001), "/models")),
         )

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from kineverse.model.body import Box, Capsule, Cylinder, Sphere
+from kineverse.model.body import Box, Capsule, Cone, Cylinder, Ellipsoid, Sphere
 from kineverse.view.geometry import triangles_of
 from kineverse.view.primitives import placeholder
 from kineverse.view.triangles import creased, join
@@ -16,6 +16,8 @@ PRIMITIVES = st.one_of(
     st.builds(Cylinder, LENGTH, LENGTH),
     st.builds(Capsule, LENGTH, LENGTH),
     st.builds(Sphere, LENGTH),
+    st.builds(Ellipsoid, st.tuples(LENGTH, LENGTH, LENGTH)),
+    st.builds(Cone, LENGTH, LENGTH),
 )
 
 
@@ -35,6 +37,10 @@ def exact_volume(shape):
             return np.pi * radius**2 * length + 4 / 3 * np.pi * radius**3
         case Sphere(radius):
             return 4 / 3 * np.pi * radius**3
+        case Ellipsoid(radii):
+            return 4 / 3 * np.pi * np.prod(radii)
+        case Cone(radius, length):
+            return np.pi * radius**2 * length / 3
 
 
 def extent(shape):
@@ -47,6 +53,10 @@ def extent(shape):
             return np.array([2 * radius, 2 * radius, length + 2 * radius])
         case Sphere(radius):
             return np.full(3, 2 * radius)
+        case Ellipsoid(radii):
+            return 2 * np.array(radii)
+        case Cone(radius, length):
+            return np.array([2 * radius, 2 * radius, length])
 
 
 @given(PRIMITIVES)

@@ -1,7 +1,7 @@
 """Layer 3: the model, its data and constraints, and the operations it is made of."""
 
 from .articulation import Articulation
-from .body import Body, Box, Capsule, Cylinder, Inertia, Mesh, Pose, Shape, Sphere
+from .body import Body, Box, Capsule, Cone, Cylinder, Ellipsoid, Inertia, Mesh, Pose, Shape, Sphere
 from .constraint import Constraint
 from .diff import Change, Diff
 from .edit import Edit
@@ -19,11 +19,13 @@ __all__ = [
     "Box",
     "Capsule",
     "Change",
+    "Cone",
     "Constraint",
     "Cylinder",
     "Diff",
     "Edit",
     "Effects",
+    "Ellipsoid",
     "Frame",
     "Inertia",
     "Mesh",

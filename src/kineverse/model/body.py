@@ -105,6 +105,21 @@ class Sphere:
 
 
 @dataclass(frozen=True, slots=True)
+class Ellipsoid:
+    """An ellipsoid around its origin; ``radii`` are the half axes along x, y, z [m]."""
+
+    radii: Vector3
+
+
+@dataclass(frozen=True, slots=True)
+class Cone:
+    """A cone around z, its base at -length/2 and its tip at +length/2; radius of the base and length [m]."""
+
+    radius: float
+    length: float
+
+
+@dataclass(frozen=True, slots=True)
 class Mesh:
     """A reference to a mesh file.
 
@@ -117,7 +132,7 @@ class Mesh:
     folder: str = ""
 
 
-Geometry: TypeAlias = Box | Cylinder | Capsule | Sphere | Mesh
+Geometry: TypeAlias = Box | Cylinder | Capsule | Sphere | Ellipsoid | Cone | Mesh
 
 
 @dataclass(frozen=True, slots=True)

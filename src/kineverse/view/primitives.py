@@ -1,4 +1,4 @@
-"""Boxes, cylinders, capsules, spheres and meshes as triangles."""
+"""Boxes, cylinders, capsules, spheres, ellipsoids and cones as triangles."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from functools import lru_cache
 
 import numpy as np
 
-from kineverse.model.body import Box, Capsule, Cylinder, Sphere
+from kineverse.model.body import Box, Capsule, Cone, Cylinder, Ellipsoid, Sphere
 from kineverse.view.triangles import Floats, Triangles, creased, join
 
 SEGMENTS = 40
@@ -14,7 +14,7 @@ SEGMENTS = 40
 
 
 @lru_cache(maxsize=4096)
-def primitive(geometry: Box | Cylinder | Capsule | Sphere) -> Triangles:
+def primitive(geometry: Box | Cylinder | Capsule | Sphere | Ellipsoid | Cone) -> Triangles:
     """Return the surface of a primitive, in its own frame [m]; equal ones share it."""
     if isinstance(geometry, Box):
         return _unit_box().scaled(geometry.size)
@@ -22,6 +22,10 @@ def primitive(geometry: Box | Cylinder | Capsule | Sphere) -> Triangles:
         return _unit_cylinder().scaled((geometry.radius, geometry.radius, geometry.length))
     if isinstance(geometry, Sphere):
         return _unit_sphere().scaled(geometry.radius)
+    if isinstance(geometry, Ellipsoid):
+        return _unit_sphere().scaled(geometry.radii)
+    if isinstance(geometry, Cone):
+        return _unit_cone().scaled((geometry.radius, geometry.radius, geometry.length))
     return _capsule(geometry.radius, geometry.length)
 
 
@@ -47,9 +51,7 @@ def _unit_box() -> Triangles:
 @lru_cache(maxsize=1)
 def _unit_cylinder() -> Triangles:
     """Return the cylinder of radius 1 and length 1 around z: a smooth wall and two flat discs."""
-    angle = np.linspace(0.0, 2.0 * np.pi, SEGMENTS, endpoint=False)
-    ring = np.stack([np.cos(angle), np.sin(angle), np.zeros(SEGMENTS)], axis=1)
-    up = np.array([0.0, 0.0, 0.5])
+    ring, up = _ring(), np.array([0.0, 0.0, 0.5])
     i = np.arange(SEGMENTS)
     j = (i + 1) % SEGMENTS
     wall = Triangles(
@@ -60,11 +62,38 @@ def _unit_cylinder() -> Triangles:
         normals=np.concatenate([ring, ring]),
         closed=True,
     )
+    return join([wall, _disc(up), _disc(-up)])
+
+
+@lru_cache(maxsize=1)
+def _unit_cone() -> Triangles:
+    """Return the cone of radius 1 and length 1 around z: a wall that is smooth around it, and a flat disc."""
+    ring, up = _ring(), np.array([0.0, 0.0, 0.5])
+    i = np.arange(SEGMENTS)
+    outward = (ring + 2.0 * up) / np.sqrt(2.0)
+    between = outward + np.roll(outward, -1, axis=0)  # at the tip each triangle has a direction of its own
+    wall = Triangles(
+        vertices=np.concatenate([ring - up, np.tile(up, (SEGMENTS, 1))]),
+        faces=np.stack([i, (i + 1) % SEGMENTS, i + SEGMENTS], axis=1),
+        normals=np.concatenate([outward, between / np.linalg.norm(between, axis=1, keepdims=True)]),
+        closed=True,
+    )
+    return join([wall, _disc(-up)])
+
+
+def _ring() -> Floats:
+    angle = np.linspace(0.0, 2.0 * np.pi, SEGMENTS, endpoint=False)
+    return np.stack([np.cos(angle), np.sin(angle), np.zeros(SEGMENTS)], axis=1)
+
+
+def _disc(centre: Floats) -> Triangles:
+    """Return the disc of radius 1 around a point above or below the origin, seen from outside."""
+    i = np.arange(SEGMENTS)
     fan = np.stack([np.zeros(SEGMENTS - 2, dtype=np.int64), i[1:-1], i[2:]], axis=1)
-    z = np.array([0.0, 0.0, 1.0])
-    top = Triangles(ring + up, fan, np.tile(z, (SEGMENTS, 1)), closed=True)
-    bottom = Triangles(ring - up, fan[:, ::-1], np.tile(-z, (SEGMENTS, 1)), closed=True)
-    return join([wall, top, bottom])
+    way = np.array([0.0, 0.0, np.sign(centre[2])])
+    return Triangles(
+        _ring() + centre, fan if way[2] > 0 else fan[:, ::-1], np.tile(way, (SEGMENTS, 1)), closed=True
+    )
 
 
 @lru_cache(maxsize=1)

@@ -21,7 +21,9 @@ from kineverse.model.body import (
     Body,
     Box,
     Capsule,
+    Cone,
     Cylinder,
+    Ellipsoid,
     Geometry,
     Inertia,
     Mesh,
@@ -41,6 +43,12 @@ from .graph import Graph
 Ref: TypeAlias = Callable[[Expression], int]
 Rename: TypeAlias = Callable[[str], str]
 
+_ROUND: dict[str, Callable[[float, float], Geometry]] = {
+    "cylinder": Cylinder,
+    "capsule": Capsule,
+    "cone": Cone,
+}
+_GEOMETRIES = ("box", *_ROUND, "sphere", "ellipsoid", "mesh")
 INERTIA_NUMBERS = 6
 POSE_NUMBERS = 12
 MAX_BITS = 10_000
@@ -151,11 +159,13 @@ def _shape(shape: Shape) -> dict[str, Any]:
 def _geometry(geometry: Geometry) -> dict[str, Any]:
     if type(geometry) is Box:
         return {"box": {"size": _numbers(geometry.size)}}
-    if type(geometry) is Cylinder or type(geometry) is Capsule:
-        kind = "cylinder" if type(geometry) is Cylinder else "capsule"
+    if type(geometry) is Cylinder or type(geometry) is Capsule or type(geometry) is Cone:
+        kind = type(geometry).__name__.lower()
         return {kind: {"radius": _number(geometry.radius), "length": _number(geometry.length)}}
     if type(geometry) is Sphere:
         return {"sphere": {"radius": _number(geometry.radius)}}
+    if type(geometry) is Ellipsoid:
+        return {"ellipsoid": {"radii": _numbers(geometry.radii)}}
     if type(geometry) is Mesh:
         scale = _numbers(geometry.scale)
         return {"mesh": {"uri": _text(geometry.uri), "scale": scale, "folder": _text(geometry.folder)}}
@@ -264,19 +274,21 @@ def _read_shape(value: Any) -> Shape:
 
 
 def _read_geometry(value: Any) -> Geometry:
-    given = fields(value, (), ("box", "cylinder", "capsule", "sphere", "mesh"))
+    given = fields(value, (), _GEOMETRIES)
     if len(given) != 1:
-        raise RefusedError("a geometry is one of box, cylinder, capsule, sphere, mesh")
+        raise RefusedError(f"a geometry is one of {', '.join(_GEOMETRIES)}")
     ((kind, inner),) = given.items()
     if kind == "box":
         return Box(_read_vector(fields(inner, ("size",))["size"]))
     if kind == "sphere":
         return Sphere(number(fields(inner, ("radius",))["radius"]))
+    if kind == "ellipsoid":
+        return Ellipsoid(_read_vector(fields(inner, ("radii",))["radii"]))
     if kind == "mesh":
         fields(inner, ("uri", "scale", "folder"))
         return Mesh(string(inner["uri"]), _read_vector(inner["scale"]), string(inner["folder"]))
     fields(inner, ("radius", "length"))
-    return (Cylinder if kind == "cylinder" else Capsule)(number(inner["radius"]), number(inner["length"]))
+    return _ROUND[kind](number(inner["radius"]), number(inner["length"]))
 
 
 def _read_vector(value: Any) -> tuple[float, float, float]:
