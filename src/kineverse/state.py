@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+from collections import Counter
 from collections.abc import Iterator, Mapping
 from typing import Any
 
@@ -30,7 +32,8 @@ class State(Mapping[Symbol, float]):
     ValueRejectedError
         For NaN or values that are not numbers.
     NameTakenError
-        If a symbol is given a value and its name another one.
+        If a symbol is given a value and its name another one; likewise, later, if a value is asked for by a
+        name that several of the symbols have.
     """
 
     __slots__ = ("_by_name", "_values", "source", "stamp")
@@ -47,7 +50,13 @@ class State(Mapping[Symbol, float]):
                 raise NameTakenError(f"There are two values for '{symbol}'.")
             known[symbol] = _number(symbol, value)
         self._values = known
-        self._by_name = {str(s): s for s in known}
+        self._by_name: dict[str, Symbol | None] = {str(s): s for s in known}
+        if len(self._by_name) < len(known):
+            # A parameter may have the name of something else; then the name alone says nothing.
+            counts = Counter(map(str, known))
+            self._by_name = {name: s if counts[name] == 1 else None for name, s in self._by_name.items()}
+        if stamp is not None and not _is_number(stamp):
+            raise ValueRejectedError(f"The stamp of a state is a time in seconds, not {stamp!r}.")
         self.stamp = stamp
         self.source = source  # from here on immutable
 
@@ -58,6 +67,10 @@ class State(Mapping[Symbol, float]):
 
     def __getitem__(self, key: Symbol | str) -> float:
         symbol = self._by_name.get(key) if isinstance(key, str) else key
+        if symbol is None and key in self._by_name:
+            raise NameTakenError(
+                f"Several symbols have the name '{key}'; ask for one by symbol, not by name."
+            )
         try:
             return self._values[symbol]  # type: ignore[index]
         except KeyError:
@@ -119,6 +132,13 @@ def _number(symbol: Symbol, value: Any) -> float:
     if number != number:
         raise ValueRejectedError(f"The value of '{symbol}' is NaN.")
     return number
+
+
+def _is_number(value: object) -> bool:
+    try:
+        return not math.isnan(real_number(value))
+    except (TypeError, ValueError, OverflowError):
+        return False
 
 
 def _restore(values: dict[Symbol, float], stamp: float | None, source: str) -> State:
