@@ -291,6 +291,23 @@ def test_where_nothing_helps_nothing_is_asked_for(expression: kv.Expression) -> 
         assert row(rows, "n", near)[1] > 90
 
 
+@pytest.mark.parametrize("braked", [False, True])
+@pytest.mark.parametrize("expression", [q[0], np.log(q[0]), np.log(q[0]) + q[1]])
+def test_a_distance_that_is_no_number_is_none_in_the_rows(expression: kv.Expression, braked: bool) -> None:
+    """And takes no other row with it."""
+    speeds: Triples = {f"speed {k}": (-1, v[k], 1) for k in range(2)}
+    brakes: Triples = {f"brake {k}": (-1, acc[k], 1) for k in range(2)} if braked else {}
+    rows = constrained({**speeds, **brakes, "n": (0, expression, 1), "1": (0, q[1], 1)}).velocity_rows(0.1)
+    bounds = kv.compile([rows.lower, rows.upper], q[:2], tier="interpreter")
+    lower, upper = bounds([math.nan if expression == q[0] else -1.0, 5.0])
+    n, other = rows.names.index("n"), rows.names.index("1")
+    assert math.isnan(lower[n])
+    assert math.isnan(upper[n])
+    # Who is in both is not counted on.
+    assert upper[other] == (-1 if q[1] not in expression.symbols else 0)
+    assert lower[other] <= upper[other]
+
+
 def test_limits_that_forbid_to_stand_still_are_kept_as_they_are() -> None:
     rows = constrained({"belt": (0.1, v[0], 0.3), "range": (-1, q[0], 1)}).velocity_rows(0.1)
     assert row(rows, "belt", {q[0]: 5.0})[1:] == (0.1, 0.3)

@@ -9,7 +9,7 @@ from typing import TypeAlias
 
 import casadi as ca
 
-from kineverse.expressions.expression import Expression, as_expression, binary
+from kineverse.expressions.expression import Expression, as_expression, binary, unary
 from kineverse.expressions.functions import norm
 from kineverse.expressions.gradient import partial
 from kineverse.symbols import Symbol
@@ -162,6 +162,21 @@ def smaller(a: Expression, b: Expression) -> Expression:
 def larger(a: Expression, b: Expression) -> Expression:
     """Return the maximum of two."""
     return binary(ca.OP_FMAX, a, b)
+
+
+def at_least(value: Expression, least: Expression) -> Expression:
+    """Return the maximum, or NaN where the value is NaN; that shall show, which CasADi's would hide."""
+    return _instead(value, binary(ca.OP_LT, value, least), least)
+
+
+def at_most(value: Expression, most: Expression) -> Expression:
+    """Return the minimum, or NaN where the value is NaN."""
+    return _instead(value, binary(ca.OP_LT, most, value), most)
+
+
+def _instead(value: Expression, beyond: Expression, end: Expression) -> Expression:
+    kept = binary(ca.OP_IF_ELSE_ZERO, unary(ca.OP_NOT, beyond), value)
+    return kept + binary(ca.OP_IF_ELSE_ZERO, beyond, end)
 
 
 def _limit(box: Box, speed: Symbol, low: Expression, high: Expression) -> None:

@@ -29,7 +29,18 @@ from kineverse.symbols import Symbol
 
 from .constraint import Constraint
 from .rates import Rates
-from .speed_limits import INFINITE, ZERO, Limits, Row, SpeedLimits, is_infinite, larger, only, smaller
+from .speed_limits import (
+    INFINITE,
+    ZERO,
+    Limits,
+    Row,
+    SpeedLimits,
+    at_most,
+    is_infinite,
+    larger,
+    only,
+    smaller,
+)
 from .way_back import Side, Sides, within_reach
 
 
@@ -225,7 +236,7 @@ def _position_rows(
                 # Of a step at speed s, with s - a·dt in the next one and so on, s²/2a + s·dt is left to go.
                 step = deceleration * dt
                 left = 2 * deceleration * larger(gap.distance, ZERO)
-                room = smaller(room, sqrt(step * step + left) - step)
+                room = at_most(room, sqrt(step * step + left) - step)
             sides.append(Side(away, room))
             signs.append(gap.sign)
         if sides:

@@ -42,6 +42,7 @@ from .speed_limits import (
     Limits,
     Row,
     Weights,
+    at_least,
     is_infinite,
     larger,
     less,
@@ -91,7 +92,7 @@ def within_reach(constraints: Sequence[Sides], limits: Limits) -> list[list[Expr
     rest = [side for c, own in zip(constraints, alone, strict=True) if not own for side in c.sides]
     motion = _common(rest, limits)
     return [
-        _clipped(c, limits.box) if own else [larger(s.room, -_along(s.away, motion)) for s in c.sides]
+        _clipped(c, limits.box) if own else [at_least(s.room, -_along(s.away, motion)) for s in c.sides]
         for c, own in zip(constraints, alone, strict=True)
     ]
 
@@ -120,7 +121,7 @@ def _clipped(constraint: Sides, box: Box) -> list[Expression]:
         if len(rooms) == 2 and not constraint.apart:
             beyond = larger(rooms[1 - k], ZERO)
             reach = beyond if is_infinite(reach) else smaller(reach, beyond)
-        result.append(side.room if is_infinite(reach) else larger(side.room, -reach))
+        result.append(side.room if is_infinite(reach) else at_least(side.room, -reach))
     return result
 
 
