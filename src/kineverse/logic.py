@@ -81,16 +81,18 @@ def _joined(kind: type[_Joined], operands: tuple[ExpressionLike, ...]) -> Expres
         # (a & b) & c is a & b & c: the trend is defined over all operands together.
         inner = _is_only(expression, kind)
         flat.extend(inner.arguments if inner is not None else (expression,))
+    if len(flat) == 1 and _is_only(flat[0], _Logic) is not None:
+        return flat[0]
     shaped = broadcast(*flat)
     return kind.of(shaped, shaped[0].shape)
 
 
-def _is_only(expression: Expression, kind: type[Node]) -> Node | None:
+def _is_only(expression: Expression, kind: type[object]) -> Node | None:
     """Return the node if the expression is nothing but one node of this kind."""
     if len(expression._nodes) != 1:
         return None
     (node,) = expression._nodes
-    if type(node) is kind and node.shape == expression.shape and ca.is_equal(expression._sx, node.sx):
+    if isinstance(node, kind) and node.shape == expression.shape and ca.is_equal(expression._sx, node.sx):
         return node
     return None
 

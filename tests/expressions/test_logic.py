@@ -146,6 +146,8 @@ def test_conjunctions_in_conjunctions_are_flattened():
         assert operator(operator(e, f), operator(a, b)) == flat
         assert join(flat) == flat
         assert join(array([e, f]), join(a, b)) == join(array([e, f]), a, b)
+        assert join(e) is e
+        assert join(a) != a, "as a fact a truth is constant, and a is not"
     # One inside of the other stays: it is an operand of its own.
     mixed = (a & b) | (c & d)
     at = {a: 0.9, b: 0.3, c: 0.2, d: 0.6}
