@@ -241,6 +241,8 @@ def _chosen_seed(name: str, samples: Samples) -> tuple[Seed, int, tuple[int, ...
     """Return the cheapest seed and number of steps that always lead to the branch, and the rows used."""
     rows = _rows(samples)
     n = len(samples.equations.unknowns)
+    if samples.turns_over(rows):
+        raise _too_close(name, samples)
     best: tuple[float, Seed, int] | None = None
     count = len(samples.inputs)
     for degree in _DEGREES:
@@ -255,12 +257,17 @@ def _chosen_seed(name: str, samples: Samples) -> tuple[Seed, int, tuple[int, ...
         if best is None or cost < best[0]:
             best = cost, seed, steps
     if best is None:
-        at = ", ".join(f"{v:.6g}" for v in samples.worst)
-        raise UnsolvedError(
-            f"Loop '{name}' is too close to singular at {at} (condition {samples.condition:.2g}) for "
-            "Newton's method to be sure of its branch. Narrow the limits, or the loop's within={...}."
-        )
+        raise _too_close(name, samples)
     return best[1], best[2], rows
+
+
+def _too_close(name: str, samples: Samples) -> UnsolvedError:
+    pairs = zip(samples.equations.inputs, samples.worst, strict=False)
+    at = ", ".join(f"{s} = {v:.6g}" for s, v in pairs)
+    return UnsolvedError(
+        f"Loop '{name}' is singular, or too close to it, near {at} (condition {samples.condition:.2g}) for "
+        "Newton's method to be sure of its branch. Narrow the limits, or the loop's within={...}."
+    )
 
 
 def _rows(samples: Samples) -> tuple[int, ...]:

@@ -74,6 +74,12 @@ class Samples:
         """Return free coordinates with the parameters behind them."""
         return np.concatenate([q, self._given])
 
+    def turns_over(self, rows: Sequence[int]) -> bool:
+        """Whether det ∂r/∂x of these rows is zero somewhere in between: it has two signs."""
+        points = zip((*self.inputs, *self.tried), (*self.solutions, *self.wanted), strict=True)
+        matrices = (self.equations(x, self.all_inputs(q))[1][list(rows)] for q, x in points)
+        return len({float(np.linalg.slogdet(matrix)[0]) for matrix in matrices}) > 1
+
     def _followed(self, x: Array, start: Array, end: Array) -> Array:
         reached = follow(self.equations, x, self.all_inputs(start), self.all_inputs(end))
         if reached.part < 1.0:
