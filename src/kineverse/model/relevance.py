@@ -37,7 +37,7 @@ class Relevance:
         """Take a constraint into the index."""
         for path in self._paths(constraint):
             self._by_expression[path][name] = None
-        for path in _bounds(constraint):
+        for path in self._with_behind(_bounds(constraint)):
             self._by_bounds[path][name] = None
         if isinstance(constraint.expression, Symbol):
             self._alone.setdefault(constraint.expression, {})[name] = None
@@ -48,7 +48,7 @@ class Relevance:
         """Take a constraint out."""
         for path in self._paths(constraint):
             self._by_expression[path].pop(name, None)
-        for path in _bounds(constraint):
+        for path in self._with_behind(_bounds(constraint)):
             self._by_bounds[path].pop(name, None)
         if isinstance(constraint.expression, Symbol):
             self._alone.get(constraint.expression, {}).pop(name, None)
@@ -56,7 +56,9 @@ class Relevance:
             self._lines.get(constraint.expression.symbols[0], {}).pop(name, None)
 
     def _paths(self, constraint: Constraint) -> set[str]:
-        paths = {s.path for s in constraint.expression.symbols}
+        return self._with_behind({s.path for s in constraint.expression.symbols})
+
+    def _with_behind(self, paths: set[str]) -> set[str]:
         return paths.union(*(self._behind.get(path, ()) for path in paths)) if self._behind else paths
 
     def on(self, symbol: Symbol) -> list[str]:
@@ -89,7 +91,7 @@ class Relevance:
             symbols = {s for e in expressions for s in e.symbols}
             return self._exact(symbols, constraints, bounds, closure)
         found: dict[str, None] = {}
-        wanted = list(coordinates(*expressions))
+        wanted = list(self._with_behind(set(coordinates(*expressions))))
         seen = set(wanted)
         while wanted:
             path = wanted.pop()
