@@ -36,6 +36,21 @@ def four_bar(
     return model
 
 
+def limited_four_bar() -> kv.Model:
+    """Return a four-bar whose rocker has limits, of speed as well, and a constraint about all three."""
+    crank, coupler, rocker = (kv.position(n) for n in ("crank", "coupler", "rocker"))
+    model = kv.Model()
+    with model.edit() as edit:
+        bar(edit, "crank", "world", at(0))
+        bar(edit, "coupler", "crank", at(0.4))
+        edit.add_frame("coupler_tip", "coupler", kv.translation(1.1, 0, 0))
+        bar(edit, "rocker", "world", at(1.0), lower=1.0, upper=2.0, velocity=0.5)
+        edit.add_frame("rocker_tip", "rocker", kv.translation(0.9, 0, 0))
+        edit.constrain("coupler/beside", -3, coupler - 2 * crank, rocker)
+        edit.close_loop("coupler_tip", "rocker_tip", name="four-bar")
+    return model
+
+
 def four_bar_by_circles(crank: float, a=0.4, b=1.1, c=0.9, d=1.0, side=1) -> np.ndarray:
     """Return where coupler and rocker meet: the intersection of two circles."""
     p, q = np.array([a * math.cos(crank), a * math.sin(crank)]), np.array([d, 0.0])

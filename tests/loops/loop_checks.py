@@ -38,7 +38,7 @@ def vector_of(rotation):
 
 def configurations(model: kv.Model, count: int, turns: float = 8.0) -> np.ndarray:
     """Return configurations within the limits of what is free; what goes round goes round many times."""
-    bounds = np.array([model.limits(s) for s in model.degrees_of_freedom])
+    bounds = np.array([model.limits(s) for s in model.degrees_of_freedom]).reshape(-1, 2)
     bounds = np.where(np.isfinite(bounds), bounds, np.array([-turns, turns]) * np.pi)
     points = np.random.default_rng(0).uniform(bounds[:, 0], bounds[:, 1], (count, len(bounds)))
     corners = np.array(np.meshgrid(*bounds)).reshape(len(bounds), -1).T
