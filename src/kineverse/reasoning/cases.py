@@ -16,7 +16,7 @@ from . import ranges, zeros
 from .boxes import Box, Interval
 from .polynomial import Axis, Polynomial
 from .terms import Term, reachable
-from .values import Value, constant, evaluate, live_arguments
+from .values import Value, evaluate, live_arguments
 
 NEGLIGIBLE = 1e-12
 """Constants up to this are what rounding left of 0."""
@@ -56,6 +56,10 @@ class Case:
         self._signs = dict(signs or {})
         self._found: dict[int, int | None] = {}
         self._roots = roots
+        places = {**limits, **{axis[0][0]: side for axis, side in self._axes.items() if len(axis) == 1}}
+        self._pinned = {
+            s: Fraction(i.lower) for s, i in places.items() if i.lower == i.upper and not math.isinf(i.lower)
+        }
         self._order = reachable(roots) if order is None else order
         self._values: dict[int, Value] = {}
         for term in self._order:
@@ -123,16 +127,21 @@ class Case:
             value = evaluate(term, self._values, self.sign)
         else:
             value = Value(polynomial=Polynomial.symbol(term.data), live=frozenset((term.data,)))
-        p = value.polynomial
-        if p is None or value.void or p.degree != 1:
+        p, live = value.polynomial, value.live
+        if value.void:
             return value
+        if not live.isdisjoint(self._pinned):
+            live = live.difference(self._pinned)
+            # A sum stays one where a part of it has one value: it is the same condition as beside that.
+            if p is not None and (p.degree > 1 or not live) and term.op != ca.OP_PARAMETER:
+                p = p.at(self._pinned)
+        if p is None or p.degree != 1:
+            span = value.range if p is None or p.symbols else ranges.enclosing(p.offset)
+            return Value(span, p, live, value.doubtful)
         side = self._sum(p.terms) if len(p.symbols) == 1 else self._line(p)
-        if side.lower == side.upper and not math.isinf(side.lower):
-            fixed = constant(side.lower)
-            return Value(fixed.range, fixed.polynomial, doubtful=value.doubtful)
         (low, _), (_, high) = ranges.enclosing(side.lower), ranges.enclosing(side.upper)
         span = (max(low, value.range[0]), min(high, value.range[1]))
-        return Value(span, p, value.live, value.doubtful)
+        return Value(span, p, live, value.doubtful)
 
     def _line(self, p: Polynomial) -> Interval:
         axis, scale = p.axis()

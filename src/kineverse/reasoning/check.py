@@ -33,8 +33,9 @@ def contradictions(model: ModelView, found: Interlocks, points: int = 20, seed: 
     symbols = {s for c in rows.values() for s in c.symbols} | {*model.symbols, *model.rates.dependent}
     chance, wrong = random.Random(seed), dict[str, None]()
     told = [box for item in found for box in item.when] + [box for u in found.undecided for box in u.where]
-    for box in [Box({})] * 5 + list(dict.fromkeys(told)):
-        for _ in range(points):
+    boxes = [Box({})] * 5 + list(dict.fromkeys(told))
+    for box in boxes:
+        for _ in range(min(points, 1 + 50 * points // len(boxes))):
             point = _point(sorted(symbols, key=str), box, limits, chance)
             try:
                 point |= {x: value_at(e, point) for x, e in model.rates.dependent.items()}

@@ -85,6 +85,16 @@ class Polynomial:
             return None
         return Polynomial({m: f for m, f in total.items() if f})
 
+    def at(self, values: Mapping[Symbol, Fraction]) -> Polynomial:
+        """Return what it is where some symbols have these values."""
+        total: dict[Monomial, Fraction] = {}
+        for monomial, factor in self.terms.items():
+            for symbol, power in monomial:
+                factor *= values[symbol] ** power if symbol in values else 1
+            rest = tuple((s, power) for s, power in monomial if s not in values)
+            total[rest] = total.get(rest, Fraction(0)) + factor
+        return Polynomial({m: f for m, f in total.items() if f})
+
     def axis(self) -> tuple[Axis, Fraction]:
         """Return a polynomial of degree 1 as ``scale·axis + offset``: the axis and its scale.
 

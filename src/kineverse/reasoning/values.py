@@ -45,8 +45,10 @@ class Value:
     @property
     def number(self) -> Fraction | None:
         """The number that it is, if it is a finite constant."""
-        p = self.polynomial
-        return p.offset if p is not None and not p.symbols else None
+        p, (low, high) = self.polynomial, self.range
+        if p is not None and not p.symbols:
+            return p.offset
+        return Fraction(low) if p is not None and not self.live and low == high else None
 
 
 Signs = Callable[[Term], int | None]
