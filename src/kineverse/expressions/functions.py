@@ -291,6 +291,8 @@ def determinant(matrix: ExpressionLike) -> Expression:
     if a.ndim != 2 or a.shape[0] != a.shape[1]:
         raise ShapeError(f"Only a square matrix has a determinant, not one of shape {a.shape}.")
     n = a.shape[0]
+    if not n:
+        return as_expression(1.0)
     if n < 5:
         return make(ca.det(a._sx), (), a._nodes)
     # Minors grow with n!, so larger ones by the characteristic polynomial (Faddeev-LeVerrier).

@@ -13,7 +13,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from kineverse.errors import ExpressionError, ShapeError
+from kineverse.errors import ExpressionError, KineverseError, ShapeError
 
 from . import functions as f
 from . import layout
@@ -83,9 +83,16 @@ def apply_ufunc(ufunc: Any, method: str, inputs: tuple[Any, ...], options: Mappi
         raise ExpressionError(
             f"np.{ufunc.__name__} cannot write expressions into an existing array of numbers."
         )
-    if method != "__call__" or options:
+    if method != "__call__":
+        reducing = ", ".join(f"np.{known.__name__}" for known in _REDUCTIONS)
         raise ExpressionError(
-            f"np.{ufunc.__name__}.{method} with {sorted(options)} is not available for expressions."
+            f"np.{ufunc.__name__}.{method} with the options {sorted(options)} is not available for "
+            f"expressions; there is reduce, with axis=, of {reducing}."
+        )
+    if options:
+        raise ExpressionError(
+            f"np.{ufunc.__name__} of expressions takes no {'=, '.join(sorted(options))}=; leave it out. "
+            "To select, there is np.where."
         )
     if ufunc in _UNARY_OPS:
         return unary(_UNARY_OPS[ufunc], as_expression(inputs[0]))
@@ -93,7 +100,7 @@ def apply_ufunc(ufunc: Any, method: str, inputs: tuple[Any, ...], options: Mappi
         return binary(_BINARY_OPS[ufunc], *inputs)
     if ufunc in _UFUNCS:
         return _UFUNCS[ufunc](*inputs)
-    raise ExpressionError(f"np.{ufunc.__name__} is not available for expressions.")
+    raise _unavailable(f"np.{ufunc.__name__}")
 
 
 _REARRANGING = {
@@ -104,6 +111,8 @@ _REARRANGING = {
 
 _AT_LEAST = {np.atleast_1d, np.atleast_2d, np.atleast_3d}
 _JOINING = {np.concatenate, np.stack, np.vstack, np.hstack, np.dstack, np.column_stack}
+# How many arguments come before an array to write into.
+_BEFORE_OUT = {np.take: 3, np.concatenate: 2, np.stack: 2}
 
 
 def apply_function(function: Any, args: Sequence[Any], options: Mapping[str, Any]) -> Any:
@@ -118,19 +127,52 @@ def apply_function(function: Any, args: Sequence[Any], options: Mapping[str, Any
     if function in _AT_LEAST and len(args) != 1:
         return tuple(function(as_expression(a)) for a in args)
     if function in _FUNCTIONS:
+        parameters = signature(_FUNCTIONS[function])
         try:
-            bound = signature(_FUNCTIONS[function]).bind(*args, **options)
+            bound = parameters.bind(*args, **options)
         except TypeError as error:
-            raise ExpressionError(f"{name} of expressions: {error}.") from None
+            raise ExpressionError(
+                f"{name} of expressions: {error}. Its parameters are {', '.join(parameters.parameters)}."
+            ) from None
         return _FUNCTIONS[function](*bound.args, **bound.kwargs)
     if function not in _REARRANGING and function not in _JOINING:
-        raise ExpressionError(f"{name} is not available for expressions.")
-    if not args or {"out", "dtype", "casting"} & options.keys():
+        raise _unavailable(name)
+    if (
+        not args
+        or {"out", "dtype", "casting"} & options.keys()
+        or len(args) > _BEFORE_OUT.get(function, len(args))
+    ):
         raise ExpressionError(f"{name} takes expressions as its first argument, and neither out= nor dtype=.")
+    if any(isinstance(a, Expression) for a in (*args[1:], *options.values())):
+        raise ExpressionError(
+            f"{name} rearranges the elements of its first argument by plain numbers, not by expressions."
+        )
     try:
         return (_rearrange if function in _REARRANGING else _join)(function, args[0], args[1:], options)
+    except KineverseError:
+        raise
     except (ValueError, IndexError) as error:
-        raise ShapeError(f"{name}: {error} (shape {np.shape(args[0])}).") from None
+        parts = [args[0]] if function in _REARRANGING else args[0]
+        shapes = " and ".join(str(as_expression(part).shape) for part in parts)
+        raise ShapeError(f"{name}: {error} (of shape {shapes}).") from None
+    except TypeError as error:
+        raise ExpressionError(f"{name} of expressions: {error}.") from None
+
+
+_INSTEAD = {
+    "all": "logic, a & b", "any": "logic, a | b", "divmod": "a // b and a % b",
+    "solve": "np.linalg.inv(A) @ b", "append": "np.concatenate", "block": "np.concatenate",
+    "einsum": "@ and np.sum", "tensordot": "@ and np.sum", "log10": "np.log(x) / np.log(10)",
+    "log2": "np.log(x) / np.log(2)", "exp2": "2**x",
+}  # fmt: skip
+
+
+def _unavailable(name: str) -> ExpressionError:
+    instead = _INSTEAD.get(name.rpartition(".")[2])
+    return ExpressionError(
+        f"{name} is not available for expressions{f'; write {instead}' if instead else ''}. "
+        "Of numbers it is: call the expression with values first, e({name: number})."
+    )
 
 
 def _rearrange(function: Any, operand: Any, args: Sequence[Any], options: Mapping[str, Any]) -> Expression:
@@ -151,7 +193,7 @@ def _join(function: Any, parts: Sequence[Any], args: Sequence[Any], options: Map
 
 
 def _trace(a: Any) -> Expression:
-    return f.sum_along(np.diagonal(a))
+    return f.sum_along(np.diagonal(as_expression(a)), -1)
 
 
 def _cross(a: Any, b: Any) -> Expression:
@@ -166,6 +208,10 @@ def _dot(a: Any, b: Any) -> Expression:
     return x * y if not x.ndim or not y.ndim else matmul(x, y)
 
 
+def _inner(a: Any, b: Any) -> Expression:
+    return _dot(a, as_expression(b).T if np.ndim(a) else b)
+
+
 def _clip(
     a: Any,
     a_min: Any = None,
@@ -174,6 +220,8 @@ def _clip(
     min: Any = None,  # noqa: A002 - numpy's name
     max: Any = None,  # noqa: A002 - numpy's name
 ) -> Expression:
+    if (a_min is not None and min is not None) or (a_max is not None and max is not None):
+        raise ExpressionError("np.clip takes one lower and one upper bound: a_min or min, a_max or max.")
     lower, upper = min if a_min is None else a_min, max if a_max is None else a_max
     result = as_expression(a) if lower is None else f.maximum(a, lower)
     return result if upper is None else f.minimum(result, upper)
@@ -181,11 +229,17 @@ def _clip(
 
 def _mean(a: Any, axis: int | tuple[int, ...] | None = None) -> Expression:
     total = f.sum_along(a, axis)
+    if total.size and not as_expression(a).size:
+        raise ShapeError(f"Nothing has no mean (of shape {as_expression(a).shape}).")
+    if not total.size:
+        return total
     return total * (total.size / as_expression(a).size)
 
 
 def _norm(x: Any, ord: Any = None, axis: int | None = None) -> Expression:  # noqa: A002 - numpy's name
-    if ord not in (None, 2, "fro") or axis is not None or (ord == 2 and as_expression(x).ndim > 1):
+    dimensions = as_expression(x).ndim
+    known = ord is None or (ord == 2 and dimensions == 1) or (ord == "fro" and dimensions == 2)
+    if axis is not None or not known:
         raise ExpressionError("Of norms, the Euclidean one over all elements is available.")
     return f.norm(x)
 
@@ -197,10 +251,12 @@ _FUNCTIONS: dict[Any, Callable[..., Any]] = {
     np.mean: _mean,
     np.min: lambda a, axis=None: f.smallest(a, axis),
     np.max: lambda a, axis=None: f.largest(a, axis),
+    np.amin: lambda a, axis=None: f.smallest(a, axis),
+    np.amax: lambda a, axis=None: f.largest(a, axis),
     np.prod: lambda a, axis=None: f.product_along(a, axis),
     np.trace: _trace,
     np.dot: _dot,
-    np.inner: lambda a, b: _dot(a, as_expression(b).T),
+    np.inner: _inner,
     np.vdot: lambda a, b: _dot(as_expression(a).ravel(), as_expression(b).ravel()),
     np.outer: lambda a, b: as_expression(a).reshape(-1, 1) * as_expression(b).reshape(1, -1),
     np.cross: _cross,

@@ -1,0 +1,142 @@
+"""What numpy can do and expressions cannot is refused by an error of the project that says what to do.
+
+Nothing becomes an array of objects in silence, and nothing is written into arrays of numbers.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import kineverse as kv
+from kineverse.errors import ExpressionError, ShapeError
+
+a, b = kv.position("np/a"), kv.position("np/b")
+e, m, out = kv.array([a, b]), kv.array([[a, b, 1.0], [b, a, 2.0]]), np.zeros(2)
+
+
+def refused(call, message, error=ExpressionError):
+    with pytest.raises(error, match=message):
+        call()
+    assert out.tolist() == [0, 0]
+
+
+@pytest.mark.parametrize("call", [
+    lambda: np.sin(e, out=out), lambda: np.add(e, 1, out=out), lambda: np.add(out, e, out), lambda: out.__iadd__(e),
+    lambda: out.__imul__(a), lambda: np.add.reduce(m, axis=1, out=out),
+])  # fmt: skip
+def test_nothing_is_written_into_arrays_of_numbers(call):
+    refused(
+        call, r"cannot write expressions into an existing array|reduce with the options \['axis', 'out'\]"
+    )
+
+
+@pytest.mark.parametrize("call", [
+    lambda: np.take(e, [0, 1], 0, np.zeros(2, dtype=int)), lambda: np.take(e, [0], out=out),
+    lambda: np.concatenate([e], 0, out), lambda: np.concatenate([e], out=out), lambda: np.stack([a, b], 0, out),
+    lambda: np.concatenate([e], dtype=float), lambda: np.vstack([e, e], dtype=int), lambda: np.stack([e], casting="no"),
+])  # fmt: skip
+def test_rearranging_takes_neither_out_nor_dtype(call):
+    refused(call, "neither out= nor dtype=")
+
+
+@pytest.mark.parametrize("name", ["where", "dtype", "casting", "order", "subok"])
+def test_options_of_ufuncs(name):
+    refused(lambda: np.sin(e, **{name: {"where": [True, False], "dtype": float, "casting": "no", "order": "C", "subok": True}[name]}),
+            f"np.sin of expressions takes no {name}=; leave it out")  # fmt: skip
+
+
+@pytest.mark.parametrize("call", [
+    lambda: np.sum(m, axis=1, keepdims=True), lambda: np.sum(m, out=out), lambda: np.mean(m, dtype=float),
+    lambda: np.max(m, initial=0), lambda: np.sum(m, where=True), lambda: np.size(m, 1),
+    lambda: np.zeros_like(m, dtype=int), lambda: np.trace(m, 1), lambda: np.where(e), lambda: np.clip(e, 0, 1, out),
+    lambda: np.cross(e, e, axis=0), lambda: np.prod(m, 0, float), lambda: np.linalg.norm(m, keepdims=True),
+])  # fmt: skip
+def test_options_of_functions(call):
+    refused(call, r"of expressions: .* Its parameters are \w+")
+
+
+@pytest.mark.parametrize("call", [
+    lambda: np.add.accumulate(e), lambda: np.add.outer(e, e), lambda: np.add.at(out, [0], a), lambda: np.hypot.reduce(e),
+    lambda: np.add.reduceat(e, [0]), lambda: np.add.reduce(e, keepdims=True), lambda: np.multiply.outer(out, e),
+])  # fmt: skip
+def test_methods_of_ufuncs(call):
+    refused(call, r"is not available for expressions; there is reduce, with axis=, of np\.add")
+
+
+UNAVAILABLE = [
+    np.cumsum, np.diff, np.round, np.any, np.all, np.sort, np.argmin, np.copy, np.std, np.median, np.isnan, np.isfinite,
+    np.unique, np.linalg.eig, np.linalg.pinv, np.linalg.cholesky, np.linalg.svd, np.cbrt, np.log10, np.exp2, np.conjugate,
+    np.nan_to_num, np.array2string, np.iscomplexobj, np.modf, np.frexp, np.isinf, np.real,
+]  # fmt: skip
+WITH_MORE = [
+    lambda: np.append(e, 1), lambda: np.einsum("i,i", e, e), lambda: np.linalg.solve(m[:, :2], e), lambda: np.kron(m, m),
+    lambda: np.divmod(e, 2), lambda: divmod(out, e), lambda: np.fmod(e, 2), lambda: np.isclose(e, 1), lambda: np.block([[e]]),
+    lambda: np.allclose(out, e), lambda: np.interp(a, [0, 1], [0, 1]), lambda: np.linspace(0, a, 3), lambda: np.pad(e, 1),
+    lambda: np.copyto(out, e), lambda: np.full_like(out, a), lambda: np.polyval([1, 2], a), lambda: np.split(e, 2),
+    lambda: np.insert(e, 0, 1), lambda: np.logical_xor(e, e), lambda: np.heaviside(e, 1), lambda: np.searchsorted(out, a),
+    lambda: np.tensordot(m, m), lambda: np.convolve(e, e), lambda: np.average(e, weights=[1, 2]), lambda: np.delete(e, 0),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("call", [*(lambda f=f: f(e) for f in UNAVAILABLE), *WITH_MORE])
+def test_what_is_not_available_says_what_to_do(call):
+    refused(
+        call,
+        r"is not available for expressions(; write .*)?\. Of numbers it is: call the expression with values first",
+    )
+
+
+def test_what_to_write_instead():
+    refused(lambda: np.linalg.solve(m, e), r"; write np\.linalg\.inv\(A\) @ b\.")
+    refused(lambda: np.any(e), r"; write logic, a \| b\.")
+    refused(lambda: np.ma.array([1, 2]) * e, "is not an array of numbers")
+
+
+@pytest.mark.parametrize("call", [
+    lambda: np.array([a, b]), lambda: np.array(e), lambda: np.asarray(e), lambda: np.array([a, 1.0], dtype=object),
+    lambda: np.asarray([[a], [b]]), lambda: np.full(3, a), lambda: np.float64(e), lambda: np.vectorize(abs)(e),
+    lambda: np.asarray(e, dtype=float), lambda: np.arange(a), lambda: out.dot(e), lambda: out.__setitem__(slice(None), e),
+    lambda: np.ones(3)[e], lambda: np.sum([a, b]), lambda: np.roll(out, a), lambda: np.take([1, 2, 3], a),
+    lambda: np.array([e, e], dtype=object), lambda: np.stack([[a, b], [1, 2]]),
+])  # fmt: skip
+def test_expressions_do_not_become_arrays(call):
+    refused(
+        call,
+        r"An expression is not an array of numbers\. Call it with values.*build arrays .* with kv\.array",
+    )
+
+
+def test_elements_of_arrays_of_numbers_stay_numbers():
+    for call in (lambda: out.__setitem__(0, a), lambda: out.fill(a), lambda: np.fromiter([a, b], float)):
+        refused(call, "setting an array element", ValueError)  # numpy's own words
+
+
+@pytest.mark.parametrize("call", [
+    lambda: np.tile(e, 1.5), lambda: np.transpose(m, "x"), lambda: np.repeat(e, a), lambda: np.moveaxis(m, [a], 0),
+    lambda: np.roll(e, shift=a), lambda: np.broadcast_to(e, a), lambda: np.reshape(e, (2, "x")),
+    lambda: np.clip(e, 0, 1, min=0), lambda: np.clip(e, None, 1, max=0), lambda: np.linalg.norm(m, axis=0),
+    lambda: np.linalg.norm(m, 1), lambda: np.linalg.norm(m, 2), lambda: np.linalg.norm(e, "fro"), lambda: np.linalg.norm(m, "nuc"),
+    lambda: e * 1j, lambda: np.array([1j, 2]) * e, lambda: np.array(["a", "b"]) + e, lambda: np.array([1, None]) * e,
+    lambda: e + "1", lambda: e + None, lambda: np.array(["2020"], dtype="M8[Y]") + a,
+])  # fmt: skip
+def test_arguments_that_do_not_fit(call):
+    refused(call, "expression|Euclidean|one lower and one upper")
+
+
+@pytest.mark.parametrize(("call", "message"), [
+    (lambda: np.concatenate([e, np.zeros((2, 2))]), r"numpy\.concatenate: .*\(of shape \(2,\) and \(2, 2\)\)"),
+    (lambda: np.stack([e, m]), r"numpy\.stack: .*\(of shape \(2,\) and \(2, 3\)\)"),
+    (lambda: np.concatenate([a, b]), r"zero-dimensional .*\(of shape \(\) and \(\)\)"),
+    (lambda: np.reshape(m, (4, 2)), r"\(of shape \(2, 3\)\)"), (lambda: np.squeeze(m, 0), r"\(of shape \(2, 3\)\)"),
+    (lambda: np.transpose(m, (0, 0)), r"\(2, 3\)"), (lambda: np.flip(m, 2), r"\(2, 3\)"), (lambda: np.take(e, 2), r"\(2,\)"),
+    (lambda: np.moveaxis(m, 3, 0), r"\(2, 3\)"), (lambda: np.diagonal(e), r"\(2,\)"), (lambda: np.broadcast_to(m, (3, 3)), r"\(2, 3\)"),
+    (lambda: np.ones(3) + e, r"\(3,\) and \(2,\)"), (lambda: m @ m, r"\(2, 3\) and \(2, 3\)"), (lambda: e @ 2, "use \\*"),
+    (lambda: np.ones((2, 2, 2)) @ e, r"\(2, 2, 2\)"), (lambda: np.linalg.inv(m), r"square matrix .* \(2, 3\)"),
+    (lambda: np.linalg.det(e), r"square matrix .* \(2,\)"), (lambda: np.cross(e, e), r"3-vectors"), (lambda: np.trace(e), "diag"),
+    (lambda: np.sum(m, axis=2), "Axis 2"), (lambda: np.max(m, axis=(0, 0)), "Axis"), (lambda: np.mean(m, axis=1.0), "Axis 1.0"),
+    (lambda: np.mean(kv.array([])), "Nothing has no mean"), (lambda: np.linalg.norm(kv.array([])), "empty"),
+    (lambda: np.where([[a], [b], [a]], e, m), r"\(3, 1\)"), (lambda: np.vdot(e, m), r"\(2,\) and \(6,\)"),
+])  # fmt: skip
+def test_shapes_that_do_not_fit(call, message):
+    refused(call, message, ShapeError)
