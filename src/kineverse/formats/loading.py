@@ -6,9 +6,12 @@ import hashlib
 import os
 from collections import OrderedDict
 from collections.abc import Iterator
+from pathlib import Path
 
 from kineverse.collection import no_collection
-from kineverse.errors import ExpressionError, FormatError
+from kineverse.errors import ExpressionError, FormatError, KineverseError
+from kineverse.loops.operation import CloseLoop
+from kineverse.model.edit import Edit
 from kineverse.model.frame import WORLD
 from kineverse.model.model import Model, Snapshot
 from kineverse.model.operation import Operation
@@ -17,6 +20,8 @@ from kineverse.symbols import position
 
 from .document import operations_from
 from .files import read_file
+from .sdf.operations import scene_operations
+from .sdf.reader import parse_sdf
 from .sources import Source, locate_model
 from .urdf.operations import robot_operations
 from .urdf.reader import parse_urdf
@@ -35,7 +40,7 @@ def load(source: str | os.PathLike[str], prefix: str | None = None) -> Model:
     Parameters
     ----------
     source
-        The path of a ``.urdf`` or ``.kv.json`` file, or a name such as ``kitchen``, ``pr2`` or
+        The path of a ``.urdf``, ``.sdf`` or ``.kv.json`` file, or a name such as ``kitchen``, ``pr2`` or
         ``articulations/screw``, see :func:`kineverse.formats.sources.locate_model`.
     prefix
         Put in front of the names of all frames and degrees of freedom, with a slash. A model that ships has
@@ -52,14 +57,16 @@ def load(source: str | os.PathLike[str], prefix: str | None = None) -> Model:
     _check_prefix(prefix)
     found = locate_model(source)
     content = _content(found)
+    # What a file includes may change while it does not.
+    remembered = b"include" not in content.replace(b"\0", b"") if _is_sdf(found.path.name) else True
     key = found, prefix, hashlib.blake2b(content).digest()
     known = _REMEMBERED.pop(key, None)
     if known is None:
         model = Model()
         with model.edit() as edit, no_collection():
             for tag, operation in _operations(found, content, prefix):
-                edit.apply(operation, tag)
-        if len(content) > LARGEST_REMEMBERED:
+                _apply(edit, tag, operation, found.path)
+        if len(content) > LARGEST_REMEMBERED or not remembered:
             return model
         known = model.snapshot()
     else:
@@ -68,6 +75,19 @@ def load(source: str | os.PathLike[str], prefix: str | None = None) -> Model:
     while len(_REMEMBERED) > MOST_REMEMBERED:
         _REMEMBERED.popitem(last=False)
     return model
+
+
+def _apply(edit: Edit, tag: str, operation: Operation, path: Path) -> None:
+    """Apply an operation; a loop that a description asks for and that cannot be closed is its fault."""
+    try:
+        edit.apply(operation, tag)
+    except KineverseError as error:
+        if isinstance(operation, CloseLoop) and _is_sdf(path.name):
+            raise FormatError(
+                f"{path.name}: the joint '{operation.name.removesuffix('/loop')}' closes a loop, which "
+                f"cannot be followed here: {error} Remove the joint, and close the loop with kv.CloseLoop."
+            ) from error
+        raise
 
 
 def operations_of(
@@ -116,8 +136,16 @@ def _operations(source: Source, content: bytes, prefix: str | None) -> Iterator[
             yield base.default_tag(), base
         for operation in robot_operations(robot, prefix, parent=WORLD if base is None else base.child):
             yield operation.default_tag(), operation
+    elif _is_sdf(name):
+        scene = parse_sdf(content, source=name, folder=str(path.absolute().parent))
+        for operation in scene_operations(scene, prefix):
+            yield operation.default_tag(), operation
     else:
         raise FormatError(
-            f"{path}: this version reads URDF (.urdf, .xml) and documents (.kv.json), "
+            f"{path}: this version reads URDF (.urdf, .xml), SDF (.sdf, .world) and documents (.kv.json), "
             f"not '{''.join(path.suffixes) or name}'."
         )
+
+
+def _is_sdf(name: str) -> bool:
+    return name.endswith((".sdf", ".world"))

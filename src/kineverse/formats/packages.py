@@ -83,6 +83,14 @@ def locate(uri: str, folder: Folder = "", search: Sequence[Folder] = ()) -> Path
     )
 
 
+def model_paths() -> Iterator[tuple[str, Path]]:
+    """Yield the folders of models that environment variables name, each with its variable."""
+    for variable in _MODELS:
+        for place in os.environ.get(variable, "").split(os.pathsep):
+            if place:
+                yield variable, Path(place).absolute()
+
+
 @dataclass
 class _Trail:
     """Where a package was looked for, for the message when it is not there."""

@@ -1,0 +1,108 @@
+"""``<include>``: which file it means, within the places where models are."""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Iterator
+from pathlib import Path
+from urllib.parse import unquote
+
+from kineverse.errors import FormatError
+from kineverse.formats.files import read_file
+from kineverse.formats.markup import Element, parse, quote
+from kineverse.formats.packages import model_paths
+
+from .nodes import Version
+from .values import text_of
+
+_LATEST = (1, 12)
+_FILES = (".sdf", ".world", ".urdf")
+
+
+def find_included(uri: str, folder: str) -> Path:
+    """Return the file that an include means: a file, or that which the manifest of a folder names.
+
+    ``model://name/...`` and plain paths are looked for below the folder of the document, then below those of
+    ``GZ_SIM_RESOURCE_PATH``, ``IGN_GAZEBO_RESOURCE_PATH``, ``GAZEBO_MODEL_PATH`` and ``SDF_PATH``, then below
+    the folders above the document. ``file://`` and absolute paths have to lie within the first two.
+
+    Raises
+    ------
+    FormatError
+        If there is none (the message says where it was looked for), if it is to be fetched from a network, or
+        if the path leaves the places where models are.
+    """
+    scheme, colon, rest = uri.partition("://")
+    if not colon:
+        scheme, rest = "", uri
+    if scheme not in ("", "model", "package", "file"):
+        raise FormatError(
+            f"{quote(uri)} is not fetched from a network. Download the model, and name it "
+            "by model:// or a path."
+        )
+    here = Path(folder).absolute()
+    given = [path for _, path in model_paths()]
+    rest = unquote(rest)
+    if "\0" in rest or not rest.strip("/. \\"):
+        raise FormatError(f"{quote(uri)} names no model.")
+    if scheme == "file" or os.path.isabs(rest):
+        places = [here, *given]
+        candidates = [(place, Path(rest)) for place in places]
+    else:
+        parts = re.split(r"[/\\]", rest)
+        if ".." in parts:
+            raise FormatError(f"{quote(uri)} leads out of the folder of models with '..', which is refused.")
+        places = [here, *given, *here.parents]
+        # A folder on the path may itself be the model.
+        candidates = [(place, place / rest) for place in places]
+        candidates += [(place, place.parent / rest) for place in given if place.name == parts[0]]
+    outside = False
+    for place, candidate in candidates:
+        if not _is_model(candidate):
+            continue
+        # A place may be a link to somewhere else; what is below it may not.
+        tops = (place.resolve(), place.parent.resolve()) if place in given else (place.resolve(),)
+        if not any(candidate.resolve().is_relative_to(top) for top in tops):
+            outside = True
+            continue
+        return _model_file(candidate) if candidate.is_dir() else candidate
+    if outside:
+        raise FormatError(f"{quote(uri)} leads out of the folders where models are, which is refused.")
+    variables = ", ".join(dict.fromkeys(variable for variable, _ in model_paths())) or "none is set"
+    raise FormatError(
+        f"{quote(uri)} is not there. Looked below {here}, the folders of GZ_SIM_RESOURCE_PATH, "
+        f"GAZEBO_MODEL_PATH and SDF_PATH ({variables}), and the folders above. Set "
+        "one of these to the folder that holds it."
+    )
+
+
+def _is_model(path: Path) -> bool:
+    if path.is_dir():
+        return (path / "model.config").is_file() or (path / "model.sdf").is_file()
+    return path.suffix in _FILES and path.is_file()
+
+
+def _model_file(folder: Path) -> Path:
+    """Return the newest description that the manifest of a model names and that can be read."""
+    manifest = folder / "model.config"
+    if not manifest.is_file():
+        return folder / "model.sdf"
+    root = parse(read_file(manifest), manifest.name, texts=True)
+    found = [(version, name) for version, name in _listed(root) if version <= _LATEST]
+    if not found:
+        raise FormatError(f"{quote(str(manifest))} names no <sdf> of a version up to 1.12.")
+    _, name = max(found)
+    path = folder / name
+    if not path.resolve().is_relative_to(folder.resolve()):
+        raise FormatError(f"{quote(str(manifest))} names {quote(name)}, which is outside of its folder.")
+    if not path.is_file():
+        raise FormatError(f"{quote(str(manifest))} names {quote(name)}, and there is no such file.")
+    return path
+
+
+def _listed(root: Element) -> Iterator[tuple[Version, str]]:
+    for element in root[2]:
+        if element[0] == "sdf" and text_of(element):
+            match = re.fullmatch(r"1\.(\d{1,3})", element[1].get("version", "1.0").strip())
+            yield (1, int(match[1])) if match else (1, 0), text_of(element)

@@ -1,0 +1,244 @@
+"""A description as operations: one for each root, joint, body and frame, and one for each loop.
+
+Links and frames become frames, joints degrees of freedom of the same name, below the prefix. A joint whose
+frame is not that of the link below it has a frame of its own in between, with its name.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Mapping
+from typing import Any
+
+from kineverse.articulations import (
+    AxisJoint,
+    Ball,
+    Continuous,
+    Fixed,
+    Floating,
+    Gearbox,
+    Limits,
+    Prismatic,
+    Revolute,
+    Screw,
+    Universal,
+)
+from kineverse.errors import FormatError
+from kineverse.expressions.expression import Expression
+from kineverse.formats.chains import Following
+from kineverse.formats.markup import quote
+from kineverse.formats.set_body import SetBody, is_empty
+from kineverse.loops.operation import AXES, CloseLoop
+from kineverse.model.edit import AddFrame
+from kineverse.model.frame import WORLD as MODEL_WORLD
+from kineverse.model.frame import Frame as Placed
+from kineverse.model.operation import Operation
+from kineverse.symbols import position
+
+from .description import WORLD, Axis, Joint, Scene
+from .poses import IDENTITY, inverse, is_identity
+
+_AXIS_JOINTS: dict[str, type[AxisJoint]] = {
+    "revolute": Revolute,
+    "continuous": Continuous,
+    "prismatic": Prismatic,
+}
+_PERPENDICULAR = 1e-6
+
+Named = Callable[[str], str]
+
+
+def scene_operations(scene: Scene, prefix: str | None = None) -> Iterator[Operation]:
+    """Yield the operations that build the models of a file, from the roots outwards.
+
+    Parameters
+    ----------
+    scene
+        The description.
+    prefix
+        Put in front of the names of frames and degrees of freedom, with a slash.
+
+    Raises
+    ------
+    FormatError
+        If two things would have the same name.
+    """
+
+    def named(name: str) -> str:
+        if name == WORLD:
+            return MODEL_WORLD
+        return f"{prefix}/{name}" if prefix else name
+
+    _check_names(scene)
+    bodies = {link.name: link.body for link in scene.links if not is_empty(link.body)}
+    poses = {link.name: link.pose for link in scene.links}
+    for root in scene.roots:
+        name = named(root.link)
+        if root.free:
+            free = f"{name}/free"
+            yield Floating(name=free, parent=MODEL_WORLD, child=name, origin=poses[root.link])
+        else:
+            yield AddFrame(name, Placed(MODEL_WORLD, (poses[root.link],)))
+        if root.link in bodies:
+            yield SetBody(name, bodies[root.link])
+    for joint in scene.joints:
+        yield from _tree_joint(joint, named)
+        if joint.child in bodies:
+            yield SetBody(named(joint.child), bodies[joint.child])
+    for frame in scene.frames:
+        yield AddFrame(named(frame.name), Placed(named(frame.parent), (frame.pose,)))
+    above = {joint.child: joint for joint in scene.joints}
+    for joint in scene.loops:
+        yield from _loop(joint, named, _home(joint, above, named))
+
+
+def _tree_joint(joint: Joint, named: Named) -> Iterator[Operation]:
+    if is_identity(joint.in_child):
+        yield from _motions(joint, named, named(joint.child))
+        return
+    between, link = named(joint.name), named(joint.child)
+    yield from _motions(joint, named, between)
+    yield AddFrame(link, Placed(between, (inverse(joint.in_child),)))
+
+
+def _home(loop: Joint, above: Mapping[str, Joint], named: Named) -> tuple[tuple[str, float], ...]:
+    """Return where quaternions are that a loop goes by; all other coordinates are 0 there."""
+    ways: list[dict[str, Joint]] = []
+    for link in (loop.parent, loop.child):
+        way: dict[str, Joint] = {}
+        while link in above:
+            way[link] = above[link]
+            link = above[link].parent
+        ways.append(way)
+    inside = [joint for link, joint in (ways[0] | ways[1]).items() if (link in ways[0]) != (link in ways[1])]
+    return tuple((f"{named(joint.name)}/qw", 1.0) for joint in inside if joint.kind == "ball")
+
+
+def _loop(joint: Joint, named: Named, home: tuple[tuple[str, float], ...]) -> Iterator[Operation]:
+    """Yield a joint that ends in a frame of its own, and the loop that ties it to the link."""
+    name = named(joint.name)
+    closed, loop = f"{name}/closed", f"{name}/loop"
+    ball = joint.kind == "ball"
+    if ball or joint.kind == "fixed":
+        yield AddFrame(name, Placed(named(joint.parent), (joint.in_parent,)))
+    else:
+        yield from _motions(joint, named, name)
+    yield AddFrame(closed, Placed(named(joint.child), (joint.in_child,)))
+    yield CloseLoop(name=loop, frame=closed, to=name, mask=AXES[:3] if ball else AXES, home=home)
+
+
+def _motions(joint: Joint, named: Named, child: str) -> Iterator[Operation]:
+    """Yield what a joint moves by, from its place in the parent to a frame."""
+    name = named(joint.name)
+    common: dict[str, Any] = {
+        "name": name,
+        "parent": named(joint.parent),
+        "child": child,
+        "origin": IDENTITY if is_identity(joint.in_parent) else joint.in_parent,
+    }
+    if joint.kind == "fixed":
+        yield Fixed(**common)
+    elif joint.kind == "ball":
+        yield Ball(**common, dynamics=_dynamics(joint, ""))
+    elif joint.kind == "gearbox":
+        (axis,) = joint.axes
+        assert joint.gear is not None
+        driver = position(named(joint.gear.leader))
+        yield Gearbox(
+            **common,
+            axis=axis.xyz,
+            driver=driver,
+            ratio=joint.gear.multiplier,
+            offset=joint.gear.offset,
+            lower=axis.lower,
+            upper=axis.upper,
+            velocity=axis.velocity,
+            dynamics=axis.dynamics,
+        )
+    elif joint.kind in ("universal", "revolute2"):
+        yield from _two_axes(joint, common, named)
+    else:
+        (axis,) = joint.axes
+        given = _axis(axis, named)
+        if joint.kind == "screw":
+            yield Screw(**common, **given, pitch=joint.pitch)
+        else:
+            yield _AXIS_JOINTS[joint.kind](**common, **given)
+
+
+def _two_axes(joint: Joint, common: dict[str, Any], named: Named) -> Iterator[Operation]:
+    """Yield a universal joint, or two hinges in a row where the axes are not such that it is one."""
+    first, second = joint.axes
+    cosine = math.fsum(a * b for a, b in zip(first.xyz, second.xyz, strict=True))
+    alone = first.following is None and second.following is None
+    if joint.kind == "universal" and alone and not joint.turned and abs(cosine) <= _PERPENDICULAR:
+        yield Universal(
+            **common,
+            first=first.xyz,
+            second=second.xyz,
+            first_limits=Limits(first.lower, first.upper, first.velocity),
+            second_limits=Limits(second.lower, second.upper, second.velocity),
+            dynamics=(*_dynamics(joint, "first/", 0), *_dynamics(joint, "second/", 1)),
+        )
+        return
+    name = common["name"]
+    between = name + first.suffix
+    yield Revolute(**(common | {"name": name + first.suffix, "child": between}), **_axis(first, named))
+    own = {"name": name + second.suffix, "parent": between, "child": common["child"], "origin": IDENTITY}
+    yield Revolute(**own, **_axis(second, named))
+
+
+def _axis(axis: Axis, named: Named) -> dict[str, Any]:
+    return {
+        "axis": axis.xyz,
+        "lower": axis.lower,
+        "upper": axis.upper,
+        "velocity": axis.velocity,
+        "position": None if axis.following is None else _followed(axis.following, named),
+        "dynamics": axis.dynamics,
+    }
+
+
+def _followed(following: Following[str], named: Named) -> Expression:
+    return following.multiplier * position(named(following.leader)) + following.offset
+
+
+def _dynamics(joint: Joint, prefix: str, index: int = 0) -> tuple[tuple[str, float], ...]:
+    axes = joint.axes[index : index + 1]
+    return tuple((prefix + key, value) for axis in axes for key, value in axis.dynamics)
+
+
+def _check_names(scene: Scene) -> None:
+    """Raise where two things of the description would have the same name in the model."""
+    frames: dict[str, str] = {MODEL_WORLD: "the world"}
+    articulations: dict[str, str] = {}
+
+    def take(taken: dict[str, str], name: str, what: str, line: int, source: str) -> None:
+        other = taken.setdefault(name, f"{what} of line {line}")
+        if other != f"{what} of line {line}" or not name:
+            raise FormatError(
+                f"{source}, line {line}: {what} would be called {quote(name)} here, as {other} is. "
+                "Rename one of them."
+            )
+
+    for link in scene.links:
+        take(frames, link.name, "the link", link.line, link.source)
+    for frame in scene.frames:
+        take(frames, frame.name, "the frame", frame.line, frame.source)
+    free = {root.link for root in scene.roots if root.free}
+    for link in scene.links:
+        if link.name in free:
+            take(articulations, f"{link.name}/free", "the free motion of the link", link.line, link.source)
+    for joint in (*scene.joints, *scene.loops):
+        take(articulations, joint.name, "the joint", joint.line, joint.source)
+        two = len(joint.axes) == 2
+        for axis in joint.axes if two else ():
+            take(
+                articulations,
+                joint.name + axis.suffix,
+                f"the {axis.suffix[1:]} axis",
+                joint.line,
+                joint.source,
+            )
+        if joint in scene.loops or not is_identity(joint.in_child):
+            take(frames, joint.name, "the frame of the joint", joint.line, joint.source)

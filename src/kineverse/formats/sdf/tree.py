@@ -1,0 +1,130 @@
+"""A tree of links out of joints in any direction: what hangs below what, and which joints close loops.
+
+Everything here is iterative and linear but for the inverse of Ackermann's function.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import replace
+
+from kineverse.formats.markup import quote
+
+from .description import WORLD, Axis, Joint, Link, Root
+
+
+class Groups:
+    """Names that belong together."""
+
+    def __init__(self) -> None:
+        self._above: dict[str, str] = {}
+
+    def of(self, name: str) -> str:
+        """Return the name that stands for the group of a name."""
+        above = self._above
+        top = name
+        while top in above:
+            top = above[top]
+        while name != top:
+            above[name], name = top, above[name]
+        return top
+
+    def unite(self, a: str, b: str) -> bool:
+        """Put two groups together; return whether they were two."""
+        first, second = self.of(a), self.of(b)
+        if first == second:
+            return False
+        self._above[second] = first
+        return True
+
+
+def span(
+    links: Sequence[Link],
+    joints: Iterable[Joint],
+    standing: Iterable[str],
+    note: Callable[[Joint, str], None],
+) -> tuple[tuple[Root, ...], tuple[Joint, ...], tuple[Joint, ...]]:
+    """Return the roots, the joints from there outwards, and those that close loops.
+
+    Parameters
+    ----------
+    links, joints
+        In the order of the file.
+    standing
+        Links that stand where they are with all that is connected to them, unless the world holds that.
+    note
+        Called with joints that are left out, and why.
+    """
+    whole, rigid = Groups(), Groups()
+    for link in links:
+        if link.static:
+            whole.unite(WORLD, link.name)
+            rigid.unite(WORLD, link.name)
+    joints = list(joints)
+    for joint in joints:
+        if joint.kind == "fixed":
+            rigid.unite(joint.parent, joint.child)
+    at: dict[str, list[Joint]] = {}
+    held: set[str] = {link.name for link in links if link.static}
+    loops: list[Joint] = []
+    for joint in joints:
+        if whole.unite(joint.parent, joint.child):
+            at.setdefault(joint.parent, []).append(joint)
+            at.setdefault(joint.child, []).append(joint)
+            held.add(joint.child)
+        elif rigid.of(joint.parent) != rigid.of(joint.child):
+            loops.append(joint)
+        else:
+            note(joint, "is left out: its links are rigidly connected anyway.")
+    roots = [Root(link.name) for link in links if link.static]
+    starts = [WORLD, *(root.link for root in roots)]
+    ordered = _outwards(starts, at, note)
+    reached = {whole.of(WORLD)}
+    fixed = {whole.of(name) for name in standing}
+    for link in links:
+        group = whole.of(link.name)
+        if group not in reached and link.name not in held:
+            reached.add(group)
+            roots.append(Root(link.name, free=group not in fixed))
+            ordered += _outwards([link.name], at, note)
+    return tuple(roots), tuple(ordered), tuple(loops)
+
+
+def _outwards(
+    starts: Sequence[str], at: dict[str, list[Joint]], note: Callable[[Joint, str], None]
+) -> list[Joint]:
+    ordered: list[Joint] = []
+    seen: set[str] = set(starts)
+    ahead = [(start, joint) for start in reversed(starts) for joint in reversed(at.get(start, ()))]
+    while ahead:
+        near, joint = ahead.pop()
+        far = joint.child if joint.parent == near else joint.parent
+        if far in seen:
+            continue
+        seen.add(far)
+        if joint.parent != near:
+            note(
+                joint, f"leads from {quote(near)} to {quote(far)} here, since that is the way from the root."
+            )
+            joint = turned(joint)
+        ordered.append(joint)
+        ahead.extend((far, other) for other in reversed(at.get(far, ())))
+    return ordered
+
+
+def turned(joint: Joint) -> Joint:
+    """Return a joint seen from the other end: the same coordinates about opposite axes."""
+    return replace(
+        joint,
+        parent=joint.child,
+        child=joint.parent,
+        in_parent=joint.in_child,
+        in_child=joint.in_parent,
+        axes=tuple(_opposite(axis) for axis in reversed(joint.axes)),
+        turned=not joint.turned,
+    )
+
+
+def _opposite(axis: Axis) -> Axis:
+    x, y, z = axis.xyz
+    return replace(axis, xyz=(0.0 - x, 0.0 - y, 0.0 - z))
