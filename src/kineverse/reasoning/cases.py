@@ -133,7 +133,7 @@ class Case:
         if not live.isdisjoint(self._pinned):
             live = live.difference(self._pinned)
             # A sum stays one where a part of it has one value: it is the same condition as beside that.
-            if p is not None and (p.degree > 1 or not live) and term.op != ca.OP_PARAMETER:
+            if p is not None and p.degree > 1:
                 p = p.at(self._pinned)
         if p is None or p.degree != 1:
             span = value.range if p is None or p.symbols else ranges.enclosing(p.offset)

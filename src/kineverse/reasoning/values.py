@@ -17,6 +17,7 @@ from .ranges import ALL, Range
 from .terms import DOMAINS, Term
 
 NOBODY: frozenset[Symbol] = frozenset()
+ZERO = Polynomial({})
 _PRODUCT_AT_MOST = 8
 
 
@@ -211,7 +212,7 @@ def _sum(op: int | str, a: Value, b: Value, same: bool, live: frozenset[Symbol])
 
 def _product(a: Value, b: Value, same: bool, live: frozenset[Symbol]) -> Value:
     for one, other in ((a, b), (b, a)):
-        if one.number == 0:
+        if one.number == 0 and (one.polynomial == ZERO or other.polynomial is None):
             infinite = other.range[0] == other.range[1] and math.isinf(other.range[0])
             return NOT_A_NUMBER if infinite else constant(0.0)
     exact = None
