@@ -116,11 +116,24 @@ class Case:
             )
         return Box(sides)
 
-    @property
-    def is_at_equality(self) -> bool:
-        """Whether a comparison is half true in this case."""
-        steps = (t.deciders[0] for t in self._order if t.op == "less" and len(t.deciders) == 1)
-        return any(self.sign(excess) == 0 for excess in steps)
+    def is_at_equality(self, roots: tuple[Term, ...]) -> bool:
+        """Whether a comparison is half true in this case, and terms are made of it."""
+        seen, stack = set[int](), list(roots)
+        while stack:
+            term = stack.pop()
+            if term.index in seen:
+                continue
+            seen.add(term.index)
+            if term.op == "less":
+                if len(term.deciders) == 1 and self.sign(term.deciders[0]) == 0:
+                    return True
+                continue
+            args = live_arguments(term, self._values, self.sign)
+            if term.op == ca.OP_MUL:
+                zero = [a for a in args if self._values[a.index].number == 0]
+                args = tuple(zero[:1]) or args
+            stack += [*args, *term.deciders]
+        return False
 
     def _evaluated(self, term: Term) -> Value:
         if term.op != ca.OP_PARAMETER:

@@ -184,7 +184,7 @@ def _leaves(
             hold = "stands still" if not lower.symbols else "stays within"
             if lower.symbols:
                 upper = lower
-        yield _Leaf(case.box(), hold, lower, upper, tighter, not case.is_at_equality)
+        yield _Leaf(case.box(), hold, lower, upper, tighter, not case.is_at_equality((low, high)))
 
 
 def _free_range(leaves: list[_Leaf], limit: Interval) -> tuple[float, float]:

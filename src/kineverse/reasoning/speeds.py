@@ -100,7 +100,7 @@ def _collect(
         elif isinstance(answer, str):
             unknown.append((answer, case.box()))
         elif isinstance(answer, int) and answer <= 0:
-            telling = not case.is_at_equality
+            telling = not case.is_at_equality((factor, room if case.sign(factor) == 1 else other))
             where.add(case.box(), telling)
             if answer < 0:
                 beyond.add(case.box(), telling)
