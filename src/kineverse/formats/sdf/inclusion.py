@@ -62,8 +62,7 @@ def find_included(uri: str, folder: str) -> Path:
         if not _is_model(candidate):
             continue
         # A place may be a link to somewhere else; what is below it may not.
-        tops = (place.resolve(), place.parent.resolve()) if place in given else (place.resolve(),)
-        if not any(candidate.resolve().is_relative_to(top) for top in tops):
+        if not candidate.resolve().is_relative_to(place.resolve()):
             outside = True
             continue
         return _model_file(candidate) if candidate.is_dir() else candidate

@@ -26,7 +26,8 @@ def resolve(parts: Parts) -> None:
     for node in parts.nodes:
         _relate(node)
     check_circles(parts.nodes)
-    for model, scope, frame, element in parts.placements:
+    # Models inside of models come later in the list, and have to be placed first.
+    for model, scope, frame, element in reversed(parts.placements):
         model.pose = product(model.pose, inverse(within(model, scope.find(frame, element, element))))
     place(parts.nodes)
 
