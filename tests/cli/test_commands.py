@@ -34,9 +34,9 @@ def python(*words):
 def test_help_names_all_commands_and_gives_examples(run):
     status, out, err = run("--help")
     assert (status, err) == (0, "")
-    for word in ("info", "fk", "view", "demo", "bench", "examples"):
+    for word in ("info", "fk", "view", "demo", "bench", "reproduce", "examples"):
         assert word in out
-    for command in ("info", "fk", "view", "demo", "bench"):
+    for command in ("info", "fk", "view", "demo", "bench", "reproduce"):
         status, out, _ = run(command, "--help")
         assert status == 0
         assert "examples:" in out
@@ -93,6 +93,24 @@ def test_info_as_json_is_one_object_and_nothing_else(run):
     assert by_name["pr2/head_tilt_joint"]["upper"] == pytest.approx(model.limits("pr2/head_tilt_joint")[1])
     assert all(edge > 0.3 for edge in answer["size"]["extent"])
     assert answer["size"]["mass"] > 10
+
+
+def test_info_says_what_locks_what(run):
+    status, out, _ = run("info", "articulations/garage_door")
+    assert status == 0
+    assert (
+        "interlocks\n  garage_door/garage/door:velocity stands still: when garage_door/garage/bolt < 0.3"
+        in out
+    )
+    assert "other constraints" not in out, "in words they are said already"
+    _, out, _ = run("info", "articulations/garage_door", "--constraints")
+    assert out.count("garage_door/garage/lock") > 1
+    _, out, _ = run("info", "articulations/microwave", "--json")
+    answer = json.loads(out)
+    assert answer["interlocks"][0]["held"] == "microwave/oven/door"
+    assert answer["undecided"] == []
+    _, out, _ = run("info", "kitchen", "--json")
+    assert json.loads(out)["interlocks"] == []
 
 
 @pytest.mark.parametrize("name", kv.shipped_models())

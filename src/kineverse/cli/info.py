@@ -65,7 +65,10 @@ def sections(summary: Summary, frames: bool = False, constraints: bool = False) 
             for f in summary.freedoms
         ]
         found.append(table(("DoF", "unit", "lower", "upper", "default", "speed"), rows, "<<>>>>"))
-    shown = summary.constraints if constraints else [c for c in summary.constraints if not c.simple]
+    if summary.interlocks:
+        found.append("\n".join(["interlocks", *(f"  {interlock}" for interlock in summary.interlocks)]))
+    said = {name for interlock in summary.interlocks for name in interlock.constraints}
+    shown = [c for c in summary.constraints if constraints or not (c.simple or c.name in said)]
     if shown:
         title = "constraint" if constraints else "other constraints"
         found.append(table((title, ""), [(c.name, c.text) for c in shown]))
@@ -110,6 +113,7 @@ def as_json(summary: Summary) -> dict[str, Any]:
             {"name": c.name, "text": c.text, "symbols": c.symbols, "simple": c.simple}
             for c in summary.constraints
         ],
+        **summary.interlocks.as_data(),
         "not_loaded": summary.problems,
         "not_finite": summary.unplaced,
     }

@@ -8,6 +8,7 @@ import numpy as np
 
 from kineverse.model.constraint import Constraint
 from kineverse.model.view import ModelView
+from kineverse.reasoning import Interlocks, interlocks
 from kineverse.symbols import Symbol
 from kineverse.view.parts import parts
 from kineverse.view.poses import Poses, complete
@@ -43,7 +44,7 @@ class Summary:
 
     ``frames`` are the parents by name; ``low``, ``high`` and ``extent`` the box around all shapes at the
     default state [m]; ``mass`` that of all bodies [kg]; ``problems`` what could not be loaded; ``unplaced``
-    the frames whose pose there is not finite, which the box leaves out.
+    the frames whose pose there is not finite, which the box leaves out; ``interlocks`` what locks what.
     """
 
     name: str
@@ -57,6 +58,7 @@ class Summary:
     shapes: int
     problems: list[str]
     unplaced: list[str]
+    interlocks: Interlocks
 
 
 def summarise(name: str, model: ModelView) -> Summary:
@@ -89,6 +91,7 @@ def summarise(name: str, model: ModelView) -> Summary:
         shapes=len(shown),
         problems=sorted(part.frame for part in shown if part.problem),
         unplaced=unplaced,
+        interlocks=interlocks(model),
     )
 
 
