@@ -229,7 +229,8 @@ def _check_names(scene: Scene) -> None:
     for link in scene.links:
         if link.name in free:
             take(articulations, f"{link.name}/free", "the free motion of the link", link.line, link.source)
-    for joint in (*scene.joints, *scene.loops):
+    both = [(joint, False) for joint in scene.joints] + [(joint, True) for joint in scene.loops]
+    for joint, closes in both:
         take(articulations, joint.name, "the joint", joint.line, joint.source)
         two = len(joint.axes) == 2
         for axis in joint.axes if two else ():
@@ -240,5 +241,5 @@ def _check_names(scene: Scene) -> None:
                 joint.line,
                 joint.source,
             )
-        if joint in scene.loops or not is_identity(joint.in_child):
+        if closes or not is_identity(joint.in_child):
             take(frames, joint.name, "the frame of the joint", joint.line, joint.source)
