@@ -21,7 +21,9 @@ TIERS = ["interpreter", pytest.param("c", marks=pytest.mark.compiler)]
 WHERE = r"'half circle' has no solution at input/u = 1\.5\b"
 
 
-@pytest.fixture(params=[True, False], ids=["extension", "no extension"])
+@pytest.fixture(
+    params=[pytest.param(True, marks=pytest.mark.compiler), False], ids=["extension", "no extension"]
+)
 def extension(request, monkeypatch):
     """Calls of C through the extension, and without it."""
     if not request.param:
