@@ -136,6 +136,15 @@ def test_an_axis_of_two_may_follow():
     assert model.articulations["u/second"].position({"u/first": 0.2}) == 0.4
 
 
+def test_nothing_follows_what_cannot_move():
+    static = f'<model name="s"><static>1</static>{link("x")}{link("y")}{joint("q", "revolute", "x", "y", Z)}</model>'
+    text = sdf(
+        link("a"), link("b"), static, joint("f", "revolute", "a", "b", Z.replace("</axis>", mimic("s::q", 2)))
+    )
+    with pytest.raises(kv.FormatError, match='it follows "s/q", which cannot move'):
+        parse_sdf(text)
+
+
 GEARS = """<gearbox_reference_body>base</gearbox_reference_body><gearbox_ratio>{}</gearbox_ratio>
 <axis><xyz>0 0 1</xyz></axis><axis2><xyz>0 0 {}</xyz></axis2>"""
 

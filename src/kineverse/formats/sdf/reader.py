@@ -14,7 +14,7 @@ from typing import NoReturn
 
 from kineverse.formats.chains import Following, resolve_chains
 from kineverse.formats.files import read_file
-from kineverse.formats.markup import Element
+from kineverse.formats.markup import Element, quote
 
 from .bodies import body_of
 from .description import WORLD, Frame, Joint, Link, Scene
@@ -109,6 +109,7 @@ def _scene(
 
     joints = _followed([hinge.joint for hinge in hinges], nodes)
     roots, ordered, loops = span(links, joints, [over[model].path for model in standing], note)
+    _check_leaders((*ordered, *loops), nodes)
     frames = tuple(
         Frame(
             node.path,
@@ -121,6 +122,17 @@ def _scene(
         if node.shown and node.sort in ("frame", "model")
     )
     return Scene(links, frames, roots, ordered, loops, document.source, tuple(remarks))
+
+
+def _check_leaders(joints: Sequence[Joint], nodes: dict[str, Node]) -> None:
+    """Look whether what joints follow is there: not among those that were left out."""
+    moving = {joint.name + axis.suffix for joint in joints for axis in joint.axes}
+    for joint in joints:
+        for following in (joint.gear, *(axis.following for axis in joint.axes)):
+            if following is not None and following.leader not in moving:
+                nodes[joint.name].refuse(
+                    f"it follows {quote(following.leader)}, which cannot move: its links are rigidly connected."
+                )
 
 
 def _link(node: Node) -> Link:
