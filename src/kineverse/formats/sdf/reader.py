@@ -131,7 +131,8 @@ def _check_leaders(joints: Sequence[Joint], nodes: dict[str, Node]) -> None:
         for following in (joint.gear, *(axis.following for axis in joint.axes)):
             if following is not None and following.leader not in moving:
                 nodes[joint.name].refuse(
-                    f"it follows {quote(following.leader)}, which cannot move: its links are rigidly connected."
+                    f"it follows {quote(following.leader)}, which cannot move: the links that it connects "
+                    "are held together anyway."
                 )
 
 
