@@ -13,6 +13,7 @@ from scipy.optimize import linprog
 from scipy.spatial.transform import Rotation
 
 import kineverse as kv
+import motion_law
 from kineverse.formats.document import document_of
 
 Matrix = np.ndarray[Any, np.dtype[np.float64]]
@@ -78,21 +79,7 @@ def assert_motion_law(
     start = random_state(model, seed) if start is None else start
     rng = np.random.default_rng(seed + 1)
     speeds = {s: float(rng.uniform(-1, 1)) for s in model.speeds}
-    h = 2e-3
-    weights = np.array([-1 / 60, 3 / 20, -3 / 4, 0, 3 / 4, -3 / 20, 1 / 60]) / h
-    points = [{**model.integrate(start, speeds, k * h), **speeds} for k in range(-3, 4)]
-    for e in expressions:
-        first = _rate_of(e)
-        for below, above in ((e, first), (first, _rate_of(first))):
-            values = np.array([below(p) for p in points])
-            expected = above(points[3])
-            size = max(1.0, float(np.abs(expected).max()), float(np.abs(values).max()))
-            np.testing.assert_allclose(np.tensordot(weights, values, 1), expected, rtol=0, atol=1e-8 * size)
-
-
-def _rate_of(e: kv.Expression) -> kv.Expression:
-    terms = (entry * key for key, entry in e.gradient(heuristic=False).items() if key.order == 1)
-    return sum(terms, kv.Expression(np.zeros(e.shape)))
+    motion_law.assert_motion_law(model, expressions, start, speeds)
 
 
 def assert_rows_keep_limits(

@@ -15,6 +15,7 @@ from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
 
 import kineverse as kv
+import motion_law
 from kineverse.errors import UnknownNameError, ValueRejectedError
 from kineverse.model.rates import plain
 
@@ -201,24 +202,7 @@ def random_expression(rng: np.random.Generator, symbols: list[kv.Symbol], depth:
 
 
 def assert_motion_law(model: kv.Model, expressions: list[kv.Expression], seed: int) -> None:
-    """Differences of values along the motion are ė, and those of ė are ë, entry by entry of the gradients."""
-    start, speeds = random_state(model, seed), random_speeds(model, seed)
-    h = 2e-3
-    weights = np.array([-1 / 60, 3 / 20, -3 / 4, 0, 3 / 4, -3 / 20, 1 / 60]) / h
-    points = [{**model.integrate(start, speeds, k * h), **speeds} for k in range(-3, 4)]
-    for e in expressions:
-        first = rate_of(e)
-        for below, above in ((e, first), (first, rate_of(first))):
-            values = np.array([below(p) for p in points])
-            expected = above(points[3])
-            size = max(1.0, float(np.abs(expected).max()), float(np.abs(values).max()))
-            np.testing.assert_allclose(np.tensordot(weights, values, 1), expected, rtol=0, atol=1e-8 * size)
-
-
-def rate_of(e: kv.Expression) -> kv.Expression:
-    """Return Σ D(e)[v]·v over the speeds, which are constant."""
-    terms = (entry * key for key, entry in e.gradient(heuristic=False).items() if key.order == 1)
-    return sum(terms, kv.Expression(np.zeros(e.shape)))
+    motion_law.assert_motion_law(model, expressions, random_state(model, seed), random_speeds(model, seed))
 
 
 @pytest.mark.parametrize("base", BASES)
