@@ -20,8 +20,6 @@ from kineverse.symbols import position
 
 from .document import operations_from
 from .files import read_file
-from .sdf.operations import scene_operations
-from .sdf.reader import parse_sdf
 from .sources import Source, locate_model
 from .urdf.operations import robot_operations
 from .urdf.reader import parse_urdf
@@ -137,6 +135,10 @@ def _operations(source: Source, content: bytes, prefix: str | None) -> Iterator[
         for operation in robot_operations(robot, prefix, parent=WORLD if base is None else base.child):
             yield operation.default_tag(), operation
     elif _is_sdf(name):
+        # Many modules, which most processes never need.
+        from .sdf.operations import scene_operations
+        from .sdf.reader import parse_sdf
+
         scene = parse_sdf(content, source=name, folder=str(path.absolute().parent))
         for operation in scene_operations(scene, prefix):
             yield operation.default_tag(), operation
