@@ -113,7 +113,7 @@ class Rates(Mapping[Symbol, Mapping[Symbol, Expression]]):
         for x in _in_order(
             expressions, lambda x: [s for s in expressions[x].symbols if s in expressions], _DEPENDING
         ):
-            self.dependent[x] = apply(expressions[x], self.dependent)
+            self.dependent[x] = self.resolve(expressions[x])
         rows = {x: self._expanded(e) for x, e in self._given.items() if not isinstance(e, Expression)}
         paths = {x.path for x in rows}
 
@@ -129,7 +129,7 @@ class Rates(Mapping[Symbol, Mapping[Symbol, Expression]]):
             return row
         result: dict[Symbol, Expression] = {}
         for speed, factor in row:
-            factor = apply(factor, {s: self.dependent[s] for s in all_symbols(factor) if s in self.dependent})
+            factor = self.resolve(factor)
             itself = self.dependent.get(speed.position)
             gradient = {speed: as_expression(1.0)} if itself is None else itself.gradient(False)
             _add(result, {v: factor * g for v, g in gradient.items()})
@@ -142,6 +142,11 @@ class Rates(Mapping[Symbol, Mapping[Symbol, Expression]]):
             inner: Mapping[Symbol, ExpressionLike] = self._rows.get(speed.position, {speed: 1.0})
             _add(result, {free: factor * rate for free, rate in inner.items()})
         return result
+
+    def resolve(self, expression: Expression) -> Expression:
+        """Return a plain expression in coordinates that do not depend on others."""
+        wanted = {s: self.dependent[s] for s in all_symbols(expression) if s in self.dependent}
+        return apply(expression, wanted)
 
     def row(self, coordinate: Symbol) -> Mapping[Symbol, Expression] | None:
         """Return how a coordinate moves with free speeds, in plain coordinates; None if it is free itself."""

@@ -8,7 +8,6 @@ from typing import Any, Generic, TypeVar
 
 from kineverse.errors import KineverseError, UnknownNameError, suggest
 from kineverse.expressions.expression import Expression
-from kineverse.expressions.substitution import apply
 from kineverse.symbols import Symbol
 
 from .articulation import Articulation
@@ -128,8 +127,7 @@ class Reader:
     def resolve(self, expression: Expression) -> Expression:
         """Return an expression in plain coordinates that do not depend on others."""
         expression = plain(expression)
-        dependent = self._rates_for(expression).dependent
-        return apply(expression, {s: dependent[s] for s in all_symbols(expression) if s in dependent})
+        return self._rates_for(expression).resolve(expression)
 
     def carry(self, expression: Expression) -> Expression:
         """Return an expression with its coordinates carried by the rates that hold here."""
