@@ -20,6 +20,7 @@ from kineverse.symbols import position
 
 from .document import operations_from
 from .files import read_file
+from .remarks import listening, tell
 from .sources import Source, locate_model
 from .urdf.operations import robot_operations
 from .urdf.reader import parse_urdf
@@ -28,8 +29,8 @@ MOST_REMEMBERED = 16
 LARGEST_REMEMBERED = 1 << 22
 """Models whose files are larger than this [byte] are not remembered, they would take too much memory."""
 
-# Models loaded by this process, the latest last, by everything that they follow from.
-_REMEMBERED: OrderedDict[tuple[Source, str | None, bytes], Snapshot] = OrderedDict()
+# Models loaded by this process and remarks on them, the latest last, by everything that they follow from.
+_REMEMBERED: OrderedDict[tuple[Source, str | None, bytes], tuple[Snapshot, list[str]]] = OrderedDict()
 
 
 def load(source: str | os.PathLike[str], prefix: str | None = None) -> Model:
@@ -61,14 +62,15 @@ def load(source: str | os.PathLike[str], prefix: str | None = None) -> Model:
     known = _REMEMBERED.pop(key, None)
     if known is None:
         model = Model()
-        with model.edit() as edit, no_collection():
+        with listening() as remarks, model.edit() as edit, no_collection():
             for tag, operation in _operations(found, content, prefix):
                 _apply(edit, tag, operation, found.path)
         if len(content) > LARGEST_REMEMBERED or not remembered:
             return model
-        known = model.snapshot()
+        known = model.snapshot(), remarks
     else:
-        model = known.model()
+        model = known[0].model()
+        tell(known[1])
     _REMEMBERED[key] = known
     while len(_REMEMBERED) > MOST_REMEMBERED:
         _REMEMBERED.popitem(last=False)

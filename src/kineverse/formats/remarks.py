@@ -3,11 +3,16 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
 from dataclasses import dataclass, field
 
 from kineverse.formats.markup import Element, label
 
 _log = logging.getLogger("kineverse.formats")
+
+_listeners: ContextVar[tuple[list[str], ...]] = ContextVar("listeners", default=())
 
 
 @dataclass(slots=True)
@@ -22,4 +27,23 @@ class Remarks:
         of = "" if owner is None or owner is element else f"{label(owner)}: "
         remark = f"line {element[3]}, {of}{label(element)} {text}"
         self.texts.append(remark)
-        _log.info("%s, %s", self.source, remark)
+        tell([f"{self.source}, {remark}"])
+
+
+def tell(remarks: Iterable[str]) -> None:
+    """Log remarks, each with its source in front, and give them to whoever listens."""
+    for remark in remarks:
+        _log.info("%s", remark)
+        for heard in _listeners.get():
+            heard.append(remark)
+
+
+@contextmanager
+def listening() -> Iterator[list[str]]:
+    """Yield a list that takes every remark of any reader, with its source, made within the block."""
+    heard: list[str] = []
+    token = _listeners.set((*_listeners.get(), heard))
+    try:
+        yield heard
+    finally:
+        _listeners.reset(token)
