@@ -8,14 +8,15 @@ from fractions import Fraction
 
 import casadi as ca
 
+from kineverse.bounds import ranges
+from kineverse.bounds.terms import Term, reachable
 from kineverse.expressions.expression import Expression, as_expression
 from kineverse.symbols import Symbol
 
 from . import polynomial as exact
-from . import ranges, zeros
+from . import zeros
 from .boxes import Box, Interval
 from .polynomial import Axis, Polynomial
-from .terms import Term, reachable
 from .values import Value, evaluate, live_arguments
 
 NEGLIGIBLE = 1e-12

@@ -6,8 +6,9 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import TypeVar
 
+from kineverse.bounds.terms import Term
+
 from .cases import Case
-from .terms import Term
 
 T = TypeVar("T")
 

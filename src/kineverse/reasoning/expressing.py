@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import casadi as ca
 
+from kineverse.bounds.terms import Term, reachable
 from kineverse.expressions.expression import Expression, as_expression, binary, unary
 from kineverse.expressions.functions import maximum, minimum, where
 from kineverse.expressions.piecewise import piecewise
@@ -11,7 +12,6 @@ from kineverse.logic import less
 
 from .cases import Case
 from .polynomial import Polynomial
-from .terms import Term, reachable
 from .values import live_arguments
 
 

@@ -6,6 +6,7 @@ import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 
+from kineverse.bounds.terms import Term, Terms
 from kineverse.expressions.expression import Expression, as_expression
 from kineverse.model.constraint import Constraint
 from kineverse.symbols import Symbol
@@ -16,7 +17,6 @@ from .distinguishing import Unclear, Unknown, distinguish
 from .expressing import expressed
 from .interlock import Hold
 from .regions import merged
-from .terms import Term, Terms
 
 _SAME = 1e-9
 

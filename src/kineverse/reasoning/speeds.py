@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
+from kineverse.bounds.terms import SATURATED, Term, Terms, reachable
 from kineverse.expressions.expression import Expression, as_expression
 from kineverse.expressions.gradient import partial
 from kineverse.model.constraint import Constraint
@@ -14,7 +15,6 @@ from .boxes import Box, Interval
 from .cases import Case
 from .distinguishing import Unclear, Unknown, distinguish
 from .regions import Region
-from .terms import SATURATED, Term, Terms, reachable
 
 
 @dataclass

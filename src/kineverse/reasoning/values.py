@@ -9,12 +9,12 @@ from fractions import Fraction
 
 import casadi as ca
 
+from kineverse.bounds import ranges
+from kineverse.bounds.ranges import ALL, Range
+from kineverse.bounds.terms import DOMAINS, Term
 from kineverse.symbols import Symbol
 
-from . import ranges
 from .polynomial import Polynomial
-from .ranges import ALL, Range
-from .terms import DOMAINS, Term
 
 NOBODY: frozenset[Symbol] = frozenset()
 ZERO = Polynomial({})

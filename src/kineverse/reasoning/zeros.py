@@ -7,11 +7,11 @@ from collections.abc import Callable, Sequence
 
 import casadi as ca
 
+from kineverse.bounds import ranges
+from kineverse.bounds.ranges import ZERO, Range
+from kineverse.bounds.terms import Term
 from kineverse.symbols import Symbol
 
-from . import ranges
-from .ranges import ZERO, Range
-from .terms import Term
 from .values import Signs, Value, live_arguments
 
 Look = Callable[[float, float], tuple[Range, Range | None]]
