@@ -78,6 +78,7 @@ from .model import (
     Reader,
     Shape,
     Snapshot,
+    difference,
 )
 from .spatial import (
     axis_angle,
@@ -167,6 +168,7 @@ __all__ = [
     "blocked_unless",
     "clip",
     "compile",
+    "difference",
     "inverse",
     "less",
     "limit_table",

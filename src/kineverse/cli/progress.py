@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Iterable, Iterator, Sized
+from contextlib import contextmanager
 from typing import TypeVar
 
 Item = TypeVar("Item")
@@ -28,3 +29,16 @@ def progress(items: Iterable[Item], what: str, unit: str = "") -> Iterator[Item]
 
     total = len(items) if isinstance(items, Sized) else None
     yield from tqdm(items, desc=what, total=total, unit=f" {unit}" if unit else "it", leave=False)
+
+
+@contextmanager
+def doing(what: str) -> Iterator[None]:
+    """Say on standard error what is being done, as long as it is; only if that is a terminal."""
+    if not sys.stderr.isatty():
+        yield
+        return
+    print(f"{what} ...", end="", file=sys.stderr, flush=True)
+    try:
+        yield
+    finally:
+        print("\r\033[K", end="", file=sys.stderr, flush=True)

@@ -4,6 +4,7 @@ from .articulation import Articulation
 from .body import Body, Box, Capsule, Cone, Cylinder, Ellipsoid, Inertia, Mesh, Pose, Shape, Sphere
 from .constraint import Constraint
 from .diff import Change, Diff
+from .difference import difference
 from .edit import Edit
 from .frame import WORLD, Frame
 from .model import Model, Snapshot
@@ -39,4 +40,5 @@ __all__ = [
     "Sphere",
     "Violation",
     "Violations",
+    "difference",
 ]

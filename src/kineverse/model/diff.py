@@ -1,4 +1,4 @@
-"""What a committed edit changed."""
+"""What a committed edit changed, or what two models differ in."""
 
 from __future__ import annotations
 
@@ -36,11 +36,14 @@ class Diff:
     Attributes
     ----------
     version
-        The version this leads to; it comes from ``version - 1``.
+        The version this leads to; that of a commit comes from ``version - 1``.
     changes
         Values that changed, in no particular order.
     added, removed, replaced
         Tags of operations, in the order of the edit.
+    moved
+        Tags of operations that come earlier or later than before, relative to the others: between models
+        (:func:`kineverse.difference`), as no edit moves one.
     runs
         How many times operations were applied to get there.
     """
@@ -51,6 +54,12 @@ class Diff:
     removed: tuple[str, ...] = ()
     replaced: tuple[str, ...] = ()
     runs: int = 0
+    moved: tuple[str, ...] = ()
+
+    @property
+    def is_empty(self) -> bool:
+        """Whether nothing differs."""
+        return not (self.changes or self.tags)
 
     @property
     def paths(self) -> tuple[str, ...]:
@@ -59,5 +68,5 @@ class Diff:
 
     @property
     def tags(self) -> frozenset[str]:
-        """Every tag that was added, removed or replaced."""
-        return frozenset((*self.added, *self.removed, *self.replaced))
+        """Every tag that was added, removed, replaced or moved."""
+        return frozenset((*self.added, *self.removed, *self.replaced, *self.moved))

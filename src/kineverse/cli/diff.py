@@ -1,0 +1,100 @@
+"""``kineverse diff``: what two models differ in."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+
+from kineverse.cli.paint import paint
+from kineverse.cli.progress import doing
+from kineverse.errors import ValueRejectedError
+
+HELP = """print what two models differ in: operations, frames, constraints, bodies
+
+Models are compared name by name, whatever formats they come from. Numbers and formulas that agree within the
+tolerance at sampled states count as equal. Operations are compared where most have a counterpart of the same
+tag. Meshes are compared by what they are called, not by what is in the files.
+
+With --values, what the models do is compared instead of how they are made: where their frames are in the
+world at sampled states, and the limits of their degrees of freedom.
+
+  +  only in B      -  only in A      ~  changed      >  comes at another place
+
+The exit status is 0 if they are equal, 1 if they differ, and 2 if a model cannot be read.
+
+examples:
+  kineverse diff robot_old.urdf robot.urdf
+  kineverse diff robot.urdf robot.sdf --values
+  kineverse diff kitchen my_kitchen.urdf --prefix kitchen --tolerance 1e-4
+  kineverse diff home.kv.json today.kv.json --json"""
+
+EQUAL, DIFFERENT = 0, 1
+SHOWN = 20
+"""How many differences of a kind are printed unless all are asked for."""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the options."""
+    for name, what in (("A", "model before"), ("B", "model after")):
+        parser.add_argument(
+            name.lower(), metavar=name, help=f"{what}: name of a shipped one, or path of a file"
+        )
+    parser.add_argument("--prefix", metavar="NAME", help="put in front of all names of both, with a slash")
+    parser.add_argument(
+        "--tolerance",
+        metavar="X",
+        type=float,
+        default=1e-9,
+        help="up to this, numbers are equal (1e-9): [m], [rad], relative above 1; 0: as written, to the bit",
+    )
+    parser.add_argument("--values", action="store_true", help="compare what the models do at sampled states")
+    parser.add_argument(
+        "--operations",
+        choices=("auto", "yes", "no"),
+        default="auto",
+        help="compare operations, too (auto: if most of them have a counterpart)",
+    )
+    parser.add_argument("--all", action="store_true", help=f"print more than {SHOWN} differences of a kind")
+    parser.add_argument("--json", action="store_true", help="everything, as one JSON object")
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Load both, compare, print."""
+    if not (math.isfinite(arguments.tolerance) and arguments.tolerance >= 0.0):
+        raise ValueRejectedError(f"--tolerance is a number from 0 on, not {arguments.tolerance}.")
+
+    import kineverse as kv
+    from kineverse.cli import behaviour_report, comparison_report
+    from kineverse.cli.behaviour import Behaviour
+    from kineverse.cli.comparison import Comparison
+    from kineverse.cli.wording import contents
+
+    models = []
+    for source in (arguments.a, arguments.b):
+        with doing(f"reading {source}"):
+            models.append(kv.load(source, arguments.prefix))
+    before, after = models
+    most = None if arguments.all else SHOWN
+    with doing("comparing"):
+        if arguments.values:
+            behaviour = Behaviour(before, after, arguments.tolerance)
+            equal, told = behaviour.equal, behaviour_report.blocks(behaviour, most)
+            data = behaviour_report.as_json(behaviour)
+        else:
+            comparison = Comparison(before, after, arguments.tolerance, arguments.operations)
+            equal, told = comparison.equal, comparison_report.blocks(comparison, most)
+            data = comparison_report.as_json(comparison)
+    if arguments.json:
+        answer = {
+            "before": arguments.a,
+            "after": arguments.b,
+            "equal": equal,
+            "tolerance": arguments.tolerance,
+        }
+        print(json.dumps({**answer, **data}, allow_nan=False))
+    else:
+        sides = (("-", arguments.a, before), ("+", arguments.b, after))
+        head = [paint(f"{sign * 3} {name}  {contents(model)}", sign) for sign, name, model in sides]
+        print("\n\n".join("\n".join(block) for block in ([] if equal else head, *told) if block))
+    return EQUAL if equal else DIFFERENT

@@ -1,0 +1,234 @@
+"""Where exactly two values of a model differ, and by how much."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, fields, is_dataclass
+from functools import reduce
+from math import inf, isnan
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from kineverse.expressions.expression import Expression, as_expression
+
+from .body import Mesh, Pose
+from .diff import Change
+from .frame import Frame
+from .operation import RATES
+from .samples import Samples
+
+Array = npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class Delta:
+    """One part of a value that differs.
+
+    Attributes
+    ----------
+    what
+        The part, as one would write it: ``parent``, ``upper``, ``visuals[0].geometry.size``; empty if it is
+        the value itself.
+    before, after
+        What the part was and is; None where there is nothing.
+    distance
+        How far apart they are. Numbers above one: relative to the larger; transforms: the distance of the
+        origins [m]. Expressions: the largest over all sampled states. Infinite where it is no matter of
+        numbers, 0 if only the way differs in which the same is written.
+    angle
+        Between transforms, the angle of the rotation from one to the other [rad]; 0 for the rest.
+    at_default
+        Distance and angle at the default state.
+    """
+
+    what: str
+    before: Any
+    after: Any
+    distance: float = inf
+    angle: float = 0.0
+    at_default: tuple[float, float] = (inf, 0.0)
+
+    def is_within(self, tolerance: float) -> bool:
+        """Return whether distance and angle are at most so large; never at 0: there, writing counts."""
+        return tolerance > 0.0 and max(self.distance, self.angle) <= tolerance
+
+
+def deltas(changes: Sequence[Change], samples: Samples) -> list[tuple[Delta, ...]]:
+    """Return, for each change, the parts that differ; none for a value that is new or gone.
+
+    Where a mesh file lies is no difference, only what it is called.
+    """
+    parts = [_parts(change) for change in changes]
+    pairs = [(a, b) for found in parts for _, a, b in found if _is_symbolic(a, b)]
+    measured = iter(_apart(pairs, samples))
+    return [
+        tuple(
+            Delta(what, a, b, *(next(measured) if _is_symbolic(a, b) else _measured(a, b)))
+            for what, a, b in found
+        )
+        for found in parts
+    ]
+
+
+# -- finding -----------------------------------------------------------------------------------------------
+
+
+def _parts(change: Change) -> list[tuple[str, Any, Any]]:
+    if change.before is None or change.after is None:
+        return []
+    if change.kind == RATES:  # each a pair of the coordinate and what moves it
+        return list(_walk("", change.before[1], change.after[1]))
+    return list(_walk("", change.before, change.after))
+
+
+def _walk(what: str, a: Any, b: Any) -> Iterator[tuple[str, Any, Any]]:
+    """Yield the innermost parts of two values that differ, with where they are."""
+    if a is b or (_is_number(a) and _is_number(b) and isnan(a) and isnan(b)):
+        return
+    if type(a) is not type(b) or isinstance(a, (Expression, Pose)):
+        if not _equal(a, b):
+            yield what, a, b
+    elif isinstance(a, Frame):
+        if a.parent != b.parent:
+            yield "parent", a.parent, b.parent
+        if a.factors != b.factors:
+            yield "transform", transform_of(a), transform_of(b)
+    elif is_dataclass(a) and not isinstance(a, type):
+        for field in fields(a):
+            if not (isinstance(a, Mesh) and field.name == "folder"):
+                name = f"{what}.{field.name}" if what else field.name
+                yield from _walk(name, getattr(a, field.name), getattr(b, field.name))
+    elif isinstance(a, tuple) and (a or b) and _are_named(a) and _are_named(b):
+        one, other = ({str(name): value for name, value in pairs} for pairs in (a, b))
+        for name in dict.fromkeys((*one, *other)):
+            yield from _walk(f"{what}[{name}]" if what else name, one.get(name), other.get(name))
+    elif isinstance(a, tuple) and not _are_numbers(a):
+        for i in range(max(len(a), len(b))):
+            yield from _walk(f"{what}[{i}]", *(side[i] if i < len(side) else None for side in (a, b)))
+    elif not _equal(a, b):
+        yield what, a, b
+
+
+def _equal(a: Any, b: Any) -> bool:
+    return bool(a == b)
+
+
+def _are_named(value: Any) -> bool:
+    """Return whether it is a table, or nothing: pairs whose first half is a name, each once."""
+    if not all(isinstance(pair, tuple) and len(pair) == 2 for pair in value):
+        return False
+    names = [str(name) for name, _ in value if isinstance(name, (str, Expression))]
+    return len(set(names)) == len(value)
+
+
+def _are_numbers(value: Any) -> bool:
+    return isinstance(value, tuple) and bool(value) and all(map(_is_number, value))
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, (int, float)) and not isinstance(value, bool)
+
+
+def _is_symbolic(a: Any, b: Any) -> bool:
+    """Return whether two parts are expressions of one shape, or an expression and a number."""
+    if not (isinstance(a, Expression) or isinstance(b, Expression)):
+        return False
+    if not all(isinstance(v, (Expression, Pose)) or _is_number(v) for v in (a, b)):
+        return False
+    return _shape(a) == _shape(b)
+
+
+def _shape(value: Any) -> tuple[int, ...]:
+    if isinstance(value, Expression):
+        return value.shape
+    return (4, 4) if isinstance(value, Pose) else ()
+
+
+def transform_of(frame: Frame) -> Pose | Expression:
+    """Return parent_T_frame as numbers if it is constant, else as an expression."""
+    if not all(isinstance(factor, Pose) for factor in frame.factors):
+        return frame.transform
+    if len(frame.factors) == 1 and isinstance(frame.factors[0], Pose):
+        return frame.factors[0]
+    product: Array = reduce(
+        np.matmul, [factor.matrix for factor in frame.factors if isinstance(factor, Pose)], np.eye(4)
+    )
+    return Pose.of(product)
+
+
+# -- measuring ---------------------------------------------------------------------------------------------
+
+
+def _measured(a: Any, b: Any) -> tuple[float, float, tuple[float, float]]:
+    """Return distance and angle, at worst and at the default state, of what no symbol is in."""
+    if isinstance(a, Pose) and isinstance(b, Pose):
+        distance, angle = (float(x[0]) for x in poses_apart(a.matrix[None], b.matrix[None]))
+        return distance, angle, (distance, angle)
+    if (_is_number(a) and _is_number(b)) or (_are_numbers(a) and _are_numbers(b) and len(a) == len(b)):
+        distance = float(_numbers_apart(np.array([a], dtype=float), np.array([b], dtype=float))[0])
+        return distance, 0.0, (distance, 0.0)
+    return inf, 0.0, (inf, 0.0)
+
+
+def _apart(
+    pairs: Sequence[tuple[Any, Any]], samples: Samples
+) -> Iterator[tuple[float, float, tuple[float, float]]]:
+    """Yield distance and angle, at worst and at the default state, for each pair of expressions."""
+    sides = [(as_expression(_matrix(a)), as_expression(_matrix(b))) for a, b in pairs]
+    trends = [_trends(a, b) for a, b in sides]
+    everything = [e for (a, b), trend in zip(sides, trends, strict=True) for e in (a, b, *trend)]
+    numbers = iter(samples.values(everything))
+    for (a, _), trend in zip(sides, trends, strict=True):
+        one, other = next(numbers), next(numbers)
+        angles: Array = np.zeros(len(one))
+        if a.shape == (4, 4):
+            distances, angles = poses_apart(one, other)
+        else:
+            distances = _numbers_apart(one, other)
+        for _ in trend[::2]:
+            # Gradients may have been overridden: values alone do not say whether expressions are the same.
+            distances = np.maximum(distances, _numbers_apart(next(numbers), next(numbers)))
+        yield (
+            float(distances.max()),
+            float(angles.max()),
+            (float(distances[0]), float(angles[0])),
+        )
+
+
+def _matrix(value: Any) -> Any:
+    return value.matrix if isinstance(value, Pose) else value
+
+
+def _trends(a: Expression, b: Expression) -> list[Expression]:
+    """Return the gradients of two expressions, key by key one after the other, if they need a comparison."""
+    if not (a._nodes or b._nodes):
+        return []
+    one, other = a.gradient(), b.gradient()
+    nothing = as_expression(np.zeros(a.shape))
+    keys = sorted({*one, *other}, key=lambda symbol: symbol.sort_key)
+    return [side.get(key, nothing) for key in keys for side in (one, other)]
+
+
+def _numbers_apart(a: Array, b: Array) -> Array:
+    """Return the largest difference in each row, relative where numbers are above one."""
+    with np.errstate(invalid="ignore", over="ignore"):
+        off = np.abs(a - b) / np.maximum(1.0, np.maximum(np.abs(a), np.abs(b)))
+    off[(a == b) | (np.isnan(a) & np.isnan(b))] = 0.0
+    off[np.isnan(off)] = inf
+    found: Array = off.reshape(len(a), -1).max(axis=1, initial=0.0)
+    return found
+
+
+def poses_apart(a: Array, b: Array) -> tuple[Array, Array]:
+    """Return distances of origins [m] and angles of rotations [rad] between poses (N, 4, 4)."""
+    both = np.isnan(a).any(axis=(1, 2)) & np.isnan(b).any(axis=(1, 2))
+    with np.errstate(invalid="ignore"):
+        distances = np.linalg.norm(a[:, :3, 3] - b[:, :3, 3], axis=1)
+        # The chord on the sphere of rotations is exact for small angles, where the trace of RᵀR is not.
+        chords = np.linalg.norm(a[:, :3, :3] - b[:, :3, :3], axis=(1, 2)) / np.sqrt(8.0)
+        angles = 2.0 * np.arcsin(np.minimum(chords, 1.0))
+    return tuple(  # type: ignore[return-value]
+        np.where(both, 0.0, np.where(np.isnan(part), inf, part)) for part in (distances, angles)
+    )
