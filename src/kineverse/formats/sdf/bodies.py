@@ -10,6 +10,7 @@ from collections.abc import Callable
 
 from kineverse.formats.markup import Element, ElementError, child, label
 from kineverse.formats.numerals import numbers as spelt
+from kineverse.formats.poses import IDENTITY, product
 from kineverse.model.body import (
     Body,
     Box,
@@ -27,7 +28,6 @@ from kineverse.model.body import (
 
 from .nodes import Node
 from .placing import relation
-from .poses import IDENTITY, product
 from .values import number, numbers, pose_of, text, text_of, vector
 
 _ROUND: dict[str, Callable[[float, float], Geometry]] = {

@@ -13,13 +13,13 @@ from dataclasses import replace
 
 from kineverse.formats.chains import Following
 from kineverse.formats.markup import quote
+from kineverse.formats.poses import rotated
 from kineverse.model.body import Vector3
 
 from .description import Axis
 from .joints import Hinge, reference_body
 from .nodes import Node
 from .placing import relation
-from .poses import rotated
 from .values import number
 
 _PARALLEL = 1e-4

@@ -11,12 +11,12 @@ from dataclasses import dataclass
 from kineverse.errors import suggest
 from kineverse.formats.chains import Following
 from kineverse.formats.markup import Element, ElementError, child, quote
+from kineverse.formats.poses import rotated
 from kineverse.model.body import Vector3
 
 from .description import AXES, Axis, Joint, Kind
 from .nodes import MODEL, Node
 from .placing import relation
-from .poses import rotated
 from .resolving import end_of
 from .values import bound, direction, number, text, text_of, truth
 

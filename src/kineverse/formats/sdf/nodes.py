@@ -9,10 +9,9 @@ from typing import Literal, NoReturn, TypeAlias
 
 from kineverse.errors import FormatError, suggest
 from kineverse.formats.markup import Element, ElementError, label, quote
+from kineverse.formats.poses import IDENTITY
 from kineverse.formats.remarks import Remarks
 from kineverse.model.body import Pose
-
-from .poses import IDENTITY
 
 Sort: TypeAlias = Literal["world", "model", "link", "joint", "frame"]
 MODEL = "__model__"

@@ -27,7 +27,9 @@ from kineverse.errors import FormatError
 from kineverse.expressions.expression import Expression
 from kineverse.formats.chains import Following
 from kineverse.formats.markup import quote
+from kineverse.formats.poses import IDENTITY, inverse, is_identity
 from kineverse.formats.set_body import SetBody, is_empty
+from kineverse.formats.ways import way_between
 from kineverse.loops.operation import AXES, CloseLoop
 from kineverse.model.edit import AddFrame
 from kineverse.model.frame import WORLD as MODEL_WORLD
@@ -36,7 +38,6 @@ from kineverse.model.operation import Operation
 from kineverse.symbols import position
 
 from .description import WORLD, Axis, Joint, Scene
-from .poses import IDENTITY, inverse, is_identity
 
 _AXIS_JOINTS: dict[str, type[AxisJoint]] = {
     "revolute": Revolute,
@@ -103,14 +104,8 @@ def _tree_joint(joint: Joint, named: Named) -> Iterator[Operation]:
 
 def _home(loop: Joint, above: Mapping[str, Joint], named: Named) -> tuple[tuple[str, float], ...]:
     """Return where quaternions are that a loop goes by; all other coordinates are 0 there."""
-    ways: list[dict[str, Joint]] = []
-    for link in (loop.parent, loop.child):
-        way: dict[str, Joint] = {}
-        while link in above:
-            way[link] = above[link]
-            link = above[link].parent
-        ways.append(way)
-    inside = [joint for link, joint in (ways[0] | ways[1]).items() if (link in ways[0]) != (link in ways[1])]
+    parents = {link: joint.parent for link, joint in above.items()}
+    inside = [above[link] for link in way_between(loop.parent, loop.child, parents)]
     return tuple((f"{named(joint.name)}/qw", 1.0) for joint in inside if joint.kind == "ball")
 
 

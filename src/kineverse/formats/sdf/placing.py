@@ -8,10 +8,10 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 
 from kineverse.formats.markup import quote
+from kineverse.formats.poses import IDENTITY, inverse, product
 from kineverse.model.body import Pose
 
 from .nodes import Node
-from .poses import IDENTITY, inverse, product
 
 _NEAR = 64
 

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from kineverse.formats.markup import TEXT, Element, child, quote
+from kineverse.formats.poses import inverse, product
 
 from .nodes import Node, Scope
 from .placing import check_circles, place, within
-from .poses import inverse, product
 from .reading import Parts
 from .values import pose_of, text_of
 

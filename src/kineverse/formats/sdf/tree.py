@@ -8,34 +8,10 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 
+from kineverse.formats.groups import Groups
 from kineverse.formats.markup import quote
 
 from .description import WORLD, Axis, Joint, Link, Root
-
-
-class Groups:
-    """Names that belong together."""
-
-    def __init__(self) -> None:
-        self._above: dict[str, str] = {}
-
-    def of(self, name: str) -> str:
-        """Return the name that stands for the group of a name."""
-        above = self._above
-        top = name
-        while top in above:
-            top = above[top]
-        while name != top:
-            above[name], name = top, above[name]
-        return top
-
-    def unite(self, a: str, b: str) -> bool:
-        """Put two groups together; return whether they were two."""
-        first, second = self.of(a), self.of(b)
-        if first == second:
-            return False
-        self._above[second] = first
-        return True
 
 
 def span(
