@@ -64,8 +64,11 @@ from .locks import blocked_unless, limit_table, unlocked_while
 from .logic import less, logic_and, logic_not, logic_or
 from .loops import CloseLoop
 from .model import (
+    AddFrame,
     Articulation,
+    Attach,
     Body,
+    Constrain,
     Constraint,
     Diff,
     Edit,
@@ -76,8 +79,10 @@ from .model import (
     Operation,
     Pose,
     Reader,
+    SetRate,
     Shape,
     Snapshot,
+    Write,
     difference,
 )
 from .spatial import (
@@ -101,13 +106,16 @@ if TYPE_CHECKING:
 
 __all__ = [
     "Ackermann",
+    "AddFrame",
     "Articulation",
+    "Attach",
     "Ball",
     "Body",
     "Cam",
     "CloseLoop",
     "CompileError",
     "CompiledFunction",
+    "Constrain",
     "Constraint",
     "Continuous",
     "Cylindrical",
@@ -152,6 +160,7 @@ __all__ = [
     "ScissorLift",
     "Screw",
     "ScrewAndNut",
+    "SetRate",
     "Shape",
     "ShapeError",
     "Snapshot",
@@ -161,6 +170,7 @@ __all__ = [
     "UnknownNameError",
     "UnsolvedError",
     "ValueRejectedError",
+    "Write",
     "__version__",
     "array",
     "articulations",

@@ -108,7 +108,10 @@ class Expression:
         """Whether the value depends on no symbol and the gradient is empty."""
         if not self._nodes:
             return bool(self._sx.is_constant())
-        return not self.symbols and not self.gradient()
+        from .leaves import leaves
+
+        symbols, nodes = leaves(self)
+        return not symbols and all(node.is_constant for node in nodes)
 
     @property
     def T(self) -> Expression:

@@ -162,6 +162,11 @@ class Implicit(Node):
         return function
 
     @property
+    def parts(self) -> tuple[Expression, ...]:
+        """The arguments, and what defines the function."""
+        return (*self.arguments, self.function.residual, self.function.seed)
+
+    @property
     def label(self) -> str:
         """The name of the function."""
         return self.function.name

@@ -115,6 +115,16 @@ class Node(ABC):
         return self._symbols
 
     @property
+    def is_constant(self) -> bool:
+        """Whether the value depends on no symbol and the gradient is empty."""
+        return not self.symbols and not self.gradient(True)
+
+    @property
+    def parts(self) -> tuple[Expression, ...]:
+        """All expressions that the node is made of, those among its options included."""
+        return self.arguments
+
+    @property
     def size(self) -> int:
         """The number of elements."""
         return math.prod(self.shape)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
-from typing import Any, TypeVar
+from typing import Any, ClassVar, TypeVar
 
 from kineverse.errors import ModelError, NameTakenError, UnsolvedError, ValueRejectedError
 from kineverse.expressions.expression import Expression, array
@@ -67,6 +67,8 @@ class CloseLoop(Operation):
     ModelError
         If the frames are connected rigidly.
     """
+
+    traceable: ClassVar[bool] = False
 
     name: str
     frame: str

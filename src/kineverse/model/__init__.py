@@ -5,7 +5,7 @@ from .body import Body, Box, Capsule, Cone, Cylinder, Ellipsoid, Inertia, Mesh, 
 from .constraint import Constraint
 from .diff import Change, Diff
 from .difference import difference
-from .edit import Edit
+from .edit import AddFrame, Attach, Constrain, Edit, SetRate, Write
 from .frame import WORLD, Frame
 from .model import Model, Snapshot
 from .operation import Effects, Operation
@@ -15,12 +15,15 @@ from .violations import Violation, Violations
 
 __all__ = [
     "WORLD",
+    "AddFrame",
     "Articulation",
+    "Attach",
     "Body",
     "Box",
     "Capsule",
     "Change",
     "Cone",
+    "Constrain",
     "Constraint",
     "Cylinder",
     "Diff",
@@ -35,10 +38,12 @@ __all__ = [
     "Pose",
     "Rates",
     "Reader",
+    "SetRate",
     "Shape",
     "Snapshot",
     "Sphere",
     "Violation",
     "Violations",
+    "Write",
     "difference",
 ]

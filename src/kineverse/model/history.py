@@ -97,6 +97,16 @@ class History:
                 f"There is no operation {tag!r}. {suggest(str(tag), self.entries, 'tag')}"
             ) from None
 
+    def operation(self, tag: str) -> Operation:
+        """Return the operation of a tag.
+
+        Raises
+        ------
+        UnknownNameError
+            Listing similar tags.
+        """
+        return self.entry(tag).operation
+
     # -- changes of the sequence ---------------------------------------------------------------------------
 
     def append(self, tag: str, operation: Operation) -> None:

@@ -10,7 +10,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 from kineverse.errors import ValueRejectedError
 from kineverse.expressions.expression import Expression, ExpressionLike
@@ -63,6 +63,20 @@ class Effects:
     bodies: Mapping[str, Body] = field(default_factory=dict)
     articulations: Mapping[str, Articulation] = field(default_factory=dict)
     data: Mapping[str, Any] = field(default_factory=dict)
+
+    @staticmethod
+    def of(writes: Mapping[tuple[str, str], Any]) -> Effects:
+        """Return the effects that have these writes, by kind and name."""
+        kinds: dict[str, dict[Any, Any]] = {kind: {} for kind in KINDS}
+        for (kind, name), value in writes.items():
+            if kind == RATES:
+                coordinate, entry = value
+                kinds[kind][coordinate] = entry if isinstance(entry, Expression) else dict(entry)
+            elif kind == FRAMES:
+                kinds[kind][name] = (value.parent, value.factors)
+            else:
+                kinds[kind][name] = value
+        return Effects(**kinds)
 
     def writes(self) -> dict[tuple[str, str], Any]:
         """Return all of it in canonical form, by kind and name, in plain coordinates."""
@@ -145,6 +159,9 @@ class Operation(ABC):
                     constraints={f"{self.name}/range": (0, q, 1)},
                 )
     """
+
+    traceable: ClassVar[bool] = True
+    """Whether what it computes can be written down as expressions of what it reads; False saves the try."""
 
     @abstractmethod
     def apply(self, model: Reader) -> Effects:

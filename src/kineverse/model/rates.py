@@ -296,6 +296,11 @@ class Carried(Node):
         return symbol
 
     @property
+    def parts(self) -> tuple[Expression, ...]:
+        """What the rows are made of; the coordinate itself is no part."""
+        return tuple(entry for row in self.rates.values() for entry in row.values())
+
+    @property
     def label(self) -> str:
         """What errors and printing call it."""
         return "carried"

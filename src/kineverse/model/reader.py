@@ -64,29 +64,30 @@ class Reader:
     @property
     def frames(self) -> Mapping[str, Frame]:
         """Frames by name."""
-        return self._view(FRAMES)
+        return self.by_kind(FRAMES)
 
     @property
     def bodies(self) -> Mapping[str, Body]:
         """Bodies by the frame they belong to."""
-        return self._view(BODIES)
+        return self.by_kind(BODIES)
 
     @property
     def articulations(self) -> Mapping[str, Articulation]:
         """Articulations by name."""
-        return self._view(ARTICULATIONS)
+        return self.by_kind(ARTICULATIONS)
 
     @property
     def constraints(self) -> Mapping[str, Constraint]:
         """Constraints by name."""
-        return self._view(CONSTRAINTS)
+        return self.by_kind(CONSTRAINTS)
 
     @property
     def data(self) -> Mapping[str, Any]:
         """All other data by name."""
-        return self._view(DATA)
+        return self.by_kind(DATA)
 
-    def _view(self, kind: str) -> _View[Any]:
+    def by_kind(self, kind: str) -> Mapping[str, Any]:
+        """Return one kind of data by name."""
         return _View(kind, self._value_at, self._names_at, self._reads)
 
     def fk(self, frame: str, relative_to: str = WORLD) -> Expression:

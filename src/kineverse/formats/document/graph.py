@@ -17,6 +17,7 @@ from kineverse.expressions.node import Augment, Node
 from kineverse.expressions.piecewise import Piecewise, checked_pieces
 from kineverse.logic import And, Less, Not, Or
 from kineverse.model.rates import Carried, Composed, Dependent, Rates, as_row
+from kineverse.model.traces import Answer
 from kineverse.symbols import ROLES, Symbol
 
 from .checks import RefusedError, exactly, listed, name, number, numbers, the, whole
@@ -26,6 +27,8 @@ MAX_ORDER = 1000
 MAX_DIMENSIONS = 16
 MAX_LENGTH = 1 << 24
 MAX_STEPS = 100
+MAX_QUESTIONS = 10_000
+MAX_ANSWER = 10_000
 MAX_NESTING = 400
 """Nodes with a gradient of their own inside one another; what works on them follows them down."""
 
@@ -41,6 +44,8 @@ class Graph:
 
     def __init__(self, prefix: str | None) -> None:
         self.place = 0
+        self.has_answers = False
+        """Whether there are ``read`` nodes, which belong into traces."""
         self._before = f"{prefix}/" if prefix else ""
         self._sx: list[Any] = []
         self._shapes: list[layout.Shape] = []
@@ -75,6 +80,7 @@ class Graph:
             "composed": self._composed,
             "dependent": self._dependent,
             "implicit": self._implicit,
+            "read": self._read,
         }
         for self.place, node in enumerate(table):
             if type(node) is not list or not node or type(node[0]) is not str:
@@ -181,13 +187,9 @@ class Graph:
 
     def _matrix(self, node: list[Any]) -> None:
         _, given, refs = exactly(node, 3)
-        if len(listed(given, "a shape")) > MAX_DIMENSIONS:
-            raise RefusedError(f"more than {MAX_DIMENSIONS} dimensions")
-        shape = tuple(whole(length, MAX_LENGTH) for length in given)
+        shape = self._shape(given)
         if math.prod(shape) != len(listed(refs, "the elements")):
             raise RefusedError(f"{len(refs)} elements do not fill the shape {shape}")
-        if math.prod(length for length in shape if length) > MAX_LENGTH:
-            raise RefusedError(f"the shape {shape} is too large")
         stored = [i for i, ref in enumerate(refs) if ref is not None]
         places = [self._scalar_at(refs[i]) for i in stored]
         elements = ca.vertcat(*(self._sx[p] for p in places)) if places else ca.SX(0, 1)
@@ -195,6 +197,14 @@ class Graph:
         rows, columns = layout.rows_and_columns(shape)
         sx = layout.from_column(column, shape) if refs else ca.SX(rows, columns)
         self._add(sx, shape, max((self._depths[p] for p in places), default=0))
+
+    def _shape(self, given: Any) -> layout.Shape:
+        if len(listed(given, "a shape")) > MAX_DIMENSIONS:
+            raise RefusedError(f"more than {MAX_DIMENSIONS} dimensions")
+        shape = tuple(whole(length, MAX_LENGTH) for length in given)
+        if math.prod(length for length in shape if length) > MAX_LENGTH:
+            raise RefusedError(f"the shape {shape} is too large")
+        return shape
 
     def _opaque(self, kind: type[Node], refs: list[Any], options: tuple[Any, ...] = ()) -> None:
         """Add a node whose arguments and itself are of one shape."""
@@ -218,10 +228,12 @@ class Graph:
             raise RefusedError(
                 f"more than {MAX_NESTING} nodes with a gradient of their own inside one another"
             )
-        expression = kind.of(tuple(self.expression(ref) for ref in refs), shape, options)
+        self._keep(kind.of(tuple(self.expression(ref) for ref in refs), shape, options), depth)
+
+    def _keep(self, expression: Expression, depth: int) -> None:
         (node,) = expression._nodes
         self._owners.update(dict.fromkeys(node.elements, node))
-        self._add(expression._sx, shape, depth, expression)
+        self._add(expression._sx, node.shape, depth, expression)
 
     def _augment(self, node: list[Any]) -> None:
         _, value, replace, heuristic, entries = exactly(node, 5)
@@ -293,6 +305,18 @@ class Graph:
             raise RefusedError("a symbol is replaced by a scalar")
         refs = [ref, *(entry for _, entry in replacements)]
         self._node(Composed, refs, (), tuple(key for key, _ in pairs))
+
+    def _read(self, node: list[Any]) -> None:
+        _, question, part, shape, steps = exactly(node, 5)
+        path = []
+        for step in listed(steps, "a path"):
+            ref, trends = exactly(listed(step, "a symbol, and whether trends count"), 2)
+            path.append((self.symbol(ref, 1), the(bool, trends, "true or false")))
+        if math.prod(self._shape(shape)) > MAX_ANSWER:
+            raise RefusedError(f"an answer of more than {MAX_ANSWER} elements")
+        question, part = whole(question, MAX_QUESTIONS), whole(part, MAX_QUESTIONS)
+        self._keep(Answer.empty(self._shape(shape), question, part, tuple(path)), 1)
+        self.has_answers = True
 
     def _dependent(self, node: list[Any]) -> None:
         _, ref, coordinate = exactly(node, 3)

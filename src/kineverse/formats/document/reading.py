@@ -3,17 +3,24 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Iterator
 from typing import Any, NoReturn
 
 from kineverse.errors import FormatError, KineverseError
+from kineverse.expressions.expression import Expression
 from kineverse.formats.files import MAX_BYTES
+from kineverse.model.contents import expressions_in
 from kineverse.model.operation import FRAMES, KINDS, RATES
-from kineverse.model.reader import Cell, Read
+from kineverse.model.reader import ABSENT, Cell, Read
+from kineverse.model.traces import Trace
+from kineverse.model.traces.answer import answers_in
 from kineverse.symbols import symbol_name
 
 from .checks import RefusedError, fields, listed, name, string
 from .graph import Graph
+from .parameters import read_parameter
 from .recorded import Recorded
+from .traces import check_answers, read_questions
 from .values import Rename, as_read, frame_name
 from .writing import FORMAT, VERSION
 
@@ -52,7 +59,8 @@ class _Document:
         self._place = ""
         self._prefix = prefix
         self._graph = Graph(prefix)
-        self._written: set[Cell] = set()
+        self._cells: dict[Cell, Any] = {}
+        self._names: dict[str, set[str]] = {kind: set() for kind in KINDS}
 
     def read(self, text: str) -> list[tuple[str, Recorded]]:
         try:
@@ -101,7 +109,7 @@ class _Document:
         result: dict[str, Recorded] = {}
         for i, given in enumerate(operations):
             self._place = f"operations[{i}]"
-            fields(given, ("tag", "kind", "reads", "writes"))
+            fields(given, ("tag", "kind", "reads", "writes"), ("parameters", "trace", "frozen"))
             tag = string(given["tag"])
             if not tag:
                 raise RefusedError("the tag is empty")
@@ -119,9 +127,37 @@ class _Document:
             for path in listed(reads.get(key, []), key):
                 cell = self._cell(*string(path).partition("/")[::2])
                 cells[cell] = cells.get(cell, Read(0)) | how
-        listings = tuple(map(_kind, listed(reads.get("listing", []), "listing")))
+        kinds = [_kind(kind) for kind in listed(reads.get("listing", []), "listing")]
+        seen = {cell: self._cells.get(cell, ABSENT) for cell in cells}
+        names = tuple((kind, tuple(sorted(self._names[kind]))) for kind in kinds)
+        writes = self._writes(given["writes"], place)
+        for expression in self._expressions(writes):
+            if answers_in(expression):
+                raise RefusedError("a read node stands outside of a trace")
+        trace = self._trace(given["trace"], f"{place}, trace") if "trace" in given else None
+        self._place = f"{place}, parameters"
+        parameters = {
+            string(key): read_parameter(value, self._graph, self._rename, self._path)
+            for key, value in _members(given.get("parameters", {})).items()
+        }
+        self._cells.update(writes)
+        for kind, written in (cell for cell, _ in writes):
+            self._names[kind].add(written)
+        return Recorded(
+            string(given["kind"]),
+            parameters,
+            tuple(sorted(cells.items())),
+            names,
+            writes,
+            trace,
+            string(given.get("frozen", "")),
+            seen,
+            self._rename(""),
+        )
+
+    def _writes(self, given: Any, place: str) -> tuple[tuple[Cell, Any], ...]:
         writes = []
-        for kind, values in fields(given["writes"], (), KINDS).items():
+        for kind, values in fields(given, (), KINDS).items():
             for key, value in _members(values).items():
                 self._place = f"{place}, writes {kind}/{key[:60]}"
                 cell = self._cell(kind, name(key))
@@ -132,13 +168,28 @@ class _Document:
                 if kind == RATES and str(read[0]) != cell[1]:
                     raise RefusedError(f"this is the rate of '{read[0]}'")
                 writes.append((cell, read))
-        required = frozenset(cell for cell in cells if cell in self._written)
-        self._written.update(cell for cell, _ in writes)
-        return Recorded(
-            string(given["kind"]), tuple(sorted(cells.items())), listings, required, tuple(writes)
-        )
+        return tuple(writes)
 
-    def _cell(self, kind: str, given: str) -> Cell:
+    def _trace(self, given: Any, place: str) -> Trace:
+        self._place = place
+        fields(given, ("questions", "writes"))
+        steps = read_questions(given["questions"], self._graph, self._cell)
+        writes = self._writes(given["writes"], place)
+        self._place = place
+        for expression in self._expressions(writes):
+            check_answers(expression, len(steps))
+        return Trace(steps, writes)
+
+    def _expressions(self, writes: tuple[tuple[Cell, Any], ...]) -> Iterator[Expression]:
+        """Yield the expressions in which there may be read nodes."""
+        if self._graph.has_answers:
+            for (kind, _), value in writes:
+                yield from expressions_in(kind, value)
+
+    def _path(self, given: str) -> str:
+        return "/".join(self._cell(*given.partition("/")[::2]))
+
+    def _cell(self, kind: Any, given: Any) -> Cell:
         kind = _kind(kind)
         if kind == RATES:
             before = f"{symbol_name(self._prefix, 0)}/" if self._prefix else ""

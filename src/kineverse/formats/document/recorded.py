@@ -1,4 +1,4 @@
-"""What a document knows of an operation: what it read and what it wrote."""
+"""What a document knows of an operation: what it was, what it read and wrote, and perhaps how."""
 
 from __future__ import annotations
 
@@ -7,90 +7,132 @@ from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
 
-from kineverse.errors import UnknownNameError
-from kineverse.expressions.expression import Expression
-from kineverse.model.operation import (
-    ARTICULATIONS,
-    BODIES,
-    CONSTRAINTS,
-    DATA,
-    FRAMES,
-    RATES,
-    Effects,
-    Operation,
-)
-from kineverse.model.reader import ABSENT, Cell, Read, Reader
+from kineverse.errors import KineverseError, ModelError, UnknownNameError
+from kineverse.model.operation import Effects, Operation
+from kineverse.model.reader import ABSENT, Cell, Read, Reader, Reads
+from kineverse.model.traces import Trace
+
+from .parameters import Written
 
 
 @dataclass(frozen=True)
 class Recorded(Operation):
-    """An operation from a document, frozen: it writes what it wrote when the document was saved.
+    """An operation from a document.
 
-    It still depends on what the original read: it is run again when that changes, and refuses an edit that
-    takes away something which was there. What it writes does not follow a changed value, though; for edits
-    upstream that should carry through, replace it by an operation of the original class.
+    While what it reads is what the original read, it writes what the original wrote, to the last bit. When
+    that changes, it is run again by its trace; if it has none, it is *frozen*, and such a change is refused.
+    Then, or when the change is one that the original decided by, replace it by an operation of its class, in
+    the same edit.
 
     Attributes
     ----------
     kind
         Name of the class that wrote this originally.
+    given
+        What that was made with, by name, see :attr:`parameters`.
     reads
         The cells (kind, name) that were looked at, and how closely.
     listings
-        Kinds of which all names were listed.
-    required
-        Those among the cells that existed.
+        Kinds of which all names were listed, with these.
     writes
         What it writes, by cell, in order.
+    trace
+        What it computes from what it reads.
+    frozen
+        Why there is no trace though it read values; empty if there is one, or no need for one.
+    seen
+        What the cells contained.
+    scope
+        What all names of the document begin with.
     """
 
     kind: str
+    given: Mapping[str, Any] = field(default_factory=dict, hash=False)
     reads: tuple[tuple[Cell, Read], ...] = ()
-    listings: tuple[str, ...] = ()
-    required: frozenset[Cell] = frozenset()
+    listings: tuple[tuple[str, tuple[str, ...]], ...] = ()
     writes: tuple[tuple[Cell, Any], ...] = field(default=(), repr=False)
+    trace: Trace | None = field(default=None, repr=False)
+    frozen: str = ""
+    seen: Mapping[Cell, Any] = field(default_factory=dict, repr=False, compare=False)
+    scope: str = ""
+
+    @property
+    def parameters(self) -> dict[str, Any]:
+        """What the original was made with, by name: ``kv.CloseLoop(**operation.parameters)`` makes it anew.
+
+        Names in it are as they were saved, without a prefix that the document was loaded under.
+        """
+        writes = {f"{kind}/{name}": value for (kind, name), value in self.writes}
+        return {
+            name: writes.get(value.path, value) if isinstance(value, Written) else value
+            for name, value in self.given.items()
+        }
 
     def apply(self, model: Reader) -> Effects:
-        """Look at what the original looked at, and write what it wrote.
+        """Write what the original wrote, or would write now.
 
         Raises
         ------
         UnknownNameError
             If something it was made from does not exist any more.
+        ModelError
+            If something it was made from has changed in a way that it cannot follow.
         """
-        model._reads.listings.update(self.listings)
+        model = self._in_scope(model)
+        changed = self._changed(model)
+        if not changed:
+            return self._effects
+        error: KineverseError = ModelError(f"{self.frozen or 'it looked whether it is there'}.")
+        if self.trace is not None:
+            try:
+                return self.trace.run(model, self._before(model))
+            except KineverseError as problem:
+                error = problem
+        kind = UnknownNameError if isinstance(error, UnknownNameError) else ModelError
+        raise kind(
+            f"{changed[0]} has changed, and this {self.kind} was made from it: {error} It comes from a "
+            "document, without its code; in the same edit, remove it, or replace it by a "
+            f"{self.kind}(...) made anew."
+        ) from None
+
+    def _in_scope(self, model: Reader) -> Reader:
+        """Return the reader without the names of others, if the document has a prefix of its own."""
+        if not self.scope:
+            return model
+        return Reader(
+            model._value_at,
+            lambda kind: [name for name in model._names_at(kind) if name.startswith(self.scope)],
+            model._reads,
+        )
+
+    def _changed(self, model: Reader) -> list[str]:
+        """Look at what the original looked at, and return what is different."""
+        changed = []
+        for kind, names in self.listings:
+            model._reads.listings.add(kind)
+            if tuple(model._names_at(kind)) != names:
+                changed.append(f"the list of all {kind}")
         for cell, how in self.reads:
             model._reads.add(cell, how)
-            if cell in self.required and model._value_at(cell) is ABSENT:
-                kind, name = cell
-                raise UnknownNameError(
-                    f"{kind}/{name} does not exist, and this {self.kind} was made from it. It comes from a "
-                    "document and cannot be made anew; keep what it needs, or remove or replace it too."
-                )
-        return self._effects
+            now, then = model._value_at(cell), self.seen.get(cell, ABSENT)
+            if now is then:
+                continue
+            if then is ABSENT or now is ABSENT or (how & Read.VALUE and now != then):
+                changed.append("/".join(cell))
+        return changed
+
+    def _before(self, model: Reader) -> Reader:
+        """Return a reader of what the original read; what it did not read cannot have mattered to it."""
+        listings = dict(self.listings)
+        return Reader(
+            lambda cell: self.seen[cell] if cell in self.seen else model._value_at(cell),
+            lambda kind: list(listings[kind]) if kind in listings else model._names_at(kind),
+            Reads(),
+        )
 
     @cached_property
     def _effects(self) -> Effects:
-        kinds: dict[str, dict[Any, Any]] = {}
-        for (kind, name), value in self.writes:
-            if kind == RATES:
-                coordinate, entry = value
-                row = entry if isinstance(entry, Expression) else dict(entry)
-                kinds.setdefault(kind, {})[coordinate] = row
-            else:
-                kinds.setdefault(kind, {})[name] = value
-
-        def of(kind: str) -> Mapping[Any, Any]:
-            return kinds.get(kind, {})
-
-        return Effects(
-            frames=of(FRAMES),
-            constraints=of(CONSTRAINTS),
-            rates=of(RATES),
-            bodies=of(BODIES),
-            articulations=of(ARTICULATIONS),
-            data=of(DATA),
-        )
+        return Effects.of(dict(self.writes))
 
     def default_tag(self) -> str:
         """Return the kind and the first name it writes."""

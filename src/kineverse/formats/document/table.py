@@ -29,6 +29,8 @@ node                                                                  meaning
 ``["implicit", name, [symbol, ...], [symbol, ...], ref, [row, ...],   unknowns as a function of inputs:
 ref, steps, [ref, ...]]``                                             residual, its rows that are solved,
                                                                       seed, Newton steps, and the inputs here
+``["read", question, part, shape, [[symbol, trends], ...]]``          in traces: a part of the answer to a
+                                                                      question, or an entry of its gradient
 ====================================================================  =====================================
 """
 
@@ -50,6 +52,7 @@ from kineverse.expressions.node import Augment, Node
 from kineverse.expressions.piecewise import Piecewise
 from kineverse.logic import And, Less, Not, Or
 from kineverse.model.rates import Carried, Composed, Dependent
+from kineverse.model.traces import Answer
 from kineverse.symbols import Symbol
 
 from .elementary import NAMES
@@ -77,8 +80,8 @@ class Table:
         self._nodes: dict[Node, int] = {}
         self._made: dict[str, int] = {}
         roots = list({id(e): e for e in expressions}.values())
-        inner = bottom_up({n: None for e in roots for n in leaves(e)[1]}, _parts, lambda _: False)
-        parts = [*roots, *(part for node in inner for part in _parts(node))]
+        inner = bottom_up({n: None for e in roots for n in leaves(e)[1]}, lambda n: n.parts, lambda _: False)
+        parts = [*roots, *(part for node in inner for part in node.parts)]
         self._program = _Program(list({id(e): e for e in parts}.values()))
         self._steps: list[int] = [-1] * len(self._program.steps)
         self._known: dict[int, int] = {}
@@ -89,7 +92,7 @@ class Table:
             return self._symbol(expression)
         known = self._known.get(id(expression))
         if known is None:
-            for node in bottom_up(leaves(expression)[1], _parts, self._nodes.__contains__):
+            for node in bottom_up(leaves(expression)[1], lambda n: n.parts, self._nodes.__contains__):
                 self._nodes[node] = self._node(node)
             known = self._known[id(expression)] = self._array(expression)
         return known
@@ -149,29 +152,33 @@ class Table:
 
     def _node(self, node: Node) -> int:
         if type(node) is Carried:
-            return self._add(f'["carried",{self.ref(node.coordinate)},{self._rates(node)}]')
+            return self._shared(f'["carried",{self.ref(node.coordinate)},{self._rates(node)}]')
+        if type(node) is Answer:
+            shape = ",".join(map(str, node.shape))
+            path = ",".join(f"[{self.ref(key)},{str(trends).lower()}]" for key, trends in node.path)
+            return self._shared(f'["read",{node.question},{node.part},[{shape}],[{path}]]')
         refs = [self.ref(argument) for argument in node.arguments]
         joined = ",".join(map(str, refs))
         if type(node) is Augment:
             entries = self._pairs(node.options[2:], refs[1:])
             flags = f"{str(node.replace).lower()},{str(node.heuristic).lower()}"
-            return self._add(f'["augment",{refs[0]},{flags},{entries}]')
+            return self._shared(f'["augment",{refs[0]},{flags},{entries}]')
         if type(node) is Less:
-            return self._add(f'["less",{joined},{number(node.options[0])}]')
+            return self._shared(f'["less",{joined},{number(node.options[0])}]')
         if type(node) is Extremum:
-            return self._add(f'["extremum","{node.options[0]}",{joined}]')
+            return self._shared(f'["extremum","{node.options[0]}",{joined}]')
         if type(node) is Piecewise:
             pieces = ",".join(_numbers(piece) for piece in node.pieces)
             knots = _numbers(node.knots)
-            return self._add(f'["piecewise",{joined},{str(node.periodic).lower()},{knots},[{pieces}]]')
+            return self._shared(f'["piecewise",{joined},{str(node.periodic).lower()},{knots},[{pieces}]]')
         if type(node) is Composed:
-            return self._add(f'["composed",{refs[0]},{self._pairs(node.options, refs[1:])}]')
+            return self._shared(f'["composed",{refs[0]},{self._pairs(node.options, refs[1:])}]')
         if type(node) is Dependent:
-            return self._add(f'["dependent",{joined},{self.ref(node.coordinate)}]')
+            return self._shared(f'["dependent",{joined},{self.ref(node.coordinate)}]')
         if type(node) is Implicit:
-            return self._add(f'["implicit",{self._function(node.function)},[{joined}]]')
+            return self._shared(f'["implicit",{self._function(node.function)},[{joined}]]')
         if type(node) in _PLAIN:
-            return self._add(f'["{node.kind}",{joined}]')
+            return self._shared(f'["{node.kind}",{joined}]')
         raise FormatError(
             f"A document of version 1 has no node '{node.kind}' ({type(node).__name__}); the model cannot be "
             "saved with it."
@@ -267,15 +274,6 @@ class _Program:
                 raise FormatError(f"A document of version 1 has no function with CasADi's code {code}.")
             memory[results(k)[0]] = len(steps) - 1
         return outputs
-
-
-def _parts(node: Node) -> tuple[Expression, ...]:
-    """Return the expressions that a node is made of."""
-    if isinstance(node, Carried):
-        return tuple(entry for row in node.rates.values() for entry in row.values())
-    if isinstance(node, Implicit):
-        return (*node.arguments, node.function.residual, node.function.seed)
-    return node.arguments
 
 
 def _numbers(values: Sequence[float]) -> str:

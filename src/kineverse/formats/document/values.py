@@ -58,26 +58,6 @@ MAX_BITS = 10_000
 # -- writing -------------------------------------------------------------------------------------------------
 
 
-def expressions_in(kind: str, value: Any) -> list[Expression]:
-    """Return the expressions of a written value, symbols of records left out."""
-    if kind == FRAMES:
-        return [factor for factor in value.factors if isinstance(factor, Expression)]
-    if kind == CONSTRAINTS:
-        return [value.lower, value.expression, value.upper]
-    if kind == RATES:
-        entry = value[1]
-        return [entry] if isinstance(entry, Expression) else [factor for _, factor in entry]
-    if kind == ARTICULATIONS:
-        return [*_expressions_below(value.dynamics), *_expressions_below(value.follows)]
-    return _expressions_below(value) if kind == DATA else []
-
-
-def _expressions_below(datum: Any) -> list[Expression]:
-    if isinstance(datum, Expression):
-        return [datum]
-    return [e for item in datum for e in _expressions_below(item)] if isinstance(datum, tuple) else []
-
-
 def written(kind: str, value: Any, ref: Ref) -> Any:
     """Return a value as JSON has it.
 
@@ -87,7 +67,7 @@ def written(kind: str, value: Any, ref: Ref) -> Any:
         For what a document has no place for.
     """
     if kind == FRAMES:
-        factors = [_pose(f) if isinstance(f, Pose) else ref(f) for f in value.factors]
+        factors = [written_pose(f) if isinstance(f, Pose) else ref(f) for f in value.factors]
         return {"parent": value.parent, "factors": factors}
     if kind == CONSTRAINTS:
         return [ref(value.lower), ref(value.expression), ref(value.upper)]
@@ -106,13 +86,20 @@ def written(kind: str, value: Any, ref: Ref) -> Any:
             "coordinates": [ref(s) for s in value.coordinates],
             "home": _numbers(value.home),
             "speeds": [ref(s) for s in value.speeds],
-            "dynamics": [[_text(item), _datum(datum, ref)] for item, datum in value.dynamics],
+            "dynamics": [[_text(item), written_datum(datum, ref)] for item, datum in value.dynamics],
         }
         return record if value.follows is None else {**record, "follows": ref(value.follows)}
-    return _datum(value, ref)
+    return written_datum(value, ref)
 
 
-def _datum(value: Any, ref: Ref) -> Any:
+def written_datum(value: Any, ref: Ref) -> Any:
+    """Return a datum as JSON has it.
+
+    Raises
+    ------
+    FormatError
+        For what is none.
+    """
     if type(value) is int and value.bit_length() > MAX_BITS:
         raise FormatError(f"an integer of {value.bit_length()} bits is too long, of more than {MAX_BITS}")
     if value is None or type(value) in (bool, int, str):
@@ -121,7 +108,7 @@ def _datum(value: Any, ref: Ref) -> Any:
         number = float(value)
         return number if math.isfinite(number) else {"float": _number(number)}
     if type(value) is tuple:
-        return [_datum(item, ref) for item in value]
+        return [written_datum(item, ref) for item in value]
     if isinstance(value, Expression):
         return {"expression": ref(value)}
     raise FormatError(
@@ -140,13 +127,13 @@ def _body(body: Body) -> dict[str, Any]:
         result["inertia"] = {
             "mass": _number(inertia.mass),
             "tensor": _numbers(inertia.tensor),
-            "origin": _pose(inertia.origin),
+            "origin": written_pose(inertia.origin),
         }
     return result
 
 
 def _shape(shape: Shape) -> dict[str, Any]:
-    result = {"geometry": _geometry(shape.geometry), "origin": _pose(shape.origin)}
+    result = {"geometry": _geometry(shape.geometry), "origin": written_pose(shape.origin)}
     if shape.name:
         result["name"] = _text(shape.name)
     if shape.color is not None:
@@ -172,7 +159,8 @@ def _geometry(geometry: Geometry) -> dict[str, Any]:
     raise FormatError(f"a {type(geometry).__name__} is no geometry that a document knows")
 
 
-def _pose(pose: Pose) -> list[float | str]:
+def written_pose(pose: Pose) -> list[float | str]:
+    """Return a pose as JSON has it: the first three rows of its matrix."""
     return _numbers(pose.rows)
 
 
@@ -222,7 +210,7 @@ def _read_frame(value: Any, graph: Graph, rename: Rename) -> Frame:
     factors: list[Pose | Expression] = []
     for factor in listed(given["factors"], "factors"):
         if type(factor) is list:
-            factors.append(_read_pose(factor))
+            factors.append(read_pose(factor))
             continue
         transform = graph.expression(factor)
         if transform.shape != (4, 4):
@@ -255,7 +243,7 @@ def _read_body(value: Any, graph: Graph, rename: Rename) -> Body:
 def _read_inertia(value: Any) -> Inertia:
     given = fields(value, ("mass", "tensor", "origin"))
     ixx, ixy, ixz, iyy, iyz, izz = numbers(given["tensor"], INERTIA_NUMBERS)
-    return Inertia(number(given["mass"]), (ixx, ixy, ixz, iyy, iyz, izz), _read_pose(given["origin"]))
+    return Inertia(number(given["mass"]), (ixx, ixy, ixz, iyy, iyz, izz), read_pose(given["origin"]))
 
 
 def _read_shape(value: Any) -> Shape:
@@ -266,7 +254,7 @@ def _read_shape(value: Any) -> Shape:
         color = red, green, blue, alpha
     return Shape(
         _read_geometry(given["geometry"]),
-        _read_pose(given["origin"]),
+        read_pose(given["origin"]),
         string(given.get("name", "")),
         color,
         string(given.get("texture", "")),
@@ -296,7 +284,8 @@ def _read_vector(value: Any) -> tuple[float, float, float]:
     return x, y, z
 
 
-def _read_pose(value: Any) -> Pose:
+def read_pose(value: Any) -> Pose:
+    """Return a pose that was written."""
     return Pose(numbers(value, POSE_NUMBERS))
 
 
@@ -311,14 +300,15 @@ def _read_articulation(value: Any, graph: Graph, rename: Rename) -> Articulation
         tuple(map(graph.symbol, listed(given["coordinates"], "coordinates"))),
         numbers(given["home"]),
         tuple(graph.symbol(ref, 1) for ref in listed(given["speeds"], "speeds")),
-        tuple((string(item), _read_datum(datum, graph, rename)) for item, datum in dynamics),
+        tuple((string(item), read_datum(datum, graph, rename)) for item, datum in dynamics),
         graph.scalar(given["follows"]) if "follows" in given else None,
     )
 
 
-def _read_datum(value: Any, graph: Graph, rename: Rename) -> Any:
+def read_datum(value: Any, graph: Graph, rename: Rename) -> Any:
+    """Return a datum that was written."""
     if type(value) is list:
-        return tuple(_read_datum(item, graph, rename) for item in value)
+        return tuple(read_datum(item, graph, rename) for item in value)
     if type(value) is dict:
         given = fields(value, (), ("expression", "float"))
         if len(given) != 1 or given.get("float", "inf") not in ("inf", "-inf"):
@@ -335,5 +325,5 @@ _READERS: dict[str, Callable[[Any, Graph, Rename], Any]] = {
     ARTICULATIONS: _read_articulation,
     CONSTRAINTS: _read_constraint,
     RATES: _read_rate,
-    DATA: _read_datum,
+    DATA: read_datum,
 }

@@ -7,20 +7,25 @@ import json
 import os
 import shutil
 import uuid
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from kineverse.errors import FormatError
+from kineverse.expressions.expression import Expression
+from kineverse.model.contents import expressions_in
 from kineverse.model.history import Entry
 from kineverse.model.model import Model, Snapshot
 from kineverse.model.operation import ARTICULATIONS, DATA, KINDS
-from kineverse.model.reader import Read
+from kineverse.model.reader import ABSENT, Cell, Read, Reader, Reads
+from kineverse.model.traces import Trace, UntraceableError, trace
 from kineverse.model.view import ModelView
 
+from .parameters import expressions_among, parameters_of, written_parameter
 from .recorded import Recorded
 from .table import Table, text
-from .values import expressions_in, written
+from .traces import expressions_of, written_questions
+from .values import written
 
 FORMAT = "kineverse"
 VERSION = 1
@@ -68,15 +73,10 @@ def document_of(model: ModelView) -> str:
     snapshot = model.snapshot() if isinstance(model, Model) else model
     if not isinstance(snapshot, Snapshot):
         raise FormatError(f"A model or a snapshot is saved, not a {type(model).__name__}.")
-    entries = snapshot._entries
     try:
-        table = Table(
-            e
-            for entry in entries
-            for (kind, _), value in entry.writes.items()
-            for e in expressions_in(kind, value)
-        )
-        operations = [_operation(entry, table) for entry in entries]
+        parts = [_Parts(entry, cells) for entry, cells in _in_order(snapshot._entries)]
+        table = Table(e for part in parts for e in part.expressions)
+        operations = [_operation(part, table) for part in parts]
     except RecursionError:
         raise FormatError("The model contains data or gradients that are nested too deeply.") from None
     return "".join(
@@ -90,6 +90,56 @@ def document_of(model: ModelView) -> str:
     )
 
 
+def _in_order(entries: Sequence[Entry]) -> Iterator[tuple[Entry, dict[Cell, Any]]]:
+    """Yield the operations, each with what the cells contain before it; one dictionary, which changes."""
+    cells: dict[Cell, Any] = {}
+    for entry in entries:
+        yield entry, cells
+        cells.update(entry.writes)
+
+
+class _Parts:
+    """What a document says about an operation.
+
+    Attributes
+    ----------
+    kind, parameters, trace, frozen
+        As in :class:`.recorded.Recorded`.
+    """
+
+    trace: Trace | None = None
+    frozen = ""
+
+    def __init__(self, entry: Entry, cells: dict[Cell, Any]) -> None:
+        self.entry = entry
+        operation = entry.operation
+        if isinstance(operation, Recorded):
+            self.kind, self.parameters = operation.kind, operation.given
+            self.trace, self.frozen = operation.trace, operation.frozen
+            return
+        self.kind, self.parameters = type(operation).__name__, parameters_of(operation)
+        if entry.reads.listings or any(how & Read.VALUE for how in entry.reads.cells.values()):
+            before = Reader(
+                lambda cell: cells.get(cell, ABSENT),
+                lambda kind: sorted(name for k, name in cells if k == kind),
+                Reads(),
+            )
+            try:
+                self.trace = trace(operation, before, entry.writes)
+            except UntraceableError as error:
+                self.frozen = str(error)
+
+    @property
+    def expressions(self) -> Iterator[Expression]:
+        """All expressions that are written down."""
+        for (kind, _), value in self.entry.writes.items():
+            yield from expressions_in(kind, value)
+        for parameter in self.parameters.values():
+            yield from expressions_among(parameter, self.entry.writes)
+        if self.trace is not None:
+            yield from expressions_of(self.trace)
+
+
 def _lines(items: list[str]) -> Iterator[str]:
     for i, item in enumerate(items):
         yield ",\n" if i else "\n"
@@ -98,31 +148,44 @@ def _lines(items: list[str]) -> Iterator[str]:
         yield "\n"
 
 
-def _operation(entry: Entry, table: Table) -> str:
-    operation = entry.operation
-    kinds: dict[str, dict[str, Any]] = {kind: {} for kind in KINDS}
-    for (kind, name), value in entry.writes.items():
-        try:
-            kinds[kind][name] = written(kind, value, table.ref)
-        except FormatError as error:
-            noun = "The datum" if kind in (DATA, ARTICULATIONS) else "What is"
-            raise FormatError(
-                f"{noun} under '{kind}/{name}', written by {entry.tag!r}, has no place in a document: {error}"
-            ) from None
+def _operation(what: _Parts, table: Table) -> str:
+    entry = what.entry
     cells = sorted(entry.reads.cells.items())
     reads = {
         "existence": [f"{kind}/{name}" for (kind, name), how in cells if how & Read.EXISTENCE],
         "value": [f"{kind}/{name}" for (kind, name), how in cells if how & Read.VALUE],
         "listing": sorted(entry.reads.listings),
     }
-    parts = {
-        "tag": text(entry.tag),
-        "kind": text(operation.kind if isinstance(operation, Recorded) else type(operation).__name__),
-        "reads": _dump({how: names for how, names in reads.items() if names}),
-        "writes": _dump({kind: values for kind, values in kinds.items() if values}),
+    parameters = {
+        name: written_parameter(value, entry.writes, table.ref) for name, value in what.parameters.items()
     }
-    joined = ",".join(f'"{key}":{value}' for key, value in parts.items())
+    parts = {"tag": entry.tag, "kind": what.kind}
+    members = {key: text(value) for key, value in parts.items()}
+    if parameters:
+        members["parameters"] = _dump(parameters)
+    members["reads"] = _dump({how: names for how, names in reads.items() if names})
+    members["writes"] = _dump(_writes(entry.tag, entry.writes, table))
+    if what.trace is not None:
+        questions = written_questions(what.trace, table.ref)
+        writes = _writes(entry.tag, dict(what.trace.writes), table)
+        members["trace"] = _dump({"questions": questions, "writes": writes})
+    if what.frozen:
+        members["frozen"] = text(what.frozen)
+    joined = ",".join(f'"{key}":{value}' for key, value in members.items())
     return f"{{{joined}}}"
+
+
+def _writes(tag: str, writes: Mapping[Cell, Any], table: Table) -> dict[str, dict[str, Any]]:
+    kinds: dict[str, dict[str, Any]] = {kind: {} for kind in KINDS}
+    for (kind, name), value in writes.items():
+        try:
+            kinds[kind][name] = written(kind, value, table.ref)
+        except FormatError as error:
+            noun = "The datum" if kind in (DATA, ARTICULATIONS) else "What is"
+            raise FormatError(
+                f"{noun} under '{kind}/{name}', written by {tag!r}, has no place in a document: {error}"
+            ) from None
+    return {kind: values for kind, values in kinds.items() if values}
 
 
 def _replace(target: Path, content: bytes) -> None:

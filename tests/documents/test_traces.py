@@ -1,0 +1,294 @@
+"""Operations of documents follow changes upstream without their code, or refuse them."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import kineverse as kv
+from kineverse.formats.document import Recorded, document_of, operations_from
+
+LIFT, KNOB, WHEEL = kv.position("lift"), kv.position("knob"), kv.velocity("wheel")
+
+
+@dataclass(frozen=True)
+class Custom(kv.Operation):
+    """An operation of anybody's code."""
+
+    code: Callable[[kv.Reader], kv.Effects]
+    name: str = "custom"
+
+    def apply(self, model: kv.Reader) -> kv.Effects:
+        return self.code(model)
+
+
+def build(code: Callable[[kv.Reader], kv.Effects], **changes: Any) -> kv.Model:
+    """Return a model with something upstream to read and an operation that reads it."""
+    given = {
+        "car": kv.translation(0.1, 0, 2 * LIFT) @ kv.rotation_x(LIFT),
+        "upper": 3.0,
+        "number": 1.5,
+        "damping": 0.1,
+        **changes,
+    }
+    model = kv.Model()
+    with model.edit() as edit:
+        edit.add_frame("car", parent="world", transform=given["car"])
+        edit.constrain("range", 0, LIFT, given["upper"])
+        edit.write("number", given["number"])
+        hinge = kv.Revolute(
+            name="hinge",
+            parent="car",
+            child="flap",
+            axis=(0, 1, 0),
+            dynamics=(("damping", given["damping"]),),
+        )
+        edit.apply(hinge, "hinge")
+        edit.apply(Custom(code), "custom")
+    return model
+
+
+def reloaded(model: kv.Model) -> kv.Model:
+    """Return what a process without the code makes of a model."""
+    result = kv.Model()
+    with result.edit() as edit:
+        for tag, operation in operations_from(document_of(model)):
+            edit.apply(operation, tag)
+    return result
+
+
+def changed(model: kv.Model, other: kv.Model) -> None:
+    """Exchange what is upstream for what another model has there."""
+    with model.edit() as edit:
+        for tag in ("frame car", "constraint range", "data number", "hinge"):
+            edit.replace(tag, other.history.operation(tag))
+
+
+def agree(one: kv.Model, other: kv.Model) -> None:
+    """Compare everything that two models contain by its values and gradients."""
+    assert list(one.frames) == list(other.frames)
+    assert list(one.constraints) == list(other.constraints)
+    at = {"lift": 0.3, "knob": -0.4, "hinge": 0.2, "wheel:velocity": 0.7, "lift:velocity": 1.1}
+    pairs = [(one.fk(f), other.fk(f)) for f in one.frames]
+    for name, constraint in one.constraints.items():
+        twin = other.constraints[name]
+        pairs += [(constraint.lower, twin.lower), (constraint.upper, twin.upper)]
+        pairs += [(constraint.expression, twin.expression)]
+    for a, b in pairs:
+        assert a.symbols == b.symbols
+        np.testing.assert_allclose(a(at), b(at), rtol=1e-13, atol=1e-14)
+        for heuristic in (True, False):
+            one_by_one, others = a.gradient(heuristic), b.gradient(heuristic)
+            assert set(one_by_one) == set(others)
+            for key, entry in one_by_one.items():
+                np.testing.assert_allclose(entry(at), others[key](at), rtol=1e-13, atol=1e-14)
+
+
+def follower(model: kv.Reader) -> kv.Effects:
+    """Read one of everything, compute with it, augment it and differentiate it."""
+    pose = model.fk("car")
+    place = model.frames["car"].transform
+    upper = model.constraints["range"].upper
+    slope = pose[:3, 3].jacobian([LIFT])[2, 0]
+    rolling = (KNOB * pose[0, 3]).augment({WHEEL: pose[2, 3]})
+    flap = model.articulations["hinge"].position
+    assert flap is not None
+    open_ = (flap < 0.5) & (upper > LIFT)
+    return kv.Effects(
+        frames={"knob": ("car", kv.translation(rolling, slope, 0) @ place)},
+        constraints={"near": (-open_, KNOB + slope * LIFT, 2 * upper)},
+        data={"twice": 2 * model.data["number"]},
+    )
+
+
+CHANGES: tuple[dict[str, Any], ...] = (
+    {"car": kv.translation(0.3, 0, 5 * LIFT) @ kv.rotation_z(LIFT)},
+    {"car": kv.translation(0, 0, LIFT**2)},
+    {"upper": 4.5},
+    {"upper": kv.parameter("height", 2.5)},
+    {"number": 2.25},
+    {"damping": 0.7},
+    {"upper": 1.0, "number": 0.0, "car": kv.rotation_y(LIFT)},
+)
+
+
+@pytest.mark.parametrize("change", CHANGES)
+def test_it_follows_what_changes_upstream(change: dict[str, Any]) -> None:
+    read = reloaded(build(follower))
+    live = build(follower, **change)
+    changed(read, live)
+    agree(read, live)
+    assert read.data["twice"] == live.data["twice"]
+    assert type(read.data["twice"]) is float
+
+
+def test_what_it_follows_is_saved_and_follows_again() -> None:
+    read = reloaded(build(follower))
+    changed(read, build(follower, upper=4.5))
+    again = reloaded(read)
+    assert document_of(again) == document_of(read)
+    live = build(follower, number=7.0, car=kv.translation(0, 0, LIFT))
+    changed(again, live)
+    agree(again, live)
+
+
+def test_a_change_and_back_is_the_first_to_the_last_bit() -> None:
+    model = build(follower)
+    read = reloaded(model)
+    changed(read, build(follower, **CHANGES[0]))
+    assert read.snapshot() != model.snapshot()
+    changed(read, model)
+    assert read.snapshot() == model.snapshot()
+    assert document_of(read) == document_of(model)
+
+
+@st.composite
+def programs(draw: st.DrawFn) -> Callable[[kv.Reader], kv.Effects]:
+    """Return code that makes something at random of what it reads."""
+    steps = draw(st.lists(st.tuples(st.integers(0, 9), st.integers(0, 99), st.integers(0, 99)), max_size=8))
+
+    def code(model: kv.Reader) -> kv.Effects:
+        pose = model.fk("car")
+        values: list[Any] = [
+            KNOB,
+            pose[2, 3],
+            model.frames["car"].transform[1, 1],
+            model.constraints["range"].upper,
+            model.data["number"],
+        ]
+        for kind, i, j in steps:
+            a, b = values[i % len(values)], values[j % len(values)]
+            a, b = a + 0 * KNOB, b + 0 * LIFT
+            values.append(
+                (
+                    lambda a, b: a + b,
+                    lambda a, b: a * b,
+                    lambda a, b: np.sin(a) - b,
+                    lambda a, b: a.augment({WHEEL: b}),
+                    lambda a, b: kv.where(a < b, a, b),
+                    lambda a, b: a.jacobian([LIFT])[0] + b,
+                    lambda a, b: b.with_gradient({WHEEL: a}),
+                    lambda a, b: a.gradient().get(WHEEL, kv.array(0.0)) + b,
+                    lambda a, b: kv.maximum(a, b),
+                    lambda a, b: a.substitute({LIFT: b}),
+                )[kind](a, b)
+            )
+        last = values[-1] + KNOB
+        return kv.Effects(
+            frames={"knob": ("car", kv.translation(last, 0, 0))},
+            constraints={"near": (-1, last + LIFT, values[-1] * values[-1])},
+        )
+
+    return code
+
+
+@given(programs(), st.sampled_from(CHANGES))
+@settings(max_examples=60, deadline=None)
+def test_any_code_is_followed_rightly_or_the_change_refused(code: Any, change: dict[str, Any]) -> None:
+    read = reloaded(build(code))
+    before = read.snapshot()
+    live = build(code, **change)
+    try:
+        changed(read, live)
+    except kv.EditError:
+        assert read.snapshot() == before
+    else:
+        agree(read, live)
+
+
+def test_most_code_needs_no_value() -> None:
+    (operation,) = (o for t, o in operations_from(document_of(build(follower))) if t == "custom")
+    assert isinstance(operation, Recorded)
+    assert not operation.frozen
+    assert operation.trace is not None
+
+
+def branching(model: kv.Reader) -> kv.Effects:
+    """Decide by a number."""
+    far = float(model.data["number"]) > 1
+    return kv.Effects(frames={"knob": ("car", kv.translation(KNOB if far else 0, model.fk("car")[2, 3], 0))})
+
+
+def listing(model: kv.Reader) -> kv.Effects:
+    """Decide by what there is."""
+    return kv.Effects(data={"count": len(list(model.frames)), "at": model.data["number"]})
+
+
+def gambling(model: kv.Reader) -> kv.Effects:
+    """Decide by the text of an expression, which nobody notices."""
+    return kv.Effects(data={"length": len(repr(model.fk("car")))})
+
+
+@pytest.mark.parametrize(
+    ("code", "change"),
+    [(branching, {"number": 0.5}), (gambling, CHANGES[0])],
+)
+def test_what_it_decides_by_must_stay(code: Any, change: dict[str, Any]) -> None:
+    read = reloaded(build(code))
+    before = read.snapshot()
+    with pytest.raises(kv.EditError, match=r"'custom': .* has changed, and this Custom was made from it"):
+        changed(read, build(code, **change))
+    assert read.snapshot() == before
+
+
+def test_what_it_does_not_decide_by_may_change() -> None:
+    read = reloaded(build(branching))
+    live = build(branching, car=kv.translation(0, 0, 7 * LIFT))
+    changed(read, live)
+    agree(read, live)
+
+
+def test_names_that_it_listed_must_stay() -> None:
+    read = reloaded(build(listing))
+    changed(read, build(listing, number=3.0))
+    assert (read.data["count"], read.data["at"]) == (2, 3.0)
+    with pytest.raises(kv.EditError, match="list of all frames"), read.edit() as edit:
+        edit.insert(kv.AddFrame("new", kv.Frame.of("world", kv.translation(1, 0, 0))), before="custom")
+
+
+def test_a_frozen_one_is_replaced_in_the_same_edit() -> None:
+    read = reloaded(build(branching))
+    live = build(branching, number=0.5)
+    with read.edit() as edit:
+        edit.replace("data number", kv.Write("number", 0.5))
+        edit.replace("custom", Custom(branching))
+    assert read.snapshot() == live.snapshot()
+
+
+def test_a_loop_from_a_document_is_made_anew_from_its_parameters() -> None:
+    model = kv.load("articulations/four_bar", prefix="")
+    read = reloaded(model)
+    (tag,) = (t for t in read.history.tags if t.startswith("loop"))
+    loop = read.history.operation(tag)
+    assert isinstance(loop, Recorded)
+    assert loop.frozen
+    assert kv.CloseLoop(**loop.parameters) == model.history.operation(tag)
+
+
+STRANGER = """
+import sys
+import kineverse as kv
+read = kv.load(sys.argv[1])
+assert not any(c.__name__ == "Custom" for c in kv.Operation.__subclasses__())
+with read.edit() as edit:
+    car = kv.translation(0.3, 0, 5 * kv.position("lift")) @ kv.rotation_z(kv.position("lift"))
+    edit.replace("frame car", kv.AddFrame("car", kv.Frame.of("world", car)))
+read.save(sys.argv[2])
+"""
+
+
+def test_another_process(tmp_path: Path) -> None:
+    """What is saved there, after the edit there, says what the code says here."""
+    path, back = tmp_path / "model.kv.json", tmp_path / "back.kv.json"
+    build(follower).save(path)
+    subprocess.run([sys.executable, "-c", STRANGER, path, back], check=True, timeout=60)
+    agree(kv.load(back), build(follower, **CHANGES[0]))
