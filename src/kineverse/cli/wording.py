@@ -30,7 +30,9 @@ def contents(model: ModelView) -> str:
 
 def number(count: int, noun: str) -> str:
     """Return a count of things."""
-    return f"{count} {noun}{'' if count == 1 or noun == 'DoF' else 's'}"
+    if count != 1 and noun != "DoF":
+        noun = f"{noun[:-1]}ies" if noun.endswith("dy") else f"{noun}s"
+    return f"{count} {noun}"
 
 
 def value(given: Any) -> str:

@@ -1,0 +1,165 @@
+"""What is wrong with a model that can be read: what a file says, but no robot can be."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from math import isfinite, isnan
+
+import numpy as np
+
+from kineverse.cli.table import figure
+from kineverse.errors import KineverseError
+from kineverse.formats.packages import locate
+from kineverse.model.body import Inertia, Mesh
+from kineverse.model.samples import Samples
+from kineverse.model.view import ModelView
+from kineverse.state import State
+
+STATES = 32
+"""In how many random states within the limits it is tried whether poses are finite and loops close."""
+
+ROUNDING = 1e-3
+"""By how much, relative to the largest, moments of inertia may miss the triangle inequality.
+
+Files have them in few digits, and of a thin plate the largest is just the sum of the others.
+"""
+
+NOTHING = 1e-12
+"""Moments of inertia below this are none [kg m²]: a grain of sand has more."""
+
+
+@dataclass(frozen=True, slots=True)
+class Finding:
+    """Something that is wrong: with what ``kind`` of thing, ``where`` (its name), and what (``text``)."""
+
+    kind: str
+    where: str
+    text: str
+
+
+def findings(model: ModelView, meshes: bool = True) -> Iterator[Finding]:
+    """Yield what is wrong with a model.
+
+    Parameters
+    ----------
+    model
+        The model.
+    meshes
+        Whether to look for the files of meshes.
+    """
+    yield from _limits(model)
+    samples = Samples(model, count=STATES)
+    allowed = _allowed(model, samples)
+    yield from _loops(model, samples, allowed)
+    yield from _poses(model, samples, allowed)
+    for name, body in model.bodies.items():
+        if body.inertia is not None:
+            for text in impossible(body.inertia):
+                yield Finding("inertia", name, text)
+    if meshes:
+        yield from _meshes(model)
+
+
+def _limits(model: ModelView) -> Iterator[Finding]:
+    """Yield the constraints that do not hold at the default state, and those that cannot hold there."""
+    state = model.default_state()
+    crossed = set()
+    varying = {name: c for name, c in model.constraints.items() if c.lower.symbols or c.upper.symbols}
+    ends = Samples(model, count=0).values([e for c in varying.values() for e in (c.lower, c.upper)])
+    for name, lower, upper in zip(varying, ends[::2], ends[1::2], strict=True):
+        if lower[0] > upper[0]:
+            crossed.add(name)
+            bounds = f"lower {figure(float(lower[0]))}, upper {figure(float(upper[0]))}"
+            yield Finding("limit", name, f"leaves no value at the default state: {bounds}")
+    for violation in model.violations(state):
+        if violation.name in crossed:
+            continue
+        if isnan(violation.value):
+            yield Finding("limit", violation.name, "is about what is not finite at the default state")
+            continue
+        bounds = f"{figure(violation.value)} is not in [{figure(violation.lower)}, {figure(violation.upper)}]"
+        yield Finding("limit", violation.name, f"is broken at the default state: {bounds}")
+
+
+def _allowed(model: ModelView, samples: Samples) -> list[int]:
+    """Return which of the sampled states break no constraint; the default state counts in any case."""
+    symbols = model.symbols
+    found = [0]
+    for k in range(1, samples.size) if symbols else ():
+        state = State({symbol: samples.of(symbol)[k] for symbol in symbols})
+        # What cannot be evaluated is not broken: it is what is looked for.
+        if all(isnan(violation.excess) for violation in model.violations(state)):
+            found.append(k)
+    return found
+
+
+def _loops(model: ModelView, samples: Samples, allowed: list[int]) -> Iterator[Finding]:
+    rates = model.rates
+    values = samples.values([rates.carry(symbol) for symbol in rates.dependent])
+    open_at = {
+        str(symbol): np.isnan(column[allowed]).tolist()
+        for symbol, column in zip(rates.dependent, values, strict=True)
+        if np.isnan(column[allowed]).any()
+    }
+    for name, record in model.articulations.items():
+        dependent = dict(record.dynamics).get("dependent", ()) if record.kind == "closedloop" else ()
+        bad = [open_at[follower] for follower in dependent if follower in open_at]
+        if bad:
+            yield Finding(
+                "loop", name, f"does not close {_when([any(states) for states in zip(*bad, strict=True)])}"
+            )
+
+
+def _poses(model: ModelView, samples: Samples, allowed: list[int]) -> Iterator[Finding]:
+    names = list(model.frames)
+    for name, poses in zip(names, samples.values([model.fk(name) for name in names]), strict=True):
+        bad = [not np.isfinite(poses[k]).all() for k in allowed]
+        if any(bad):
+            yield Finding("pose", name, f"is not finite {_when(bad)}")
+
+
+def _when(bad: Sequence[bool]) -> str:
+    """Return at which of the states that are allowed something is wrong; the first is the default state."""
+    if bad[0]:
+        return "at the default state"
+    return f"in {sum(bad)} of {len(bad)} states within the limits"
+
+
+def impossible(inertia: Inertia) -> Iterator[str]:
+    """Yield why no body has this inertia."""
+    ixx, ixy, ixz, iyy, iyz, izz = inertia.tensor
+    if not isfinite(inertia.mass) or inertia.mass < 0.0:
+        yield f"a mass of {figure(inertia.mass)} kg"
+    if not all(map(isfinite, inertia.tensor)):
+        yield "moments of inertia that are not finite"
+        return
+    moments = np.linalg.eigvalsh([[ixx, ixy, ixz], [ixy, iyy, iyz], [ixz, iyz, izz]])
+    if abs(moments).max() < NOTHING:
+        return
+    moments[abs(moments) < 1e-9 * abs(moments).max()] = 0.0
+    least, middle, most = moments.tolist()
+    shown = f"principal moments {figure(least)}, {figure(middle)}, {figure(most)} kg m²"
+    if least < -ROUNDING * max(most, 0.0):
+        yield f"{shown}, one of which is negative"
+    elif most - least - middle > ROUNDING * most:
+        yield f"{shown}: the largest exceeds the sum of the others"
+    elif inertia.mass == 0.0 and most > 0.0:
+        yield f"{shown} without any mass"
+
+
+def _meshes(model: ModelView) -> Iterator[Finding]:
+    missing: dict[Mesh, str] = {}
+    found: set[Mesh] = set()
+    for name, body in model.bodies.items():
+        shapes = [shape.geometry for shape in (*body.visuals, *body.collisions)]
+        for mesh in dict.fromkeys(g for g in shapes if isinstance(g, Mesh)):
+            if mesh not in found and mesh not in missing:
+                try:
+                    locate(mesh.uri, mesh.folder)
+                    found.add(mesh)
+                except (KineverseError, OSError) as error:
+                    # Where it was looked for is long, and for all meshes the same.
+                    missing[mesh] = " ".join(str(error).partition(" Looked ")[0].split())
+            if mesh in missing:
+                yield Finding("mesh", name, missing[mesh])
