@@ -47,6 +47,21 @@ class Base(Joint):
             self.child: Frame.of(self.parent, (self.origin, translation(x, y, 0), rotation_z(angle))),
         }
 
+    def check_wheels(self, paths: object, count: int) -> None:
+        """Look whether paths are those of so many wheels.
+
+        Raises
+        ------
+        ValueRejectedError
+            If they are more or less, the same twice, or no texts.
+        """
+        given = paths if isinstance(paths, (tuple, list)) else ()
+        texts = {path for path in given if isinstance(path, str) and path}
+        if len(given) != count or len(texts) != count:
+            raise ValueRejectedError(
+                f"The wheels of the {self.noun} '{self.name}' are {count} different paths, not {paths!r}."
+            )
+
     def limit(self, field: str) -> float | None:
         """Return a limit among the fields, None if there is none."""
         return checked_limit(getattr(self, field), f"'{field}' of the {self.noun} '{self.name}'")
@@ -113,7 +128,7 @@ class DifferentialDrive(Base):
     Raises
     ------
     ValueRejectedError
-        For a radius or a track that is not positive.
+        For a radius or a track that is not positive, or one wheel on both sides.
     """
 
     radius: float
@@ -127,12 +142,21 @@ class DifferentialDrive(Base):
     def __post_init__(self) -> None:
         super().__post_init__()
         self.lengths("radius", "track")
+        self.check_wheels(self.wheels, 2)
+
+    @property
+    def wheels(self) -> tuple[str, str]:
+        """The paths of the left and the right wheel."""
+        # Compared with "" and not asked for its truth, which not everything has that is no text.
+        return (
+            f"{self.name}/left_wheel" if self.left == "" else self.left,
+            f"{self.name}/right_wheel" if self.right == "" else self.right,
+        )
 
     def apply(self, model: Reader) -> Effects:
         """Write the child frame, the rates and the limits."""
         x, y, angle = self.coordinates
-        left = velocity(self.left or f"{self.name}/left_wheel")
-        right = velocity(self.right or f"{self.name}/right_wheel")
+        left, right = map(velocity, self.wheels)
         along, about = self.radius / 2, self.radius / self.track
         return Effects(
             frames=self.frames,
@@ -271,11 +295,9 @@ class Mecanum(Base):
     def __post_init__(self) -> None:
         super().__post_init__()
         self.lengths("radius", "track", "wheelbase")
-        object.__setattr__(self, "wheels", tuple(self.wheels))
-        if len(set(self.wheels)) not in (0, 4) or len(self.wheels) not in (0, 4):
-            raise ValueRejectedError(
-                f"The wheels of the {self.noun} '{self.name}' are four different ones, not {self.wheels!r}."
-            )
+        if not isinstance(self.wheels, tuple) or self.wheels:
+            self.check_wheels(self.wheels, 4)
+            object.__setattr__(self, "wheels", tuple(self.wheels))
 
     def apply(self, model: Reader) -> Effects:
         """Write the child frame, the rates and the limits."""

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Iterable
 from dataclasses import dataclass
 
-from kineverse.errors import UnknownNameError, ValueRejectedError
+import numpy as np
+
+from kineverse.errors import KineverseError, UnknownNameError, ValueRejectedError
 from kineverse.expressions.expression import Expression
 from kineverse.expressions.piecewise import spline
 from kineverse.model.body import Pose
@@ -191,9 +192,17 @@ class Cam(Coupling):
         super().__post_init__()
         for what in ("angles", "values"):
             given = getattr(self, what)
-            if not isinstance(given, Iterable):
-                raise ValueRejectedError(f"The {what} of the cam '{self.name}' are numbers, not {given!r}.")
-            object.__setattr__(self, what, tuple(given))
+            try:
+                object.__setattr__(self, what, tuple(given))
+            except (KineverseError, TypeError):
+                raise ValueRejectedError(
+                    f"The {what} of the cam '{self.name}' are numbers, not {given!r}."
+                ) from None
+        for what in ("periodic", "turns"):
+            if not isinstance(getattr(self, what), (bool, np.bool_)):
+                raise ValueRejectedError(
+                    f"'{what}' of the cam '{self.name}' is True or False, not {getattr(self, what)!r}."
+                )
         try:
             spline(0.0, self.angles, self.values, self.periodic)
         except ValueRejectedError as error:

@@ -9,12 +9,13 @@ from collections.abc import Container, Iterable
 from dataclasses import dataclass
 from typing import Any
 
-from kineverse.errors import NameTakenError, ValueRejectedError
+from kineverse.errors import KineverseError, NameTakenError, ValueRejectedError
 from kineverse.expressions.expression import Expression, ExpressionLike
 from kineverse.model.articulation import Articulation
 from kineverse.model.body import Pose, Vector3
 from kineverse.model.operation import Effects, Operation
 from kineverse.model.reader import Reader
+from kineverse.number import real_number
 from kineverse.spatial import normalised
 from kineverse.symbols import Symbol, position
 
@@ -40,8 +41,17 @@ class Placed(Operation):
     origin: Pose = Pose()
 
     def __post_init__(self) -> None:
-        if not isinstance(self.origin, (Pose, Expression)):
+        self.check_texts("name", "parent")
+        if isinstance(self.origin, Pose) or (
+            isinstance(self.origin, Expression) and self.origin.shape == (4, 4)
+        ):
+            return
+        try:
             object.__setattr__(self, "origin", Pose.of(self.origin))
+        except (KineverseError, TypeError, ValueError) as error:
+            raise ValueRejectedError(
+                f"The origin of the {self.noun} '{self.name}' is none. {error}"
+            ) from None
 
     @property
     def kind(self) -> str:
@@ -65,6 +75,20 @@ class Placed(Operation):
             checked_number(
                 getattr(self, field), f"The {field} of the {self.noun} '{self.name}'", positive=True
             )
+
+    def check_texts(self, *fields: str) -> None:
+        """Look whether fields are names.
+
+        Raises
+        ------
+        ValueRejectedError
+            If one is no text, or empty.
+        """
+        for field in fields:
+            given = getattr(self, field)
+            if not isinstance(given, str) or not given:
+                what = f"The {field} of the {self.noun} '{self.name}'"
+                raise ValueRejectedError(f"{what} is a path like 'kitchen/door', not {given!r}.")
 
     def check_names(self, model: Reader, frames: Iterable[str]) -> None:
         """Look whether the names of the articulation and of its frames are free.
@@ -100,6 +124,10 @@ class Joint(Placed):
 
     child: str
     dynamics: tuple[tuple[str, Any], ...] = ()
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self.check_texts("child")
 
     def default_tag(self) -> str:
         """Return ``joint`` and the name."""
@@ -214,8 +242,8 @@ def checked_axis(axis: Vector3, name: str) -> Vector3:
         If it is not three numbers with a direction.
     """
     try:
-        x, y, z = map(float, axis)
-    except (TypeError, ValueError):
+        x, y, z = map(real_number, axis)
+    except (TypeError, ValueError, OverflowError):
         raise ValueRejectedError(f"The axis of joint '{name}' is three numbers, not {axis!r}.") from None
     if normalised((x, y, z)) is None:
         problem = "has length zero" if (x, y, z) == (0, 0, 0) else f"is {(x, y, z)}, which is no direction"
@@ -250,8 +278,8 @@ def checked_number(number: object, what: str, *, positive: bool = False) -> floa
         If it is none, or not positive where it has to be.
     """
     try:
-        value = float(number)  # type: ignore[arg-type]
-    except (TypeError, ValueError):
+        value = real_number(number)
+    except (TypeError, ValueError, OverflowError):
         raise ValueRejectedError(f"{what} is a number, not {number!r}.") from None
     if not math.isfinite(value) or (positive and value <= 0):
         kind = "a positive, finite number" if positive else "a finite number"

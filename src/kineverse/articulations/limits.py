@@ -10,6 +10,7 @@ from kineverse.errors import KineverseError, ValueRejectedError
 from kineverse.expressions.expression import Expression, ExpressionLike
 from kineverse.expressions.gradient import total_derivative
 from kineverse.model.constraint import Constraint
+from kineverse.number import real_number
 
 
 @dataclass(frozen=True)
@@ -89,8 +90,8 @@ def checked_limit(limit: object, what: str) -> float | None:
     if limit is None:
         return None
     try:
-        value = float(limit)  # type: ignore[arg-type]
-    except (TypeError, ValueError):
+        value = real_number(limit)
+    except (TypeError, ValueError, OverflowError):
         raise ValueRejectedError(f"{what} is a number or None, not {limit!r}.") from None
     if not value >= 0:
         raise ValueRejectedError(f"{what} is {limit!r}; it cannot be negative.")

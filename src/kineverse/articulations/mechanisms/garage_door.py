@@ -74,7 +74,7 @@ class GarageDoor(Mechanism):
 
     def __post_init__(self) -> None:
         self.lengths("length", "width", "thickness", "play", "speed")
-        if self.form not in ("regular", "published"):
+        if not isinstance(self.form, str) or self.form not in ("regular", "published"):
             raise ValueRejectedError(f"{self.its('form')} is 'regular' or 'published', not {self.form!r}.")
         if not self.play < self.length:
             raise ValueRejectedError(
