@@ -104,8 +104,9 @@ class PedalBin(Mechanism):
     """A bin whose lid a pedal opens; the lid's angle is no multiple of the pedal's.
 
     By the pedal's angle ``name``, p [rad], 0 when nobody steps on it. The pedal is a lever about a pivot
-    under the bin, and its inner arm a lifts a rod that slides straight up in guides, by a sin p. The rod ends
-    in a slot of the lid, at b in front of its hinge, so
+    under the bin, and a rod in guides slides straight up. It has a level slot at either end: in the lower one
+    is a pin of the pedal, at a from its pivot, which lifts the rod by a sin p; in the upper one is a pin of
+    the lid, at b from its hinge, which the rod lifts by b sin of the lid's angle. So
 
         lid's angle = arcsin(a/b sin p)
 
