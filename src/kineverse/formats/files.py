@@ -1,7 +1,11 @@
-"""Reading a whole file, up to a size."""
+"""Whole files: read up to a size, written in one step."""
 
 from __future__ import annotations
 
+import contextlib
+import os
+import shutil
+import uuid
 from pathlib import Path
 
 from kineverse.errors import FormatError
@@ -31,3 +35,34 @@ def read_file(path: Path) -> bytes:
     if len(data) > MAX_BYTES:
         raise FormatError(f"{path}: larger than {MAX_BYTES} bytes, the most that is read of one file.")
     return data
+
+
+def replace_file(path: Path, content: bytes) -> None:
+    """Put a file in the place of another in one step: it is there whole, or what was there stays.
+
+    Raises
+    ------
+    FormatError
+        If it cannot be written.
+    """
+    try:
+        _replace(Path(os.path.realpath(path)), content)
+    except (OSError, ValueError) as error:  # a name with a zero byte is a ValueError
+        reason = getattr(error, "strerror", None) or error
+        raise FormatError(f"{path} cannot be written: {reason}.") from None
+
+
+def _replace(target: Path, content: bytes) -> None:
+    # Beside the target, since only within one file system does a file take another's place in one step.
+    beside = target.with_name(f".{target.name[:100]}.{uuid.uuid4().hex}")
+    try:
+        with open(beside, "xb") as file:
+            file.write(content)
+            file.flush()
+            os.fsync(file.fileno())
+        with contextlib.suppress(FileNotFoundError):
+            shutil.copymode(target, beside)
+        os.replace(beside, target)
+    except BaseException:
+        beside.unlink(missing_ok=True)
+        raise

@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-import contextlib
 import json
 import os
-import shutil
-import uuid
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from kineverse.errors import FormatError
 from kineverse.expressions.expression import Expression
+from kineverse.formats.files import replace_file
 from kineverse.model.contents import expressions_in
 from kineverse.model.history import Entry
 from kineverse.model.model import Model, Snapshot
@@ -56,10 +54,7 @@ def write_document(model: ModelView, path: str | os.PathLike[str]) -> None:
     except UnicodeEncodeError as error:
         bad = ascii(error.object[max(error.start - 20, 0) : error.end])
         raise FormatError(f"{target} is not written. Half a surrogate pair is no text: {bad}.") from None
-    try:
-        _replace(Path(os.path.realpath(target)), content)
-    except OSError as error:
-        raise FormatError(f"{target} cannot be written: {error.strerror or error}.") from None
+    replace_file(target, content)
 
 
 def document_of(model: ModelView) -> str:
@@ -186,20 +181,3 @@ def _writes(tag: str, writes: Mapping[Cell, Any], table: Table) -> dict[str, dic
                 f"{noun} under '{kind}/{name}', written by {tag!r}, has no place in a document: {error}"
             ) from None
     return {kind: values for kind, values in kinds.items() if values}
-
-
-def _replace(target: Path, content: bytes) -> None:
-    """Put a file in the place of another in one step."""
-    # Beside the target, since only within one file system does a file take another's place in one step.
-    beside = target.with_name(f".{target.name[:100]}.{uuid.uuid4().hex}")
-    try:
-        with open(beside, "xb") as file:
-            file.write(content)
-            file.flush()
-            os.fsync(file.fileno())
-        with contextlib.suppress(FileNotFoundError):
-            shutil.copymode(target, beside)
-        os.replace(beside, target)
-    except BaseException:
-        beside.unlink(missing_ok=True)
-        raise
