@@ -186,7 +186,7 @@ class Ball(Joint):
     def apply(self, model: Reader) -> Effects:
         """Write the child frame, the rates of the quaternion and the limits."""
         self.check_free(model)
-        q, omega, rows = _orientation(self.name)
+        q, omega, rows = orientation(self.name)
         whole = array(q)
         along = np.array(unit_axis(self.axis))
         p, w = whole[:3] @ along, q[3]
@@ -224,7 +224,7 @@ class Floating(Joint):
     def apply(self, model: Reader) -> Effects:
         """Write the child frame and the rates of the quaternion."""
         xyz = tuple(position(f"{self.name}/{c}") for c in "xyz")
-        q, omega, rows = _orientation(self.name)
+        q, omega, rows = orientation(self.name)
         speeds = (*(c.derivative() for c in xyz), *omega)
         return Effects(
             frames={self.child: (self.parent, (self.origin, translation(*xyz), quaternion(*q)))},
@@ -233,7 +233,7 @@ class Floating(Joint):
         )
 
 
-class _Orientation(NamedTuple):
+class Orientation(NamedTuple):
     """A quaternion (x, y, z, w), the angular velocity in the child's axes, and q̇ = ½ q ⊗ (ω, 0) by rows."""
 
     coordinates: tuple[Symbol, ...]
@@ -241,7 +241,8 @@ class _Orientation(NamedTuple):
     rates: Mapping[Symbol, Mapping[Symbol, Expression]]
 
 
-def _orientation(name: str) -> _Orientation:
+def orientation(name: str) -> Orientation:
+    """Return the coordinates and speeds of a quaternion below a name."""
     x, y, z, w = q = tuple(position(f"{name}/q{c}") for c in "xyzw")
     wx, wy, wz = omega = tuple(velocity(f"{name}/w{c}") for c in "xyz")
     rows = {
@@ -250,7 +251,7 @@ def _orientation(name: str) -> _Orientation:
         z: {wx: -y / 2, wy: x / 2, wz: w / 2},
         w: {wx: -x / 2, wy: -y / 2, wz: -z / 2},
     }
-    return _Orientation(q, omega, rows)
+    return Orientation(q, omega, rows)
 
 
 def from_z(axis: Vector3) -> np.ndarray[tuple[int, int], np.dtype[np.float64]]:

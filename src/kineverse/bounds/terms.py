@@ -79,11 +79,15 @@ class Terms:
 
     def of(self, expression: Expression) -> Term:
         """Return a scalar expression as a term."""
+        (term,) = self.elements(expression)
+        return term
+
+    def elements(self, expression: Expression) -> list[Term]:
+        """Return the elements of an expression as terms, column by column."""
         nodes = bottom_up(leaves(expression)[1], _parts, self._of_node.__contains__)
         for node in nodes:
             self._of_node[node] = self._node(node)
-        (term,) = self._graph(expression)
-        return term
+        return self._graph(expression)
 
     def constant(self, number: float) -> Term:
         """Return a number."""

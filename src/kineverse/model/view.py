@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import threading
 from collections.abc import ItemsView, Iterable, Iterator, Mapping, Sequence, ValuesView
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import casadi as ca
 import numpy as np
@@ -28,6 +28,9 @@ from .reader import ABSENT, Cell, missing
 from .relevance import Relevance
 from .velocity import VelocityRows, velocity_rows
 from .violations import Checks, Violations, find_violations
+
+if TYPE_CHECKING:
+    from kineverse.formats.saving import Saved
 
 JacobianForm = Literal["world_aligned", "world", "body"]
 
@@ -386,7 +389,8 @@ class ModelView:
         """Return the constraints that values break: (name, value, lower, upper, excess) each, worst first.
 
         Constraints about none of the given symbols, or about speeds that are not given, are listed as
-        ``unchecked``.
+        ``unchecked``. A closed loop that does not close here is listed by its name, and like any constraint
+        without a value before all others: NaN, off by NaN.
 
         Parameters
         ----------
@@ -405,9 +409,8 @@ class ModelView:
         with self._lock:
             self._catch_up()
             if self._checks is None:
-                self._checks = Checks(
-                    {name: self._followed(c) for name, c in self._head[CONSTRAINTS].items()}
-                )
+                followed = {name: self._followed(c) for name, c in self._head[CONSTRAINTS].items()}
+                self._checks = Checks(followed, self.rates.dependent.values())
             known = self._index.sorted() if not isinstance(values, State) else ()
             return find_violations(self._checks, values, (*known, *self.rates, *self.speeds), tolerance)
 
@@ -524,17 +527,27 @@ class ModelView:
             coordinates, rates = self.degrees_of_freedom, self.rates
         return integrate(coordinates, rates, state, speeds, dt)
 
-    def save(self, path: str | os.PathLike[str]) -> None:
-        """Write the model to a ``.kv.json`` document, see :mod:`kineverse.formats.document`.
+    def save(self, path: str | os.PathLike[str], leave_out: Iterable[str] = ()) -> Saved:
+        """Write the model to a file: a document (.kv.json), URDF (.urdf) or MJCF (.xml).
+
+        A document says all of it. What the others cannot say is refused by name, unless it is to be left out,
+        see :func:`kineverse.formats.saving.save`.
+
+        Parameters
+        ----------
+        path
+            Of the file.
+        leave_out
+            Names of constraints and articulations.
 
         Raises
         ------
         FormatError
-            If the name has another ending, or naming what a document cannot carry.
+            If the name has another ending, the file cannot be written, or naming what the format cannot say.
         """
-        from kineverse.formats.document import write_document
+        from kineverse.formats.saving import save
 
-        write_document(self, path)
+        return save(self, path, leave_out)
 
     # -- printing ------------------------------------------------------------------------------------------
 

@@ -7,6 +7,7 @@ for what its kind can have: the limits of a fixed joint mean nothing and are not
 from __future__ import annotations
 
 import math
+import sys
 
 from kineverse.errors import suggest
 from kineverse.formats.markup import Element, ElementError, abbreviate, name_of
@@ -147,7 +148,9 @@ def _limits(
     for key in ("acceleration", "deceleration", "jerk"):
         if key in limit[1]:
             remarks.add(limit, f"has {key}, which is ignored: it came with URDF 1.2.", joint)
-    return Limits(lower, upper, velocity if velocity > 0.0 else None, abs(effort))
+    return Limits(
+        _bound(lower), _bound(upper), _bound(velocity) if velocity > 0.0 else None, _bound(abs(effort))
+    )
 
 
 def _limits_1_2(limit: Element, kind: Kind) -> Limits:
@@ -162,7 +165,12 @@ def _limits_1_2(limit: Element, kind: Kind) -> Limits:
             raise ElementError(limit, f"has {key}={value!r}; URDF 1.2 refuses negative magnitudes.")
     if "acceleration" in values:
         values.setdefault("deceleration", values["acceleration"])
-    return Limits(lower, upper, **values)
+    return Limits(_bound(lower), _bound(upper), **{key: _bound(value) for key, value in values.items()})
+
+
+def _bound(value: float | None) -> float | None:
+    """Return a bound; the largest number there is bounds nothing, and is written where URDF wants one."""
+    return None if value is None or abs(value) == sys.float_info.max else value
 
 
 def _range(limit: Element, lower: float, upper: float) -> tuple[float, float]:

@@ -1,0 +1,1 @@
+"""What writers of formats share: motions recognised, limits sorted, what is refused collected."""

@@ -1,0 +1,206 @@
+"""Sums of powers and waves of coordinates: a normal form in which motions can be compared exactly.
+
+Rotations by multiples of coordinates, and all products of them with translations along multiples of
+coordinates, are made of terms c · x^n · exp(i w·x). Written so, two of them are equal if and only if their
+coefficients are, sin² + cos² is 1, and derivatives are as easy as sums.
+"""
+
+from __future__ import annotations
+
+import cmath
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import TypeAlias
+
+import casadi as ca
+
+from kineverse.bounds.terms import Term
+
+Exponents: TypeAlias = tuple[tuple[int, float], ...]
+"""Pairs of a variable and how often it occurs: its power, or the frequency of its wave; sorted."""
+
+NOISE = 1e-14
+"""What is left of a coefficient by rounding, of a motion in [m] and [rad], is this at most."""
+_MOST_TERMS = 300
+
+
+class TooLargeError(Exception):
+    """A product has more terms than are looked at; no user ever sees it."""
+
+
+@dataclass(frozen=True)
+class Harmonic:
+    """A sum of coefficients · powers · waves; variables are numbered by the terms that they are."""
+
+    terms: Mapping[tuple[Exponents, Exponents], complex]
+
+    @staticmethod
+    def constant(number: float) -> Harmonic:
+        """Return a number."""
+        return Harmonic({((), ()): complex(number)} if number else {})
+
+    @staticmethod
+    def variable(index: int) -> Harmonic:
+        """Return a variable."""
+        return Harmonic({(((index, 1.0),), ()): 1.0 + 0.0j})
+
+    def __add__(self, other: Harmonic) -> Harmonic:
+        total = dict(self.terms)
+        for key, c in other.terms.items():
+            total[key] = total.get(key, 0.0) + c
+        return _clean(total)
+
+    def __neg__(self) -> Harmonic:
+        return self.scaled(-1.0)
+
+    def __sub__(self, other: Harmonic) -> Harmonic:
+        return self + (-other)
+
+    def scaled(self, factor: complex) -> Harmonic:
+        """Return a multiple."""
+        return Harmonic({key: factor * c for key, c in self.terms.items()})
+
+    def __mul__(self, other: Harmonic) -> Harmonic:
+        if len(self.terms) * len(other.terms) > _MOST_TERMS**2:
+            raise TooLargeError
+        total: dict[tuple[Exponents, Exponents], complex] = {}
+        for (p, w), c in self.terms.items():
+            for (q, v), d in other.terms.items():
+                key = _merged(p, q), _merged(w, v)
+                total[key] = total.get(key, 0.0) + c * d
+        return _clean(total)
+
+    @property
+    def number(self) -> float | None:
+        """The constant that it is; None if it is none."""
+        if all(key == ((), ()) for key in self.terms):
+            return self.terms.get(((), ()), 0j).real
+        return None
+
+    @property
+    def line(self) -> tuple[dict[int, float], float] | None:
+        """Slopes by variable, and the constant, of a sum of multiples; None for anything else."""
+        slopes, offset = dict[int, float](), 0.0
+        for (powers, waves), c in self.terms.items():
+            if waves or sum(n for _, n in powers) > 1:
+                return None
+            if powers:
+                slopes[powers[0][0]] = c.real
+            else:
+                offset = c.real
+        return slopes, offset
+
+    @property
+    def variables(self) -> set[int]:
+        """The variables that occur."""
+        return {index for key in self.terms for part in key for index, _ in part}
+
+    def wave(self) -> Harmonic | None:
+        """Return exp(i·x) of a sum of multiples x; None for anything else."""
+        line = self.line
+        if line is None:
+            return None
+        slopes, offset = line
+        frequencies = tuple(sorted((index, w) for index, w in slopes.items() if w))
+        return Harmonic({((), frequencies): cmath.exp(1j * offset)})
+
+    def derivative(self, index: int) -> Harmonic:
+        """Return the partial derivative by a variable."""
+        total: dict[tuple[Exponents, Exponents], complex] = {}
+        for (powers, waves), c in self.terms.items():
+            w, n = dict(waves).get(index, 0.0), dict(powers).get(index, 0.0)
+            if w:
+                total[powers, waves] = total.get((powers, waves), 0.0) + 1j * w * c
+            if n:
+                key = _merged(powers, ((index, -1.0),)), waves
+                total[key] = total.get(key, 0.0) + n * c
+        return _clean(total)
+
+    def at_zero(self, index: int) -> Harmonic:
+        """Return what is left where a variable is 0."""
+        total: dict[tuple[Exponents, Exponents], complex] = {}
+        for (powers, waves), c in self.terms.items():
+            if index not in dict(powers):
+                key = powers, tuple(pair for pair in waves if pair[0] != index)
+                total[key] = total.get(key, 0.0) + c
+        return _clean(total)
+
+
+class Harmonics:
+    """Turns steps of a graph into sums of powers and waves; what is neither becomes a variable."""
+
+    def __init__(self) -> None:
+        self._known: dict[int, Harmonic] = {}
+        self.variables: dict[int, Term] = {}
+
+    def of(self, term: Term) -> Harmonic:
+        """Return a step; its arguments are looked at first, however deep they are."""
+        waiting = [term]
+        while waiting:
+            last = waiting[-1]
+            missing = [a for a in last.args if a.index not in self._known]
+            if missing:
+                waiting += missing
+                continue
+            waiting.pop()
+            if last.index not in self._known:
+                found = self._step(last, [self._known[a.index] for a in last.args])
+                self._known[last.index] = self._variable(last) if found is None else found
+        return self._known[term.index]
+
+    def _variable(self, term: Term) -> Harmonic:
+        self.variables[term.index] = term
+        return Harmonic.variable(term.index)
+
+    def _step(self, term: Term, args: list[Harmonic]) -> Harmonic | None:
+        """Return the sum that a step is, None if it is none."""
+        op = term.op
+        if op == ca.OP_CONST:
+            return Harmonic.constant(term.data)
+        if op == ca.OP_ADD:
+            return args[0] + args[1]
+        if op == ca.OP_SUB:
+            return args[0] - args[1]
+        if op == ca.OP_NEG:
+            return -args[0]
+        if op == ca.OP_MUL:
+            return args[0] * args[1]
+        if op == ca.OP_DIV:
+            divisor = args[1].number
+            return args[0].scaled(1.0 / divisor) if divisor else None
+        if op in (ca.OP_SIN, ca.OP_COS):
+            wave = args[0].wave()
+            return None if wave is None else _real(wave, op == ca.OP_SIN)
+        if op == ca.OP_POW:
+            power = args[1].number
+            if power is None or power != int(power) or not 0 <= power <= 4:
+                return None
+            result = Harmonic.constant(1.0)
+            for _ in range(int(power)):
+                result = result * args[0]
+            return result
+        return None
+
+
+def _real(wave: Harmonic, sine: bool) -> Harmonic:
+    """Return the real part of exp(i x), or its imaginary part."""
+    ((powers, frequencies), c) = next(iter(wave.terms.items()))
+    back = tuple((index, -w) for index, w in frequencies)
+    half = -0.5j if sine else 0.5
+    first = Harmonic({(powers, frequencies): half * c})
+    return first + Harmonic({(powers, back): half.conjugate() * c.conjugate()})
+
+
+def _merged(a: Exponents, b: Exponents) -> Exponents:
+    if not a or not b:
+        return a or b
+    total = dict(a)
+    for index, n in b:
+        total[index] = total.get(index, 0.0) + n
+    return tuple(sorted((index, n) for index, n in total.items() if n))
+
+
+def _clean(terms: Mapping[tuple[Exponents, Exponents], complex]) -> Harmonic:
+    if len(terms) > _MOST_TERMS:
+        raise TooLargeError
+    return Harmonic({key: c for key, c in terms.items() if abs(c) > NOISE})

@@ -1,0 +1,138 @@
+"""A model as links with joints: what descriptions of robots consist of, whatever they are written as."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any, TypeAlias
+
+import numpy as np
+import numpy.typing as npt
+
+from kineverse.model.body import Body, Vector3
+from kineverse.symbols import Symbol
+
+Matrix: TypeAlias = npt.NDArray[np.float64]
+Polynomial: TypeAlias = tuple[float, ...]
+"""Coefficients of the powers of a coordinate, constant first."""
+
+ITSELF: Polynomial = (0.0, 1.0)
+NO_BODY = Body()
+
+
+@dataclass
+class Bounds:
+    """What limits a joint: its position, its speed, and where a safety controller defends it.
+
+    ``lower`` and ``upper`` are of the position [rad] or [m], ``slowest`` and ``fastest`` of the speed.
+    """
+
+    lower: float = -math.inf
+    upper: float = math.inf
+    slowest: float = -math.inf
+    fastest: float = math.inf
+    soft: tuple[float, float] | None = None
+
+    def keep(self, lower: float, upper: float) -> None:
+        """Limit the position further."""
+        self.lower, self.upper = max(self.lower, lower), min(self.upper, upper)
+
+    def slow(self, slowest: float, fastest: float) -> None:
+        """Limit the speed further."""
+        self.slowest, self.fastest = max(self.slowest, slowest), min(self.fastest, fastest)
+
+    @property
+    def open(self) -> bool:
+        """Whether the position is not limited."""
+        return self.lower == -math.inf and self.upper == math.inf
+
+
+@dataclass
+class Joint:
+    """A rotation about, or a translation along, a line in the frame of its link.
+
+    Attributes
+    ----------
+    name
+        Unique among joints; the coordinate's own if the joint is one.
+    turns, axis, point
+        Whether it is a rotation, a unit vector, and a point of the line [m].
+    symbol, amount
+        The coordinate and the polynomial of it that is the joint's position [rad] or [m].
+    """
+
+    name: str
+    turns: bool
+    axis: Vector3
+    point: Vector3
+    symbol: Symbol
+    amount: Polynomial = ITSELF
+    bounds: Bounds = field(default_factory=Bounds)
+    dynamics: Mapping[str, Any] = field(default_factory=dict)
+
+    @property
+    def leads(self) -> bool:
+        """Whether the joint is a coordinate, rather than what follows one."""
+        return self.amount == ITSELF and self.name == self.symbol.path
+
+
+@dataclass
+class BallJoint:
+    """A rotation by a quaternion: coordinates ``name/qx`` and so on."""
+
+    name: str
+    point: Vector3
+    dynamics: Mapping[str, Any] = field(default_factory=dict)
+
+
+@dataclass
+class Link:
+    """A frame: where it is in its parent while all of its joints are at 0, and what moves it from there."""
+
+    name: str
+    parent: str
+    pose: Matrix
+    joints: list[Joint | BallJoint] = field(default_factory=list)
+    body: Body = NO_BODY
+    label: str = ""
+    """What the connection to the parent is called, if nothing moves."""
+    recorded: bool = False
+    """Whether that is the name of an articulation."""
+
+
+@dataclass(frozen=True)
+class Sum:
+    """A constraint on a sum of multiples of coordinates: lower <= Σ factor · coordinate <= upper."""
+
+    name: str
+    factors: Mapping[Symbol, float]
+    lower: float
+    upper: float
+
+
+@dataclass
+class Plan:
+    """A model as links, parents first, and what else is to be said.
+
+    Attributes
+    ----------
+    links
+        Without the world.
+    world
+        What is attached to the world itself.
+    sums
+        Constraints on sums of several coordinates.
+    remarks
+        What is written other than it was, or left out: for people.
+    """
+
+    links: list[Link]
+    world: Body
+    sums: list[Sum] = field(default_factory=list)
+    remarks: list[str] = field(default_factory=list)
+
+    @property
+    def joints(self) -> list[Joint]:
+        """The joints that move along or about a line."""
+        return [joint for link in self.links for joint in link.joints if isinstance(joint, Joint)]

@@ -1,0 +1,314 @@
+"""From a model to links with joints, by what its transforms and constraints say."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, replace
+
+import casadi as ca
+import numpy as np
+
+from kineverse.bounds.terms import Terms
+from kineverse.errors import UnknownNameError, suggest
+from kineverse.expressions.expression import Expression, as_expression
+from kineverse.expressions.substitution import apply
+from kineverse.model.articulation import Articulation
+from kineverse.model.body import Pose
+from kineverse.model.constraint import Constraint
+from kineverse.model.frame import WORLD
+from kineverse.model.operation import CONSTRAINTS
+from kineverse.model.view import ModelView
+from kineverse.motions import AxisMotion
+from kineverse.symbols import Symbol
+
+from .limits import has_given_gradient, limit, sort_constraints
+from .motions import Motion, Placing, Turning, UnrecognisedError, placing
+from .names import Names
+from .plan import NO_BODY, BallJoint, Joint, Link, Plan, Sum
+from .quaternions import quaternions
+from .refusals import Refusals
+
+_LOOP = "closedloop"
+
+
+@dataclass(frozen=True)
+class Target:
+    """What a format can say.
+
+    Attributes
+    ----------
+    name
+        Of the format.
+    sums
+        Whether it limits sums of several coordinates.
+    one_way
+        Whether a speed may have another limit forwards than backwards.
+    """
+
+    name: str
+    sums: bool = False
+    one_way: bool = False
+
+
+class Recognition:
+    """Turns one model into a plan.
+
+    Parameters
+    ----------
+    model
+        The model.
+    target
+        What the format can say.
+    leave_out
+        Names of constraints that are left out, and of articulations whose own speeds are.
+    """
+
+    def __init__(self, model: ModelView, target: Target, leave_out: Iterable[str] = ()) -> None:
+        self.model, self.target = model, target
+        self.refusals = Refusals(target.name)
+        self.remarks: list[str] = []
+        # What refused frames move by: its own limits need no complaint of their own.
+        self._lost: set[Symbol] = set()
+        self._left_out = _checked(leave_out, model)
+        self._records = {record.child: name for name, record in _own_records(model)}
+        self._values: dict[Symbol, Expression] = {}
+        self._terms = Terms({})
+        self._quaternions = dict(quaternions(model))
+
+    def plan(self) -> Plan:
+        """Return the plan; what cannot be said is in :attr:`refusals`."""
+        placed = {name: self._placed(name) for name in _parents_first(self.model)}
+        self._check_rates(placed)
+        coordinates = {s.path for s in self.model.degrees_of_freedom}
+        joints = Names(coordinates)
+        leading = self._leading(placed)
+        links = [
+            self._link(name, found, leading, joints) for name, found in placed.items() if found is not None
+        ]
+        used = {s for found in placed.values() if found is not None for s in _turned(found)}
+        links += self._carriers(placed, set(leading), used, links)
+        plan = Plan(links, self.model.bodies.get(WORLD, NO_BODY))
+        kept = {n: c for n, c in self._plain_constraints() if n not in self._left_out}
+        found = [
+            item
+            for item in sort_constraints(kept, self.resolve, self.refusals)
+            if isinstance(item, Sum) or item.symbol.position not in self._lost
+        ]
+        limit(plan, found, self.target.name, self.target.sums, self.target.one_way, self.refusals)
+        self._remark()
+        plan.remarks = self.remarks
+        return plan
+
+    def resolve(self, expression: Expression) -> Expression:
+        """Return an expression of coordinates that depend on nothing, parameters at their values."""
+        expression = self.model.rates.resolve(expression)
+        parameters = [s for s in expression.symbols if not s.has_derivative]
+        for s in parameters:
+            if s not in self._values and s.value is not None:
+                self._values[s] = as_expression(s.value)
+                self.remarks.append(f"the parameter '{s}' is written with its value {s.value!r}")
+            elif s.value is None:
+                self.refusals.add(str(s), "is a parameter without a value")
+        known = {s: self._values[s] for s in parameters if s in self._values}
+        return apply(expression, known) if known else expression
+
+    def _placed(self, name: str) -> Placing | None:
+        """Return where a frame is in its parent; None if that is refused."""
+        factors = [self._factor(f) for f in self.model.frames[name].factors]
+        follows = name in self._records and self.model.articulations[self._records[name]].follows is not None
+        if any(has_given_gradient(f) for f in factors if isinstance(f, Expression)):
+            self.refusals.add(name, "moves with a gradient that was given and is not the derivative")
+            self._lost.update(s for f in factors if isinstance(f, Expression) for s in f.symbols)
+            return None
+        try:
+            found = placing(factors, self._terms, list(self._quaternions.values()), offsets=follows)
+        except UnrecognisedError as problem:
+            self._refuse(name, factors, str(problem))
+            return None
+        for motion in found.moving:
+            if isinstance(motion, Motion) and motion.variable.op != ca.OP_PARAMETER:
+                verb = "turns" if motion.turns else "slides"
+                self._refuse(name, factors, f"{verb} by no multiple of a coordinate")
+                return None
+        return found
+
+    def _refuse(self, name: str, factors: Iterable[Pose | Expression], problem: str) -> None:
+        about = dict.fromkeys(s for f in factors if isinstance(f, Expression) for s in f.symbols)
+        self._lost.update(about)
+        self.refusals.add(name, f"{problem}; it moves with {', '.join(map(str, about))}")
+
+    def _factor(self, factor: Pose | Expression) -> Pose | Expression:
+        if isinstance(factor, Pose):
+            return factor
+        if isinstance(factor, AxisMotion):
+            amount = self.resolve(factor.amount)
+            return factor if amount is factor.amount else AxisMotion(factor.direction, amount, factor.turns)
+        return self.resolve(factor)
+
+    def _leading(self, placed: Mapping[str, Placing | None]) -> dict[Symbol, tuple[str, int]]:
+        """Return for each coordinate the frame, and which of its motions, that is just this coordinate.
+
+        Of several, the one that is on record for it; for some there is none.
+        """
+        leading: dict[Symbol, tuple[str, int]] = {}
+        on_record: set[Symbol] = set()
+        for name, found in placed.items():
+            own = self._record(name)
+            for k, motion in enumerate(found.moving if found is not None else ()):
+                if not isinstance(motion, Motion) or abs(motion.factor) != 1.0 or motion.offset:
+                    continue
+                symbol = motion.variable.data
+                if symbol not in leading:
+                    leading[symbol] = name, k
+                if own is not None and symbol in own.coordinates and symbol not in on_record:
+                    leading[symbol] = name, k
+                    on_record.add(symbol)
+        return leading
+
+    def _record(self, frame: str) -> Articulation | None:
+        name = self._records.get(frame)
+        return None if name is None else self.model.articulations[name]
+
+    def _link(
+        self, name: str, found: Placing, leading: Mapping[Symbol, tuple[str, int]], joints: Names
+    ) -> Link:
+        record = self._record(name)
+        label = self._records.get(name, name)
+        dynamics = dict(record.dynamics) if record is not None else {}
+        follows = None
+        if record is not None and record.follows is not None:
+            position = self.resolve(record.follows)
+            follows = Constraint(position, position, position).line
+        made: list[Joint | BallJoint] = []
+        for k, motion in enumerate(found.moving):
+            if isinstance(motion, Turning):
+                ball = next(n for n, q in self._quaternions.items() if q == motion.factor)
+                made.append(BallJoint(ball, motion.point))
+                continue
+            symbol: Symbol = motion.variable.data
+            if leading.get(symbol) == (name, k):
+                axis = motion.axis if motion.factor > 0 else _negative(motion.axis)
+                made.append(Joint(symbol.path, motion.turns, axis, motion.point, symbol))
+                continue
+            what = "turn" if motion.turns else "slide"
+            wishes = [label, name] if len(found.moving) == 1 else []
+            own = joints.take(*wishes, f"{label}/{what}")
+            axis, amount = motion.axis, (motion.offset, motion.factor)
+            if follows is not None and follows == (-motion.factor, -motion.offset):
+                # Its own limits are on what is on record, so that is its position, and not the opposite.
+                axis, amount = _negative(axis), (-motion.offset, -motion.factor)
+            made.append(Joint(own, motion.turns, axis, motion.point, symbol, amount))
+        given = _shared(dynamics, made)
+        made = [replace(joint, dynamics=own) for joint, own in zip(made, given, strict=True)]
+        body = self.model.bodies.get(name, NO_BODY)
+        fixed = "" if made else joints.take(label, name, f"{name}/fixed")
+        return Link(name, self.model.frames[name].parent, found.pose, made, body, fixed, record is not None)
+
+    def _carriers(
+        self,
+        placed: Mapping[str, Placing | None],
+        leading: set[Symbol],
+        used: set[Symbol],
+        links: list[Link],
+    ) -> Iterator[Link]:
+        """Yield links that carry nothing, for coordinates that only others follow, or that move nothing."""
+        frames = Names([*self.model.frames, WORLD])
+        first: dict[Symbol, tuple[str, Motion]] = {}
+        for name, found in placed.items():
+            for motion in found.moving if found is not None else ():
+                if isinstance(motion, Motion):
+                    first.setdefault(motion.variable.data, (self.model.frames[name].parent, motion))
+        for symbol in self.model.degrees_of_freedom:
+            if symbol in leading or symbol in used or symbol in self._lost:
+                continue
+            parent, turns, axis = links[0].name if links else WORLD, True, (0.0, 0.0, 1.0)
+            if symbol in first:
+                parent, follower = first[symbol]
+                turns, axis = follower.turns, follower.axis
+            joint = Joint(symbol.path, turns, axis, (0.0, 0.0, 0.0), symbol)
+            self.remarks.append(f"'{symbol}' has a link of its own that carries nothing")
+            yield Link(frames.take(symbol.path, f"{symbol.path}/carrier"), parent, np.eye(4), [joint])
+
+    def _check_rates(self, placed: Mapping[str, Placing | None]) -> None:
+        """Refuse coordinates that move by the speeds of others, except quaternions that turn."""
+        fine = {s for found in placed.values() if found is not None for s in _turned(found)}
+        driven: dict[str, set[str]] = {}
+        for coordinate, row in self.model.rates.items():
+            if coordinate in fine:
+                continue
+            owner = next(
+                (n for n, r in self.model.articulations.items() if coordinate in r.coordinates),
+                str(coordinate),
+            )
+            if owner in self._left_out or str(coordinate) in self._left_out:
+                continue
+            driven.setdefault(owner, set()).update(map(str, row))
+        for owner, speeds in driven.items():
+            self.refusals.add(owner, f"moves by speeds that are not its own, {', '.join(sorted(speeds))}")
+
+    def _plain_constraints(self) -> Iterator[tuple[str, Constraint]]:
+        # Plain ones: with rates, what is handed out has coordinates as nodes that only look like curves.
+        self.model._settle()
+        yield from self.model._head[CONSTRAINTS].items()
+
+    def _remark(self) -> None:
+        if self.model.data:
+            names = list(self.model.data)
+            more = f" and {len(names) - 4} more" if len(names) > 4 else ""
+            self.remarks.append(f"data are not written: {', '.join(names[:4])}{more}")
+        for name in self._left_out:
+            self.remarks.append(f"'{name}' is left out, as asked for")
+
+
+def _own_records(model: ModelView) -> Iterator[tuple[str, Articulation]]:
+    for name, record in model.articulations.items():
+        if record.kind != _LOOP:
+            yield name, record
+
+
+def _turned(found: Placing) -> Iterator[Symbol]:
+    for motion in found.moving:
+        if isinstance(motion, Turning):
+            yield from motion.factor.symbols
+
+
+def _parents_first(model: ModelView) -> list[str]:
+    """Return the names of all frames, each after its parent, in their order where that allows it."""
+    frames = dict(model.frames)
+    done = {WORLD: None}
+    for name in frames:
+        chain = []
+        while name not in done:
+            chain.append(name)
+            name = frames[name].parent
+        done |= dict.fromkeys(reversed(chain))
+    return [name for name in done if name in frames]
+
+
+def _shared(dynamics: dict[str, object], joints: list[Joint | BallJoint]) -> list[dict[str, object]]:
+    """Return what is known of each joint: all of it of a single one, else what bears its last name."""
+    if len(joints) == 1:
+        return [dynamics]
+    result = []
+    for joint in joints:
+        start = f"{joint.name.rpartition('/')[2]}/"
+        result.append({k.removeprefix(start): v for k, v in dynamics.items() if k.startswith(start)})
+    return result
+
+
+def _negative(axis: tuple[float, float, float]) -> tuple[float, float, float]:
+    x, y, z = axis
+    return 0.0 - x, 0.0 - y, 0.0 - z
+
+
+def _checked(leave_out: Iterable[str], model: ModelView) -> frozenset[str]:
+    """Return the names of what is to be left out, if all of them exist."""
+    wanted = [leave_out] if isinstance(leave_out, str) else list(leave_out)
+    known = {*model.constraints, *model.articulations, *map(str, model.rates)}
+    for name in wanted:
+        if name not in known:
+            raise UnknownNameError(
+                f"{name!r} cannot be left out: it is neither a constraint nor an articulation. "
+                f"{suggest(str(name), known, 'name')}"
+            )
+    return frozenset(wanted)

@@ -1,0 +1,93 @@
+"""The law of writers: what is read again has the frames, coordinates, poses and limits of what was written."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from robots import SHARED
+
+import kineverse as kv
+from kineverse import gallery
+from kineverse.formats.sources import shipped_models
+
+EXACT = 1e-12
+SCENES = [f"articulations/{name}" for name in gallery.names()]
+SHIPPED = list(shipped_models())
+
+
+def described() -> list[Path | None]:
+    """Return the URDF files of the shared data that can be read; None alone if there are no data."""
+    found: list[Path | None] = []
+    for file in sorted(SHARED.rglob("*.urdf")):
+        try:
+            kv.load(file)
+        except kv.FormatError:
+            continue
+        found.append(file)
+    return found or [None]
+
+
+def poses(model: kv.Model, frames: list[str], values: dict[str, float]) -> list[np.ndarray]:
+    symbols = model.degrees_of_freedom
+    parameters = [s for s in model.symbols if not s.has_derivative]
+    f = kv.compile([model.fk(name) for name in frames], [*symbols, *parameters], tier="interpreter")
+    numbers = [values[str(s)] for s in symbols] + [s.value for s in parameters]
+    result = f(np.array(numbers))
+    return list(result)
+
+
+def random_values(model: kv.Model, rng: np.random.Generator) -> dict[str, float]:
+    """Return a value for each coordinate, within its limits where there are any."""
+    values = {}
+    for s in model.degrees_of_freedom:
+        low, high = model.limits(s)
+        low, high = max(low, -2.0), min(high, 2.0)
+        values[str(s)] = rng.uniform(low, high) if low < high else low
+    return values
+
+
+def assert_same_motion(written: kv.Model, read: kv.Model, tolerance: float = EXACT, count: int = 2) -> None:
+    """Compare frames, coordinates, poses and limits; what was read may have more frames."""
+    frames = list(written.frames)
+    assert set(frames) <= set(read.frames)
+    assert written.degrees_of_freedom == read.degrees_of_freedom
+    rng = np.random.default_rng(len(frames))
+    for _ in range(count):
+        values = random_values(written, rng)
+        ours, theirs = poses(written, frames, values), poses(read, frames, values)
+        for name, a, b in zip(frames, ours, theirs, strict=True):
+            size = max(1.0, np.abs(a).max())
+            np.testing.assert_allclose(b, a, rtol=0, atol=tolerance * size, err_msg=name)
+    for s in written.degrees_of_freedom:
+        np.testing.assert_allclose(read.limits(s), written.limits(s), rtol=EXACT, err_msg=str(s))
+
+
+def assert_same_bodies(written: kv.Model, read: kv.Model) -> None:
+    """Compare shapes, colours and inertia of all frames."""
+    assert set(written.bodies) == set(read.bodies)
+    for name, body in written.bodies.items():
+        other = read.bodies[name]
+        for shapes, others in ((body.visuals, other.visuals), (body.collisions, other.collisions)):
+            assert [(s.name, s.color, s.texture) for s in shapes] == [
+                (s.name, s.color, s.texture) for s in others
+            ]
+            for a, b in zip(shapes, others, strict=True):
+                assert _form(a) == _form(b)
+                np.testing.assert_allclose(a.origin.matrix, b.origin.matrix, rtol=0, atol=EXACT)
+        assert (body.inertia is None) == (other.inertia is None)
+        if body.inertia is not None and other.inertia is not None:
+            assert body.inertia.mass == other.inertia.mass
+            assert body.inertia.tensor == other.inertia.tensor
+            np.testing.assert_allclose(
+                body.inertia.origin.matrix, other.inertia.origin.matrix, rtol=0, atol=EXACT
+            )
+
+
+def _form(shape: object) -> object:
+    """Return the geometry, a mesh by its file: another folder calls it something else."""
+    geometry = shape.geometry  # type: ignore[attr-defined]
+    if not hasattr(geometry, "uri"):
+        return geometry
+    file = geometry.uri if "://" in geometry.uri else Path(geometry.folder, geometry.uri).resolve()
+    return file, geometry.scale
