@@ -34,9 +34,20 @@ def python(*words):
 def test_help_names_all_commands_and_gives_examples(run):
     status, out, err = run("--help")
     assert (status, err) == (0, "")
-    for word in ("info", "fk", "view", "validate", "diff", "demo", "bench", "reproduce", "examples"):
+    for word in (
+        "info",
+        "fk",
+        "view",
+        "convert",
+        "diff",
+        "validate",
+        "demo",
+        "bench",
+        "reproduce",
+        "examples",
+    ):
         assert word in out
-    for command in ("info", "fk", "view", "validate", "diff", "demo", "bench", "reproduce"):
+    for command in ("info", "fk", "view", "convert", "diff", "validate", "demo", "bench", "reproduce"):
         status, out, _ = run(command, "--help")
         assert status == 0
         assert "examples:" in out

@@ -89,6 +89,14 @@ def test_documents_say_their_version(run, tmp_path, good):
     assert f"{path}: document, version 1" in out
 
 
+def test_operations_that_cannot_follow_are_remarks(run, tmp_path):
+    four_bar().save(tmp_path / "loop.kv.json")
+    status, out, _ = run(tmp_path / "loop.kv.json")
+    assert status == 0
+    assert "no problems, 1 remark" in out
+    assert "operation 'loop four_bar' is frozen" in out
+
+
 def test_remarks_are_no_problems_unless_one_is_strict(run, good):
     good.write_text(robot(hinge(), "<my_joint/>"))
     status, out, _ = run(good)

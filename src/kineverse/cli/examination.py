@@ -10,6 +10,7 @@ import kineverse as kv
 from kineverse.cli.findings import Finding, findings
 from kineverse.cli.wording import contents, number
 from kineverse.errors import KineverseError
+from kineverse.formats.document import Recorded
 from kineverse.formats.remarks import listening
 from kineverse.formats.sources import Source, locate_model
 
@@ -75,9 +76,20 @@ def examine(name: str, meshes: bool = True, strict: bool = False) -> Examination
             kind = format_of(locate_model(name))
             model = kv.load(name)
             problems = tuple(findings(model, meshes))
+            remarks += _frozen(model)
         except (KineverseError, OSError) as error:
             return Examination(name, kind, error=error, remarks=remarks, strict=strict)
     return Examination(name, kind, model, None, remarks, problems, strict)
+
+
+def _frozen(model: kv.Model) -> list[str]:
+    """Return which operations of a document cannot follow when what they read is changed, and why."""
+    operations = {tag: model.history.operation(tag) for tag in model.history.tags}
+    return [
+        f"operation {tag!r} is frozen: {operation.frozen}"
+        for tag, operation in operations.items()
+        if isinstance(operation, Recorded) and operation.frozen
+    ]
 
 
 def format_of(source: Source) -> str:

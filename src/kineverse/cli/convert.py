@@ -1,0 +1,173 @@
+"""``kineverse convert``: a model from one file into another."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from kineverse.cli.paint import bounded
+from kineverse.cli.progress import doing
+from kineverse.errors import FormatError, NameTakenError, ValueRejectedError
+
+if TYPE_CHECKING:
+    import kineverse as kv
+
+HELP = """write a model to a file, in the format that its name ends in
+
+IN is whatever can be opened. OUT is a document (.kv.json), which says all of a model, URDF (.urdf) or MJCF
+(.xml). What the format cannot say is refused by name, and nothing is written; --leave-out names what may be
+missing. OUT is written whole or not at all, and replaces a file only with --force. If OUT is a dash, a
+document goes to standard output.
+
+To see whether the result moves as it should: kineverse diff IN OUT --values
+
+examples:
+  kineverse convert robot.sdf robot.urdf
+  kineverse convert robot.urdf robot.kv.json --prefix left --force
+  kineverse convert kitchen - | gzip > kitchen.kv.json.gz
+  kineverse convert garage.kv.json garage.urdf --leave-out garage/lock"""
+
+STDOUT = "-"
+SHOWN = 10
+"""How many remarks are printed unless all are asked for."""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the options."""
+    parser.add_argument("source", metavar="IN", help="name of a shipped model, or path of a file")
+    parser.add_argument("target", metavar="OUT", help="path of the file to write; - for standard output")
+    parser.add_argument("--prefix", metavar="NAME", help="put in front of all names, with a slash")
+    parser.add_argument("--force", action="store_true", help="replace OUT if it is there")
+    parser.add_argument(
+        "--leave-out",
+        metavar="NAME",
+        action="append",
+        default=[],
+        help="a constraint, or an articulation, that OUT need not say; may be given several times",
+    )
+    parser.add_argument("--all", action="store_true", help=f"print more than {SHOWN} remarks")
+    parser.add_argument("--json", action="store_true", help="what was done, as one JSON object")
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Read, write, and say what was written."""
+    to_stdout = arguments.target == STDOUT
+    if not to_stdout:
+        # Before the model is loaded: a name that cannot be written to should not take seconds to be found.
+        check(arguments.target, arguments.source, arguments.force)
+    elif arguments.json or arguments.leave_out:
+        option = "--json" if arguments.json else "--leave-out"
+        raise ValueRejectedError(
+            f"{option} and - exclude each other: the output is a document, which says all."
+        )
+
+    import kineverse as kv
+    from kineverse.formats.remarks import listening
+
+    with listening() as left_out, doing(f"reading {arguments.source}"):
+        model = kv.load(arguments.source, arguments.prefix)
+    with listening() as other, doing(f"writing {arguments.target}"):
+        if to_stdout:
+            size = _print_document(model)
+        else:
+            options = {"leave_out": arguments.leave_out} if arguments.leave_out else {}
+            model.save(arguments.target, **options)
+            size = os.path.getsize(Path(arguments.target).expanduser())
+    if arguments.json:
+        print(json.dumps(_as_json(arguments, model, size, left_out, other), allow_nan=False))
+    else:
+        lines = _report(arguments, model, size, {"reading": left_out, "writing": other})
+        print("\n".join(lines), file=sys.stderr if to_stdout else sys.stdout)
+    return 0
+
+
+def check(target: str, source: str, force: bool = False) -> None:
+    """Look whether a file can be written, as far as that can be known before there is a model.
+
+    Raises
+    ------
+    FormatError
+        If the name has no ending that is written, its folder does not exist, or it is none of a file.
+    NameTakenError
+        If it is the source itself, or another file that may not be replaced.
+    UnknownNameError
+        If a file is there, and the source is not.
+    """
+    from kineverse.formats.saving import ENDINGS
+    from kineverse.formats.sources import locate_model
+
+    if not target:
+        raise FormatError("Which file is to be written? Its name is empty.")
+    path = Path(target).expanduser()
+    if path.is_dir():
+        inside = path / f"{_stem(source)}{ENDINGS[0]}"
+        raise FormatError(f"{target} is a folder; name a file in it, such as {inside}.")
+    if not path.name.endswith(ENDINGS):
+        raise FormatError(
+            f"{target}: nothing is known that ends like this. Written are {', '.join(ENDINGS)}."
+        )
+    if not path.parent.is_dir():
+        raise FormatError(f"{target}: the folder {path.parent} does not exist.")
+    if not os.path.lexists(path):
+        return
+    if not path.is_file():
+        raise FormatError(f"{target} is no regular file.")
+    found = locate_model(source)
+    if not found.scene and path.samefile(found.path):
+        raise NameTakenError(f"{target} is what is read; give the result another name.")
+    if not force:
+        raise NameTakenError(f"{target} is there already; --force replaces it.")
+
+
+def _stem(source: str) -> str:
+    return Path(source).name.partition(".")[0] or "model"
+
+
+def _print_document(model: kv.Model) -> int:
+    """Write a document to standard output; return its size [byte]."""
+    from kineverse.formats.document import document_of
+
+    content = document_of(model).encode()
+    sys.stdout.buffer.write(content)
+    sys.stdout.flush()
+    return len(content)
+
+
+def _report(
+    arguments: argparse.Namespace, model: kv.Model, size: int, remarks: dict[str, list[str]]
+) -> list[str]:
+    from kineverse.cli.wording import contents
+
+    lines = [f"{arguments.source} → {arguments.target}", f"  {contents(model)}, {_size(size)}"]
+    most = None if arguments.all else SHOWN
+    for when, texts in remarks.items():
+        if texts:
+            lines += [f"  remarks on {when}", *bounded([f"    {text}" for text in texts], most, "    ")]
+    return lines
+
+
+def _size(size: int) -> str:
+    for unit, factor in (("MiB", 1 << 20), ("KiB", 1 << 10)):
+        if size >= factor:
+            return f"{size / factor:.3g} {unit}"
+    return f"{size} byte{'' if size == 1 else 's'}"
+
+
+def _as_json(
+    arguments: argparse.Namespace, model: kv.Model, size: int, left_out: list[str], other: list[str]
+) -> dict[str, object]:
+    return {
+        "in": arguments.source,
+        "out": arguments.target,
+        "bytes": size,
+        "counts": {
+            "frames": len(model.frames),
+            "dof": len(model.degrees_of_freedom),
+            "constraints": len(model.constraints),
+        },
+        "remarks": {"reading": left_out, "writing": other},
+    }

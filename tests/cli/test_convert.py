@@ -1,0 +1,180 @@
+"""``kineverse convert``: a model from one file into another, or into standard output."""
+
+from __future__ import annotations
+
+import json
+import os
+
+import pytest
+
+import kineverse as kv
+from kineverse.cli import main
+
+LIMIT = '<limit lower="-1" upper="2" effort="1" velocity="1"/>'
+HINGE = f'<joint name="j" type="revolute"><parent link="a"/><child link="b"/>{LIMIT}</joint>'
+
+
+@pytest.fixture
+def run(capsys):
+    """Run the command in this process: status, standard output, standard error."""
+
+    def call(*words):
+        status = main(["convert", *map(str, words)])
+        captured = capsys.readouterr()
+        return status, captured.out, captured.err
+
+    return call
+
+
+@pytest.fixture
+def robot(tmp_path, monkeypatch):
+    """Write a robot into an empty folder, which becomes the current one."""
+    monkeypatch.chdir(tmp_path)
+    path = tmp_path / "robot.urdf"
+    path.write_text(f'<robot name="r"><link name="a"/><link name="b"/>{HINGE}<my_joint/></robot>')
+    return path
+
+
+def test_a_document_is_the_model_to_the_bit(run, robot, tmp_path):
+    status, out, err = run("robot.urdf", "robot.kv.json")
+    assert (status, err) == (0, "")
+    size = (tmp_path / "robot.kv.json").stat().st_size
+    assert out.splitlines() == [
+        "robot.urdf → robot.kv.json",
+        f"  2 frames, 1 DoF, 2 constraints, {size / 1024:.3g} KiB",
+        "  remarks on reading",
+        "    robot.urdf, line 1, <my_joint> is ignored: URDF does not know it.",
+    ]
+    assert kv.difference(kv.load("robot.urdf"), kv.load("robot.kv.json")).is_empty
+
+
+@pytest.mark.parametrize("ending", [".kv.json", ".urdf"])
+@pytest.mark.parametrize("source", ["robot.urdf", "shelf_door", "articulations/revolute"])
+def test_what_is_written_moves_alike(run, robot, source, ending):
+    status, _, err = run(source, f"out{ending}")
+    assert (status, err) == (0, "")
+    assert main(["diff", "--values", source, f"out{ending}"]) == 0
+
+
+def test_prefix(run, robot):
+    assert run("robot.urdf", "left.kv.json", "--prefix", "left")[0] == 0
+    assert list(kv.load("left.kv.json").frames) == ["left/a", "left/b"]
+
+
+def test_json_is_one_object_and_nothing_else(run, robot):
+    status, out, err = run("robot.urdf", "robot.kv.json", "--json")
+    assert (status, err) == (0, "")
+    answer = json.loads(out)
+    assert answer["bytes"] == os.path.getsize("robot.kv.json")
+    assert answer["counts"] == {"frames": 2, "dof": 1, "constraints": 2}
+    assert len(answer["remarks"]["reading"]) == 1
+
+
+def test_a_dash_is_standard_output(robot, tmp_path, capfdbinary):
+    kv.load("robot.urdf").save("robot.kv.json")
+    assert main(["convert", "robot.urdf", "-"]) == 0
+    captured = capfdbinary.readouterr()
+    assert captured.out == (tmp_path / "robot.kv.json").read_bytes()
+    assert b"2 frames, 1 DoF" in captured.err
+    for option in (["--json"], ["--leave-out", "j/position"]):
+        assert main(["convert", "robot.urdf", "-", *option]) == 2
+        captured = capfdbinary.readouterr()
+        assert captured.out == b""
+        assert option[0].encode() in captured.err
+
+
+def test_what_is_left_out_is_missing_and_nothing_else(run, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    model = kv.Model()
+    q, bolt = kv.position("door"), kv.position("bolt")
+    with model.edit() as edit:
+        edit.add_frame("door", parent="world", transform=kv.rotation_z(q))
+        edit.constrain("range", 0, q, 1)
+        edit.constrain("lock", -(bolt > 1), q.derivative(), bolt > 1)
+    model.save("door.kv.json")
+    status, out, err = run("door.kv.json", "door.urdf")
+    assert (status, out) == (2, "")
+    assert "lock" in err
+    assert not (tmp_path / "door.urdf").exists()
+    assert run("door.kv.json", "door.urdf", "--leave-out", "lock")[0] == 0
+    assert kv.load("door.urdf").limits("door") == (0.0, 1.0)
+    status, _, err = run("door.kv.json", "again.urdf", "--leave-out", "lokc")
+    assert status == 2
+    assert "lock" in err
+
+
+def test_a_file_is_replaced_only_by_force(run, robot, tmp_path):
+    (tmp_path / "out.kv.json").write_text("precious")
+    status, out, err = run("robot.urdf", "out.kv.json")
+    assert (status, out) == (2, "")
+    assert "--force" in err
+    assert (tmp_path / "out.kv.json").read_text() == "precious"
+    assert run("robot.urdf", "out.kv.json", "--force")[0] == 0
+    assert len(kv.load("out.kv.json").frames) == 2
+
+
+def test_a_file_is_not_converted_into_itself(run, robot, tmp_path):
+    before = robot.read_bytes()
+    (tmp_path / "link.urdf").symlink_to(robot)
+    os.link(robot, tmp_path / "twin.urdf")
+    for target in (robot, "./robot.urdf", "link.urdf", "twin.urdf"):
+        status, out, err = run("robot.urdf", target, "--force")
+        assert (status, out) == (2, "")
+        assert "is what is read" in err
+    assert robot.read_bytes() == before
+
+
+def test_names_of_any_script(run, robot, tmp_path):
+    (tmp_path / "机 器").mkdir()
+    status, out, err = run("robot.urdf", "机 器/тело-ü.kv.json", "--prefix", "рука")
+    assert (status, err) == (0, "")
+    assert "机 器/тело-ü.kv.json" in out
+    assert "рука/a" in kv.load("机 器/тело-ü.kv.json").frames
+
+
+@pytest.mark.parametrize(
+    ("target", "hint"),
+    [
+        ("out.txt", ".kv.json, .urdf"),
+        ("out", ".kv.json, .urdf"),
+        ("", "Which file"),
+        ("out.sdf", ".kv.json, .urdf"),
+        ("nowhere/out.kv.json", "the folder nowhere does not exist"),
+        ("robot.urdf/out.kv.json", "the folder robot.urdf does not exist"),
+        ("folder", "folder/robot.kv.json"),
+        (".", "robot.kv.json"),
+        ("folder.kv.json", "folder.kv.json/robot.kv.json"),
+        ("pipe.kv.json", "no regular file"),
+        ("dead.kv.json", "no regular file"),
+    ],
+)
+def test_places_that_cannot_be_written_to(run, robot, tmp_path, target, hint):
+    for name in ("folder", "folder.kv.json"):
+        (tmp_path / name).mkdir()
+    os.mkfifo(tmp_path / "pipe.kv.json")
+    (tmp_path / "dead.kv.json").symlink_to("nothing")
+    before = sorted(os.listdir(tmp_path))
+    status, out, err = run("robot.urdf", target, "--force")
+    assert (status, out, len(err.splitlines())) == (2, "", 1)
+    assert hint in err
+    assert sorted(os.listdir(tmp_path)) == before
+
+
+@pytest.mark.parametrize("source", ["missing.urdf", ".", "noise.urdf", "notes.txt", ""])
+def test_what_cannot_be_read_writes_nothing(run, robot, tmp_path, source):
+    (tmp_path / "noise.urdf").write_bytes(os.urandom(100))
+    (tmp_path / "notes.txt").write_text("hello")
+    status, out, err = run(source, "out.kv.json")
+    assert (status, out, len(err.splitlines())) == (2, "", 1)
+    assert not (tmp_path / "out.kv.json").exists()
+
+
+def test_a_folder_that_may_not_be_written_to(run, robot, tmp_path, monkeypatch):
+    def refuse(*_, **__):
+        raise PermissionError(13, "Permission denied")
+
+    monkeypatch.setattr(os, "replace", refuse)
+    status, out, err = run("robot.urdf", "out.kv.json")
+    assert (status, out, len(err.splitlines())) == (2, "", 1)
+    assert "Permission denied" in err
+    assert os.listdir(tmp_path) == ["robot.urdf"]
