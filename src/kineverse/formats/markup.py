@@ -187,8 +187,9 @@ def quote(text: str) -> str:
 
 def abbreviate(text: str, limit: int = 80) -> str:
     """Return text for a message: on one line, printable and bounded."""
-    shown = text if len(text) <= limit else text[: limit - 1] + "…"
-    return shown if shown.isprintable() else shown.encode("unicode_escape").decode("ascii")
+    if not text[:limit].isprintable():
+        text = text[:limit].encode("unicode_escape").decode("ascii")  # ten times as long, perhaps
+    return text if len(text) <= limit else text[: limit - 1] + "…"
 
 
 _CODES = expat.errors.codes
