@@ -161,18 +161,6 @@ def test_violations_are_about_the_crank(model, rocks):
     assert "rocker/velocity" in model.violations({"crank": 0.5}).unchecked
 
 
-def test_violations_where_it_does_not_close():
-    """No answer about what there is not would be a wrong one."""
-    bars = four_bar(0.9, 0.6, 0.6, 1.0, within={"crank": (0.3, 1.2)}, home={"crank": 1.0})
-    with bars.edit() as edit:
-        edit.constrain("rocker/range", -4, rocker, 4)
-    assert not list(bars.violations({"crank": 1.0}))
-    try:
-        assert list(bars.violations({"crank": 1.5}))
-    except kv.UnsolvedError as error:
-        assert "four-bar" in str(error)  # noqa: PT017 - both are an answer
-
-
 def test_velocity_rows_keep_the_rocker_in_its_limits(model, rocks):
     rows = model.velocity_rows(0.01, [crank])
     assert rows.speeds == (crank.derivative(),)
@@ -265,3 +253,54 @@ def test_lengths_may_be_parameters():
     np.testing.assert_array_equal(tip({"crank": 0.5}), tip({"crank": 0.5, "rod": 1.1}))
     with pytest.raises(kv.UnsolvedError, match=r"'four-bar' has no solution at crank = 3, rod = 0\.2"):
         tip({"crank": 3.0, "rod": 0.2})
+
+
+# -- where it does not close -------------------------------------------------------------------------------
+
+
+def double_rocker(**constraints):
+    """Return a linkage whose crank cannot go round, and which may be asked about any angle of it."""
+    model = four_bar(
+        1.0, 1.0, 0.6, 1.3, home={"crank": 1.2, "coupler": -1, "rocker": 1.5}, within={"crank": (0.6, 1.2)}
+    )
+    with model.edit() as edit:
+        for name, triple in constraints.items():
+            edit.constrain(name, *triple)
+    return model
+
+
+def test_a_configuration_in_which_a_loop_does_not_close_is_not_valid():
+    """Even if no constraint is about what follows."""
+    model = double_rocker()
+    assert not model.violations({"crank": 1.0})
+    (broken,) = model.violations({"crank": 3.0})
+    assert broken.name == "four-bar"
+    assert np.isnan(broken.value)
+    assert np.isnan(broken.excess)
+    assert (
+        str(model.violations({"crank": 3.0}))
+        == "1 violated\n  four-bar: -inf <= nan <= inf has no value here"
+    )
+
+
+def test_a_bound_without_a_value_holds_nothing():
+    crank, rocker = kv.position("crank"), kv.position("rocker")
+    model = double_rocker(
+        above=(-9, crank, kv.maximum(rocker, 9)),
+        chosen=(kv.where(rocker > 9, 0, -9), crank, 9),
+        table=(-9, crank, kv.limit_table(rocker, {0: 9, 1: 10})),
+        other=(0, crank, 2.5),
+    )
+    assert not model.violations({crank: 1.0})
+    found = model.violations({crank: 3.0})
+    assert [v.name for v in found] == ["above", "chosen", "four-bar", "table", "other"]
+    assert found[-1].excess == 0.5
+
+
+def test_limits_of_what_follows_by_name():
+    model = limited_four_bar()
+    assert model.limits("rocker") == (1.0, 2.0)
+    assert model.limits("rocker:velocity") == (-0.5, 0.5)
+    assert model.symbol("coupler") == kv.position("coupler")
+    with pytest.raises(kv.UnknownNameError, match="Did you mean 'rocker'"):
+        model.limits("rokcer")

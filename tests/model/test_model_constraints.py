@@ -262,6 +262,13 @@ def test_a_value_that_is_none_is_a_violation() -> None:
     assert [v.name for v in model.violations({"a": -1})] == ["root"]
 
 
+def test_where_nothing_moves_nothing_has_to_be_given() -> None:
+    model = kv.Model()
+    with model.edit() as edit:
+        edit.add_frame("post", "world", kv.translation(1, 0, 0))
+    assert not model.violations({})
+
+
 def test_violations_follow_edits_and_rates() -> None:
     model = constrained(a=(0, a, 1))
     assert len(model.violations({"a": 2})) == 1

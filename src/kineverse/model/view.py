@@ -448,7 +448,7 @@ class ModelView:
         return float(bound(known))
 
     def symbol(self, name: str) -> Symbol:
-        """Return the symbol of a text name, if the model knows its coordinate.
+        """Return the symbol of a text name, if the model knows its coordinate, be it free or dependent.
 
         Raises
         ------
@@ -456,14 +456,15 @@ class ModelView:
             With similar names.
         """
         path, order = parse_symbol_name(name)
-        for known in self.symbols:
+        coordinates = (*self.symbols, *self.rates.dependent)
+        for known in coordinates:
             if known.path == path:
                 return known if order == 0 else Symbol(path, order, known.role)
         for speed in self.speeds:
             if speed.path == path and order >= 1:
                 return Symbol(path, order, speed.role)
         raise UnknownNameError(
-            f"There is no symbol {name!r}. {suggest(name, map(str, self.symbols), 'symbol')}"
+            f"There is no symbol {name!r}. {suggest(name, map(str, coordinates), 'symbol')}"
         )
 
     def default_state(self) -> State:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Mapping
 from typing import Any, NamedTuple
 
@@ -10,6 +11,8 @@ import numpy as np
 
 from kineverse.errors import ExpressionError, NameTakenError, UnknownNameError, suggest
 from kineverse.expressions.evaluation import assign
+from kineverse.expressions.expression import Expression, as_expression
+from kineverse.expressions.implicit import implicit_nodes
 from kineverse.expressions.lowering import lower
 from kineverse.state import State
 from kineverse.symbols import Symbol
@@ -33,28 +36,45 @@ class Violations(tuple[Violation, ...]):
     unchecked: tuple[str, ...]
 
     def __new__(cls, broken: Iterable[Violation], unchecked: Iterable[str] = ()) -> Violations:
-        """Sort the violations by excess."""
-        self = super().__new__(cls, sorted(broken, key=lambda v: (-v.excess, v.name)))
+        """Sort the violations by excess, what has no value first."""
+        order = [(-math.inf if math.isnan(v.excess) else -v.excess, v.name, v) for v in broken]
+        self = super().__new__(cls, (v for _, _, v in sorted(order, key=lambda item: item[:2])))
         self.unchecked = tuple(unchecked)
         return self
 
     def __repr__(self) -> str:
         lines = [
-            f"  {v.name}: {v.lower:g} <= {v.value:g} <= {v.upper:g} is off by {v.excess:g}" for v in self
+            f"  {v.name}: {v.lower:g} <= {v.value:g} <= {v.upper:g} "
+            + ("has no value here" if math.isnan(v.excess) else f"is off by {v.excess:g}")
+            for v in self
         ]
         return f"{len(self)} violated\n" + "\n".join(lines) if lines else "none violated"
 
 
 class Checks:
-    """All constraints of a model in one function over all of their symbols."""
+    """All constraints of a model in one function over all of their symbols.
 
-    def __init__(self, constraints: Mapping[str, Constraint]) -> None:
-        self.names = list(constraints)
+    Parameters
+    ----------
+    constraints
+        By name.
+    dependent
+        What coordinates are that depend on others. A loop among them that does not close is a broken
+        constraint of its name, without a value.
+    """
+
+    def __init__(self, constraints: Mapping[str, Constraint], dependent: Iterable[Expression] = ()) -> None:
+        loops = implicit_nodes(tuple(dependent))
+        self.names = [*constraints, *(loop.label for loop in loops)]
         self.needs = [c.symbols for c in constraints.values()]
+        self.needs += [tuple({s for a in loop.arguments for s in a.symbols}) for loop in loops]
         self.symbols: tuple[Symbol, ...] = tuple(
             sorted({s for need in self.needs for s in need}, key=lambda s: s.sort_key)
         )
         parts = [e for c in constraints.values() for e in (c.lower, c.expression, c.upper)]
+        for loop in loops:
+            # All of a solution is NaN where there is none, and that is all that is asked of it.
+            parts += [as_expression(-math.inf), loop.value[0], as_expression(math.inf)]
         stacked = ca.vertcat(*lower(parts)) if parts else ca.SX(0, 1)
         inputs = ca.vertcat(*(s._sx for s in self.symbols)) if self.symbols else ca.SX(0, 1)
         self._function = ca.Function("constraints", [inputs], [stacked])
@@ -93,8 +113,8 @@ def find_violations(
     broken = []
     for i in checked:
         low, value, high = (float(v) for v in rows[i])
-        excess = max(low - value, value - high)
-        # NaN is no valid value either: it compares false with everything.
+        # NaN is no valid value, and no bound either: it compares false with everything.
+        excess = max(low - value, value - high) if not np.isnan(rows[i]).any() else math.nan
         if not excess <= tolerance:
             broken.append(Violation(checks.names[i], value, low, high, excess))
     return Violations(broken, unchecked)
@@ -125,6 +145,6 @@ def _checked(values: Mapping[Any, float], known: Iterable[Symbol]) -> State:
         if symbol in result:
             raise NameTakenError(f"There are two values for '{symbol}', by symbol and by name.")
         result[symbol] = value
-    if not result:
+    if not result and by_name:
         raise UnknownNameError("No values given; model.default_state() has one for everything.")
     return State(result)
