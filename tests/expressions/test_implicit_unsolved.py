@@ -282,3 +282,25 @@ def test_a_branch_that_is_not_taken_is_not_asked(tier):
     assert function([1.5])[0] == 7.0
     assert function([0.6])[0] == pytest.approx(0.8)
     assert function.batch([[1.5], [0.6]])[0] == pytest.approx([7.0, 0.8])
+
+
+# -- what is chosen by it ----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("tier", TIERS)
+def test_nothing_is_chosen_by_what_has_no_solution(tier):
+    """NaN compares false with everything, so a choice by it looked like the second branch."""
+    chosen = f.where(height > 0.5, 2 * a, 3 * a)
+    parts = [chosen, chosen.jacobian([a]), f.where(height > 0.5, array([a, b]), 0.0)]
+    function = compiled(parts, [a, b], tier)
+    for at, factor in ((0.1, 2.0), (0.95, 3.0)):
+        value, slope, both = function([at, 7.0])
+        assert (value, slope[0]) == (factor * at, factor)
+        np.testing.assert_array_equal(both, [at, 7.0] if factor == 2 else [0.0, 0.0])
+    for part in parts:
+        with pytest.raises(kv.UnsolvedError, match=WHERE):
+            compiled(part, [a, b], tier)([1.5, 0.0])
+    many = compiled(chosen, [a], tier)
+    np.testing.assert_allclose(many.batch(np.array([[0.1], [0.95]])), [0.2, 2.85])
+    with pytest.raises(kv.UnsolvedError, match=WHERE):
+        many.batch(np.array([[0.1], [1.5]]))

@@ -317,12 +317,22 @@ class Select(Node):
         return binary(ca.OP_LE, 0.5, self.arguments[0])
 
     def _value(self) -> Expression:
-        return _selected(self._holds, self.arguments[1], self.arguments[2])
+        return self._chosen(self.arguments[1], self.arguments[2])
 
     def _gradient(self, heuristic: bool) -> Mapping[Symbol, Expression]:
         a, b = (argument.gradient(heuristic) for argument in self.arguments[1:])
-        zero, holds = as_expression(np.zeros(self.shape)), self._holds
-        return {key: _selected(holds, a.get(key, zero), b.get(key, zero)) for key in {**a, **b}}
+        zero = as_expression(np.zeros(self.shape))
+        return {key: self._chosen(a.get(key, zero), b.get(key, zero)) for key in {**a, **b}}
+
+    def _chosen(self, if_true: Expression, if_false: Expression) -> Expression:
+        from .implicit import implicit_nodes
+
+        if implicit_nodes(self.arguments[:1]):
+            # A loop that does not close here is NaN. Nothing is chosen then, and evaluation says why.
+            fails = binary(ca.OP_LT, self.arguments[0], 0.5)
+            neither = make(ca.SX.nan(*if_false._sx.shape), if_false.shape, frozenset())
+            if_false = _selected(fails, if_false, neither)
+        return _selected(self._holds, if_true, if_false)
 
     def differentiated(self, heuristic: bool) -> tuple[Expression, ...]:
         """Return the branches; the condition selects and has no part in the gradient."""
