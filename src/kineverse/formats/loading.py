@@ -20,6 +20,7 @@ from kineverse.symbols import position
 
 from .document import operations_from
 from .files import read_file
+from .markup import root_tag
 from .remarks import listening, tell
 from .sources import Source, locate_model
 from .urdf.operations import robot_operations
@@ -39,8 +40,8 @@ def load(source: str | os.PathLike[str], prefix: str | None = None) -> Model:
     Parameters
     ----------
     source
-        The path of a ``.urdf``, ``.sdf`` or ``.kv.json`` file, or a name such as ``kitchen``, ``pr2`` or
-        ``articulations/screw``, see :func:`kineverse.formats.sources.locate_model`.
+        The path of a ``.urdf``, ``.sdf``, ``.xml`` (MJCF, or URDF) or ``.kv.json`` file, or a name such as
+        ``kitchen``, ``pr2`` or ``articulations/screw``, see :func:`kineverse.formats.sources.locate_model`.
     prefix
         Put in front of the names of all frames and degrees of freedom, with a slash. A model that ships has
         its own name as prefix unless another is given (``screw`` for ``articulations/screw``); ``""`` means
@@ -56,8 +57,7 @@ def load(source: str | os.PathLike[str], prefix: str | None = None) -> Model:
     _check_prefix(prefix)
     found = locate_model(source)
     content = _content(found)
-    # What a file includes may change while it does not.
-    remembered = b"include" not in content.replace(b"\0", b"") if _is_sdf(found.path.name) else True
+    remembered = _stands_alone(found, content)
     key = found, prefix, hashlib.blake2b(content).digest()
     known = _REMEMBERED.pop(key, None)
     if known is None:
@@ -82,10 +82,11 @@ def _apply(edit: Edit, tag: str, operation: Operation, path: Path) -> None:
     try:
         edit.apply(operation, tag)
     except KineverseError as error:
-        if isinstance(operation, CloseLoop) and _is_sdf(path.name):
+        what = "joint" if _is_sdf(path.name) else "equality" if path.name.endswith((".xml", ".mjcf")) else ""
+        if isinstance(operation, CloseLoop) and what:
             raise FormatError(
-                f"{path.name}: the joint '{operation.name.removesuffix('/loop')}' closes a loop, which "
-                f"cannot be followed here: {error} Remove the joint, and close the loop with kv.CloseLoop."
+                f"{path.name}: the {what} '{operation.name.removesuffix('/loop')}' closes a loop, which "
+                f"cannot be followed here: {error} Remove the {what}, and close the loop with kv.CloseLoop."
             ) from error
         raise
 
@@ -129,6 +130,13 @@ def _operations(source: Source, content: bytes, prefix: str | None) -> Iterator[
             yield operation.default_tag(), operation
     elif name.endswith(".kv.json"):
         yield from operations_from(content, str(path), prefix)
+    elif _is_mjcf(name, content):
+        from .mjcf.operations import scene_operations as mjcf_operations
+        from .mjcf.reader import parse_mjcf
+
+        description = parse_mjcf(content, source=name, folder=str(path.absolute().parent))
+        for operation in mjcf_operations(description, prefix):
+            yield operation.default_tag(), operation
     elif name.endswith((".urdf", ".xml")):
         robot = parse_urdf(content, source=name, folder=str(path.absolute().parent))
         base = base_of(source.shipped, prefix) if source.shipped else None
@@ -146,10 +154,22 @@ def _operations(source: Source, content: bytes, prefix: str | None) -> Iterator[
             yield operation.default_tag(), operation
     else:
         raise FormatError(
-            f"{path}: this version reads URDF (.urdf, .xml), SDF (.sdf, .world) and documents (.kv.json), "
-            f"not '{''.join(path.suffixes) or name}'."
+            f"{path}: this version reads URDF (.urdf, .xml), SDF (.sdf, .world), MJCF (.xml, .mjcf) and "
+            f"documents (.kv.json), not '{''.join(path.suffixes) or name}'."
         )
 
 
 def _is_sdf(name: str) -> bool:
     return name.endswith((".sdf", ".world"))
+
+
+def _is_mjcf(name: str, content: bytes) -> bool:
+    return name.endswith(".mjcf") or (name.endswith(".xml") and root_tag(content).startswith("mujoco"))
+
+
+def _stands_alone(source: Source, content: bytes) -> bool:
+    """Return whether a model follows from its file alone: what a file names may change while it does not."""
+    plain = content.replace(b"\0", b"")  # in two bytes a letter, too
+    if _is_sdf(source.path.name):
+        return b"include" not in plain
+    return b"file" not in plain or not _is_mjcf(source.path.name, content)

@@ -22,6 +22,8 @@ MAX_DEPTH = 200
 Element: TypeAlias = "tuple[str, dict[str, str], list[Element], int]"
 """Tag, attributes, children, line."""
 
+_PIECE = 1 << 12
+
 TEXT = ""
 """The attribute that has the text of an element without children: no attribute of XML has an empty name."""
 
@@ -44,6 +46,7 @@ def parse(
     skipped: frozenset[str] = frozenset(),
     begin: Begin | None = None,
     texts: bool = False,
+    depth: int = MAX_DEPTH,
 ) -> Element:
     """Parse a document and return its root element.
 
@@ -61,12 +64,14 @@ def parse(
         its longest part.
     texts
         Whether to keep the text of elements that have any, as their attribute ``TEXT``.
+    depth
+        The deepest nesting of elements.
 
     Raises
     ------
     FormatError
         If the text is not well-formed XML, declares a document type or entities, nests deeper than
-        ``MAX_DEPTH`` or is larger than ``MAX_BYTES``.
+        ``depth`` or is larger than ``MAX_BYTES``.
     """
     if len(data) > MAX_BYTES:
         raise FormatError(f"{source}: larger than {MAX_BYTES} bytes, the most that is read of one document.")
@@ -94,7 +99,7 @@ def parse(
         open_lists[-1].append((tag, attributes, children, parser.CurrentLineNumber))
         open_lists.append(children)
         pieces.clear()
-        if len(open_lists) > MAX_DEPTH:
+        if len(open_lists) > depth:
             refuse_depth(tag)
 
     def end(tag: str) -> None:
@@ -114,7 +119,7 @@ def parse(
     def start_skipped(tag: str, attributes: dict[str, str]) -> None:
         nonlocal skipped_depth
         skipped_depth += 1
-        if skipped_depth > MAX_DEPTH:
+        if skipped_depth > depth:
             refuse_depth(tag)
 
     def end_skipped(tag: str) -> None:
@@ -128,7 +133,7 @@ def parse(
     def refuse_depth(tag: str) -> NoReturn:
         raise FormatError(
             f"{source}, line {parser.CurrentLineNumber}, <{abbreviate(tag)}>: elements are nested more than "
-            f"{MAX_DEPTH} deep; no robot description needs that."
+            f"{depth} deep; no robot description needs that."
         )
 
     def refuse_doctype(name: str, *_: object) -> None:
@@ -153,6 +158,27 @@ def parse(
         # An encoding that expat cannot have, or a str with lone surrogates.
         raise FormatError(f"{source}, line 1: cannot be decoded: {error}. Save it as UTF-8.") from None
     return document[0]
+
+
+def root_tag(data: bytes) -> str:
+    """Return the tag of the root element; empty where no element is found."""
+    parser = expat.ParserCreate()
+    found: list[str] = []
+
+    def start(tag: str, _: dict[str, str]) -> None:
+        found.append(tag)
+        parser.StartElementHandler = None
+
+    parser.StartElementHandler = start
+    parser.StartDoctypeDeclHandler = lambda *_: found.append("")
+    try:
+        for begin in range(0, len(data), _PIECE):
+            parser.Parse(data[begin : begin + _PIECE])
+            if found:
+                break
+    except (expat.ExpatError, ValueError, LookupError):
+        pass  # whoever reads all of it says what is wrong
+    return found[0] if found else ""
 
 
 def name_of(element: Element) -> str:

@@ -1,0 +1,46 @@
+"""Actuators: how strong the joints are that they drive."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+from .engine import mujoco
+
+
+def efforts(spec: Any) -> dict[str, float]:
+    """Return the largest force [N] or torque [N m] of actuators on each joint, by its name.
+
+    A joint with an actuator of unknown strength is not in there: controllers decide that.
+    """
+    engine = mujoco()
+    direct = (engine.mjtTrn.mjTRN_JOINT, engine.mjtTrn.mjTRN_JOINTINPARENT)
+    found: dict[str, float] = {}
+    for actuator in spec.actuators:
+        if actuator.trntype in direct:
+            strength = _strength(actuator) * abs(float(actuator.gear[0]))
+            found[actuator.target] = found.get(actuator.target, 0.0) + strength
+    return {name: effort for name, effort in found.items() if math.isfinite(effort)}
+
+
+def _strength(actuator: Any) -> float:
+    engine = mujoco()
+    if _limited(actuator.forcelimited, actuator.forcerange):
+        return _largest(actuator.forcerange)
+    motor = (
+        actuator.gaintype == engine.mjtGain.mjGAIN_FIXED
+        and actuator.biastype == engine.mjtBias.mjBIAS_NONE
+        and actuator.dyntype == engine.mjtDyn.mjDYN_NONE
+    )
+    if motor and _limited(actuator.ctrllimited, actuator.ctrlrange):
+        return abs(float(actuator.gainprm[0])) * _largest(actuator.ctrlrange)
+    return math.inf
+
+
+def _limited(flag: Any, limits: Any) -> bool:
+    kinds = mujoco().mjtLimited
+    return bool(flag == kinds.mjLIMITED_TRUE or (flag == kinds.mjLIMITED_AUTO and limits[0] < limits[1]))
+
+
+def _largest(limits: Any) -> float:
+    return max(abs(float(limits[0])), abs(float(limits[1])))

@@ -1,0 +1,226 @@
+"""Equalities and tendons as MuJoCo compiled them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from typing import Any, Literal
+
+import numpy as np
+
+from kineverse.errors import FormatError
+from kineverse.formats.poses import IDENTITY, inverse, product
+from kineverse.model.body import Pose
+
+from .bodies import Bodies
+from .description import Closure, Coupling, Dynamics, Quartic, Tendon
+from .engine import mujoco
+from .naming import Names
+from .preparing import Prepared
+from .shapes import pose_at
+from .tree import Node
+
+_CLOSED = 1e-6
+"""How far apart ends that are rigidly connected may be [m], [rad]: files have six digits."""
+
+_UNTURNED = (1.0, 0.0, 0.0, 0.0)
+
+
+class Constraints:
+    """What couples joints, closes loops and ties lengths."""
+
+    def __init__(
+        self,
+        spec: Any,
+        model: Any,
+        prepared: Prepared,
+        bodies: Bodies,
+        note: Callable[[Node | None, str], None],
+    ) -> None:
+        self._model, self._bodies, self._note = model, bodies, note
+        self._nodes = {thing.id: prepared.node(thing.info) for thing in spec.equalities}
+        self._tendon_nodes = {tendon.id: prepared.node(tendon.info) for tendon in spec.tendons}
+        self._rest = _at_rest(model)
+        names = Names()
+        self._tendon_names = self._named(names, "tendon", model.ntendon, self._tendon_nodes)
+        self._names = self._named(Names(), "equality", model.neq, self._nodes)
+        found = [self._tendon(number) for number in range(model.ntendon)]
+        self.tendons = tuple(tendon for tendon in found if tendon is not None)
+        self._known = {tendon.name for tendon in self.tendons}
+        couplings: list[Coupling] = []
+        tendon_couplings: list[Coupling] = []
+        closures: list[Closure] = []
+        kinds = mujoco().mjtEq
+        for number in range(model.neq):
+            kind = model.eq_type[number]
+            if not model.eq_active0[number]:
+                note(self._nodes.get(number), "is left out: it is not active.")
+            elif kind == kinds.mjEQ_JOINT:
+                couplings.append(self._joint_coupling(number))
+            elif kind == kinds.mjEQ_TENDON:
+                tendon_couplings += self._tendon_coupling(number)
+            elif kind == kinds.mjEQ_CONNECT:
+                closures += self._closure(number, "connect")
+            elif kind == kinds.mjEQ_WELD:
+                closures += self._closure(number, "weld")
+            else:
+                note(self._nodes.get(number), "is left out: no constraint here says it.")
+        self.couplings, self.closures = tuple(couplings), tuple(closures)
+        self.tendon_couplings = tuple(tendon_couplings)
+
+    def _named(self, names: Names, kind: str, count: int, nodes: dict[int, Node | None]) -> list[str]:
+        """Return the names of equalities or tendons; those that have none are numbered by their element."""
+        result = [""] * count
+        own = [getattr(self._model, kind if kind == "tendon" else "equality")(k).name for k in range(count)]
+        for number in range(count):
+            if own[number]:
+                result[number] = names.take(own[number], self._where(nodes.get(number)))
+        numbers: dict[str, int] = {}
+        for number in range(count):
+            if not own[number]:
+                node = nodes.get(number)
+                tag = kind if node is None else node.tag
+                numbers[tag] = numbers.get(tag, -1) + 1
+                result[number] = names.invent(f"{tag}{numbers[tag]}", self._where(node))
+        return result
+
+    def _where(self, node: Node | None) -> str:
+        return "" if node is None else node.where
+
+    # -- couplings -------------------------------------------------------------------------------------------
+
+    def _joint_coupling(self, number: int) -> Coupling:
+        m = self._model
+        follower, leader = int(m.eq_obj1id[number]), int(m.eq_obj2id[number])
+        rest = [float(m.qpos0[m.jnt_qposadr[joint]]) if joint >= 0 else 0.0 for joint in (follower, leader)]
+        names = self._bodies.joint_names
+        return Coupling(
+            self._names[number],
+            names[follower],
+            names[leader] if leader >= 0 else None,
+            self._quartic(number),
+            rest[0],
+            rest[1],
+            self._where(self._nodes.get(number)),
+        )
+
+    def _tendon_coupling(self, number: int) -> Iterator[Coupling]:
+        m = self._model
+        follower, leader = int(m.eq_obj1id[number]), int(m.eq_obj2id[number])
+        names = self._tendon_names
+        ends = [names[tendon] for tendon in (follower, leader) if tendon >= 0]
+        if any(name not in self._known for name in ends):
+            self._note(self._nodes.get(number), "is left out, as its tendon is.")
+            return
+        rest = [float(m.tendon_length0[tendon]) if tendon >= 0 else 0.0 for tendon in (follower, leader)]
+        yield Coupling(
+            self._names[number],
+            ends[0],
+            ends[1] if leader >= 0 else None,
+            self._quartic(number),
+            rest[0],
+            rest[1],
+            self._where(self._nodes.get(number)),
+        )
+
+    def _quartic(self, number: int) -> Quartic:
+        a, b, c, d, e = self._model.eq_data[number][:5].tolist()
+        return a, b, c, d, e
+
+    # -- closures --------------------------------------------------------------------------------------------
+
+    def _closure(self, number: int, kind: Literal["connect", "weld"]) -> Iterator[Closure]:
+        m = self._model
+        node, data = self._nodes.get(number), m.eq_data[number]
+        ends = [int(m.eq_obj1id[number]), int(m.eq_obj2id[number])]
+        if m.eq_objtype[number] == mujoco().mjtObj.mjOBJ_SITE:
+            bodies = [int(m.site_bodyid[site]) for site in ends]
+            names = [self._bodies.site_names[site] for site in ends]
+            poses = [pose_at(m.site_pos[site], m.site_quat[site]) for site in ends]
+            inside = [IDENTITY, IDENTITY]
+        else:
+            bodies, names = ends, [self._bodies.body_names[body] for body in ends]
+            if kind == "connect":
+                poses = [pose_at(data[:3], _UNTURNED), pose_at(data[3:6], _UNTURNED)]
+            else:
+                poses = [pose_at(data[3:6], data[6:10]), pose_at(data[:3], _UNTURNED)]
+            inside = poses
+        if any(m.body_mocapid[body] >= 0 for body in bodies):
+            self._note(node, "is left out: it ties to a mocap body, by which a user drags another.")
+            return
+        where = self._where(node)
+        if m.body_weldid[bodies[0]] == m.body_weldid[bodies[1]]:
+            first, second = (product(self._rest[b], pose) for b, pose in zip(bodies, poses, strict=True))
+            gap = _gap(first, second, kind)
+            if gap > _CLOSED:
+                raise FormatError(
+                    f"{where}: it ties bodies that are rigidly connected, and {gap:.3g} is left between its "
+                    "ends. Remove it, or move one of them."
+                )
+            self._note(node, "is left out: it ties bodies that are rigidly connected anyway.")
+            return
+        yield Closure(self._names[number], kind, names[0], names[1], inside[0], inside[1], where)
+
+    # -- tendons ---------------------------------------------------------------------------------------------
+
+    def _tendon(self, number: int) -> Tendon | None:
+        m, kinds = self._model, mujoco().mjtWrap
+        node = self._tendon_nodes.get(number)
+        first = int(m.tendon_adr[number])
+        steps = range(first, first + int(m.tendon_num[number]))
+        terms: list[tuple[str, float]] = []
+        paths: list[tuple[float, list[str]]] = [(1.0, [])]
+        for step in steps:
+            kind, thing, number_of = m.wrap_type[step], int(m.wrap_objid[step]), float(m.wrap_prm[step])
+            if kind == kinds.mjWRAP_JOINT:
+                terms.append((self._bodies.joint_names[thing], number_of))
+            elif kind == kinds.mjWRAP_SITE:
+                paths[-1][1].append(self._bodies.site_names[thing])
+            elif kind == kinds.mjWRAP_PULLEY:
+                paths.append((number_of, []))
+            else:
+                self._note(node, "is left out: it wraps round a geom.")
+                return None
+        lower = upper = None
+        if m.tendon_limited[number]:
+            lower, upper = m.tendon_range[number].tolist()
+        return Tendon(
+            self._tendon_names[number],
+            tuple(terms),
+            tuple((divisor, tuple(sites)) for divisor, sites in paths if len(sites) > 1),
+            lower,
+            upper,
+            self._tendon_dynamics(number),
+            self._where(node),
+        )
+
+    def _tendon_dynamics(self, number: int) -> Dynamics:
+        m = self._model
+        stiffness = float(m.tendon_stiffness[number])
+        shortest, longest = m.tendon_lengthspring[number].tolist()
+        values = {
+            "damping": float(m.tendon_damping[number]),
+            "friction": float(m.tendon_frictionloss[number]),
+            "armature": float(m.tendon_armature[number]),
+            "spring_stiffness": stiffness,
+            "spring_lower": shortest if stiffness else 0.0,
+            "spring_upper": longest if stiffness else 0.0,
+        }
+        return tuple((key, value) for key, value in values.items() if value)
+
+
+def _at_rest(model: Any) -> list[Pose]:
+    """Return where all bodies are in the world while no joint has moved."""
+    poses = [IDENTITY]
+    for body in range(1, model.nbody):
+        above = poses[int(model.body_parentid[body])]
+        poses.append(product(above, pose_at(model.body_pos[body], model.body_quat[body])))
+    return poses
+
+
+def _gap(first: Pose, second: Pose, kind: str) -> float:
+    """Return what is left between two ends [m], and for welds between their axes [rad]."""
+    between = product(inverse(first), second).matrix
+    gap = float(np.linalg.norm(between[:3, 3]))
+    if kind == "weld":
+        gap = max(gap, float(np.linalg.norm(between[:3, :3] - np.eye(3))))
+    return gap

@@ -1,0 +1,140 @@
+"""What an MJCF describes as MuJoCo compiled it, before anything symbolic is made of it.
+
+Units are [m], [rad], [kg], [s]. Everything has a name, and names of frames are unique. ``where`` is the place
+in the file, for messages. A description is plain immutable data.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal, TypeAlias
+
+from kineverse.formats.poses import IDENTITY
+from kineverse.model.body import Body, Pose, Vector3
+
+Kind: TypeAlias = Literal["hinge", "slide", "ball", "free"]
+Dynamics: TypeAlias = tuple[tuple[str, float], ...]
+Quartic: TypeAlias = tuple[float, float, float, float, float]
+
+_NOTHING = Body()
+
+WORLD = "world"
+"""What the body at the root is called."""
+
+SUFFIXES: dict[Kind, tuple[str, ...]] = {
+    "hinge": (),
+    "slide": (),
+    "ball": ("qx", "qy", "qz", "qw"),
+    "free": ("x", "y", "z", "qx", "qy", "qz", "qw"),
+}
+"""What the names of coordinates have behind the name of a joint, in the order of its home."""
+
+
+@dataclass(frozen=True, slots=True)
+class Joint:
+    """A joint of a body; several of them move a body one after the other.
+
+    ``anchor`` is the point about which it turns and ``axis`` a unit vector, both in the frame of the body.
+    While its coordinate is ``reference`` [rad] or [m], it has moved nothing. ``lower`` and ``upper`` bound
+    the coordinate, or ``upper`` the angle of a ball [rad]; None is no bound. ``frame`` is what the frame that
+    it moves is called if that is not the body's. ``home`` are the values of its coordinates at home.
+    ``dynamics`` are effort [N] or [N m], damping, friction, spring_stiffness, spring_reference and armature,
+    as far as they are not zero.
+    """
+
+    name: str
+    kind: Kind
+    frame: str
+    axis: Vector3 = (0.0, 0.0, 1.0)
+    anchor: Vector3 = (0.0, 0.0, 0.0)
+    reference: float = 0.0
+    lower: float | None = None
+    upper: float | None = None
+    home: tuple[float, ...] = ()
+    dynamics: Dynamics = ()
+    where: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Link:
+    """A body: where it is in its parent while its joints are at rest, and what moves it."""
+
+    name: str
+    parent: str
+    pose: Pose = IDENTITY
+    joints: tuple[Joint, ...] = ()
+    body: Body = _NOTHING
+    where: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Site:
+    """A frame that moves with a body."""
+
+    name: str
+    parent: str
+    pose: Pose = IDENTITY
+    where: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Coupling:
+    """One joint or tendon as a polynomial of another: y - y0 = Σ aₖ (x - x0)ᵏ, with y = a0 where none leads.
+
+    ``rest`` is y0 and ``leader_rest`` x0.
+    """
+
+    name: str
+    follower: str
+    leader: str | None
+    coefficients: Quartic
+    rest: float = 0.0
+    leader_rest: float = 0.0
+    where: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Closure:
+    """Two points (``connect``) or two poses (``weld``) that coincide, each in the frame of a link or site."""
+
+    name: str
+    kind: Literal["connect", "weld"]
+    first: str
+    second: str
+    in_first: Pose = IDENTITY
+    in_second: Pose = IDENTITY
+    where: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Tendon:
+    """A length [m]: a sum of joint positions, each with its factor; or that of a line through sites.
+
+    ``terms`` are joints and factors, ``paths`` divisors of pulleys and the sites of the branch behind.
+    """
+
+    name: str
+    terms: tuple[tuple[str, float], ...] = ()
+    paths: tuple[tuple[float, tuple[str, ...]], ...] = ()
+    lower: float | None = None
+    upper: float | None = None
+    dynamics: Dynamics = ()
+    where: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Scene:
+    """All of a file.
+
+    ``links`` begin with the world, and each comes after its parent. ``remarks`` say what was left out or read
+    in a way its author may not have meant; each names its line.
+    """
+
+    links: tuple[Link, ...] = ()
+    sites: tuple[Site, ...] = ()
+    couplings: tuple[Coupling, ...] = ()
+    closures: tuple[Closure, ...] = ()
+    tendons: tuple[Tendon, ...] = ()
+    tendon_couplings: tuple[Coupling, ...] = ()
+    source: str = ""
+    remarks: tuple[str, ...] = ()

@@ -1,0 +1,99 @@
+"""Which joint follows which, out of equalities between two of them.
+
+An equality says y - y0 = Σ aₖ (x - x0)ᵏ. In the order of the file, y follows x, unless it follows already or
+x follows y: then the equality stays as what it is, a constraint.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator
+
+from kineverse.errors import FormatError
+from kineverse.expressions.expression import Expression, as_expression
+from kineverse.formats.groups import Groups
+from kineverse.model.constraint import Constraint
+from kineverse.model.edit import Constrain
+from kineverse.symbols import position
+
+from .description import Coupling, Quartic
+
+_FIXED = "\0"
+"""Stands for what leads a joint that an equality holds where it is: no name has it."""
+
+
+class Followers:
+    """The joints that follow others.
+
+    Attributes
+    ----------
+    leaders
+        What each of them follows directly; None where it stands still.
+    left_over
+        The equalities that made none follow.
+    """
+
+    def __init__(self, couplings: Iterable[Coupling], named: Callable[[str], str]) -> None:
+        self._named = named
+        self._by_follower: dict[str, Coupling] = {}
+        self.left_over: list[Coupling] = []
+        groups = Groups()
+        for coupling in couplings:
+            follower = coupling.follower
+            if follower not in self._by_follower and groups.unite(coupling.leader or _FIXED, follower):
+                self._by_follower[follower] = coupling
+            else:
+                self.left_over.append(coupling)
+        self._expressions: dict[str, Expression] = {}
+        self.leaders = {name: coupling.leader for name, coupling in self._by_follower.items()}
+
+    def __contains__(self, joint: str) -> bool:
+        return joint in self._by_follower
+
+    def position(self, joint: str) -> Expression:
+        """Return the position of a joint: its coordinate, or what it is in terms of those that lead."""
+        chain: list[Coupling] = []
+        ahead: str | None = joint
+        while ahead is not None and ahead in self._by_follower and ahead not in self._expressions:
+            chain.append(self._by_follower[ahead])
+            ahead = chain[-1].leader
+        if ahead is None:
+            end = as_expression(0.0)  # of the polynomial only a0 is left
+        else:
+            end = self._expressions.get(ahead, position(self._named(ahead)))
+        for coupling in reversed(chain):
+            end = self._expressions[coupling.follower] = coupling.rest + polynomial(
+                coupling.coefficients, end - coupling.leader_rest
+            )
+        return end
+
+    def constraints(self) -> Iterator[Constrain]:
+        """Yield the equalities that are left over.
+
+        Raises
+        ------
+        FormatError
+            If one says of joints that stand still that they are elsewhere.
+        """
+        for coupling in self.left_over:
+            leader = as_expression(0.0) if coupling.leader is None else self.position(coupling.leader)
+            along = polynomial(coupling.coefficients, leader - coupling.leader_rest)
+            residual = self.position(coupling.follower) - coupling.rest - along
+            if residual.symbols:
+                name = self._named(coupling.name)
+                yield Constrain(name, Constraint.of(0.0, residual, 0.0))
+            elif abs(float(residual)) > 1e-9:
+                raise FormatError(
+                    f"{coupling.where}: it holds its joint {abs(float(residual)):.6g} away from where another "
+                    "equality does. Remove one of them."
+                )
+
+
+def polynomial(coefficients: Quartic, x: Expression) -> Expression:
+    """Return Σ aₖ xᵏ, by Horner's rule and without terms that are zero."""
+    result: Expression | None = None
+    for a in reversed(coefficients):
+        if result is not None:
+            result = result * x
+        if a:
+            result = as_expression(a) if result is None else result + a
+    return as_expression(0.0) if result is None else result

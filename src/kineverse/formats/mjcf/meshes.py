@@ -1,0 +1,157 @@
+"""Meshes: boxes stand for their files while MuJoCo compiles, and say where each file's own frame is.
+
+MuJoCo moves the origin of a mesh to its centre and turns it to its principal axes. What it did to the box,
+undone, is the frame of the file, for any content of the file. A file is read only where it decides something:
+the inertia of a body that states none, or the size of a shape fitted to it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from kineverse.errors import FormatError
+from kineverse.formats import rpy
+from kineverse.formats.files import read_file
+from kineverse.formats.markup import quote
+from kineverse.formats.poses import product
+from kineverse.model.body import Mesh, Pose
+
+from .engine import mujoco
+from .preparing import Prepared
+from .tree import Node, find_below
+
+_FORMATS = (".stl", ".obj", ".msh")
+_DIAGONAL = 1e-9
+_UNMOVED = [1.0] * 3, [0.0] * 3, [1.0, 0.0, 0.0, 0.0]
+
+
+@dataclass(frozen=True, slots=True)
+class Asset:
+    """A mesh as the description says it: v' = S Rᵀ (v - p) for the vertices v of the file."""
+
+    uri: str
+    scale: tuple[float, ...]
+    position: tuple[float, ...]
+    quaternion: tuple[float, ...]
+
+
+@dataclass(slots=True)
+class Meshes:
+    """The meshes of a specification, by name.
+
+    ``guessed`` are the bodies whose inertia nobody knows since a file is not there, ``fitted`` the shapes
+    whose size nobody knows.
+    """
+
+    assets: dict[str, Asset] = field(default_factory=dict)
+    guessed: list[Any] = field(default_factory=list)
+    fitted: list[Any] = field(default_factory=list)
+
+
+class Replacement:
+    """Puts boxes for files into a specification, and files where they decide something."""
+
+    def __init__(self, spec: Any, prepared: Prepared, top: str, note: Callable[[Node, str], None]) -> None:
+        self._spec, self._prepared, self._top, self._note = spec, prepared, top, note
+        self.meshes = Meshes()
+        self._nodes: dict[str, Node] = {}
+        self._boxes: dict[str, tuple[Any, list[float], list[int]]] = {}
+        for mesh in spec.meshes:
+            node = prepared.node(mesh.info)
+            if node is None or node not in prepared.files:
+                continue
+            self._nodes[mesh.name] = node
+            scale, position, turn = (tuple(map(float, v)) for v in (mesh.scale, mesh.refpos, mesh.refquat))
+            self.meshes.assets[mesh.name] = Asset(prepared.files[node].uri, scale, position, turn)
+            mesh.scale, mesh.refpos, mesh.refquat = _UNMOVED
+            self._boxes[mesh.name] = mesh, list(mesh.uservert), list(mesh.userface)
+
+    def read_files(self, wanted: bool = True) -> bool:
+        """Give MuJoCo the files that decide something; return whether there are any.
+
+        Where they are not wanted, or cannot be had, their boxes are back and what they decide is not known.
+        """
+        self.meshes.guessed, self.meshes.fitted = [], []
+        needed = [
+            (geom, body) for body in self._spec.bodies for geom in body.geoms if self._decides(geom, body)
+        ]
+        contents: dict[str, bytes] = {}
+        missing: dict[str, bool] = {}
+        for geom, body in needed:
+            name = geom.meshname
+            if name not in missing:
+                content = self._content(name) if wanted else None
+                missing[name] = content is None
+                self._set_file(name, content, contents)
+            if missing[name]:
+                if geom.type != mujoco().mjtGeom.mjGEOM_MESH:
+                    self.meshes.fitted.append(geom)
+                if not any(body is other for other in self.meshes.guessed) and body.name != "world":
+                    self.meshes.guessed.append(body)
+        self._spec.assets = contents
+        return bool(contents)
+
+    def _decides(self, geom: Any, body: Any) -> bool:
+        if geom.meshname not in self._nodes:
+            return False
+        engine, compiler = mujoco(), self._spec.compiler
+        if geom.type != engine.mjtGeom.mjGEOM_MESH:
+            return True
+        low, high = compiler.inertiagrouprange
+        weightless = geom.mass == 0.0 or (np.isnan(geom.mass) and geom.density == 0.0)
+        if body.name == "world" or weightless or not low <= geom.group <= high:
+            return False
+        rule = compiler.inertiafromgeom
+        kinds = engine.mjtInertiaFromGeom
+        if rule == kinds.mjINERTIAFROMGEOM_AUTO:
+            return not body.explicitinertial
+        return bool(rule == kinds.mjINERTIAFROMGEOM_TRUE)
+
+    def _content(self, name: str) -> bytes | None:
+        """Return the content of a file, None if it is not below the folder, or of no known format."""
+        node, uri = self._nodes[name], self.meshes.assets[name].uri
+        if not uri:
+            return None
+        try:
+            if Path(uri).suffix.lower() not in _FORMATS:
+                node.refuse(f"names {quote(uri)}, which is in no format that MuJoCo reads.")
+            return read_file(find_below(node, uri, self._top, self._top))
+        except FormatError as error:
+            reason = str(error).removeprefix(f"{node.where}: ")
+            self._note(node, f"is not read, where its triangles decide an inertia or a size: {reason}")
+            return None
+
+    def _set_file(self, name: str, content: bytes | None, contents: dict[str, bytes]) -> None:
+        asset = self.meshes.assets[name]
+        mesh, *box = self._boxes[name]
+        if content is None:
+            mesh.file, (mesh.uservert, mesh.userface) = "", box
+            mesh.scale, mesh.refpos, mesh.refquat = _UNMOVED
+            return
+        mesh.file = f"{len(contents)}{Path(asset.uri).suffix.lower()}"
+        contents[mesh.file] = content
+        mesh.uservert, mesh.userface = [], []
+        mesh.scale, mesh.refpos, mesh.refquat = asset.scale, asset.position, asset.quaternion
+
+
+def placed(asset: Asset, body_T_mesh: Pose, folder: str) -> tuple[Mesh, Pose] | None:
+    """Return a mesh and where its file's frame is; None where no scale of the file says it.
+
+    With v' = S Rᵀ (v - p), v' = Rᵀ (R S Rᵀ v) - S Rᵀ p, so R S Rᵀ has to be a scale, too.
+    """
+    w, x, y, z = asset.quaternion
+    turn = rpy.pose_of_quaternion((0.0, 0.0, 0.0), (x, y, z, w)).matrix[:3, :3]
+    scale = np.diag(asset.scale)
+    along = turn @ scale @ turn.T
+    if np.abs(along - np.diag(np.diag(along))).max() > _DIAGONAL * np.abs(scale).max():
+        return None
+    mesh_T_file = np.eye(4)
+    mesh_T_file[:3, :3] = turn.T
+    mesh_T_file[:3, 3] = -scale @ turn.T @ asset.position
+    a, b, c = np.diag(along).tolist()
+    return Mesh(asset.uri, (a, b, c), folder), product(body_T_mesh, Pose.of(mesh_T_file + 0.0))

@@ -1,0 +1,148 @@
+"""What MuJoCo is not given: files, plugins, what grows without bound, and what has no place in a model here.
+
+Where bodies are does not depend on any of it. Mesh files are replaced by boxes, see :mod:`.meshes`.
+"""
+
+from __future__ import annotations
+
+import posixpath
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+
+from kineverse.formats.markup import quote
+
+from .tree import Node
+
+MOST_ELEMENTS = 200_000
+"""The most elements that a file may be once <replicate> and <attach> have copied them."""
+
+BOX = {
+    "vertex": "-1 -2 -3  1 -2 -3  -1 2 -3  1 2 -3  -1 -2 3  1 -2 3  -1 2 3  1 2 3",
+    "face": "0 2 1 1 2 3 4 5 6 5 7 6 0 1 4 1 5 4 2 6 3 3 6 7 0 4 2 2 4 6 1 3 5 3 7 5",
+}
+"""The triangles that stand for those of files."""
+
+_SECTIONS = frozenset(
+    ("size", "visual", "statistic", "custom", "sensor", "extension", "contact", "deformable")
+)
+_ELEMENTS = frozenset(("plugin", "flexcomp", "skin", "texture", "hfield", "light", "camera", "layer"))
+_FLEXIBLE = frozenset(("flex", "flexvert", "flexstrain"))
+_TOLD = {
+    "deformable": "is left out: what bends has no frames here.",
+    "flexcomp": "is left out: what bends has no frames here.",
+    "flex": "is left out: what bends has no frames here.",
+    "flexvert": "is left out: what bends has no frames here.",
+    "flexstrain": "is left out: what bends has no frames here.",
+    "plugin": "is left out: plugins are not loaded.",
+    "contact": "is left out: which pairs are allowed to touch is not read.",
+}
+_ATTRIBUTES = {
+    "compiler": ("meshdir", "texturedir", "assetdir", "strippath", "fusestatic", "discardvisual"),
+    "material": ("texture",),
+    "body": ("fuse",),
+    "mesh": ("file", "builtin", "params", "content_type"),
+}
+_INLINE = ("vertex", "normal", "texcoord", "face")
+_NAMES = frozenset(("name", "class", "childclass", "prefix", "file"))
+_NOT_NUMBERS = frozenset(("nan", "+nan", "-nan"))
+
+
+@dataclass(frozen=True, slots=True)
+class MeshFile:
+    """The file of a mesh as the description names it; empty for shapes that MuJoCo generates."""
+
+    uri: str
+
+
+def screen(root: Node, note: Callable[[Node, str], None]) -> dict[Node, MeshFile]:
+    """Take out of a tree what MuJoCo is not given; return the files of meshes.
+
+    Raises
+    ------
+    FormatError
+        For numbers that are none.
+    """
+    meshdir, strips = _directory(root)
+    root.children = [child for child in root.children if not _is_left_out(child, _SECTIONS, note)]
+    files: dict[Node, MeshFile] = {}
+    for node in root.walk():
+        unwanted = _ELEMENTS | _FLEXIBLE if node.tag == "equality" else _ELEMENTS
+        node.children = [child for child in node.children if not _is_left_out(child, unwanted, note)]
+        if node.tag == "mesh" and ("file" in node.attributes or "builtin" in node.attributes):
+            files[node] = _without_file(node, meshdir, strips)
+        for key in _ATTRIBUTES.get(node.tag, ()):
+            node.attributes.pop(key, None)
+        for key, value in node.attributes.items():
+            if key not in _NAMES and not _NOT_NUMBERS.isdisjoint(value.lower().split()):
+                node.refuse(f"{key}={quote(value)} has a NaN, where a number is expected.")
+    return files
+
+
+def _is_left_out(node: Node, unwanted: frozenset[str], note: Callable[[Node, str], None]) -> bool:
+    if node.tag not in unwanted:
+        return False
+    if node.tag in _TOLD:
+        note(node, _TOLD[node.tag])
+    return True
+
+
+def _directory(root: Node) -> tuple[str, bool]:
+    """Return the folder of meshes as the compiler settings say, and whether paths of files do not count."""
+    meshdir, strips = "", False
+    for node in root.children:
+        if node.tag == "compiler":
+            meshdir = node.attributes.get("assetdir", meshdir)
+            meshdir = node.attributes.get("meshdir", meshdir)
+            strips = node.attributes.get("strippath", str(strips)).lower() == "true"
+    return meshdir, strips
+
+
+def _without_file(node: Node, meshdir: str, strips: bool) -> MeshFile:
+    """Put a box in place of what a mesh gets from elsewhere, under the name that the mesh would have."""
+    file = node.attributes.get("file", "")
+    if strips:
+        file = posixpath.basename(file)
+    if not node.attributes.get("name") and file:
+        node.attributes["name"] = posixpath.splitext(posixpath.basename(file))[0]
+    for key in _INLINE:
+        node.attributes.pop(key, None)
+    node.attributes |= BOX
+    return MeshFile(posixpath.join(meshdir, file) if file else "")
+
+
+def check_size(root: Node, attached: Mapping[str, int]) -> int:
+    """Return how many elements a document has once all is copied that is to be copied.
+
+    Parameters
+    ----------
+    root
+        The document.
+    attached
+        How many elements its models have, by name.
+
+    Raises
+    ------
+    FormatError
+        If they are more than ``MOST_ELEMENTS``.
+    """
+    total = 0
+    ahead = [(root, 1)]
+    while ahead:
+        node, copies = ahead.pop()
+        if node.tag in ("replicate", "composite"):
+            copies *= _count(node)
+        total += copies * (1 + attached.get(node.attributes.get("model", ""), 0) * (node.tag == "attach"))
+        if total > MOST_ELEMENTS:
+            node.refuse(f"makes the model larger than {MOST_ELEMENTS} elements, the most that is read.")
+        ahead.extend((child, copies) for child in node.children)
+    return total
+
+
+def _count(node: Node) -> int:
+    product = 1
+    for word in node.attributes.get("count", "1").split():
+        try:
+            product *= max(1, int(float(word[:20])))
+        except (ValueError, OverflowError):
+            node.refuse(f"count={quote(word)} is no number.")
+    return product

@@ -1,0 +1,99 @@
+"""Operations of tendons: lengths as data, their ranges and what couples them as constraints."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import pairwise
+
+from kineverse.expressions.expression import Expression, as_expression
+from kineverse.expressions.functions import norm
+from kineverse.model.constraint import Constraint
+from kineverse.model.operation import Effects, Operation
+from kineverse.model.rates import plain
+from kineverse.model.reader import Reader
+
+from .description import Quartic
+from .following import polynomial
+
+LENGTH = "length"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Tendon(Operation):
+    """A length that is a sum over joints, or that of a line through frames.
+
+    L = Σ coef · q [m], where q are positions of articulations; or L = Σ |pₖ₊₁ - pₖ| / divisor [m] over the
+    origins p of frames, one pulley after the other. It is the datum ``name/length``, and its range the
+    constraint of the same name.
+
+    Attributes
+    ----------
+    name
+        Of the tendon.
+    terms
+        Pairs of articulation and factor.
+    paths
+        Pairs of a pulley's divisor and the frames of the branch behind it.
+    lower, upper
+        Of the length [m]; None leaves that side open.
+    dynamics
+        What is known beside, as (name, value) pairs, the datum ``name/dynamics``.
+    """
+
+    name: str
+    terms: tuple[tuple[str, float], ...] = ()
+    paths: tuple[tuple[float, tuple[str, ...]], ...] = ()
+    lower: float | None = None
+    upper: float | None = None
+    dynamics: tuple[tuple[str, float], ...] = ()
+
+    def apply(self, model: Reader) -> Effects:
+        """Write the length and its range."""
+        length = as_expression(0.0)
+        for joint, factor in self.terms:
+            q = model.articulations[joint].position
+            assert q is not None  # MuJoCo has hinges and slides in tendons only
+            length = length + factor * q
+        for divisor, frames in self.paths:
+            for near, far in pairwise(frames):
+                length = length + norm(model.fk(far, near)[:3, 3]) / divisor
+        name = f"{self.name}/{LENGTH}"
+        lower = -float("inf") if self.lower is None else self.lower
+        upper = float("inf") if self.upper is None else self.upper
+        bounded = length.symbols and not (self.lower is None and self.upper is None)
+        return Effects(
+            data={name: plain(length)} | ({f"{self.name}/dynamics": self.dynamics} if self.dynamics else {}),
+            constraints={name: Constraint.of(lower, length, upper)} if bounded else {},
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
+class TendonCoupling(Operation):
+    """One tendon's length as a polynomial of another's: L - L0 = Σ aₖ (M - M0)ᵏ, a constraint.
+
+    Attributes
+    ----------
+    name
+        Of the constraint.
+    tendon, leader
+        The tendons; no leader means L - L0 = a0.
+    coefficients
+        a0 to a4.
+    rest, leader_rest
+        L0 and M0 [m].
+    """
+
+    name: str
+    tendon: str
+    leader: str | None
+    coefficients: Quartic
+    rest: float = 0.0
+    leader_rest: float = 0.0
+
+    def apply(self, model: Reader) -> Effects:
+        """Write the constraint."""
+        length: Expression = model.data[f"{self.tendon}/{LENGTH}"]
+        other = as_expression(0.0) if self.leader is None else model.data[f"{self.leader}/{LENGTH}"]
+        along = polynomial(self.coefficients, other - self.leader_rest)
+        residual = length - self.rest - along
+        return Effects(constraints={self.name: Constraint.of(0.0, residual, 0.0)} if residual.symbols else {})

@@ -1,0 +1,153 @@
+"""An MJCF and the files it includes as one tree of elements, before MuJoCo sees any of them.
+
+MuJoCo is given no path: it would open whatever a file names. Includes are expanded here, from within the
+folder of the file and nowhere else.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import NoReturn
+
+from kineverse.errors import FormatError
+from kineverse.formats.files import read_file
+from kineverse.formats.markup import Element, label, parse, quote
+
+DEEPEST = 450
+"""The deepest nesting of elements: MuJoCo reads 500, and a body is inside of the body that carries it."""
+
+
+@dataclass(slots=True, eq=False)
+class Node:
+    """An element, and where it was written."""
+
+    tag: str
+    attributes: dict[str, str]
+    children: list[Node] = field(default_factory=list)
+    source: str = ""
+    line: int = 0
+
+    @property
+    def place(self) -> str:
+        """Line and opening tag, for remarks."""
+        return f"line {self.line}, {label((self.tag, self.attributes, [], self.line))}"
+
+    @property
+    def where(self) -> str:
+        """File, line and opening tag, for errors."""
+        return f"{self.source}, {self.place}"
+
+    def refuse(self, reason: str) -> NoReturn:
+        """Raise the error that people see.
+
+        Raises
+        ------
+        FormatError
+            Always.
+        """
+        raise FormatError(f"{self.where}: {reason}")
+
+    def walk(self) -> Iterator[Node]:
+        """Yield the node and all below it."""
+        ahead = [self]
+        while ahead:
+            node = ahead.pop()
+            yield node
+            ahead.extend(reversed(node.children))
+
+
+def read_tree(data: str | bytes, source: str, folder: str, top: str) -> Node:
+    """Return the root of a document, with the content of what it includes in place of the includes.
+
+    Parameters
+    ----------
+    data
+        The document.
+    source
+        Its name in messages.
+    folder
+        Where it lies, from where the files it includes are named. Empty for text that lies nowhere.
+    top
+        The folder that they do not leave.
+
+    Raises
+    ------
+    FormatError
+        For what is no XML, or no MJCF; for includes that are not there, lead out of the folder, or come
+        twice.
+    """
+    root = parse(data, source, depth=DEEPEST)
+    _check_root(root, source)
+    whole = Node("", {})
+    included: set[Path] = set()
+    ahead: list[tuple[Element, Node, str, str]] = [(root, whole, source, folder)]
+    while ahead:
+        element, parent, source, here = ahead.pop()
+        tag, attributes, children, line = element
+        node = Node(tag, attributes, source=source, line=line)
+        if tag == "include":
+            path = find_below(node, attributes.get("file", ""), top, folder, here)
+            # A file in twice would have all its names twice, or include itself.
+            if path in included:
+                node.refuse("is there a second time; a file is included once.")
+            included.add(path)
+            below = str(path.parent)
+            children = parse(read_file(path), path.name, depth=DEEPEST)[2]
+            ahead.extend((child, parent, path.name, below) for child in reversed(children))
+            continue
+        parent.children.append(node)
+        ahead.extend((child, node, source, here) for child in reversed(children))
+    return whole.children[0]
+
+
+def find_below(node: Node, name: str, top: str, *places: str) -> Path:
+    """Return the file that an element names, which is below a folder.
+
+    Parameters
+    ----------
+    node
+        The element.
+    name
+        What it says: a path relative to one of the places.
+    top
+        The folder that it does not leave.
+    places
+        Folders from which it is looked for, one after the other.
+
+    Raises
+    ------
+    FormatError
+        If it is somewhere else, or is not there.
+    """
+    if not top:
+        node.refuse(f"names the file {quote(name)}, and the text has no folder. Load it from its file.")
+    if not name or "\0" in name:
+        node.refuse("names no file.")
+    outside = False
+    for place in dict.fromkeys(places):
+        path = (Path(place) / name).resolve()
+        if not path.is_relative_to(Path(top).resolve()):
+            outside = True
+        elif path.is_file():
+            return path
+    return node.refuse(
+        f"names {quote(name)}, which leads out of the folder of the file. That is refused."
+        if outside
+        else f"names {quote(name)}, and there is no such file below {top}."
+    )
+
+
+def _check_root(root: Element, source: str) -> None:
+    tag, _, _, line = root
+    if tag == "mujoco":
+        return
+    hint = {
+        "mujocoinclude": " It is a part that other files include; load one of these.",
+        "robot": " This is a URDF.",
+        "sdf": " This is an SDF.",
+    }.get(tag, "")
+    raise FormatError(
+        f"{source}, line {line}, {label(root)}: is not <mujoco>, the root element of an MJCF.{hint}"
+    )

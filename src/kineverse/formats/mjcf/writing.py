@@ -1,0 +1,265 @@
+"""A model as MJCF text.
+
+Every frame is a body and every coordinate a joint of its name. A body may have several joints, about lines
+anywhere; what moves by a polynomial of a coordinate is an equality, and loops stay closed by equalities, too.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+
+import numpy as np
+
+from kineverse.formats import rpy
+from kineverse.formats.export.markup import Tag, document
+from kineverse.formats.export.names import Names
+from kineverse.formats.export.plan import NO_BODY, BallJoint, Joint, Link, Plan
+from kineverse.formats.export.poses import RIGID, deviation, quaternion
+from kineverse.formats.export.recognition import Recognition, Target
+from kineverse.formats.export.refusals import Refusals
+from kineverse.formats.mjcf.writing_bodies import BodyWriter, placed
+from kineverse.model.frame import WORLD
+from kineverse.model.view import ModelView
+from kineverse.symbols import Symbol
+
+MJCF = Target("MJCF", sums=True, one_way=True, loops=True, degree=4)
+
+_AXES = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
+_MOST_SPEEDS = 6
+_QUATERNION = ("qx", "qy", "qz", "qw")
+_DYNAMICS = {
+    "damping": "damping",
+    "friction": "frictionloss",
+    "armature": "armature",
+    "spring_stiffness": "stiffness",
+    "spring_reference": "springref",
+}
+_REMEDY = (
+    "Write a document (.kv.json), which says all of it, or leave constraints out on purpose with "
+    "leave_out=(name, ...)."
+)
+
+
+def mjcf_of(model: ModelView, path: Path, leave_out: Iterable[str] = ()) -> tuple[bytes, list[str]]:
+    """Return the text of an MJCF file, and what it says other than the model, or not at all.
+
+    Parameters
+    ----------
+    model
+        The model.
+    path
+        Where the file will lie; meshes are named from there.
+    leave_out
+        Names of constraints that are not to be said, and of articulations whose speeds are not.
+
+    Raises
+    ------
+    FormatError
+        Naming what MJCF cannot say, and why.
+    """
+    recognition = Recognition(model, MJCF, leave_out)
+    plan = recognition.plan()
+    home = {str(s): v for s, v in recognition.home().items()}
+    return MjcfWriter(plan, path, recognition.refusals, home).document(), plan.remarks
+
+
+class MjcfWriter:
+    """Writes one plan.
+
+    ``home`` has a value for every coordinate, which becomes the key of that name.
+    """
+
+    def __init__(self, plan: Plan, path: Path, refusals: Refusals, home: Mapping[str, float]) -> None:
+        self._plan, self._path, self._refusals, self._home = plan, path, refusals, home
+        self._bodies = BodyWriter(path.absolute().parent, plan.remarks)
+        self._children: dict[str, list[Link]] = {}
+        for link in plan.links:
+            self._children.setdefault(link.parent, []).append(link)
+        self._names = Names([WORLD, *(link.name for link in plan.links)])
+        self._qpos: list[float] = []
+        self._elements: dict[str, Tag] = {}
+
+    def document(self) -> bytes:
+        """Return the text.
+
+        Raises
+        ------
+        FormatError
+            Naming what MJCF cannot say.
+        """
+        root = Tag("mujoco", {"model": self._path.name.removesuffix(self._path.suffix) or "model"})
+        compiler = root.add("compiler", angle="radian")
+        world = Tag("worldbody")
+        self._elements[WORLD] = world
+        self._bodies.write(world, self._plan.world, WORLD, moves=False)
+        # Depth first, as MuJoCo numbers its joints.
+        waiting = self._children.get(WORLD, [])[::-1]
+        while waiting:
+            link = waiting.pop()
+            self._link(link)
+            waiting += self._children.get(link.name, [])[::-1]
+        self._refusals.check(self._path.name, _REMEDY)
+        equality, tendon, custom, key = self._equalities(), self._tendons(), self._speeds(), Tag("keyframe")
+        for name, value in self._bodies.settings().items():
+            compiler.give(name, value)
+        if any(self._qpos):
+            key.add("key", name="home", qpos=self._qpos)
+        parts = (custom, self._bodies.assets, world, tendon, equality, key)
+        root.inside += [part for part in parts if part.inside or part is world]
+        return document(root, self._plan.remarks)
+
+    def _link(self, link: Link) -> None:
+        if deviation(link.pose) > RIGID:
+            self._refusals.add(
+                link.name,
+                f"is turned by a constant that is off by {deviation(link.pose):.2g} from any rotation",
+            )
+        body = self._elements[link.parent]
+        groups = _groups(link.joints)
+        for k, joints in enumerate(groups):
+            last = k == len(groups) - 1
+            body = body.add("body", name=link.name if last else self._names.take(f"{link.name}/{k + 1}"))
+            if not k:
+                placed(body, link.pose)
+            self._joints(body, link, joints)
+            if not last:
+                self._bodies.write(body, NO_BODY, body.attributes["name"], moves=True)
+        self._elements[link.name] = body
+        self._bodies.write(body, link.body, link.name, moves=bool(link.joints))
+
+    def _joints(self, body: Tag, link: Link, joints: Iterable[Joint | BallJoint]) -> None:
+        free = self._free(link)
+        if free is not None:
+            body.add("freejoint", name=free)
+            self._rest_free(link, free)
+        else:
+            for joint in joints:
+                if isinstance(joint, BallJoint):
+                    body.add("joint", name=joint.name, type="ball", pos=_unless_zero(joint.point))
+                    w, x, y, z = (self._home.get(f"{joint.name}/q{c}", 0.0) for c in "wxyz")
+                    self._qpos += [w, x, y, z]
+                else:
+                    self._joint(body, joint)
+                    self._qpos.append(self._at_home(joint))
+
+    def _free(self, link: Link) -> str | None:
+        """Return the name of a joint that leaves a body free; only in the world there is one."""
+        if link.parent != WORLD or len(link.joints) != 4:
+            return None
+        *slides, ball = link.joints
+        if not isinstance(ball, BallJoint) or any(ball.point) or ball.dynamics:
+            return None
+        for joint, axis, c in zip(slides, _AXES, "xyz", strict=True):
+            if not isinstance(joint, Joint) or joint.turns or not joint.leads or joint.axis != axis:
+                return None
+            if joint.name != f"{ball.name}/{c}" or not joint.bounds.open or joint.dynamics:
+                return None
+        return ball.name
+
+    def _rest_free(self, link: Link, name: str) -> None:
+        """Note where a free body is at home: MuJoCo counts from the world, not from where it is placed."""
+        x, y, z, a, b, c, w = (
+            self._home.get(f"{name}/{part}", 0.0) for part in ("x", "y", "z", *_QUATERNION)
+        )
+        turn = rpy.pose_of_quaternion((x, y, z), (a, b, c, w)).matrix
+        pose = link.pose @ turn
+        a, b, c, w = quaternion(pose)
+        self._qpos += [*pose[:3, 3].tolist(), w, a, b, c]
+
+    def _joint(self, body: Tag, joint: Joint) -> None:
+        kind = "hinge" if joint.turns else "slide"
+        element = body.add(
+            "joint", name=joint.name, type=kind, pos=_unless_zero(joint.point), axis=joint.axis
+        )
+        lower, upper = joint.bounds.lower, joint.bounds.upper
+        if joint.bounds.soft is not None:
+            lower, upper = max(lower, joint.bounds.soft[0]), min(upper, joint.bounds.soft[1])
+            self._plan.remarks.append(f"the soft limits of '{joint.name}' are written as its limits")
+        if (lower, upper) != (-math.inf, math.inf):
+            element.attributes["range"] = _range(lower, upper)
+        known = joint.dynamics
+        for key, attribute in _DYNAMICS.items():
+            if isinstance(known.get(key), (int, float)) and known[key]:
+                element.give(attribute, float(known[key]))
+        effort = known.get("effort")
+        if isinstance(effort, (int, float)) and 0 < effort < math.inf:
+            element.give("actuatorfrcrange", (-float(effort), float(effort)))
+        for key, value in known.items():
+            if key not in _DYNAMICS and (key != "effort" or not value) and value:
+                self._plan.remarks.append(f"MJCF has no {key}: that of '{joint.name}' is left out")
+
+    def _at_home(self, joint: Joint) -> float:
+        x = self._home.get(joint.symbol.path, 0.0)
+        return float(np.polynomial.polynomial.polyval(x, joint.amount))
+
+    def _equalities(self) -> Tag:
+        equality = Tag("equality")
+        for joint in self._plan.joints:
+            if not joint.leads:
+                coefficients = [*joint.amount, 0.0, 0.0, 0.0, 0.0][:5]
+                equality.add(
+                    "joint",
+                    name=joint.name,
+                    joint1=joint.name,
+                    joint2=joint.symbol.path,
+                    polycoef=coefficients,
+                )
+        sites: set[str] = set()
+        for loop in self._plan.loops:
+            for end in (loop.frame, loop.to):
+                if end not in sites:
+                    sites.add(end)
+                    self._elements[end].add("site", name=f"{end}/end")
+            equality.add(loop.kind, name=loop.name, site1=f"{loop.to}/end", site2=f"{loop.frame}/end")
+        return equality
+
+    def _tendons(self) -> Tag:
+        tendon = Tag("tendon")
+        for item in self._plan.sums:
+            fixed = tendon.add("fixed", name=item.name)
+            fixed.attributes["range"] = _range(item.lower, item.upper)
+            for symbol, factor in item.factors.items():
+                fixed.add("joint", joint=symbol.path, coef=factor)
+        return tendon
+
+    def _speeds(self) -> Tag:
+        """Return limits of speeds, which MuJoCo does not know: numbers under the names of the speeds."""
+        custom = Tag("custom")
+        for joint in self._plan.joints:
+            slowest, fastest = joint.bounds.slowest, joint.bounds.fastest
+            if (slowest, fastest) != (-math.inf, math.inf):
+                name = str(Symbol(joint.name, 1))
+                numeric = custom.add("numeric", name=name)
+                numeric.attributes["data"] = _range(slowest, fastest)
+        if custom.inside:
+            self._plan.remarks.append("MuJoCo knows no limits of speeds: they are custom numbers, <numeric>")
+        return custom
+
+
+def _groups(joints: Iterable[Joint | BallJoint]) -> list[list[Joint | BallJoint]]:
+    """Return joints in groups of six speeds at most, more than which no body of MuJoCo has."""
+    groups: list[list[Joint | BallJoint]] = [[]]
+    room = _MOST_SPEEDS
+    for joint in joints:
+        speeds = 3 if isinstance(joint, BallJoint) else 1
+        if speeds > room:
+            groups.append([])
+            room = _MOST_SPEEDS
+        groups[-1].append(joint)
+        room -= speeds
+    return groups
+
+
+def _unless_zero(point: Iterable[float]) -> Iterable[float] | None:
+    return point if any(point) else None
+
+
+def _range(lower: float, upper: float) -> str:
+    """Return the ends of a range, which MuJoCo wants to be apart."""
+    if lower == upper:
+        upper += 1e-15 * max(1.0, abs(lower))
+    return " ".join(
+        "inf" if end == math.inf else "-inf" if end == -math.inf else repr(end) for end in (lower, upper)
+    )

@@ -1,0 +1,168 @@
+"""An MJCF as MuJoCo moves it, beside the model that is made of it here.
+
+MuJoCo reads the file itself. Joints, bodies and sites correspond by their number, so that those without a name
+are compared, too.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+
+import kineverse as kv
+from kineverse.formats.mjcf import Scene, parse_mjcf
+from kineverse.formats.mjcf.operations import scene_operations
+
+mujoco = pytest.importorskip("mujoco")
+
+Array = npt.NDArray[np.float64]
+
+
+def model_of(scene: Scene, prefix: str | None = None) -> kv.Model:
+    model = kv.Model()
+    with model.edit() as edit:
+        for operation in scene_operations(scene, prefix):
+            edit.apply(operation)
+    return model
+
+
+class Pair:
+    """One description, as MuJoCo has it and as it is here."""
+
+    def __init__(self, text: str | bytes, engine: mujoco.MjModel, folder: str = "") -> None:
+        self.scene = parse_mjcf(text, "x.xml", folder)
+        self.model = model_of(self.scene)
+        self.engine = engine
+        self.data = mujoco.MjData(engine)
+        self.bodies = [link.name for link in self.scene.links]
+        self.joints = [
+            joint for link in self.scene.links for joint in link.joints if not self._is_handle(joint.name)
+        ]
+        assert len(self.bodies) == engine.nbody
+        assert len(self.joints) == engine.njnt
+
+    @staticmethod
+    def of_text(text: str) -> Pair:
+        return Pair(text, mujoco.MjModel.from_xml_string(text))
+
+    @staticmethod
+    def of_file(path: Path) -> Pair:
+        return Pair(path.read_bytes(), mujoco.MjModel.from_xml_path(str(path)), str(path.parent))
+
+    def _is_handle(self, name: str) -> bool:
+        return any(name == f"{link.name}/free" for link in self.scene.links)
+
+    def random_state(self, rng: np.random.Generator) -> dict[kv.Symbol, float]:
+        """Return a state within the limits; quaternions have length one."""
+        state = dict(self.model.default_state())
+        for symbol in state:
+            if symbol.path.rpartition("/")[2] in ("qx", "qy", "qz", "qw"):
+                state[symbol] = rng.normal()
+                continue
+            low, high = self.model.limits(symbol)
+            state[symbol] = rng.uniform(max(low, -2.0), min(high, 2.0))
+        for symbol in state:
+            if symbol.path.endswith("/qw"):
+                stem = symbol.path[:-1]
+                names = [kv.position(stem + c) for c in "xyzw"]
+                length = np.linalg.norm([state[n] for n in names])
+                state |= {n: state[n] / length for n in names}
+        return state
+
+    def value(self, expression: kv.Expression, state: dict[kv.Symbol, float]) -> Array:
+        resolved = self.model.rates.resolve(expression)
+        return np.asarray(resolved({s: state[s] for s in resolved.symbols}))
+
+    def place(self, state: dict[kv.Symbol, float]) -> None:
+        """Put MuJoCo's joints and mocap bodies where the state has them."""
+        for number, joint in enumerate(self.joints):
+            at = int(self.engine.jnt_qposadr[number])
+            record = self.model.articulations[joint.name]
+            if joint.kind in ("hinge", "slide"):
+                self.data.qpos[at] = self.value(record.position, state)
+                continue
+            values = np.array([state[s] for s in record.coordinates])
+            wxyz = np.roll(values[-4:], 1)
+            if joint.kind == "ball":
+                self.data.qpos[at : at + 4] = wxyz
+            else:
+                body = int(self.engine.jnt_bodyid[number])
+                self.data.qpos[at : at + 3], self.data.qpos[at + 3 : at + 7] = self._free(
+                    body, values[:3], wxyz
+                )
+        for body, mocap in enumerate(self.engine.body_mocapid):
+            if mocap >= 0:
+                record = self.model.articulations[f"{self.bodies[body]}/free"]
+                values = np.array([state[s] for s in record.coordinates])
+                where = self._free(body, values[:3], np.roll(values[-4:], 1))
+                self.data.mocap_pos[mocap], self.data.mocap_quat[mocap] = where
+        mujoco.mj_kinematics(self.engine, self.data)
+        mujoco.mj_comPos(self.engine, self.data)
+
+    def _free(self, body: int, offset: Array, wxyz: Array) -> tuple[Array, Array]:
+        """Return where a body is by its pose in the file and what has moved it from there."""
+        turned, quat = np.zeros(3), np.zeros(4)
+        mujoco.mju_rotVecQuat(turned, offset, self.engine.body_quat[body])
+        mujoco.mju_mulQuat(quat, self.engine.body_quat[body], wxyz)
+        return self.engine.body_pos[body] + turned, quat
+
+    def compare_poses(self, state: dict[kv.Symbol, float], tolerance: float = 1e-10) -> None:
+        self.place(state)
+        frames = [(name, self.data.xpos[k], self.data.xmat[k]) for k, name in enumerate(self.bodies)]
+        frames += [
+            (site.name, self.data.site_xpos[k], self.data.site_xmat[k])
+            for k, site in enumerate(self.scene.sites)
+        ]
+        for name, position, matrix in frames:
+            pose = np.eye(4)
+            pose[:3, 3], pose[:3, :3] = position, matrix.reshape(3, 3)
+            here = self.value(self.model.fk(name), state)
+            np.testing.assert_allclose(here, pose, atol=tolerance, err_msg=name)
+
+    def compare_jacobians(self, state: dict[kv.Symbol, float], tolerance: float = 1e-9) -> None:
+        """Compare columns: MuJoCo's speeds are a linear function of those here."""
+        self.place(state)
+        speeds = self.model.speeds
+        to_engine = np.zeros((self.engine.nv, len(speeds)))
+        for number, joint in enumerate(self.joints):
+            at = int(self.engine.jnt_dofadr[number])
+            record = self.model.articulations[joint.name]
+            if joint.kind in ("hinge", "slide"):
+                gradient = self.model.rates.resolve(record.position).gradient()
+                for key, slope in gradient.items():
+                    to_engine[at, speeds.index(key)] = slope({s: state[s] for s in slope.symbols})
+                continue
+            block = np.eye(len(record.speeds))
+            if joint.kind == "free":
+                matrix = np.zeros(9)
+                mujoco.mju_quat2Mat(matrix, self.engine.body_quat[self.engine.jnt_bodyid[number]])
+                block[:3, :3] = matrix.reshape(3, 3)
+            columns = [speeds.index(s) for s in record.speeds]
+            to_engine[at : at + len(block), columns] = block
+        still = {
+            speeds.index(s)
+            for name, record in self.model.articulations.items()
+            for s in record.speeds
+            if self._is_handle(name)
+        }
+        for body, name in enumerate(self.bodies):
+            linear, angular = np.zeros((3, self.engine.nv)), np.zeros((3, self.engine.nv))
+            mujoco.mj_jacBody(self.engine, self.data, linear, angular, body)
+            expected = np.vstack([linear, angular]) @ to_engine
+            own = self.model.speeds_of(name)
+            jacobian = self.model.jacobian(name)
+            here = np.zeros((6, len(speeds)))
+            if own:
+                here[:, [speeds.index(s) for s in own]] = jacobian({s: state[s] for s in jacobian.symbols})
+            moving = [k for k in range(len(speeds)) if k not in still]  # MuJoCo has no speeds of mocap bodies
+            np.testing.assert_allclose(here[:, moving], expected[:, moving], atol=tolerance, err_msg=name)
+
+    def compare(self, samples: int = 5, seed: int = 0) -> None:
+        rng = np.random.default_rng(seed)
+        for _ in range(samples):
+            state = self.random_state(rng)
+            self.compare_poses(state)
+            self.compare_jacobians(state)
