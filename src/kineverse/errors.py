@@ -63,6 +63,9 @@ class MissingExtraError(KineverseError, ImportError):
     """An optional dependency is not installed; the message names the extra that brings it."""
 
 
+_LONGEST = 100
+
+
 def suggest(name: str, available: Iterable[str], what: str = "name", limit: int = 12) -> str:
     """Return the half of an error message that lists close matches, or what there is.
 
@@ -80,10 +83,15 @@ def suggest(name: str, available: Iterable[str], what: str = "name", limit: int 
     names = sorted(set(available))
     if not names:
         return f"There is no {what} at all."
-    close = difflib.get_close_matches(name, names, n=4, cutoff=0.6) if len(names) <= 20_000 else []
+    # What is longer resembles nothing, and takes long to compare.
+    close = difflib.get_close_matches(name[:1000], names, n=4, cutoff=0.6) if len(names) <= 20_000 else []
     parts = (n for n in names if n.endswith(f"/{name}") or n.startswith((f"{name}/", f"{name}:")))
     close += [n for n in parts if n not in close][: max(0, 4 - len(close))]
     if close:
-        return f"Did you mean {' or '.join(repr(n) for n in close)}?"
+        return f"Did you mean {' or '.join(_shown(repr(n)) for n in close)}?"
     more = f" and {len(names) - limit} more" if len(names) > limit else ""
-    return f"Available: {', '.join(names[:limit])}{more}."
+    return f"Available: {', '.join(map(_shown, names[:limit]))}{more}."
+
+
+def _shown(name: str) -> str:
+    return name if len(name) <= _LONGEST else f"{name[: _LONGEST - 1]}…"

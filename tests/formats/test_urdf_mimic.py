@@ -12,7 +12,7 @@ from robots import joint, robot
 from kineverse.errors import FormatError
 from kineverse.formats.urdf import Mimic, parse_urdf
 
-FACTOR = st.floats(-3, 3, allow_subnormal=False)
+FACTOR = st.integers(-3000, 3000).map(lambda thousandths: thousandths / 1000)
 
 
 def followers(factors, order):

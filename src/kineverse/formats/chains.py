@@ -6,12 +6,12 @@ resolved once, so that chains of any length take linear time.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Hashable, Mapping
 from dataclasses import dataclass
 from typing import Generic, NoReturn, TypeVar
 
 from kineverse.formats.markup import quote
+from kineverse.formats.numerals import LARGEST, SMALLEST
 
 K = TypeVar("K", bound=Hashable)
 
@@ -65,7 +65,16 @@ def resolve_chains(
         for follower in reversed(chain):
             step = chain[follower]
             multiplier, offset = step.multiplier * end.multiplier, step.multiplier * end.offset + step.offset
-            if not (math.isfinite(multiplier) and math.isfinite(offset)):
-                refuse(follower, "the factors along its chain of <mimic> overflow.")
+            if not (factor_is_sound(multiplier) and abs(offset) <= LARGEST):
+                refuse(
+                    follower,
+                    f"the factors of its chain of <mimic> come to {multiplier:g} and {offset:g}: positions "
+                    f"or limits overflow. Multipliers are 0 or from {SMALLEST:g} to {LARGEST:g}.",
+                )
             end = resolved[follower] = Following(end.leader, multiplier, offset)
     return resolved
+
+
+def factor_is_sound(factor: float) -> bool:
+    """Return whether positions and limits stay finite when they go through a factor."""
+    return not factor or SMALLEST <= abs(factor) <= LARGEST

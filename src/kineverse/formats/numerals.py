@@ -1,5 +1,8 @@
 """Numbers as robot descriptions write them: decimal text, one or several, finite.
 
+Those that come several at a time are coordinates, and no larger than ``LARGEST``: products of larger ones
+overflow, and a pose would not be finite. A single one may be a limit, and 1.8e308 says that there is none.
+
 Descriptions repeat themselves ("0 0 0" by the hundred), so the results are remembered.
 """
 
@@ -7,6 +10,14 @@ from __future__ import annotations
 
 import math
 from functools import lru_cache
+
+from .markup import abbreviate
+
+LARGEST = 1e50
+"""The largest magnitude of what poses are made of: coordinates, positions, and factors between positions."""
+
+SMALLEST = 1e-50
+"""The smallest factor between positions but 0: by a smaller one, limits of a follower are out of reach."""
 
 _MAX_LENGTH = 1000
 
@@ -25,14 +36,17 @@ def number(text: str) -> float:
 
 @lru_cache(maxsize=8192)
 def numbers(text: str, count: int) -> tuple[float, ...]:
-    """Return the ``count`` finite numbers that the text spells, separated by white space.
+    """Return the ``count`` coordinates that the text spells, separated by white space.
 
     Raises
     ------
     ValueError
         With the reason, if the text is anything else.
     """
-    return _read(text, count)
+    values = _read(text, count)
+    if values and max(map(abs, values)) > LARGEST:
+        raise ValueError(f"has a number beyond {LARGEST:g}, where {_expected(count)}")
+    return values
 
 
 def _read(text: str, count: int) -> tuple[float, ...]:
@@ -48,13 +62,13 @@ def _read(text: str, count: int) -> tuple[float, ...]:
 def _number(word: str, count: int) -> float:
     # Python reads more than a description may say: digits grouped by underscores and those of other scripts.
     if "_" in word or not word.isascii():
-        raise ValueError(f"has {word!r}, where {_expected(count)}")
+        raise ValueError(f"has '{abbreviate(word)}', where {_expected(count)}")
     try:
         value = float(word)
     except ValueError:
-        raise ValueError(f"has {word!r}, where {_expected(count)}{_hint(word)}") from None
+        raise ValueError(f"has '{abbreviate(word)}', where {_expected(count)}{_hint(word)}") from None
     if not math.isfinite(value):
-        raise ValueError(f"has {word!r}, where {_expected(count)}; leave a limit out if there is none")
+        raise ValueError(f"has '{word}', where {_expected(count)}; leave a limit out if there is none")
     return value
 
 

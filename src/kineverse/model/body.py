@@ -6,7 +6,6 @@ is opened before somebody asks for it.
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from typing import Any, TypeAlias
 
@@ -17,6 +16,8 @@ from kineverse.errors import ShapeError, ValueRejectedError
 from kineverse.expressions.expression import Expression
 
 _RIGID = 2e-5
+_FARTHEST = 1e100
+"""A chain of poses within that does not overflow [m]."""
 
 Vector3: TypeAlias = tuple[float, float, float]
 Rgba: TypeAlias = tuple[float, float, float, float]
@@ -37,11 +38,13 @@ class Pose:
         turns = a * (e * i - f * h) - b * (d * i - f * g) + c * (d * h - e * g) > 0
         # Written so that NaN fails every one of them.
         if not (
-            turns and all(-_RIGID < v < _RIGID for v in (*squares, *products)) and math.isfinite(x + y + z)
+            turns
+            and all(-_RIGID < v < _RIGID for v in (*squares, *products))
+            and all(-_FARTHEST <= v <= _FARTHEST for v in (x, y, z))
         ):
             raise ValueRejectedError(
                 f"The pose is not rigid: the first three columns of {self.rows} must be a rotation "
-                "and all numbers finite."
+                f"and all numbers finite, of at most {_FARTHEST:g}."
             )
 
     @staticmethod

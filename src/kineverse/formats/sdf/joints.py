@@ -9,7 +9,7 @@ import math
 from dataclasses import dataclass
 
 from kineverse.errors import suggest
-from kineverse.formats.chains import Following
+from kineverse.formats.chains import Following, factor_is_sound
 from kineverse.formats.markup import Element, ElementError, child, quote
 from kineverse.formats.poses import rotated
 from kineverse.model.body import Vector3
@@ -157,8 +157,6 @@ def _following(node: Node, axis: Element) -> Following[str] | None:
         raise ElementError(mimic, f"names {quote(name)}, which is {kind} and has {what} to follow.")
     multiplier, offset = number(mimic, "multiplier", 1.0), number(mimic, "offset", 0.0)
     shift = offset - multiplier * number(mimic, "reference", 0.0)
-    if not math.isfinite(shift):
-        raise ElementError(mimic, "has factors that overflow.")
     return Following(leader.path + _SUFFIXES[count][which == "axis2"], multiplier, shift)
 
 
@@ -169,8 +167,10 @@ def _pitch(element: Element) -> float:
     else:
         radians = number(element, "thread_pitch")  # per metre, left-handed
         pitch = -math.tau / radians if radians else math.inf
-    if not pitch or not math.isfinite(pitch):
-        raise ElementError(element, "has a thread without pitch: it would only turn, or only slide.")
+    if not pitch or not factor_is_sound(pitch):
+        raise ElementError(
+            element, "has a thread without pitch, or with too much: it would only turn, or only slide."
+        )
     return pitch
 
 

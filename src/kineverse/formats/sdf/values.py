@@ -74,7 +74,7 @@ def listed(element: Element, count: int) -> tuple[float, ...]:
     """Return the finite numbers that an element spells."""
     said = text_of(element)
     try:
-        return numerals.numbers(said, count)
+        return (numerals.number(said),) if count == 1 else numerals.numbers(said, count)
     except ValueError as error:
         raise ElementError(element, f"says {quote(said)}: it {error}.") from None
 

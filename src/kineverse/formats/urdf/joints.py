@@ -11,6 +11,7 @@ import sys
 
 from kineverse.errors import suggest
 from kineverse.formats.markup import Element, ElementError, abbreviate, name_of
+from kineverse.formats.numerals import LARGEST
 from kineverse.formats.remarks import Remarks
 from kineverse.formats.rpy import snap
 from kineverse.formats.urdf.attributes import number, pose, vector
@@ -176,6 +177,10 @@ def _bound(value: float | None) -> float | None:
 def _range(limit: Element, lower: float, upper: float) -> tuple[float, float]:
     if lower > upper:
         raise ElementError(limit, f"has lower={lower!r} above upper={upper!r}: no position would be valid.")
+    if lower > LARGEST or upper < -LARGEST:
+        raise ElementError(
+            limit, f"has lower={lower!r} and upper={upper!r}: all positions would be beyond {LARGEST:g}."
+        )
     return lower, upper
 
 

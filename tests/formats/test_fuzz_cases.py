@@ -1,0 +1,157 @@
+"""What fuzzing found, made small by hand: each input now gives a model, or one error that says why not."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from robots import joint, pair, robot
+from test_sdf_frames import link, pose, sdf
+from test_sdf_joints import Z, mimic
+from test_sdf_joints import joint as sdf_joint
+
+import kineverse as kv
+from kineverse.errors import suggest
+from kineverse.formats.markup import abbreviate, quote
+
+INVISIBLE = "\U000e0001"
+"""A character of ten in the escaped form that messages show."""
+
+
+def loaded(tmp_path, text: str, name: str = "input.urdf") -> kv.Model | str:
+    """Return the model or the message of the one error there is."""
+    path = tmp_path / name
+    path.write_text(text, encoding="utf-8")
+    try:
+        return kv.load(path)
+    except kv.FormatError as error:
+        return str(error)
+
+
+def limited(lower: str, upper: str) -> str:
+    return f'<limit lower="{lower}" upper="{upper}" effort="1" velocity="1"/>'
+
+
+def follower(factors: str, kind: str) -> str:
+    leader = joint("j", "l0", "l1", kind, limited("-1", "1"))
+    return robot(
+        leader, joint("k", "l1", "l2", kind, limited("1", "2") + f'<mimic joint="j" {factors}/>'), links=3
+    )
+
+
+@pytest.mark.parametrize(
+    ("text", "reason"),
+    [
+        # Two offsets of this size were an infinite one.
+        (
+            robot(
+                joint("a", "l0", "l1", "fixed", '<origin xyz="1e308 0 0"/>'),
+                joint("b", "l1", "l2", "fixed", '<origin xyz="1e308 0 0"/>'),
+                links=3,
+            ),
+            "has a number beyond 1e+50",
+        ),
+        # The length of the axis was infinite, and its direction (0, 0, 0).
+        (pair(limited("0", "1") + '<axis xyz="1.7e308 1.7e308 1.7e308"/>'), "has a number beyond 1e+50"),
+        (
+            robot(
+                joint("a", "l0", "l1", "fixed", '<origin quat_xyzw="1e308 1e308 1e308 1e308"/>'),
+                links=2,
+                attributes='name="r" version="1.1"',
+            ),
+            "has a number beyond 1e+50",
+        ),
+        # Two such sliders in a row were infinitely far away.
+        (pair(limited("1e308", "1.7e308"), "prismatic"), "all positions would be beyond 1e+50"),
+        (pair(limited("-1.7e308", "-1e308"), "prismatic"), "all positions would be beyond 1e+50"),
+        # To reach its limits, the follower needed its leader at infinity.
+        (follower('multiplier="5e-324"', "prismatic"), "positions or limits overflow"),
+        (follower('multiplier="1e200" offset="1e200"', "revolute"), "positions or limits overflow"),
+    ],
+)
+def test_numbers_of_a_urdf_that_overflow(tmp_path, text, reason):
+    message = loaded(tmp_path, text)
+    assert isinstance(message, str)
+    assert message.startswith("input.urdf, line ")
+    assert reason in message
+
+
+@pytest.mark.parametrize(
+    ("text", "reason"),
+    [
+        (
+            sdf(
+                link("a"),
+                link("b", pose("1e308 0 0 0 0 0")),
+                '<frame name="f" attached_to="b"><pose>1e308 0 0 0 0 0</pose></frame>',
+            ),
+            "has a number beyond 1e+50",
+        ),
+        (sdf(link("a", pose("0 0 0 0 0 1e300"))), "has a number beyond 1e+50"),
+        (
+            sdf(
+                link("a"),
+                link("b"),
+                sdf_joint("j", "screw", "a", "b", Z + "<screw_thread_pitch>1e300</screw_thread_pitch>"),
+            ),
+            "has a thread without pitch, or with too much",
+        ),
+        (
+            sdf(
+                link("a"),
+                link("b"),
+                link("c"),
+                sdf_joint("j", "revolute", "a", "b", Z),
+                sdf_joint(
+                    "k", "revolute", "b", "c", Z.replace("</axis>", mimic("j", 1e200, reference=1e200))
+                ),
+            ),
+            "positions or limits overflow",
+        ),
+    ],
+)
+def test_numbers_of_an_sdf_that_overflow(tmp_path, text, reason):
+    message = loaded(tmp_path, text, "input.sdf")
+    assert isinstance(message, str)
+    assert message.startswith("input.sdf, line ")
+    assert reason in message
+
+
+def test_the_largest_double_is_no_limit_to_speak_of(tmp_path):
+    """Exporters write it for no limit at all, so it stays."""
+    model = loaded(tmp_path, pair(limited("-1.7976931348623157e308", "1.7976931348623157e308")))
+    assert isinstance(model, kv.Model)
+    assert np.isfinite(model.fk("l1")(model.default_state())).all()
+
+
+def test_poses_that_would_overflow_in_chains():
+    with pytest.raises(kv.ValueRejectedError, match=r"all numbers finite, of at most 1e\+100"):
+        kv.Pose.of(kv.translation(1e200, 0, 0))
+
+
+@pytest.mark.parametrize("name", ["y" * 3000, INVISIBLE * 400, "é" * 100 + "\x85" * 100])
+@pytest.mark.parametrize("places", [("child",), ("link", "link"), ("joint", "joint"), ("mimic",), ("value",)])
+def test_messages_are_bounded_whatever_is_in_the_file(tmp_path, name, places):
+    parts = {
+        "child": joint("j", "l0", "nobody", "fixed") + f'<link name="{name}"/>',
+        "link": f'<link name="{name}"/>',
+        "joint": joint(name, "l0", "l1", "fixed"),
+        "mimic": joint("j", "l0", "l1", "continuous", f'<mimic joint="z{name}"/>') + joint(name, "l1", "l2"),
+        "value": f'<link name="a"><inertial><mass value="{name}"/></inertial></link>',
+    }
+    message = loaded(tmp_path, robot(*(parts[place] for place in places), links=3))
+    assert isinstance(message, str)
+    assert len(message) < 2000
+
+
+@pytest.mark.parametrize("text", ["x" * 500, INVISIBLE * 500, INVISIBLE * 79, "x" * 79 + INVISIBLE, "\n"])
+def test_what_is_shown_of_a_text_is_printable_and_bounded(text):
+    assert len(abbreviate(text)) <= 80
+    assert abbreviate(text).isprintable()
+    assert quote(text) == f'"{abbreviate(text)}"'
+
+
+def test_suggestions_are_bounded():
+    names = [f"{i}{INVISIBLE * 3000}" for i in range(20)]
+    assert len(suggest("a", names)) < 1500
+    assert len(suggest(names[0][:-1], names)) < 1500
+    assert suggest("cab", ["cap"]) == "Did you mean 'cap'?"
