@@ -8,6 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import kineverse as kv
+from kineverse.model.body import Mesh
 from kineverse.model.delta import deltas
 from kineverse.model.difference import _moved
 from kineverse.model.samples import Samples
@@ -141,13 +142,22 @@ def test_gradients_count_as_well_as_values():
     assert delta.distance == pytest.approx(3 / 4)
 
 
-def test_where_a_mesh_lies_is_no_difference():
-    one, other = kv.Model(), kv.Model()
-    for model, folder in ((one, "/here"), (other, "/there")):
-        mesh = kv.Shape(kv.model.body.Mesh("a.stl", folder=folder))
+@pytest.mark.parametrize(
+    ("mesh", "parts"),
+    [
+        (Mesh("a.stl", folder="/there"), []),
+        (Mesh("../here/a.stl", folder="/there"), []),
+        (Mesh("../a.stl", folder="/there"), ["visuals[0].geometry.uri"]),
+        (Mesh("a.stl", (2.0, 2.0, 2.0), "/here"), ["visuals[0].geometry.scale"]),
+    ],
+)
+def test_where_a_mesh_lies_is_no_difference(mesh, parts):
+    models = kv.Model(), kv.Model()
+    for model, geometry in zip(models, (Mesh("a.stl", folder="/here"), mesh), strict=True):
         with model.edit() as edit:
-            edit.add_frame("a", parent="world", transform=np.eye(4), body=kv.Body(visuals=(mesh,)))
-    assert details(one, other)["bodies/a"] == []
+            body = kv.Body(visuals=(kv.Shape(geometry),))
+            edit.add_frame("a", parent="world", transform=np.eye(4), body=body)
+    assert [delta.what for delta in details(*models)["bodies/a"]] == parts
 
 
 def test_samples_are_the_same_for_all_models_and_within_limits():

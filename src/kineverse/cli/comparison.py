@@ -5,9 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import cached_property
 
-from kineverse.model.delta import Delta, deltas
+from kineverse.model.articulation import Articulation
+from kineverse.model.delta import Delta, deltas, poses_apart
 from kineverse.model.diff import Change, Diff
 from kineverse.model.difference import difference
+from kineverse.model.frame import Frame
 from kineverse.model.history import History
 from kineverse.model.model import Model
 from kineverse.model.samples import Samples
@@ -51,13 +53,51 @@ class Comparison:
         self.differences: list[Difference] = []
         self.alike: list[str] = []
         self._asked = operations
-        parts = deltas(self.diff.changes, Samples(before, after))
+        samples = Samples(before, after)
+        parts = deltas(self.diff.changes, samples)
+        elsewhere = self._reparented(samples)
         for change, found in zip(self.diff.changes, parts, strict=True):
+            if change.path in elsewhere:
+                found = (found[0], elsewhere[change.path])
             counting = tuple(delta for delta in found if not delta.is_within(tolerance))
-            if counting or change.before is None or change.after is None:
+            alone = (change.before is None or change.after is None) and not self._says_nothing(change)
+            if counting or alone:
                 self.differences.append(Difference(change, counting))
             else:
                 self.alike.append(change.path)
+
+    def _reparented(self, samples: Samples) -> dict[str, Delta]:
+        """Return how far apart frames are in the world that have another parent, as theirs says nothing."""
+        changes = [
+            c
+            for c in self.diff.changes
+            if isinstance(c.before, Frame)
+            and isinstance(c.after, Frame)
+            and c.before.parent != c.after.parent
+        ]
+        poses = samples.values([model.fk(c.name) for c in changes for model in (self.before, self.after)])
+        found = {}
+        for change, one, other in zip(changes, poses[::2], poses[1::2], strict=True):
+            distances, angles = poses_apart(one, other)
+            found[change.path] = Delta(
+                "place",
+                change.before.parent,
+                change.after.parent,
+                float(distances.max()),
+                float(angles.max()),
+                (float(distances[0]), float(angles[0])),
+            )
+        return found
+
+    def _says_nothing(self, change: Change) -> bool:
+        """Return whether it is the record of a fixed joint between frames that both have."""
+        record = change.after if change.before is None else change.before
+        return (
+            isinstance(record, Articulation)
+            and record.kind == "fixed"
+            and record.child in self.before.frames
+            and record.child in self.after.frames
+        )
 
     @property
     def equal(self) -> bool:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 from typing import Any
 
 from kineverse.cli.comparison import SIGNS, Comparison, Difference
@@ -12,19 +13,34 @@ from kineverse.model.delta import Delta
 from kineverse.model.operation import ARTICULATIONS, BODIES, CONSTRAINTS, DATA, FRAMES, RATES
 
 ORDER = (FRAMES, CONSTRAINTS, BODIES, ARTICULATIONS, RATES, DATA)
-MOVED = {**SIGNS, ">": "moved"}
+WORDS = {**SIGNS, ">": "moved"}
 _WIDEST = 44
 
 
-def blocks(found: Comparison, most: int | None) -> list[list[str]]:
-    """Return the paragraphs of the report, with at most so many differences each."""
-    result = [_operations(found, most)] if any(found.operations.values()) else []
-    for kind in ORDER:
-        differences = found.of(kind)
-        if differences:
-            result.append([paint(kind, "bold"), *_lines(differences, most)])
-    result.append(_closing(found))
-    return result
+@dataclass(frozen=True)
+class ComparisonReport:
+    """What two models differ in, to be printed."""
+
+    found: Comparison
+
+    def blocks(self, most: int | None) -> list[list[str]]:
+        """Return the paragraphs of the report, with at most so many differences each."""
+        result = [_operations(self.found, most)] if any(self.found.operations.values()) else []
+        for kind in ORDER:
+            differences = self.found.of(kind)
+            if differences:
+                result.append([paint(kind, "bold"), *_lines(differences, most)])
+        result.append(_closing(self.found))
+        return result
+
+    def as_json(self) -> dict[str, Any]:
+        """Return all of it as JSON has it: by operation, and by kind of data."""
+        operations = {WORDS[sign]: list(tags) for sign, tags in self.found.operations.items()}
+        return {
+            "operations": operations if self.found.operations_compared else None,
+            **{kind: _kind(self.found.of(kind)) for kind in ORDER},
+            "alike": self.found.alike,
+        }
 
 
 def _operations(found: Comparison, most: int | None) -> list[str]:
@@ -69,16 +85,6 @@ def _closing(found: Comparison) -> list[str]:
     if not set(found.before.frames) & set(found.after.frames) and found.before.frames and found.after.frames:
         lines.append("They have no frame in common; --prefix NAME puts the same name in front of both.")
     return lines
-
-
-def as_json(found: Comparison) -> dict[str, Any]:
-    """Return all of it as JSON has it: by operation, and by kind of data."""
-    operations = {MOVED[sign]: list(tags) for sign, tags in found.operations.items()}
-    return {
-        "operations": operations if found.operations_compared else None,
-        **{kind: _kind(found.of(kind)) for kind in ORDER},
-        "alike": found.alike,
-    }
 
 
 def _kind(differences: list[Difference]) -> dict[str, Any]:

@@ -65,9 +65,10 @@ def run(arguments: argparse.Namespace) -> int:
         raise ValueRejectedError(f"--tolerance is a number from 0 on, not {arguments.tolerance}.")
 
     import kineverse as kv
-    from kineverse.cli import behaviour_report, comparison_report
     from kineverse.cli.behaviour import Behaviour
+    from kineverse.cli.behaviour_report import BehaviourReport
     from kineverse.cli.comparison import Comparison
+    from kineverse.cli.comparison_report import ComparisonReport
     from kineverse.cli.wording import contents
 
     models = []
@@ -75,16 +76,13 @@ def run(arguments: argparse.Namespace) -> int:
         with doing(f"reading {source}"):
             models.append(kv.load(source, arguments.prefix))
     before, after = models
-    most = None if arguments.all else SHOWN
+    report: BehaviourReport | ComparisonReport
     with doing("comparing"):
         if arguments.values:
-            behaviour = Behaviour(before, after, arguments.tolerance)
-            equal, told = behaviour.equal, behaviour_report.blocks(behaviour, most)
-            data = behaviour_report.as_json(behaviour)
+            report = BehaviourReport(Behaviour(before, after, arguments.tolerance))
         else:
-            comparison = Comparison(before, after, arguments.tolerance, arguments.operations)
-            equal, told = comparison.equal, comparison_report.blocks(comparison, most)
-            data = comparison_report.as_json(comparison)
+            report = ComparisonReport(Comparison(before, after, arguments.tolerance, arguments.operations))
+    equal = report.found.equal
     if arguments.json:
         answer = {
             "before": arguments.a,
@@ -92,9 +90,10 @@ def run(arguments: argparse.Namespace) -> int:
             "equal": equal,
             "tolerance": arguments.tolerance,
         }
-        print(json.dumps({**answer, **data}, allow_nan=False))
+        print(json.dumps({**answer, **report.as_json()}, allow_nan=False))
     else:
         sides = (("-", arguments.a, before), ("+", arguments.b, after))
         head = [paint(f"{sign * 3} {name}  {contents(model)}", sign) for sign, name, model in sides]
+        told = report.blocks(None if arguments.all else SHOWN)
         print("\n\n".join("\n".join(block) for block in ([] if equal else head, *told) if block))
     return EQUAL if equal else DIFFERENT

@@ -101,6 +101,8 @@ def _body(body: Body) -> str:
 
 def part(delta: Delta) -> list[str]:
     """Return what differs in one part of a value, in one line or several."""
+    if delta.what == "place":
+        return [f"in the world {_motion(delta)}"]
     if delta.what == "transform":
         return [_motion(delta), *_places(delta)]
     name = f"{delta.what} " if delta.what else ""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, fields, is_dataclass
 from functools import reduce
@@ -58,7 +59,7 @@ class Delta:
 def deltas(changes: Sequence[Change], samples: Samples) -> list[tuple[Delta, ...]]:
     """Return, for each change, the parts that differ; none for a value that is new or gone.
 
-    Where a mesh file lies is no difference, only what it is called.
+    Where a mesh file lies is no difference, only what it is called; nor how a path leads to the same file.
     """
     parts = [_parts(change) for change in changes]
     pairs = [(a, b) for found in parts for _, a, b in found if _is_symbolic(a, b)]
@@ -89,15 +90,18 @@ def _walk(what: str, a: Any, b: Any) -> Iterator[tuple[str, Any, Any]]:
         return
     if type(a) is not type(b) or isinstance(a, (Expression, Pose)):
         if not _equal(a, b):
-            yield what, a, b
+            yield what, _number(a), _number(b)
     elif isinstance(a, Frame):
         if a.parent != b.parent:
             yield "parent", a.parent, b.parent
         if a.factors != b.factors:
             yield "transform", transform_of(a), transform_of(b)
     elif is_dataclass(a) and not isinstance(a, type):
+        alike = ("folder",) if isinstance(a, Mesh) else ()
+        if isinstance(a, Mesh) and _file(a) == _file(b):
+            alike = ("folder", "uri")
         for field in fields(a):
-            if not (isinstance(a, Mesh) and field.name == "folder"):
+            if field.name not in alike:
                 name = f"{what}.{field.name}" if what else field.name
                 yield from _walk(name, getattr(a, field.name), getattr(b, field.name))
     elif isinstance(a, tuple) and (a or b) and _are_named(a) and _are_named(b):
@@ -109,6 +113,11 @@ def _walk(what: str, a: Any, b: Any) -> Iterator[tuple[str, Any, Any]]:
             yield from _walk(f"{what}[{i}]", *(side[i] if i < len(side) else None for side in (a, b)))
     elif not _equal(a, b):
         yield what, a, b
+
+
+def _file(mesh: Mesh) -> str:
+    """Return the file of a mesh as far as it can be told without looking for it."""
+    return mesh.uri if "://" in mesh.uri else os.path.normpath(os.path.join(mesh.folder, mesh.uri))
 
 
 def _equal(a: Any, b: Any) -> bool:
@@ -129,6 +138,12 @@ def _are_numbers(value: Any) -> bool:
 
 def _is_number(value: Any) -> bool:
     return isinstance(value, (int, float)) and not isinstance(value, bool)
+
+
+def _number(value: Any) -> Any:
+    """Return a constant scalar as a number."""
+    is_scalar = isinstance(value, Expression) and not value.shape
+    return float(value) if is_scalar and value.is_constant else value
 
 
 def _is_symbolic(a: Any, b: Any) -> bool:
