@@ -87,6 +87,29 @@ def test_documents_say_their_version(run, tmp_path, good):
     status, out, _ = run(path)
     assert status == 0
     assert f"{path}: document, version 1" in out
+    written = json.loads(path.read_text())
+    (file,) = json.loads(run(path, "--json")[1])["files"]
+    assert file["version"] == written["version"]
+    assert file.get("sha256") == written.get("sha256")
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "language"),
+    [
+        ("a.sdf", '<sdf version="1.9"><model name="m"><link name="a"/></model></sdf>', "SDF"),
+        ("a.world", '<sdf version="1.9"><world name="w"/></sdf>', "SDF"),
+        ("a.xml", '<robot name="r"><link name="a"/></robot>', "URDF"),
+        ("a.xml", "<mujoco><worldbody><body/></worldbody></mujoco>", "MJCF"),
+        ("a.mjcf", "<mujoco><worldbody><body/></worldbody></mujoco>", "MJCF"),
+    ],
+)
+def test_it_says_what_a_file_is(run, tmp_path, name, text, language):
+    if language == "MJCF":
+        pytest.importorskip("mujoco")
+    (tmp_path / name).write_text(text)
+    status, out, err = run(tmp_path / name)
+    assert (status, err) == (0, "")
+    assert out.startswith(f"{tmp_path / name}: {language}\n")
 
 
 def test_operations_that_cannot_follow_are_remarks(run, tmp_path):

@@ -3,16 +3,20 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 
 import kineverse as kv
 from kineverse.cli.findings import Finding, findings
 from kineverse.cli.wording import contents, number
 from kineverse.errors import KineverseError
 from kineverse.formats.document import Recorded
+from kineverse.formats.files import read_file
+from kineverse.formats.markup import root_tag
 from kineverse.formats.remarks import listening
 from kineverse.formats.sources import Source, locate_model
+
+FORMATS = {".kv.json": "document", ".urdf": "URDF", ".sdf": "SDF", ".world": "SDF", ".mjcf": "MJCF"}
 
 GOOD, BAD, UNREADABLE = 0, 1, 2
 """What :attr:`Examination.status` may be."""
@@ -30,6 +34,8 @@ class Examination:
         What it is, as far as that is known.
     model
         What is in it; None if it cannot be read, and then ``error`` says why.
+    facts
+        What a document says about itself: its ``version``, and ``sha256``, the hash of its content.
     remarks
         What its reader left out, or took another way.
     problems
@@ -42,6 +48,7 @@ class Examination:
     format: str = ""
     model: kv.Model | None = None
     error: KineverseError | OSError | None = None
+    facts: Mapping[str, int | str] = field(default_factory=dict)
     remarks: Sequence[str] = ()
     problems: Sequence[Finding] = ()
     strict: bool = False
@@ -52,6 +59,11 @@ class Examination:
         if self.model is None:
             return UNREADABLE
         return BAD if self.problems or (self.strict and self.remarks) else GOOD
+
+    @property
+    def kind(self) -> str:
+        """The format, with the facts; of a hash only so much as people compare."""
+        return ", ".join([self.format, *(f"{name} {str(fact)[:12]}" for name, fact in self.facts.items())])
 
     @property
     def contents(self) -> str:
@@ -70,16 +82,17 @@ class Examination:
 
 def examine(name: str, meshes: bool = True, strict: bool = False) -> Examination:
     """Return what is found in a file; nothing is raised for what is wrong with it."""
-    kind = ""
+    language = ""
     with listening() as remarks:
         try:
-            kind = format_of(locate_model(name))
+            source = locate_model(name)
+            language = format_of(source)
             model = kv.load(name)
+            facts = _facts(source)
             problems = tuple(findings(model, meshes))
-            remarks += _frozen(model)
         except (KineverseError, OSError) as error:
-            return Examination(name, kind, error=error, remarks=remarks, strict=strict)
-    return Examination(name, kind, model, None, remarks, problems, strict)
+            return Examination(name, language, error=error, remarks=remarks, strict=strict)
+    return Examination(name, language, model, None, facts, [*remarks, *_frozen(model)], problems, strict)
 
 
 def _frozen(model: kv.Model) -> list[str]:
@@ -93,25 +106,18 @@ def _frozen(model: kv.Model) -> list[str]:
 
 
 def format_of(source: Source) -> str:
-    """Return in which language a model is written, with what a document says about itself."""
+    """Return in which language a model is written; empty if its name does not say."""
     if source.scene:
         return "scene of the gallery"
-    name = source.path.name
-    if name.endswith(".kv.json"):
-        return _document(source)
-    if name.endswith((".sdf", ".world")):
-        return "SDF"
-    if name.endswith(".xml"):
-        with source.path.open("rb") as file:
-            return "MJCF" if b"<mujoco" in file.read(1 << 16) else "URDF"
-    return "URDF" if name.endswith(".urdf") else ""
+    if source.path.name.endswith(".xml"):
+        return "MJCF" if root_tag(read_file(source.path)).startswith("mujoco") else "URDF"
+    endings = (name for name in FORMATS if source.path.name.endswith(name))
+    return FORMATS.get(next(endings, ""), "")
 
 
-def _document(source: Source) -> str:
-    """Return the version of a document, and its hash if it has one; its reader says what is wrong with it."""
-    try:
-        head = json.loads(source.path.read_bytes())
-        facts = [f"{key} {str(head[key])[:20]}" for key in ("version", "hash") if key in head]
-    except (ValueError, TypeError, RecursionError):
-        return "document"
-    return ", ".join(["document", *facts])
+def _facts(source: Source) -> dict[str, int | str]:
+    """Return the version of a document, and its hash if it has one; its reader has checked both."""
+    if source.scene or not source.path.name.endswith(".kv.json"):
+        return {}
+    head = json.loads(read_file(source.path))
+    return {key: head[key] for key in ("version", "sha256") if key in head}

@@ -69,7 +69,7 @@ def report(found: Examination, most: int | None) -> list[str]:
     """Return what was found in one file, with at most so many remarks, and problems of a kind."""
     if found.error is not None:
         return [found.name, f"  {paint('cannot be read', '!')}: {found.reason}"]
-    lines = [f"{found.name}: {found.format}", f"  {found.contents}", f"  {_verdict(found)}"]
+    lines = [f"{found.name}: {found.kind}", f"  {found.contents}", f"  {_verdict(found)}"]
     for kind, texts in _by_kind(found).items():
         lines += [f"  {kind}", *bounded([f"    {text}" for text in texts], most, "    ")]
     return lines
@@ -122,6 +122,7 @@ def as_json(found: Examination) -> dict[str, Any]:
     return {
         "file": found.name,
         "format": found.format or None,
+        **found.facts,
         "status": found.status,
         "error": found.reason if found.error is not None else None,
         "counts": counts,
