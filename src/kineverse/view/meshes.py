@@ -1,29 +1,21 @@
-"""Mesh files as triangles, read when somebody wants to see them."""
+"""Mesh files as triangles with colours, read when somebody wants to see them."""
 
 from __future__ import annotations
 
-import hashlib
 import logging
-import re
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from kineverse.errors import KineverseError, MissingExtraError
-from kineverse.formats.packages import locate
+from kineverse.errors import KineverseError
+from kineverse.geometry.mesh_files import MeshFile, find, metres, parts
 from kineverse.model.body import Mesh
 from kineverse.model.view import ModelView
 from kineverse.view.primitives import placeholder
 from kineverse.view.triangles import Floats, Triangles, creased, join
 
 logger = logging.getLogger(__name__)
-
-LARGEST = 256 * 2**20
-"""No mesh file above this size is read [bytes]: a description is not trusted with the viewer's memory."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,15 +67,11 @@ def _missing(mesh: Mesh, problem: str) -> Loaded:
 
 
 def _read(mesh: Mesh) -> Triangles:
-    path = locate(mesh.uri, mesh.folder)
-    size = path.stat().st_size
-    if size > LARGEST:
-        raise OSError(f"{path} has {size / 2**20:.0f} MiB, more than the {LARGEST / 2**20:.0f} MiB read here")
-    digest = hashlib.sha256(path.read_bytes()).hexdigest()
+    file = find(mesh)
     # The folder is part of the key because materials and textures lie beside the file.
-    source = (digest, path.suffix.lower(), str(path.parent))
+    source = (file.digest, file.kind, str(file.path.parent))
     if source not in _by_content:
-        _by_content[source] = _parse(path)
+        _by_content[source] = _parse(file)
     if mesh.scale == (1.0, 1.0, 1.0):
         return _by_content[source]
     scaled = (*source, mesh.scale)
@@ -92,37 +80,14 @@ def _read(mesh: Mesh) -> Triangles:
     return _by_content[scaled]
 
 
-def _parse(path: Path) -> Triangles:
-    """Read a file by trimesh and return its triangles in metres."""
-    try:
-        import trimesh
-    except ImportError as error:
-        raise MissingExtraError(
-            "reading meshes needs trimesh: pip install 'kineverse-articulation[view]'"
-        ) from error
-    with _quiet("trimesh"):
-        scene = trimesh.load_scene(path, process=False)
-        pieces = [_piece(g) for g in scene.dump() if isinstance(g, trimesh.Trimesh) and len(g.faces)]
-    pieces = [piece for piece in pieces if len(piece.faces)]
+def _parse(file: MeshFile) -> Triangles:
+    """Return the triangles of a file in metres, with the colours it brings."""
+    pieces = [piece for part in parts(file) if len((piece := _piece(part)).faces)]
     if not pieces:
-        raise OSError(f"{path} holds no triangles")
+        raise OSError(f"{file.path} holds no triangles")
     if any(piece.colors is not None for piece in pieces):
         pieces = [_colored(piece) for piece in pieces]
-    return join(pieces).scaled(_metres(path))
-
-
-@contextmanager
-def _quiet(name: str) -> Iterator[None]:
-    """Keep a library from logging: a missing texture of a mesh costs it its colour, nothing else."""
-    log, nowhere = logging.getLogger(name), logging.NullHandler()
-    before = log.propagate
-    log.addHandler(nowhere)
-    log.propagate = False
-    try:
-        yield
-    finally:
-        log.propagate = before
-        log.removeHandler(nowhere)
+    return join(pieces).scaled(metres(file.path))
 
 
 def _piece(mesh: Any) -> Triangles:
@@ -133,20 +98,6 @@ def _piece(mesh: Any) -> Triangles:
         logger.debug("no colours from %s", mesh, exc_info=True)
         colors = None
     return surface if colors is None else surface.painted(colors[kept])
-
-
-def _metres(path: Path) -> float:
-    """Return the length of the file's unit [m].
-
-    Only COLLADA says what its numbers mean; like RViz this honours the unit and ignores the up axis, which
-    is what the authors of robot descriptions have come to rely on.
-    """
-    if path.suffix.lower() != ".dae":
-        return 1.0
-    with path.open("rb") as file:
-        match = re.search(rb"<unit\b[^>]*\bmeter\s*=\s*[\"']\s*([-+.\deE]+)", file.read(2**16))
-    factor = float(match.group(1)) if match else 1.0
-    return factor if np.isfinite(factor) and factor > 0.0 else 1.0
 
 
 def _face_colors(mesh: Any) -> Floats | None:

@@ -1,0 +1,159 @@
+"""Mesh files: found, checked, read and kept by content."""
+
+from __future__ import annotations
+
+import hashlib
+import logging
+import re
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, TypeAlias
+
+import numpy as np
+import numpy.typing as npt
+
+from kineverse.errors import FormatError, MissingExtraError
+from kineverse.formats.packages import locate
+from kineverse.model.body import Mesh
+
+Floats: TypeAlias = npt.NDArray[np.float64]
+Integers: TypeAlias = npt.NDArray[np.int64]
+
+LARGEST = 256 * 2**20
+"""No mesh file above this size is read [bytes]: a description is not trusted with memory."""
+
+
+@dataclass(frozen=True, slots=True)
+class MeshFile:
+    """A mesh file that is there and not too large, with the SHA-256 of its content."""
+
+    path: Path
+    digest: str
+
+    @property
+    def kind(self) -> str:
+        """The ending of its name, in lower case, with the dot."""
+        return self.path.suffix.lower()
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Faces:
+    """The triangles of a mesh: (V, 3) vertices [m] and (F, 3) indices; read-only."""
+
+    vertices: Floats
+    faces: Integers
+
+
+_by_content: dict[tuple[str, str], Faces] = {}
+_reading = threading.Lock()
+
+
+def find(mesh: Mesh) -> MeshFile:
+    """Return the file of a mesh.
+
+    Raises
+    ------
+    FormatError
+        If there is none.
+    OSError
+        If it cannot be read, or is larger than :data:`LARGEST`.
+    """
+    path = locate(mesh.uri, mesh.folder)
+    size = path.stat().st_size
+    if size > LARGEST:
+        raise OSError(f"{path} has {size / 2**20:.0f} MiB, more than the {LARGEST / 2**20:.0f} MiB read here")
+    return MeshFile(path, hashlib.sha256(path.read_bytes()).hexdigest())
+
+
+def read_faces(file: MeshFile) -> Faces:
+    """Return all triangles of a file, in its frame [m]; files of equal content are read once.
+
+    Raises
+    ------
+    FormatError
+        If it cannot be read as what its name says, holds no triangles, or numbers that are not finite.
+    """
+    key = (file.digest, file.kind)
+    with _reading:
+        if key not in _by_content:
+            _by_content[key] = _read(file)
+        return _by_content[key]
+
+
+def _read(file: MeshFile) -> Faces:
+    try:
+        found = parts(file)
+    except MissingExtraError:
+        raise
+    except Exception as error:  # Parsers of other people's formats raise anything at all.
+        reason = (str(error).strip().splitlines() or [type(error).__name__])[0]
+        raise FormatError(f"{file.path} cannot be read as a mesh: {reason}") from error
+    sizes = np.cumsum([0, *(len(part.vertices) for part in found[:-1])])
+    vertices = np.concatenate([np.asarray(part.vertices, dtype=float) for part in found]) * metres(file.path)
+    faces = np.concatenate(
+        [np.asarray(part.faces, dtype=np.int64) + n for part, n in zip(found, sizes, strict=True)]
+    )
+    if not np.isfinite(vertices).all():
+        raise FormatError(f"{file.path} has vertices that are not finite.")
+    if faces.min() < 0 or faces.max() >= len(vertices):
+        raise FormatError(f"{file.path} has faces between vertices that are not there.")
+    vertices.flags.writeable = faces.flags.writeable = False
+    return Faces(vertices, faces)
+
+
+def parts(file: MeshFile) -> list[Any]:
+    """Return the parts of a file as ``trimesh.Trimesh``, at least one, in the file's own unit of length.
+
+    Raises
+    ------
+    MissingExtraError
+        If trimesh is not installed.
+    OSError
+        If there are no triangles; whatever trimesh raises for what it cannot read.
+    """
+    try:
+        import trimesh
+    except ImportError as error:
+        raise MissingExtraError(
+            "reading meshes needs trimesh: pip install 'kineverse-articulation[geometry]'"
+        ) from error
+    with _quiet("trimesh"):
+        scene = trimesh.load_scene(file.path, process=False)
+        found = [g for g in scene.dump() if isinstance(g, trimesh.Trimesh) and len(g.faces)]
+    if not found:
+        raise OSError(f"{file.path} holds no triangles")
+    return found
+
+
+def metres(path: Path) -> float:
+    """Return the length of a file's unit [m].
+
+    Only COLLADA says what its numbers mean; like RViz this honours the unit and ignores the up axis, which
+    is what the authors of robot descriptions have come to rely on.
+    """
+    if path.suffix.lower() != ".dae":
+        return 1.0
+    with path.open("rb") as file:
+        match = re.search(rb"<unit\b[^>]*\bmeter\s*=\s*[\"']\s*([-+.\deE]+)", file.read(2**16))
+    try:
+        factor = float(match.group(1)) if match else 1.0
+    except ValueError:
+        return 1.0
+    return factor if np.isfinite(factor) and factor > 0.0 else 1.0
+
+
+@contextmanager
+def _quiet(name: str) -> Iterator[None]:
+    """Keep a library from logging: a missing texture of a mesh costs it its colour, nothing else."""
+    log, nowhere = logging.getLogger(name), logging.NullHandler()
+    before = log.propagate
+    log.addHandler(nowhere)
+    log.propagate = False
+    try:
+        yield
+    finally:
+        log.propagate = before
+        log.removeHandler(nowhere)
