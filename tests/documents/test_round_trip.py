@@ -151,4 +151,5 @@ def test_the_empty_model(tmp_path):
         "version": 1,
         "nodes": [],
         "operations": [],
+        "sha256": kv.document_hash(read),
     }

@@ -2,15 +2,16 @@
 
 A document is one JSON object::
 
-    {"format": "kineverse", "version": 1, "nodes": [...], "operations": [...]}
+    {"format": "kineverse", "version": 1, "nodes": [...], "operations": [...], "sha256": "..."}
 
 ``nodes`` holds all expressions of the model in one table, each node made of earlier ones
-(:mod:`.table` says which nodes there are); ``operations`` what every operation read and wrote.
+(:mod:`.table` says which nodes there are); ``operations`` what every operation read and wrote;
+``sha256`` is the hash of all that (:mod:`.canonical`), and may be missing.
 Reading one runs no code and imports no name.
 """
 
 from .reading import operations_from
 from .recorded import Recorded
-from .writing import document_of, write_document
+from .writing import document_hash, document_of, write_document
 
-__all__ = ["Recorded", "document_of", "operations_from", "write_document"]
+__all__ = ["Recorded", "document_hash", "document_of", "operations_from", "write_document"]

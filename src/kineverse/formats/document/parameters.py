@@ -115,7 +115,7 @@ def read_parameter(value: Any, graph: Graph, rename: Rename, path: Callable[[str
         return tuple(map(inner, value))
     if type(value) is not dict:
         return read_datum(value, graph, rename)
-    tag = next(iter(value), None)
+    tag = next((tag for tag in _TAGS if tag in value), None)
     if tag == "pose":
         return read_pose(fields(value, ("pose",))["pose"])
     if tag == "mapping":
@@ -134,6 +134,6 @@ def read_parameter(value: Any, graph: Graph, rename: Rename, path: Callable[[str
         return Written(path(string(fields(value, (tag,))[tag])))
     if tag == "unwritten":
         return Unwritten(string(fields(value, (tag,))[tag]))
-    if tag not in _TAGS:
+    if tag is None:
         raise RefusedError(f"an object among parameters has one of the keys {', '.join(_TAGS)}")
     return read_datum(value, graph, rename)

@@ -16,6 +16,7 @@ from kineverse.model.traces import Trace
 from kineverse.model.traces.answer import answers_in
 from kineverse.symbols import symbol_name
 
+from .canonical import HASH, check_hash
 from .checks import RefusedError, fields, listed, name, string
 from .graph import Graph
 from .parameters import read_parameter
@@ -47,10 +48,11 @@ def operations_from(
     if len(content) > MAX_BYTES:
         raise FormatError(f"{source}: larger than {MAX_BYTES} bytes, the most a document has.")
     try:
-        text = content if isinstance(content, str) else content.decode()
-    except UnicodeDecodeError as error:
-        raise FormatError(f"{source}: byte {error.start} is not UTF-8; a document is UTF-8 text.") from None
-    return _Document(source, prefix).read(text)
+        content = content.encode() if isinstance(content, str) else content
+        text = content.decode()
+    except UnicodeError as error:
+        raise FormatError(f"{source}: a document is UTF-8 text, and this is not: {error}.") from None
+    return _Document(source, prefix).read(text, content)
 
 
 class _Document:
@@ -62,7 +64,7 @@ class _Document:
         self._cells: dict[Cell, Any] = {}
         self._names: dict[str, set[str]] = {kind: set() for kind in KINDS}
 
-    def read(self, text: str) -> list[tuple[str, Recorded]]:
+    def read(self, text: str, content: bytes) -> list[tuple[str, Recorded]]:
         try:
             given = json.loads(text, object_pairs_hook=_object, parse_constant=_no_constant)
             self._place = "the document"
@@ -71,7 +73,9 @@ class _Document:
                     f'it does not begin with {{"format": "{FORMAT}", and so is not one of Kineverse'
                 )
             self._check_version(given.get("version"))
-            fields(given, ("format", "version", "nodes", "operations"))
+            fields(given, ("format", "version", "nodes", "operations"), (HASH,))
+            if HASH in given:
+                check_hash(given[HASH], content, given)
             self._read_nodes(listed(given["nodes"], "nodes"))
             return self._read_operations(listed(given["operations"], "operations"))
         except json.JSONDecodeError as error:
@@ -157,8 +161,9 @@ class _Document:
 
     def _writes(self, given: Any, place: str) -> tuple[tuple[Cell, Any], ...]:
         writes = []
-        for kind, values in fields(given, (), KINDS).items():
-            for key, value in _members(values).items():
+        given = fields(given, (), KINDS)
+        for kind in (kind for kind in KINDS if kind in given):
+            for key, value in _members(given[kind]).items():
                 self._place = f"{place}, writes {kind}/{key[:60]}"
                 cell = self._cell(kind, name(key))
                 try:

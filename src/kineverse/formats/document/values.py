@@ -175,7 +175,10 @@ def _number(value: Any) -> float | str:
         raise FormatError(f"a number is wanted, not {value!r}")
     if value != value:
         raise FormatError("NaN has no place in a document")
-    result: float = value
+    try:
+        result = float(value)
+    except OverflowError:
+        raise FormatError("an integer is too large for a 64-bit float") from None
     return result if abs(result) < math.inf else ("inf" if result > 0 else "-inf")
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
@@ -19,6 +18,7 @@ from kineverse.model.reader import ABSENT, Cell, Read, Reader, Reads
 from kineverse.model.traces import Trace, UntraceableError, trace
 from kineverse.model.view import ModelView
 
+from .canonical import dump, hash_of, sealed
 from .parameters import expressions_among, parameters_of, written_parameter
 from .recorded import Recorded
 from .table import Table, text
@@ -28,8 +28,6 @@ from .values import written
 FORMAT = "kineverse"
 VERSION = 1
 SUFFIX = ".kv.json"
-
-_dump = json.JSONEncoder(ensure_ascii=False, allow_nan=False, separators=(",", ":")).encode
 
 
 def write_document(model: ModelView, path: str | os.PathLike[str]) -> None:
@@ -51,14 +49,11 @@ def write_document(model: ModelView, path: str | os.PathLike[str]) -> None:
         content = document_of(model).encode()
     except FormatError as error:
         raise FormatError(f"{target} is not written. {error}") from None
-    except UnicodeEncodeError as error:
-        bad = ascii(error.object[max(error.start - 20, 0) : error.end])
-        raise FormatError(f"{target} is not written. Half a surrogate pair is no text: {bad}.") from None
     replace_file(target, content)
 
 
 def document_of(model: ModelView) -> str:
-    """Return the text of a document; equal for models made by the same operations.
+    """Return the text of a document, its hash at the end; equal for models made by the same operations.
 
     Raises
     ------
@@ -74,15 +69,39 @@ def document_of(model: ModelView) -> str:
         operations = [_operation(part, table) for part in parts]
     except RecursionError:
         raise FormatError("The model contains data or gradients that are nested too deeply.") from None
-    return "".join(
+    body = "".join(
         (
             f'{{"format":"{FORMAT}","version":{VERSION},\n"nodes":[',
             *_lines(table.lines),
             '],\n"operations":[',
             *_lines(operations),
-            "]}\n",
+            "]",
         )
     )
+    try:
+        return sealed(body)
+    except UnicodeEncodeError as error:
+        bad = ascii(body[max(error.start - 20, 0) : error.end])
+        raise FormatError(f"Half a surrogate pair is no text: {bad}.") from None
+
+
+def document_hash(model: ModelView) -> str:
+    """Return the hash of a model's content, 64 hexadecimal digits.
+
+    It is equal for models made by the same operations, in any process, and stays what it is when a model is
+    saved and loaded, whatever it is saved as. Names are part of it, so a prefix changes it.
+
+    Parameters
+    ----------
+    model
+        A model or a snapshot.
+
+    Raises
+    ------
+    FormatError
+        Naming what a document cannot carry.
+    """
+    return hash_of(document_of(model))
 
 
 def _in_order(entries: Sequence[Entry]) -> Iterator[tuple[Entry, dict[Cell, Any]]]:
@@ -157,13 +176,13 @@ def _operation(what: _Parts, table: Table) -> str:
     parts = {"tag": entry.tag, "kind": what.kind}
     members = {key: text(value) for key, value in parts.items()}
     if parameters:
-        members["parameters"] = _dump(parameters)
-    members["reads"] = _dump({how: names for how, names in reads.items() if names})
-    members["writes"] = _dump(_writes(entry.tag, entry.writes, table))
+        members["parameters"] = dump(parameters)
+    members["reads"] = dump({how: names for how, names in reads.items() if names})
+    members["writes"] = dump(_writes(entry.tag, entry.writes, table))
     if what.trace is not None:
         questions = written_questions(what.trace, table.ref)
         writes = _writes(entry.tag, dict(what.trace.writes), table)
-        members["trace"] = _dump({"questions": questions, "writes": writes})
+        members["trace"] = dump({"questions": questions, "writes": writes})
     if what.frozen:
         members["frozen"] = text(what.frozen)
     joined = ",".join(f'"{key}":{value}' for key, value in members.items())

@@ -1,0 +1,136 @@
+"""The hash of a document: the same for the same content, however it is laid out, and no other content has it."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from document_models import rich_model
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import kineverse as kv
+from kineverse.formats.document import document_of, operations_from
+
+MODEL = rich_model()
+TEXT = document_of(MODEL)
+HASH = kv.document_hash(MODEL)
+NAMED = ("parameters", "fields", "frames", "bodies", "articulations", "constraints", "rates", "data")
+
+
+def shuffled(value: Any, random: Any, named: bool = False) -> Any:
+    """Return a value of JSON with the members that the format names in another order."""
+    if isinstance(value, list):
+        return [shuffled(item, random) for item in value]
+    if not isinstance(value, dict):
+        return value
+    keys = list(value)
+    if not named:
+        random.shuffle(keys)
+    return {key: shuffled(value[key], random, key in NAMED and not named) for key in keys}
+
+
+def test_it_is_sha256_of_the_text_without_it() -> None:
+    """As anybody computes it who has the file and the documentation."""
+    tree = json.loads(TEXT)
+    claim = tree.pop("sha256")
+    compact = json.dumps(tree, ensure_ascii=False, separators=(",", ":"))
+    assert hashlib.sha256(compact.encode()).hexdigest() == claim == HASH
+    body = TEXT[: TEXT.rindex(',\n"sha256"')] + "}"
+    assert hashlib.sha256(body.replace("\n", "").encode()).hexdigest() == claim
+
+
+@given(
+    random=st.randoms(use_true_random=False), indent=st.sampled_from([None, 0, 2]), ascii_only=st.booleans()
+)
+@settings(max_examples=20, deadline=None)
+def test_the_layout_does_not_matter(random: Any, indent: int | None, ascii_only: bool) -> None:
+    text = json.dumps(shuffled(json.loads(TEXT), random), indent=indent, ensure_ascii=ascii_only)
+    assert operations_from(text) == operations_from(TEXT)
+
+
+def leaves_of(value: Any, path: tuple[Any, ...] = ()) -> list[tuple[Any, ...]]:
+    """Return the paths to all that is no list and no object."""
+    if not isinstance(value, (list, dict)):
+        return [path]
+    items = enumerate(value) if isinstance(value, list) else value.items()
+    return [found for key, item in items for found in leaves_of(item, (*path, key))]
+
+
+LEAVES = leaves_of(json.loads(TEXT))
+
+
+@given(st.data())
+@settings(max_examples=100, deadline=None)
+def test_whatever_is_changed_is_noticed(data: st.DataObject) -> None:
+    tree = json.loads(TEXT)
+    *path, last = data.draw(st.sampled_from([p for p in LEAVES if p[0] in ("nodes", "operations")]))
+    place = tree
+    for key in path:
+        place = place[key]
+    old = place[last]
+    other = {str: f"{old}x", bool: old is False, float: None, int: None, type(None): 0}[type(old)]
+    if isinstance(old, float):
+        other = float(np.nextafter(old, 7.0))  # one bit
+    elif type(old) is int:
+        other = old + 1
+    place[last] = other
+    with pytest.raises(kv.FormatError, match="not what 'sha256' says; it was changed or damaged"):
+        operations_from(json.dumps(tree))
+
+
+def test_where_it_is_changed_as_text() -> None:
+    """The place of a digit, in what is laid out as it was written."""
+    place = TEXT.index("0.30000000000000004")
+    with pytest.raises(kv.FormatError, match="delete the member 'sha256'"):
+        operations_from(TEXT[:place] + "0.30000000000000014" + TEXT[place + 19 :])
+
+
+def test_a_change_that_is_meant() -> None:
+    """Without the hash a document is what it says."""
+    tree = json.loads(document_of(kv.load("shelf_door")))
+    del tree["sha256"]
+    assert operations_from(json.dumps(tree)) == operations_from(document_of(kv.load("shelf_door")))
+
+
+@pytest.mark.parametrize("wrong", [None, 7, "", "0" * 63, "0" * 65, "G" * 64, HASH.upper(), [HASH]])
+def test_what_is_no_hash(wrong: Any) -> None:
+    with pytest.raises(kv.FormatError, match="64 digits from 0 to f"):
+        operations_from(json.dumps({**json.loads(TEXT), "sha256": wrong}))
+
+
+def test_it_stays_when_a_model_is_saved_and_loaded(tmp_path: Path) -> None:
+    MODEL.save(tmp_path / "m.kv.json")
+    read = kv.load(tmp_path / "m.kv.json")
+    assert kv.document_hash(read) == kv.document_hash(read.snapshot()) == HASH
+    assert (tmp_path / "m.kv.json").read_text().endswith(f'"sha256":"{HASH}"}}\n')
+
+
+def test_in_another_process() -> None:
+    script = (
+        "import sys; sys.path.insert(0, sys.argv[1]); import kineverse as kv;"
+        "from document_models import rich_model; print(kv.document_hash(rich_model()))"
+    )
+    command = [sys.executable, "-c", script, str(Path(__file__).parent)]
+    environment = {**os.environ, "PYTHONHASHSEED": "11"}
+    other = subprocess.run(command, capture_output=True, check=True, text=True, env=environment)
+    assert other.stdout == f"{HASH}\n"
+
+
+def test_it_is_about_what_models_are_made_of() -> None:
+    """Whole and real numbers of equal value make equal shapes; another tag makes another document."""
+    made = []
+    for size, tag in (((1, 2, 3), "t"), ((1.0, 2.0, 3.0), "t"), ((1, 2, 3), "u")):
+        body = kv.Body((kv.Shape(kv.model.body.Box(size)),))
+        model = kv.Model()
+        with model.edit() as edit:
+            edit.add_frame("a", parent="world", transform=np.eye(4), body=body, tag=tag)
+        made.append(kv.document_hash(model))
+    assert made[0] == made[1] != made[2]
