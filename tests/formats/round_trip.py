@@ -60,7 +60,7 @@ def assert_same_motion(written: kv.Model, read: kv.Model, tolerance: float = EXA
             size = max(1.0, np.abs(a).max())
             np.testing.assert_allclose(b, a, rtol=0, atol=tolerance * size, err_msg=name)
     for s in written.degrees_of_freedom:
-        np.testing.assert_allclose(read.limits(s), written.limits(s), rtol=EXACT, err_msg=str(s))
+        np.testing.assert_allclose(read.limits(s), written.limits(s), rtol=EXACT, atol=EXACT, err_msg=str(s))
 
 
 def assert_same_bodies(written: kv.Model, read: kv.Model) -> None:

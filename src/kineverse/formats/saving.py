@@ -76,6 +76,10 @@ def _content(model: ModelView, target: Path, leave_out: Iterable[str]) -> tuple[
             from .urdf.writing import urdf_of
 
             return urdf_of(model, target, leave_out)
+        if target.name.endswith(".xml"):
+            from .mjcf.writing import mjcf_of
+
+            return mjcf_of(model, target, leave_out)
     except FormatError as error:
         raise _named(target, error) from None
     raise FormatError(

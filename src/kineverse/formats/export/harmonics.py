@@ -78,17 +78,30 @@ class Harmonic:
         return None
 
     @property
-    def line(self) -> tuple[dict[int, float], float] | None:
-        """Slopes by variable, and the constant, of a sum of multiples; None for anything else."""
-        slopes, offset = dict[int, float](), 0.0
-        for (powers, waves), c in self.terms.items():
-            if waves or sum(n for _, n in powers) > 1:
+    def polynomials(self) -> tuple[dict[int, tuple[float, ...]], float] | None:
+        """Coefficients by variable, of its first power on, and the constant; None if it is no such sum."""
+        powers: dict[int, dict[int, float]] = {}
+        offset = 0.0
+        for (factors, waves), c in self.terms.items():
+            if waves or len(factors) > 1:
                 return None
-            if powers:
-                slopes[powers[0][0]] = c.real
+            if factors:
+                ((index, n),) = factors
+                powers.setdefault(index, {})[int(n)] = c.real
             else:
                 offset = c.real
-        return slopes, offset
+        return {
+            index: tuple(found.get(n, 0.0) for n in range(1, max(found) + 1))
+            for index, found in powers.items()
+        }, offset
+
+    @property
+    def line(self) -> tuple[dict[int, float], float] | None:
+        """Slopes by variable, and the constant, of a sum of multiples; None for anything else."""
+        found = self.polynomials
+        if found is None or any(len(coefficients) > 1 for coefficients in found[0].values()):
+            return None
+        return {index: slope for index, (slope,) in found[0].items()}, found[1]
 
     @property
     def variables(self) -> set[int]:

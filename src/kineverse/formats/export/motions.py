@@ -11,6 +11,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import TypeAlias
 
+import casadi as ca
 import numpy as np
 import numpy.typing as npt
 
@@ -21,6 +22,7 @@ from kineverse.motions import AxisMotion
 from kineverse.spatial import snapped
 
 from .harmonics import NOISE, Harmonic, Harmonics, TooLargeError
+from .plan import ITSELF, Polynomial
 
 Matrix: TypeAlias = npt.NDArray[np.float64]
 _NOTHING: Vector3 = (0.0, 0.0, 0.0)
@@ -29,7 +31,7 @@ _SAME = 1e-12
 
 @dataclass(frozen=True)
 class Motion:
-    """A rotation about a line or a translation, by ``factor · variable + offset`` [rad] or [m].
+    """A rotation about a line or a translation, by a polynomial of a variable [rad] or [m].
 
     Attributes
     ----------
@@ -40,17 +42,21 @@ class Motion:
     point
         On the line of a rotation [m].
     variable
-        What moves it: a symbol, or a term of which nothing more is known.
-    factor, offset
-        Of the variable.
+        What moves it: a coordinate, or a curve over coordinates.
+    amount
+        The coefficients of the polynomial, constant first.
     """
 
     turns: bool
     axis: Vector3
     point: Vector3
     variable: Term
-    factor: float
-    offset: float = 0.0
+    amount: Polynomial
+
+    @property
+    def curved(self) -> bool:
+        """Whether it moves by a curve over coordinates, and not by a polynomial of one."""
+        return self.variable.op != ca.OP_PARAMETER
 
     def seen_from(self, pose: Matrix) -> Motion:
         """Return the same motion in coordinates of a frame that is at ``pose`` where this one is in."""
@@ -62,9 +68,7 @@ class Motion:
         return self._with(axis, point - axis * (axis @ point))
 
     def _with(self, axis: Matrix, point: Matrix) -> Motion:
-        return Motion(
-            self.turns, _vector(axis), _vector(_rounded(point)), self.variable, self.factor, self.offset
-        )
+        return Motion(self.turns, _vector(axis), _vector(_rounded(point)), self.variable, self.amount)
 
 
 @dataclass(frozen=True)
@@ -143,7 +147,7 @@ def _parts(factor: Expression, terms: Terms, offsets: bool) -> list[Matrix | Mov
     try:
         if isinstance(factor, AxisMotion):
             amount = harmonics.of(terms.of(factor.amount))
-            found = _axis_motion(factor, amount, harmonics, offsets)
+            found = _axis_motion(factor, amount, harmonics, terms, offsets)
             if found is not None:
                 return found
         entries = [harmonics.of(term) for term in terms.elements(factor)]
@@ -154,21 +158,23 @@ def _parts(factor: Expression, terms: Terms, offsets: bool) -> list[Matrix | Mov
 
 
 def _axis_motion(
-    factor: AxisMotion, amount: Harmonic, harmonics: Harmonics, offsets: bool
+    factor: AxisMotion, amount: Harmonic, harmonics: Harmonics, terms: Terms, offsets: bool
 ) -> list[Matrix | Moving] | None:
-    line = amount.line
-    if line is None and not factor.turns:
-        return None  # a sum of waves along a line is one of circles
-    if line is None:
-        raise UnrecognisedError("turns by what is no multiple of a coordinate")
-    slopes, offset = line
+    """Return one by its amount; None for a translation by waves, which is one along circles."""
+    known = all(harmonics.variables[v].op == ca.OP_PARAMETER for v in amount.variables)
+    sums = amount.polynomials if known else None
+    if sums is None:
+        if known and not factor.turns:
+            return None
+        return [Motion(factor.turns, factor.direction, _NOTHING, terms.of(factor.amount), ITSELF)]
+    polynomials, offset = sums
     found: list[Matrix | Moving] = []
-    if offset and not (offsets and slopes):
+    if offset and not (offsets and polynomials):
         found.append(AxisMotion(factor.direction, offset, factor.turns)())
         offset = 0.0
-    for index, slope in sorted(slopes.items()):
-        variable = harmonics.variables[index]
-        found.append(Motion(factor.turns, factor.direction, _NOTHING, variable, slope, offset))
+    for index, coefficients in sorted(polynomials.items()):
+        whole = (offset, *coefficients)
+        found.append(Motion(factor.turns, factor.direction, _NOTHING, harmonics.variables[index], whole))
         offset = 0.0
     return found
 
@@ -232,13 +238,13 @@ def _exponential(twist: Matrix, variable: Term) -> list[Matrix | Moving]:
     speed = float(np.linalg.norm(w))
     if speed < NOISE:
         length = float(np.linalg.norm(v))
-        return [Motion(False, _vector(snapped(v / length)), _NOTHING, variable, length)]
+        return [Motion(False, _vector(snapped(v / length)), _NOTHING, variable, (0.0, length))]
     axis = snapped(w / speed)
     point, pitch = np.cross(axis, v) / speed, float(axis @ v)
-    turn = Motion(True, _vector(axis), _vector(_rounded(point)), variable, speed)
+    turn = Motion(True, _vector(axis), _vector(_rounded(point)), variable, (0.0, speed))
     if abs(pitch) < NOISE:
         return [turn]
-    return [Motion(False, _vector(axis), _NOTHING, variable, pitch), turn]
+    return [Motion(False, _vector(axis), _NOTHING, variable, (0.0, pitch)), turn]
 
 
 def _circles(matrix: list[list[Harmonic]], harmonics: Harmonics) -> list[Matrix | Moving]:
@@ -265,7 +271,7 @@ def _circles(matrix: list[list[Harmonic]], harmonics: Harmonics) -> list[Matrix 
     for index, direction in slides.items():
         length = float(np.linalg.norm(direction))
         axis = _vector(snapped(direction / length))
-        found.append(Motion(False, axis, _NOTHING, harmonics.variables[index], length))
+        found.append(Motion(False, axis, _NOTHING, harmonics.variables[index], (0.0, length)))
     for frequencies, amplitude in waves.items():
         found += _ellipse(frequencies, amplitude, harmonics)
     return found
@@ -292,8 +298,10 @@ def _ellipse(
         reach = np.eye(4)
         reach[:3, 3] = arm.real * u + sign * arm.imag * v
         axis = _vector(sign * normal)
-        turns = [Motion(True, axis, _NOTHING, harmonics.variables[index], w) for index, w in frequencies]
-        back = [Motion(True, axis, _NOTHING, m.variable, -m.factor) for m in turns]
+        turns = [
+            Motion(True, axis, _NOTHING, harmonics.variables[index], (0.0, w)) for index, w in frequencies
+        ]
+        back = [Motion(True, axis, _NOTHING, m.variable, (0.0, -m.amount[1])) for m in turns]
         found += [*turns, reach, *back]
     return found
 

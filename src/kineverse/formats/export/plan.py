@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any, TypeAlias
+from typing import Any, Literal, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
@@ -111,6 +111,16 @@ class Sum:
     upper: float
 
 
+@dataclass(frozen=True)
+class Loop:
+    """Two frames that are tied: their origins coincide (``connect``), or all of them does (``weld``)."""
+
+    name: str
+    kind: Literal["connect", "weld"]
+    frame: str
+    to: str
+
+
 @dataclass
 class Plan:
     """A model as links, parents first, and what else is to be said.
@@ -123,6 +133,8 @@ class Plan:
         What is attached to the world itself.
     sums
         Constraints on sums of several coordinates.
+    loops
+        Ties that close loops.
     remarks
         What is written other than it was, or left out: for people.
     """
@@ -130,6 +142,7 @@ class Plan:
     links: list[Link]
     world: Body
     sums: list[Sum] = field(default_factory=list)
+    loops: list[Loop] = field(default_factory=list)
     remarks: list[str] = field(default_factory=list)
 
     @property

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 
-import casadi as ca
 import numpy as np
 
 from kineverse.bounds.terms import Terms
@@ -16,19 +15,24 @@ from kineverse.model.articulation import Articulation
 from kineverse.model.body import Pose
 from kineverse.model.constraint import Constraint
 from kineverse.model.frame import WORLD
-from kineverse.model.operation import CONSTRAINTS
+from kineverse.model.operation import CONSTRAINTS, RATES
+from kineverse.model.rates import Rates
 from kineverse.model.view import ModelView
 from kineverse.motions import AxisMotion
 from kineverse.symbols import Symbol
 
 from .limits import has_given_gradient, limit, sort_constraints
+from .loops import tied
 from .motions import Motion, Placing, Turning, UnrecognisedError, placing
 from .names import Names
-from .plan import NO_BODY, BallJoint, Joint, Link, Plan, Sum
+from .plan import ITSELF, NO_BODY, BallJoint, Joint, Link, Loop, Plan, Sum
 from .quaternions import quaternions
 from .refusals import Refusals
 
 _LOOP = "closedloop"
+_POWERS = {1: "multiple", 4: "polynomial of degree 4"}
+_WHOLE = (ITSELF, (0.0, -1.0))
+"""The amounts by which a joint may be a coordinate."""
 
 
 @dataclass(frozen=True)
@@ -43,11 +47,17 @@ class Target:
         Whether it limits sums of several coordinates.
     one_way
         Whether a speed may have another limit forwards than backwards.
+    loops
+        Whether it ties frames, so that what closes a loop needs not be solved for.
+    degree
+        Of the polynomials by which a joint may follow another.
     """
 
     name: str
     sums: bool = False
     one_way: bool = False
+    loops: bool = False
+    degree: int = 1
 
 
 class Recognition:
@@ -74,20 +84,29 @@ class Recognition:
         self._values: dict[Symbol, Expression] = {}
         self._terms = Terms({})
         self._quaternions = dict(quaternions(model))
+        self._loops: list[Loop] = []
+        tied_by_loops: set[Symbol] = set()
+        if target.loops:
+            for loops, determined in tied(model):
+                self._loops += loops
+                tied_by_loops.update(determined)
+        given = dict(model._head[RATES].values())
+        self._rates = Rates({x: e for x, e in given.items() if x not in tied_by_loops})
+        # What a tie determines is a coordinate like any other for who reads it.
+        self._coordinates = sorted({*model.degrees_of_freedom, *tied_by_loops}, key=lambda s: s.sort_key)
 
     def plan(self) -> Plan:
         """Return the plan; what cannot be said is in :attr:`refusals`."""
         placed = {name: self._placed(name) for name in _parents_first(self.model)}
         self._check_rates(placed)
-        coordinates = {s.path for s in self.model.degrees_of_freedom}
-        joints = Names(coordinates)
+        joints = Names(s.path for s in self._coordinates)
         leading = self._leading(placed)
         links = [
             self._link(name, found, leading, joints) for name, found in placed.items() if found is not None
         ]
         used = {s for found in placed.values() if found is not None for s in _turned(found)}
         links += self._carriers(placed, set(leading), used, links)
-        plan = Plan(links, self.model.bodies.get(WORLD, NO_BODY))
+        plan = Plan(links, self.model.bodies.get(WORLD, NO_BODY), loops=self._loops)
         kept = {n: c for n, c in self._plain_constraints() if n not in self._left_out}
         found = [
             item
@@ -99,9 +118,18 @@ class Recognition:
         plan.remarks = self.remarks
         return plan
 
+    def home(self) -> dict[Symbol, float]:
+        """Return where every coordinate is unless more is known, those that loops determine among them."""
+        state = self.model.default_state()
+        values = {s: state[s] for s in self._coordinates if s in state}
+        for s in self._coordinates:
+            if s not in values:
+                values[s] = float(self.model.rates.dependent[s](state))
+        return values
+
     def resolve(self, expression: Expression) -> Expression:
         """Return an expression of coordinates that depend on nothing, parameters at their values."""
-        expression = self.model.rates.resolve(expression)
+        expression = self._rates.resolve(expression)
         parameters = [s for s in expression.symbols if not s.has_derivative]
         for s in parameters:
             if s not in self._values and s.value is not None:
@@ -126,9 +154,9 @@ class Recognition:
             self._refuse(name, factors, str(problem))
             return None
         for motion in found.moving:
-            if isinstance(motion, Motion) and motion.variable.op != ca.OP_PARAMETER:
-                verb = "turns" if motion.turns else "slides"
-                self._refuse(name, factors, f"{verb} by no multiple of a coordinate")
+            if isinstance(motion, Motion) and (motion.curved or len(motion.amount) > self.target.degree + 1):
+                verb, powers = "turns" if motion.turns else "slides", _POWERS[self.target.degree]
+                self._refuse(name, factors, f"{verb} by no {powers} of a coordinate")
                 return None
         return found
 
@@ -155,7 +183,7 @@ class Recognition:
         for name, found in placed.items():
             own = self._record(name)
             for k, motion in enumerate(found.moving if found is not None else ()):
-                if not isinstance(motion, Motion) or abs(motion.factor) != 1.0 or motion.offset:
+                if not isinstance(motion, Motion) or motion.amount not in _WHOLE:
                     continue
                 symbol = motion.variable.data
                 if symbol not in leading:
@@ -187,16 +215,17 @@ class Recognition:
                 continue
             symbol: Symbol = motion.variable.data
             if leading.get(symbol) == (name, k):
-                axis = motion.axis if motion.factor > 0 else _negative(motion.axis)
+                axis = motion.axis if motion.amount == ITSELF else _negative(motion.axis)
                 made.append(Joint(symbol.path, motion.turns, axis, motion.point, symbol))
                 continue
             what = "turn" if motion.turns else "slide"
             wishes = [label, name] if len(found.moving) == 1 else []
             own = joints.take(*wishes, f"{label}/{what}")
-            axis, amount = motion.axis, (motion.offset, motion.factor)
-            if follows is not None and follows == (-motion.factor, -motion.offset):
+            axis, amount = motion.axis, motion.amount
+            opposite = tuple(-c for c in amount)
+            if follows is not None and follows == opposite[::-1]:
                 # Its own limits are on what is on record, so that is its position, and not the opposite.
-                axis, amount = _negative(axis), (-motion.offset, -motion.factor)
+                axis, amount = _negative(axis), opposite
             made.append(Joint(own, motion.turns, axis, motion.point, symbol, amount))
         given = _shared(dynamics, made)
         made = [replace(joint, dynamics=own) for joint, own in zip(made, given, strict=True)]
@@ -218,7 +247,7 @@ class Recognition:
             for motion in found.moving if found is not None else ():
                 if isinstance(motion, Motion):
                     first.setdefault(motion.variable.data, (self.model.frames[name].parent, motion))
-        for symbol in self.model.degrees_of_freedom:
+        for symbol in self._coordinates:
             if symbol in leading or symbol in used or symbol in self._lost:
                 continue
             parent, turns, axis = links[0].name if links else WORLD, True, (0.0, 0.0, 1.0)
@@ -233,7 +262,7 @@ class Recognition:
         """Refuse coordinates that move by the speeds of others, except quaternions that turn."""
         fine = {s for found in placed.values() if found is not None for s in _turned(found)}
         driven: dict[str, set[str]] = {}
-        for coordinate, row in self.model.rates.items():
+        for coordinate, row in self._rates.items():
             if coordinate in fine:
                 continue
             owner = next(

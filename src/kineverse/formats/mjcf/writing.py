@@ -28,6 +28,8 @@ MJCF = Target("MJCF", sums=True, one_way=True, loops=True, degree=4)
 
 _AXES = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 _MOST_SPEEDS = 6
+_ARMATURE = 1e-3
+"""The inertia [kg m²], [kg] of joints that are so many that not all of them move something of their own."""
 _QUATERNION = ("qx", "qy", "qz", "qw")
 _DYNAMICS = {
     "damping": "damping",
@@ -142,6 +144,8 @@ class MjcfWriter:
                     self._qpos += [w, x, y, z]
                 else:
                     self._joint(body, joint)
+                    if len(link.joints) > 2 and not joint.leads and "armature" not in joint.dynamics:
+                        body.inside[-1].give("armature", _ARMATURE)
                     self._qpos.append(self._at_home(joint))
 
     def _free(self, link: Link) -> str | None:
