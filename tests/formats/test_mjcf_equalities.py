@@ -173,6 +173,55 @@ def test_a_weld_with_a_relative_pose_and_an_anchor():
     check_closed(pair, rows=6)
 
 
+ARM = body("arm", '<joint name="x" range="-60 60"/><site name="palm" pos="1 0 .2" euler="10 20 30"/>')
+BOX = '<body name="box" pos="3 1 2" euler="40 0 10"><freejoint name="f"/><geom size=".1"/><site name="s" pos=".1 .2 .3"/>{}</body>'
+MORE = body("lid", '<joint name="y" axis="1 0 0"/>', 'pos="0 0 1"') + body(
+    "knob", "", 'pos="0 1 0" euler="1 2 3"'
+)
+
+
+@pytest.mark.parametrize(
+    "equality",
+    [
+        '<weld body1="arm" body2="box"/>',
+        '<weld body1="box" body2="arm" relpose=".1 .2 .3 .5 .5 .5 .5" anchor=".1 .1 0"/>',
+        '<weld body1="box"/>',
+        '<weld body1="arm" body2="knob" relpose=".1 .2 .3 1 2 3 4"/>',
+        '<weld site1="s" site2="palm"/>',
+    ],
+)
+@pytest.mark.parametrize("first", ["arm", "box"])
+def test_a_free_body_that_is_welded_is_carried(equality, first):
+    parts = [ARM, BOX.format(MORE)]
+    pair = Pair.of_text(scene("".join(parts if first == "arm" else parts[::-1]), equality))
+    assert [str(s) for s in pair.model.degrees_of_freedom] == ["x", "y"]
+    check_closed(pair, rows=6)
+
+
+@pytest.mark.parametrize(
+    "equality",
+    [
+        '<connect body1="box" body2="arm" anchor=".1 .2 .3"/>',
+        '<connect site1="palm" site2="s"/>',
+        '<connect body1="knob" anchor="0 0 1"/>',
+    ],
+)
+def test_a_free_body_that_is_pinned_turns(equality):
+    pair = Pair.of_text(scene(ARM + BOX.format(MORE), equality))
+    assert [str(s) for s in pair.model.degrees_of_freedom] == ["f/qw", "f/qx", "f/qy", "f/qz", "x", "y"]
+    check_closed(pair, rows=3)
+
+
+def test_what_is_held_twice_is_closed_or_refused():
+    boxes = BOX.format("") + BOX.format("").replace("box", "crate").replace('"f"', '"g"').replace(
+        '"s"', '"t"'
+    )
+    chain = '<weld body1="box" body2="crate"/><weld body1="box" relpose="0 0 1 1 0 0 0"/>'
+    check_closed(Pair.of_text(scene(boxes, chain)), rows=12, samples=1)
+    with pytest.raises(kv.ModelError, match="rigidly connected"):
+        model_of(parse_mjcf(scene(boxes, chain + '<weld body1="crate" relpose="0 0 2 1 0 0 0"/>')))
+
+
 def test_loops_that_cannot_be_followed_are_refused_by_name(tmp_path):
     hung = body(
         "a", '<joint type="ball" name="j"/>' + body("b", '<joint type="ball" name="k"/>', 'pos="1 0 0"')

@@ -12,6 +12,7 @@ from kineverse.formats.poses import IDENTITY, inverse, product
 from kineverse.model.body import Pose
 
 from .bodies import Bodies
+from .carrying import at_rest
 from .description import Closure, Coupling, Dynamics, Quartic, Tendon
 from .engine import mujoco
 from .naming import Names
@@ -39,7 +40,7 @@ class Constraints:
         self._model, self._bodies, self._note = model, bodies, note
         self._nodes = {thing.id: prepared.node(thing.info) for thing in spec.equalities}
         self._tendon_nodes = {tendon.id: prepared.node(tendon.info) for tendon in spec.tendons}
-        self._rest = _at_rest(model)
+        self._rest = at_rest(bodies.links)
         names = Names()
         self._tendon_names = self._named(names, "tendon", model.ntendon, self._tendon_nodes)
         self._names = self._named(Names(), "equality", model.neq, self._nodes)
@@ -149,7 +150,10 @@ class Constraints:
             return
         where = self._where(node)
         if m.body_weldid[bodies[0]] == m.body_weldid[bodies[1]]:
-            first, second = (product(self._rest[b], pose) for b, pose in zip(bodies, poses, strict=True))
+            first, second = (
+                product(self._rest[self._bodies.body_names[b]], pose)
+                for b, pose in zip(bodies, poses, strict=True)
+            )
             gap = _gap(first, second, kind)
             if gap > _CLOSED:
                 raise FormatError(
@@ -206,15 +210,6 @@ class Constraints:
             "spring_upper": longest if stiffness else 0.0,
         }
         return tuple((key, value) for key, value in values.items() if value)
-
-
-def _at_rest(model: Any) -> list[Pose]:
-    """Return where all bodies are in the world while no joint has moved."""
-    poses = [IDENTITY]
-    for body in range(1, model.nbody):
-        above = poses[int(model.body_parentid[body])]
-        poses.append(product(above, pose_at(model.body_pos[body], model.body_quat[body])))
-    return poses
 
 
 def _gap(first: Pose, second: Pose, kind: str) -> float:

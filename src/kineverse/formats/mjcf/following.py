@@ -83,8 +83,8 @@ class Followers:
                 yield Constrain(name, Constraint.of(0.0, residual, 0.0))
             elif abs(float(residual)) > 1e-9:
                 raise FormatError(
-                    f"{coupling.where}: it holds its joint {abs(float(residual)):.6g} away from where another "
-                    "equality does. Remove one of them."
+                    f"{coupling.where}: it holds its joint {abs(float(residual)):.6g} away from where "
+                    "another equality does. Remove one of them."
                 )
 
 

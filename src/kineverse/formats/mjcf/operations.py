@@ -26,6 +26,7 @@ from kineverse.model.operation import Operation
 from kineverse.spatial import axis_angle
 from kineverse.symbols import position
 
+from .carrying import carried
 from .description import WORLD, Closure, Coupling, Joint, Link, Scene
 from .following import Followers
 from .home import SetHome
@@ -54,6 +55,7 @@ def scene_operations(scene: Scene, prefix: str | None = None) -> Iterator[Operat
     def named(name: str) -> str:
         return f"{prefix}/{name}" if prefix else name
 
+    scene = carried(scene)
     followers = Followers(scene.couplings, named)
     if prefix:
         yield AddFrame(named(WORLD), Frame(MODEL_WORLD, (IDENTITY,)))

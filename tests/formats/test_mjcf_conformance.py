@@ -1,0 +1,72 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from mujoco_oracle import Pair, mujoco
+from robots import SHARED, shared
+
+import kineverse as kv
+
+_TABLE = """
+articulated_objects/robosuite_mit/objects/door.xml | 11 1
+articulated_objects/robosuite_mit/objects/door_lock.xml | 11 2
+furniture_sim/furniture_sim/boxcabinet/boxcabinet_assets.xml | line 1, <mujocoinclude>: is not <mujoco>
+furniture_sim/furniture_sim/boxcabinet/boxcabinet_body.xml | line 1, <mujocoinclude>: is not <mujoco>
+furniture_sim/furniture_sim/boxcabinet.xml | 5 1
+furniture_sim/furniture_sim/dishwasher/dishwasher_asset.xml | line 1, <mujocoinclude>: is not <mujoco>
+furniture_sim/furniture_sim/dishwasher/dishwasher_body.xml | line 1, <mujocoinclude>: is not <mujoco>
+furniture_sim/furniture_sim/dishwasher.xml | 5 2
+furniture_sim/furniture_sim/hingecabinet/hingecabinet_asset.xml | line 1, <mujocoinclude>: is not <mujoco>
+furniture_sim/furniture_sim/hingecabinet/hingecabinet_body.xml | line 1, <mujocoinclude>: is not <mujoco>
+furniture_sim/furniture_sim/hingecabinet.xml | 7 2
+furniture_sim/furniture_sim/microwave/microwave_asset.xml | line 1, <mujocoinclude>: is not <mujoco>
+furniture_sim/furniture_sim/microwave/microwave_body0.xml | line 1, <mujocoinclude>: is not <mujoco>
+furniture_sim/furniture_sim/microwave/microwave_body1.xml | line 1, <mujocoinclude>: is not <mujoco>
+furniture_sim/furniture_sim/microwave/microwave_body2.xml | line 1, <mujocoinclude>: is not <mujoco>
+furniture_sim/furniture_sim/microwave/microwave_body3.xml | line 1, <mujocoinclude>: is not <mujoco>
+furniture_sim/furniture_sim/microwave.xml | 5 1
+furniture_sim/furniture_sim/oven/oven_asset.xml | line 1, <mujocoinclude>: is not <mujoco>
+furniture_sim/furniture_sim/oven/oven_body.xml | line 1, <mujocoinclude>: is not <mujoco>
+furniture_sim/furniture_sim/oven.xml | 20 5
+furniture_sim/furniture_sim/slidecabinet/slidecabinet_asset.xml | line 1, <mujocoinclude>: is not <mujoco>
+furniture_sim/furniture_sim/slidecabinet/slidecabinet_body.xml | line 1, <mujocoinclude>: is not <mujoco>
+furniture_sim/furniture_sim/slidecabinet.xml | 5 1
+"""
+
+VERDICTS: dict[str, str] = dict(line.split(" | ", 1) for line in _TABLE.strip().splitlines())  # type: ignore[misc]
+"""Every MJCF of the shared data has its frames and degrees of freedom, or is refused for its reason."""
+
+LOADED = [file for file, verdict in VERDICTS.items() if verdict[0].isdecimal()]
+
+
+@pytest.mark.parametrize("file", VERDICTS)
+def test_verdicts(file: str):
+    path, expected = shared(file), VERDICTS[file]
+    if file in LOADED:
+        model = kv.load(path, prefix="p")
+        assert f"{len(model.frames)} {len(model.degrees_of_freedom)}" == expected
+        return
+    with pytest.raises(kv.FormatError) as info:
+        kv.load(path, prefix="p")
+    assert str(info.value).startswith(f"{path.name}, {expected}")
+
+
+def test_no_file_is_left_out():
+    folders = [shared(name) for name in ("furniture_sim", "articulated_objects", "kineverse_shelf_objects")]
+    files = {path.relative_to(SHARED).as_posix() for folder in folders for path in folder.rglob("*.xml")}
+    files = {file for file in files if b"<mujoco" in (SHARED / file).read_bytes()}
+    assert files == set(VERDICTS)
+
+
+@pytest.mark.parametrize("file", LOADED)
+def test_poses_and_jacobians_are_those_of_mujoco(file: str):
+    Pair.of_file(shared(file)).compare()
+
+
+def test_models_that_come_with_mujoco():
+    files = sorted((Path(mujoco.__path__[0]) / "testdata").glob("*.xml"))
+    if not files:
+        pytest.skip("this MuJoCo comes without models")
+    for path in files:
+        Pair.of_file(path).compare(samples=2)
