@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
 import pytest
 from constraints import model
 
@@ -82,3 +83,37 @@ def test_it_is_short_and_shares_nothing_with_what_it_checks() -> None:
     assert len([line for line in text.splitlines() if line.strip()]) < 100
     own = {line.split()[1] for line in text.splitlines() if line.startswith("from .")}
     assert own == {".boxes", ".evaluating", ".interlock"}
+
+
+def test_a_claim_is_looked_at_where_its_constraint_is_unknown() -> None:
+    """Some of a constraint may be known: what is told of it has to be true all the same."""
+    subject = model(lock=(0, SPEED, np.sin(B) > 0.5))
+    found = interlocks(subject)
+    assert found.undecided[0].where == (Box({}),)
+    assert reasoning.contradictions(subject, found) == []
+    for hold in ("stands still", "cannot increase", "has no value"):
+        wrong = Interlocks([lock(Box({}), hold=hold)], found.undecided)
+        assert reasoning.contradictions(subject, wrong) == [f"a:velocity {hold}: not so by lock"]
+
+
+def test_standing_still_is_a_value() -> None:
+    assert reasoning.contradictions(garage(), Interlocks([lock(SHUT, hold="has no value")]))
+
+
+def test_two_speeds_of_any_sign_are_no_norm() -> None:
+    """Their sum happens to be 0 as often as not where both are at one of their ends."""
+    subject = model(lock=(0, SPEED + B.derivative(), kv.position("c") > 0.5))
+    for seed in range(5):
+        assert reasoning.contradictions(subject, interlocks(subject), seed=seed) == []
+
+
+def test_one_demands_what_the_other_forbids() -> None:
+    """Nothing stands still there: no speed is allowed at all."""
+    subject = model(moves=(0.5, SPEED, 1), lock=(-1, SPEED, B > 0.3))
+    found = interlocks(subject)
+    pair = [(k.hold, k.when) for k in found if k.constraints == ("moves", "lock")]
+    assert pair == [("has no value", (Box({B: Interval(upper=0.3)}),))]
+    assert reasoning.contradictions(subject, found) == []
+    still = Interlock(SPEED, "stands still", ("moves", "lock"), (Box({B: Interval(upper=0.3)}),))
+    rest = [k for k in found if k.hold != "has no value"]
+    assert reasoning.contradictions(subject, Interlocks([*rest, still]))

@@ -19,12 +19,13 @@ Point = dict[Symbol, float]
 Room = tuple[float, float]
 Limits = dict[Expression, Room]
 ANY: Room = (-math.inf, math.inf)
+TINY, BOTH_WAYS = 1e-12, ("stands still", "has no value")
 
 
 def contradictions(model: ModelView, found: Interlocks, points: int = 20, seed: int = 0) -> list[str]:
     """Return claims that are wrong at one of many points, in boxes and beside them, and locks not claimed."""
     given = model.constraints.items()
-    rows = {n: Constraint(*map(plain, (c.lower, c.expression, c.upper))) for n, c in given}
+    rows = {n: Constraint(plain(c.lower), plain(c.expression), plain(c.upper)) for n, c in given}
     limits: Limits = {}
     for c in rows.values():
         if not c.lower.symbols and not c.upper.symbols:
@@ -49,25 +50,25 @@ def _compared(rows: dict[str, Constraint], found: Interlocks, limits: Limits, po
     unknown = {u.constraint for u in found.undecided if any(_inside(box, point) for box in u.where)}
     rooms: dict[Expression, dict[str, Room]] = {}
     for name, c in rows.items():
-        moving = {s for s in c.expression.symbols if s.order == c.order}
+        about = {s for s in c.expression.symbols if s.order == c.order}
         claimed = {k.held for k in found if name in k.constraints}
-        whole = c.expression in claimed or (c.order > 0 and len(moving) > 1)
-        for held in {c.expression} if whole else moving | claimed:
-            rooms.setdefault(held, {})[name] = ANY if name in unknown else _room(c, held, point)
+        whole = c.expression in claimed or (c.order > 0 and len(about) > 1)
+        for held in {c.expression} if whole else about | claimed:
+            rooms.setdefault(held, {})[name] = _room(c, held, point)
     for held, of in rooms.items():
         claims = [k for k in found if k.held == held and any(_inside(box, point) for box in k.when)]
-        if max(s.order for s in held.symbols):
-            ends = {"decrease": -max(r[0] for r in of.values()), "increase": min(r[1] for r in of.values())}
-            for way, end in {} if unknown & of.keys() else ends.items():
-                said = any(k.hold in (f"cannot {way}", "stands still", "has no value") for k in claims)
-                if said != (end <= 1e-9):
-                    yield f"{held} {'can' if said else 'cannot'} {way}"
-            continue
-        limit = limits.get(held, ANY)
-        for names in ({k.constraints for k in claims} | {(n,) for n in of}) - {(n,) for n in unknown}:
-            room = max(limit[0], *(of[n][0] for n in names)), min(limit[1], *(of[n][1] for n in names))
+        limit = ANY if (speed := any(s.order for s in held.symbols)) else limits.get(held, ANY)
+        for names in {k.constraints for k in claims} | {(n,) for n in of.keys() - unknown}:
+            lows, highs = zip(limit, *(of.get(n, ANY) for n in names), strict=True)
+            room = max(lows), min(highs)
             own = [k for k in claims if k.constraints == names]
-            if not all(_fits(k, limit, room, point) for k in own) or not (own or _same(limit, room, True)):
+            wrong = [k.hold for k in own if not _fits(k, limit, room, point)]
+            yield from (f"{held} {hold}: not so by {', '.join(names)}" for hold in wrong)
+            for way, end in (("decrease", -room[0]), ("increase", room[1])) if speed else ():
+                free = end > TINY or not unknown.isdisjoint(names)
+                if not (free or any(k.hold in (f"cannot {way}", *BOTH_WAYS) for k in claims)):
+                    yield f"{held} cannot {way}"
+            if not (own or speed or _same(limit, room, True)):
                 yield f"{held} is kept in {room} by {', '.join(names)}"
 
 
@@ -75,19 +76,18 @@ def _room(c: Constraint, held: Expression, point: Point) -> Room:
     low, here, high = (value_at(e, point) for e in (c.lower, c.expression, c.upper))
     if isinstance(held, Symbol):
         zero, one = (value_at(c.expression, {**point, held: x}) for x in (0.0, 1.0))
-        if one == zero:
-            return ANY
-        low, high = (low - zero) / (one - zero), (high - zero) / (one - zero)
-        return (low, high) if one > zero else (high, low)
+        sides = ((low - zero) / (one - zero), (high - zero) / (one - zero)) if one != zero else ANY
+        return sides if one >= zero else sides[::-1]
     back = value_at(c.expression, {s: -x if s.order else x for s, x in point.items()})
-    if c.order and min(here, back) >= 0 >= low:
+    if c.order and min(here, back) > 0 >= low:
         low = 0.0 if high <= 0 else -math.inf
     return low, high
 
 
 def _fits(lock: Interlock, limit: Room, room: Room, point: Point) -> bool:
     if lock.lower is None or lock.upper is None:
-        return room[0] > room[1]
+        ends = {"increase": room[1] <= TINY, "decrease": room[0] >= -TINY, "value": room[0] > room[1]}
+        return ends.get(lock.hold.split()[-1], max(map(abs, room)) <= TINY)
     low, high = value_at(lock.lower, point), value_at(lock.upper, point)
     return _same((max(low, limit[0]), min(high, limit[1])), room)
 

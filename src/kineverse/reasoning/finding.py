@@ -136,18 +136,20 @@ def _of_speed(name: str, one: Blocked) -> list[Interlock]:
 
 
 def _by_two(blocked: Mapping[str, Blocked]) -> list[Interlock]:
-    """Return where one constraint stops what another one lets go."""
-    found = []
+    """Return where one constraint stops what another one lets go, or even demands."""
+    found: list[Interlock] = []
     names = list(blocked)
     for first in names:
         for second in names:
             a, b = blocked[first], blocked[second]
             if first == second or a.held != b.held:
                 continue
-            both = ((a.up & b.down) - ((a.up & a.down) | (b.up & b.down))).short()
-            if both:
-                pair = tuple(sorted((first, second), key=names.index))
-                found.append(Interlock(a.held, "stands still", pair, both))
+            pair = tuple(sorted((first, second), key=names.index))
+            void = (a.up_beyond & b.down) | (a.up & b.down_beyond)
+            both = (a.up & b.down) - ((a.up & a.down) | (b.up & b.down))
+            regions: dict[Hold, Region] = {"stands still": both - void, "has no value": void}
+            holds = {hold: region.short() for hold, region in regions.items()}
+            found += [Interlock(a.held, hold, pair, where) for hold, where in holds.items() if where]
     return found
 
 
