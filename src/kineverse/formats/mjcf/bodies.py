@@ -2,19 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from kineverse.formats.poses import IDENTITY
 from kineverse.model.body import Vector3
 
+from .compiling import Compiled, Note
 from .description import SUFFIXES, WORLD, Dynamics, Joint, Kind, Link, Site
 from .engine import mujoco
 from .naming import Names, plain
-from .preparing import Prepared
 from .shapes import Shapes, pose_at
 from .tree import Node
 
@@ -33,27 +31,16 @@ class Bodies:
         By the numbers that they have in the model.
     """
 
-    def __init__(
-        self,
-        spec: Any,
-        model: Any,
-        prepared: Prepared,
-        shapes: Shapes,
-        guessed: Collection[int],
-        efforts: dict[str, float],
-        home: npt.NDArray[np.float64] | None,
-        source: str,
-        note: Callable[[Node | None, str], None],
-    ) -> None:
-        self._model, self._source = model, source
-        self._efforts = efforts
-        self._home = home
-        if home is not None and len(home) != model.nq:
+    def __init__(self, compiled: Compiled, shapes: Shapes, source: str, note: Note) -> None:
+        self._model, self._source, self._shapes = compiled.model, source, shapes
+        self._efforts, self._home = compiled.efforts, compiled.home
+        model, spec = compiled.model, compiled.spec
+        if self._home is not None and len(self._home) != model.nq:
             note(None, 'the key "home" does not fit the joints that are read, and is left out.')
             self._home = None
-        self._body_nodes = {body.id: prepared.node(body.info) for body in spec.bodies}
-        self._joint_nodes = {joint.id: prepared.node(joint.info) for joint in spec.joints}
-        self._site_nodes = {site.id: prepared.node(site.info) for site in spec.sites}
+        self._body_nodes = compiled.nodes(spec.bodies)
+        self._joint_nodes = compiled.nodes(spec.joints)
+        self._site_nodes = compiled.nodes(spec.sites)
         self._frames = Names(WORLD)
         self._movers = Names()
         self.body_names = self._named_bodies()
@@ -64,10 +51,7 @@ class Bodies:
         for number in range(model.nbody):
             if model.body_mocapid[number] >= 0:
                 joints[number] = [self._handle(number)]
-        self.links = tuple(
-            self._link(number, tuple(joints.get(number, ())), shapes, guessed)
-            for number in range(model.nbody)
-        )
+        self.links = tuple(self._link(number, tuple(joints.get(number, ()))) for number in range(model.nbody))
         self.site_names = self._named_sites()
         self.sites = tuple(self._site(number) for number in range(model.nsite))
         self._check_coordinates()
@@ -122,14 +106,14 @@ class Bodies:
                 names[number] = self._frames.invent(f"{self.body_names[body]}/site{count}", where)
         return names
 
-    def _link(self, number: int, joints: tuple[Joint, ...], shapes: Shapes, guessed: Collection[int]) -> Link:
+    def _link(self, number: int, joints: tuple[Joint, ...]) -> Link:
         m = self._model
         return Link(
             self.body_names[number],
             self.body_names[int(m.body_parentid[number])],
             pose_at(m.body_pos[number], m.body_quat[number]) if number else IDENTITY,
             joints,
-            shapes.body(number, guessed),
+            self._shapes.body(number),
             self._where(self._body_nodes[number]),
         )
 

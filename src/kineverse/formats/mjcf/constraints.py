@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from typing import Any, Literal
+from collections.abc import Iterator
+from typing import Literal
 
 import numpy as np
 
@@ -13,10 +13,10 @@ from kineverse.model.body import Pose
 
 from .bodies import Bodies
 from .carrying import at_rest
+from .compiling import Compiled, Note
 from .description import Closure, Coupling, Dynamics, Quartic, Tendon
 from .engine import mujoco
 from .naming import Names
-from .preparing import Prepared
 from .shapes import pose_at
 from .tree import Node
 
@@ -29,17 +29,11 @@ _UNTURNED = (1.0, 0.0, 0.0, 0.0)
 class Constraints:
     """What couples joints, closes loops and ties lengths."""
 
-    def __init__(
-        self,
-        spec: Any,
-        model: Any,
-        prepared: Prepared,
-        bodies: Bodies,
-        note: Callable[[Node | None, str], None],
-    ) -> None:
-        self._model, self._bodies, self._note = model, bodies, note
-        self._nodes = {thing.id: prepared.node(thing.info) for thing in spec.equalities}
-        self._tendon_nodes = {tendon.id: prepared.node(tendon.info) for tendon in spec.tendons}
+    def __init__(self, compiled: Compiled, bodies: Bodies, note: Note) -> None:
+        self._model, self._bodies, self._note = compiled.model, bodies, note
+        model = compiled.model
+        self._nodes = compiled.nodes(compiled.spec.equalities)
+        self._tendon_nodes = compiled.nodes(compiled.spec.tendons)
         self._rest = at_rest(bodies.links)
         names = Names()
         self._tendon_names = self._named(names, "tendon", model.ntendon, self._tendon_nodes)

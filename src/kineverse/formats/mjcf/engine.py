@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import threading
+import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
@@ -39,13 +40,15 @@ def listening() -> Iterator[list[str]]:
     """Yield a list that takes MuJoCo's warnings, which would go to the terminal and a file otherwise."""
     engine = mujoco()
     heard: list[str] = []
-    with _ALONE:  # there is one place for warnings in a process
+    with _ALONE, warnings.catch_warnings(record=True) as warned:  # both are one for all of the process
+        warnings.simplefilter("always")
         before = engine.get_mju_user_warning()
         engine.set_mju_user_warning(heard.append)
         try:
             yield heard
         finally:
             engine.set_mju_user_warning(before)
+            heard += [str(warning.message) for warning in warned]
 
 
 def parse(prepared: Prepared, source: str) -> Any:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection
 from typing import Any
 
 from kineverse.formats import rpy
@@ -21,8 +20,9 @@ from kineverse.model.body import (
     Sphere,
 )
 
+from .compiling import Compiled, Note
 from .engine import mujoco
-from .meshes import Asset, placed
+from .meshes import placed
 
 _SHOWN = range(3)
 """The groups that MuJoCo's viewers show unless they are asked for others."""
@@ -36,31 +36,20 @@ class Shapes:
 
     Parameters
     ----------
-    model
-        As MuJoCo compiled it.
-    assets
-        The meshes of files, by name.
-    unknown
-        The numbers of geoms that are left out, by number with the reason.
+    compiled
+        What MuJoCo made of the document.
     folder
         From where mesh files are found.
     note
-        Called with the number of a geom that is left out, and why.
+        Called with what is left out, and why.
     """
 
-    def __init__(
-        self,
-        model: Any,
-        assets: dict[str, Asset],
-        unknown: dict[int, str],
-        folder: str,
-        note: Callable[[int, str], None],
-    ) -> None:
-        self._model, self._assets, self._unknown = model, assets, unknown
-        self._folder, self._note = folder, note
+    def __init__(self, compiled: Compiled, folder: str, note: Note) -> None:
+        self._model, self._compiled, self._folder = compiled.model, compiled, folder
+        self._nodes, self._say = compiled.nodes(compiled.spec.geoms), note
 
-    def body(self, number: int, guessed: Collection[int]) -> Body:
-        """Return what a body carries; its inertia is none where that is only guessed."""
+    def body(self, number: int) -> Body:
+        """Return what a body carries; its inertia is none where nobody knows it."""
         m = self._model
         visuals: list[Shape] = []
         collisions: list[Shape] = []
@@ -75,13 +64,13 @@ class Shapes:
                     visuals.append(shape)
                 if touches:
                     collisions.append(shape)
-        return Body(tuple(visuals), tuple(collisions), None if number in guessed else self._inertia(number))
+        return Body(tuple(visuals), tuple(collisions), self._inertia(number))
 
     def _inertia(self, number: int) -> Inertia | None:
         m = self._model
         mass = float(m.body_mass[number])
         a, b, c = m.body_inertia[number].tolist()
-        if not mass and not (a or b or c):
+        if number in self._compiled.guessed or not (mass or a or b or c):
             return None
         return Inertia(mass, (a, 0.0, 0.0, b, 0.0, c), pose_at(m.body_ipos[number], m.body_iquat[number]))
 
@@ -89,8 +78,8 @@ class Shapes:
         m, kinds = self._model, mujoco().mjtGeom
         name, kind = m.geom(geom).name, m.geom_type[geom]
         pose = pose_at(m.geom_pos[geom], m.geom_quat[geom])
-        if geom in self._unknown:
-            self._note(geom, self._unknown[geom])
+        if geom in self._compiled.left_out:
+            self._note(geom, self._compiled.left_out[geom])
             return None
         if kind != kinds.mjGEOM_MESH:
             form = _primitive(kind, m.geom_size[geom].tolist())
@@ -99,7 +88,7 @@ class Shapes:
                 return None
             return Shape(form, pose, name, color)
         mesh = int(m.geom_dataid[geom])
-        asset = self._assets.get(m.mesh(mesh).name)
+        asset = self._compiled.assets.get(m.mesh(mesh).name)
         if asset is None or not asset.uri:
             self._note(geom, "is left out: its triangles are in no file.")
             return None
@@ -110,6 +99,9 @@ class Shapes:
             return None
         form, origin = found
         return Shape(form, origin, name, color)
+
+    def _note(self, geom: int, text: str) -> None:
+        self._say(self._nodes[geom], text)
 
     def _color(self, geom: int) -> Rgba:
         m = self._model

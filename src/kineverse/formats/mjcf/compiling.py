@@ -1,0 +1,143 @@
+"""A document compiled by MuJoCo, with what its model has no place for.
+
+Of the two things that MuJoCo makes of a file, its ``MjSpec`` still has everything as it was written:
+defaults, frames, six ways to say an orientation, degrees. Its ``MjModel`` has everything resolved, in one
+convention, and is what its kinematics run on. So the description is taken from the ``MjModel``, and the
+``MjSpec`` is asked for the rest: lines, actuators, keys, whether a body states its inertia.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from kineverse.errors import FormatError
+
+from . import engine
+from .actuators import efforts
+from .meshes import Asset, Replacement
+from .preparing import Prepared
+from .tree import Node
+
+Note = Callable[[Node | None, str], None]
+
+_NUMBERS = ("body_pos", "body_quat", "jnt_pos", "jnt_axis", "qpos0", "site_pos", "site_quat", "eq_data")
+_SHAPELESS = {"mjGEOM_HFIELD": "a height field is no shape here", "mjGEOM_SDF": "its shape is a plugin's"}
+
+
+@dataclass(frozen=True, slots=True)
+class Compiled:
+    """What MuJoCo made of a document.
+
+    Attributes
+    ----------
+    spec, model
+        Its ``MjSpec`` and ``MjModel``; things in both have the same numbers.
+    prepared
+        What it was given.
+    assets
+        The meshes of files, by name.
+    left_out
+        The numbers of geoms whose shape is not known, with the reason.
+    guessed
+        The numbers of bodies whose inertia is not known.
+    efforts
+        How strong joints are, by name [N] or [N m].
+    home
+        Positions of all joints in the key ``home``.
+    """
+
+    spec: Any
+    model: Any
+    prepared: Prepared
+    assets: dict[str, Asset]
+    left_out: dict[int, str]
+    guessed: frozenset[int]
+    efforts: dict[str, float]
+    home: npt.NDArray[np.float64] | None
+
+    def nodes(self, things: Any) -> dict[int, Node | None]:
+        """Return the elements of things of the specification, by their numbers."""
+        return {thing.id: self.prepared.node(thing.info) for thing in things}
+
+
+class _MeshError(FormatError):
+    """What MuJoCo says where it may be the fault of a mesh file."""
+
+
+def compile_document(prepared: Prepared, source: str, folder: str, note: Note) -> Compiled:
+    """Have MuJoCo parse and compile a document.
+
+    Parameters
+    ----------
+    prepared
+        The document.
+    source
+        Its name in messages.
+    folder
+        Below which mesh files are read, where they decide something.
+    note
+        Called with what is left out.
+
+    Raises
+    ------
+    FormatError
+        With what MuJoCo says about which element; for numbers that are none.
+    """
+    with engine.listening() as heard:
+        try:
+            compiled = _attempt(prepared, source, folder, note)
+        except _MeshError as error:
+            note(None, f"inertia and sizes that follow from meshes are left out: {error}")
+            compiled = _attempt(prepared, source, folder, note, with_files=False)
+    for remark in dict.fromkeys(heard):
+        note(None, f"MuJoCo says: {remark.strip()}")
+    for name in _NUMBERS:
+        if not np.isfinite(getattr(compiled.model, name)).all():
+            raise FormatError(f"{source}: a number of it is not finite, or too large ({name}).")
+    return compiled
+
+
+def _attempt(prepared: Prepared, source: str, folder: str, note: Note, with_files: bool = True) -> Compiled:
+    spec = engine.parse(prepared, source)
+    shapeless = _without_shape(spec)
+    replacement = Replacement(spec, prepared, folder, note)
+    files = replacement.read_files(with_files)
+    strength, home = efforts(spec), _home(spec)
+    # What has been read goes: muscles make compiling long, and keys of what is left out make it fail.
+    for thing in (*spec.actuators, *spec.keys):
+        spec.delete(thing)
+    try:
+        model = engine.compiled(spec, prepared, source)
+    except FormatError as error:
+        raise _MeshError(str(error)) from None if files else error
+    meshes = replacement.meshes
+    shapeless += [(geom, "its size is that of a mesh that is not there") for geom in meshes.fitted]
+    left_out = {geom.id: f"is left out: {reason}." for geom, reason in shapeless}
+    guessed = frozenset(body.id for body in meshes.guessed)
+    return Compiled(spec, model, prepared, meshes.assets, left_out, guessed, strength, home)
+
+
+def _without_shape(spec: Any) -> list[tuple[Any, str]]:
+    """Make spheres of geoms that need files or plugins; return them, each with the reason."""
+    kinds = engine.mujoco().mjtGeom
+    found: list[tuple[Any, str]] = []
+    for geom in spec.geoms:
+        for kind, reason in _SHAPELESS.items():
+            if geom.type == getattr(kinds, kind):
+                geom.type, geom.size = kinds.mjGEOM_SPHERE, [1.0] * 3
+                geom.hfieldname = geom.meshname = ""
+                found.append((geom, reason))
+    return found
+
+
+def _home(spec: Any) -> npt.NDArray[np.float64] | None:
+    """Return the joint positions of the key ``home``."""
+    for key in spec.keys:
+        if key.name == "home" and len(key.qpos):
+            return np.array(key.qpos, dtype=float)
+    return None
