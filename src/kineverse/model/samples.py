@@ -10,7 +10,7 @@ import casadi as ca
 import numpy as np
 import numpy.typing as npt
 
-from kineverse.expressions.expression import Expression
+from kineverse.expressions.expression import SYMBOLS, Expression
 from kineverse.expressions.lowering import lower
 from kineverse.symbols import Symbol
 
@@ -79,10 +79,11 @@ class Samples:
         """Return, for each expression, an array (states, *shape); NaN where a closed loop does not close."""
         if not expressions:
             return []
-        columns = lower(expressions)
-        symbols = list(dict.fromkeys(symbol for e in expressions for symbol in e.symbols))
+        stacked = ca.vertcat(*lower(expressions))
+        # Not from each expression: in a long chain, nearly every pose is about nearly every joint.
+        symbols = [SYMBOLS[leaf.element_hash()] for leaf in ca.symvar(stacked)]
         vector = ca.vertcat(*(symbol._sx for symbol in symbols)) if symbols else ca.SX(0, 1)
-        function = ca.Function("samples", [vector], [ca.vertcat(*columns)])
+        function = ca.Function("samples", [vector], [stacked])
         if symbols:
             numbers = np.array(function(np.array([self.of(symbol) for symbol in symbols]))).T
         else:
