@@ -70,13 +70,13 @@ def run(arguments: argparse.Namespace) -> int:
 
     with listening() as left_out, doing(f"reading {arguments.source}"):
         model = kv.load(arguments.source, arguments.prefix)
-    with listening() as other, doing(f"writing {arguments.target}"):
+    other: list[str] = []
+    with doing(f"writing {arguments.target}"):
         if to_stdout:
             size = _print_document(model)
         else:
-            options = {"leave_out": arguments.leave_out} if arguments.leave_out else {}
-            model.save(arguments.target, **options)
-            size = os.path.getsize(Path(arguments.target).expanduser())
+            saved = model.save(arguments.target, leave_out=arguments.leave_out)
+            size, other = os.path.getsize(saved.path), list(saved.remarks)
     if arguments.json:
         print(json.dumps(_as_json(arguments, model, size, left_out, other), allow_nan=False))
     else:
