@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+
 import numpy as np
 import pytest
 from robots import joint, pair, robot
@@ -11,6 +13,7 @@ from test_sdf_joints import joint as sdf_joint
 
 import kineverse as kv
 from kineverse.errors import suggest
+from kineverse.formats.document import document_of, operations_from
 from kineverse.formats.markup import abbreviate, quote
 
 INVISIBLE = "\U000e0001"
@@ -141,6 +144,51 @@ def test_messages_are_bounded_whatever_is_in_the_file(tmp_path, name, places):
     message = loaded(tmp_path, robot(*(parts[place] for place in places), links=3))
     assert isinstance(message, str)
     assert len(message) < 2000
+
+
+def document(nodes: list, *writes: dict) -> bytes:
+    operations = [
+        {"tag": f"t{i}", "kind": "K", "reads": {}, "writes": write} for i, write in enumerate(writes)
+    ]
+    text = json.dumps({"format": "kineverse", "version": 1, "nodes": nodes, "operations": operations})
+    return text.encode()
+
+
+def built(data: bytes | str) -> kv.Model:
+    model = kv.Model()
+    with model.edit() as edit:
+        for tag, operation in operations_from(data):
+            edit.apply(operation, tag)
+    return model
+
+
+def test_a_carried_coordinate_that_a_composition_leaves_alone_is_plain_at_once():
+    """It was after the second time that a document was written."""
+    nodes = [
+        ["symbol", "b", 0, "dof"],
+        ["symbol", "a", 0, "dof"],
+        ["symbol", "a", 2, "dof"],
+        ["carried", 0, [[0, []]]],
+        ["dependent", 1, 0],
+        ["composed", 3, [[2, 4]]],
+    ]
+    model = built(document(nodes, {"constraints": {"c": [5, 1, 1]}}))
+    assert model.constraints["c"].lower == kv.position("b")
+    text = document_of(model)
+    assert document_of(built(text)) == text
+
+
+@pytest.mark.parametrize("depth", [33, 65, 300])
+def test_data_nested_deeper_than_arrays_can_be_overwritten_by_an_expression(depth):
+    deep = 1
+    for _ in range(depth):
+        deep = [deep]
+    model = built(
+        document([["symbol", "a", 0, "dof"]], {"data": {"x": deep}}, {"data": {"x": {"expression": 0}}})
+    )
+    assert model.data["x"] == kv.position("a")
+    with pytest.raises(kv.ShapeError, match="nested more than 32 deep"):
+        kv.array(deep)
 
 
 @pytest.mark.parametrize("text", ["x" * 500, INVISIBLE * 500, INVISIBLE * 79, "x" * 79 + INVISIBLE, "\n"])

@@ -555,13 +555,21 @@ def array(values: Any) -> Expression:
     return make(layout.from_column(elements, full), full, union(flat))
 
 
-def _flatten(values: Any, flat: list[Expression]) -> Shape | None:
+_MOST_DIMENSIONS = 32
+"""Those that every version of numpy has."""
+
+
+def _flatten(values: Any, flat: list[Expression], depth: int = 0) -> Shape | None:
     """Append the entries of nested sequences to ``flat``; return the shape, None if it is ragged."""
     if not isinstance(values, (list, tuple)):
         entry = as_expression(values)
         flat.append(entry)
         return entry.shape
-    shapes = {_flatten(v, flat) for v in values}
+    if depth == _MOST_DIMENSIONS:
+        raise ShapeError(
+            f"Sequences are nested more than {_MOST_DIMENSIONS} deep; no array has so many dimensions."
+        )
+    shapes = {_flatten(v, flat, depth + 1) for v in values}
     if not shapes:
         return (0,)
     inner = shapes.pop()

@@ -437,9 +437,9 @@ def _recomposed(node: Composed, plain_part: Callable[[Expression], Expression]) 
     replacements = {s: p for s, e in given.items() if (p := plain_part(e)) != s}
     if source is inner and all(replacements.get(s) is e for s, e in given.items()):
         return None
-    if not replacements:
-        return plain_part(inner)
-    return apply(source, replacements)
+    composed = apply(source, replacements) if replacements else source
+    # What the replacements leave as it is, is a carried coordinate like any other.
+    return plain_part(inner) if composed is source else composed
 
 
 def all_symbols(expression: Expression) -> set[Symbol]:
