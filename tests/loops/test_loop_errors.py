@@ -53,6 +53,9 @@ def closing(model, frame="coupler_tip", to="rocker_tip", *, name=LOOP, **options
     [
         ({"mask": ("x", "q")}, ValueRejectedError, r"mask of loop 'four-bar'.*'q'"),
         ({"mask": ()}, ValueRejectedError, r"mask of loop 'four-bar'.*\(\)"),
+        ({"mask": None}, ValueRejectedError, "mask of loop 'four-bar'.*None"),
+        ({"home": {"crank": "1"}}, ValueRejectedError, "Loop 'four-bar' takes home=.*'1'"),
+        ({"within": {"crank": ("0", 1)}}, ValueRejectedError, "Loop 'four-bar' takes home=.*'0'"),
         ({"mask": ("x", "x")}, ValueRejectedError, r"mask of loop 'four-bar'.*\('x', 'x'\)"),
         ({"mask": ("z",)}, ModelError, "Loop 'four-bar' is closed already"),
         (
@@ -234,7 +237,7 @@ def _heading(known):
     return {name: known["base/yaw"]}
 
 
-def test_a_quaternion_that_is_none():
+def test_a_quaternion_has_no_limits():
     model = kv.Model()
     with model.edit() as edit:
         bar(edit, "drive", "world", at(0), Z)
@@ -243,8 +246,8 @@ def test_a_quaternion_that_is_none():
         bar(edit, "driven", "world", at(0.4, 0.3), X)
         edit.add_frame("driven_end", "driven", kv.translation(0, 0.25, 0))
     refused(
-        kv.UnsolvedError,
-        "'rod' is not defined at drive = 0, ball/qw = 0",
+        ValueRejectedError,
+        "Loop 'rod' has to know how far 'ball/q[xyzw]' goes",
         lambda: closing(model, "rod_end", "driven_end", name="rod"),
     )
 

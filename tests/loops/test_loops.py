@@ -304,3 +304,22 @@ def test_limits_of_what_follows_by_name():
     assert model.symbol("coupler") == kv.position("coupler")
     with pytest.raises(kv.UnknownNameError, match="Did you mean 'rocker'"):
         model.limits("rokcer")
+
+
+def test_what_has_speeds_of_its_own_does_not_follow():
+    """Neither wheels nor quaternions; and a loop begins where a ball is at rest, not where it is nothing."""
+    model = kv.Model()
+    with model.edit() as edit:
+        bar(edit, "crank", "world", at(0))
+        edit.apply(kv.Ball(name="ball", parent="crank", child="rod", origin=at(0.3)))
+        edit.add_frame("rod_end", "rod", kv.translation(1.0, 0, 0))
+        edit.close_loop(
+            "rod_end",
+            name="on the line",
+            mask=("y",),
+            within={f"ball/q{c}": (-0.1, 0.1) if c != "w" else (0.9, 1) for c in "xyzw"},
+        )
+    assert dict(model.articulations["on the line"].dynamics)["dependent"] == ("crank",)
+    at_rest = model.default_state()
+    assert at_rest["ball/qw"] == 1
+    assert model.fk("rod_end")(at_rest)[1, 3] == pytest.approx(0, abs=1e-10)

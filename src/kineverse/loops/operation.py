@@ -13,6 +13,7 @@ from kineverse.model.articulation import Articulation
 from kineverse.model.frame import WORLD
 from kineverse.model.operation import Effects, Operation
 from kineverse.model.reader import Reader
+from kineverse.number import real_number
 from kineverse.symbols import Symbol
 
 from .closing import Closed, close
@@ -49,7 +50,7 @@ class CloseLoop(Operation):
     dependent
         The coordinates that follow, by name; by default the last ones along both chains that can.
     home
-        Pairs of coordinate and value, near which the loop closes at first; by default 0, or the limit
+        Pairs of coordinate and value, near which the loop closes at first; by default at rest, or the limit
         next to it.
     branch
         Which solution there: 0 is the nearest to ``home``, 1 the next.
@@ -81,8 +82,12 @@ class CloseLoop(Operation):
     within: tuple[tuple[str, float, float], ...] = ()
 
     def __post_init__(self) -> None:
-        strange = [a for a in self.mask if a not in AXES]
-        if strange or not self.mask or len(set(self.mask)) < len(self.mask):
+        for field in ("mask", "dependent", "more"):
+            given = getattr(self, field)
+            if isinstance(given, list) or (field == "mask" and isinstance(given, str)):
+                object.__setattr__(self, field, tuple(given))
+        known = isinstance(self.mask, tuple) and all(a in AXES for a in self.mask)
+        if not known or not self.mask or len(set(self.mask)) < len(self.mask):
             raise ValueRejectedError(
                 f"The mask of loop '{self.name}' has names out of {', '.join(AXES)}, not {self.mask!r}."
             )
@@ -94,12 +99,13 @@ class CloseLoop(Operation):
             object.__setattr__(self, "dependent", (self.dependent,))
         try:
             home = self.home.items() if isinstance(self.home, Mapping) else self.home
-            object.__setattr__(self, "home", tuple((str(k), float(v)) for k, v in home))
+            object.__setattr__(self, "home", tuple((str(k), real_number(v)) for k, v in home))
             within: Iterable[Any] = self.within
             if isinstance(self.within, Mapping):
                 within = [(k, a, b) for k, (a, b) in self.within.items()]
-            object.__setattr__(self, "within", tuple((str(k), float(a), float(b)) for k, a, b in within))
-        except (TypeError, ValueError):
+            ranges = tuple((str(k), real_number(a), real_number(b)) for k, a, b in within)
+            object.__setattr__(self, "within", ranges)
+        except (TypeError, ValueError, OverflowError):
             raise ValueRejectedError(
                 f"Loop '{self.name}' takes home={{name: value}} and within={{name: (lower, upper)}}, "
                 f"not home={self.home!r} and within={self.within!r}."
@@ -128,12 +134,15 @@ class CloseLoop(Operation):
         moving = {s for s in residual.symbols if s.has_derivative}
         on_the_way = [s for frame, to in self._ends for s in model.coordinates_between(frame, to)]
         coordinates = list(dict.fromkeys([s for s in on_the_way if s in moving] + sorted(moving, key=str)))
+        # What has speeds of its own does not follow, so it is the first to be free.
+        coordinates.sort(key=lambda s: model.carry(s) is s)
         by_name = {str(s): s for s in coordinates}
         limits = {s: found for s in coordinates if (found := self._limits(model, s)) is not None}
         limits.update({by_name[n]: (a, b) for n, a, b in self._known(self.within, by_name)})
         home = {s: s.value or 0.0 for s in residual.symbols}
-        for s, (a, b) in limits.items():
-            home[s] = min(max(0.0, a), b)
+        for s in coordinates:
+            a, b = limits.get(s, (-math.inf, math.inf))
+            home[s] = min(max(self._rest(model, s), a), b)
         home.update({by_name[n]: v for n, v in self._known(self.home, by_name)})
         closed = close(
             self.name,
@@ -219,6 +228,14 @@ class CloseLoop(Operation):
         if constraint.lower.symbols or constraint.upper.symbols:
             return None
         return float(constraint.lower), float(constraint.upper)
+
+    def _rest(self, model: Reader, symbol: Symbol) -> float:
+        """Return where the joint of a coordinate is at rest: 1 for a quaternion's scalar part, else 0."""
+        joint = symbol.path.rpartition("/")[0]
+        record = model.articulations.get(joint) if joint else None
+        if record is None or symbol not in record.coordinates:
+            return 0.0
+        return float(record.home[record.coordinates.index(symbol)])
 
     def _known(self, items: Iterable[Item], by_name: Mapping[str, Symbol]) -> Iterator[Item]:
         for item in items:

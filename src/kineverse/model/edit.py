@@ -211,7 +211,7 @@ class Edit:
         self,
         frame: str,
         to: str = WORLD,
-        mask: Sequence[str] = ("x", "y", "z"),
+        mask: tuple[str, ...] = ("x", "y", "z"),
         name: str | None = None,
         tag: str | None = None,
         **options: Any,
@@ -219,7 +219,7 @@ class Edit:
         """Let two frames coincide, see :class:`kineverse.CloseLoop`, which also says what the options are."""
         from kineverse.loops import CloseLoop
 
-        loop = CloseLoop(name=name or f"{frame} to {to}", frame=frame, to=to, mask=tuple(mask), **options)
+        loop = CloseLoop(name=name or f"{frame} to {to}", frame=frame, to=to, mask=mask, **options)
         return self.apply(loop, tag)
 
     def set_rate(
