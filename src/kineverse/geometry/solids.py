@@ -1,0 +1,186 @@
+"""What coal computes with: one solid for each geometry, shared by whoever has the same."""
+
+from __future__ import annotations
+
+import math
+import threading
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any, TypeAlias
+
+import numpy as np
+
+from kineverse.errors import MissingExtraError, ValueRejectedError
+from kineverse.model.body import Box, Capsule, Cone, Cylinder, Ellipsoid, Geometry, Mesh, Sphere
+
+from .hulls import check_extent, hull
+from .mesh_files import Faces, Floats, MeshFile, find, read_faces
+
+Primitive: TypeAlias = Box | Sphere | Cylinder | Capsule | Cone | Ellipsoid
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Hull:
+    """A convex polytope: the points x with ``normals @ x <= offsets``; (F, 3) and (F,) [m]."""
+
+    normals: Floats
+    offsets: Floats
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Solid:
+    """A shape that distances can be computed to. Equal geometries have the same solid; it never changes.
+
+    Attributes
+    ----------
+    engine
+        What coal computes with. coal keeps pointers only, so the solid must outlive what is made of it.
+    surface
+        What it is, for rays: a primitive, a hull, or triangles.
+    centre, half
+        The box around it in its own frame: (3,) and (3,) half edges [m].
+    radius
+        Of the sphere about ``centre`` that holds it [m].
+    stand_in
+        The same shape as coal should see it beside a cylinder; None if that is ``engine``.
+    """
+
+    engine: Any
+    surface: Primitive | Hull | Faces
+    centre: Floats
+    half: Floats
+    radius: float
+    stand_in: Any = None
+
+    @property
+    def is_convex(self) -> bool:
+        """Whether it has an inside and a depth: everything but triangles."""
+        return not isinstance(self.surface, Faces)
+
+
+_by_content: dict[tuple[object, ...], Solid] = {}
+_making = threading.Lock()
+
+
+def solid_of(geometry: Geometry, triangles: bool = False) -> Solid:
+    """Return the solid of a geometry.
+
+    Parameters
+    ----------
+    geometry
+        A primitive or a mesh; a scale with negative factors mirrors a mesh.
+    triangles
+        Whether a mesh is kept as it is, a surface without an inside, rather than as its convex hull.
+
+    Raises
+    ------
+    MissingExtraError
+        If coal or trimesh is not installed.
+    FormatError, OSError
+        If a mesh cannot be found or read.
+    ValueRejectedError
+        If sizes are not positive numbers, or a mesh is degenerate or of an impossible size.
+    """
+    _engine()
+    if not isinstance(geometry, Mesh):
+        return _primitive(geometry)
+    scale = tuple(map(float, geometry.scale))
+    if not all(math.isfinite(factor) and factor for factor in scale):
+        raise ValueRejectedError(f"its scale is {scale}: factors are finite and not 0.")
+    file = find(geometry)
+    key = (file.digest, file.kind, scale, triangles)
+    with _making:
+        if key not in _by_content:
+            _by_content[key] = _from_file(file, np.array(scale), triangles)
+        return _by_content[key]
+
+
+def _engine() -> Any:
+    try:
+        import coal
+    except ImportError as error:
+        raise MissingExtraError(
+            "distances need coal: pip install 'kineverse-articulation[geometry]'"
+        ) from error
+    return coal
+
+
+def _from_file(file: MeshFile, scale: Floats, triangles: bool) -> Solid:
+    mesh = read_faces(file)
+    vertices = mesh.vertices * scale
+    if not triangles:
+        return _hull(vertices[np.unique(mesh.faces)])
+    check_extent(vertices)
+    return _triangles(vertices, mesh.faces[:, ::-1] if np.prod(scale) < 0 else mesh.faces)
+
+
+def _hull(points: Floats) -> Solid:
+    convex = hull(points)
+    corners = np.array(convex.points())
+    low, high = corners.min(axis=0), corners.max(axis=0)
+    surface = Hull(np.array(convex.normals()), -np.array(convex.offsets()).reshape(-1))
+    return _solid(convex, surface, (low + high) / 2, (high - low) / 2, corners)
+
+
+def _triangles(vertices: Floats, faces: Any) -> Solid:
+    bvh = _engine().BVHModelOBBRSS()
+    bvh.beginModel(len(faces), len(vertices))
+    bvh.addVertices(vertices)
+    bvh.addTriangles(np.ascontiguousarray(faces))
+    bvh.endModel()
+    used = vertices[np.unique(faces)]
+    low, high = used.min(axis=0), used.max(axis=0)
+    return _solid(bvh, Faces(vertices, faces), (low + high) / 2, (high - low) / 2, used)
+
+
+def _solid(engine: Any, surface: Hull | Faces, centre: Floats, half: Floats, points: Floats) -> Solid:
+    engine.computeLocalAABB()
+    return Solid(engine, surface, centre, half, float(np.linalg.norm(points - centre, axis=1).max()))
+
+
+@lru_cache(maxsize=65536)
+def _primitive(geometry: Primitive) -> Solid:
+    sizes = _sizes(geometry)
+    if not all(math.isfinite(size) and size > 0.0 for size in sizes):
+        raise ValueRejectedError(f"{geometry} has sizes that are not positive numbers [m].")
+    if not all(SMALLEST_SIZE <= size <= LARGEST_SIZE for size in sizes):
+        raise ValueRejectedError(
+            f"{geometry} has sizes beyond {SMALLEST_SIZE:g} m to {LARGEST_SIZE:g} m, which cannot be right."
+        )
+    coal = _engine()
+    stand_in = None
+    x, y, z = (*sizes, 0.0, 0.0)[:3]
+    if isinstance(geometry, Box):
+        engine, half = coal.Box(x, y, z), (x / 2, y / 2, z / 2)
+        radius = math.hypot(*half)
+    elif isinstance(geometry, Sphere):
+        engine, half, radius = coal.Sphere(x), (x, x, x), x
+        # coal looks only at the wall when the centre of a sphere is inside a cylinder, and not at its ends.
+        stand_in = coal.Capsule(x, 0.0)
+        stand_in.computeLocalAABB()
+    elif isinstance(geometry, Ellipsoid):
+        engine, half, radius = coal.Ellipsoid(x, y, z), (x, y, z), max(x, y, z)
+    elif isinstance(geometry, Capsule):
+        engine, half, radius = coal.Capsule(x, y), (x, x, x + y / 2), x + y / 2
+    elif isinstance(geometry, Cylinder):
+        engine, half, radius = coal.Cylinder(x, y), (x, x, y / 2), math.hypot(x, y / 2)
+    else:
+        engine, half, radius = coal.Cone(x, y), (x, x, y / 2), math.hypot(x, y / 2)
+    engine.computeLocalAABB()
+    return Solid(engine, geometry, np.zeros(3), np.array(half), radius, stand_in)
+
+
+SMALLEST_SIZE, LARGEST_SIZE = 1e-7, 1e6
+"""Beyond these sizes a primitive is taken for a mistake [m]."""
+
+
+def _sizes(geometry: Primitive) -> tuple[float, ...]:
+    if isinstance(geometry, Box):
+        return tuple(map(float, geometry.size))
+    if isinstance(geometry, Ellipsoid):
+        return tuple(map(float, geometry.radii))
+    if isinstance(geometry, Sphere):
+        return (float(geometry.radius),)
+    if isinstance(geometry, Cylinder | Capsule | Cone):
+        return (float(geometry.radius), float(geometry.length))
+    raise ValueRejectedError(f"{geometry!r} is no geometry that a body can have.")
