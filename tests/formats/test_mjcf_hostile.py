@@ -117,9 +117,7 @@ def test_what_a_part_includes_is_found_from_both_folders(tmp_path):
         '<mujocoinclude><body name="a"/><include file="b.xml"/><include file="sub/c.xml"/></mujocoinclude>',
     )
     write(top, "sub/b.xml", '<mujocoinclude><body name="b"/></mujocoinclude>')
-    write(
-        tmp_path, "sub/c.xml", '<mujocoinclude><body name="c">\n<body name="d" no=""/></body></mujocoinclude>'
-    )
+    write(top, "sub/c.xml", '<mujocoinclude><body name="c">\n<body name="d" no=""/></body></mujocoinclude>')
     text = mjcf('<worldbody><include file="../robot/sub/a.xml"/></worldbody>')
     assert outcome(text, top).startswith('c.xml, line 2, <body name="d">: MuJoCo refuses it: ')
     write(top, "sub/c.xml", '<mujocoinclude><body name="c"/></mujocoinclude>')
