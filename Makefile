@@ -7,12 +7,13 @@ VENV := .venv
 BIN := $(VENV)/bin
 INSTALL := $(BIN)/python -m pip install --quiet --no-input --disable-pip-version-check --no-deps
 
-.PHONY: help demo test format clean
+.PHONY: help demo test fuzz format clean
 .NOTPARALLEL:
 
 help:
 	@echo "make demo    open a kitchen and a robot in the browser (ARGS=--headless: write a picture and end)"
 	@echo "make test    formatter, linter, types, tests"
+	@echo "make fuzz    look for inputs that break a reader (ARGS='--target sdf --minutes 60')"
 	@echo "make format  format the code and mend what the linter can mend"
 	@echo "make clean   remove the environment and what the tools left"
 
@@ -24,6 +25,9 @@ test: $(VENV)/test.installed
 	$(BIN)/ruff check .
 	$(BIN)/mypy
 	$(BIN)/python -m pytest -q -n $(JOBS) $(ARGS)
+
+fuzz: $(VENV)/fuzz.installed
+	PYTHONPATH=tools $(BIN)/python -m fuzz $(ARGS)
 
 format: $(VENV)/test.installed
 	$(BIN)/ruff format .
@@ -47,4 +51,8 @@ $(VENV)/demo.installed: requirements/build.txt requirements/core.txt requirement
 $(VENV)/test.installed: requirements/test.txt $(VENV)/demo.installed | $(BIN)/python
 	@echo "Installing what the tests need into $(VENV); this takes a few minutes, once."
 	$(INSTALL) -r requirements/test.txt
+	@touch $@
+
+$(VENV)/fuzz.installed: requirements/fuzz.txt $(VENV)/test.installed
+	$(INSTALL) -r requirements/fuzz.txt
 	@touch $@

@@ -1,0 +1,169 @@
+"""Search for inputs that break a reader: ``make fuzz ARGS="--target sdf --minutes 60"``.
+
+The search runs in processes of its own, which may die of what they read and are started again. What it finds
+lies in build/fuzz/TARGET/findings, minimised; what reached new code, in build/fuzz/TARGET/corpus.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import re
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+from .law import Finding, check
+from .minimise import minimise
+from .records import Records
+from .targets import TARGETS, Target
+from .worker import HANG, place
+
+ROUND = 300
+"""[s] after which a process is exchanged for a fresh one: what it remembers is memory."""
+_COVERAGE = re.compile(r"cov: (\d+) ft: (\d+) corp: (\d+)")
+
+
+def main() -> int:
+    """Search; return how many things were found."""
+    parser = argparse.ArgumentParser(prog="make fuzz", description=__doc__)
+    parser.add_argument("--target", choices=TARGETS, action="append", help="a format; may be repeated (all)")
+    parser.add_argument("--minutes", type=float, default=10.0, help="how long, for all targets together (10)")
+    parser.add_argument("--seed", type=int, default=1, help="of the search (1)")
+    parser.add_argument(
+        "--folder", type=Path, default=Path("build/fuzz"), help="where results go (build/fuzz)"
+    )
+    parser.add_argument("--check", type=Path, metavar="FILE", help="only look at one input, and minimise it")
+    given = parser.parse_args()
+    targets = given.target or list(TARGETS)
+    if given.check is not None:
+        return _look(TARGETS[targets[0]], given.check)
+    searches = [_Search(TARGETS[name], given.folder / name) for name in targets]
+    end, seed = time.monotonic() + 60 * given.minutes, given.seed
+    try:
+        while (left := end - time.monotonic()) > 1:
+            for search in searches:
+                search.round(int(max(1, min(ROUND, left / len(searches)))), seed)
+                seed += 1
+    except KeyboardInterrupt:
+        _say("stopped")
+    found = [line for search in searches for line in search.summary()]
+    _say(f"{len(found)} found" + "".join(f"\n  {line}" for line in found))
+    return min(len(found), 99)
+
+
+class _Search:
+    """The search for one target, over many processes."""
+
+    def __init__(self, target: Target, folder: Path) -> None:
+        self._target, self._folder = target, folder
+        self._records = Records(folder / "findings")
+        self._models = self._errors = self._deaths = 0
+        self._seconds = 0.0
+
+    def round(self, seconds: int, seed: int) -> None:
+        """Let a process search for some seconds, and take up what it left."""
+        folder, log = self._folder, self._folder / "log.txt"
+        status = folder / "status.json"
+        status.unlink(missing_ok=True)
+        command = ["--folder", str(folder), "--seconds", str(seconds), "--seed", str(seed)]
+        start = time.monotonic()
+        with log.open("wb") as file:
+            process = subprocess.Popen(self._worker(*command), stdout=file, stderr=file)
+            try:
+                process.wait(seconds + 6 * HANG)
+            except subprocess.TimeoutExpired:
+                process.kill()
+            finally:
+                process.terminate()
+                process.wait()
+        self._seconds += time.monotonic() - start
+        died = list(folder.glob("died-*"))
+        for path in died:
+            self._died(path)
+        if status.exists():
+            tally = json.loads(status.read_text())
+            self._models, self._errors = self._models + tally["models"], self._errors + tally["errors"]
+        elif process.returncode:
+            raise SystemExit(f"the search ended at once:\n{log.read_text(errors='replace')[-3000:]}")
+        if process.returncode and not died:
+            _say(f"{self._target.name}: the fuzzer itself failed, see {log.rename(folder / 'failed.txt')}")
+            return
+        reached = _COVERAGE.findall(log.read_text(errors="replace")) or [("0", "0", "0")]
+        _say(f"{self._line()}; branches {reached[-1][0]}, inputs kept {reached[-1][2]}")
+
+    def summary(self) -> list[str]:
+        """Minimise what was found, and return a line for each."""
+        _say(self._line())
+        lines = []
+        for signature, path in self._records.all():
+            if signature.startswith(("dies", "slow", "large")):
+                lines.append(f"{signature}: {path}")
+                continue
+            with tempfile.TemporaryDirectory() as folder:
+                small = _minimised(self._target, path.read_bytes(), signature, place(Path(folder)))
+            path.write_bytes(small)
+            lines.append(f"{signature}: {path} ({len(small)} bytes)")
+        return lines
+
+    def _died(self, path: Path) -> None:
+        """Look whether an input kills a process of its own, too, or its successor was to blame."""
+        data, how = path.read_bytes(), path.name.split("-")[1]
+        path.unlink()
+        again = self._folder / "again"
+        again.write_bytes(data)
+        try:
+            code = subprocess.run(
+                self._worker("--replay", str(again)), timeout=3 * HANG, capture_output=True
+            ).returncode
+        except subprocess.TimeoutExpired:
+            code = -1
+        if code not in (0, 1):
+            self._deaths += 1
+            self._records.add(Finding(f"dies: {how}", f"the process ends with {code}"), data)
+
+    def _worker(self, *arguments: str) -> list[str]:
+        return [sys.executable, "-m", "fuzz.worker", "--target", self._target.name, *arguments]
+
+    def _line(self) -> str:
+        runs = self._models + self._errors
+        return (
+            f"{self._target.name}: {runs} inputs in {self._seconds / 60:.1f} min, "
+            f"{self._models} gave models; {len(self._records.all())} findings, {self._deaths} deaths"
+        )
+
+
+def _look(target: Target, path: Path) -> int:
+    data = path.read_bytes()
+    with tempfile.TemporaryDirectory() as name:
+        folder = place(Path(name))
+        finding = check(target, data, folder)
+        if finding is None:
+            _say("nothing is wrong")
+            return 0
+        small = _minimised(target, data, finding.signature, folder)
+    sys.stdout.write(f"{finding.signature}\n{finding.detail}\n\n{small.decode(errors='backslashreplace')}\n")
+    return 1
+
+
+def _minimised(target: Target, data: bytes, signature: str, folder: Path) -> bytes:
+    def fails(candidate: bytes) -> bool:
+        finding = check(target, candidate, folder)
+        return finding is not None and finding.signature == signature
+
+    return minimise(data, target, fails) if fails(data) else data
+
+
+def _say(text: str) -> None:
+    sys.stdout.write(f"{time.strftime('%H:%M:%S')} {text}\n")
+    sys.stdout.flush()
+
+
+if __name__ == "__main__":
+    os.environ["PYTHONPATH"] = os.pathsep.join(
+        filter(None, (str(Path(__file__).parents[1]), os.environ.get("PYTHONPATH")))
+    )
+    sys.exit(main())

@@ -1,0 +1,1 @@
+"""Inputs by grammar, right and wrong: a module for each format."""

@@ -1,0 +1,107 @@
+"""The formats whose readers are fuzzed."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from random import Random
+
+import kineverse as kv
+from kineverse.formats.document import operations_from
+from kineverse.formats.sdf.operations import scene_operations
+from kineverse.formats.sdf.reader import parse_sdf
+from kineverse.formats.urdf import parse_urdf
+from kineverse.formats.urdf.operations import robot_operations
+
+from . import json_trees, xml_trees
+from .grammars import document, sdf, urdf
+
+SEEDS = Path(__file__).parent / "seeds"
+DATA = Path(__file__).resolve().parents[3] / "shared" / "data"
+MAX_SEED = 20_000
+"""Larger files [byte] make slow seeds, and have nothing in them that smaller ones have not."""
+
+Operations = Iterable[tuple[str | None, kv.Operation]]
+
+
+@dataclass(frozen=True)
+class Target:
+    """A format: its reader, and where inputs for that come from.
+
+    Attributes
+    ----------
+    suffix
+        What the names of its files end with.
+    operations
+        The reader: what a text in a folder describes.
+    generate
+        Returns an input by grammar, right or wrong.
+    mutate
+        Returns another input, made of one and of parts of a second one.
+    reduce
+        Yields smaller inputs with the structure of the format, for minimising.
+    finite
+        Whether poses have to be finite; where expressions are free, they may be what they like.
+    """
+
+    name: str
+    suffix: str
+    operations: Callable[[bytes, Path], Operations]
+    generate: Callable[[Random], bytes]
+    mutate: Callable[[bytes, bytes, Random], bytes]
+    reduce: Callable[[bytes], Iterator[bytes]]
+    finite: bool = True
+
+    def model(self, data: bytes, folder: Path) -> kv.Model:
+        """Return the model that an input describes."""
+        model = kv.Model()
+        with model.edit() as edit:
+            for tag, operation in self.operations(data, folder):
+                edit.apply(operation, tag)
+        return model
+
+    def seeds(self) -> list[bytes]:
+        """Return the inputs to begin with: those written for it, and small files of the data beside."""
+        own = sorted(SEEDS.glob(f"*{self.suffix}"))
+        found = sorted(DATA.rglob(f"*{self.suffix}")) if DATA.is_dir() else []
+        small = [path for path in found if path.is_file() and path.stat().st_size <= MAX_SEED]
+        return [path.read_bytes() for path in (*own, *small)]
+
+    def own_seeds(self) -> list[bytes]:
+        """Return the inputs that were written for it."""
+        return [path.read_bytes() for path in sorted(SEEDS.glob(f"*{self.suffix}"))]
+
+
+def _urdf(data: bytes, folder: Path) -> Operations:
+    robot = parse_urdf(data, source="input.urdf", folder=str(folder))
+    return ((None, operation) for operation in robot_operations(robot))
+
+
+def _sdf(data: bytes, folder: Path) -> Operations:
+    scene = parse_sdf(data, source="input.sdf", folder=str(folder))
+    return ((None, operation) for operation in scene_operations(scene))
+
+
+def _document(data: bytes, folder: Path) -> Operations:
+    return list(operations_from(data, "input.kv.json"))
+
+
+TARGETS = {
+    target.name: target
+    for target in (
+        Target(
+            "urdf", ".urdf", _urdf, urdf.generate, xml_trees.mutator(urdf.VOCABULARY), xml_trees.reductions
+        ),
+        Target("sdf", ".sdf", _sdf, sdf.generate, xml_trees.mutator(sdf.VOCABULARY), xml_trees.reductions),
+        Target(
+            "document",
+            ".kv.json",
+            _document,
+            document.generate,
+            json_trees.mutator(document.VOCABULARY),
+            json_trees.reductions,
+            finite=False,
+        ),
+    )
+}

@@ -1,0 +1,116 @@
+"""A process that feeds a reader until it is stopped, or dies of an input: the search guided by coverage.
+
+``python -m fuzz.worker --target urdf --folder build/fuzz/urdf --seconds 300`` searches.
+With ``--replay FILE`` it looks at one input and says what is wrong with it; it returns 1 if anything is.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import resource
+import sys
+import tempfile
+from pathlib import Path
+from random import Random
+
+MAX_LENGTH = 60_000
+MAX_SPACE = 6 << 30
+MAX_RESIDENT = 2048
+"""[MiB]; an input may take half of that, see :mod:`.law`."""
+HANG = 20
+"""[s] of wall clock, after which an input counts as a hang; :mod:`.law` complains of 5 s of work."""
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(prog="python -m fuzz.worker", description=__doc__)
+    parser.add_argument("--target", required=True)
+    parser.add_argument("--folder", type=Path, default=None)
+    parser.add_argument("--seconds", type=int, default=60)
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--replay", type=Path)
+    given = parser.parse_args()
+    resource.setrlimit(resource.RLIMIT_AS, (MAX_SPACE, MAX_SPACE))
+    os.environ.setdefault("KINEVERSE_CACHE_DIR", tempfile.gettempdir())
+    if given.replay is None:
+        _search(given.target, given.folder, given.seconds, given.seed)
+        return 0
+    return _replay(given.target, given.replay)
+
+
+def _replay(name: str, path: Path) -> int:
+    from .law import check
+    from .targets import TARGETS
+
+    with tempfile.TemporaryDirectory() as folder:
+        finding = check(TARGETS[name], path.read_bytes(), place(Path(folder)))
+    if finding is not None:
+        sys.stdout.write(f"{finding.signature}\n\n{finding.detail}\n")
+    return finding is not None
+
+
+def _search(name: str, folder: Path, seconds: int, seed: int) -> None:
+    import atheris
+
+    with atheris.instrument_imports(include=["kineverse.formats"]):
+        from .targets import TARGETS
+    from .inputs import another
+    from .law import Tally, check
+    from .records import Records
+
+    target, records, tally = TARGETS[name], Records(folder / "findings"), Tally()
+    beside = place(Path(tempfile.mkdtemp(prefix="fuzz-")))
+    others = target.seeds()
+    status = folder / "status.json"
+
+    def one(data: bytes) -> None:
+        finding = check(target, data, beside, tally)
+        if finding is not None and records.add(finding, data):
+            sys.stderr.write(f"FOUND {finding.signature}\n")
+        if (tally.models + tally.errors) % 100 == 0:
+            status.write_text(json.dumps({"models": tally.models, "errors": tally.errors}))
+
+    def mutate(data: bytes, max_size: int, chance: int) -> bytes:
+        random = Random(chance)
+        if random.random() < 0.1:
+            return bytes(atheris.Mutate(data, max_size))
+        return another(target, data, others, random)[:max_size]
+
+    corpus = folder / "corpus"
+    corpus.mkdir(parents=True, exist_ok=True)
+    for number, data in enumerate(others):
+        (corpus / f"seed-{number}").write_bytes(data[:MAX_LENGTH])
+    options = {
+        "max_total_time": seconds,
+        "max_len": MAX_LENGTH,
+        "timeout": HANG,
+        "rss_limit_mb": MAX_RESIDENT,
+        "seed": seed,
+        "artifact_prefix": f"{folder}/died-",
+        "len_control": 0,
+        "verbosity": 1,
+    }
+    atheris.Setup(
+        [name, *(f"-{key}={value}" for key, value in options.items()), str(corpus)],
+        one,
+        custom_mutator=mutate,
+    )
+    atheris.Fuzz()
+
+
+def place(folder: Path) -> Path:
+    """Return a folder with a model in it that others may include."""
+    folder = folder.resolve() / "inputs"
+    part = folder / "part"
+    part.mkdir(parents=True)
+    (part / "model.config").write_text('<model><sdf version="1.7">model.sdf</sdf></model>')
+    (part / "model.sdf").write_text(
+        '<sdf version="1.7"><model name="part"><link name="a"/><link name="b"/>'
+        '<joint name="j0" type="revolute"><parent>a</parent><child>b</child></joint></model></sdf>'
+    )
+    return folder
+
+
+if __name__ == "__main__":
+    sys.exit(main())
