@@ -43,6 +43,9 @@ class Pair:
         ]
         assert len(self.bodies) == engine.nbody
         assert len(self.joints) == engine.njnt
+        frames = [*self.bodies, *(site.name for site in self.scene.sites)]
+        self._poses = self._function([self.model.fk(name) for name in frames])
+        self._frames = frames
 
     @staticmethod
     def of_text(text: str) -> Pair:
@@ -76,6 +79,14 @@ class Pair:
                 length = np.linalg.norm([state[n] for n in names])
                 state |= {n: state[n] / length for n in names}
         return state
+
+    def _function(self, expressions: list[kv.Expression]) -> kv.Function:
+        resolve = self.model.rates.resolve
+        return kv.compile([resolve(e) for e in expressions], tier="interpreter")
+
+    @staticmethod
+    def _values(function: kv.Function, state: dict[kv.Symbol, float]) -> list[Array]:
+        return list(function({s: state[s] for s in function.inputs}))
 
     def value(self, expression: kv.Expression, state: dict[kv.Symbol, float]) -> Array:
         resolved = self.model.rates.resolve(expression)
@@ -121,15 +132,12 @@ class Pair:
 
     def compare_poses(self, state: dict[kv.Symbol, float], tolerance: float = 1e-10) -> None:
         self.place(state)
-        frames = [(name, self.data.xpos[k], self.data.xmat[k]) for k, name in enumerate(self.bodies)]
-        frames += [
-            (site.name, self.data.site_xpos[k], self.data.site_xmat[k])
-            for k, site in enumerate(self.scene.sites)
-        ]
-        for name, position, matrix in frames:
+        positions = [*self.data.xpos, *self.data.site_xpos]
+        matrices = [*self.data.xmat, *self.data.site_xmat]
+        values = self._values(self._poses, state)
+        for name, position, matrix, here in zip(self._frames, positions, matrices, values, strict=True):
             pose = np.eye(4)
             pose[:3, 3], pose[:3, :3] = position, matrix.reshape(3, 3)
-            here = self.value(self.model.fk(name), state)
             np.testing.assert_allclose(here, pose, atol=tolerance, err_msg=name)
 
     def compare_jacobians(self, state: dict[kv.Symbol, float], tolerance: float = 1e-9) -> None:
@@ -152,29 +160,24 @@ class Pair:
                 block[:3, :3] = matrix.reshape(3, 3)
             columns = [speeds.index(s) for s in record.speeds]
             to_engine[at : at + len(block), columns] = block
-        still = {
-            speeds.index(s)
-            for name, record in self.model.articulations.items()
-            for s in record.speeds
-            if self._is_handle(name)
-        }
-        for body, name in enumerate(self.bodies):
+        # MuJoCo has no speeds of mocap bodies.
+        moving = [k for k, s in enumerate(speeds) if not self._is_handle(s.path.rpartition("/")[0])]
+        names = [name for name in self.bodies if self.model.speeds_of(name)]
+        if not names:
+            return
+        jacobians = self._values(self._function([self.model.jacobian(name) for name in names]), state)
+        for name, jacobian in zip(names, jacobians, strict=True):
             linear, angular = np.zeros((3, self.engine.nv)), np.zeros((3, self.engine.nv))
-            mujoco.mj_jacBody(self.engine, self.data, linear, angular, body)
+            mujoco.mj_jacBody(self.engine, self.data, linear, angular, self.bodies.index(name))
             expected = np.vstack([linear, angular]) @ to_engine
-            own = self.model.speeds_of(name)
-            jacobian = self.model.jacobian(name)
             here = np.zeros((6, len(speeds)))
-            if own:
-                here[:, [speeds.index(s) for s in own]] = jacobian({s: state[s] for s in jacobian.symbols})
-            moving = [k for k in range(len(speeds)) if k not in still]  # MuJoCo has no speeds of mocap bodies
+            here[:, [speeds.index(s) for s in self.model.speeds_of(name)]] = jacobian
             np.testing.assert_allclose(here[:, moving], expected[:, moving], atol=tolerance, err_msg=name)
 
     def compare(self, samples: int = 5, seed: int = 0) -> None:
         rng = np.random.default_rng(seed)
         held = any(joint.kind == "free" and self._is_held(joint.name) for joint in self.joints)
         for _ in range(samples):
-            state = self.random_state(rng)
-            self.compare_poses(state)
-            if not held:  # MuJoCo's columns know nothing of what holds a body
-                self.compare_jacobians(state)
+            self.compare_poses(state := self.random_state(rng))
+        if not held:  # MuJoCo's columns know nothing of what holds a body
+            self.compare_jacobians(state)
