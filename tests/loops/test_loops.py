@@ -323,3 +323,20 @@ def test_what_has_speeds_of_its_own_does_not_follow():
     at_rest = model.default_state()
     assert at_rest["ball/qw"] == 1
     assert model.fk("rod_end")(at_rest)[1, 3] == pytest.approx(0, abs=1e-10)
+
+
+def test_many_inputs():
+    """More than a grid over all of them could be sampled for: two bars of a chain of six follow four."""
+    model = kv.Model()
+    with model.edit() as edit:
+        for k in range(6):
+            limits = {"lower": 0.2, "upper": 0.35} if k < 4 else {}
+            bar(edit, f"bar_{k}", "world" if k == 0 else f"bar_{k - 1}", at(0.3 if k else 0.0), **limits)
+        edit.add_frame("tip", "bar_5", kv.translation(0.3, 0, 0))
+        edit.add_frame("pin", "world", kv.translation(1.1, 0.9, 0))
+        edit.close_loop("tip", "pin", name="ring", mask=("x", "y"), home={"bar_4": 1.0, "bar_5": 1.0})
+    assert dict(model.articulations["ring"].dynamics)["mobility"] == 4
+    free = model.degrees_of_freedom
+    assert [str(s) for s in free] == ["bar_0", "bar_1", "bar_2", "bar_3"]
+    assert_closed(model)
+    assert_moves_as_its_jacobian_says(model, "bar_4", 20)

@@ -18,7 +18,7 @@ from kineverse.symbols import Symbol
 from .branches import find_branches, nearest_closed
 from .equations import CLOSED, Array, Equations, periodic
 from .samples import Samples
-from .seed import Interval, Seed
+from .seed import Interval, Seed, products_of
 
 RANK = 1e-7
 """What a singular value is, relative to the largest, below which a direction counts as free."""
@@ -246,8 +246,7 @@ def _chosen_seed(name: str, samples: Samples) -> tuple[Seed, int, tuple[int, ...
     best: tuple[float, Seed, int] | None = None
     count = len(samples.inputs)
     for degree in _DEGREES:
-        terms = int(np.prod([2 * degree + 1 if i.whole else degree + 1 for i in samples.intervals]))
-        if terms > count:
+        if len(products_of(samples.intervals, degree)) > count:
             break
         seed = Seed.fit(samples.intervals, degree, samples.inputs, samples.solutions, samples.winding)
         steps = _steps(samples, seed, rows)

@@ -12,9 +12,10 @@ from kineverse.errors import UnsolvedError
 
 from .continuation import follow
 from .equations import Array, Equations
-from .seed import Interval
+from .seed import FEW, Interval
 
 _SAMPLES = {1: 65, 2: 17, 3: 9}
+_SCATTERED = 400
 _TRIED = 200
 
 
@@ -52,7 +53,11 @@ class Samples:
         upper = np.array([i.upper for i in intervals])
         home = np.clip(u[:k], lower, upper)
         x = self._followed(x, u[:k], home)
-        grid = _grid([i.samples(_SAMPLES.get(k, 5)) for i in intervals])
+        if k <= FEW:
+            grid = _grid([i.samples(_SAMPLES.get(k, 1)) for i in intervals])
+        else:  # a grid would have more points than anybody waits for
+            parts = generator.uniform(size=(_SCATTERED, k))
+            grid = np.column_stack([i.spread(p) for i, p in zip(intervals, parts.T, strict=True)])
         corners = np.vstack([_corners(limits), _corners(intervals)])
         tried = np.vstack([corners, generator.uniform(lower, upper, (_TRIED, k))])
         everywhere = np.vstack([home, grid, tried])

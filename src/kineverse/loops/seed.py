@@ -1,13 +1,13 @@
 """First guesses of unknowns as smooth functions of the inputs, fitted to one branch of solutions.
 
 Over inputs within limits they are Chebyshev polynomials, over whole turns Fourier series; over several inputs
-products of these. They need not be exact, Newton's method makes them so; but from every point of the domain
-it has to arrive at this branch, and that is tried out before a seed is used.
+products of these, and over many inputs only those whose degrees add up to no more than the degree. They need
+not be exact, Newton's method makes them so; but from every point of the domain it has to arrive at this
+branch, and that is tried out before a seed is used.
 """
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -18,6 +18,9 @@ from kineverse.expressions.functions import cos, maximum, minimum, sin
 from kineverse.symbols import Symbol
 
 from .equations import Array
+
+FEW = 3
+"""Up to how many inputs all products are used, and samples lie on a grid."""
 
 _MARGIN = 0.05
 """How much further than its limits a loop is to be evaluated on each side, of their distance."""
@@ -46,10 +49,21 @@ class Interval:
 
     def samples(self, count: int) -> Array:
         """Return points at which fits are well behaved, in order."""
+        parts = np.arange(count) + (0.0 if self.whole else 0.5)
+        return self.spread(parts / count)
+
+    def spread(self, parts: Array) -> Array:
+        """Return points for numbers in [0, 1): dense where fits need it."""
+        width = self.upper - self.lower
         if self.whole:
-            return self.lower + (self.upper - self.lower) * np.arange(count) / count
-        angles = (np.arange(count) + 0.5) * np.pi / count
-        return (self.lower + self.upper) / 2 - (self.upper - self.lower) / 2 * np.cos(angles)
+            return self.lower + width * parts
+        return (self.lower + self.upper) / 2 - width / 2 * np.cos(parts * np.pi)
+
+    def orders(self, degree: int) -> list[int]:
+        """Return the degree of each of the basis functions up to one."""
+        if self.whole:
+            return [(i + 1) // 2 for i in range(2 * degree + 1)]
+        return [0] if self.upper == self.lower else list(range(degree + 1))
 
     def numbers(self, u: Array, degree: int) -> Array:
         """Return the basis functions at points, shape (N, size)."""
@@ -128,10 +142,10 @@ class Seed:
         """Return the guesses as an expression of shape (n,)."""
         bases = [i.functions(u, self.degree) for i, u in zip(self.intervals, inputs, strict=True)]
         products = []
-        for factors in itertools.product(*bases):
+        for which in products_of(self.intervals, self.degree):
             product = array(1.0)
-            for factor in factors:
-                product = product * factor
+            for basis, i in zip(bases, which, strict=True):
+                product = product * basis[i]
             products.append(product)
         guesses = []
         for column, grows in zip(self.coefficients.T, self.winding.T, strict=True):
@@ -145,9 +159,24 @@ class Seed:
 
 
 def _products(inputs: Array, intervals: Sequence[Interval], degree: int) -> Array:
-    """Return all products of basis functions, one of each input, in the order of itertools.product."""
-    result = np.ones((len(inputs), 1))
-    for column, interval in zip(inputs.T, intervals, strict=True):
-        other = interval.numbers(column, degree)
-        result = (result[:, :, None] * other[:, None, :]).reshape(len(result), -1)
+    """Return the products of basis functions at points, shape (N, P)."""
+    which = products_of(intervals, degree)
+    result = np.ones((len(inputs), len(which)))
+    for column, interval, i in zip(inputs.T, intervals, np.array(which, dtype=int).T, strict=True):
+        result *= interval.numbers(column, degree)[:, i]
     return result
+
+
+def products_of(intervals: Sequence[Interval], degree: int) -> list[tuple[int, ...]]:
+    """Return which basis function of each input each product is made of."""
+    most = degree if len(intervals) > FEW else degree * len(intervals)
+    found: list[tuple[tuple[int, ...], int]] = [((), 0)]
+    for interval in intervals:
+        orders = interval.orders(degree)
+        found = [
+            ((*which, i), total + order)
+            for which, total in found
+            for i, order in enumerate(orders)
+            if total + order <= most
+        ]
+    return [which for which, _ in found]
