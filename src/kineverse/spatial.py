@@ -17,7 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from .errors import ShapeError, ValueRejectedError
-from .expressions.expression import Expression, ExpressionLike, array, as_expression, make, union
+from .expressions.expression import Expression, ExpressionLike, array, as_expression, make, union, watcher_of
 from .expressions.functions import arctan2, cos, norm, sin, sqrt, where
 from .motions import X, Y, Z, turn
 
@@ -119,6 +119,10 @@ def quaternion(x: ExpressionLike, y: ExpressionLike, z: ExpressionLike, w: Expre
         For a constant quaternion of length zero, or infinite.
     """
     q = array([x, y, z, w])
+    watcher = watcher_of(q)
+    if watcher is not None:
+        anew: Expression = watcher.ask("quaternion", q)
+        return anew
     if not q.symbols:
         largest = float(np.abs(q()).max())
         if not 0 < largest < math.inf:
@@ -299,6 +303,10 @@ def unit(v: Vector, what: str = "The vector") -> Expression:
         For a constant vector of length zero.
     """
     expression = _three(v, what)
+    watcher = watcher_of(expression)
+    if watcher is not None:
+        anew: Expression = watcher.ask("unit", expression)
+        return anew
     if not expression.symbols:
         number = normalised(expression())
         if number is None:

@@ -25,7 +25,7 @@ from .layout import SX, Shape
 if TYPE_CHECKING:
     from kineverse.symbols import Symbol
 
-    from .node import Node
+    from .node import Node, Watcher
 
 ExpressionLike: TypeAlias = "Expression | float | int | npt.ArrayLike | Sequence[Any]"
 
@@ -110,7 +110,7 @@ class Expression:
             return bool(self._sx.is_constant())
         from .leaves import leaves
 
-        symbols, nodes = leaves(self)
+        symbols, nodes = leaves(looked_at(self))
         return not symbols and all(node.is_constant for node in nodes)
 
     @property
@@ -412,10 +412,10 @@ class Expression:
                 other = as_expression(other)  # type: ignore[arg-type]
             except (ExpressionError, ValueRejectedError, ShapeError):
                 return NotImplemented
-        return self._shape == other._shape and self.key == other.key
+        return self._shape == other._shape and looked_at(self).key == looked_at(other).key
 
     def __hash__(self) -> int:
-        return hash(self.key)
+        return hash(looked_at(self).key)
 
     def __reduce__(self) -> Any:
         from .structure import pack, unpack
@@ -433,12 +433,12 @@ class Expression:
     def __repr__(self) -> str:
         from .printing import text
 
-        return text(self)
+        return text(looked_at(self))
 
     def _repr_latex_(self) -> str:
         from .printing import latex
 
-        return f"$\\displaystyle {latex(self)}$"
+        return f"$\\displaystyle {latex(looked_at(self))}$"
 
     # -- numpy ---------------------------------------------------------------------------------------------
 
@@ -457,6 +457,17 @@ class Expression:
         from .numpy_protocol import apply_function
 
         return apply_function(function, args, options)
+
+
+def watcher_of(expression: Expression) -> Watcher | None:
+    """Return who wants to know how closely an expression is looked at; None but while code is traced."""
+    return next((node.watcher for node in expression._nodes if node.watcher is not None), None)
+
+
+def looked_at(expression: Expression) -> Expression:
+    """Return an expression for those who decide by what it is, and let it be known that they do."""
+    watcher = watcher_of(expression) if expression._nodes else None
+    return expression if watcher is None else watcher.settled(expression)
 
 
 def make(sx: SX, shape: Shape, nodes: frozenset[Node]) -> Expression:

@@ -18,7 +18,7 @@ import numpy as np
 from kineverse.errors import ExpressionError
 
 from . import layout
-from .expression import NO_NODES, Expression, as_expression, make, union
+from .expression import NO_NODES, Expression, array, as_expression, make, union, watcher_of
 from .leaves import bottom_up, leaves
 from .substitution import apply, renamed, replace_nodes, stand_ins
 
@@ -106,6 +106,10 @@ def jacobian(expression: Expression, symbols: Sequence[Symbol], heuristic: bool 
                 f"Parameter '{symbol}' has no derivative to read a column from; "
                 "use partial([...]) for ∂/∂parameter."
             )
+    watcher = watcher_of(expression)
+    if watcher is not None:
+        anew: Expression = watcher.ask("jacobian" if heuristic else "facts", expression, array(list(wanted)))
+        return anew
     entries = gradient(expression, heuristic)
     return _side_by_side([entries.get(symbol.derivative()) for symbol in wanted], expression._shape)
 
@@ -115,6 +119,10 @@ def partial(expression: Expression, symbols: Sequence[Symbol]) -> Expression:
     from kineverse.symbols import check_symbols
 
     wanted = check_symbols(symbols)
+    watcher = watcher_of(expression)
+    if watcher is not None:
+        anew: Expression = watcher.ask("partial", expression, array(list(wanted)))
+        return anew
     # Parameters do not move, so D has nothing to say about them; symbols that do move take their places.
     moving = stand_ins(wanted)
     entries = gradient(renamed(_without_augmentation(expression), moving), False)

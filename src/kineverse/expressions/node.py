@@ -13,7 +13,7 @@ import math
 import threading
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar, Protocol
 from weakref import WeakValueDictionary
 
 import casadi as ca
@@ -31,6 +31,16 @@ if TYPE_CHECKING:
 
 _INTERNED: WeakValueDictionary[bytes, Node] = WeakValueDictionary()
 _INTERNING = threading.Lock()
+
+
+class Watcher(Protocol):
+    """Who wants to know how closely code looks at expressions that it was given, see :mod:`.model.traces`."""
+
+    def settled(self, expression: Expression) -> Expression:
+        """Return an expression of what was given as it is, and note that it was looked at."""
+
+    def ask(self, kind: str, *arguments: Any) -> Any:
+        """Return what a function that looks at its arguments makes of them, so that it is made anew later."""
 
 
 class Node(ABC):
@@ -53,6 +63,7 @@ class Node(ABC):
         "options",
         "shape",
         "sx",
+        "watcher",
     )
 
     kind: ClassVar[str]
@@ -62,6 +73,7 @@ class Node(ABC):
     arguments: tuple[Expression, ...]
     options: tuple[Any, ...]
     depth: int
+    watcher: Watcher | None
 
     @classmethod
     def of(
@@ -106,6 +118,7 @@ class Node(ABC):
         self._keys: dict[bool, frozenset[Symbol]] = {}
         self._symbols: frozenset[Symbol] | None = None
         self.depth = 1 + max((inner.depth for a in arguments for inner in a._nodes), default=0)
+        self.watcher = next((w for a in arguments for inner in a._nodes if (w := inner.watcher)), None)
 
     @property
     def symbols(self) -> frozenset[Symbol]:

@@ -9,7 +9,7 @@ import casadi as ca
 
 from kineverse.errors import ExpressionError, ShapeError
 
-from .expression import NO_NODES, Expression, ExpressionLike, as_expression, make
+from .expression import NO_NODES, Expression, ExpressionLike, array, as_expression, make, watcher_of
 from .layout import SX
 from .leaves import bottom_up, gradient_keys, leaves
 
@@ -67,6 +67,12 @@ def substitute(expression: Expression, values: Mapping[Symbol, ExpressionLike]) 
             )
         if replacement is not symbol:
             substitution[symbol] = replacement
+    watcher = watcher_of(expression)
+    if watcher is not None and substitution:
+        anew: Expression = watcher.ask(
+            "substitute", expression, array(list(substitution)), array(list(substitution.values()))
+        )
+        return anew
     moving = stand_ins(s for s, e in substitution.items() if not s.has_derivative and gradient_keys(e))
     if moving:
         # D of a parameter is empty; for a while it is a symbol that has one, which is then replaced.

@@ -9,7 +9,7 @@ from functools import cached_property
 from typing import TypeAlias
 
 from kineverse.errors import ShapeError, ValueRejectedError
-from kineverse.expressions.expression import Expression, ExpressionLike, as_expression
+from kineverse.expressions.expression import Expression, ExpressionLike, as_expression, watcher_of
 from kineverse.expressions.leaves import gradient_keys
 from kineverse.symbols import Symbol
 
@@ -43,6 +43,8 @@ class Constraint:
             for part, name in ((low, "lower bound"), (middle, "expression"), (high, "upper bound")):
                 if part.shape:
                     raise ShapeError(f"The {name} of a constraint is a scalar, not of shape {part.shape}.")
+        if any(watcher_of(part) is not None for part in (low, middle, high)):
+            return Constraint(low, middle, high)  # a trace looks when it knows what was read
         if not middle.symbols:
             raise ValueRejectedError(
                 f"The constrained expression ({middle!r}) depends on no symbol. "

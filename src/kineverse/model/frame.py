@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from kineverse.errors import ShapeError
-from kineverse.expressions.expression import Expression, as_expression
+from kineverse.expressions.expression import Expression, as_expression, watcher_of
 
 from .body import Pose
 
@@ -82,7 +82,7 @@ def _factor(transform: TransformLike) -> Pose | Expression:
     expression = as_expression(transform)
     if expression.shape != (4, 4):
         raise ShapeError(f"A frame is placed by a 4×4 transform, not by one of shape {expression.shape}.")
-    if not expression.is_constant:
+    if watcher_of(expression) is not None or not expression.is_constant:
         return expression
     matrix = np.array(ca.DM(expression.casadi))
     return Pose.of(matrix)

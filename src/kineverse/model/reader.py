@@ -32,13 +32,17 @@ class Read(IntFlag):
 
 
 class Reads:
-    """The recorded reads of one run: cells with how closely they were read, and listings by kind."""
+    """The recorded reads of one run: cells with how closely they were read, and listings by kind.
 
-    __slots__ = ("cells", "listings")
+    What is found out about the run from them, its trace, is kept here, and gone with the next run.
+    """
+
+    __slots__ = ("cells", "listings", "trace")
 
     def __init__(self) -> None:
         self.cells: dict[Cell, Read] = {}
         self.listings: set[str] = set()
+        self.trace: object = None
 
     def add(self, cell: Cell, how: Read) -> None:
         """Remember a look at a cell."""

@@ -12,11 +12,11 @@ from typing import Any
 
 from kineverse.expressions.expression import Expression
 from kineverse.model.contents import expressions_in
-from kineverse.model.operation import BODIES, FRAMES
+from kineverse.model.operation import FRAMES
 from kineverse.model.reader import Cell
 from kineverse.model.traces import Look, Question, Step, Trace
 from kineverse.model.traces.answer import answers_in
-from kineverse.model.traces.question import KINDS, OF_KIND
+from kineverse.model.traces.question import KINDS, OF_EXPRESSIONS, OF_KIND
 
 from .checks import RefusedError, exactly, listed, whole
 from .graph import Graph
@@ -94,6 +94,6 @@ def _arguments(
         return (cell(given[0], "x")[0],)
     if kind in ("fk", "between"):
         return tuple(cell(FRAMES, name)[1] for name in given)
-    if kind in ("resolve", "carry"):
-        return (graph.expression(given[0]),)
-    return (cell(FRAMES if _KIND_OF[kind] == BODIES else _KIND_OF[kind], given[0])[1],)
+    if kind in OF_EXPRESSIONS:
+        return tuple(map(graph.expression, given))
+    return (cell(FRAMES if kind in ("body", "factors") else _KIND_OF[kind], given[0])[1],)

@@ -133,15 +133,10 @@ class _Parts:
             return
         self.kind, self.parameters = type(operation).__name__, parameters_of(operation)
         if entry.reads.listings or any(how & Read.VALUE for how in entry.reads.cells.values()):
-            before = Reader(
-                lambda cell: cells.get(cell, ABSENT),
-                lambda kind: sorted(name for k, name in cells if k == kind),
-                Reads(),
-            )
-            try:
-                self.trace = trace(operation, before, entry.writes)
-            except UntraceableError as error:
-                self.frozen = str(error)
+            if entry.reads.trace is None:
+                entry.reads.trace = _traced(entry, cells)
+            found = entry.reads.trace
+            self.trace, self.frozen = (found, "") if isinstance(found, Trace) else (None, str(found))
 
     @property
     def expressions(self) -> Iterator[Expression]:
@@ -152,6 +147,19 @@ class _Parts:
             yield from expressions_among(parameter, self.entry.writes)
         if self.trace is not None:
             yield from expressions_of(self.trace)
+
+
+def _traced(entry: Entry, cells: dict[Cell, Any]) -> Trace | str:
+    """Return the trace of an operation, or why there is none."""
+    before = Reader(
+        lambda cell: cells.get(cell, ABSENT),
+        lambda kind: sorted(name for k, name in cells if k == kind),
+        Reads(),
+    )
+    try:
+        return trace(entry.operation, before, entry.writes)
+    except UntraceableError as error:
+        return str(error)
 
 
 def _lines(items: list[str]) -> Iterator[str]:

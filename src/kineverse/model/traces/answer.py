@@ -10,7 +10,7 @@ import numpy as np
 from kineverse.errors import ModelError
 from kineverse.expressions.expression import Expression, as_expression
 from kineverse.expressions.leaves import bottom_up, leaves
-from kineverse.expressions.node import Node
+from kineverse.expressions.node import Node, Watcher
 from kineverse.expressions.substitution import apply, replace_nodes
 
 from .question import Look
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 Path = tuple[tuple["Symbol", bool], ...]
 
 
-class Watcher(Protocol):
+class Tracer(Watcher, Protocol):
     """Who wants to know how closely an answer is looked at."""
 
     serial: int
@@ -35,9 +35,9 @@ class Watcher(Protocol):
 class Answer(Node):
     """An expression that the model gave, kept apart from what is made of it.
 
-    While an operation is traced it behaves as what it stands for, and everything that an operation may decide
-    by is noted: which symbols there are, and the value itself. In a trace that comes from elsewhere it stands
-    for nothing yet (it has no arguments).
+    While an operation is traced it behaves as what it stands for, and what an operation may decide by is
+    noted: which symbols there are, and the value itself, which is also what comparing and printing show.
+    In a trace that comes from elsewhere it stands for nothing yet (it has no arguments).
 
     The options are who watches (None for nobody), the place of the question, the place of the expression in
     its answer, and the *path*: the gradient entries that lead from there to this one, each with whether
@@ -48,7 +48,7 @@ class Answer(Node):
     kind = "read"
 
     @classmethod
-    def standing_for(cls, expression: Expression, watcher: Watcher, question: int, part: int) -> Expression:
+    def standing_for(cls, expression: Expression, watcher: Tracer, question: int, part: int) -> Expression:
         """Return the place of an expression, of its shape."""
         return cls.of((expression,), expression.shape, (watcher, question, part, ()))
 
@@ -83,6 +83,12 @@ class Answer(Node):
         """Never, so that what works for expressions is done also where a number would do."""
         return False
 
+    def _initialise(
+        self, key: bytes, arguments: tuple[Expression, ...], shape: Shape, options: tuple[Any, ...]
+    ) -> None:
+        super()._initialise(key, arguments, shape, options)
+        self.watcher = options[0]
+
     @classmethod
     def _options_key(cls, options: tuple[Any, ...]) -> str:
         watcher, question, part, path = options
@@ -93,7 +99,8 @@ class Answer(Node):
         """Return what it stands for, and let it be known."""
         if not self.arguments:
             raise ModelError("A trace has no value before it is run.")
-        self.options[0].look(self.question, how)
+        # How the entries of a gradient depend on symbols does not show in what it stands for.
+        self.options[0].look(self.question, Look.VALUE if self.path else how)
         return self.arguments[0]
 
     @property

@@ -6,15 +6,15 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from kineverse.errors import ModelError
-from kineverse.expressions.expression import Expression
+from kineverse.errors import KineverseError, ModelError
+from kineverse.expressions.expression import Expression, as_expression
+from kineverse.model.constraint import Constraint
 from kineverse.model.contents import mapped
-from kineverse.model.operation import ARTICULATIONS, DATA, Effects
+from kineverse.model.operation import ARTICULATIONS, CONSTRAINTS, DATA, Effects
 from kineverse.model.reader import Cell, Reader
-from kineverse.symbols import Symbol
 
-from .answer import Answer, entry_along, filled
-from .question import Look, Question, Reply
+from .answer import Answer, answers_in, entry_along, filled
+from .question import FAILED, Look, Part, Question, Reply
 
 
 class UntraceableError(ModelError):
@@ -64,8 +64,12 @@ class Trace:
         old: list[Reply] = []
         new: list[Reply] = []
         for step in self.steps:
-            for replies, reader in ((old, before), (new, model)):
-                replies.append(in_terms_of(step.question, replies).ask(reader))
+            then = _answered(in_terms_of(step.question, old), before)
+            now = _answered(in_terms_of(step.question, new), model)
+            if isinstance(now, KineverseError) and not isinstance(then, KineverseError):
+                raise now
+            old.append(_reply(then))
+            new.append(_like(_reply(now), old[-1]))
             problem = _difference(step.look, old[-1], new[-1])
             if problem:
                 asked = ", ".join(str(a) for a in step.question.arguments if isinstance(a, str))
@@ -79,17 +83,38 @@ class Trace:
         put = _into(replies)
 
         def put_datum(expression: Expression) -> Expression | float:
-            # What was a number when it was read is one again.
+            # What is made of numbers alone is a number again.
+            parts = [replies[a.question].parts[a.part] for a in answers_in(expression)]
             result = put(expression)
-            is_number = result is not expression and not result.shape and result.is_constant
+            of_numbers = bool(parts) and all(isinstance(part, float) for part in parts)
+            is_number = of_numbers and not result.shape and not result._nodes and result.is_constant
             return float(result) if is_number else result
 
-        return Effects.of(
-            {
-                (kind, name): mapped(kind, value, put_datum if kind in (DATA, ARTICULATIONS) else put)
-                for (kind, name), value in self.writes
-            }
-        )
+        written = {
+            (kind, name): mapped(kind, value, put_datum if kind in (DATA, ARTICULATIONS) else put)
+            for (kind, name), value in self.writes
+        }
+        for (kind, _), value in written.items():
+            if kind == CONSTRAINTS:
+                Constraint.of(value.lower, value.expression, value.upper)  # raises where there is no range
+        return Effects.of(written)
+
+
+def _answered(question: Question, model: Reader) -> Reply | KineverseError:
+    try:
+        return question.ask(model)
+    except KineverseError as error:
+        return error
+
+
+def _reply(answered: Reply | KineverseError) -> Reply:
+    return Reply(FAILED, ()) if isinstance(answered, KineverseError) else answered
+
+
+def _like(reply: Reply, before: Reply) -> Reply:
+    """Return a reply with a whole number as a number, if that was one that is not whole."""
+    is_whole = type(reply.rest) is int and isinstance(before.rest, Part)
+    return Reply(before.rest, (float(reply.rest),)) if is_whole else reply
 
 
 def in_terms_of(question: Question, replies: Sequence[Reply]) -> Question:
@@ -105,9 +130,10 @@ def in_terms_of(question: Question, replies: Sequence[Reply]) -> Question:
 def _into(replies: Sequence[Reply]) -> Callable[[Expression], Expression]:
     def place(answer: Answer) -> Expression:
         parts = replies[answer.question].parts
-        if answer.part >= len(parts) or parts[answer.part].shape != answer.shape:
+        part = as_expression(parts[answer.part]) if answer.part < len(parts) else None
+        if part is None or part.shape != answer.shape:
             raise UntraceableError("it needs more than there is now.")
-        return entry_along(parts[answer.part], answer.path)
+        return entry_along(part, answer.path)
 
     return lambda expression: filled(expression, place)
 
@@ -115,15 +141,20 @@ def _into(replies: Sequence[Reply]) -> Callable[[Expression], Expression]:
 def _difference(look: Look, old: Reply, new: Reply) -> str | None:
     if old.rest != new.rest or len(old.parts) != len(new.parts):
         return "the names and kinds"
-    for a, b in zip(old.parts, new.parts, strict=True):
+    for one, other in zip(old.parts, new.parts, strict=True):
+        a, b = as_expression(one), as_expression(other)
         if a.shape != b.shape:
             return "the shape"
         if look >= Look.VALUE and a != b:
             return "the value"
-        if look >= Look.SYMBOLS and (a.symbols != b.symbols or _keys(a) != _keys(b)):
+        if look >= Look.SYMBOLS and _symbols(a) != _symbols(b):
             return "the symbols"
     return None
 
 
-def _keys(e: Expression) -> tuple[set[Symbol], ...]:
-    return tuple(set(e.gradient(heuristic)) for heuristic in (False, True))
+def _symbols(expression: Expression) -> list[object]:
+    """Return the symbols of each element and of its gradients."""
+    return [
+        (e.symbols, *(frozenset(e.gradient(heuristic)) for heuristic in (False, True)))
+        for e in (expression.ravel() if expression.shape else [expression])
+    ]
