@@ -1,0 +1,64 @@
+"""Which pieces may be near each other: a sweep along one axis, and bounds carried from state to state.
+
+A point of a piece at c from its centre moves by ``|Δcentre + ΔR c| <= |Δcentre| + r ‖ΔR‖``, with r the radius
+of its sphere. The sum of this over all updates is its *travel* s. Two pieces that were at a distance d when
+they had travelled s_i and s_j are therefore at least ``d + s_i + s_j`` less their present travel apart.
+
+This is the whole of it in numpy; :mod:`.sweep_native` has the same in C, several times as fast.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from .mesh_files import Floats
+from .table import Indices, Table
+
+
+def place(table: Table, fresh: Floats) -> int:
+    """Put the moving pieces at new poses (moving, 3, 4) and add to their travel.
+
+    Returns the first piece whose pose is not finite, and then nothing has happened; -1 if all is well.
+    """
+    bad = ~np.isfinite(fresh).all(axis=(1, 2))
+    if bad.any():
+        return int(np.argmax(bad))
+    moving = np.arange(table.moving)
+    before, old = table.place[moving], table.poses[moving, :, :3]
+    table.poses[moving] = fresh
+    table.put(moving)
+    # The spectral norm of the difference of two rotations is its Frobenius norm by the root of 2.
+    turned = np.sqrt(((fresh[:, :, :3] - old) ** 2).sum(axis=(1, 2)) / 2)
+    shifted = np.sqrt(((table.place[moving] - before) ** 2).sum(axis=1))
+    table.travel[moving] += shifted + table.radius[moving] * turned
+    return -1
+
+
+def near(table: Table, reach: float) -> tuple[Indices, Floats]:
+    """Return the pairs that may be within ``reach`` [m] of each other.
+
+    Only active pieces of pairs of bodies that are looked at, of which at least one moves; no pair is missing
+    whose distance, when it was or would be measured, is at most ``reach``.
+
+    Returns
+    -------
+    pairs, lows
+        (K, 2) pieces, the smaller number first, in no particular order; (K,) lower bounds of distances [m].
+    """
+    low, high = table.low[:, table.axis], table.high[:, table.axis]
+    order = np.argsort(low, kind="stable").astype(np.int32)
+    order = order[table.active[order] == 1]
+    ends = np.searchsorted(low[order], high[order] + reach, side="right")
+    counts = np.maximum(ends - np.arange(len(order)) - 1, 0)
+    first = np.repeat(np.arange(len(order)), counts)
+    step = np.arange(len(first)) - np.repeat(np.cumsum(counts) - counts, counts) + 1
+    ones, others = order[first], order[first + step]
+    ones, others = np.minimum(ones, others), np.maximum(ones, others)
+    keep = (table.allowed[table.body[ones], table.body[others]] == 1) & (ones < table.moving)
+    ones, others = ones[keep], others[keep]
+    gaps = np.maximum(table.low[ones] - table.high[others], table.low[others] - table.high[ones])
+    keep = (np.maximum(gaps, 0.0) ** 2).sum(axis=1) <= reach * reach
+    ones, others = ones[keep], others[keep]
+    lows = table.lower_bounds(ones, others)
+    keep = lows <= reach
+    return np.stack([ones[keep], others[keep]], axis=1), lows[keep]

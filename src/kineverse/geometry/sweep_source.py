@@ -1,0 +1,141 @@
+"""C text: what :mod:`.sweep` does, on the same table."""
+
+SWEEP = r"""
+#include <math.h>
+#include <stdint.h>
+
+typedef struct {
+  int64_t count, moving, bodies, axis;
+  const int32_t *body;
+  const uint8_t *allowed, *active;
+  const double *centre, *half, *radius;
+  double *poses, *travel, *place, *low, *high, *bounds;
+  int32_t *order;
+} Table;
+
+#define EXPORT __attribute__((visibility("default")))
+
+static inline double square(double x) { return x * x; }
+
+/* fmax is a call, for the sake of NaN, and there is none here. */
+static inline double larger(double x, double y) { return x > y ? x : y; }
+
+EXPORT int64_t place(Table *t, const double *fresh) {
+  for (int64_t k = 0; k < 12 * t->moving; k++)
+    if (!isfinite(fresh[k])) return k / 12;
+  for (int64_t k = 0; k < t->moving; k++) {
+    const double *new = fresh + 12 * k, *c = t->centre + 3 * k, *h = t->half + 3 * k;
+    double *old = t->poses + 12 * k, turned = 0.0, shifted = 0.0;
+    for (int r = 0; r < 3; r++) {
+      const double *row = new + 4 * r;
+      const double at = row[0] * c[0] + row[1] * c[1] + row[2] * c[2] + row[3];
+      const double extent = fabs(row[0]) * h[0] + fabs(row[1]) * h[1] + fabs(row[2]) * h[2];
+      shifted += square(at - t->place[3 * k + r]);
+      t->place[3 * k + r] = at;
+      t->low[3 * k + r] = at - extent;
+      t->high[3 * k + r] = at + extent;
+      for (int i = 0; i < 3; i++) turned += square(row[i] - old[4 * r + i]);
+      for (int i = 0; i < 4; i++) old[4 * r + i] = row[i];
+    }
+    t->travel[k] += sqrt(shifted) + t->radius[k] * sqrt(turned / 2);
+  }
+  return -1;
+}
+
+/* The distance of the sphere of one piece from the box of another; -inf from inside of it. */
+static double box_to_sphere(const Table *t, int64_t box, int64_t sphere, const double *between) {
+  const double *pose = t->poses + 12 * box, *half = t->half + 3 * box;
+  double outside = 0.0;
+  for (int i = 0; i < 3; i++) {
+    const double inside = pose[i] * between[0] + pose[4 + i] * between[1] + pose[8 + i] * between[2];
+    const double beyond = fabs(inside) - half[i];
+    if (beyond > 0.0) outside += beyond * beyond;
+  }
+  return outside > 0.0 ? sqrt(outside) - t->radius[sphere] : -INFINITY;
+}
+
+static double lower_bound(const Table *t, int64_t i, int64_t j) {
+  const double *a = t->place + 3 * i, *b = t->place + 3 * j;
+  const double between[3] = {b[0] - a[0], b[1] - a[1], b[2] - a[2]};
+  const double back[3] = {-between[0], -between[1], -between[2]};
+  double bound = sqrt(square(between[0]) + square(between[1]) + square(between[2]));
+  bound = bound - t->radius[i] - t->radius[j];
+  bound = larger(bound, box_to_sphere(t, i, j, between));
+  return larger(bound, box_to_sphere(t, j, i, back));
+}
+
+/* Sorts pieces by where they begin; they nearly are, as things move little between two questions. */
+static void sort(const Table *t, int32_t *order, int64_t n) {
+  for (int64_t k = 1; k < n; k++) {
+    const int32_t piece = order[k];
+    const double low = t->low[3 * piece + t->axis];
+    int64_t at = k;
+    for (; at > 0 && t->low[3 * order[at - 1] + t->axis] > low; at--) order[at] = order[at - 1];
+    order[at] = piece;
+  }
+}
+
+typedef struct {
+  double reach;
+  int32_t *pairs;
+  double *lows;
+  int64_t room, found;
+} Answer;
+
+static void consider(const Table *t, int64_t one, int64_t other, Answer *answer) {
+  if (!t->allowed[t->bodies * t->body[one] + t->body[other]] || !t->active[other]) return;
+  const double reach = answer->reach;
+  double gap = 0.0;
+  for (int r = 0; r < 3; r++) {
+    const double here = t->low[3 * one + r] - t->high[3 * other + r];
+    const double there = t->low[3 * other + r] - t->high[3 * one + r];
+    gap += square(larger(larger(here, there), 0.0));
+  }
+  if (gap > reach * reach) return;
+  const int64_t i = one < other ? one : other, j = one < other ? other : one;
+  double known = -INFINITY;
+  if (t->bounds) {
+    known = t->bounds[t->count * i + j] - t->travel[i] - t->travel[j];
+    if (known > reach) return;
+  }
+  const double low = larger(lower_bound(t, i, j), known);
+  if (low > reach) return;
+  if (answer->found < answer->room) {
+    answer->pairs[2 * answer->found] = (int32_t)i;
+    answer->pairs[2 * answer->found + 1] = (int32_t)j;
+    answer->lows[answer->found] = low;
+  }
+  answer->found++;
+}
+
+/* Considers the pairs of a piece with those of a list, from a place of it on, that begin inside the piece. */
+static void considered(
+    const Table *t, int64_t one, const int32_t *list, int64_t from, int64_t n, Answer *answer) {
+  const double end = t->high[3 * one + t->axis] + answer->reach;
+  for (int64_t k = from; k < n && t->low[3 * list[k] + t->axis] <= end; k++)
+    consider(t, one, list[k], answer);
+}
+
+/* Returns how many pairs there are; only the first `room` of them are written. */
+EXPORT int64_t near(Table *t, double reach, int32_t *pairs, double *lows, int64_t room) {
+  const int64_t standing = t->count - t->moving;
+  int32_t *movers = t->order, *rest = t->order + t->moving;
+  sort(t, movers, t->moving);
+  sort(t, rest, standing);
+  Answer answer = {reach, pairs, lows, room, 0};
+  /* Of two pieces, the one that begins first finds the other. Two that stand still are of no interest. */
+  for (int64_t k = 0, at = 0; k < t->moving; k++) {
+    const double low = t->low[3 * movers[k] + t->axis];
+    while (at < standing && t->low[3 * rest[at] + t->axis] < low) at++;
+    if (!t->active[movers[k]]) continue;
+    considered(t, movers[k], movers, k + 1, t->moving, &answer);
+    considered(t, movers[k], rest, at, standing, &answer);
+  }
+  for (int64_t k = 0, at = 0; k < standing; k++) {
+    const double low = t->low[3 * rest[k] + t->axis];
+    while (at < t->moving && t->low[3 * movers[at] + t->axis] <= low) at++;
+    if (t->active[rest[k]]) considered(t, rest[k], movers, at, t->moving, &answer);
+  }
+  return answer.found;
+}
+"""
