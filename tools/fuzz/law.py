@@ -95,19 +95,24 @@ def check(target: Target, data: bytes, folder: Path, tally: Tally | None = None)
 
 def _use(target: Target, model: kv.Model) -> None:
     """Do with a model what anybody would do first."""
-    text = document_of(model)
-    again = kv.Model()
-    with again.edit() as edit:
-        for tag, operation in operations_from(text, "saved"):
-            edit.apply(operation, tag)
-    if document_of(again) != text:
-        raise BrokenError("saved and loaded, the model is another one")
+    try:
+        text = document_of(model)
+        again = kv.Model()
+        with again.edit() as edit:
+            for tag, operation in operations_from(text, "saved"):
+                edit.apply(operation, tag)
+        if document_of(again) != text:
+            raise BrokenError("saved and loaded, the model is another one")
+    except kv.KineverseError as error:
+        raise BrokenError(f"it cannot be saved and loaded, at {_place(error)}: {error}") from error
     state = model.default_state()
     if target.finite and not all(np.isfinite(value) for value in state.values()):
         raise BrokenError(f"a position is not finite: {state}")
     names = list(model.frames)[:MOST_FRAMES]
     if not names:
         return
+    model.violations(state)
+    model.jacobian(names[-1])(state)
     poses = kv.compile([model.fk(name) for name in names], tier="interpreter")
     values = poses({str(symbol): state[symbol] for symbol in poses.inputs})
     if target.finite:
