@@ -13,7 +13,7 @@ from kineverse.formats.markup import quote
 
 from .tree import Node
 
-MOST_ELEMENTS = 200_000
+MOST_ELEMENTS = 30_000
 """The most elements that a file may be once <replicate> and <attach> have copied them."""
 
 BOX = {
