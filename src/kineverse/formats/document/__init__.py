@@ -12,6 +12,7 @@ Reading one runs no code and imports no name.
 
 from .reading import operations_from
 from .recorded import Recorded
+from .schema import schema
 from .writing import document_hash, document_of, write_document
 
-__all__ = ["Recorded", "document_hash", "document_of", "operations_from", "write_document"]
+__all__ = ["Recorded", "document_hash", "document_of", "operations_from", "schema", "write_document"]

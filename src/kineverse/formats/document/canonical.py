@@ -71,8 +71,8 @@ def check_hash(claim: Any, content: bytes, given: dict[str, Any]) -> None:
     rest = {key: value for key, value in given.items() if key != HASH}
     if claim not in (_digest_of(rest), _digest_of(_in_order(rest))):
         raise RefusedError(
-            f"its content is not what {HASH!r} says; it was changed or damaged since it was written. Get "
-            f"it anew, or, if the change is meant, delete the member {HASH!r}: it is made anew when the model "
+            f"its content is not what {HASH!r} says; it was changed or damaged since it was written. Get it "
+            f"anew, or, if the change is meant, delete the member {HASH!r}: it comes again when the model "
             "is saved, for instance by 'kineverse convert'"
         )
 

@@ -44,7 +44,7 @@ def fields(value: Any, required: Collection[str], optional: Collection[str] = ()
     for key in value:
         if key not in required and key not in optional:
             known = ", ".join((*required, *optional))
-            raise RefusedError(f"unknown key {key[:60]!r}; keys are {known}")
+            raise RefusedError(f"unknown key {str(key)[:60]!r}; keys are {known}")
     return value
 
 
@@ -94,6 +94,12 @@ def string(value: Any) -> str:
     except UnicodeEncodeError:
         raise RefusedError("half a surrogate pair is no text") from None
     return str(value)
+
+
+def shown(value: Any) -> str:
+    """Return what an error shows of a value."""
+    text = repr(value) if isinstance(value, (str, int, float, bool, type(None))) else type(value).__name__
+    return text if len(text) <= 60 else f"{text[:57]}..."
 
 
 def _kind(value: Any) -> str:

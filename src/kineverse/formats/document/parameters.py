@@ -21,9 +21,11 @@ from kineverse.model.reader import Cell
 
 from .checks import RefusedError, exactly, fields, listed, string
 from .graph import Graph
-from .values import Ref, Rename, read_datum, read_pose, written_datum, written_pose
+from .limits import check_depth
+from .shapes import read_pose, written_pose
+from .values import DATUM_TAGS, Ref, Rename, read_datum, written_datum
 
-_TAGS = ("pose", "mapping", "record", "written", "unwritten", "expression", "float")
+TAGS = ("pose", "mapping", "record", "written", "unwritten", *DATUM_TAGS)
 
 
 @dataclass(frozen=True)
@@ -99,8 +101,10 @@ def written_parameter(value: Any, writes: Mapping[Cell, Any], ref: Ref) -> Any:
     return {"unwritten": type(value).__name__}
 
 
-def read_parameter(value: Any, graph: Graph, rename: Rename, path: Callable[[str], str]) -> Any:
-    """Return a parameter that was written.
+def read_parameter(
+    value: Any, graph: Graph, rename: Rename, path: Callable[[str], str], depth: int = 0
+) -> Any:
+    """Return a parameter that was written, and lies in so many others.
 
     Raises
     ------
@@ -109,13 +113,14 @@ def read_parameter(value: Any, graph: Graph, rename: Rename, path: Callable[[str
     """
 
     def inner(item: Any) -> Any:
-        return read_parameter(item, graph, rename, path)
+        return read_parameter(item, graph, rename, path, depth + 1)
 
+    check_depth(depth)
     if type(value) is list:
         return tuple(map(inner, value))
     if type(value) is not dict:
         return read_datum(value, graph, rename)
-    tag = next((tag for tag in _TAGS if tag in value), None)
+    tag = next((tag for tag in TAGS if tag in value), None)
     if tag == "pose":
         return read_pose(fields(value, ("pose",))["pose"])
     if tag == "mapping":
@@ -135,5 +140,5 @@ def read_parameter(value: Any, graph: Graph, rename: Rename, path: Callable[[str
     if tag == "unwritten":
         return Unwritten(string(fields(value, (tag,))[tag]))
     if tag is None:
-        raise RefusedError(f"an object among parameters has one of the keys {', '.join(_TAGS)}")
+        raise RefusedError(f"an object among parameters has one of the keys {', '.join(TAGS)}")
     return read_datum(value, graph, rename)

@@ -10,6 +10,7 @@ from kineverse.errors import FormatError, KineverseError
 from kineverse.expressions.expression import Expression
 from kineverse.formats.files import MAX_BYTES
 from kineverse.model.contents import expressions_in
+from kineverse.model.frame import WORLD
 from kineverse.model.operation import FRAMES, KINDS, RATES
 from kineverse.model.reader import ABSENT, Cell, Read
 from kineverse.model.traces import Trace
@@ -19,10 +20,12 @@ from kineverse.symbols import symbol_name
 from .canonical import HASH, check_hash
 from .checks import RefusedError, fields, listed, name, string
 from .graph import Graph
+from .limits import MAX_NODES, check_counts
+from .nodes import read_node
 from .parameters import read_parameter
 from .recorded import Recorded
 from .traces import check_answers, read_questions
-from .values import Rename, as_read, frame_name
+from .values import Rename, as_read
 from .writing import FORMAT, VERSION
 
 
@@ -66,6 +69,7 @@ class _Document:
 
     def read(self, text: str, content: bytes) -> list[tuple[str, Recorded]]:
         try:
+            check_counts(content)
             given = json.loads(text, object_pairs_hook=_object, parse_constant=_no_constant)
             self._place = "the document"
             if type(given) is not dict or given.get("format") != FORMAT:
@@ -103,10 +107,14 @@ class _Document:
             )
 
     def _read_nodes(self, table: list[Any]) -> None:
+        if len(table) > MAX_NODES:
+            raise RefusedError(f"{len(table):,} nodes; a document has up to {MAX_NODES:,}")
+        graph = self._graph
         try:
-            self._graph.read(table)
+            for node in table:
+                read_node(graph, node)
         except (RefusedError, RecursionError):
-            self._place = f"nodes[{self._graph.place}]"
+            self._place = f"nodes[{len(graph.sx)}]"
             raise
 
     def _read_operations(self, operations: list[Any]) -> list[tuple[str, Recorded]]:
@@ -195,11 +203,11 @@ class _Document:
         return "/".join(self._cell(*given.partition("/")[::2]))
 
     def _cell(self, kind: Any, given: Any) -> Cell:
-        kind = _kind(kind)
+        kind, wanted = _kind(kind), string(given)  # not a name: an operation may look for anything
         if kind == RATES:
             before = f"{symbol_name(self._prefix, 0)}/" if self._prefix else ""
-            return kind, before + name(given)
-        return kind, frame_name(given, self._rename) if kind == FRAMES else self._rename(name(given))
+            return kind, before + wanted
+        return kind, wanted if kind == FRAMES and wanted == WORLD else self._rename(wanted)
 
     @property
     def _rename(self) -> Rename:

@@ -1,0 +1,81 @@
+"""What a document may cost. All of it is checked before memory or time is spent.
+
+A text of some kilobytes can ask for a lot of work: arrays of many elements that are repeated by each node
+above them, Newton steps that are made within Newton steps. So reading has a budget of steps, each about what
+one node of an expression costs, and what would go over it is refused. A robot takes some ten thousand.
+"""
+
+from __future__ import annotations
+
+from .checks import RefusedError
+
+MAX_NODES = 1 << 22
+MAX_LISTS = 10_000_000
+"""Lists and objects in a document."""
+MAX_VALUES = 1 << 26
+"""All values in a document."""
+MAX_WORK = 30_000_000
+MAX_DEPTH = 100
+"""Lists and objects inside one another, among data and parameters."""
+MAX_NESTING = 400
+"""Nodes with a gradient of their own inside one another; what works on them follows them down."""
+MAX_ORDER = 1000
+MAX_DIMENSIONS = 16
+MAX_LENGTH = 1 << 24
+MAX_STEPS = 100
+"""Newton steps."""
+MAX_PATH = 16
+"""Gradient entries of gradient entries that a ``read`` node follows."""
+MAX_QUESTIONS = 10_000
+MAX_ELEMENTS = 10_000
+"""Elements of a node with a gradient of its own."""
+
+
+class Budget:
+    """How much work the reading of one document may still be."""
+
+    def __init__(self) -> None:
+        self._left = MAX_WORK
+
+    def spend(self, steps: int) -> None:
+        """Note work that is going to be done.
+
+        Raises
+        ------
+        RefusedError
+            If it is too much.
+        """
+        self._left -= steps
+        if self._left < 0:
+            raise RefusedError(
+                f"to evaluate it takes more than {MAX_WORK:,} steps, the most a document may need"
+            )
+
+
+def check_counts(content: bytes) -> None:
+    """Refuse a text of JSON that has too many parts, before it is parsed.
+
+    Raises
+    ------
+    RefusedError
+        If it has.
+    """
+    lists = content.count(b"[") + content.count(b"{")
+    if lists > MAX_LISTS:
+        raise RefusedError(
+            f"more than {MAX_LISTS:,} lists and objects; a document has up to {MAX_NODES:,} nodes"
+        )
+    if lists + content.count(b",") > MAX_VALUES:
+        raise RefusedError(f"more than {MAX_VALUES:,} values, the most a document has")
+
+
+def check_depth(depth: int) -> None:
+    """Refuse data that lie in too many others.
+
+    Raises
+    ------
+    RefusedError
+        If they do.
+    """
+    if depth > MAX_DEPTH:
+        raise RefusedError(f"data are nested too deeply, in more than {MAX_DEPTH} others")

@@ -1,0 +1,183 @@
+"""The published JSON Schema: what is written follows it, it knows what the reader knows, and both refuse the same."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from typing import Any
+
+import pytest
+from document_models import rich_model
+from jsonschema import Draft202012Validator
+
+import kineverse as kv
+from kineverse.formats.document import document_of, operations_from, schema
+from kineverse.formats.document.elementary import BINARY, UNARY
+from kineverse.formats.document.nodes import NODE_TYPES
+from kineverse.formats.document.parameters import TAGS
+from kineverse.formats.document.shapes import GEOMETRIES
+from kineverse.model.operation import KINDS
+from kineverse.model.traces import question
+from kineverse.symbols import ROLES
+
+SCHEMA = schema()
+DEFINITIONS = SCHEMA["$defs"]
+VALID = Draft202012Validator(SCHEMA)
+MODELS = {
+    "rich": rich_model,
+    **{
+        name: lambda name=name: kv.load(name)
+        for name in (
+            "kitchen",
+            "pr2",
+            "articulations/four_bar",
+            "articulations/latch",
+            "articulations/gearbox",
+            "articulations/ball",
+        )
+    },
+}
+
+
+def test_it_is_a_schema() -> None:
+    Draft202012Validator.check_schema(SCHEMA)
+
+
+@pytest.mark.parametrize("name", MODELS)
+def test_what_is_written_follows_it(name: str) -> None:
+    error = next(VALID.iter_errors(json.loads(document_of(MODELS[name]()))), None)
+    assert error is None, f"{error.json_path}: {error.message[:300]}"
+
+
+def branches(what: str) -> list[str]:
+    """Return the values of the first item between which a definition chooses."""
+    definition = DEFINITIONS[what]
+    firsts = [branch["if"]["prefixItems"][0]["const"] for branch in definition["allOf"]]
+    assert firsts == definition["prefixItems"][0]["enum"]
+    assert [branch["then"] for branch in definition["allOf"]] == [
+        {"$ref": f"#/$defs/{what}_{first}"} for first in firsts
+    ]
+    return firsts
+
+
+def test_it_knows_what_the_reader_knows() -> None:
+    """Both ways: nothing is only here, nothing only there."""
+    assert set(branches("node")) == set(NODE_TYPES)
+    for kind in NODE_TYPES:
+        shapes = DEFINITIONS[f"node_{kind}"]
+        for shape in shapes.get("oneOf", [shapes]):
+            assert shape["prefixItems"][0] == {"const": kind}
+    one, two = (shape["prefixItems"][1]["enum"] for shape in DEFINITIONS["node_elementary"]["oneOf"])
+    assert (set(one), set(two)) == (set(UNARY), set(BINARY))
+    plain, parameter = (shape["prefixItems"][3] for shape in DEFINITIONS["node_symbol"]["oneOf"])
+    assert {*plain["enum"], parameter["const"]} == set(ROLES)
+    assert set(branches("question")) == set(question.KINDS)
+    for kind, asked in question.KINDS.items():
+        assert len(DEFINITIONS[f"question_{kind}"]["prefixItems"]) == 2 + asked.arguments
+    assert DEFINITIONS["kind"]["enum"] == list(KINDS) == list(DEFINITIONS["writes"]["properties"])
+    assert all(f"kind_{kind}" in DEFINITIONS for kind in KINDS)
+    assert [next(iter(g["properties"])) for g in DEFINITIONS["geometry"]["oneOf"]] == list(GEOMETRIES)
+    tags = {tag for branch in DEFINITIONS["parameter"]["then"]["oneOf"] for tag in branch["properties"]}
+    assert tags == {*TAGS, "fields"}
+
+
+NODE = '{"format": "kineverse", "version": 1, "nodes": [["symbol", "a", 0, "dof"], %s], "operations": []}'
+OPERATION = (
+    '{"format": "kineverse", "version": 1, "nodes": [["symbol", "a", 0, "dof"]], "operations": '
+    '[{"tag": "t", "kind": "k", "reads": {}, "writes": {}%s}]}'
+)
+WRITES = OPERATION.replace('"writes": {}%s', '"writes": %s')
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "[]",
+        "{}",
+        '{"format": "kineverse", "version": 2, "nodes": [], "operations": []}',
+        '{"format": "kineverse", "version": 1, "nodes": [], "operations": [], "more": 1}',
+        '{"format": "kineverse", "version": 1, "nodes": [], "operations": [], "sha256": "abc"}',
+        NODE % "[]",
+        NODE % "7",
+        NODE % '["surprise", 1]',
+        NODE % '["constant"]',
+        NODE % '["constant", 1, 2]',
+        NODE % '["constant", "1"]',
+        NODE % '["constant", true]',
+        NODE % '["symbol", "a//b", 0, "dof"]',
+        NODE % '["symbol", "a", -1, "dof"]',
+        NODE % '["symbol", "a", 0, "king"]',
+        NODE % '["symbol", "a", 0, "parameter"]',
+        NODE % '["symbol", "a", 0, "dof", 1.0]',
+        NODE % '["elementary", "eval", 0]',
+        NODE % '["elementary", "sin", 0, 0]',
+        NODE % '["elementary", "add", 0]',
+        NODE % '["elementary", "add", 0, -1]',
+        NODE % '["elementary", "add", 0, 0.5]',
+        NODE % '["matrix", [-1], []]',
+        NODE % '["matrix", [1], ["a"]]',
+        NODE % '["less", 0, 0, 0]',
+        NODE % '["not", 0, 0]',
+        NODE % '["extremum", "mean", 0, 0]',
+        NODE % '["extremum", "min", 0]',
+        NODE % '["augment", 0, 1, false, []]',
+        NODE % '["augment", 0, true, false, [[0]]]',
+        NODE % '["piecewise", 0, false, [0, "inf"], [[1], [1], [1]]]',
+        NODE % '["carried", 0, []]',
+        NODE % '["read", 0, 0, [1], [[0, 1]]]',
+        NODE % '["implicit", "a", [], [], 0, [], 0, 1, []]',
+        OPERATION % ', "parameters": []',
+        OPERATION % ', "parameters": {"a": {"b": 1}}',
+        OPERATION % ', "parameters": {"a": {"pose": [1]}}',
+        OPERATION % ', "parameters": {"a": {"integer": "0x1"}}',
+        OPERATION % ', "parameters": {"a": {"float": "nan"}}',
+        OPERATION % ', "trace": {}',
+        OPERATION % ', "trace": {"questions": [["fk", 0, "a"]], "writes": {}}',
+        OPERATION % ', "trace": {"questions": [["why", 0, "a"]], "writes": {}}',
+        OPERATION % ', "trace": {"questions": [["fk", 3, "a", "b"]], "writes": {}}',
+        OPERATION % ', "frozen": 1',
+        WRITES % '{"souls": {}}',
+        WRITES % '{"data": {"a//b": 1}}',
+        WRITES % '{"frames": {"a": {"parent": "world"}}}',
+        WRITES % '{"frames": {"a": {"parent": "world", "factors": [[1, 2]]}}}',
+        WRITES % '{"constraints": {"a": [0, 0]}}',
+        WRITES % '{"rates": {"a": [0, [[0]]]}}',
+        WRITES % '{"bodies": {"a": {"visuals": [], "collisions": [{}]}}}',
+        WRITES % '{"bodies": {"a": {"visuals": [{"geometry": {"egg": 1}, "origin": []}], "collisions": []}}}',
+        WRITES % '{"articulations": {"a": {"kind": "k"}}}',
+    ],
+)
+def test_both_refuse(text: str) -> None:
+    assert not VALID.is_valid(json.loads(text))
+    with pytest.raises(kv.FormatError):
+        operations_from(text)
+
+
+def test_a_parameter_is_no_schema_of_its_own() -> None:
+    """What the two tests above build on is accepted by both."""
+    for text in (
+        NODE % '["constant", 1]',
+        OPERATION % "",
+        OPERATION % ', "parameters": {"a": [{"integer": "-12"}]}',
+        WRITES % "{}",
+    ):
+        assert VALID.is_valid(json.loads(text))
+        operations_from(text)
+
+
+def test_it_lies_in_the_package() -> None:
+    """Where others find it, without anything but the standard library."""
+    script = (
+        "from importlib.resources import files; import json;"
+        "print(json.loads(files('kineverse.formats.document').joinpath('schema.json').read_text('utf-8'))['$id'])"
+    )
+    said = subprocess.run([sys.executable, "-c", script], capture_output=True, check=True, text=True).stdout
+    assert said == f"{SCHEMA['$id']}\n"
+
+
+def test_it_does_not_grow_by_itself() -> None:
+    """Every definition is used."""
+    text = json.dumps(SCHEMA)
+    unused: list[Any] = [name for name in DEFINITIONS if f'"#/$defs/{name}"' not in text]
+    assert unused == []
