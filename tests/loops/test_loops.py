@@ -91,8 +91,7 @@ def test_home_may_be_turns_away():
 def test_a_range_of_its_own():
     bars = four_bar(0.9, 0.6, 0.6, 1.0, within={"crank": (0.3, 1.2)}, home={"crank": 1.0})
     assert_closed_between(bars, 0.3, 1.2)
-    # A range is where it is used, and no limit of the joint.
-    assert not bars.constraints
+    assert list(bars.constraints) == ["four-bar/crank"]
 
 
 def test_no_mobility_at_all():
@@ -273,14 +272,22 @@ def test_a_configuration_in_which_a_loop_does_not_close_is_not_valid():
     """Even if no constraint is about what follows."""
     model = double_rocker()
     assert not model.violations({"crank": 1.0})
-    (broken,) = model.violations({"crank": 3.0})
-    assert broken.name == "four-bar"
+    broken, beyond = model.violations({"crank": 3.0})
+    assert (broken.name, beyond.name) == ("four-bar", "four-bar/crank")
     assert np.isnan(broken.value)
     assert np.isnan(broken.excess)
-    assert (
-        str(model.violations({"crank": 3.0}))
-        == "1 violated\n  four-bar: -inf <= nan <= inf has no value here"
-    )
+    assert "four-bar: -inf <= nan <= inf has no value here" in str(model.violations({"crank": 3.0}))
+
+
+def test_the_range_of_a_loop_is_a_limit():
+    """So whoever asks for a state, or how far a slider goes, stays where the loop closes."""
+    model = double_rocker()
+    assert model.limits("crank") == (0.6, 1.2)
+    assert model.default_state()["crank"] == 0.6
+    assert not model.violations(model.default_state())
+    with model.edit() as edit:
+        edit.remove("loop four-bar")
+    assert model.limits("crank") == (-np.inf, np.inf)
 
 
 def test_a_bound_without_a_value_holds_nothing():
@@ -293,7 +300,7 @@ def test_a_bound_without_a_value_holds_nothing():
     )
     assert not model.violations({crank: 1.0})
     found = model.violations({crank: 3.0})
-    assert [v.name for v in found] == ["above", "chosen", "four-bar", "table", "other"]
+    assert [v.name for v in found] == ["above", "chosen", "four-bar", "table", "four-bar/crank", "other"]
     assert found[-1].excess == 0.5
 
 

@@ -55,8 +55,9 @@ class CloseLoop(Operation):
     branch
         Which solution there: 0 is the nearest to ``home``, 1 the next.
     within
-        Triples of free coordinate, lower and upper limit, in which the loop is used; by default the
-        coordinate's own position limits. An angle without any goes round.
+        Triples of free coordinate, lower and upper limit, in which the loop is used, which become the
+        constraints ``name/coordinate``; by default the coordinate's own position limits. An angle without
+        any goes round.
 
     Raises
     ------
@@ -159,6 +160,7 @@ class CloseLoop(Operation):
         self._check(model, closed)
         solution = closed.function.of(closed.function.inputs)
         return Effects(
+            constraints={f"{self.name}/{k}": (a, by_name[k], b) for k, a, b in self.within},
             rates={x: solution[i] for i, x in enumerate(closed.dependent)},
             articulations={self.name: self._record(closed)},
         )
