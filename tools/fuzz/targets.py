@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from random import Random
 
 import kineverse as kv
-from kineverse.formats.document import operations_from
+from kineverse import gallery
+from kineverse.formats.document import document_of, operations_from
 from kineverse.formats.sdf.operations import scene_operations
 from kineverse.formats.sdf.reader import parse_sdf
+from kineverse.formats.set_body import SetBody
 from kineverse.formats.urdf import parse_urdf
 from kineverse.formats.urdf.operations import robot_operations
 
@@ -43,6 +46,8 @@ class Target:
         Yields smaller inputs with the structure of the format, for minimising.
     finite
         Whether poses have to be finite; where expressions are free, they may be what they like.
+    examples
+        Returns further inputs to begin a search with.
     """
 
     name: str
@@ -52,6 +57,7 @@ class Target:
     mutate: Callable[[bytes, bytes, Random], bytes]
     reduce: Callable[[bytes], Iterator[bytes]]
     finite: bool = True
+    examples: Callable[[], list[bytes]] = list
 
     def model(self, data: bytes, folder: Path) -> kv.Model:
         """Return the model that an input describes."""
@@ -62,11 +68,11 @@ class Target:
         return model
 
     def seeds(self) -> list[bytes]:
-        """Return the inputs to begin with: those written for it, and small files of the data beside."""
+        """Return the inputs to begin with: written for it, small files of the data beside, and examples."""
         own = sorted(SEEDS.glob(f"*{self.suffix}"))
         found = sorted(DATA.rglob(f"*{self.suffix}")) if DATA.is_dir() else []
         small = [path for path in found if path.is_file() and path.stat().st_size <= MAX_SEED]
-        return [path.read_bytes() for path in (*own, *small)]
+        return [path.read_bytes() for path in (*own, *small)] + self.examples()
 
     def own_seeds(self) -> list[bytes]:
         """Return the inputs that were written for it."""
@@ -87,6 +93,21 @@ def _document(data: bytes, folder: Path) -> Operations:
     return list(operations_from(data, "input.kv.json"))
 
 
+def _scenes() -> list[bytes]:
+    """Return the scenes of the gallery as documents, without the hash that forbids to change them."""
+    found = []
+    for name in gallery.names():
+        model = kv.Model()
+        with model.edit() as edit:
+            for operation in gallery.operations(name):
+                if not isinstance(operation, SetBody):
+                    edit.apply(operation)
+        tree = json.loads(document_of(model))
+        tree.pop("sha256", None)
+        found.append(json.dumps(tree).encode())
+    return [data for data in found if len(data) <= MAX_SEED]
+
+
 TARGETS = {
     target.name: target
     for target in (
@@ -102,6 +123,7 @@ TARGETS = {
             json_trees.mutator(document.VOCABULARY),
             json_trees.reductions,
             finite=False,
+            examples=_scenes,
         ),
     )
 }
