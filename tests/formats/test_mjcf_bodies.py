@@ -83,6 +83,19 @@ def test_inertia_from_a_mesh_needs_the_file(tmp_path):
     )
 
 
+def test_free_bodies_are_aligned_with_an_inertia_that_is_known(tmp_path):
+    text = mjcf(
+        asset(""),
+        '<worldbody><body name="a"><freejoint align="true"/><geom type="mesh" mesh="m"/></body></worldbody>',
+    )
+    found, scene = link(text, tmp_path)
+    assert found.pose == Pose()
+    assert scene.remarks[-1] == 'line 3, <body name="a"> is not aligned with its inertia, which is not known.'
+    (tmp_path / "m.obj").write_text(obj())
+    (tmp_path / "x.xml").write_text(text)
+    Pair.of_file(tmp_path / "x.xml").compare()
+
+
 def test_sizes_fitted_to_a_mesh_need_the_file(tmp_path):
     inertial = '<inertial pos="0 0 0" mass="1" diaginertia="1 1 1"/>'
     text = mjcf(

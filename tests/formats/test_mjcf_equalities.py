@@ -244,6 +244,14 @@ def test_what_is_rigid_is_left_out_or_refused():
         parse_mjcf(scene(fixed, '<weld name="w" body1="a" body2="b" relpose=".5 0 0 1 0 0 0"/>'))
 
 
+def test_a_loop_may_leave_nothing_free():
+    pair = Pair.of_text(
+        scene(body("a", '<joint name="j"/>', 'pos="1 0 0"'), '<connect body1="a" anchor=".5 .5 0"/>')
+    )
+    assert pair.model.degrees_of_freedom == ()
+    check_closed(pair, rows=3, samples=1)
+
+
 def test_handles_are_not_tied():
     parts = body("hand", '<joint name="j" type="slide"/>') + body("handle", "", 'mocap="true"')
     found = parse_mjcf(scene(parts, '<weld name="w" body1="hand" body2="handle"/>'))

@@ -39,7 +39,11 @@ class Bodies:
             note(None, 'the key "home" does not fit the joints that are read, and is left out.')
             self._home = None
         self._body_nodes = compiled.nodes(spec.bodies)
-        self._joint_nodes = compiled.nodes(spec.joints)
+        # Of a <freejoint>, MuJoCo does not know the line.
+        self._joint_nodes = {
+            number: node or self._body_nodes[int(model.jnt_bodyid[number])]
+            for number, node in compiled.nodes(spec.joints).items()
+        }
         self._site_nodes = compiled.nodes(spec.sites)
         self._frames = Names(WORLD)
         self._movers = Names()

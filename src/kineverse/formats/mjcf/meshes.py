@@ -94,7 +94,21 @@ class Replacement:
                 if not any(body is other for other in self.meshes.guessed) and body.name != "world":
                     self.meshes.guessed.append(body)
         self._spec.assets = contents
+        for body in self.meshes.guessed:
+            self._keep_frame(body)
         return bool(contents)
+
+    def _keep_frame(self, body: Any) -> None:
+        """Leave the frame of a free body where it is: it would be aligned with an inertia nobody knows."""
+        engine, kinds = mujoco(), mujoco().mjtAlignFree
+        for joint in body.joints:
+            if joint.type != engine.mjtJoint.mjJNT_FREE or joint.align == kinds.mjALIGNFREE_FALSE:
+                continue
+            if joint.align == kinds.mjALIGNFREE_TRUE or self._spec.compiler.alignfree:
+                node = self._prepared.node(body.info)
+                if node is not None:
+                    self._note(node, "is not aligned with its inertia, which is not known.")
+            joint.align = kinds.mjALIGNFREE_FALSE
 
     def _decides(self, geom: Any, body: Any) -> bool:
         if geom.meshname not in self._nodes:
