@@ -5,7 +5,6 @@ from __future__ import annotations
 import subprocess
 import sys
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -13,84 +12,10 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from trace_models import KNOB, LIFT, WHEEL, Custom, agree, build, changed, reloaded
 
 import kineverse as kv
 from kineverse.formats.document import Recorded, document_of, operations_from
-
-LIFT, KNOB, WHEEL = kv.position("lift"), kv.position("knob"), kv.velocity("wheel")
-
-
-@dataclass(frozen=True)
-class Custom(kv.Operation):
-    """An operation of anybody's code."""
-
-    code: Callable[[kv.Reader], kv.Effects]
-    name: str = "custom"
-
-    def apply(self, model: kv.Reader) -> kv.Effects:
-        return self.code(model)
-
-
-def build(code: Callable[[kv.Reader], kv.Effects], **changes: Any) -> kv.Model:
-    """Return a model with something upstream to read and an operation that reads it."""
-    given = {
-        "car": kv.translation(0.1, 0, 2 * LIFT) @ kv.rotation_x(LIFT),
-        "upper": 3.0,
-        "number": 1.5,
-        "damping": 0.1,
-        **changes,
-    }
-    model = kv.Model()
-    with model.edit() as edit:
-        edit.add_frame("car", parent="world", transform=given["car"])
-        edit.constrain("range", 0, LIFT, given["upper"])
-        edit.write("number", given["number"])
-        hinge = kv.Revolute(
-            name="hinge",
-            parent="car",
-            child="flap",
-            axis=(0, 1, 0),
-            dynamics=(("damping", given["damping"]),),
-        )
-        edit.apply(hinge, "hinge")
-        edit.apply(Custom(code), "custom")
-    return model
-
-
-def reloaded(model: kv.Model) -> kv.Model:
-    """Return what a process without the code makes of a model."""
-    result = kv.Model()
-    with result.edit() as edit:
-        for tag, operation in operations_from(document_of(model)):
-            edit.apply(operation, tag)
-    return result
-
-
-def changed(model: kv.Model, other: kv.Model) -> None:
-    """Exchange what is upstream for what another model has there."""
-    with model.edit() as edit:
-        for tag in ("frame car", "constraint range", "data number", "hinge"):
-            edit.replace(tag, other.history.operation(tag))
-
-
-def agree(one: kv.Model, other: kv.Model) -> None:
-    """Compare everything that two models contain by its values and gradients."""
-    assert list(one.frames) == list(other.frames)
-    assert list(one.constraints) == list(other.constraints)
-    at = {"lift": 0.3, "knob": -0.4, "hinge": 0.2, "wheel:velocity": 0.7, "lift:velocity": 1.1}
-    pairs = [(one.fk(f), other.fk(f)) for f in one.frames]
-    for name, constraint in one.constraints.items():
-        twin = other.constraints[name]
-        pairs += [(constraint.lower, twin.lower), (constraint.upper, twin.upper)]
-        pairs += [(constraint.expression, twin.expression)]
-    for a, b in pairs:
-        assert a.symbols == b.symbols
-        np.testing.assert_allclose(a(at), b(at), rtol=1e-13, atol=1e-14)
-        for heuristic in (True, False):
-            one_by_one, others = a.gradient(heuristic), b.gradient(heuristic)
-            assert set(one_by_one) == set(others)
-            for key, entry in one_by_one.items():
-                np.testing.assert_allclose(entry(at), others[key](at), rtol=1e-13, atol=1e-14)
 
 
 def follower(model: kv.Reader) -> kv.Effects:

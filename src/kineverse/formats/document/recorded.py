@@ -92,8 +92,14 @@ class Recorded(Operation):
         raise kind(
             f"{changed[0]} has changed, and this {self.kind} was made from it: {error} It comes from a "
             "document, without its code; in the same edit, remove it, or replace it by a "
-            f"{self.kind}(...) made anew."
+            f"{self.kind}(...) made anew.{self._hint}"
         ) from None
+
+    @property
+    def _hint(self) -> str:
+        if not self.given or not self.scope:
+            return ""
+        return f" Its parameters say from what, in names that lack '{self.scope}'."
 
     def _in_scope(self, model: Reader) -> Reader:
         """Return the reader without the names of others, if the document has a prefix of its own."""

@@ -87,7 +87,7 @@ class Trace:
             parts = [replies[a.question].parts[a.part] for a in answers_in(expression)]
             result = put(expression)
             of_numbers = bool(parts) and all(isinstance(part, float) for part in parts)
-            is_number = of_numbers and not result.shape and not result._nodes and result.is_constant
+            is_number = of_numbers and not result.shape and result.is_constant
             return float(result) if is_number else result
 
         written = {
