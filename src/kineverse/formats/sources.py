@@ -109,7 +109,9 @@ def _no_scene(name: str) -> str:
             f"'{GALLERY}' is many models, one for each articulation: {', '.join(scenes)}. "
             f"Load one as '{GALLERY}/{scenes[0]}'."
         )
-    return f"There is no model {_shown(f'{GALLERY}/{name}')}. {suggest(name, scenes, 'articulation')}"
+    found = _alike(name, [])
+    meant = f"Did you mean {' or '.join(map(repr, found))}?" if found else f"Available: {', '.join(scenes)}."
+    return f"There is no model {_shown(f'{GALLERY}/{name}')}. {meant}"
 
 
 def model_folders() -> Iterator[tuple[str, Path]]:
@@ -155,7 +157,14 @@ def _only(found: list[str], name: str, folder: Path) -> str:
 
 
 def _similar(name: str, files: list[str]) -> str:
-    """Return what could have been meant: models spelt alike, and those with the name in their path."""
+    found = _alike(name, files)
+    if not found:
+        return f"Models that ship: {', '.join(shipped_models())}."
+    return f"Did you mean {' or '.join(map(repr, found))}?"
+
+
+def _alike(name: str, files: list[str]) -> list[str]:
+    """Return what could have been meant and can be typed: spelt alike, or with the name in its path."""
     wanted = name.casefold().strip("/ ")
     paths = sorted({_stem(f) for f in files})
     ends = Counter(_end(p) for p in paths)
@@ -166,9 +175,7 @@ def _similar(name: str, files: list[str]) -> str:
     close = [n for end in alike for p, n in shown.items() if _end(p).casefold() == end]
     within = [n for p, n in shown.items() if wanted in p.casefold()]
     found = list(dict.fromkeys(close + sorted(within, key=lambda n: (len(n), n))))[:_LISTED]
-    if not wanted or not found:
-        return f"Models that ship: {', '.join(shipped_models())}."
-    return f"Did you mean {' or '.join(map(repr, found))}?"
+    return found if wanted else []
 
 
 def _end(path: str) -> str:
