@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +17,7 @@ SCENES = [f"articulations/{name}" for name in gallery.names()]
 SHIPPED = list(shipped_models())
 
 
+@cache
 def described() -> list[Path | None]:
     """Return the URDF files of the shared data that can be read; None alone if there are no data."""
     found: list[Path | None] = []
@@ -26,6 +28,12 @@ def described() -> list[Path | None]:
             continue
         found.append(file)
     return found or [None]
+
+
+@cache
+def loaded(name: str) -> kv.Model:
+    """Return a model that ships or a scene, which nobody changes: some take seconds."""
+    return kv.load(name)
 
 
 def poses(model: kv.Model, frames: list[str], values: dict[str, float]) -> list[np.ndarray]:

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from robots import SHARED
-from round_trip import SCENES, SHIPPED, assert_same_motion, described, poses, random_values
+from round_trip import SCENES, SHIPPED, assert_same_motion, described, loaded, poses, random_values
 from trees import KINDS, trees
 from written_mjcf import Reference, mujoco
 
@@ -109,7 +109,7 @@ def turned(body: Body) -> np.ndarray:
 
 @pytest.mark.parametrize("name", [*SHIPPED, *SCENES])
 def test_what_ships_is_said_or_refused_by_name(name: str, tmp_path: Path) -> None:
-    model = kv.load(name)
+    model = loaded(name)
     file = tmp_path / "m.xml"
     if name in REFUSED:
         with pytest.raises(kv.FormatError) as info:

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from pinocchio_oracle import Reference
 from robots import SHARED
-from round_trip import SCENES, SHIPPED, assert_same_bodies, assert_same_motion, described, poses
+from round_trip import SCENES, SHIPPED, assert_same_bodies, assert_same_motion, described, loaded, poses
 from trees import trees
 
 import kineverse as kv
@@ -66,7 +66,7 @@ def test_every_urdf_survives(file: Path | None, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("name", [*SHIPPED, *SCENES])
 def test_what_ships_is_said_or_refused_by_name(name: str, tmp_path: Path) -> None:
-    model = kv.load(name)
+    model = loaded(name)
     if name in REFUSED:
         with pytest.raises(kv.FormatError) as info:
             model.save(tmp_path / "m.urdf")

@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+import math
 import os
-from collections.abc import Iterable
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from kineverse.errors import FormatError, KineverseError
+from kineverse.errors import FormatError, KineverseError, ValueRejectedError
+from kineverse.formats.export.plan import FrameError, Written
 from kineverse.formats.files import replace_file
 from kineverse.formats.remarks import tell
 from kineverse.model.view import ModelView
+from kineverse.number import real_number
 
 ENDINGS = (".kv.json", ".urdf", ".xml")
 
@@ -26,13 +29,31 @@ class Saved:
         Of the file.
     remarks
         What the file says other than the model, or not at all, though nothing was refused.
+    errors
+        By how much frames are off at most [m], [rad], where that was tolerated: certain bounds over all
+        values of coordinates within their limits. Frames that are not in here are exact.
     """
 
     path: Path
     remarks: tuple[str, ...] = ()
+    errors: Mapping[str, FrameError] = field(default_factory=dict)
+
+    @property
+    def error(self) -> FrameError:
+        """The largest of the errors."""
+        found = self.errors.values()
+        return FrameError(
+            max((e.position for e in found), default=0.0), max((e.angle for e in found), default=0.0)
+        )
 
 
-def save(model: ModelView, path: str | os.PathLike[str], leave_out: Iterable[str] = ()) -> Saved:
+def save(
+    model: ModelView,
+    path: str | os.PathLike[str],
+    *,
+    tolerance: float | None = None,
+    leave_out: Iterable[str] = (),
+) -> Saved:
     """Write a model to a file, whose ending says what it becomes.
 
     The file is there whole or not at all; if it cannot be written, it is what it was before.
@@ -44,6 +65,9 @@ def save(model: ModelView, path: str | os.PathLike[str], leave_out: Iterable[str
     path
         A name that ends in ``.kv.json`` for a document, which says all of the model, ``.urdf`` for URDF or
         ``.xml`` for MJCF.
+    tolerance
+        How far any frame may be from where it should be, in position [m] and in angle [rad], wherever
+        coordinates are within their limits. Then motions by curves are approximated. None for none.
     leave_out
         Names of constraints that URDF or MJCF need not say, and of articulations that have speeds other than
         those of their coordinates, which it need not say either.
@@ -55,31 +79,43 @@ def save(model: ModelView, path: str | os.PathLike[str], leave_out: Iterable[str
         cannot say, with the reason.
     UnknownNameError
         If something that is to be left out does not exist.
+    ValueRejectedError
+        For a tolerance that is no positive number.
     """
     target = _target(path)
     if target.name.endswith(".kv.json"):
-        if tuple(leave_out):
-            raise FormatError(f"{target.name}: a document says all of a model, so nothing can be left out.")
+        if tuple(leave_out) or tolerance is not None:
+            what = "nothing can be left out" if tolerance is None else "it has no tolerance"
+            raise FormatError(f"{target.name}: a document says all of a model exactly, so {what}.")
         from .document import write_document
 
         write_document(model, target)
         return Saved(target)
-    content, remarks = _content(model, target, leave_out)
-    replace_file(target, content)
-    tell(f"{target.name}: {remark}" for remark in remarks)
-    return Saved(target, tuple(remarks))
+    written = _written(model, target, leave_out, _checked(tolerance))
+    replace_file(target, written.content)
+    tell(f"{target.name}: {remark}" for remark in written.remarks)
+    return Saved(target, written.remarks, written.errors)
 
 
-def _content(model: ModelView, target: Path, leave_out: Iterable[str]) -> tuple[bytes, list[str]]:
+def _checked(tolerance: object) -> float | None:
+    try:
+        if tolerance is None or 0 < real_number(tolerance) < math.inf:
+            return None if tolerance is None else real_number(tolerance)
+    except (TypeError, ValueError, OverflowError):
+        pass
+    raise ValueRejectedError(f"A tolerance is a positive number [m] and [rad], or None, not {tolerance!r}.")
+
+
+def _written(model: ModelView, target: Path, leave_out: Iterable[str], tolerance: float | None) -> Written:
     try:
         if target.name.endswith(".urdf"):
             from .urdf.writing import urdf_of
 
-            return urdf_of(model, target, leave_out)
+            return urdf_of(model, target, leave_out, tolerance)
         if target.name.endswith(".xml"):
             from .mjcf.writing import mjcf_of
 
-            return mjcf_of(model, target, leave_out)
+            return mjcf_of(model, target, leave_out, tolerance)
     except FormatError as error:
         raise _named(target, error) from None
     raise FormatError(

@@ -528,7 +528,13 @@ class ModelView:
             coordinates, rates = self.degrees_of_freedom, self.rates
         return integrate(coordinates, rates, state, speeds, dt)
 
-    def save(self, path: str | os.PathLike[str], leave_out: Iterable[str] = ()) -> Saved:
+    def save(
+        self,
+        path: str | os.PathLike[str],
+        *,
+        tolerance: float | None = None,
+        leave_out: Iterable[str] = (),
+    ) -> Saved:
         """Write the model to a file: a document (.kv.json), URDF (.urdf) or MJCF (.xml).
 
         A document says all of it. What the others cannot say is refused by name, unless it is to be left out,
@@ -538,6 +544,9 @@ class ModelView:
         ----------
         path
             Of the file.
+        tolerance
+            How far frames may be off in URDF and MJCF, in position [m] and angle [rad], with proof; None for
+            nowhere.
         leave_out
             Names of constraints and articulations.
 
@@ -548,7 +557,7 @@ class ModelView:
         """
         from kineverse.formats.saving import save
 
-        return save(self, path, leave_out)
+        return save(self, path, tolerance=tolerance, leave_out=leave_out)
 
     # -- printing ------------------------------------------------------------------------------------------
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Collection, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 
 from kineverse.expressions.expression import Expression, as_expression
@@ -36,10 +36,23 @@ class Range:
         return min(ends), max(ends)
 
 
+@dataclass(frozen=True)
+class Curve:
+    """A constraint with numbers as bounds on anything else, and why it is nothing simpler."""
+
+    name: str
+    expression: Expression
+    lower: float
+    upper: float
+    reason: str
+
+
 def sort_constraints(
-    constraints: Mapping[str, Constraint], resolve: Callable[[Expression], Expression], refusals: Refusals
-) -> Iterator[Range | Sum]:
-    """Yield constraints as ranges of one symbol or of a sum of positions; refuse the others.
+    constraints: Mapping[str, Constraint],
+    resolve: Callable[[Expression], Expression],
+    refusals: Refusals,
+) -> Iterator[Range | Sum | Curve]:
+    """Yield constraints as ranges of one symbol, of a sum of positions or of a curve; refuse the others.
 
     Parameters
     ----------
@@ -67,15 +80,21 @@ def sort_constraints(
         elif any(s.order > 1 for s in middle.symbols):
             refusals.add(name, "limits accelerations")
         else:
-            found = _range(name, middle, lower, upper)
-            if isinstance(found, str):
-                refusals.add(name, found)
-            else:
-                yield found
+            yield _range(name, middle, lower, upper)
 
 
-def _range(name: str, expression: Expression, lower: float, upper: float) -> Range | Sum | str:
-    """Return a constraint on a sum of multiples; for any other, why it is none."""
+def limits_of(found: Iterable[Range]) -> dict[Symbol, tuple[float, float]]:
+    """Return between which values symbols are, by all that limits them."""
+    result: dict[Symbol, tuple[float, float]] = {}
+    for item in found:
+        low, high = item.of_symbol
+        before = result.get(item.symbol, (-math.inf, math.inf))
+        result[item.symbol] = max(low, before[0]), min(high, before[1])
+    return result
+
+
+def _range(name: str, expression: Expression, lower: float, upper: float) -> Range | Sum | Curve:
+    """Return a constraint on a sum of multiples, or a curve with the reason why it is none."""
     line = Constraint(as_expression(lower), expression, as_expression(upper)).line
     if line is not None:
         return Range(name, expression.symbols[0], *line, lower, upper)
@@ -83,9 +102,10 @@ def _range(name: str, expression: Expression, lower: float, upper: float) -> Ran
     names = ", ".join(map(str, symbols))
     slopes = None if expression._nodes else expression.partial(symbols)
     if slopes is None or slopes.symbols:
-        return f"is no multiple of one coordinate, but a curve over {names}"
+        reason = f"is no multiple of one coordinate, but a curve over {names}"
+        return Curve(name, expression, lower, upper, reason)
     if any(s.order for s in symbols):
-        return f"limits a mixture of speeds, {names}"
+        return Curve(name, expression, lower, upper, f"limits a mixture of speeds, {names}")
     offset = float(expression(dict.fromkeys(symbols, 0.0)))
     factors = {s: float(slopes[i]) for i, s in enumerate(symbols)}
     return Sum(name, factors, lower - offset, upper - offset)

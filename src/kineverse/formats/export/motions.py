@@ -8,7 +8,7 @@ about a line, a translation, or both. That is split off, and the rest is looked 
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TypeAlias
 
 import casadi as ca
@@ -45,6 +45,8 @@ class Motion:
         What moves it: a coordinate, or a curve over coordinates.
     amount
         The coefficients of the polynomial, constant first.
+    curve
+        The variable as an expression, if it is a curve that was given as one.
     """
 
     turns: bool
@@ -52,6 +54,7 @@ class Motion:
     point: Vector3
     variable: Term
     amount: Polynomial
+    curve: Expression | None = None
 
     @property
     def curved(self) -> bool:
@@ -68,7 +71,7 @@ class Motion:
         return self._with(axis, point - axis * (axis @ point))
 
     def _with(self, axis: Matrix, point: Matrix) -> Motion:
-        return Motion(self.turns, _vector(axis), _vector(_rounded(point)), self.variable, self.amount)
+        return replace(self, axis=_vector(axis), point=_vector(_rounded(point)))
 
 
 @dataclass(frozen=True)
@@ -166,7 +169,8 @@ def _axis_motion(
     if sums is None:
         if known and not factor.turns:
             return None
-        return [Motion(factor.turns, factor.direction, _NOTHING, terms.of(factor.amount), ITSELF)]
+        curve = factor.amount
+        return [Motion(factor.turns, factor.direction, _NOTHING, terms.of(curve), ITSELF, curve)]
     polynomials, offset = sums
     found: list[Matrix | Moving] = []
     if offset and not (offsets and polynomials):

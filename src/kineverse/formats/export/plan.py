@@ -121,6 +121,21 @@ class Loop:
     to: str
 
 
+@dataclass(frozen=True, slots=True)
+class FrameError:
+    """By how much a frame may be off at most, wherever coordinates are within their limits.
+
+    ``position`` is how far its origin may be from where it should be [m], ``angle`` that of the rotation that
+    may be left [rad].
+    """
+
+    position: float = 0.0
+    angle: float = 0.0
+
+    def __str__(self) -> str:
+        return f"{self.position:.3g} m and {self.angle:.3g} rad"
+
+
 @dataclass
 class Plan:
     """A model as links, parents first, and what else is to be said.
@@ -137,6 +152,8 @@ class Plan:
         Ties that close loops.
     remarks
         What is written other than it was, or left out: for people.
+    errors
+        Of frames that are not quite where they should be.
     """
 
     links: list[Link]
@@ -144,8 +161,24 @@ class Plan:
     sums: list[Sum] = field(default_factory=list)
     loops: list[Loop] = field(default_factory=list)
     remarks: list[str] = field(default_factory=list)
+    errors: dict[str, FrameError] = field(default_factory=dict)
+
+    @property
+    def said_errors(self) -> list[str]:
+        """The errors as lines for the file, the largest position first."""
+        order = sorted(self.errors, key=lambda name: -self.errors[name].position)
+        return [f"approximated: '{name}' is off by {self.errors[name]} at most" for name in order]
 
     @property
     def joints(self) -> list[Joint]:
         """The joints that move along or about a line."""
         return [joint for link in self.links for joint in link.joints if isinstance(joint, Joint)]
+
+
+@dataclass(frozen=True)
+class Written:
+    """The text of a file, and what it says other than the model."""
+
+    content: bytes
+    remarks: tuple[str, ...]
+    errors: Mapping[str, FrameError]

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
 from kineverse.bounds.terms import Terms
-from kineverse.errors import UnknownNameError, suggest
 from kineverse.expressions.expression import Expression, as_expression
 from kineverse.expressions.substitution import apply
 from kineverse.model.articulation import Articulation
@@ -21,43 +21,21 @@ from kineverse.model.view import ModelView
 from kineverse.motions import AxisMotion
 from kineverse.symbols import Symbol
 
-from .limits import has_given_gradient, limit, sort_constraints
+from .approximation import Approximation
+from .asking import checked_names, parents_first
+from .limits import Curve, Range, has_given_gradient, limit, limits_of, sort_constraints
 from .loops import tied
 from .motions import Motion, Placing, Turning, UnrecognisedError, placing
 from .names import Names
-from .plan import ITSELF, NO_BODY, BallJoint, Joint, Link, Loop, Plan, Sum
+from .plan import ITSELF, NO_BODY, BallJoint, FrameError, Joint, Link, Loop, Plan, Sum
 from .quaternions import quaternions
 from .refusals import Refusals
+from .target import Target
 
 _LOOP = "closedloop"
 _POWERS = {1: "multiple", 4: "polynomial of degree 4"}
 _WHOLE = (ITSELF, (0.0, -1.0))
 """The amounts by which a joint may be a coordinate."""
-
-
-@dataclass(frozen=True)
-class Target:
-    """What a format can say.
-
-    Attributes
-    ----------
-    name
-        Of the format.
-    sums
-        Whether it limits sums of several coordinates.
-    one_way
-        Whether a speed may have another limit forwards than backwards.
-    loops
-        Whether it ties frames, so that what closes a loop needs not be solved for.
-    degree
-        Of the polynomials by which a joint may follow another.
-    """
-
-    name: str
-    sums: bool = False
-    one_way: bool = False
-    loops: bool = False
-    degree: int = 1
 
 
 class Recognition:
@@ -71,19 +49,28 @@ class Recognition:
         What the format can say.
     leave_out
         Names of constraints that are left out, and of articulations whose own speeds are.
+    tolerance
+        How far frames may be off [m], [rad]; None for nowhere.
     """
 
-    def __init__(self, model: ModelView, target: Target, leave_out: Iterable[str] = ()) -> None:
+    def __init__(
+        self,
+        model: ModelView,
+        target: Target,
+        leave_out: Iterable[str] = (),
+        tolerance: float | None = None,
+    ) -> None:
         self.model, self.target = model, target
         self.refusals = Refusals(target.name)
         self.remarks: list[str] = []
         # What refused frames move by: its own limits need no complaint of their own.
         self._lost: set[Symbol] = set()
-        self._left_out = _checked(leave_out, model)
+        self._left_out = checked_names(leave_out, model)
         self._records = {record.child: name for name, record in _own_records(model)}
         self._values: dict[Symbol, Expression] = {}
         self._terms = Terms({})
         self._quaternions = dict(quaternions(model))
+        self._tolerance = tolerance
         self._loops: list[Loop] = []
         tied_by_loops: set[Symbol] = set()
         if target.loops:
@@ -97,26 +84,57 @@ class Recognition:
 
     def plan(self) -> Plan:
         """Return the plan; what cannot be said is in :attr:`refusals`."""
-        placed = {name: self._placed(name) for name in _parents_first(self.model)}
+        kept = {n: c for n, c in self._plain_constraints() if n not in self._left_out}
+        found = list(sort_constraints(kept, self.resolve, self.refusals))
+        ranges = limits_of(item for item in found if isinstance(item, Range))
+        approximation = None
+        if self._tolerance is not None:
+            approximation = Approximation(self._terms, ranges, self.target.degree, self._tolerance)
+        everywhere = {name: self._placed(name, approximation) for name in parents_first(self.model)}
+        placed = {name: there for name, there in everywhere.items() if there is not None}
         self._check_rates(placed)
         joints = Names(s.path for s in self._coordinates)
         leading = self._leading(placed)
-        links = [
-            self._link(name, found, leading, joints) for name, found in placed.items() if found is not None
-        ]
-        used = {s for found in placed.values() if found is not None for s in _turned(found)}
-        links += self._carriers(placed, set(leading), used, links)
+        links = [self._link(name, there, leading, joints) for name, there in placed.items()]
+        links += self._carriers(placed, set(leading), links)
         plan = Plan(links, self.model.bodies.get(WORLD, NO_BODY), loops=self._loops)
-        kept = {n: c for n, c in self._plain_constraints() if n not in self._left_out}
-        found = [
-            item
-            for item in sort_constraints(kept, self.resolve, self.refusals)
-            if isinstance(item, Sum) or item.symbol.position not in self._lost
-        ]
-        limit(plan, found, self.target.name, self.target.sums, self.target.one_way, self.refusals)
+        simple = list(self._simple(found, approximation))
+        limit(plan, simple, self.target.name, self.target.sums, self.target.one_way, self.refusals)
+        if approximation is not None and len(placed) == len(everywhere):
+            plan.errors = approximation.errors(placed, {n: self.model.frames[n].parent for n in placed})
+            self._check_errors(plan.errors)
         self._remark()
         plan.remarks = self.remarks
         return plan
+
+    def _simple(
+        self, found: Iterable[Range | Sum | Curve], approximation: Approximation | None
+    ) -> Iterator[Range | Sum]:
+        """Yield the constraints that can be said, without those that hold because of others."""
+        for item in found:
+            if isinstance(item, Curve):
+                curve = item.expression, item.lower, item.upper
+                if approximation is None or not approximation.implied(*curve):
+                    self.refusals.add(item.name, item.reason)
+                else:
+                    self.remarks.append(f"'{item.name}' is not written: it holds within the other limits")
+            elif isinstance(item, Sum) or item.symbol.position not in self._lost:
+                yield item
+
+    def _check_errors(self, errors: Mapping[str, FrameError]) -> None:
+        """Refuse the frame that is off most, if that is too much."""
+        assert self._tolerance is not None
+        worst = max(errors, key=lambda name: max(errors[name].position, errors[name].angle), default=None)
+        if worst is None:
+            return
+        error = errors[worst]
+        if error.position == math.inf:
+            self.refusals.add(
+                worst,
+                "is carried by something approximated, and a coordinate without limits takes it anywhere",
+            )
+        elif max(error.position, error.angle) > self._tolerance:
+            self.refusals.add(worst, f"would be off by up to {error}, and no less was found")
 
     def home(self) -> dict[Symbol, float]:
         """Return where every coordinate is unless more is known, those that loops determine among them."""
@@ -140,7 +158,7 @@ class Recognition:
         known = {s: self._values[s] for s in parameters if s in self._values}
         return apply(expression, known) if known else expression
 
-    def _placed(self, name: str) -> Placing | None:
+    def _placed(self, name: str, approximation: Approximation | None) -> Placing | None:
         """Return where a frame is in its parent; None if that is refused."""
         factors = [self._factor(f) for f in self.model.frames[name].factors]
         follows = name in self._records and self.model.articulations[self._records[name]].follows is not None
@@ -153,6 +171,12 @@ class Recognition:
         except UnrecognisedError as problem:
             self._refuse(name, factors, str(problem))
             return None
+        if approximation is not None:
+            near = approximation.placing(name, found)
+            if isinstance(near, str):
+                self._refuse(name, factors, near)
+                return None
+            return near
         for motion in found.moving:
             if isinstance(motion, Motion) and (motion.curved or len(motion.amount) > self.target.degree + 1):
                 verb, powers = "turns" if motion.turns else "slides", _POWERS[self.target.degree]
@@ -173,7 +197,7 @@ class Recognition:
             return factor if amount is factor.amount else AxisMotion(factor.direction, amount, factor.turns)
         return self.resolve(factor)
 
-    def _leading(self, placed: Mapping[str, Placing | None]) -> dict[Symbol, tuple[str, int]]:
+    def _leading(self, placed: Mapping[str, Placing]) -> dict[Symbol, tuple[str, int]]:
         """Return for each coordinate the frame, and which of its motions, that is just this coordinate.
 
         Of several, the one that is on record for it; for some there is none.
@@ -182,7 +206,7 @@ class Recognition:
         on_record: set[Symbol] = set()
         for name, found in placed.items():
             own = self._record(name)
-            for k, motion in enumerate(found.moving if found is not None else ()):
+            for k, motion in enumerate(found.moving):
                 if not isinstance(motion, Motion) or motion.amount not in _WHOLE:
                     continue
                 symbol = motion.variable.data
@@ -235,16 +259,16 @@ class Recognition:
 
     def _carriers(
         self,
-        placed: Mapping[str, Placing | None],
+        placed: Mapping[str, Placing],
         leading: set[Symbol],
-        used: set[Symbol],
         links: list[Link],
     ) -> Iterator[Link]:
         """Yield links that carry nothing, for coordinates that only others follow, or that move nothing."""
         frames = Names([*self.model.frames, WORLD])
+        used = {s for found in placed.values() for s in _turned(found)}
         first: dict[Symbol, tuple[str, Motion]] = {}
         for name, found in placed.items():
-            for motion in found.moving if found is not None else ():
+            for motion in found.moving:
                 if isinstance(motion, Motion):
                     first.setdefault(motion.variable.data, (self.model.frames[name].parent, motion))
         for symbol in self._coordinates:
@@ -258,9 +282,9 @@ class Recognition:
             self.remarks.append(f"'{symbol}' has a link of its own that carries nothing")
             yield Link(frames.take(symbol.path, f"{symbol.path}/carrier"), parent, np.eye(4), [joint])
 
-    def _check_rates(self, placed: Mapping[str, Placing | None]) -> None:
+    def _check_rates(self, placed: Mapping[str, Placing]) -> None:
         """Refuse coordinates that move by the speeds of others, except quaternions that turn."""
-        fine = {s for found in placed.values() if found is not None for s in _turned(found)}
+        fine = {s for found in placed.values() for s in _turned(found)}
         driven: dict[str, set[str]] = {}
         for coordinate, row in self._rates.items():
             if coordinate in fine:
@@ -301,19 +325,6 @@ def _turned(found: Placing) -> Iterator[Symbol]:
             yield from motion.factor.symbols
 
 
-def _parents_first(model: ModelView) -> list[str]:
-    """Return the names of all frames, each after its parent, in their order where that allows it."""
-    frames = dict(model.frames)
-    done = {WORLD: None}
-    for name in frames:
-        chain = []
-        while name not in done:
-            chain.append(name)
-            name = frames[name].parent
-        done |= dict.fromkeys(reversed(chain))
-    return [name for name in done if name in frames]
-
-
 def _shared(dynamics: dict[str, object], joints: list[Joint | BallJoint]) -> list[dict[str, object]]:
     """Return what is known of each joint: all of it of a single one, else what bears its last name."""
     if len(joints) == 1:
@@ -328,16 +339,3 @@ def _shared(dynamics: dict[str, object], joints: list[Joint | BallJoint]) -> lis
 def _negative(axis: tuple[float, float, float]) -> tuple[float, float, float]:
     x, y, z = axis
     return 0.0 - x, 0.0 - y, 0.0 - z
-
-
-def _checked(leave_out: Iterable[str], model: ModelView) -> frozenset[str]:
-    """Return the names of what is to be left out, if all of them exist."""
-    wanted = [leave_out] if isinstance(leave_out, str) else list(leave_out)
-    known = {*model.constraints, *model.articulations, *map(str, model.rates)}
-    for name in wanted:
-        if name not in known:
-            raise UnknownNameError(
-                f"{name!r} cannot be left out: it is neither a constraint nor an articulation. "
-                f"{suggest(str(name), known, 'name')}"
-            )
-    return frozenset(wanted)

@@ -15,10 +15,11 @@ import numpy as np
 from kineverse.formats import rpy
 from kineverse.formats.export.markup import Tag, document
 from kineverse.formats.export.names import Names
-from kineverse.formats.export.plan import NO_BODY, BallJoint, Joint, Link, Plan
+from kineverse.formats.export.plan import NO_BODY, BallJoint, Joint, Link, Plan, Written
 from kineverse.formats.export.poses import RIGID, deviation, quaternion
-from kineverse.formats.export.recognition import Recognition, Target
+from kineverse.formats.export.recognition import Recognition
 from kineverse.formats.export.refusals import Refusals
+from kineverse.formats.export.target import Target
 from kineverse.formats.mjcf.writing_bodies import BodyWriter, placed
 from kineverse.model.frame import WORLD
 from kineverse.model.view import ModelView
@@ -44,8 +45,10 @@ _REMEDY = (
 )
 
 
-def mjcf_of(model: ModelView, path: Path, leave_out: Iterable[str] = ()) -> tuple[bytes, list[str]]:
-    """Return the text of an MJCF file, and what it says other than the model, or not at all.
+def mjcf_of(
+    model: ModelView, path: Path, leave_out: Iterable[str] = (), tolerance: float | None = None
+) -> Written:
+    """Return the text of a file, and what it says other than the model, or not at all.
 
     Parameters
     ----------
@@ -55,16 +58,19 @@ def mjcf_of(model: ModelView, path: Path, leave_out: Iterable[str] = ()) -> tupl
         Where the file will lie; meshes are named from there.
     leave_out
         Names of constraints that are not to be said, and of articulations whose speeds are not.
+    tolerance
+        How far frames may be off where motions are approximated [m], [rad]; None for no approximation.
 
     Raises
     ------
     FormatError
         Naming what MJCF cannot say, and why.
     """
-    recognition = Recognition(model, MJCF, leave_out)
+    recognition = Recognition(model, MJCF, leave_out, tolerance)
     plan = recognition.plan()
     home = {str(s): v for s, v in recognition.home().items()}
-    return MjcfWriter(plan, path, recognition.refusals, home).document(), plan.remarks
+    content = MjcfWriter(plan, path, recognition.refusals, home).document()
+    return Written(content, tuple(plan.remarks), plan.errors)
 
 
 class MjcfWriter:
@@ -110,7 +116,7 @@ class MjcfWriter:
             key.add("key", name="home", qpos=self._qpos)
         parts = (custom, self._bodies.assets, world, tendon, equality, key)
         root.inside += [part for part in parts if part.inside or part is world]
-        return document(root, self._plan.remarks)
+        return document(root, [*self._plan.remarks, *self._plan.said_errors])
 
     def _link(self, link: Link) -> None:
         if deviation(link.pose) > RIGID:

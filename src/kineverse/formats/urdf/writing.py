@@ -18,10 +18,11 @@ import numpy.typing as npt
 from kineverse.articulations.free_joints import from_z
 from kineverse.formats.export.markup import Tag, document
 from kineverse.formats.export.names import Names
-from kineverse.formats.export.plan import ITSELF, NO_BODY, BallJoint, Joint, Link, Plan
+from kineverse.formats.export.plan import ITSELF, NO_BODY, BallJoint, Joint, Link, Plan, Written
 from kineverse.formats.export.poses import RIGID, angles, deviation
-from kineverse.formats.export.recognition import Recognition, Target
+from kineverse.formats.export.recognition import Recognition
 from kineverse.formats.export.refusals import Refusals
+from kineverse.formats.export.target import Target
 from kineverse.formats.urdf.writing_bodies import BodyWriter
 from kineverse.model.frame import WORLD
 from kineverse.model.view import ModelView
@@ -41,8 +42,10 @@ _REMEDY = (
 )
 
 
-def urdf_of(model: ModelView, path: Path, leave_out: Iterable[str] = ()) -> tuple[bytes, list[str]]:
-    """Return the text of a URDF file, and what it says other than the model, or not at all.
+def urdf_of(
+    model: ModelView, path: Path, leave_out: Iterable[str] = (), tolerance: float | None = None
+) -> Written:
+    """Return the text of a file, and what it says other than the model, or not at all.
 
     Parameters
     ----------
@@ -52,15 +55,18 @@ def urdf_of(model: ModelView, path: Path, leave_out: Iterable[str] = ()) -> tupl
         Where the file will lie; its name becomes that of the robot, and meshes are named from there.
     leave_out
         Names of constraints that are not to be said, and of articulations whose speeds are not.
+    tolerance
+        How far frames may be off where motions are approximated [m], [rad]; None for no approximation.
 
     Raises
     ------
     FormatError
         Naming what URDF cannot say, and why.
     """
-    recognition = Recognition(model, URDF, leave_out)
+    recognition = Recognition(model, URDF, leave_out, tolerance)
     plan = recognition.plan()
-    return UrdfWriter(plan, path, recognition.refusals).document(), plan.remarks
+    content = UrdfWriter(plan, path, recognition.refusals).document()
+    return Written(content, tuple(plan.remarks), plan.errors)
 
 
 class UrdfWriter:
@@ -90,7 +96,7 @@ class UrdfWriter:
         for link in links:
             self._link(link, link is root)
         self._refusals.check(self._path.name, _REMEDY)
-        return document(self._root, self._plan.remarks)
+        return document(self._root, [*self._plan.remarks, *self._plan.said_errors])
 
     def _root_link(self) -> Link | None:
         """Return the link that is where the world is and carries all others, if there is one."""
@@ -164,7 +170,7 @@ class UrdfWriter:
         element = self._joint(joint.name, kind, parent, child, pose, joint.axis)
         self._limit(element, joint, kind)
         if joint.amount != ITSELF or not joint.leads:
-            offset, factor = joint.amount
+            offset, factor = (*joint.amount, 0.0)[:2]
             element.add(
                 "mimic", joint=joint.symbol.path, multiplier=factor, offset=offset if offset else None
             )
