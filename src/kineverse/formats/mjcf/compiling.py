@@ -114,7 +114,9 @@ def _attempt(prepared: Prepared, source: str, folder: str, note: Note, with_file
     try:
         model = engine.compiled(spec, prepared, source)
     except FormatError as error:
-        raise _MeshError(str(error)) from None if files else error
+        if files:
+            raise _MeshError(str(error)) from None
+        raise
     meshes = replacement.meshes
     shapeless += [(geom, "its size is that of a mesh that is not there") for geom in meshes.fitted]
     left_out = {geom.id: f"is left out: {reason}." for geom, reason in shapeless}
