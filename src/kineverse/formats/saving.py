@@ -16,7 +16,7 @@ from kineverse.formats.remarks import tell
 from kineverse.model.view import ModelView
 from kineverse.number import real_number
 
-ENDINGS = (".kv.json", ".urdf", ".xml")
+ENDINGS = (".kv.json", ".urdf", ".xml", ".mjcf")
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,7 +64,7 @@ def save(
         The model.
     path
         A name that ends in ``.kv.json`` for a document, which says all of the model, ``.urdf`` for URDF or
-        ``.xml`` for MJCF.
+        ``.xml`` or ``.mjcf`` for MJCF.
     tolerance
         How far any frame may be from where it should be, in position [m] and in angle [rad], wherever
         coordinates are within their limits. Then motions by curves are approximated. None for none.
@@ -112,7 +112,7 @@ def _written(model: ModelView, target: Path, leave_out: Iterable[str], tolerance
             from .urdf.writing import urdf_of
 
             return urdf_of(model, target, leave_out, tolerance)
-        if target.name.endswith(".xml"):
+        if target.name.endswith((".xml", ".mjcf")):
             from .mjcf.writing import mjcf_of
 
             return mjcf_of(model, target, leave_out, tolerance)
