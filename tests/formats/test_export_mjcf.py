@@ -123,7 +123,7 @@ def test_what_ships_is_said_or_refused_by_name(name: str, tmp_path: Path) -> Non
         assert_same_motion(model, kv.load(file), tolerance=1e-9 if model.rates.dependent else 1e-12)
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=20, deadline=None)
 @given(model=trees((*KINDS, "ball")), seed=st.integers(0, 99))
 def test_random_trees_against_mujoco(
     model: kv.Model, seed: int, tmp_path_factory: pytest.TempPathFactory
