@@ -90,6 +90,7 @@ DECIDING: dict[str, Code] = {
     "whether it is a pose": said(is_pose),
     "prints a pose": said(lambda m: "cos" in repr(m.fk("car"))),
     "prints a limit": said(lambda m: "height" in str(upper(m))),
+    "digest": said(lambda m: upper(m).key == kv.array(4.5).key),
     "LaTeX": said(lambda m: "height" in upper(m)._repr_latex_()),
     "symbols of an element": said(lambda m: len(m.fk("car")[2, 3].symbols)),
     "symbols of a gradient": said(
@@ -108,6 +109,7 @@ DECIDING: dict[str, Code] = {
     "range of what does not move": limited(lambda m: (0, m.fk("car")[2, 3], 1)),
     "range of nothing": limited(lambda m: (0, KNOB, m.data["number"])),
     "axis": placed(lambda m: kv.axis_angle((m.data["number"], 0, 0), KNOB)),
+    "one by zero": said(lambda m: 1 / m.data["number"]),
     "not a number": placed(lambda m: kv.translation(np.sqrt(m.data["number"]), 0, 0)),
 }
 FOLLOWED: dict[str, Code] = {

@@ -402,7 +402,7 @@ class Expression:
         """A digest of shape and structure, the same in every process."""
         from .structure import structural_key
 
-        return structural_key(self)
+        return structural_key(looked_at(self))
 
     def __eq__(self, other: object) -> bool:
         if self is other:
@@ -412,10 +412,10 @@ class Expression:
                 other = as_expression(other)  # type: ignore[arg-type]
             except (ExpressionError, ValueRejectedError, ShapeError):
                 return NotImplemented
-        return self._shape == other._shape and looked_at(self).key == looked_at(other).key
+        return self._shape == other._shape and self.key == other.key
 
     def __hash__(self) -> int:
-        return hash(looked_at(self).key)
+        return hash(self.key)
 
     def __reduce__(self) -> Any:
         from .structure import pack, unpack

@@ -23,6 +23,7 @@ from kineverse.errors import ExpressionError, ShapeError
 from . import layout
 from .expression import NODES, Expression, ExpressionLike, as_expression, broadcast_to, make
 from .leaves import gradient_keys, symbols_below
+from .structure import structural_key
 
 if TYPE_CHECKING:
     from kineverse.symbols import Symbol
@@ -96,7 +97,7 @@ class Node(ABC):
     ) -> bytes:
         digest = hashlib.blake2b(f"{cls.kind}{shape}{cls._options_key(options)}".encode(), digest_size=16)
         for argument in arguments:
-            digest.update(argument.key)
+            digest.update(structural_key(argument))
         return digest.digest()
 
     @classmethod

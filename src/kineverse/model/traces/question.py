@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from kineverse.expressions.expression import Expression, as_expression
+from kineverse.expressions.structure import structural_key
 from kineverse.model.articulation import Articulation
 from kineverse.model.body import Body, Pose
 from kineverse.model.constraint import Constraint
@@ -66,7 +67,7 @@ class Question:
     @property
     def key(self) -> tuple[object, ...]:
         """What tells it from others, without looking at expressions closely."""
-        return self.kind, *(a.key if isinstance(a, Expression) else a for a in self.arguments)
+        return self.kind, *(structural_key(a) if isinstance(a, Expression) else a for a in self.arguments)
 
     def ask(self, model: Reader) -> Reply:
         """Return the model's answer.

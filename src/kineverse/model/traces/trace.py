@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -88,7 +89,12 @@ class Trace:
             result = put(expression)
             of_numbers = bool(parts) and all(isinstance(part, float) for part in parts)
             is_number = of_numbers and not result.shape and result.is_constant
-            return float(result) if is_number else result
+            if not is_number:
+                return result
+            number = float(result)
+            if not math.isfinite(number):
+                raise UntraceableError(f"a number that it writes would be {number}.")
+            return number
 
         written = {
             (kind, name): mapped(kind, value, put_datum if kind in (DATA, ARTICULATIONS) else put)
