@@ -2,7 +2,7 @@
 
 ``import kineverse as kv`` gives the whole public face: symbols and expressions (layer 1), :func:`compile`
 (layer 2), models, operations and :func:`load` (layer 3). Articulations are in :mod:`kineverse.articulations`;
-:mod:`kineverse.reasoning` (layer 5) is imported when it is used.
+:mod:`kineverse.geometry` (layer 4) and :mod:`kineverse.reasoning` (layer 5) are imported when they are used.
 """
 
 from typing import TYPE_CHECKING
@@ -103,7 +103,7 @@ from .state import State
 from .symbols import Symbol, parameter, position, symbol, velocity
 
 if TYPE_CHECKING:
-    from . import reasoning
+    from . import geometry, reasoning
 
 __all__ = [
     "Ackermann",
@@ -181,6 +181,7 @@ __all__ = [
     "compile",
     "difference",
     "document_hash",
+    "geometry",
     "inverse",
     "less",
     "limit_table",
@@ -216,8 +217,8 @@ __all__ = [
 
 
 def __getattr__(name: str) -> object:
-    if name == "reasoning":
+    if name in ("geometry", "reasoning"):
         import importlib
 
-        return importlib.import_module("kineverse.reasoning")
+        return importlib.import_module(f"kineverse.{name}")
     raise AttributeError(f"module 'kineverse' has no attribute {name!r}")

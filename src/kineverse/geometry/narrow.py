@@ -10,12 +10,15 @@ which in penetration is minus the shortest translation that separates them.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from dataclasses import replace
+from typing import Any, TypeAlias
 
 import numpy as np
 
+from kineverse.model.body import Sphere
+
 from .mesh_files import Floats
-from .solids import Solid
+from .solids import Solid, solid_of
 
 APART_TOLERANCE, DEPTH_TOLERANCE = 1e-8, 1e-6
 """What coal's iterations stop at, between things apart and in penetration [m].
@@ -31,6 +34,12 @@ _TOUCH = 1e-6
 # So far things are moved apart to see in which direction they touch, and no further than this part of them.
 _APART, _APART_OF_RADIUS = 1e-4, 1e-3
 _CONTACTS = 256
+# The radius of a ball that is taken for a point [m].
+_SPECK = 1e-7
+
+
+Witness: TypeAlias = tuple[Floats, Floats, Floats]
+"""The closest points of two solids and the unit normal from one to the other, each (3,), in the world."""
 
 
 class Narrow:
@@ -49,7 +58,6 @@ class Narrow:
 
         self._coal = coal
         self._solids = solids
-        self._poses = poses
         self._parts = [(pose[:, :3], pose[:, 3]) for pose in poses]
         self._transforms = [coal.Transform3s() for _ in poses]
         self._placed = [-1] * len(poses)
@@ -57,7 +65,7 @@ class Narrow:
         self._functors: dict[tuple[Solid, Solid], Any] = {}
         self._request, *self._rougher = (_request(coal, factor) for factor in (1.0, 10.0, 100.0))
         self._result = coal.DistanceResult()
-        self._mended: tuple[Floats, Floats, Floats] | None = None
+        self._mended: Witness | None = None
         self.calls = 0
 
     def moved(self) -> None:
@@ -89,7 +97,7 @@ class Narrow:
             distance = functor(at_a, at_b, request, result)
         return self._mend(i, j, functor)
 
-    def witness(self) -> tuple[Floats, Floats, Floats]:
+    def witness(self) -> Witness:
         """Return the closest points and the unit normal from the first to the second, of the last distance.
 
         All are in the world, (3,), and ``distance == normal @ (point_b - point_a)``.
@@ -180,6 +188,23 @@ class Narrow:
         point = np.array(deepest.pos)
         self._mended = point + normal * depth / 2, point - normal * depth / 2, normal
         return -depth
+
+
+def distance_to_point(solid: Solid, pose: Floats, point: Floats) -> tuple[float, Floats, Floats]:
+    """Return the signed distance of a placed solid to a point [m], its surface there, and the outward normal.
+
+    Parameters
+    ----------
+    solid, pose, point
+        The solid, its (3, 4) pose and the (3,) point, in the world.
+    """
+    ball = solid_of(Sphere(_SPECK))
+    # In touch, its own size is no measure of how far it may be moved.
+    speck = replace(ball, radius=solid.radius)
+    narrow = Narrow([solid, speck], np.stack([pose, np.column_stack([np.eye(3), point])]))
+    distance = narrow.distance(0, 1) + _SPECK
+    nearest, _, normal = narrow.witness()
+    return distance, nearest, normal
 
 
 def _request(coal: Any, factor: float) -> Any:

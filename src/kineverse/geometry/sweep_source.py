@@ -94,8 +94,8 @@ static void consider(const Table *t, int64_t one, int64_t other, Answer *answer)
   if (gap > reach * reach) return;
   const int64_t i = one < other ? one : other, j = one < other ? other : one;
   double known = -INFINITY;
-  if (t->bounds) {
-    known = t->bounds[t->count * i + j] - t->travel[i] - t->travel[j];
+  if (t->bounds && t->bounds[t->count * i + j] != 0.0) {
+    known = t->bounds[t->count * i + j] - (t->travel[i] + t->travel[j]);
     if (known > reach) return;
   }
   const double low = larger(lower_bound(t, i, j), known);

@@ -91,6 +91,20 @@ class Table:
         extent = np.einsum("kij,kj->ki", np.abs(rotation), self.half[pieces])
         self.place[pieces], self.low[pieces], self.high[pieces] = place, place - extent, place + extent
 
+    def take_over(self, old: Table, kept: npt.NDArray[np.integer[Any]]) -> None:
+        """Enter what another table knew of pieces: (K, 2) their numbers here and there."""
+        here, there = kept[:, 0], kept[:, 1]
+        for name in ("active", "centre", "half", "radius", "poses", "travel"):
+            getattr(self, name)[here] = getattr(old, name)[there]
+        self.axis = old.axis
+        if self.bounds is None or old.bounds is None:
+            return
+        known = old.bounds[np.ix_(there, there)]
+        # Kept for the smaller number first, 0 for the other way round; numbers may have changed places.
+        known = known + known.T
+        rows, columns = np.meshgrid(here, here, indexing="ij")
+        self.bounds[np.minimum(rows, columns), np.maximum(rows, columns)] = known
+
     def choose_axis(self) -> None:
         """Sort along the axis on which the pieces are spread the most, from now on."""
         there = self.active.astype(bool)
@@ -109,8 +123,10 @@ class Table:
         np.maximum(bound, self._box_to_sphere(ones, others, between), out=bound)
         np.maximum(bound, self._box_to_sphere(others, ones, -between), out=bound)
         if self.bounds is not None:
-            known = self.bounds[ones, others] - self.travel[ones] - self.travel[others]
-            np.maximum(bound, known, out=bound)
+            known = self.bounds[ones, others]
+            measured = known != 0.0
+            known -= self.travel[ones] + self.travel[others]
+            np.maximum(bound, known, out=bound, where=measured)
         return bound
 
     def _box_to_sphere(self, boxes: Indices, spheres: Indices, between: Floats) -> Floats:

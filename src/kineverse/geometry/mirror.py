@@ -1,0 +1,241 @@
+"""A model mirrored in tables that distances are computed from, at one state."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from kineverse.compile.function import compile as compile_expressions
+from kineverse.errors import UnknownNameError, ValueRejectedError, suggest
+from kineverse.model.view import ModelView
+from kineverse.state import State
+from kineverse.symbols import Symbol
+
+from .mesh_files import Floats
+from .narrow import Narrow, Witness
+from .pieces import Piece, Pieces, load
+from .rules import RULES, Rule, allowed, check_names, rules_of
+from .solids import Solid
+from .sweep_native import sweep_library
+from .table import Table
+
+_MOST_MEASURED = 200_000
+
+
+class Mirror:
+    """The pieces of a model and where they are; for one thread.
+
+    Parameters
+    ----------
+    model
+        What is mirrored, at whatever version it is.
+    rules
+        Beside those that the model keeps; they come after them.
+    triangles, leave_out
+        Patterns of bodies whose meshes stay triangles, and of bodies that do not take part.
+
+    Attributes
+    ----------
+    pieces
+        In the order of the table: those that move first, each group in the order of the bodies.
+    bodies
+        The names of the bodies that have pieces, in the order of the model.
+    members
+        The numbers of the pieces of each body, in the order of :attr:`bodies`.
+    table, narrow
+        See there.
+    """
+
+    def __init__(
+        self, model: ModelView, rules: Iterable[Rule], triangles: Iterable[str], leave_out: Iterable[str]
+    ) -> None:
+        self.model = model
+        self._own_rules = rules_of(rules)
+        check_names(self._own_rules, model)
+        self._source = Pieces(_names(triangles), _names(leave_out))
+        self._version: int | None = None
+        self._values: dict[Symbol, float] = {}
+        self._lacks: list[str] = []
+        self._evaluator: Any = None
+        self.inputs: tuple[Symbol, ...] = ()
+        self.pieces: list[Piece] = []
+        self.bodies: tuple[str, ...] = ()
+        self.members: list[list[int]] = []
+        self._solids: list[Solid | None] = []
+        self._all_loaded = False
+        self.table = Table(0, np.zeros(0, dtype=np.int32), np.zeros((0, 0), dtype=np.uint8))
+        sweep_library.prepare()
+        self.follow()
+
+    # -- the model -----------------------------------------------------------------------------------------
+
+    def follow(self) -> None:
+        """Catch up with the model's version: what is the same keeps its solids, travel and bounds."""
+        if self._version == self.model.version:
+            return
+        version = self.model.version
+        rules = (*rules_of(self.model.data.get(RULES, ())), *self._own_rules)
+        moved = self._source.follow(self.model)
+        if moved:
+            self._rebuild(rules)
+        else:
+            # Other frames may have come in between, and with them other neighbours.
+            self.table.allowed[:] = allowed(self.model, self.bodies, rules)
+        self._version = version
+
+    def _rebuild(self, rules: Sequence[Rule]) -> None:
+        by_body = self._source.by_body
+        before, old = {id(piece): k for k, piece in enumerate(self.pieces)}, self.table
+        old_solids = self._solids
+        everything = [piece for pieces in by_body.values() for piece in pieces]
+        moving = [piece for piece in everything if piece.moves]
+        same = moving == self.pieces[: old.moving]
+        self.pieces = [*moving, *(piece for piece in everything if not piece.moves)]
+        self.bodies = tuple(by_body)
+        number = {name: k for k, name in enumerate(self.bodies)}
+        body = np.array([number[piece.body] for piece in self.pieces], dtype=np.int32)
+        self.members = [[] for _ in self.bodies]
+        for k, owner in enumerate(body.tolist()):
+            self.members[owner].append(k)
+        self.table = table = Table(len(moving), body, allowed(self.model, self.bodies, rules))
+        kept = [(k, before[id(piece)]) for k, piece in enumerate(self.pieces) if id(piece) in before]
+        self._solids = [None] * len(self.pieces)
+        for new, previous in kept:
+            self._solids[new] = old_solids[previous]
+        table.take_over(old, np.array(kept, dtype=int).reshape(-1, 2))
+        known = {new for new, _ in kept}
+        for k in range(len(moving), len(self.pieces)):
+            if k not in known:
+                table.poses[k] = self.pieces[k].pose({})
+        table.put(np.arange(table.count))
+        self._all_loaded = all(solid is not None for solid in self._solids)
+        self.narrow = Narrow(self._solids, table.poses)
+        self._measured: dict[tuple[int, int], tuple[float, float, float, Witness]] = {}
+        if not same:
+            self._compile([piece.pose for piece in moving])
+        self._place_again()
+
+    def _compile(self, poses: list[Any]) -> None:
+        function = compile_expressions(np.stack(poses)) if poses else None
+        self.inputs = function.inputs if function else ()
+        self._evaluator = function.bind() if function else None
+
+    # -- the state -----------------------------------------------------------------------------------------
+
+    def update(self, state: Mapping[Any, float] | Sequence[float] | Floats) -> None:
+        """Place everything, see :meth:`Scene.update`."""
+        self.follow()
+        if isinstance(state, Mapping):
+            state = self._relevant(state)
+        if self._evaluator is not None:
+            self._evaluator(state)
+            self._place()
+            self._values = dict(zip(self.inputs, self._evaluator.input.tolist(), strict=True))
+        elif not isinstance(state, Mapping) and len(state):
+            raise ValueRejectedError(f"Nothing moves in this scene, and {len(state)} values are given.")
+        self._lacks = []
+
+    def _relevant(self, state: Mapping[Any, float]) -> Mapping[Any, float]:
+        """Return the part of a mapping that poses depend on; the rest has to be known to the model."""
+        if isinstance(state, State):
+            return state
+        inputs = {key for symbol in self.inputs for key in (symbol, str(symbol))}
+        for key in state:
+            if key not in inputs:
+                self.model.symbol(str(key))
+        return {key: value for key, value in state.items() if key in inputs}
+
+    def _place(self) -> None:
+        bad = sweep_library.place(self.table, self._evaluator.outputs[0])
+        if bad >= 0:
+            names = dict.fromkeys(
+                piece.body
+                for piece, pose in zip(self.pieces, self._evaluator.outputs[0], strict=False)
+                if not np.isfinite(pose).all()
+            )
+            raise ValueRejectedError(
+                f"At this state the pose of {', '.join(map(repr, names))} is not finite; nothing was moved."
+            )
+        self.narrow.moved()
+
+    def _place_again(self) -> None:
+        """Place everything at the last state after an edit, as far as that says where things are."""
+        values = {s: self._values.get(s, s.value) for s in self.inputs}
+        self._lacks = [str(s) for s, value in values.items() if value is None]
+        if self._evaluator is not None and not self._lacks:
+            self._evaluator(np.array([values[s] for s in self.inputs], dtype=float))
+            self._place()
+
+    # -- questions -----------------------------------------------------------------------------------------
+
+    def ready(self, pieces: Iterable[int] | None = None) -> None:
+        """Catch up with the model, and make the solids of pieces, or of all.
+
+        Raises
+        ------
+        UnknownNameError
+            If there is no state that says where everything is.
+        KineverseError
+            If a solid cannot be made.
+        """
+        self.follow()
+        if self._lacks:
+            raise UnknownNameError(
+                f"The scene has no value for {', '.join(self._lacks[:12])}: call scene.update(state) first."
+            )
+        if self._all_loaded:
+            return
+        wanted = [
+            k for k in (range(len(self.pieces)) if pieces is None else pieces) if self._solids[k] is None
+        ]
+        first = self.table.active.any()
+        for k, solid in zip(wanted, load(self.pieces[k] for k in wanted), strict=True):
+            self._solids[k] = solid
+            self.table.give_solid(k, solid.centre, solid.half, solid.radius)
+        if wanted and (pieces is None or not first):
+            self.table.choose_axis()
+        self._all_loaded = pieces is None
+
+    def measured(self, i: int, j: int) -> tuple[float, Witness]:
+        """Return distance and witness of two pieces, i < j, from memory if neither has moved since."""
+        travel = self.table.travel.data
+        one, other = travel[i], travel[j]
+        known = self._measured.get((i, j))
+        if known is not None and known[0] == one and known[1] == other:
+            return known[2], known[3]
+        distance = self.narrow.distance(i, j)
+        witness = self.narrow.witness()
+        for vector in witness:
+            vector.flags.writeable = False  # it is kept, and given out more than once
+        self.table.remember(i, j, distance)
+        if len(self._measured) >= _MOST_MEASURED:
+            self._measured.clear()
+        self._measured[i, j] = one, other, distance, witness
+        return distance, witness
+
+    def number(self, body: str) -> int:
+        """Return the number of a body.
+
+        Raises
+        ------
+        UnknownNameError
+            If it has no pieces, with similar names.
+        """
+        self.follow()
+        try:
+            return self.bodies.index(body)
+        except ValueError:
+            what = "has no shapes here" if body in self.model.frames else "is no frame of the model"
+            raise UnknownNameError(f"'{body}' {what}. {suggest(str(body), self.bodies, 'body')}") from None
+
+    def solid(self, piece: int) -> Solid:
+        """Return the solid of a piece that is there."""
+        solid = self._solids[piece]
+        assert solid is not None
+        return solid
+
+
+def _names(names: Iterable[str]) -> tuple[str, ...]:
+    return (names,) if isinstance(names, str) else tuple(names)

@@ -1,0 +1,166 @@
+"""The pieces of a scene: the shapes of a model's bodies, and where they are."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass
+from fnmatch import fnmatchcase
+
+from kineverse.errors import FormatError, ValueRejectedError
+from kineverse.expressions.expression import Expression
+from kineverse.model.body import Body, Mesh, Shape
+from kineverse.model.frame import WORLD, Frame
+from kineverse.model.view import ModelView
+
+from .solids import Solid, solid_of
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Piece:
+    """One shape of a body.
+
+    Attributes
+    ----------
+    body
+        The frame it moves with.
+    number
+        Its place among the shapes of the body.
+    shape
+        What it is, and where in the frame.
+    triangles
+        Whether a mesh is kept as triangles rather than as its convex hull.
+    pose
+        world_T_piece, the first three rows: a (3, 4) expression.
+    """
+
+    body: str
+    number: int
+    shape: Shape
+    triangles: bool
+    pose: Expression
+
+    @property
+    def moves(self) -> bool:
+        """Whether its pose depends on any symbol."""
+        return bool(self.pose.symbols)
+
+    def solid(self) -> Solid:
+        """Make what distances are computed to.
+
+        Raises
+        ------
+        KineverseError
+            Of the kind that the cause has, naming the body and the file.
+        """
+        try:
+            return solid_of(self.shape.geometry, self.triangles)
+        except OSError as error:
+            raise FormatError(f"{self._described()}: {error}") from error
+        except (FormatError, ValueRejectedError) as error:
+            raise type(error)(f"{self._described()}: {error}") from error
+
+    def _described(self) -> str:
+        geometry = self.shape.geometry
+        what = f"mesh {geometry.uri}" if isinstance(geometry, Mesh) else type(geometry).__name__.lower()
+        return f"Shape {self.number} of body '{self.body}', {what}"
+
+
+def touchable(body: Body) -> tuple[Shape, ...]:
+    """Return the shapes that stand for a body: the collision shapes, or else what is seen of it."""
+    return body.collisions or body.visuals
+
+
+def touched_by_what_is_seen(model: ModelView) -> list[str]:
+    """Return the bodies without collision shapes, for which hulls of what is seen of them are taken."""
+    return [name for name, body in model.bodies.items() if body.visuals and not body.collisions]
+
+
+def matches(name: str, patterns: Iterable[str]) -> bool:
+    """Return whether a name is, or matches, one of some patterns, in which ``*`` is any text."""
+    return any(name == pattern or fnmatchcase(name, pattern) for pattern in patterns)
+
+
+class Pieces:
+    """The pieces of a model at one version, and how to get to those of the next.
+
+    Parameters
+    ----------
+    triangles, leave_out
+        Patterns of bodies whose meshes stay triangles, and of those that have no pieces.
+    """
+
+    def __init__(self, triangles: tuple[str, ...], leave_out: tuple[str, ...]) -> None:
+        self._triangles, self._leave_out = triangles, leave_out
+        self._frames: Mapping[str, Frame] = {}
+        self._bodies: Mapping[str, Body] = {}
+        self._rates = b""
+        self.by_body: dict[str, tuple[Piece, ...]] = {}
+
+    def follow(self, model: ModelView) -> bool:
+        """Take over what is different in the model; return whether anything was.
+
+        Pieces of bodies that are the same and that hang on the same frames stay the same objects.
+        """
+        frames, bodies, rates = dict(model.frames), dict(model.bodies), model.rates.key
+        same = _Same(self._frames, frames) if rates == self._rates else None
+        found: dict[str, tuple[Piece, ...]] = {}
+        for name, body in bodies.items():
+            if matches(name, self._leave_out) or not touchable(body):
+                continue
+            kept = self.by_body.get(name)
+            if kept is None or self._bodies[name] is not body or same is None or not same.pose_of(name):
+                kept = tuple(self._made(model, name, body))
+            found[name] = kept
+        changed = list(found.items()) != list(self.by_body.items())
+        self._frames, self._bodies, self._rates, self.by_body = frames, bodies, rates, found
+        return changed
+
+    def _made(self, model: ModelView, name: str, body: Body) -> Iterator[Piece]:
+        world_T_body = model.fk(name)
+        triangles = matches(name, self._triangles)
+        for number, shape in enumerate(touchable(body)):
+            yield Piece(name, number, shape, triangles, (world_T_body @ shape.origin.matrix)[:3])
+
+
+class _Same:
+    """Which frames are where they were: all up to the world are the very same."""
+
+    def __init__(self, before: Mapping[str, Frame], after: Mapping[str, Frame]) -> None:
+        self._before, self._after = before, after
+        self._known = {WORLD: True}
+
+    def pose_of(self, name: str) -> bool:
+        path = []
+        while name not in self._known:
+            path.append(name)
+            frame = self._after[name]
+            if self._before.get(name) is not frame:
+                self._known[name] = False
+                break
+            name = frame.parent
+        answer = self._known[name]
+        self._known.update(dict.fromkeys(path, answer))
+        return answer
+
+
+def load(pieces: Iterable[Piece]) -> list[Solid]:
+    """Make the solids of pieces.
+
+    Raises
+    ------
+    KineverseError
+        The one that is wrong, or if several are, one that lists them.
+    """
+    solids, errors = [], []
+    for piece in pieces:
+        try:
+            solids.append(piece.solid())
+        except (FormatError, ValueRejectedError) as error:
+            errors.append(error)
+    if not errors:
+        return solids
+    advice = "Mend the model, or leave such bodies out: Scene(model, leave_out=[...])."
+    if len(errors) == 1:
+        raise type(errors[0])(f"{errors[0]} {advice}") from errors[0]
+    lines = "\n".join(f"  {error}" for error in errors)
+    raise FormatError(f"{len(errors)} shapes cannot be used. {advice}\n{lines}") from errors[0]

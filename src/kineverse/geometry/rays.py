@@ -1,0 +1,174 @@
+"""Rays against solids, in the frame of the solid.
+
+A convex solid keeps a ray between the last place where it enters and the first where it leaves: a polytope
+cuts by half-spaces, everything round by quadrics.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from kineverse.model.body import Box, Capsule, Cone, Cylinder, Ellipsoid, Sphere
+
+from .mesh_files import Faces, Floats
+from .solids import Hull, Primitive, Solid
+
+Entry = tuple[float, Floats]
+"""How far along the ray, and the outward normal there."""
+
+_PARALLEL = 1e-14
+
+
+def enter(solid: Solid, origin: Floats, direction: Floats) -> Entry | None:
+    """Return where a ray meets a solid first: the distance [m], 0 from inside, and the normal; None if never.
+
+    Parameters
+    ----------
+    origin, direction
+        (3,) point [m] and unit vector.
+    """
+    surface = solid.surface
+    if isinstance(surface, Faces):
+        return _triangles(surface, origin, direction)
+    if isinstance(surface, Hull):
+        return _polytope(surface.normals, surface.offsets, origin, direction)
+    return _primitive(surface, origin, direction)
+
+
+def _primitive(shape: Primitive, origin: Floats, direction: Floats) -> Entry | None:
+    if isinstance(shape, Box):
+        half = np.array(shape.size, dtype=float) / 2
+        return _polytope(_AXES, np.concatenate([half, half]), origin, direction)
+    if isinstance(shape, Sphere):
+        return _ball(np.full(3, shape.radius), origin, direction)
+    if isinstance(shape, Ellipsoid):
+        return _ball(np.array(shape.radii, dtype=float), origin, direction)
+    if isinstance(shape, Capsule):
+        return _capsule(shape, origin, direction)
+    return _round(shape, origin, direction)
+
+
+_AXES = np.concatenate([np.eye(3), -np.eye(3)])
+
+
+def _polytope(normals: Floats, offsets: Floats, origin: Floats, direction: Floats) -> Entry | None:
+    speed, gap = normals @ direction, offsets - normals @ origin
+    if ((np.abs(speed) < _PARALLEL) & (gap < 0.0)).any():
+        return None
+    inwards, outwards = speed <= -_PARALLEL, speed >= _PARALLEL
+    times = np.divide(gap, speed, out=np.zeros_like(gap), where=inwards | outwards)
+    first = int(np.argmax(np.where(inwards, times, -math.inf)))
+    enters = times[first] if inwards.any() else -math.inf
+    leaves = times[outwards].min() if outwards.any() else math.inf
+    return _between(float(enters), float(leaves), normals[first], direction)
+
+
+def _between(enters: float, leaves: float, normal: Floats, direction: Floats) -> Entry | None:
+    if enters > leaves or leaves < 0.0:
+        return None
+    return (enters, normal) if enters >= 0.0 else (0.0, -direction)
+
+
+def _ball(radii: Floats, origin: Floats, direction: Floats) -> Entry | None:
+    span = _roots(origin / radii, direction / radii, 1.0)
+    if span is None:
+        return None
+    point = (origin + span[0] * direction) / radii**2
+    return _between(*span, point / np.linalg.norm(point), direction)
+
+
+def _roots(origin: Floats, direction: Floats, radius: float) -> tuple[float, float] | None:
+    """Return the times between which a line is inside a ball; None for never."""
+    a, b = float(direction @ direction), float(origin @ direction)
+    # The distance of the line from the centre, which has more digits than the difference of squares.
+    nearest = origin - b / a * direction
+    inside = radius * radius - float(nearest @ nearest)
+    if inside < 0.0:
+        return None
+    root = math.sqrt(inside / a)
+    return -b / a - root, -b / a + root
+
+
+def _capsule(shape: Capsule, origin: Floats, direction: Floats) -> Entry | None:
+    half = np.array([0.0, 0.0, shape.length / 2])
+    found = [_round(Cylinder(shape.radius, shape.length), origin, direction)]
+    found += [_ball(np.full(3, shape.radius), origin + end, direction) for end in (half, -half)]
+    hits = [hit for hit in found if hit is not None]
+    # From inside any of the three it is inside the capsule.
+    return min(hits, key=lambda hit: hit[0]) if hits else None
+
+
+def _round(shape: Cylinder | Cone, origin: Floats, direction: Floats) -> Entry | None:
+    """Cut between two discs by the wall x² + y² = r(z)², r linear in z; z runs between ±length/2."""
+    radius, half = shape.radius, shape.length / 2
+    slope = radius / shape.length if isinstance(shape, Cone) else 0.0
+    start = radius / 2 if isinstance(shape, Cone) else radius
+    caps = _polytope_span(half, origin[2], direction[2])
+    if caps is None:
+        return None
+    # r(z) = start - slope z; the inside is where q(t) = x² + y² - r² <= 0 and r >= 0, which the caps ensure.
+    r, dr = start - slope * origin[2], -slope * direction[2]
+    a = float(direction[:2] @ direction[:2]) - dr * dr
+    b = float(origin[:2] @ direction[:2]) - r * dr
+    c = float(origin[:2] @ origin[:2]) - r * r
+    best: Entry | None = None
+    for low, high in _inside(a, b, c):
+        enters, leaves = max(low, caps[0]), min(high, caps[1])
+        if caps[0] >= low:
+            normal = np.array([0.0, 0.0, -math.copysign(1.0, direction[2])])
+        else:
+            point = origin + enters * direction
+            side = math.hypot(point[0], point[1])
+            normal = np.array([point[0], point[1], slope * side]) / max(side * math.hypot(1.0, slope), 1e-300)
+        hit = _between(enters, leaves, normal, direction)
+        if hit is not None and (best is None or hit[0] < best[0]):
+            best = hit
+    return best
+
+
+def _polytope_span(half: float, z: float, speed: float) -> tuple[float, float] | None:
+    if abs(speed) < _PARALLEL:
+        return (-math.inf, math.inf) if abs(z) <= half else None
+    one, other = (-half - z) / speed, (half - z) / speed
+    return min(one, other), max(one, other)
+
+
+def _inside(a: float, b: float, c: float) -> list[tuple[float, float]]:
+    """Return the intervals of t in which a t² + 2 b t + c <= 0."""
+    if abs(a) < _PARALLEL:
+        if abs(b) < _PARALLEL:
+            return [(-math.inf, math.inf)] if c <= 0.0 else []
+        root = -c / (2 * b)
+        return [(-math.inf, root)] if b > 0.0 else [(root, math.inf)]
+    discriminant = b * b - a * c
+    if discriminant < 0.0:
+        return [] if a > 0.0 else [(-math.inf, math.inf)]
+    # The root with the larger magnitude first, which loses no digits; the other by Vieta.
+    q = -(b + math.copysign(math.sqrt(discriminant), b))
+    roots = sorted((q / a, c / q if q else 0.0))
+    return [(roots[0], roots[1])] if a > 0.0 else [(-math.inf, roots[0]), (roots[1], math.inf)]
+
+
+def _triangles(mesh: Faces, origin: Floats, direction: Floats) -> Entry | None:
+    """Return the nearest crossing, of either side (Möller and Trumbore 1997)."""
+    corners = mesh.vertices[mesh.faces]
+    one, other = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
+    across = np.cross(direction, other)
+    volume = np.einsum("ij,ij->i", one, across)
+    usable = np.abs(volume) > _PARALLEL * np.abs(one).max(axis=1) * np.abs(other).max(axis=1)
+    scale = np.divide(1.0, volume, out=np.zeros_like(volume), where=usable)
+    arm = origin - corners[:, 0]
+    u = np.einsum("ij,ij->i", arm, across) * scale
+    turn = np.cross(arm, one)
+    v = (turn @ direction) * scale
+    times = np.einsum("ij,ij->i", other, turn) * scale
+    edge = 1e-12
+    hits = usable & (u >= -edge) & (v >= -edge) & (u + v <= 1 + edge) & (times >= 0.0)
+    if not hits.any():
+        return None
+    first = int(np.argmin(np.where(hits, times, math.inf)))
+    normal = np.cross(one[first], other[first])
+    normal /= np.linalg.norm(normal)
+    return float(times[first]), -normal if normal @ direction > 0.0 else normal

@@ -1,0 +1,134 @@
+"""Which pairs of bodies are looked at.
+
+Not looked at are bodies that are rigidly connected, bodies joined by one articulation, and what rules except.
+Rules are data: a model keeps them under the name :data:`RULES`, for whoever makes a scene of it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from kineverse.errors import UnknownNameError, ValueRejectedError, suggest
+from kineverse.model.body import Pose
+from kineverse.model.frame import WORLD, Frame
+from kineverse.model.view import ModelView
+
+from .pieces import matches
+from .table import Flags
+
+RULES = "geometry/rules"
+"""Where a model keeps its rules."""
+
+_FREE = 6
+
+
+class Rule(NamedTuple):
+    """Whether pairs of bodies are looked at; the last rule that is about a pair decides.
+
+    Attributes
+    ----------
+    a, b
+        Names of bodies, or patterns in which ``*`` is any text, also across slashes.
+    check
+        Whether to look at such pairs. True brings back what is adjacent, or excepted by an earlier rule.
+    why
+        For people.
+    """
+
+    a: str
+    b: str = "*"
+    check: bool = False
+    why: str = ""
+
+
+def rules_of(entries: Any) -> tuple[Rule, ...]:
+    """Return rules from what a model or document keeps of them.
+
+    Raises
+    ------
+    ValueRejectedError
+        If an entry is no ``(a, b, check, why)``.
+    """
+    if isinstance(entries, str | Rule) or not isinstance(entries, Iterable):
+        raise ValueRejectedError(f"Rules are a sequence of kv.geometry.Rule, not {entries!r}.")
+    rules = []
+    for entry in entries:
+        try:
+            rule = Rule(*entry)
+        except TypeError:
+            rule = Rule("")
+        if not (rule.a and all(isinstance(x, str) for x in (rule.a, rule.b, rule.why))):
+            raise ValueRejectedError(f"A rule is (a, b, check, why), as kv.geometry.Rule, not {entry!r}.")
+        rules.append(Rule(rule.a, rule.b, bool(rule.check), rule.why))
+    return tuple(rules)
+
+
+def rules_as_data(rules: Iterable[Rule]) -> tuple[tuple[str, str, bool, str], ...]:
+    """Return rules as a model can keep them: ``edit.write(RULES, rules_as_data(rules))``."""
+    return tuple((rule.a, rule.b, rule.check, rule.why) for rule in rules_of(rules))
+
+
+def check_names(rules: Sequence[Rule], model: ModelView) -> None:
+    """Raise an error for rules about a body by a name that no frame has; patterns may match nothing."""
+    for name in (name for rule in rules for name in (rule.a, rule.b)):
+        if not any(sign in name for sign in "*?[") and name not in model.frames and name != WORLD:
+            raise UnknownNameError(
+                f"A rule is about '{name}', which is no frame. {suggest(name, model.frames, 'frame')}"
+            )
+
+
+def allowed(model: ModelView, bodies: Sequence[str], rules: Sequence[Rule]) -> Flags:
+    """Return (B, B) flags, 1 for pairs that are looked at."""
+    table = 1 - adjacent(model, bodies)
+    for rule in rules:
+        ones = np.array([matches(name, (rule.a,)) for name in bodies], dtype=bool)
+        others = np.array([matches(name, (rule.b,)) for name in bodies], dtype=bool)
+        table[np.outer(ones, others) | np.outer(others, ones)] = rule.check
+    np.fill_diagonal(table, 0)
+    return np.ascontiguousarray(table)
+
+
+def adjacent(model: ModelView, bodies: Sequence[str]) -> Flags:
+    """Return (B, B) flags, 1 for pairs that are rigidly connected or joined by one articulation.
+
+    What hangs on something that does not move at all is joined only to the body that it hangs on: a door to
+    its cupboard, and not to the wall. What moves freely, with six speeds, is joined to nothing.
+    """
+    frames = dict(model.frames)
+    groups = {name: _group(name, frames) for name in bodies}
+    numbers = {group: k for k, group in enumerate(dict.fromkeys(groups.values()))}
+    number = np.array([numbers[groups[name]] for name in bodies], dtype=int)
+    table: Flags = (number[:, None] == number[None, :]).astype(np.uint8)
+    place = {name: k for k, name in enumerate(bodies)}
+    for group, own in numbers.items():
+        if group == WORLD:
+            continue
+        parent = frames[group].parent
+        parent_group = _group(parent, frames)
+        if len(model.speeds_of(group, parent)) >= _FREE:
+            continue
+        if parent_group == WORLD:
+            carrier = _carrier(parent, frames, place)
+            joined = number == -1 if carrier is None else np.arange(len(bodies)) == carrier
+        else:
+            joined = number == numbers.get(parent_group, -1)
+        members = number == own
+        table[np.outer(members, joined) | np.outer(joined, members)] = 1
+    return table
+
+
+def _group(name: str, frames: Mapping[str, Frame]) -> str:
+    """Return the frame with which one is rigidly connected and that moves in its parent; or the world."""
+    while name != WORLD and all(isinstance(factor, Pose) for factor in frames[name].factors):
+        name = frames[name].parent
+    return name
+
+
+def _carrier(name: str, frames: Mapping[str, Frame], place: Mapping[str, int]) -> int | None:
+    """Return the number of the nearest body at or above a frame that does not move."""
+    while name not in place and name != WORLD:
+        name = frames[name].parent
+    return place.get(name)

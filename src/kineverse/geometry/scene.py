@@ -1,0 +1,258 @@
+"""The collision scene of a model: what is how near to what, at a state."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from kineverse.errors import UnknownNameError, suggest
+from kineverse.model.frame import WORLD
+from kineverse.model.kinematics import ancestors
+from kineverse.model.view import ModelView
+from kineverse.symbols import Symbol
+
+from . import probing, queries
+from .expressions import PairDistance, Parameters, pair_distance, parameters_of
+from .mesh_files import Floats
+from .mirror import Mirror
+from .moving import Motion
+from .results import Closest, Hit, Nearby
+from .rules import Rule
+
+
+class Scene:
+    """The bodies of a model and where they are, for one thread; as many side by side as wanted.
+
+    It follows the model: after an edit the next question is about the new version. Bodies stand where the
+    last :meth:`update` put them. Files are read when the first question needs them. A body without collision
+    shapes is there as what is seen of it, a mesh as its convex hull.
+
+    Parameters
+    ----------
+    model
+        A model or a snapshot of one.
+    rules
+        Which pairs of bodies are looked at, beside those that the model keeps under ``geometry/rules``; see
+        :class:`Rule`.
+    triangles
+        Bodies, or patterns, whose meshes stay as they are: surfaces without an inside.
+    leave_out
+        Bodies, or patterns, that do not take part.
+
+    Raises
+    ------
+    MissingExtraError
+        If coal is not installed.
+    UnknownNameError
+        If a rule is about a frame that does not exist.
+    """
+
+    def __init__(
+        self,
+        model: ModelView,
+        *,
+        rules: Iterable[Rule] = (),
+        triangles: Iterable[str] = (),
+        leave_out: Iterable[str] = (),
+    ) -> None:
+        self.model = model
+        self._mirror = Mirror(model, rules, triangles, leave_out)
+        self._parameters: dict[tuple[str, str], Parameters] = {}
+
+    @property
+    def bodies(self) -> tuple[str, ...]:
+        """The bodies that take part, in the order of the model."""
+        self._mirror.follow()
+        return self._mirror.bodies
+
+    @property
+    def inputs(self) -> tuple[Symbol, ...]:
+        """The symbols that poses depend on: the order of a vector given to :meth:`update`."""
+        self._mirror.follow()
+        return self._mirror.inputs
+
+    def update(self, state: Mapping[Any, float] | Sequence[float] | Floats) -> None:
+        """Put everything where it is at a state.
+
+        Parameters
+        ----------
+        state
+            A state or a mapping from symbols or names to values, of which speeds are not needed; or the
+            values of :attr:`inputs` as a vector, which is faster [m], [rad].
+
+        Raises
+        ------
+        UnknownNameError
+            If a value is missing or one is for a symbol that the model does not know.
+        ShapeError
+            If a vector has another length.
+        ValueRejectedError
+            If a value is NaN or a pose is not finite, naming the bodies; then everything stays where it was.
+        """
+        self._mirror.update(state)
+
+    def pose(self, body: str) -> npt.NDArray[np.float64]:
+        """Return where a body was put, world_T_body, (4, 4) [m]."""
+        mirror = self._mirror
+        piece = mirror.members[mirror.number(body)][0]
+        mirror.ready(())
+        world_T_piece = np.vstack([mirror.table.poses[piece], [0.0, 0.0, 0.0, 1.0]])
+        return np.asarray(world_T_piece @ np.linalg.inv(mirror.pieces[piece].shape.origin.matrix))
+
+    # -- distances -----------------------------------------------------------------------------------------
+
+    def distance(self, a: str, b: str) -> Closest:
+        """Return how near two bodies are, whatever the rules say.
+
+        Raises
+        ------
+        UnknownNameError
+            If one of them has no shapes, or there was no :meth:`update` yet.
+        KineverseError
+            If one of its shapes cannot be used, naming body and file.
+        """
+        return queries.pair(self._mirror, a, b)
+
+    def distances(self, pairs: Iterable[tuple[str, str]]) -> list[Closest]:
+        """Return how near the two bodies of each pair are, in the order of the pairs."""
+        return [queries.pair(self._mirror, a, b) for a, b in pairs]
+
+    def around(self, body: str, radius: float = math.inf) -> list[Closest]:
+        """Return how near others are to a body, ``a`` in the results, nearest first, within a radius [m]."""
+        return queries.around(self._mirror, body, radius)
+
+    def within(self, radius: float) -> list[Closest]:
+        """Return all pairs of bodies within a radius of each other [m], nearest first.
+
+        Bounds are carried from one state to the next, so that the cost follows what is near.
+        """
+        return queries.within(self._mirror, radius)
+
+    def between(self, one: str, other: str, radius: float) -> list[Closest]:
+        """Return the pairs within a radius [m] of which one body is at or below each of two frames."""
+        first, second = self._below(one), self._below(other)
+        return queries.within(
+            self._mirror, radius, lambda a, b: (a in first and b in second) or (b in first and a in second)
+        )
+
+    def inside(self, frame: str, radius: float) -> list[Closest]:
+        """Return the pairs within a radius [m] that are both at or below a frame: self-collision."""
+        return self.between(frame, frame, radius)
+
+    def expression(self, a: str, b: str) -> PairDistance:
+        """Return the signed distance of two bodies as an expression, exact to first order at the state now.
+
+        At other states give it :meth:`expression_values` of there; the symbols are the same every time.
+        """
+        closest, *poses = self._with_poses(a, b)
+        if (a, b) not in self._parameters:
+            self._parameters[a, b] = parameters_of(closest, *poses)
+        return pair_distance(self.model, a, b, self._parameters[a, b])
+
+    def expression_values(self, pairs: PairDistance | Iterable[PairDistance]) -> dict[Symbol, float]:
+        """Return the values that the parameters of distances have now: to be added to a state."""
+        values: dict[Symbol, float] = {}
+        for pair in [pairs] if isinstance(pairs, PairDistance) else pairs:
+            values.update(pair.values(*self._with_poses(pair.a, pair.b)))
+        return values
+
+    def _with_poses(self, a: str, b: str) -> tuple[Closest, Floats, Floats]:
+        return self.distance(a, b), self.pose(a), self.pose(b)
+
+    def first_contact(self, margin: float = 0.0) -> Closest | None:
+        """Return the first pair found within a margin [m], always the same at a state; None if none is."""
+        return queries.first(self._mirror, margin)
+
+    @property
+    def in_collision(self) -> bool:
+        """Whether any pair touches."""
+        return self.first_contact() is not None
+
+    def looks_at(self, a: str, b: str) -> bool:
+        """Return whether a pair is looked at, by adjacency and rules."""
+        one, other = self._mirror.number(a), self._mirror.number(b)
+        return bool(self._mirror.table.allowed[one, other])
+
+    def never_touching(self, states: Iterable[Mapping[Any, float]], margin: float = 0.0) -> tuple[Rule, ...]:
+        """Return rules that except the pairs which are within a margin [m] at none of some states.
+
+        That is an observation and no proof: choose states over the whole range. The scene stays at the last.
+        """
+        met: set[frozenset[str]] = set()
+        every = list(states)
+        for state in every:
+            self.update(state)
+            met.update(frozenset((found.a, found.b)) for found in self.within(margin))
+        bodies, table = self.bodies, self._mirror.table.allowed
+        pairs = [(a, b) for k, a in enumerate(bodies) for m, b in enumerate(bodies[:k]) if table[k, m]]
+        why = f"never within {margin:g} m at {len(every)} states"
+        return tuple(Rule(b, a, False, why) for a, b in pairs if frozenset((a, b)) not in met)
+
+    # -- rays and points -----------------------------------------------------------------------------------
+
+    def ray(self, origin: npt.ArrayLike, direction: npt.ArrayLike, length: float = math.inf) -> Hit | None:
+        """Return what a ray meets first, None if nothing.
+
+        Parameters
+        ----------
+        origin, direction
+            (3,) in the world [m]; the direction has any length but 0.
+        length
+            How far to look [m].
+        """
+        return probing.cast(self._mirror, origin, direction, length)
+
+    def point(self, point: npt.ArrayLike, radius: float = math.inf) -> Nearby | None:
+        """Return what is nearest to a point (3,) in the world within a radius [m], None if nothing is.
+
+        Of what the point is inside of, that is where it is deepest. Triangles have no inside.
+        """
+        return probing.locate(self._mirror, point, radius)
+
+    # -- symbols -------------------------------------------------------------------------------------------
+
+    def moved_by(self, symbols: Symbol | str | Iterable[Symbol | str]) -> tuple[str, ...]:
+        """Return the bodies that move in the world with some symbols, in the order of the model.
+
+        A wheel's speed moves the whole robot, the crank of a loop all that follows it.
+
+        Raises
+        ------
+        UnknownNameError
+            For a symbol that the model does not know.
+        """
+        motion = Motion(self.model, _several(symbols))
+        return tuple(body for body in self.bodies if motion.moves(body))
+
+    def affected_by(self, symbols: Symbol | str | Iterable[Symbol | str]) -> tuple[tuple[str, str], ...]:
+        """Return the pairs that are looked at whose distance depends on some symbols."""
+        motion = Motion(self.model, _several(symbols))
+        bodies, table = self.bodies, self._mirror.table.allowed
+        ones, others = np.nonzero(np.triu(table))
+        pairs = ((bodies[i], bodies[j]) for i, j in zip(ones.tolist(), others.tolist(), strict=True))
+        return tuple(pair for pair in pairs if motion.moves_between(*pair))
+
+    def near_what_moves(self, symbols: Symbol | str | Iterable[Symbol | str], radius: float) -> list[Closest]:
+        """Return the pairs within a radius [m] whose distance depends on some symbols, nearest first."""
+        motion = Motion(self.model, _several(symbols))
+        return queries.within(self._mirror, radius, motion.moves_between)
+
+    def _below(self, frame: str) -> frozenset[str]:
+        frames = self.model.frames
+        if frame != WORLD and frame not in frames:
+            raise UnknownNameError(f"There is no frame '{frame}'. {suggest(frame, frames, 'frame')}")
+        lookup = frames.__getitem__
+        return frozenset(
+            body for body in self.bodies if frame in (WORLD, body) or frame in ancestors(body, lookup)
+        )
+
+    def __repr__(self) -> str:
+        return f"<Scene: {len(self._mirror.pieces)} pieces of {len(self._mirror.bodies)} bodies>"
+
+
+def _several(symbols: Symbol | str | Iterable[Symbol | str]) -> list[Symbol | str]:
+    return [symbols] if isinstance(symbols, Symbol | str) else list(symbols)

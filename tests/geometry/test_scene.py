@@ -1,0 +1,306 @@
+"""A scene answers what brute force answers, at every state, after every edit, in every thread."""
+
+from __future__ import annotations
+
+import threading
+
+import numpy as np
+import pytest
+from scenes import arm_among_boxes, body, brute_force, by_names, random_state
+
+import kineverse as kv
+from kineverse.geometry import Rule, Scene, mirror, pieces, sweep, sweep_native
+from kineverse.model.body import Body, Box, Shape, Sphere
+
+
+@pytest.fixture(scope="module")
+def model():
+    return arm_among_boxes()
+
+
+@pytest.fixture(params=["numpy", pytest.param("c", marks=pytest.mark.compiler)])
+def either_sweep(request, monkeypatch):
+    """Both ways to find what is near."""
+    library = sweep_native.SweepLibrary()
+    if request.param == "c":
+        assert library.prepare(wait=True)
+    else:
+        library.place, library.near = sweep.place, sweep.near
+        library.prepare = lambda wait=False: False
+    for module in ("mirror", "queries"):
+        monkeypatch.setattr(f"kineverse.geometry.{module}.sweep_library", library)
+
+
+def test_what_is_near_is_what_brute_force_finds(model, either_sweep):
+    scene = Scene(model)
+    rng = np.random.default_rng(1)
+    state = random_state(model, rng)
+    for step in range(25):
+        size = 0.5 if step % 10 == 9 else 0.01
+        state = state.updated({s: v + float(rng.normal()) * size for s, v in state.items()})
+        scene.update(state)
+        expected = brute_force(scene, state)
+        radius = (0.0, 0.1, 0.4)[step % 3]
+        near = scene.within(radius)
+        want = {frozenset(names): d for names, d in expected.items() if d <= radius}
+        assert by_names(near).keys() == want.keys()
+        for names, distance in by_names(near).items():
+            assert distance == pytest.approx(want[names], abs=1e-6)
+        assert [r.distance for r in near] == sorted(r.distance for r in near)
+        assert scene.in_collision == any(d <= 0 for d in expected.values())
+
+
+def test_most_pairs_are_settled_without_measuring(model):
+    scene = Scene(model)
+    state = model.default_state()
+    scene.update(state)
+    scene.within(0.3)
+    before = scene._mirror.narrow.calls
+    for k in range(20):
+        scene.update(state.updated({"j0": 0.002 * k}))
+        scene.within(0.3)
+    measured = (scene._mirror.narrow.calls - before) / 20
+    assert measured < 0.3 * len(brute_force(scene, state))
+
+
+def test_one_against_all_and_lists_of_pairs(model):
+    scene = Scene(model)
+    state = random_state(model, np.random.default_rng(4))
+    scene.update(state)
+    expected = brute_force(scene, state)
+    around = scene.around("hand")
+    assert all(r.a == "hand" for r in around)
+    assert {r.b: pytest.approx(r.distance, abs=1e-6) for r in around} == {
+        (set(names) - {"hand"}).pop(): d for names, d in expected.items() if "hand" in names
+    }
+    assert [r.b for r in scene.around("hand", around[1].distance)] == [r.b for r in around[:2]]
+    pairs = [("hand", "box0"), ("box0", "hand"), ("box1", "box2")]
+    one, other, boxes = scene.distances(pairs)
+    assert (one.a, one.b, other.a, other.b) == ("hand", "box0", "box0", "hand")
+    assert one.distance == other.distance
+    np.testing.assert_array_equal(one.point_a, other.point_b)
+    np.testing.assert_array_equal(one.normal, -other.normal)
+    assert boxes.distance == pytest.approx(boxes.normal @ (boxes.point_b - boxes.point_a), abs=1e-9)
+
+
+def test_answers_do_not_depend_on_what_was_asked_before(model):
+    rng = np.random.default_rng(6)
+    states = [random_state(model, rng) for _ in range(6)]
+    used = Scene(model)
+    for state in states[:-1]:
+        used.update(state)
+        used.within(0.5)
+        used.first_contact()
+    fresh = Scene(model)
+    for scene in (used, fresh):
+        scene.update(states[-1])
+    one, other = used.within(0.4), fresh.within(0.4)
+    assert [(r.a, r.b, r.distance) for r in one] == [(r.a, r.b, r.distance) for r in other]
+    for a, b in zip(one, other, strict=True):
+        np.testing.assert_array_equal(a.normal, b.normal)
+    first, same = used.first_contact(0.2), fresh.first_contact(0.2)
+    assert (first.a, first.b, first.distance) == (same.a, same.b, same.distance)
+
+
+def test_parts_of_a_scene_against_each_other(model):
+    scene = Scene(model)
+    state = random_state(model, np.random.default_rng(8))
+    scene.update(state)
+    everything = by_names(scene.within(0.5))
+    own = {f"link{k}" for k in range(5)} | {"base", "hand"}
+    assert by_names(scene.inside("base", 0.5)) == {n: d for n, d in everything.items() if n <= own}
+    assert by_names(scene.between("base", "ball", 0.5)) == {
+        n: d for n, d in everything.items() if n & own and "ball/body" in n
+    }
+
+
+def test_two_scenes_in_two_threads_answer_as_alone(model):
+    rng = np.random.default_rng(9)
+    states = [[random_state(model, rng) for _ in range(40)] for _ in range(2)]
+
+    def answers(scene, states):
+        found = []
+        for state in states:
+            scene.update(state)
+            found.append([(r.a, r.b, r.distance, *r.point_a, *r.normal) for r in scene.within(0.2)])
+        return found
+
+    alone = [answers(Scene(model), s) for s in states]
+    together = [None, None]
+
+    def run(k):
+        together[k] = answers(Scene(model), states[k])
+
+    threads = [threading.Thread(target=run, args=(k,)) for k in range(2)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert together == alone
+
+
+def test_a_vector_is_a_state(model):
+    by_name, by_vector = Scene(model), Scene(model)
+    state = random_state(model, np.random.default_rng(2))
+    by_name.update(dict(state))
+    by_vector.update(np.array([state[s] for s in by_vector.inputs]))
+    assert by_names(by_name.within(0.3)) == by_names(by_vector.within(0.3))
+    np.testing.assert_allclose(by_name.pose("hand"), model.fk("hand")(state), atol=1e-12)
+
+
+# -- edits -------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def counted(monkeypatch):
+    """How often pieces are made, solids are asked for, and poses are compiled."""
+    counts = {"pieces": 0, "solids": 0, "compiled": 0}
+
+    def counting(key, function):
+        def wrapped(*args, **options):
+            counts[key] += 1
+            return function(*args, **options)
+
+        return wrapped
+
+    monkeypatch.setattr(pieces, "Piece", counting("pieces", pieces.Piece))
+    monkeypatch.setattr(pieces, "solid_of", counting("solids", pieces.solid_of))
+    monkeypatch.setattr(mirror, "compile_expressions", counting("compiled", mirror.compile_expressions))
+    return counts
+
+
+def test_an_edit_changes_what_it_touches(counted):
+    model = arm_among_boxes()
+    scene = Scene(model)
+    state = random_state(model, np.random.default_rng(3))
+    scene.update(state)
+    scene.within(0.3)
+
+    def after(change):
+        counted.update(dict.fromkeys(counted, 0))
+        with model.edit() as edit:
+            change(edit)
+        near = scene.within(0.3)
+        fresh = Scene(model)
+        work = dict(counted)
+        fresh.update({**state, **{s: model.default_state()[s] for s in model.symbols if s not in state}})
+        assert by_names(near) == by_names(fresh.within(0.3))
+        made = len(fresh._mirror.pieces)
+        return {**work, "pieces": work["pieces"] - made, "compiled": work["compiled"] - 1}
+
+    def constrain(edit):
+        edit.constrain("limit", 0, kv.position("j1"), 1)
+
+    def stand(edit):
+        edit.add_frame("post", "world", kv.translation(0.5, 0, 0), body(Box((0.1, 0.1, 1))))
+
+    def shift(edit):
+        edit.attach("post", "world", kv.translation(0.4, 0, 0))
+
+    def grow(edit):
+        edit.add_frame("finger", "hand", kv.translation(0, 0, 0.1), body(Sphere(0.02), Sphere(0.03)))
+
+    def remove(edit):
+        edit.remove("frame post")
+        edit.remove("attach post to world")
+
+    assert after(constrain) == {"pieces": 0, "solids": 0, "compiled": 0}
+    assert after(stand) == {"pieces": 1, "solids": 1, "compiled": 0}
+    assert after(shift) == {"pieces": 1, "solids": 1, "compiled": 0}
+    assert after(grow) == {"pieces": 2, "solids": 2, "compiled": 1}
+    assert after(remove) == {"pieces": 0, "solids": 0, "compiled": 0}
+
+
+def test_what_is_picked_up_goes_with_the_hand():
+    model = arm_among_boxes(boxes=1)
+    state = random_state(model, np.random.default_rng(5))
+    scene = Scene(model)
+    scene.update(state)
+    assert scene.looks_at("hand", "box0")
+    with model.edit() as edit:
+        edit.attach("box0", "hand", kv.translation(0, 0, 0.3))
+    assert not scene.looks_at("hand", "box0")  # held, so they may touch
+    assert scene.looks_at("link1", "box0")
+    np.testing.assert_allclose(scene.pose("box0"), model.fk("box0")(state), atol=1e-12)
+    other = state.updated({"j0": 0.9})
+    scene.update(other)
+    assert by_names(scene.within(0.3)) == {
+        frozenset(n): pytest.approx(d, abs=1e-6) for n, d in brute_force(scene, other).items() if d <= 0.3
+    }
+
+
+def test_after_an_edit_a_new_symbol_needs_a_value():
+    model = arm_among_boxes(boxes=1)
+    scene = Scene(model)
+    scene.update(model.default_state())
+    with model.edit() as edit:
+        edit.add_frame("flap", "world", kv.rotation_z(kv.position("flap")), body(Box((1, 0.1, 0.1))))
+    with pytest.raises(kv.UnknownNameError, match=r"flap.*update"):
+        scene.within(0.1)
+    scene.update(model.default_state())
+    assert scene.distance("flap", "box0").distance > 0
+
+
+# -- rules -------------------------------------------------------------------------------------------------
+
+
+def test_neighbours_are_not_looked_at(model):
+    scene = Scene(model)
+    assert not scene.looks_at("link0", "link1")
+    assert not scene.looks_at("link4", "hand")  # rigidly connected
+    assert not scene.looks_at("link3", "hand")  # joined by one articulation, through link4
+    assert not scene.looks_at("box0", "box1")  # neither ever moves
+    assert scene.looks_at("link0", "link2")
+    assert scene.looks_at("base", "box0")  # the rail does not join the base to everything that stands
+    assert scene.looks_at("ball/body", "box0")
+
+
+def test_a_door_is_joined_to_what_it_hangs_on_and_not_to_the_wall():
+    model = kv.load("kitchen")
+    scene = Scene(model)
+    assert not scene.looks_at("kitchen/fridge_door", "kitchen/fridge")
+    assert scene.looks_at("kitchen/fridge_door", "kitchen/wall")
+
+
+def test_rules_are_data_and_the_last_one_decides(tmp_path):
+    model = arm_among_boxes()
+    scene = Scene(model)
+    assert scene.looks_at("hand", "box0")
+    stored = (Rule("hand", "box*", why="it pushes them"), Rule("hand", "box1", check=True))
+    with model.edit() as edit:
+        edit.write(kv.geometry.RULES, kv.geometry.rules_as_data(stored))
+    assert not scene.looks_at("hand", "box0")
+    assert scene.looks_at("hand", "box1")
+    model.save(tmp_path / "m.kv.json")
+    again = Scene(kv.load(tmp_path / "m.kv.json"), rules=[Rule("link0", "link1", check=True)])
+    assert not again.looks_at("box0", "hand")
+    assert again.looks_at("box1", "hand")
+    assert again.looks_at("link1", "link0")
+
+
+def test_pairs_that_never_touched_are_a_rule(model):
+    rng = np.random.default_rng(0)
+    states = [random_state(model, rng) for _ in range(30)]
+    scene = Scene(model)
+    rules = scene.never_touching(states)
+    assert rules
+    quiet = Scene(model, rules=rules)
+    for state in states:
+        for s in (scene, quiet):
+            s.update(state)
+        assert by_names(scene.within(0.0)) == by_names(quiet.within(0.0))
+        assert len(quiet.within(0.5)) <= len(scene.within(0.5))
+
+
+def test_bodies_without_collision_shapes_are_what_is_seen_of_them():
+    model = kv.Model()
+    with model.edit() as edit:
+        edit.add_frame("seen", "world", np.eye(4), Body(visuals=(Shape(Box((1, 1, 1))),)))
+        both = Body(visuals=(Shape(Box((9, 9, 9))),), collisions=(Shape(Sphere(0.5)),))
+        edit.add_frame("both", "world", kv.translation(kv.position("x"), 0, 0), both)
+        edit.add_frame("neither", "world", np.eye(4), Body())
+    scene = Scene(model)
+    assert scene.bodies == ("seen", "both")
+    scene.update({"x": 2.0})
+    assert scene.distance("seen", "both").distance == pytest.approx(1.0)
+    assert pieces.touched_by_what_is_seen(model) == ["seen"]
