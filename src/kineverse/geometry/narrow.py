@@ -18,7 +18,7 @@ import numpy as np
 from kineverse.model.body import Sphere
 
 from .mesh_files import Floats
-from .solids import Solid, solid_of
+from .solids import Solid, coal_engine, solid_of
 
 APART_TOLERANCE, DEPTH_TOLERANCE = 1e-8, 1e-6
 """What coal's iterations stop at, between things apart and in penetration [m].
@@ -54,9 +54,7 @@ class Narrow:
     """
 
     def __init__(self, solids: Sequence[Solid | None], poses: Floats) -> None:
-        import coal
-
-        self._coal = coal
+        self._coal = coal = coal_engine()
         self._solids = solids
         self._parts = [(pose[:, :3], pose[:, 3]) for pose in poses]
         self._transforms = [coal.Transform3s() for _ in poses]

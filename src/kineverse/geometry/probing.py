@@ -74,11 +74,12 @@ def locate(mirror: Mirror, point: npt.ArrayLike, radius: float) -> Nearby | None
 
 
 def _vector(values: npt.ArrayLike, what: str) -> Floats:
-    vector = np.asarray(values, dtype=float)
+    try:
+        vector = np.asarray(values, dtype=float)
+    except (TypeError, ValueError):
+        vector = np.zeros(0)
     if vector.shape != (3,):
-        raise ShapeError(
-            f"The {what} is a vector of three numbers in the world, not of shape {vector.shape}."
-        )
+        raise ShapeError(f"The {what} is a vector of three numbers in the world, not {values!r}.")
     if not np.isfinite(vector).all():
         raise ValueRejectedError(f"The {what} {vector} is not finite.")
     return vector

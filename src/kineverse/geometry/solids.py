@@ -81,7 +81,7 @@ def solid_of(geometry: Geometry, triangles: bool = False) -> Solid:
     ValueRejectedError
         If sizes are not positive numbers, or a mesh is degenerate or of an impossible size.
     """
-    _engine()
+    coal_engine()
     if not isinstance(geometry, Mesh):
         return _primitive(geometry)
     scale = tuple(map(float, geometry.scale))
@@ -95,7 +95,8 @@ def solid_of(geometry: Geometry, triangles: bool = False) -> Solid:
         return _by_content[key]
 
 
-def _engine() -> Any:
+def coal_engine() -> Any:
+    """Return coal; raises MissingExtraError if it is not installed."""
     try:
         import coal
     except ImportError as error:
@@ -123,7 +124,7 @@ def _hull(points: Floats) -> Solid:
 
 
 def _triangles(vertices: Floats, faces: Any) -> Solid:
-    bvh = _engine().BVHModelOBBRSS()
+    bvh = coal_engine().BVHModelOBBRSS()
     bvh.beginModel(len(faces), len(vertices))
     bvh.addVertices(vertices)
     bvh.addTriangles(np.ascontiguousarray(faces))
@@ -147,7 +148,7 @@ def _primitive(geometry: Primitive) -> Solid:
         raise ValueRejectedError(
             f"{geometry} has sizes beyond {SMALLEST_SIZE:g} m to {LARGEST_SIZE:g} m, which cannot be right."
         )
-    coal = _engine()
+    coal = coal_engine()
     stand_in = None
     x, y, z = (*sizes, 0.0, 0.0)[:3]
     if isinstance(geometry, Box):

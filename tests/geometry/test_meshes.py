@@ -1,0 +1,220 @@
+"""Meshes as hulls and as triangles; bad ones are named, and the scene goes on without them."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import trimesh
+from scenes import body
+from scipy.spatial import ConvexHull
+
+import kineverse as kv
+from kineverse.geometry import Scene, mesh_files, solids
+from kineverse.geometry.hulls import THICKNESS, hull
+from kineverse.geometry.solids import solid_of
+from kineverse.model.body import Body, Box, Capsule, Cone, Cylinder, Ellipsoid, Mesh, Shape, Sphere
+
+
+def test_hulls_are_those_of_scipy():
+    rng = np.random.default_rng(0)
+    for scale in (1.0, 1e-3, 10.0):
+        points = rng.normal(size=(300, 3)) * scale
+        ours, theirs = hull(points), ConvexHull(points)
+        corners = np.array(sorted(np.array(ours.points()).tolist()))
+        np.testing.assert_allclose(corners, sorted(points[theirs.vertices].tolist()), atol=1e-12 * scale)
+        assert ours.computeVolume() == pytest.approx(theirs.volume)
+        assert trimesh.Trimesh(points).convex_hull.volume == pytest.approx(theirs.volume)
+
+
+def saved(mesh: trimesh.Trimesh, folder, name: str) -> Mesh:
+    mesh.export(folder / name)
+    return Mesh(name, folder=str(folder))
+
+
+@pytest.mark.parametrize("ending", ["stl", "obj", "dae", "ply"])
+def test_a_mesh_is_its_hull_or_its_triangles(tmp_path, ending):
+    torus = trimesh.creation.torus(0.5, 0.1)
+    mesh = saved(torus, tmp_path, f"torus.{ending}")
+    model = kv.Model()
+    with model.edit() as edit:
+        edit.add_frame("torus", "world", kv.translation(0, 0, kv.position("z")), body(mesh))
+        edit.add_frame("ball", "world", np.eye(4), body(Sphere(0.1)))
+    for triangles, around, above in ((), -0.2, 0.8), (("tor*",), 0.3, np.hypot(0.5, 1) - 0.2):
+        scene = Scene(model, triangles=triangles)
+        scene.update({"z": 0.0})
+        assert scene.distance("torus", "ball").distance == pytest.approx(around, abs=0.02)
+        scene.update({"z": 1.0})
+        assert scene.distance("torus", "ball").distance == pytest.approx(above, abs=0.02)
+
+
+def test_scale_stretches_and_mirrors(tmp_path):
+    corner = trimesh.Trimesh(
+        [[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]], [[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]]
+    )
+    mesh = saved(corner, tmp_path, "corner.stl")
+    for scale in ((1, 1, 1), (2, 3, 0.5), (-1, 1, 1), (-1, -2, -0.001)):
+        scaled = Mesh(mesh.uri, scale=scale, folder=mesh.folder)
+        for solid in (solid_of(scaled), solid_of(scaled, triangles=True)):
+            low, high = solid.centre - solid.half, solid.centre + solid.half
+            np.testing.assert_allclose(low, np.minimum(scale, 0), atol=1e-6)
+            np.testing.assert_allclose(high, np.maximum(scale, 0), atol=1e-6)
+        assert solid_of(scaled).engine.computeVolume() == pytest.approx(abs(np.prod(scale)) / 6, rel=1e-5)
+        assert solid_of(scaled) is solid_of(scaled)
+
+
+def test_files_of_equal_content_are_one_solid(tmp_path):
+    one = saved(trimesh.creation.box((1, 2, 3)), tmp_path, "one.stl")
+    (tmp_path / "other.stl").write_bytes((tmp_path / "one.stl").read_bytes())
+    assert solid_of(one) is solid_of(Mesh("other.stl", folder=str(tmp_path)))
+    assert solid_of(Box((1, 2, 3))) is solid_of(Box((1, 2, 3)))
+    assert solid_of(one) is not solid_of(one, triangles=True)
+
+
+def test_a_flat_mesh_is_given_a_thickness(tmp_path):
+    pane = trimesh.Trimesh([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], [[0, 1, 2], [0, 2, 3]])
+    solid = solid_of(saved(pane, tmp_path, "pane.stl"))
+    np.testing.assert_allclose(2 * solid.half, [1, 1, THICKNESS], atol=1e-9)
+
+
+BAD_MESHES = {
+    "missing.stl": None,
+    "empty.stl": b"",
+    "words.obj": b"this is no mesh",
+    "noise.stl": b"\x00\x01" * 400,
+    "noise.dae": b"<COLLADA>",
+    "what.xyz123": b"v 0 0 0",
+    "line.obj": b"v 0 0 0\nv 1 0 0\nv 2 0 0\nf 1 2 3\n",
+    "point.obj": b"v 1 1 1\nv 1 1 1\nv 1 1 1\nf 1 2 3\n",
+    "nan.obj": b"v 0 0 0\nv 1 0 nan\nv 0 1 0\nf 1 2 3\n",
+    "far.obj": b"v 0 0 0\nv 1e9 0 0\nv 0 1e9 0\nv 0 0 1e9\nf 1 2 3\nf 1 2 4\n",
+    "speck.obj": b"v 0 0 0\nv 1e-9 0 0\nv 0 1e-9 0\nv 0 0 1e-9\nf 1 2 3\nf 1 2 4\n",
+    "no_faces.obj": b"v 0 0 0\nv 1 0 0\nv 0 1 0\n",
+}
+BAD_SHAPES = [
+    Box((1, 0, 1)),
+    Box((1, -1, 1)),
+    Box((1, np.nan, 1)),
+    Sphere(0.0),
+    Sphere(np.inf),
+    Cylinder(0.1, 0.0),
+    Capsule(-0.1, 1.0),
+    Cone(0.1, -1.0),
+    Ellipsoid((1, 1, 0)),
+    Sphere(1e12),
+]
+
+
+def with_a_bad_one(geometry):
+    model = kv.Model()
+    with model.edit() as edit:
+        edit.add_frame("good", "world", kv.translation(kv.position("x"), 0, 0), body(Box((1, 1, 1))))
+        edit.add_frame("fine", "world", kv.translation(3, 0, 0), body(Sphere(0.5)))
+        edit.add_frame("bad", "world", kv.translation(5, 0, 0), Body(collisions=(Shape(geometry),)))
+    return model
+
+
+def check(model, *names):
+    """The error names body and file; the rest of the scene can be used, before and after it."""
+    scene = Scene(model)
+    scene.update({"x": 0.0})
+    for ask in (
+        lambda: scene.within(1.0),
+        lambda: scene.distance("good", "bad"),
+        lambda: scene.ray((0, 0, 9), (1, 0, 0)),
+    ):
+        with pytest.raises(kv.KineverseError) as caught:
+            ask()
+        assert all(name in str(caught.value) for name in ("'bad'", "leave_out", *names)), str(caught.value)
+        assert len(str(caught.value)) < 1500
+        assert scene.distance("good", "fine").distance == pytest.approx(2.0)
+    scene.update({"x": 1.0})
+    assert scene.distance("good", "fine").distance == pytest.approx(1.0)
+    without = Scene(model, leave_out=["bad"])
+    without.update({"x": 1.0})
+    assert [r.distance for r in without.within(2.0)] == [pytest.approx(1.0)]
+    with model.edit() as edit:
+        edit.remove("frame bad")
+    assert [r.distance for r in scene.within(2.0)] == [pytest.approx(1.0)]
+
+
+@pytest.mark.parametrize("name", BAD_MESHES)
+def test_a_bad_mesh_is_named_with_its_body(tmp_path, name):
+    if BAD_MESHES[name] is not None:
+        (tmp_path / name).write_bytes(BAD_MESHES[name])
+    check(with_a_bad_one(Mesh(name, folder=str(tmp_path))), name)
+
+
+@pytest.mark.parametrize("shape", BAD_SHAPES, ids=str)
+def test_sizes_that_cannot_be_are_named_with_their_body(shape):
+    check(with_a_bad_one(shape), type(shape).__name__.lower())
+
+
+@pytest.mark.parametrize("scale", [(0, 1, 1), (1, np.nan, 1), (1, 1, np.inf)])
+def test_a_scale_that_flattens_is_refused(tmp_path, scale):
+    mesh = saved(trimesh.creation.box(), tmp_path, "box.stl")
+    check(with_a_bad_one(Mesh(mesh.uri, scale=scale, folder=mesh.folder)), "box.stl", "scale")
+
+
+def test_an_enormous_file_is_not_read(tmp_path, monkeypatch):
+    monkeypatch.setattr(mesh_files, "LARGEST", 100)
+    mesh = saved(trimesh.creation.icosphere(), tmp_path, "large.stl")
+    check(with_a_bad_one(mesh), "large.stl", "MiB")
+
+
+def test_several_bad_ones_are_listed(tmp_path):
+    model = with_a_bad_one(Sphere(0.0))
+    with model.edit() as edit:
+        edit.add_frame("worse", "world", np.eye(4), body(Mesh("gone.stl", folder=str(tmp_path))))
+    scene = Scene(model)
+    scene.update({"x": 0.0})
+    with pytest.raises(kv.FormatError, match=r"2 shapes(.|\n)*'bad'(.|\n)*'worse'.*gone"):
+        scene.within(1.0)
+
+
+def test_a_pose_that_is_not_finite_moves_nothing():
+    model = kv.Model()
+    x = kv.position("x")
+    with model.edit() as edit:
+        edit.add_frame("odd", "world", kv.translation(np.sqrt(x), 0, 0), body(Box((1, 1, 1))))
+        edit.add_frame("ball", "world", kv.translation(3, 0, 0), body(Sphere(0.5)))
+    scene = Scene(model)
+    scene.update({"x": 1.0})
+    with pytest.raises(kv.ValueRejectedError, match="odd"):
+        scene.update({"x": -1.0})
+    with pytest.raises(kv.ValueRejectedError, match="NaN"):
+        scene.update({"x": np.nan})
+    assert scene.distance("odd", "ball").distance == pytest.approx(1.0)
+    scene.update([4.0])
+    assert scene.distance("odd", "ball").distance == pytest.approx(0.0, abs=1e-6)
+
+
+def test_wrong_names_and_values_are_errors():
+    model = with_a_bad_one(Sphere(0.5))
+    scene = Scene(model)
+    with pytest.raises(kv.UnknownNameError, match=r"'x'|x: call"):
+        scene.within(1.0)
+    with pytest.raises(kv.UnknownNameError, match="'x'"):
+        scene.update({})
+    with pytest.raises(kv.UnknownNameError, match="no symbol"):
+        scene.update({"x": 1.0, "y": 2.0})
+    with pytest.raises(kv.ShapeError):
+        scene.update([1.0, 2.0])
+    scene.update({"x": 1.0, "x:velocity": 0.0})
+    with pytest.raises(kv.UnknownNameError, match="'good'"):
+        scene.distance("goood", "fine")
+    with pytest.raises(kv.ValueRejectedError, match="itself"):
+        scene.distance("good", "good")
+    for radius in (-1.0, np.nan):
+        with pytest.raises(kv.ValueRejectedError, match="radius"):
+            scene.within(radius)
+    with pytest.raises(kv.UnknownNameError, match="rule"):
+        Scene(model, rules=[kv.geometry.Rule("good", "goood")])
+    with pytest.raises(kv.ValueRejectedError, match="rule"):
+        Scene(model, rules=[("good",), 3])
+
+
+def test_without_coal_the_extra_is_named(monkeypatch):
+    monkeypatch.setitem(__import__("sys").modules, "coal", None)
+    with pytest.raises(kv.MissingExtraError, match=r"\[geometry\]"):
+        Scene(with_a_bad_one(Sphere(0.5)))
+    assert solids.solid_of.__doc__
