@@ -178,6 +178,25 @@ def test_a_carried_coordinate_that_a_composition_leaves_alone_is_plain_at_once()
     assert document_of(built(text)) == text
 
 
+def test_a_loop_without_solution_is_to_blame_where_its_input_cancels():
+    """The Jacobian is NaN whatever b is, and so did not ask for b; looking for the reason did."""
+    nodes = [
+        ["symbol", "a", 0, "dof"],
+        ["symbol", "b", 0, "dof"],
+        ["symbol", "b", 2, "dof"],
+        ["constant", 5],
+        ["matrix", [1], [3]],
+        ["matrix", [1], [0]],
+        ["implicit", "i", [1], [0], 4, [0], 5, 5, [2]],
+        ["element", 6, 0],
+        ["symbol", "a", 1, "dof"],
+        ["matrix", [4, 4], [2, 0, 0, 0, None, 7, 8, 0, 0, 0, None, 0, 0, 0, 0, 0]],
+    ]
+    model = built(document(nodes, {"frames": {"h": {"parent": "world", "factors": [9]}}}))
+    with pytest.raises(kv.UnsolvedError, match="'i' has no solution at a = 0"):
+        model.jacobian("h")(model.default_state())
+
+
 @pytest.mark.parametrize("depth", [33, 65])
 def test_data_nested_deeper_than_arrays_can_be_overwritten_by_an_expression(depth):
     deep = 1

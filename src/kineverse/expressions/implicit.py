@@ -236,8 +236,12 @@ def explain(
     vector = ca.vertcat(*(s._sx for s in symbols)) if symbols else ca.SX(0, 1)
     for node in nodes:
         arguments = [ca.densify(lowered(a)) for a in node.arguments]
-        found = ca.Function("at", [vector], [ca.densify(lowered(node.value)), ca.vertcat(*arguments)])
-        value, inputs = (np.array(part).ravel() for part in found(numbers))
+        outputs = [ca.densify(lowered(node.value)), ca.vertcat(*arguments)]
+        # What cancels in the expression has no value here, and any will do.
+        given = {s.element_hash() for s in ca.symvar(vector)}
+        others = [s for s in ca.symvar(ca.vertcat(*outputs)) if s.element_hash() not in given]
+        found = ca.Function("at", [vector, ca.vertcat(*others)], outputs)
+        value, inputs = (np.array(part).ravel() for part in found(numbers, 0))
         # What was asked for at NaN owes no answer; if another function is to blame for it, that came first.
         if np.isnan(value).any() and not np.isnan(inputs).any():
             names = node.function.inputs
