@@ -112,6 +112,7 @@ class Mirror:
         table.put(np.arange(table.count))
         self._all_loaded = all(solid is not None for solid in self._solids)
         self.narrow = Narrow(self._solids, table.poses)
+        self._travel = table.travel.data
         self._measured: dict[tuple[int, int], tuple[float, float, float, Witness]] = {}
         if not same:
             self._compile([piece.pose for piece in moving])
@@ -198,18 +199,22 @@ class Mirror:
             self.table.choose_axis()
         self._all_loaded = pieces is None
 
-    def measured(self, i: int, j: int) -> tuple[float, Witness]:
-        """Return distance and witness of two pieces, i < j, from memory if neither has moved since."""
-        travel = self.table.travel.data
-        one, other = travel[i], travel[j]
+    def measured(self, i: int, j: int, limit: float) -> tuple[float, Witness | None]:
+        """Return distance and witness of two pieces, i < j, from memory if neither has moved since.
+
+        There is no witness if they are further apart than a limit.
+        """
+        one, other = self._travel[i], self._travel[j]
         known = self._measured.get((i, j))
         if known is not None and known[0] == one and known[1] == other:
             return known[2], known[3]
         distance = self.narrow.distance(i, j)
+        self.table.remember(i, j, distance)
+        if distance > limit:
+            return distance, None
         witness = self.narrow.witness()
         for vector in witness:
             vector.flags.writeable = False  # it is kept, and given out more than once
-        self.table.remember(i, j, distance)
         if len(self._measured) >= _MOST_MEASURED:
             self._measured.clear()
         self._measured[i, j] = one, other, distance, witness

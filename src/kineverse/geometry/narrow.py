@@ -60,7 +60,8 @@ class Narrow:
         self._transforms = [coal.Transform3s() for _ in poses]
         self._placed = [-1] * len(poses)
         self._time = 0
-        self._functors: dict[tuple[Solid, Solid], Any] = {}
+        self._functors: dict[tuple[int, int], Any] = {}
+        self._kept: list[tuple[Solid, Solid]] = []
         self._request, *self._rougher = (_request(coal, factor) for factor in (1.0, 10.0, 100.0))
         self._result = coal.DistanceResult()
         self._mended: Witness | None = None
@@ -73,19 +74,21 @@ class Narrow:
     def distance(self, i: int, j: int) -> float:
         """Return the signed distance of two pieces [m], and keep where it is for :meth:`witness`."""
         self.calls += 1
-        a, b = self._solids[i], self._solids[j]
-        assert a is not None
-        assert b is not None
-        result = self._result
+        placed, now = self._placed, self._time
+        for k in (i, j):
+            if placed[k] != now:
+                self._transforms[k].setTransform(*self._parts[k])
+                placed[k] = now
+        functor = self._functors.get((i, j)) or self._functor(i, j)
+        at_a, at_b, result = self._transforms[i], self._transforms[j], self._result
         result.clear()
         self._mended = None
-        functor = self._functor(a, b)
-        at_a, at_b = self._placed_at(i), self._placed_at(j)
         distance: float = functor(at_a, at_b, self._request, result)
         if _TOUCH < distance < 1e300:
             return distance
+        a, b = self._pair(i, j)
         if not (a.is_convex and b.is_convex):
-            return self._with_triangles(a, b, at_a, at_b, distance)
+            return self._with_triangles(a, b, at_a, at_b)
         for request in (*self._rougher, None):
             if -1e300 < distance < -_TOUCH and self._normal_is_right():
                 return distance
@@ -105,23 +108,20 @@ class Narrow:
         result = self._result
         return result.getNearestPoint1(), result.getNearestPoint2(), np.array(result.normal)
 
-    def _functor(self, a: Solid, b: Solid) -> Any:
-        functor = self._functors.get((a, b))
-        if functor is None:
-            # The solids are kept by the key, as coal does not keep what it computes with.
-            beside_a, beside_b = a.stand_in or a.engine, b.stand_in or b.engine
-            cylinder = self._coal.Cylinder
-            one = beside_a if isinstance(b.engine, cylinder) else a.engine
-            other = beside_b if isinstance(a.engine, cylinder) else b.engine
-            functor = self._functors[a, b] = self._coal.ComputeDistance(one, other)
-        return functor
+    def _pair(self, i: int, j: int) -> tuple[Solid, Solid]:
+        a, b = self._solids[i], self._solids[j]
+        assert a is not None
+        assert b is not None
+        return a, b
 
-    def _placed_at(self, i: int) -> Any:
-        transform = self._transforms[i]
-        if self._placed[i] != self._time:
-            transform.setTransform(*self._parts[i])
-            self._placed[i] = self._time
-        return transform
+    def _functor(self, i: int, j: int) -> Any:
+        a, b = self._pair(i, j)
+        cylinder = self._coal.Cylinder
+        one = a.stand_in if a.stand_in and isinstance(b.engine, cylinder) else a.engine
+        other = b.stand_in if b.stand_in and isinstance(a.engine, cylinder) else b.engine
+        functor = self._functors[i, j] = self._coal.ComputeDistance(one, other)
+        self._kept.append((a, b))  # coal does not keep what it computes with
+        return functor
 
     def _normal_is_right(self) -> bool:
         x, y, z = self._result.normal.tolist()
@@ -133,7 +133,7 @@ class Narrow:
         By how much and in which direction they were moved is taken off again. For flat faces that is exact,
         for round ones the rest is of second order in 0.1 mm.
         """
-        at_a, result = self._placed_at(i), self._result
+        at_a, result = self._transforms[i], self._result
         rotation, position = self._parts[j]
         for shift in self._ways_apart(i, j):
             shifted = self._coal.Transform3s(rotation, position + shift)
@@ -145,25 +145,23 @@ class Narrow:
                     self._mended = point_a, point_b - shift, normal
                     return distance - float(normal @ shift)
         # Nothing is left but the line between the centres, along which they overlap for certain.
-        solids = self._solids[i], self._solids[j]
-        centres = [
-            self._parts[k][0] @ s.centre + self._parts[k][1] for k, s in zip((i, j), solids, strict=True) if s
-        ]
-        normal = _unit(centres[1] - centres[0])
-        self._mended = centres[0], centres[1], normal
-        return float(normal @ (centres[1] - centres[0]))
+        start, end = self._centres(i, j)
+        normal = _unit(end - start)
+        self._mended = start, end, normal
+        return float(normal @ (end - start))
 
     def _ways_apart(self, i: int, j: int) -> list[Floats]:
-        a, b = self._solids[i], self._solids[j]
-        assert a is not None
-        assert b is not None
-        far = min(_APART, _APART_OF_RADIUS * min(a.radius, b.radius))
-        (rotation_a, at_a), (rotation_b, at_b) = self._parts[i], self._parts[j]
+        far = min(_APART, _APART_OF_RADIUS * min(solid.radius for solid in self._pair(i, j)))
+        start, end = self._centres(i, j)
         # Convex things in touch come apart along the line between any two points of their insides.
-        between = (rotation_b @ b.centre + at_b) - (rotation_a @ a.centre + at_a)
-        return [far * _unit(between), *(far * np.eye(3))]
+        return [far * _unit(end - start), *(far * np.eye(3))]
 
-    def _with_triangles(self, a: Solid, b: Solid, at_a: Any, at_b: Any, distance: float) -> float:
+    def _centres(self, i: int, j: int) -> tuple[Floats, Floats]:
+        a, b = self._pair(i, j)
+        (rotation_a, at_a), (rotation_b, at_b) = self._parts[i], self._parts[j]
+        return rotation_a @ a.centre + at_a, rotation_b @ b.centre + at_b
+
+    def _with_triangles(self, a: Solid, b: Solid, at_a: Any, at_b: Any) -> float:
         """Measure in touch where triangles take part: how deep in the triangle that is entered the most."""
         coal = self._coal
         request = coal.CollisionRequest(coal.CollisionRequestFlag.CONTACT, _CONTACTS)

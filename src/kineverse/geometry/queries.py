@@ -25,13 +25,13 @@ def pair(mirror: Mirror, a: str, b: str) -> Closest:
         raise ValueRejectedError(f"'{a}' is asked for its distance to itself.")
     members, others = mirror.members[one], mirror.members[other]
     mirror.ready((*members, *others))
-    nearest = _Nearest(mirror)
+    nearest = _Nearest(mirror, math.inf)
     if len(members) == len(others) == 1:
         nearest.take(min(members[0], others[0]), max(members[0], others[0]))
     else:
         left, right = np.repeat(members, len(others)), np.tile(others, len(members))
         _take_in_order(nearest, np.minimum(left, right), np.maximum(left, right))
-    (found,) = nearest.results(math.inf)
+    (found,) = nearest.results()
     return found if found.a == a else found.swapped()
 
 
@@ -39,10 +39,10 @@ def within(mirror: Mirror, radius: float, choice: Choice | None = None) -> list[
     """Return the pairs of bodies within a radius [m], nearest first; only those of ``choice`` if given."""
     _check_radius(radius)
     mirror.ready()
-    nearest = _Nearest(mirror)
+    nearest = _Nearest(mirror, radius)
     for i, j, low in _candidates(mirror, radius, choice):
         nearest.take(i, j, low)
-    return nearest.results(radius)
+    return nearest.results()
 
 
 def first(mirror: Mirror, margin: float, choice: Choice | None = None) -> Closest | None:
@@ -50,9 +50,9 @@ def first(mirror: Mirror, margin: float, choice: Choice | None = None) -> Closes
     _check_radius(margin)
     mirror.ready()
     for i, j, _ in sorted(_candidates(mirror, margin, choice)):
-        nearest = _Nearest(mirror)
+        nearest = _Nearest(mirror, margin)
         nearest.take(i, j)
-        if found := nearest.results(margin):
+        if found := nearest.results():
             return found[0]
     return None
 
@@ -66,9 +66,9 @@ def around(mirror: Mirror, body: str, radius: float) -> list[Closest]:
     others = np.flatnonzero(table.allowed[one][table.body] == 1).astype(np.int32)
     members = np.array(mirror.members[one], dtype=np.int32)
     left, right = np.repeat(members, len(others)), np.tile(others, len(members))
-    nearest = _Nearest(mirror)
+    nearest = _Nearest(mirror, radius)
     _take_in_order(nearest, np.minimum(left, right), np.maximum(left, right), radius)
-    return [found if found.a == body else found.swapped() for found in nearest.results(radius)]
+    return [found if found.a == body else found.swapped() for found in nearest.results()]
 
 
 def _candidates(mirror: Mirror, radius: float, choice: Choice | None) -> Iterable[tuple[int, int, float]]:
@@ -90,10 +90,11 @@ def _take_in_order(nearest: _Nearest, ones: Indices, others: Indices, radius: fl
 
 
 class _Nearest:
-    """The nearest pieces of each pair of bodies."""
+    """The nearest pieces of each pair of bodies, within a radius [m]."""
 
-    def __init__(self, mirror: Mirror) -> None:
+    def __init__(self, mirror: Mirror, radius: float) -> None:
         self.mirror = mirror
+        self._radius = radius
         self._body = mirror.table.body.tolist()
         self._found: dict[tuple[int, int], tuple[float, int, int, Witness]] = {}
 
@@ -104,17 +105,17 @@ class _Nearest:
         # Within the accuracy a pair that comes later may still be the nearest.
         if known is not None and low > known[0] + ACCURACY:
             return
-        distance, witness = self.mirror.measured(i, j)
-        if known is None or (distance, i, j) < known[:3]:
+        distance, witness = self.mirror.measured(i, j, self._radius)
+        if witness is not None and (known is None or (distance, i, j) < known[:3]):
             self._found.pop(key[::-1], None)
             self._found[key] = distance, i, j, witness
 
-    def results(self, radius: float) -> list[Closest]:
-        """Return what is within a radius, nearest first, then by the order of the bodies."""
+    def results(self) -> list[Closest]:
+        """Return them, nearest first, then by the order of the bodies."""
         names, pieces = self.mirror.bodies, self.mirror.pieces
         found = []
         for (one, other), (distance, i, j, (point_a, point_b, normal)) in self._found.items():
-            if distance > radius:
+            if distance > self._radius:
                 continue
             answer = Closest(
                 names[one],
