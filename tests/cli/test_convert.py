@@ -87,7 +87,7 @@ def test_a_dash_is_standard_output(robot, tmp_path, capfdbinary):
     captured = capfdbinary.readouterr()
     assert captured.out == (tmp_path / "robot.kv.json").read_bytes()
     assert b"2 frames, 1 DoF" in captured.err
-    for option in (["--json"], ["--leave-out", "j/position"]):
+    for option in (["--json"], ["--leave-out", "j/position"], ["--tolerance", "0.1"]):
         assert main(["convert", "robot.urdf", "-", *option]) == 2
         captured = capfdbinary.readouterr()
         assert captured.out == b""
@@ -112,6 +112,29 @@ def test_what_is_left_out_is_missing_and_nothing_else(run, tmp_path, monkeypatch
     status, _, err = run("door.kv.json", "again.urdf", "--leave-out", "lokc")
     assert status == 2
     assert "lock" in err
+
+
+def test_curves_are_approximated_when_asked_to_and_by_how_much_is_told(run, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    source = "articulations/folding_door"
+    status, out, err = run(source, "door.urdf")
+    assert (status, out) == (2, "")
+    assert "approximated with --tolerance" in err
+    assert "--leave-out NAME" in err
+    assert "leave_out=" not in err
+    status, out, err = run(source, "door.urdf", "--tolerance", "0.05", "--json")
+    assert (status, err) == (0, "")
+    answer, saved = json.loads(out), kv.load(source).save(tmp_path / "same.urdf", tolerance=0.05)
+    assert answer["largest"] == {"distance": saved.error.position, "angle": saved.error.angle}
+    told = {e["name"]: (e["distance"], e["angle"]) for e in answer["approximated"]}
+    assert told == {name: (e.position, e.angle) for name, e in saved.errors.items()}
+    furthest = answer["approximated"][0]
+    assert furthest["distance"] == answer["largest"]["distance"] > 0
+    out = run(source, "door.urdf", "--tolerance", "0.05", "--force")[1]
+    assert f"{1000 * furthest['distance']:.3g} mm ({furthest['name']})" in out
+    assert kv.load("door.urdf").degrees_of_freedom == kv.load(source).degrees_of_freedom
+    status, _, err = run(source, "door.urdf", "--tolerance", "-1", "--force")
+    assert (status, "positive number" in err) == (2, True)
 
 
 def test_a_file_is_replaced_only_by_force(run, robot, tmp_path):

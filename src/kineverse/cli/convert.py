@@ -15,12 +15,14 @@ from kineverse.errors import FormatError, NameTakenError, ValueRejectedError
 
 if TYPE_CHECKING:
     import kineverse as kv
+    from kineverse.formats.saving import Saved
 
 HELP = """write a model to a file, in the format that its name ends in
 
 IN is whatever can be opened. OUT is a document (.kv.json), which says all of a model, URDF (.urdf) or MJCF
 (.xml). What the format cannot say is refused by name, and nothing is written; --leave-out names what may be
-missing. OUT is written whole or not at all, and replaces a file only with --force. If OUT is a dash, a
+missing. With --tolerance, motions by curves are approximated; by how much frames are off at most is certain,
+and printed. OUT is written whole or not at all, and replaces a file only with --force. If OUT is a dash, a
 document goes to standard output.
 
 To see whether the result moves as it should: kineverse diff IN OUT --values
@@ -29,7 +31,8 @@ examples:
   kineverse convert robot.sdf robot.urdf
   kineverse convert robot.urdf robot.kv.json --prefix left --force
   kineverse convert kitchen - | gzip > kitchen.kv.json.gz
-  kineverse convert garage.kv.json garage.urdf --leave-out garage/lock"""
+  kineverse convert garage.kv.json garage.urdf --leave-out garage/lock
+  kineverse convert articulations/pedal_bin bin.xml --tolerance 0.01"""
 
 STDOUT = "-"
 SHOWN = 10
@@ -49,6 +52,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         default=[],
         help="a constraint, or an articulation, that OUT need not say; may be given several times",
     )
+    parser.add_argument(
+        "--tolerance",
+        metavar="X",
+        type=float,
+        help="how far any frame of OUT may be off [m], [rad]; without it nothing is approximated",
+    )
     parser.add_argument("--all", action="store_true", help=f"print more than {SHOWN} remarks")
     parser.add_argument("--json", action="store_true", help="what was done, as one JSON object")
 
@@ -59,30 +68,39 @@ def run(arguments: argparse.Namespace) -> int:
     if not to_stdout:
         # Before the model is loaded: a name that cannot be written to should not take seconds to be found.
         check(arguments.target, arguments.source, arguments.force)
-    elif arguments.json or arguments.leave_out:
-        option = "--json" if arguments.json else "--leave-out"
+    elif arguments.json or arguments.leave_out or arguments.tolerance is not None:
+        option = "--json" if arguments.json else "--leave-out" if arguments.leave_out else "--tolerance"
         raise ValueRejectedError(
             f"{option} and - exclude each other: the output is a document, which says all."
         )
 
     import kineverse as kv
     from kineverse.formats.remarks import listening
+    from kineverse.formats.saving import Saved
 
     with listening() as left_out, doing(f"reading {arguments.source}"):
         model = kv.load(arguments.source, arguments.prefix)
-    other: list[str] = []
     with doing(f"writing {arguments.target}"):
         if to_stdout:
-            size = _print_document(model)
+            saved, size = Saved(Path(STDOUT)), _print_document(model)
         else:
-            saved = model.save(arguments.target, leave_out=arguments.leave_out)
-            size, other = os.path.getsize(saved.path), list(saved.remarks)
+            saved = _saved(model, arguments)
+            size = os.path.getsize(saved.path)
     if arguments.json:
-        print(json.dumps(_as_json(arguments, model, size, left_out, other), allow_nan=False))
+        print(json.dumps(_as_json(arguments, model, size, left_out, saved), allow_nan=False))
     else:
-        lines = _report(arguments, model, size, {"reading": left_out, "writing": other})
+        lines = _report(arguments, model, size, left_out, saved)
         print("\n".join(lines), file=sys.stderr if to_stdout else sys.stdout)
     return 0
+
+
+def _saved(model: kv.Model, arguments: argparse.Namespace) -> Saved:
+    from kineverse.formats.export.refusals import UnsayableError
+
+    try:
+        return model.save(arguments.target, tolerance=arguments.tolerance, leave_out=arguments.leave_out)
+    except UnsayableError as error:
+        raise error.told_with("--leave-out NAME", "--tolerance 0.001") from None
 
 
 def check(target: str, source: str, force: bool = False) -> None:
@@ -138,16 +156,31 @@ def _print_document(model: kv.Model) -> int:
 
 
 def _report(
-    arguments: argparse.Namespace, model: kv.Model, size: int, remarks: dict[str, list[str]]
+    arguments: argparse.Namespace, model: kv.Model, size: int, left_out: list[str], saved: Saved
 ) -> list[str]:
     from kineverse.cli.wording import contents
 
     lines = [f"{arguments.source} → {arguments.target}", f"  {contents(model)}, {_size(size)}"]
+    if saved.errors:
+        lines.append(f"  {_errors(saved)}")
     most = None if arguments.all else SHOWN
-    for when, texts in remarks.items():
+    for when, texts in (("reading", left_out), ("writing", saved.remarks)):
         if texts:
             lines += [f"  remarks on {when}", *bounded([f"    {text}" for text in texts], most, "    ")]
     return lines
+
+
+def _errors(saved: Saved) -> str:
+    """Return by how much frames are off at most, and which ones."""
+    from kineverse.cli.wording import apart, number
+
+    errors = saved.errors
+    furthest = max(errors, key=lambda name: errors[name].position)
+    most_turned = max(errors, key=lambda name: errors[name].angle)
+    worst = [f"{apart(saved.error.position, 0.0)} ({furthest})"] if saved.error.position else []
+    if saved.error.angle:
+        worst.append(f"{apart(0.0, saved.error.angle)} ({most_turned})")
+    return f"{number(len(errors), 'frame')} approximated, off by at most {' and '.join(worst)}"
 
 
 def _size(size: int) -> str:
@@ -158,8 +191,9 @@ def _size(size: int) -> str:
 
 
 def _as_json(
-    arguments: argparse.Namespace, model: kv.Model, size: int, left_out: list[str], other: list[str]
+    arguments: argparse.Namespace, model: kv.Model, size: int, left_out: list[str], saved: Saved
 ) -> dict[str, object]:
+    worst_first = sorted(saved.errors.items(), key=lambda item: (-item[1].position, -item[1].angle))
     return {
         "in": arguments.source,
         "out": arguments.target,
@@ -169,5 +203,9 @@ def _as_json(
             "dof": len(model.degrees_of_freedom),
             "constraints": len(model.constraints),
         },
-        "remarks": {"reading": left_out, "writing": other},
+        "largest": {"distance": saved.error.position, "angle": saved.error.angle},
+        "approximated": [
+            {"name": name, "distance": error.position, "angle": error.angle} for name, error in worst_first
+        ],
+        "remarks": {"reading": left_out, "writing": list(saved.remarks)},
     }

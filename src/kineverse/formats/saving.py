@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from kineverse.errors import FormatError, KineverseError, ValueRejectedError
+from kineverse.errors import FormatError, ValueRejectedError
 from kineverse.formats.export.plan import FrameError, Written
 from kineverse.formats.files import replace_file
 from kineverse.formats.remarks import tell
@@ -124,10 +124,10 @@ def _written(model: ModelView, target: Path, leave_out: Iterable[str], tolerance
     )
 
 
-def _named(target: Path, error: KineverseError) -> FormatError:
+def _named(target: Path, error: FormatError) -> FormatError:
     """Return an error with the name of the file in front, once."""
     text = str(error)
-    return FormatError(text if target.name in text else f"{target.name} is not written. {text}")
+    return error if target.name in text else FormatError(f"{target.name} is not written. {text}")
 
 
 def _target(path: Any) -> Path:

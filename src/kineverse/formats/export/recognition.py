@@ -181,6 +181,7 @@ class Recognition:
             if isinstance(motion, Motion) and (motion.curved or len(motion.amount) > self.target.degree + 1):
                 verb, powers = "turns" if motion.turns else "slides", _POWERS[self.target.degree]
                 self._refuse(name, factors, f"{verb} by no {powers} of a coordinate")
+                self.refusals.curved = True
                 return None
         return found
 

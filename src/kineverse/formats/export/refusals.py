@@ -9,6 +9,38 @@ from kineverse.errors import FormatError
 _SHOWN = 6
 
 
+class UnsayableError(FormatError):
+    """What a model says and a format cannot, with what can be done about it.
+
+    Parameters
+    ----------
+    problem
+        What that is.
+    curved
+        Whether some of it could be approximated.
+    leave_out, tolerance
+        How whoever reads the message leaves constraints out and has curves approximated.
+    """
+
+    def __init__(
+        self,
+        problem: str,
+        curved: bool = False,
+        leave_out: str = "leave_out=(name, ...)",
+        tolerance: str = "tolerance=0.001",
+    ) -> None:
+        remedies = ["Write a document (.kv.json), which says all of it"]
+        if curved:
+            remedies.append(f"have curves approximated with {tolerance}")
+        remedies.append(f"leave constraints out on purpose with {leave_out}")
+        super().__init__(f"{problem} {', '.join(remedies[:-1])}, or {remedies[-1]}.")
+        self._problem, self._curved = problem, curved
+
+    def told_with(self, leave_out: str, tolerance: str) -> UnsayableError:
+        """Return the same for somebody who says that in another way."""
+        return UnsayableError(self._problem, self._curved, leave_out, tolerance)
+
+
 @dataclass
 class Refusals:
     """A growing list of what is refused.
@@ -17,9 +49,12 @@ class Refusals:
     ----------
     target
         The name of the format.
+    curved
+        Whether something among them could be approximated.
     """
 
     target: str
+    curved: bool = False
     _reasons: dict[str, list[str]] = field(default_factory=dict)
 
     def add(self, name: str, reason: str) -> None:
@@ -31,12 +66,12 @@ class Refusals:
     def __bool__(self) -> bool:
         return bool(self._reasons)
 
-    def check(self, file: str, remedy: str) -> None:
+    def check(self, file: str) -> None:
         """Raise if there is something.
 
         Raises
         ------
-        FormatError
+        UnsayableError
             With the first of the names, each with its reasons, and how many more there are.
         """
         if not self._reasons:
@@ -47,7 +82,8 @@ class Refusals:
         ]
         more = f"; and {count - _SHOWN} more" if count > _SHOWN else ""
         things = "one thing" if count == 1 else f"{count} things"
-        raise FormatError(
+        raise UnsayableError(
             f"{file} is not written: {self.target} cannot say {things} of this model. "
-            f"{'; '.join(shown)}{more}. {remedy}"
+            f"{'; '.join(shown)}{more}.",
+            self.curved,
         )

@@ -39,10 +39,6 @@ _DYNAMICS = {
     "spring_stiffness": "stiffness",
     "spring_reference": "springref",
 }
-_REMEDY = (
-    "Write a document (.kv.json), which says all of it, or leave constraints out on purpose with "
-    "leave_out=(name, ...)."
-)
 
 
 def mjcf_of(
@@ -108,7 +104,7 @@ class MjcfWriter:
             link = waiting.pop()
             self._link(link)
             waiting += self._children.get(link.name, [])[::-1]
-        self._refusals.check(self._path.name, _REMEDY)
+        self._refusals.check(self._path.name)
         equality, tendon, custom, key = self._equalities(), self._tendons(), self._speeds(), Tag("keyframe")
         for name, value in self._bodies.settings().items():
             compiler.give(name, value)

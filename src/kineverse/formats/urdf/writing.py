@@ -36,10 +36,6 @@ OPEN = sys.float_info.max
 _NEWER = ("acceleration", "deceleration", "jerk")
 _KNOWN = frozenset(("effort", "damping", "friction", "k_position", "k_velocity", *_NEWER))
 _SPACE = (("x", (1.0, 0.0, 0.0)), ("y", (0.0, 1.0, 0.0)), ("z", (0.0, 0.0, 1.0)))
-_REMEDY = (
-    "Write a document (.kv.json), which says all of it, or leave constraints out on purpose with "
-    "leave_out=(name, ...)."
-)
 
 
 def urdf_of(
@@ -95,7 +91,7 @@ class UrdfWriter:
             self._bodies.write(self._root.add("link", name=WORLD), self._plan.world)
         for link in links:
             self._link(link, link is root)
-        self._refusals.check(self._path.name, _REMEDY)
+        self._refusals.check(self._path.name)
         return document(self._root, [*self._plan.remarks, *self._plan.said_errors])
 
     def _root_link(self) -> Link | None:
