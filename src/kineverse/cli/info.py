@@ -58,6 +58,13 @@ def sections(summary: Summary, frames: bool = False, constraints: bool = False) 
     ]
     if summary.unplaced:
         lines.append(f"  not finite at the default state: {', '.join(summary.unplaced)}")
+    if summary.touched_as_seen:
+        bodies = (
+            "1 body has"
+            if len(summary.touched_as_seen) == 1
+            else f"{len(summary.touched_as_seen)} bodies have"
+        )
+        lines.append(f"  {bodies} no collision shapes; distances are to hulls of what is seen")
     found = ["\n".join(lines)]
     if summary.freedoms:
         rows = [
@@ -116,6 +123,7 @@ def as_json(summary: Summary) -> dict[str, Any]:
         **summary.interlocks.as_data(),
         "not_loaded": summary.problems,
         "not_finite": summary.unplaced,
+        "touched_as_seen": summary.touched_as_seen,
     }
 
 

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from kineverse.geometry.pieces import touched_by_what_is_seen
 from kineverse.model.constraint import Constraint
 from kineverse.model.view import ModelView
 from kineverse.reasoning import Interlocks, interlocks
@@ -44,7 +45,8 @@ class Summary:
 
     ``frames`` are the parents by name; ``low``, ``high`` and ``extent`` the box around all shapes at the
     default state [m]; ``mass`` that of all bodies [kg]; ``problems`` what could not be loaded; ``unplaced``
-    the frames whose pose there is not finite, which the box leaves out; ``interlocks`` what locks what.
+    the frames whose pose there is not finite, which the box leaves out; ``interlocks`` what locks what;
+    ``touched_as_seen`` the bodies without collision shapes, for which distances are to hulls of what is seen.
     """
 
     name: str
@@ -59,6 +61,7 @@ class Summary:
     problems: list[str]
     unplaced: list[str]
     interlocks: Interlocks
+    touched_as_seen: list[str]
 
 
 def summarise(name: str, model: ModelView) -> Summary:
@@ -92,6 +95,7 @@ def summarise(name: str, model: ModelView) -> Summary:
         problems=sorted(part.frame for part in shown if part.problem),
         unplaced=unplaced,
         interlocks=interlocks(model),
+        touched_as_seen=touched_by_what_is_seen(model),
     )
 
 
