@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import pytest
-from linkages import at, bar, four_bar, four_bar_by_circles, limited_four_bar
+from linkages import at, bar, four_bar, four_bar_by_circles, limited_four_bar, slider_crank
 from loop_checks import (
     assert_closed,
     assert_moves_as_its_jacobian_says,
@@ -347,3 +349,14 @@ def test_many_inputs():
     assert [str(s) for s in free] == ["bar_0", "bar_1", "bar_2", "bar_3"]
     assert_closed(model)
     assert_moves_as_its_jacobian_says(model, "bar_4", 20)
+
+
+def test_what_comes_back_after_a_turn_is_the_same():
+    """A guess that grew by what rounding leaves of 0 would have no period."""
+    model = slider_crank()
+    (loop,) = model.rates.dependent[kv.position("piston")]._nodes
+    guess = kv.compile(loop.function.seed[1])
+    # Two angles that are the same number, as sine and cosine see it, but a rate of 1e-16 [m/rad] does not.
+    far = 1e17
+    near = math.atan2(math.sin(far), math.cos(far))
+    assert guess([far]) == pytest.approx(guess([near]), abs=1e-9)

@@ -130,7 +130,9 @@ class Samples:
                     f"Loop '{self.name}' is on another branch after a turn of '{self.equations.inputs[k]}': "
                     "it goes through a singular configuration. Limit that coordinate."
                 )
-            winding[k] = np.where(self._angles, np.round(grown), grown)
+            # A length may grow, as a nut on a screw does; what rounding leaves of 0 would be no period.
+            lengths = np.where(np.abs(grown) < 1e-9, 0.0, grown)
+            winding[k] = np.where(self._angles, np.round(grown), lengths)
         return winding
 
     def _singular_values(self, q: Array, x: Array) -> Array:
