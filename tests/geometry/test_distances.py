@@ -6,9 +6,12 @@ import itertools
 
 import numpy as np
 import pytest
+import trimesh
 from convex_shapes import EXACT, KINDS, MujocoPairs, gap, random_pose, random_shape
 
 from kineverse.geometry.narrow import Narrow
+from kineverse.geometry.solids import _triangles, solid_of
+from kineverse.model.body import Box, Sphere
 
 EACH = 4
 PAIRS = list(itertools.combinations_with_replacement(KINDS, 2))
@@ -95,3 +98,45 @@ def test_centre_on_centre_there_is_a_way_out(one, other, shapes):
     assert np.linalg.norm(normal) == pytest.approx(1, abs=1e-6)
     assert normal @ (point_b - point_a) == pytest.approx(distance, abs=1e-6)
     assert gap(a, b, poses, normal) == pytest.approx(distance, abs=3e-4)
+
+
+def test_triangles_have_distances_and_in_touch_a_normal():
+    box = trimesh.creation.box((1, 1, 1)).subdivide().subdivide()
+    surface = _triangles(np.array(box.vertices), np.array(box.faces))
+    for solid, reach in ((surface, 0.5), (solid_of(Sphere(0.1)), 0.1), (solid_of(Box((0.2, 0.2, 0.2))), 0.1)):
+        for at in (2.0, 1.1, 0.7, 0.61, 0.59, 0.55, 0.5):
+            poses = np.stack([np.eye(4)[:3]] * 2)
+            poses[1, :, 3] = at, 0.02, 0.03
+            narrow = Narrow([surface, solid], poses)
+            distance = narrow.distance(0, 1)
+            point_a, point_b, normal = narrow.witness()
+            if at - 0.5 - reach > 0:
+                assert distance == pytest.approx(at - 0.5 - reach, abs=1e-6)
+                np.testing.assert_allclose(normal, [1, 0, 0], atol=1e-5)
+            else:
+                assert distance <= 0
+            assert np.linalg.norm(normal) == pytest.approx(1, abs=1e-6)
+            assert normal @ (point_b - point_a) == pytest.approx(distance, abs=1e-6)
+
+
+def test_triangles_of_a_convex_body_are_as_far_as_its_hull(shapes):
+    rng = np.random.default_rng(11)
+    apart = 0
+    for _ in range(150):
+        a, b = shapes["hull"][rng.integers(EACH)], shapes["hull"][rng.integers(EACH)]
+        poses = np.stack([random_pose(rng, 0.4), random_pose(rng, 0.4)])
+        distance, _, _, normal = measured(a, b, poses)
+        if distance < 1e-3:
+            continue
+        apart += 1
+        meshes = [trimesh.Trimesh(shape.points).convex_hull for shape in (a, b)]
+        one, other = (_triangles(np.array(mesh.vertices), np.array(mesh.faces)) for mesh in meshes)
+        for solids in ((one, other), (one, b.solid), (a.solid, other)):
+            narrow = Narrow(solids, poses)
+            assert narrow.distance(0, 1) == pytest.approx(distance, abs=1e-6)
+            point_a, point_b, way = narrow.witness()
+            assert way @ (point_b - point_a) == pytest.approx(distance, abs=1e-6)
+            np.testing.assert_allclose(way, normal, atol=1e-4)
+            assert gap(a, b, poses, way) == pytest.approx(distance, abs=1e-5)
+            assert way @ point_a == pytest.approx(a.support(way, poses[0]), abs=1e-5)
+    assert apart > 30

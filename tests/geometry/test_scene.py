@@ -241,6 +241,37 @@ def test_after_an_edit_a_new_symbol_needs_a_value():
     assert scene.distance("flap", "box0").distance > 0
 
 
+def test_after_an_edit_the_last_state_may_be_impossible():
+    model = arm_among_boxes(boxes=1)
+    scene = Scene(model)
+    scene.update(model.default_state())
+    with model.edit() as edit:
+        root = np.sqrt(kv.position("rail") - 1)
+        edit.add_frame("flap", "world", kv.translation(0, 0, root), body(Box((1, 0.1, 0.1))))
+    with pytest.raises(kv.KineverseError, match=r"flap.*update"):
+        scene.within(0.1)
+    scene.update({**model.default_state(), kv.position("rail"): 2.0})
+    assert scene.distance("flap", "box0").distance > 0
+
+
+def test_an_edit_that_a_scene_cannot_follow_is_said_until_it_is_mended():
+    model = arm_among_boxes(boxes=1)
+    scene = Scene(model)
+    scene.update(model.default_state())
+    near = by_names(scene.within(0.3))
+    with model.edit() as edit:
+        for k, width in enumerate((1.0, 2.0)):  # two parameters of one name
+            post = kv.translation(kv.parameter("width", width), 0, 0)
+            edit.add_frame(f"post{k}", "world", post, body(Box((0.1, 0.1, 0.1))))
+    for _ in range(2):
+        with pytest.raises(kv.NameTakenError, match="width"):
+            scene.within(0.3)
+    with model.edit() as edit:
+        edit.remove("frame post0")
+        edit.remove("frame post1")
+    assert by_names(scene.within(0.3)) == near
+
+
 # -- rules -------------------------------------------------------------------------------------------------
 
 

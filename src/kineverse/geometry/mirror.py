@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from kineverse.compile.function import compile as compile_expressions
-from kineverse.errors import UnknownNameError, ValueRejectedError, suggest
+from kineverse.errors import KineverseError, UnknownNameError, ValueRejectedError, suggest
 from kineverse.model.view import ModelView
 from kineverse.state import State
 from kineverse.symbols import Symbol
@@ -57,7 +57,7 @@ class Mirror:
         self._source = Pieces(_names(triangles), _names(leave_out))
         self._version: int | None = None
         self._values: dict[Symbol, float] = {}
-        self._lacks: list[str] = []
+        self._unplaced = ""
         self._evaluator: Any = None
         self.inputs: tuple[Symbol, ...] = ()
         self.pieces: list[Piece] = []
@@ -77,9 +77,12 @@ class Mirror:
             return
         version = self.model.version
         rules = (*rules_of(self.model.data.get(RULES, ())), *self._own_rules)
-        moved = self._source.follow(self.model)
-        if moved:
-            self._rebuild(rules)
+        if self._source.follow(self.model):
+            try:
+                self._rebuild(rules)
+            except BaseException:
+                self._source.forget()  # so that the next question finds a difference again
+                raise
         else:
             # Other frames may have come in between, and with them other neighbours.
             self.table.allowed[:] = allowed(self.model, self.bodies, rules)
@@ -136,7 +139,7 @@ class Mirror:
             self._values = dict(zip(self.inputs, self._evaluator.input.tolist(), strict=True))
         elif not isinstance(state, Mapping) and len(state):
             raise ValueRejectedError(f"Nothing moves in this scene, and {len(state)} values are given.")
-        self._lacks = []
+        self._unplaced = ""
 
     def _relevant(self, state: Mapping[Any, float]) -> Mapping[Any, float]:
         """Return the part of a mapping that poses depend on; the rest has to be known to the model."""
@@ -164,10 +167,16 @@ class Mirror:
     def _place_again(self) -> None:
         """Place everything at the last state after an edit, as far as that says where things are."""
         values = {s: self._values.get(s, s.value) for s in self.inputs}
-        self._lacks = [str(s) for s, value in values.items() if value is None]
-        if self._evaluator is not None and not self._lacks:
+        missing = [str(s) for s, value in values.items() if value is None]
+        more = f" and {len(missing) - 12} more" if len(missing) > 12 else ""
+        self._unplaced = f"There is no value for {', '.join(missing[:12])}{more}" if missing else ""
+        if self._evaluator is None or missing:
+            return
+        try:
             self._evaluator(np.array([values[s] for s in self.inputs], dtype=float))
             self._place()
+        except KineverseError as error:  # a loop that does not close, a root of what is negative
+            self._unplaced = f"The last state has no poses after the edit ({error})"
 
     # -- questions -----------------------------------------------------------------------------------------
 
@@ -182,10 +191,8 @@ class Mirror:
             If a solid cannot be made.
         """
         self.follow()
-        if self._lacks:
-            raise UnknownNameError(
-                f"The scene has no value for {', '.join(self._lacks[:12])}: call scene.update(state) first."
-            )
+        if self._unplaced:
+            raise UnknownNameError(f"{self._unplaced}: call scene.update(state) first.")
         if self._all_loaded:
             return
         wanted = [

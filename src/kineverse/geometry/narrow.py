@@ -62,6 +62,8 @@ class Narrow:
         self._time = 0
         self._functors: dict[tuple[int, int], Any] = {}
         self._kept: list[tuple[Solid, Solid]] = []
+        # Pairs of triangle meshes, for which coal leaves the normal as it was in memory.
+        self._surfaces: set[tuple[int, int]] = set()
         self._request, *self._rougher = (_request(coal, factor) for factor in (1.0, 10.0, 100.0))
         self._result = coal.DistanceResult()
         self._mended: Witness | None = None
@@ -85,6 +87,8 @@ class Narrow:
         self._mended = None
         distance: float = functor(at_a, at_b, self._request, result)
         if _TOUCH < distance < 1e300:
+            if (i, j) in self._surfaces:
+                self._mended = self._between_points(distance)
             return distance
         a, b = self._pair(i, j)
         if not (a.is_convex and b.is_convex):
@@ -108,6 +112,10 @@ class Narrow:
         result = self._result
         return result.getNearestPoint1(), result.getNearestPoint2(), np.array(result.normal)
 
+    def _between_points(self, distance: float) -> Witness:
+        point_a, point_b = self._result.getNearestPoint1(), self._result.getNearestPoint2()
+        return point_a, point_b, (point_b - point_a) / distance
+
     def _pair(self, i: int, j: int) -> tuple[Solid, Solid]:
         a, b = self._solids[i], self._solids[j]
         assert a is not None
@@ -121,6 +129,8 @@ class Narrow:
         other = b.stand_in if b.stand_in and isinstance(a.engine, cylinder) else b.engine
         functor = self._functors[i, j] = self._coal.ComputeDistance(one, other)
         self._kept.append((a, b))  # coal does not keep what it computes with
+        if not (a.is_convex or b.is_convex):
+            self._surfaces.add((i, j))
         return functor
 
     def _normal_is_right(self) -> bool:

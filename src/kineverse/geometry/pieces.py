@@ -96,6 +96,10 @@ class Pieces:
         self._rates = b""
         self.by_body: dict[str, tuple[Piece, ...]] = {}
 
+    def forget(self) -> None:
+        """Know nothing, as at the beginning."""
+        self._frames, self._bodies, self._rates, self.by_body = {}, {}, b"", {}
+
     def follow(self, model: ModelView) -> bool:
         """Take over what is different in the model; return whether anything was.
 
