@@ -116,6 +116,7 @@ class Mirror:
         self._all_loaded = all(solid is not None for solid in self._solids)
         self.narrow = Narrow(self._solids, table.poses)
         self._travel = table.travel.data
+        self._bounds: Any = None if table.bounds is None else table.bounds.data
         self._measured: dict[tuple[int, int], tuple[float, float, float, Witness]] = {}
         if not same:
             self._compile([piece.pose for piece in moving])
@@ -216,7 +217,8 @@ class Mirror:
         if known is not None and known[0] == one and known[1] == other:
             return known[2], known[3]
         distance = self.narrow.distance(i, j)
-        self.table.remember(i, j, distance)
+        if self._bounds is not None:
+            self._bounds[i, j] = distance + one + other  # as Table.remember, in a fifth of the time
         if distance > limit:
             return distance, None
         witness = self.narrow.witness()
