@@ -163,7 +163,7 @@ class Mirror:
             raise ValueRejectedError(
                 f"At this state the pose of {', '.join(map(repr, names))} is not finite; nothing was moved."
             )
-        self.narrow.moved()
+        self.narrow.moved(self.table.moving)
 
     def _place_again(self) -> None:
         """Place everything at the last state after an edit, as far as that says where things are."""

@@ -58,8 +58,7 @@ class Narrow:
         self._solids = solids
         self._parts = [(pose[:, :3], pose[:, 3]) for pose in poses]
         self._transforms = [coal.Transform3s() for _ in poses]
-        self._placed = [-1] * len(poses)
-        self._time = 0
+        self._placed = bytearray(len(poses))
         self._functors: dict[tuple[int, int], Any] = {}
         self._kept: list[tuple[Solid, Solid]] = []
         # Pairs of triangle meshes, for which coal leaves the normal as it was in memory.
@@ -69,18 +68,18 @@ class Narrow:
         self._mended: Witness | None = None
         self.calls = 0
 
-    def moved(self) -> None:
-        """Note that poses have changed."""
-        self._time += 1
+    def moved(self, count: int) -> None:
+        """Note that the poses of so many pieces, the first ones, have changed."""
+        self._placed[:count] = bytes(count)
 
     def distance(self, i: int, j: int) -> float:
         """Return the signed distance of two pieces [m], and keep where it is for :meth:`witness`."""
         self.calls += 1
-        placed, now = self._placed, self._time
+        placed = self._placed
         for k in (i, j):
-            if placed[k] != now:
+            if not placed[k]:
                 self._transforms[k].setTransform(*self._parts[k])
-                placed[k] = now
+                placed[k] = 1
         functor = self._functors.get((i, j)) or self._functor(i, j)
         at_a, at_b, result = self._transforms[i], self._transforms[j], self._result
         result.clear()
