@@ -1,0 +1,138 @@
+"""CoACD in a process of its own, with bounds on its time and memory."""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+import signal
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from kineverse.errors import KineverseError, MissingExtraError
+from kineverse.geometry.mesh_files import Floats
+
+from .surface import Surface
+
+PROGRAM = Path(__file__).with_name("program.py")
+_POLL = 0.05
+_LAST_WORDS = 300
+
+
+class DecompositionError(KineverseError, RuntimeError):
+    """A mesh could not be decomposed: CoACD crashed, ran out of time or memory, or answered nonsense."""
+
+
+@dataclass(frozen=True, slots=True)
+class Limits:
+    """What one mesh may cost.
+
+    Attributes
+    ----------
+    seconds
+        Of time [s].
+    memory
+        Of address space [bytes]. Not bounded on Windows, and not reliably on macOS.
+    """
+
+    seconds: float = 600.0
+    memory: int = 4 * 2**30
+
+
+def run(surface: Surface, error: float, limits: Limits, stop: threading.Event | None = None) -> list[Floats]:
+    """Return the corners of convex hulls, (n, 3) each [m], as CoACD makes them.
+
+    Parameters
+    ----------
+    surface
+        What is decomposed.
+    error
+        CoACD's measure of concavity that is allowed [m].
+    limits
+        What it may cost.
+    stop
+        Ends it, when set.
+
+    Raises
+    ------
+    MissingExtraError
+        If CoACD is not installed.
+    DecompositionError
+        If it crashes, answers nothing that could be right, exceeds its limits, or is stopped.
+    """
+    if importlib.util.find_spec("coacd") is None:
+        raise MissingExtraError(
+            "decomposing meshes needs CoACD: pip install 'kineverse-articulation[decomposition]'"
+        )
+    with tempfile.TemporaryDirectory(prefix="kineverse-decompose-", ignore_cleanup_errors=True) as folder:
+        source, target, said = (Path(folder) / name for name in ("in.npz", "out.npz", "said.txt"))
+        np.savez(source, vertices=surface.faces.vertices, faces=surface.faces.faces, parts=surface.parts)
+        with said.open("wb") as errors:
+            status = _run(_command(source, target, error, limits), errors.fileno(), limits, stop)
+        if status == 0:
+            return _answer(target, surface)
+        raise DecompositionError(_why(status, said.read_bytes()[-20_000:]))
+
+
+def _command(source: Path, target: Path, error: float, limits: Limits) -> list[str]:
+    # With -P the program's neighbours cannot be imported by accident.
+    return [sys.executable, "-P", str(PROGRAM), str(source), str(target), repr(error), str(limits.memory)]
+
+
+def _run(command: list[str], errors: int, limits: Limits, stop: threading.Event | None) -> int:
+    # Its threads make it hardly any faster, and several meshes are decomposed side by side.
+    environment = {**os.environ, "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
+    end = time.monotonic() + limits.seconds
+    with subprocess.Popen(
+        command, stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, stderr=errors, env=environment
+    ) as process:
+        try:
+            while process.poll() is None:
+                if stop is not None and stop.wait(_POLL):
+                    raise DecompositionError("It was stopped.")
+                if time.monotonic() > end:
+                    raise DecompositionError(
+                        f"CoACD did not end within {limits.seconds:g} s. Simplify the mesh, allow a larger "
+                        "error, or more time."
+                    )
+                if stop is None:
+                    time.sleep(_POLL)
+        finally:
+            process.kill()
+        return process.wait()
+
+
+def _answer(target: Path, surface: Surface) -> list[Floats]:
+    """Read the hulls, and do not trust them."""
+    try:
+        with np.load(target, allow_pickle=False) as arrays:
+            points, sizes = np.asarray(arrays["points"], dtype=float), np.asarray(arrays["sizes"])
+        hulls = np.split(points, np.cumsum(sizes)[:-1])
+    except Exception as error:
+        raise DecompositionError("CoACD answered nothing that can be read.") from error
+    low, high = surface.faces.vertices.min(axis=0), surface.faces.vertices.max(axis=0)
+    room = 0.1 * surface.size
+    if not (np.isfinite(points).all() and (points > low - room).all() and (points < high + room).all()):
+        raise DecompositionError("CoACD answered hulls that are not where the mesh is.")
+    return hulls
+
+
+def _why(status: int, said: bytes) -> str:
+    lines = said.decode(errors="replace").split("\n")
+    last = next((line.strip() for line in reversed(lines) if line.strip()), "")[:_LAST_WORDS]
+    if status < 0:
+        try:
+            how = f"was ended by {signal.Signals(-status).name}"
+        except ValueError:
+            how = f"was ended by signal {-status}"
+    else:
+        how = f"ended with status {status}"
+    short = "bad_alloc" in last or "MemoryError" in last
+    advice = "It needs more memory than it may have." if short else "Simplify or mend the mesh."
+    return f"CoACD {how}{': ' if last else ''}{last} {advice}".rstrip()
