@@ -11,7 +11,7 @@ from contextlib import contextmanager
 from typing import TextIO
 
 from kineverse._version import __version__
-from kineverse.cli import bench, convert, demo, diff, fk, info, reproduce, validate, view
+from kineverse.cli import bench, convert, decompose, demo, diff, fk, info, reproduce, validate, view
 from kineverse.errors import KineverseError
 
 WRONG, INTERRUPTED, PIPE_CLOSED = 2, 130, 141
@@ -77,7 +77,7 @@ def parser() -> argparse.ArgumentParser:
     top.add_argument("--version", action="version", version=f"kineverse {__version__}")
     top.add_argument("-v", "--verbose", action="store_true", help="say more on standard error")
     commands = top.add_subparsers(title="commands", metavar="COMMAND", required=True)
-    for command in (info, fk, view, convert, diff, validate, demo, bench, reproduce):
+    for command in (info, fk, view, convert, diff, validate, decompose, demo, bench, reproduce):
         name = command.__name__.rpartition(".")[2]
         summary, _, description = command.HELP.partition("\n")
         sub = commands.add_parser(

@@ -10,7 +10,7 @@ from typing import TypeVar
 Item = TypeVar("Item")
 
 
-def progress(items: Iterable[Item], what: str, unit: str = "") -> Iterator[Item]:
+def progress(items: Iterable[Item], what: str, unit: str = "", total: int | None = None) -> Iterator[Item]:
     """Yield the items, with a bar on standard error if that is a terminal.
 
     Parameters
@@ -21,13 +21,16 @@ def progress(items: Iterable[Item], what: str, unit: str = "") -> Iterator[Item]
         What is being done, in front of the bar.
     unit
         What is counted.
+    total
+        How many items there are, if they cannot say so themselves.
     """
     if not sys.stderr.isatty():
         yield from items
         return
     from tqdm import tqdm
 
-    total = len(items) if isinstance(items, Sized) else None
+    if isinstance(items, Sized):
+        total = len(items)
     yield from tqdm(items, desc=what, total=total, unit=f" {unit}" if unit else "it", leave=False)
 
 

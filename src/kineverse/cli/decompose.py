@@ -1,0 +1,260 @@
+"""``kineverse decompose``: meshes as unions of convex hulls."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import time
+from collections.abc import Iterable, Sequence
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from kineverse.cli.assignments import parse_value
+from kineverse.cli.paint import paint
+from kineverse.cli.progress import doing, progress
+from kineverse.cli.table import figure, table
+from kineverse.errors import KineverseError, UnknownNameError, ValueRejectedError, suggest
+from kineverse.model.body import Mesh
+
+if TYPE_CHECKING:
+    from kineverse.geometry.decomposition import Decomposition, Kept, Outcome
+
+HELP = """decompose meshes into convex hulls, once, for fast distances with a depth
+
+Of a model, the meshes of its collision shapes are decomposed, or of bodies without them, those that are seen.
+The hulls are kept in the user's cache by the content of the mesh and the settings; what is there is not made
+again. Each mesh takes seconds to minutes; after Ctrl-C, what is done is kept.
+
+"excess" is how far the hulls stand out from the mesh, "uncovered" how far the mesh stands out from the hulls:
+the largest among some thousand sampled points, so that the true ones may be a little larger.
+
+The exit status is 0 if all went well, 1 if a mesh could not be decomposed, 2 if a model could not be read.
+
+examples:
+  kineverse decompose robot.urdf
+  kineverse decompose mug.stl plate.obj --error 2mm
+  kineverse decompose robot.urdf --links gripper_finger palm --max-hulls 8 --force
+  kineverse decompose --list"""
+
+ENDINGS = (".stl", ".obj", ".dae", ".ply", ".off", ".glb")
+"""What is taken for a mesh rather than a model."""
+
+WRONG_MESH, WRONG_MODEL = 1, 2
+
+
+@dataclass
+class Task:
+    """A mesh, and the links it belongs to, of which model; a mesh file has none."""
+
+    mesh: Mesh
+    links: list[str] = field(default_factory=list)
+
+    @property
+    def name(self) -> str:
+        """What it is called in a table: its first links, and the name of the file."""
+        file = Path(self.mesh.uri).name
+        if not self.links:
+            return file
+        more = f" and {len(self.links) - 1} more" if len(self.links) > 1 else ""
+        return f"{self.links[0]}{more}: {file}"
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the options."""
+    parser.add_argument(
+        "names", metavar="MODEL_OR_MESH", nargs="*", help="name or path of a model, or a mesh file"
+    )
+    parser.add_argument("--links", metavar="LINK", nargs="+", help="only the meshes of these links")
+    parser.add_argument("--max-hulls", metavar="N", type=int, help="at most so many hulls of each mesh (32)")
+    parser.add_argument(
+        "--error",
+        metavar="M",
+        help="how far hulls may stand out: 0.002, 2mm (2%% of the mesh's longest edge)",
+    )
+    parser.add_argument("--jobs", metavar="N", type=int, help="so many at a time (one for each core)")
+    parser.add_argument("--timeout", metavar="S", type=float, help="the most that a mesh may take [s] (600)")
+    parser.add_argument(
+        "--memory", metavar="GIB", type=float, help="the most memory that it may take [GiB] (4)"
+    )
+    parser.add_argument("--force", action="store_true", help="make them anew though they are in the cache")
+    parser.add_argument("--list", action="store_true", help="say what is in the cache, and end")
+    parser.add_argument("--clear", action="store_true", help="empty the cache, and end")
+    parser.add_argument("--json", action="store_true", help="everything, as one JSON object")
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Decompose, print, and return the worst status."""
+    if arguments.list or arguments.clear:
+        return _on_cache(arguments)
+    if not arguments.names:
+        raise UnknownNameError("Which model, or mesh? See kineverse decompose --help.")
+    from kineverse.geometry.decomposition import decompose_all
+
+    settings, limits, jobs = _settings(arguments)
+    tasks, unread = _tasks(arguments.names, arguments.links)
+    order = {task.mesh: k for k, task in enumerate(tasks)}
+    outcomes = decompose_all([task.mesh for task in tasks], settings, limits, arguments.force, jobs)
+    found = sorted(
+        progress(outcomes, "decomposing", "mesh", len(tasks)), key=lambda outcome: order[outcome.mesh]
+    )
+    status = WRONG_MODEL if unread else WRONG_MESH if any(o.error for o in found) else 0
+    if arguments.json:
+        meshes = [_as_json(task, outcome) for task, outcome in zip(tasks, found, strict=True)]
+        answer = {"status": status, "meshes": meshes, "not_read": unread}
+        print(json.dumps(answer, allow_nan=False))
+    else:
+        print("\n\n".join(_report(tasks, found, unread)))
+    return status
+
+
+def _settings(arguments: argparse.Namespace) -> tuple[Any, Any, int]:
+    from kineverse.geometry.decomposition import Limits, Settings
+
+    asked: dict[str, Any] = {}
+    if arguments.error is not None:
+        asked["error"] = parse_value(arguments.error)
+    if arguments.max_hulls is not None:
+        asked["max_hulls"] = arguments.max_hulls
+    limits: dict[str, Any] = {}
+    if arguments.timeout is not None:
+        limits["seconds"] = _positive(arguments.timeout, "--timeout")
+    if arguments.memory is not None:
+        limits["memory"] = int(_positive(arguments.memory, "--memory") * 2**30)
+    jobs = (os.cpu_count() or 1) if arguments.jobs is None else int(_positive(arguments.jobs, "--jobs"))
+    return Settings(**asked), Limits(**limits), jobs
+
+
+def _positive(value: float, option: str) -> float:
+    if not 0.0 < value < 1e6:
+        raise ValueRejectedError(f"{option} {value:g}: write a positive number.")
+    return value
+
+
+def _tasks(names: Iterable[str], links: Sequence[str] | None) -> tuple[list[Task], dict[str, str]]:
+    """Return each mesh once, and why models could not be read, by their names."""
+    tasks: dict[Mesh, Task] = {}
+    unread: dict[str, str] = {}
+    with_meshes: set[str] = set()
+    for name in names:
+        if name.lower().endswith(ENDINGS):
+            mesh = Mesh(os.path.abspath(name))
+            tasks.setdefault(mesh, Task(mesh))
+            continue
+        try:
+            meshes = _meshes_of(name)
+        except (KineverseError, OSError) as error:
+            unread[name] = " ".join(str(error).split())
+            continue
+        for link, mesh in meshes:
+            with_meshes.add(link)
+            if links is None or link in links:
+                task = tasks.setdefault(mesh, Task(mesh))
+                task.links += [] if link in task.links else [link]
+    if not unread:
+        # Otherwise the link may well be of the model that cannot be read.
+        for link in links or ():
+            if link not in with_meshes:
+                raise UnknownNameError(
+                    f"No link {link!r} has a mesh. {suggest(link, with_meshes, 'link with a mesh')}"
+                )
+    return list(tasks.values()), unread
+
+
+def _meshes_of(name: str) -> list[tuple[str, Mesh]]:
+    import kineverse as kv
+
+    with doing(f"reading {name}"):
+        model = kv.load(name)
+    return [
+        (link, shape.geometry)
+        for link, body in model.bodies.items()
+        for shape in body.collisions or body.visuals
+        if isinstance(shape.geometry, Mesh)
+    ]
+
+
+def _report(tasks: Sequence[Task], found: Sequence[Outcome], unread: dict[str, str]) -> list[str]:
+    rows, remarks, errors = [], [], []
+    for task, outcome in zip(tasks, found, strict=True):
+        made = outcome.decomposition
+        if made is None:
+            errors.append(f"  {task.name}: {' '.join(str(outcome.error).split())}")
+            continue
+        time_ = "cached" if outcome.cached else f"{made.seconds:.1f} s"
+        rows.append((task.name, *_figures(made), time_))
+        remarks += [f"  {task.name}: {remark}" for remark in made.remarks]
+    sections = [_table(("mesh", *HEAD, "time"), rows)] if rows else []
+    sections += ["\n".join(["remarks", *remarks])] if remarks else []
+    sections += ["\n".join([paint("not decomposed", "!"), *errors])] if errors else []
+    unread_lines = [f"  {name}: {why}" for name, why in unread.items()]
+    sections += ["\n".join([paint("cannot be read", "!"), *unread_lines])] if unread else []
+    return sections or ["There are no meshes."]
+
+
+HEAD = ("hulls", "mesh [l]", "hulls [l]", "one hull [l]", "error [mm]", "excess [mm]", "uncovered [mm]")
+
+
+def _figures(made: Decomposition) -> tuple[str, ...]:
+    a = made.accuracy
+    volumes = ["open" if v is None else figure(1e3 * v) for v in (a.mesh_volume, a.volume, a.hull_volume)]
+    lengths = [figure(1e3 * length, 3) for length in (made.error, a.excess, a.uncovered)]
+    return (str(len(made.hulls)), *volumes, *lengths)
+
+
+def _table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    return table(head, rows, "<" + ">" * (len(head) - 1))
+
+
+def _facts(made: Decomposition) -> dict[str, Any]:
+    return {
+        "file": made.name,
+        "hulls": len(made.hulls),
+        "corners": sum(len(hull) for hull in made.hulls),
+        "error": made.error,
+        "max_hulls": made.max_hulls,
+        **asdict(made.accuracy),
+        "seconds": made.seconds,
+        "remarks": list(made.remarks),
+    }
+
+
+def _as_json(task: Task, outcome: Outcome) -> dict[str, Any]:
+    made = outcome.decomposition
+    facts = {"file": task.mesh.uri} if made is None else _facts(made)
+    error = None if outcome.error is None else " ".join(str(outcome.error).split())
+    return {
+        **facts,
+        "links": task.links,
+        "scale": list(task.mesh.scale),
+        "cached": outcome.cached,
+        "failure": error,
+    }
+
+
+def _on_cache(arguments: argparse.Namespace) -> int:
+    from kineverse.geometry.decomposition import clear, folder, listing
+
+    if arguments.names or (arguments.list and arguments.clear):
+        raise ValueRejectedError("--list and --clear are about the whole cache, and one at a time.")
+    if arguments.clear:
+        count = clear()
+        told = json.dumps({"removed": count}) if arguments.json else f"{count} removed from {folder()}"
+        print(told)
+        return 0
+    kept = listing()
+    if arguments.json:
+        entries = [{**_facts(k.decomposition), "made": k.decomposition.made, "bytes": k.bytes} for k in kept]
+        print(json.dumps({"folder": str(folder()), "decompositions": entries}, allow_nan=False))
+    elif kept:
+        print(_table(("mesh", *HEAD, "made"), [_kept_row(k) for k in kept]))
+    else:
+        print(f"There are no decompositions in {folder()}.")
+    return 0
+
+
+def _kept_row(kept: Kept) -> tuple[str, ...]:
+    made = kept.decomposition
+    when = time.strftime("%Y-%m-%d %H:%M", time.localtime(made.made))
+    return (Path(made.name).name, *_figures(made), when)
