@@ -202,6 +202,24 @@ def test_a_loop_is_closed():
     np.testing.assert_allclose(at(model, "coupler", **q)[:3, :3], np.eye(3), atol=1e-9)
 
 
+@pytest.mark.parametrize("name", ["q2", "q:2"])
+def test_balls_in_loops_are_found_whatever_they_are_called(name):
+    axis = "<axis><xyz>0 0 1</xyz><limit><lower>-0.5</lower><upper>0.5</upper></limit></axis>"
+    text = sdf(
+        link("base"),
+        bar("crank", 0, 0, math.pi / 2),
+        bar("coupler", 0, 1, 0.0),
+        bar("rocker", 2, 0, math.pi / 2),
+        joint("q1", "revolute", "base", "crank", axis),
+        joint(name, "ball", "crank", "coupler"),
+        joint("q3", "revolute", "base", "rocker", axis),
+        joint("q4", "revolute", "coupler", "rocker", pose("1 0 0 0 0 0") + Z),
+    )
+    # A quaternion does not follow, and nobody knows its range.
+    with pytest.raises(kv.KineverseError, match=f"has to know how far '{name.replace(':', '%3A')}/qz' goes"):
+        model_of(text)
+
+
 def test_joints_are_turned_where_the_root_is_at_the_other_end():
     text = sdf(
         link("a"),

@@ -213,3 +213,18 @@ def test_documents_under_a_prefix(tmp_path):
         assert found.tobytes() == model.fk("rocker_tip")({"crank": 0.4}).tobytes()
         with pytest.raises(kv.UnsolvedError, match="four-bar"):
             both.fk(f"{side}/rocker_tip")({f"{side}/crank": np.inf})
+
+
+def test_names_with_colons_have_limits_too():
+    model = kv.Model()
+    with model.edit() as edit:
+        for name, parent, x in (("a:0", "world", 0.0), ("a:1", "a:0", 0.4), ("a:2", "world", 1.0)):
+            origin = kv.Pose.of(kv.translation(x, 0, 0))
+            limits = {"lower": -0.3, "upper": 0.3} if name == "a:0" else {}
+            edit.apply(
+                kv.Revolute(name=name, parent=parent, child=name, axis=(0, 0, 1), origin=origin, **limits)
+            )
+            edit.add_frame(f"{name} end", parent=name, transform=kv.translation(0.5, 0, 0))
+        # It closes within the limits, and not all around.
+        edit.close_loop("a:1 end", "a:2 end", home={"a%3A1": 1.0, "a%3A2": 2.0})
+    assert [str(s) for s in model.degrees_of_freedom] == ["a%3A0"]

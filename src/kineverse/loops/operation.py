@@ -224,7 +224,7 @@ class CloseLoop(Operation):
 
     def _limits(self, model: Reader, symbol: Symbol) -> tuple[float, float] | None:
         """Return the position limits that the joint of a coordinate wrote, if they are numbers."""
-        constraint = model.constraints.get(f"{symbol}/position")
+        constraint = model.constraints.get(f"{symbol.path}/position")
         if constraint is None or constraint.expression is not symbol:
             return None
         if constraint.lower.symbols or constraint.upper.symbols:

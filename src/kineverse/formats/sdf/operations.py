@@ -35,7 +35,7 @@ from kineverse.model.edit import AddFrame
 from kineverse.model.frame import WORLD as MODEL_WORLD
 from kineverse.model.frame import Frame as Placed
 from kineverse.model.operation import Operation
-from kineverse.symbols import position
+from kineverse.symbols import position, symbol_name
 
 from .description import WORLD, Axis, Joint, Scene
 
@@ -106,7 +106,7 @@ def _home(loop: Joint, above: Mapping[str, Joint], named: Named) -> tuple[tuple[
     """Return where quaternions are that a loop goes by; all other coordinates are 0 there."""
     parents = {link: joint.parent for link, joint in above.items()}
     inside = [above[link] for link in way_between(loop.parent, loop.child, parents)]
-    return tuple((f"{named(joint.name)}/qw", 1.0) for joint in inside if joint.kind == "ball")
+    return tuple((symbol_name(f"{named(joint.name)}/qw", 0), 1.0) for joint in inside if joint.kind == "ball")
 
 
 def _loop(joint: Joint, named: Named, home: tuple[tuple[str, float], ...]) -> Iterator[Operation]:
