@@ -56,15 +56,12 @@ def test_what_is_written_moves_alike(run, robot, source, ending):
     assert main(["diff", "--values", source, f"out{ending}"]) == 0
 
 
-def test_what_a_format_cannot_say_is_remarked(run, robot, capsys):
+def test_what_a_format_cannot_say_is_remarked(run, robot):
     pytest.importorskip("mujoco")
     status, out, err = run("robot.urdf", "robot.xml")
     assert (status, err) == (0, "")
     assert "remarks on writing\n    MuJoCo knows no limits of speeds" in out
-    main(["diff", "--values", "--json", "robot.urdf", "robot.xml"])
-    answer = json.loads(capsys.readouterr().out)
-    assert answer["frames"] == {"removed": [], "added": [], "changed": []}
-    assert [limits["name"] for limits in answer["dof"]["changed"]] == ["j:velocity"]
+    assert main(["diff", "--values", "robot.urdf", "robot.xml"]) == 0
 
 
 def test_prefix(run, robot):

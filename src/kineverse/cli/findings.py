@@ -11,6 +11,7 @@ import numpy as np
 from kineverse.cli.table import figure
 from kineverse.errors import KineverseError
 from kineverse.formats.packages import locate
+from kineverse.loops.record import loops_of
 from kineverse.model.body import Inertia, Mesh
 from kineverse.model.samples import Samples
 from kineverse.model.view import ModelView
@@ -102,12 +103,13 @@ def _loops(model: ModelView, samples: Samples, allowed: list[int]) -> Iterator[F
         for symbol, column in zip(rates.dependent, values, strict=True)
         if np.isnan(column[allowed]).any()
     }
-    for name, record in model.articulations.items():
-        dependent = dict(record.dynamics).get("dependent", ()) if record.kind == "closedloop" else ()
-        bad = [open_at[follower] for follower in dependent if follower in open_at]
+    for loop in loops_of(model):
+        bad = [open_at[follower] for follower in loop.dependent if follower in open_at]
         if bad:
             yield Finding(
-                "loop", name, f"does not close {_when([any(states) for states in zip(*bad, strict=True)])}"
+                "loop",
+                loop.name,
+                f"does not close {_when([any(states) for states in zip(*bad, strict=True)])}",
             )
 
 

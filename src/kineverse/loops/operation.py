@@ -9,7 +9,6 @@ from typing import Any, ClassVar, TypeVar
 
 from kineverse.errors import ModelError, NameTakenError, UnsolvedError, ValueRejectedError
 from kineverse.expressions.expression import Expression, array
-from kineverse.model.articulation import Articulation
 from kineverse.model.frame import WORLD
 from kineverse.model.operation import Effects, Operation
 from kineverse.model.reader import Reader
@@ -17,6 +16,7 @@ from kineverse.number import real_number
 from kineverse.symbols import Symbol
 
 from .closing import Closed, close
+from .record import loop_record
 
 Item = TypeVar("Item", bound=tuple[Any, ...])
 
@@ -162,7 +162,7 @@ class CloseLoop(Operation):
         return Effects(
             constraints={f"{self.name}/{k}": (a, by_name[k], b) for k, a, b in self.within},
             rates={x: solution[i] for i, x in enumerate(closed.dependent)},
-            articulations={self.name: self._record(closed)},
+            articulations={self.name: loop_record(self._ends, self.mask, closed)},
         )
 
     def _check(self, model: Reader, closed: Closed) -> None:
@@ -246,19 +246,3 @@ class CloseLoop(Operation):
                     f"Loop '{self.name}' is not about '{item[0]}', only about {', '.join(by_name)}."
                 )
             yield item
-
-    def _record(self, closed: Closed) -> Articulation:
-        return Articulation(
-            "closedloop",
-            self.to,
-            self.frame,
-            dynamics=(
-                ("free", tuple(map(str, closed.free))),
-                ("dependent", tuple(map(str, closed.dependent))),
-                ("mobility", closed.mobility),
-                ("branches", closed.branches),
-                ("branch", closed.branch),
-                ("condition", closed.condition),
-                ("worst at", closed.worst),
-            ),
-        )

@@ -113,12 +113,16 @@ class Sum:
 
 @dataclass(frozen=True)
 class Loop:
-    """Two frames that are tied: their origins coincide (``connect``), or all of them does (``weld``)."""
+    """Pairs of frames that are tied: their origins coincide (``connect``), or all of them does (``weld``).
+
+    ``free`` and ``dependent`` are the names of the coordinates in the loop, those that follow last.
+    """
 
     name: str
     kind: Literal["connect", "weld"]
-    frame: str
-    to: str
+    ends: tuple[tuple[str, str], ...]
+    free: tuple[str, ...]
+    dependent: tuple[str, ...]
 
 
 @dataclass(frozen=True, slots=True)

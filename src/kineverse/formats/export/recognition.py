@@ -11,6 +11,7 @@ import numpy as np
 from kineverse.bounds.terms import Terms
 from kineverse.expressions.expression import Expression, as_expression
 from kineverse.expressions.substitution import apply
+from kineverse.loops.record import KIND as LOOP
 from kineverse.model.articulation import Articulation
 from kineverse.model.body import Pose
 from kineverse.model.constraint import Constraint
@@ -27,12 +28,11 @@ from .limits import Curve, Range, has_given_gradient, limit, limits_of, sort_con
 from .loops import tied
 from .motions import Motion, Placing, Turning, UnrecognisedError, placing
 from .names import Names
-from .plan import ITSELF, NO_BODY, BallJoint, FrameError, Joint, Link, Loop, Plan, Sum
+from .plan import ITSELF, NO_BODY, BallJoint, FrameError, Joint, Link, Plan, Sum
 from .quaternions import quaternions
 from .refusals import Refusals
 from .target import Target
 
-_LOOP = "closedloop"
 _POWERS = {1: "multiple", 4: "polynomial of degree 4"}
 _WHOLE = (ITSELF, (0.0, -1.0))
 """The amounts by which a joint may be a coordinate."""
@@ -71,12 +71,9 @@ class Recognition:
         self._terms = Terms({})
         self._quaternions = dict(quaternions(model))
         self._tolerance = tolerance
-        self._loops: list[Loop] = []
-        tied_by_loops: set[Symbol] = set()
-        if target.loops:
-            for loops, determined in tied(model):
-                self._loops += loops
-                tied_by_loops.update(determined)
+        self._loops = list(tied(model)) if target.loops else []
+        determined = {name for loop in self._loops for name in loop.dependent}
+        tied_by_loops = {s for s in model.rates.dependent if str(s) in determined}
         given = dict(model._head[RATES].values())
         self._rates = Rates({x: e for x, e in given.items() if x not in tied_by_loops})
         # What a tie determines is a coordinate like any other for who reads it.
@@ -316,7 +313,7 @@ class Recognition:
 
 def _own_records(model: ModelView) -> Iterator[tuple[str, Articulation]]:
     for name, record in model.articulations.items():
-        if record.kind != _LOOP:
+        if record.kind != LOOP:
             yield name, record
 
 

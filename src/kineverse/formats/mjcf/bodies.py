@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
-from kineverse.formats.poses import IDENTITY
+from kineverse.formats.poses import IDENTITY, is_identity
 from kineverse.model.body import Vector3
 
 from .compiling import Compiled, Note
@@ -34,6 +35,7 @@ class Bodies:
     def __init__(self, compiled: Compiled, shapes: Shapes, source: str, note: Note) -> None:
         self._model, self._source, self._shapes = compiled.model, source, shapes
         self._efforts, self._home = compiled.efforts, compiled.home
+        self._custom, self._bound = compiled.prepared.custom, float(compiled.spec.compiler.boundmass)
         model, spec = compiled.model, compiled.spec
         if self._home is not None and len(self._home) != model.nq:
             note(None, 'the key "home" does not fit the joints that are read, and is left out.')
@@ -57,8 +59,14 @@ class Bodies:
                 joints[number] = [self._handle(number)]
         self.links = tuple(self._link(number, tuple(joints.get(number, ()))) for number in range(model.nbody))
         self.site_names = self._named_sites()
-        self.sites = tuple(self._site(number) for number in range(model.nsite))
+        self.sites = tuple(self._site(k) for k in range(model.nsite) if not self.is_end(k))
         self._check_coordinates()
+
+    def is_end(self, site: int) -> bool:
+        """Whether a site is only there to say where its body is tied, which is at its origin."""
+        m = self._model
+        pose = pose_at(m.site_pos[site], m.site_quat[site])
+        return plain(m.site(site).name) in self._custom.ends and is_identity(pose)
 
     def _where(self, node: Node | None) -> str:
         return self._source if node is None else node.where
@@ -102,7 +110,9 @@ class Bodies:
         nameless: dict[int, int] = {}
         for number in range(m.nsite):
             body, where = int(m.site_bodyid[number]), self._where(self._site_nodes[number])
-            if m.site(number).name:
+            if self.is_end(number):
+                names[number] = self.body_names[body]
+            elif m.site(number).name:
                 name = plain(m.site(number).name)
                 names[number] = self._frames.invent(name, where, f"{name}_site")
             else:
@@ -111,13 +121,16 @@ class Bodies:
         return names
 
     def _link(self, number: int, joints: tuple[Joint, ...]) -> Link:
-        m = self._model
+        m, name = self._model, self.body_names[number]
+        body = self._shapes.body(number)
+        if name in self._custom.massless and m.body_mass[number] <= self._bound:
+            body = replace(body, inertia=None)
         return Link(
-            self.body_names[number],
+            name,
             self.body_names[int(m.body_parentid[number])],
             pose_at(m.body_pos[number], m.body_quat[number]) if number else IDENTITY,
             joints,
-            self._shapes.body(number),
+            body,
             self._where(self._body_nodes[number]),
         )
 
@@ -157,6 +170,7 @@ class Bodies:
             float(m.qpos0[address]) if kind in ("hinge", "slide") else 0.0,
             lower,
             upper,
+            self._custom.speeds.get(name),
             self._values(number, kind, address),
             self._dynamics(number, kind),
             where,

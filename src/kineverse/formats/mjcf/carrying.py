@@ -19,13 +19,13 @@ from .description import WORLD, Closure, Link, Scene
 def carried(scene: Scene) -> Scene:
     """Return a description in which free bodies hang below what an equality ties them to.
 
-    Only where the end of the equality is rigidly connected to the free body, and no other holds it already.
-    The links are in the order from the world outwards again.
+    Only where the end of the equality is rigidly connected to the free body, no other holds it already, and
+    the file does not say itself who follows. The links are in the order from the world outwards again.
     """
     if not scene.closures:
         return scene
     holding = _Holding(scene)
-    closures = tuple(closure for closure in scene.closures if not holding.take(closure))
+    closures = tuple(c for c in scene.closures if c.dependent is not None or not holding.take(c))
     return replace(scene, links=_outwards(holding.links.values()), closures=closures)
 
 

@@ -16,6 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from kineverse.errors import FormatError
+from kineverse.formats.numerals import LARGEST
 
 from . import engine
 from .actuators import efforts
@@ -97,7 +98,7 @@ def compile_document(prepared: Prepared, source: str, folder: str, note: Note) -
     for remark in dict.fromkeys(heard):
         note(None, f"MuJoCo says: {remark.strip()}")
     for name in _NUMBERS:
-        if not np.isfinite(getattr(compiled.model, name)).all():
+        if not (np.abs(getattr(compiled.model, name)) <= LARGEST).all():
             raise FormatError(f"{source}: a number of it is not finite, or too large ({name}).")
     return compiled
 

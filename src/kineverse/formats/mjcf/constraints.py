@@ -14,6 +14,7 @@ from kineverse.model.body import Pose
 from .bodies import Bodies
 from .carrying import at_rest
 from .compiling import Compiled, Note
+from .custom import closed_as_said
 from .description import Closure, Coupling, Dynamics, Quartic, Tendon
 from .engine import mujoco
 from .naming import Names
@@ -59,7 +60,9 @@ class Constraints:
                 closures += self._closure(number, "weld")
             else:
                 note(self._nodes.get(number), "is left out: no constraint here says it.")
-        self.couplings, self.closures = tuple(couplings), tuple(closures)
+        self.couplings = tuple(couplings)
+        said = compiled.prepared.custom.loops
+        self.closures = closed_as_said(tuple(closures), bodies.links, said, note)
         self.tendon_couplings = tuple(tendon_couplings)
 
     def _named(self, names: Names, kind: str, count: int, nodes: dict[int, Node | None]) -> list[str]:
@@ -131,7 +134,7 @@ class Constraints:
             bodies = [int(m.site_bodyid[site]) for site in ends]
             names = [self._bodies.site_names[site] for site in ends]
             poses = [pose_at(m.site_pos[site], m.site_quat[site]) for site in ends]
-            inside = [IDENTITY, IDENTITY]
+            inside = [IDENTITY, IDENTITY]  # the name is that of the site, or of the body where it is
         else:
             bodies, names = ends, [self._bodies.body_names[body] for body in ends]
             if kind == "connect":

@@ -36,7 +36,8 @@ class Joint:
 
     ``anchor`` is the point about which it turns and ``axis`` a unit vector, both in the frame of the body.
     While its coordinate is ``reference`` [rad] or [m], it has moved nothing. ``lower`` and ``upper`` bound
-    the coordinate, or ``upper`` the angle of a ball [rad]; None is no bound. ``frame`` is what the frame that
+    the coordinate, or ``upper`` the angle of a ball [rad]; None is no bound. ``speed`` is the range of its
+    speed, if that is known. ``frame`` is what the frame that
     it moves is called if that is not the body's. ``home`` are the values of its coordinates at home.
     ``dynamics`` are effort [N] or [N m], damping, friction, spring_stiffness, spring_reference and armature,
     as far as they are not zero.
@@ -50,6 +51,7 @@ class Joint:
     reference: float = 0.0
     lower: float | None = None
     upper: float | None = None
+    speed: tuple[float, float] | None = None
     home: tuple[float, ...] = ()
     dynamics: Dynamics = ()
     where: str = ""
@@ -95,7 +97,11 @@ class Coupling:
 
 @dataclass(frozen=True, slots=True)
 class Closure:
-    """Two points (``connect``) or two poses (``weld``) that coincide, each in the frame of a link or site."""
+    """Two points (``connect``) or two poses (``weld``) that coincide, each in the frame of a link or site.
+
+    ``more`` are others of the same loop. ``free`` and ``dependent`` are the joints in it, those
+    that follow last, if the file says so.
+    """
 
     name: str
     kind: Literal["connect", "weld"]
@@ -104,6 +110,9 @@ class Closure:
     in_first: Pose = IDENTITY
     in_second: Pose = IDENTITY
     where: str = ""
+    more: tuple[Closure, ...] = ()
+    free: tuple[str, ...] = ()
+    dependent: tuple[str, ...] | None = None
 
 
 @dataclass(frozen=True, slots=True)

@@ -13,10 +13,9 @@ from typing import Any
 from kineverse.articulations import Ball, Continuous, Floating, Prismatic, Revolute
 from kineverse.articulations import Joint as JointOperation
 from kineverse.expressions.expression import array
+from kineverse.expressions.gradient import total_derivative
 from kineverse.formats.poses import IDENTITY, product
 from kineverse.formats.set_body import SetBody, is_empty
-from kineverse.formats.ways import way_between
-from kineverse.loops.operation import AXES, CloseLoop
 from kineverse.model.body import Pose, Vector3
 from kineverse.model.constraint import Constraint
 from kineverse.model.edit import AddFrame, Constrain
@@ -27,9 +26,10 @@ from kineverse.spatial import axis_angle
 from kineverse.symbols import position
 
 from .carrying import carried
-from .description import WORLD, Closure, Coupling, Joint, Link, Scene
+from .description import WORLD, Coupling, Joint, Link, Scene
 from .following import Followers
 from .home import SetHome
+from .loops import loop_operations
 from .tendons import Tendon, TendonCoupling
 
 Named = Callable[[str], str]
@@ -67,7 +67,7 @@ def scene_operations(scene: Scene, prefix: str | None = None) -> Iterator[Operat
     for site in scene.sites:
         yield AddFrame(named(site.name), Frame(named(site.parent), (site.pose,)))
     yield from followers.constraints()
-    yield from _closures(scene, named, followers)
+    yield from loop_operations(scene, named, followers)
     for tendon in scene.tendons:
         yield Tendon(
             name=named(tendon.name),
@@ -85,9 +85,6 @@ def scene_operations(scene: Scene, prefix: str | None = None) -> Iterator[Operat
                 yield SetHome(named(joint.name), joint.home)
 
 
-# -- bodies --------------------------------------------------------------------------------------------------
-
-
 def _link(link: Link, named: Named, followers: Followers) -> Iterator[Operation]:
     """Yield the joints of a body one after the other, each from where the one before has moved it."""
     child, parent, place = named(link.name), named(link.parent), link.pose
@@ -100,6 +97,10 @@ def _link(link: Link, named: Named, followers: Followers) -> Iterator[Operation]
         yield _joint(joint, parent, moved, origin, named, followers)
         if joint.kind == "ball" and joint.upper is not None:
             yield _largest_angle(named(joint.name), joint.upper)
+        if joint.speed is not None and _velocity(joint) is None:
+            q = followers.position(joint.name)
+            limit = Constraint.of(joint.speed[0], total_derivative(q), joint.speed[1])
+            yield Constrain(f"{named(joint.name)}/velocity", limit)
         x, y, z = joint.anchor
         place, parent = _offset((-x, -y, -z)), moved
     if parent != child:
@@ -127,8 +128,16 @@ def _joint(
         axis=joint.axis,
         lower=joint.lower,
         upper=joint.upper,
+        velocity=_velocity(joint),
         position=followers.position(joint.name) if joint.name in followers else None,
     )
+
+
+def _velocity(joint: Joint) -> float | None:
+    """Return the limit of a speed that is the same in both directions."""
+    if joint.speed is None or joint.speed[0] != -joint.speed[1]:
+        return None
+    return joint.speed[1]
 
 
 def _largest_angle(name: str, angle: float) -> Constrain:
@@ -154,57 +163,6 @@ def _motion_back(joint: Joint) -> Pose:
         return Pose.of(axis_angle(joint.axis, -joint.reference))
     x, y, z = (-joint.reference * a for a in joint.axis)
     return _offset((x, y, z))
-
-
-# -- what ties them ------------------------------------------------------------------------------------------
-
-
-def _closures(scene: Scene, named: Named, followers: Followers) -> Iterator[Operation]:
-    parents = {link.name: link.parent for link in scene.links if link.name != WORLD}
-    parents |= {site.name: site.parent for site in scene.sites}
-    joints = {link.name: link.joints for link in scene.links}
-    tied: set[str] = set()
-    for closure in scene.closures:
-        inside: dict[str, Joint] = {}
-        by_name = {joint.name: joint for link in scene.links for joint in link.joints}
-        for link in way_between(closure.first, closure.second, parents):
-            for joint in joints.get(link, ()):
-                name: str | None = joint.name
-                while name is not None and name in followers:
-                    name = followers.leaders[name]
-                if name is not None:
-                    inside[name] = by_name[name]
-        # What an earlier loop determines is none of this one's coordinates.
-        home = tuple(
-            value for name, joint in inside.items() if name not in tied for value in _rest(joint, named)
-        )
-        tied |= inside.keys()
-        yield from _closure(closure, named, home)
-
-
-def _rest(joint: Joint, named: Named) -> Iterator[tuple[str, float]]:
-    """Yield the coordinates of a joint that are not zero at rest, where its equalities hold."""
-    if joint.kind in ("ball", "free"):
-        yield f"{named(joint.name)}/qw", 1.0
-    elif joint.reference:
-        yield named(joint.name), joint.reference
-
-
-def _closure(closure: Closure, named: Named, home: tuple[tuple[str, float], ...]) -> Iterator[Operation]:
-    name = named(closure.name)
-    ends: list[str] = []
-    for suffix, frame, pose in (
-        ("first", closure.first, closure.in_first),
-        ("second", closure.second, closure.in_second),
-    ):
-        end = named(frame)
-        if pose is not IDENTITY:
-            end = f"{name}/{suffix}"
-            yield AddFrame(end, Frame(named(frame), (pose,)))
-        ends.append(end)
-    # The coordinates on the way to the first end come first, and so are the ones that stay free.
-    mask = AXES[:3] if closure.kind == "connect" else AXES
-    yield CloseLoop(name=name, frame=ends[0], to=ends[1], mask=mask, home=home)
 
 
 def _tendon_coupling(coupling: Coupling, named: Named) -> TendonCoupling:

@@ -8,6 +8,7 @@ from pathlib import Path
 
 from kineverse.formats.files import read_file
 
+from .custom import Custom, custom_of
 from .rewriting import written
 from .screening import MeshFile, check_size, screen
 from .tree import Node, find_below, read_tree
@@ -22,12 +23,14 @@ class Prepared:
 
     ``models`` are the texts of attached models, by the names that ``text`` and they know each other by. Line
     n of all of them together is ``nodes[n - 1]``. ``files`` are the files of the meshes.
+    ``custom`` is what the file says beside that, if it was written here.
     """
 
     text: str = ""
     models: dict[str, bytes] = field(default_factory=dict)
     nodes: list[Node] = field(default_factory=list)
     files: dict[Node, MeshFile] = field(default_factory=dict)
+    custom: Custom = field(default_factory=Custom)
 
     def node(self, info: str) -> Node | None:
         """Return the element that MuJoCo says something about, as ``line 5``."""
@@ -47,7 +50,7 @@ class _Model:
 class Preparation:
     """Reads a file and those that it attaches, each of them once."""
 
-    def __init__(self, top: str, note: Callable[[Node, str], None]) -> None:
+    def __init__(self, top: str, note: Callable[[Node | None, str], None]) -> None:
         self._top = top
         self._note = note
         self._known: dict[Path, _Model] = {}
@@ -62,11 +65,12 @@ class Preparation:
         FormatError
             For what is no MJCF, leaves its folder, holds itself, or is too large.
         """
-        self.prepared.text = self._document(data, source, self._top)[0]
+        root = read_tree(data, source, self._top, self._top)
+        self.prepared.custom = custom_of(root, self._note)
+        self.prepared.text = self._document(root, self._top)[0]
         return self.prepared
 
-    def _document(self, data: str | bytes, source: str, folder: str) -> tuple[str, _Model]:
-        root = read_tree(data, source, folder, self._top)
+    def _document(self, root: Node, folder: str) -> tuple[str, _Model]:
         models: dict[str, int] = {}
         for node in root.walk():
             if node.tag == "model" and "file" in node.attributes:
@@ -89,7 +93,8 @@ class Preparation:
             node.refuse("attaches itself, directly or through others.")
         if path not in self._known:
             self._open.append(path)
-            text, model = self._document(read_file(path), path.name, str(path.parent))
+            folder = str(path.parent)
+            text, model = self._document(read_tree(read_file(path), path.name, folder, self._top), folder)
             self._open.pop()
             model.name = f"{len(self._known)}.xml"
             self._known[path] = model

@@ -5,11 +5,14 @@ Where bodies are does not depend on any of it. Mesh files are replaced by boxes,
 
 from __future__ import annotations
 
+import math
 import posixpath
+import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 from kineverse.formats.markup import quote
+from kineverse.formats.numerals import LARGEST
 
 from .tree import Node
 
@@ -45,6 +48,7 @@ _ATTRIBUTES = {
 _INLINE = ("vertex", "normal", "texcoord", "face")
 _NAMES = frozenset(("name", "class", "childclass", "prefix", "file"))
 _NOT_NUMBERS = frozenset(("nan", "+nan", "-nan"))
+_LARGE = re.compile(r"e\+?\d\d|\d{40}|0x", re.IGNORECASE)
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,9 +77,32 @@ def screen(root: Node, note: Callable[[Node, str], None]) -> dict[Node, MeshFile
         for key in _ATTRIBUTES.get(node.tag, ()):
             node.attributes.pop(key, None)
         for key, value in node.attributes.items():
-            if key not in _NAMES and not _NOT_NUMBERS.isdisjoint(value.lower().split()):
-                node.refuse(f"{key}={quote(value)} has a NaN, where a number is expected.")
+            if key not in _NAMES:
+                _check_numbers(node, key, value)
     return files
+
+
+def _check_numbers(node: Node, key: str, value: str) -> None:
+    if not _NOT_NUMBERS.isdisjoint(value.lower().split()):
+        node.refuse(f"{key}={quote(value)} has a NaN, where a number is expected.")
+    # Squares of larger ones overflow inside of MuJoCo. As a limit they may say that there is none.
+    if (
+        key != "count"
+        and not key.endswith("range")
+        and _LARGE.search(value)
+        and any(map(_is_large, value.split()))
+    ):
+        node.refuse(f"{key}={quote(value)} has a number beyond {LARGEST:g}.")
+
+
+def _is_large(word: str) -> bool:
+    try:
+        number = float.fromhex(word) if "x" in word.lower() else float(word)
+    except OverflowError:
+        return True
+    except ValueError:  # MuJoCo says so
+        return False
+    return LARGEST < abs(number) < math.inf
 
 
 def _is_left_out(node: Node, unwanted: frozenset[str], note: Callable[[Node, str], None]) -> bool:

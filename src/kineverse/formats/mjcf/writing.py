@@ -20,10 +20,11 @@ from kineverse.formats.export.poses import RIGID, deviation, quaternion
 from kineverse.formats.export.recognition import Recognition
 from kineverse.formats.export.refusals import Refusals
 from kineverse.formats.export.target import Target
+from kineverse.formats.mjcf.custom import ENDS, MASSLESS
 from kineverse.formats.mjcf.writing_bodies import BodyWriter, placed
+from kineverse.formats.mjcf.writing_custom import add_loop, add_names, add_speeds, interval
 from kineverse.model.frame import WORLD
 from kineverse.model.view import ModelView
-from kineverse.symbols import Symbol
 
 MJCF = Target("MJCF", sums=True, one_way=True, loops=True, degree=4)
 
@@ -84,6 +85,9 @@ class MjcfWriter:
         self._names = Names([WORLD, *(link.name for link in plan.links)])
         self._qpos: list[float] = []
         self._elements: dict[str, Tag] = {}
+        self._joint_names: set[str] = set()
+        self._ends: dict[str, str] = {}
+        self._ties: dict[str, list[str]] = {}
 
     def document(self) -> bytes:
         """Return the text.
@@ -105,12 +109,12 @@ class MjcfWriter:
             self._link(link)
             waiting += self._children.get(link.name, [])[::-1]
         self._refusals.check(self._path.name)
-        equality, tendon, custom, key = self._equalities(), self._tendons(), self._speeds(), Tag("keyframe")
+        equality, tendon, key = self._equalities(), self._tendons(), Tag("keyframe")
         for name, value in self._bodies.settings().items():
             compiler.give(name, value)
         if any(self._qpos):
             key.add("key", name="home", qpos=self._qpos)
-        parts = (custom, self._bodies.assets, world, tendon, equality, key)
+        parts = (self._said(), self._bodies.assets, world, tendon, equality, key)
         root.inside += [part for part in parts if part.inside or part is world]
         return document(root, [*self._plan.remarks, *self._plan.said_errors])
 
@@ -137,9 +141,11 @@ class MjcfWriter:
         free = self._free(link)
         if free is not None:
             body.add("freejoint", name=free)
+            self._joint_names.add(free)
             self._rest_free(link, free)
         else:
             for joint in joints:
+                self._joint_names.add(joint.name)
                 if isinstance(joint, BallJoint):
                     body.add("joint", name=joint.name, type="ball", pos=_unless_zero(joint.point))
                     w, x, y, z = (self._home.get(f"{joint.name}/q{c}", 0.0) for c in "wxyz")
@@ -201,24 +207,25 @@ class MjcfWriter:
         return float(np.polynomial.polynomial.polyval(x, joint.amount))
 
     def _equalities(self) -> Tag:
-        equality = Tag("equality")
+        equality, names = Tag("equality"), Names()
         for joint in self._plan.joints:
             if not joint.leads:
                 coefficients = [*joint.amount, 0.0, 0.0, 0.0, 0.0][:5]
                 equality.add(
                     "joint",
-                    name=joint.name,
+                    name=names.take(joint.name),
                     joint1=joint.name,
                     joint2=joint.symbol.path,
                     polycoef=coefficients,
                 )
-        sites: set[str] = set()
+        for frame in dict.fromkeys(end for loop in self._plan.loops for pair in loop.ends for end in pair):
+            self._elements[frame].add("site", name=self._ends.setdefault(frame, f"{frame}/end"))
         for loop in self._plan.loops:
-            for end in (loop.frame, loop.to):
-                if end not in sites:
-                    sites.add(end)
-                    self._elements[end].add("site", name=f"{end}/end")
-            equality.add(loop.kind, name=loop.name, site1=f"{loop.to}/end", site2=f"{loop.frame}/end")
+            for k, (frame, to) in enumerate(loop.ends):
+                name = names.take(f"{loop.name}/{k}" if k else loop.name)
+                self._ties.setdefault(loop.name, []).append(name)
+                # What the first end hangs on is free when somebody else closes the loop.
+                equality.add(loop.kind, name=name, site1=self._ends[to], site2=self._ends[frame])
         return equality
 
     def _tendons(self) -> Tag:
@@ -230,17 +237,15 @@ class MjcfWriter:
                 fixed.add("joint", joint=symbol.path, coef=factor)
         return tendon
 
-    def _speeds(self) -> Tag:
-        """Return limits of speeds, which MuJoCo does not know: numbers under the names of the speeds."""
+    def _said(self) -> Tag:
+        """Return what only the reader here understands, and MuJoCo ignores."""
         custom = Tag("custom")
-        for joint in self._plan.joints:
-            slowest, fastest = joint.bounds.slowest, joint.bounds.fastest
-            if (slowest, fastest) != (-math.inf, math.inf):
-                name = str(Symbol(joint.name, 1))
-                numeric = custom.add("numeric", name=name)
-                numeric.attributes["data"] = _range(slowest, fastest)
-        if custom.inside:
+        if add_speeds(custom, self._plan.joints):
             self._plan.remarks.append("MuJoCo knows no limits of speeds: they are custom numbers, <numeric>")
+        add_names(custom, MASSLESS, "body", self._bodies.massless)
+        add_names(custom, ENDS, "site", self._ends.values())
+        for loop in self._plan.loops:
+            add_loop(custom, loop, self._ties[loop.name], self._joint_names)
         return custom
 
 
@@ -266,6 +271,4 @@ def _range(lower: float, upper: float) -> str:
     """Return the ends of a range, which MuJoCo wants to be apart."""
     if lower == upper:
         upper += 1e-15 * max(1.0, abs(lower))
-    return " ".join(
-        "inf" if end == math.inf else "-inf" if end == -math.inf else repr(end) for end in (lower, upper)
-    )
+    return interval(lower, upper)

@@ -44,6 +44,7 @@ class BodyWriter:
     def __init__(self, folder: Path, remarks: list[str]) -> None:
         self.assets = Tag("asset")
         self._unbalanced = self._weightless = False
+        self._without_inertia: list[str] = []
         self._least_mass = self._least_inertia = math.inf
         self._folder, self._remarks = folder, remarks
         self._meshes: dict[tuple[str, tuple[float, ...]], str] = {}
@@ -52,8 +53,8 @@ class BodyWriter:
 
     def write(self, element: Tag, body: Body, name: str, *, moves: bool) -> None:
         """Put a body into the element of its frame."""
-        if body.inertia is not None and name != "world":
-            self._inertia(element, body.inertia, name)
+        if name != "world" and (body.inertia is None or not self._inertia(element, body.inertia, name)):
+            self._without_inertia.append(name)
         mass = 0.0 if body.inertia is None else body.inertia.mass
         inertia = 0.0 if body.inertia is None else min(body.inertia.tensor[k] for k in (0, 3, 5))
         self._least_mass = min(self._least_mass, mass if mass > 0 else math.inf)
@@ -73,13 +74,19 @@ class BodyWriter:
             found["boundinertia"] = min(_SMALLEST_INERTIA, self._least_inertia)
         return found
 
-    def _inertia(self, element: Tag, inertia: Inertia, name: str) -> None:
+    @property
+    def massless(self) -> list[str]:
+        """The frames without inertia, if :meth:`settings` give them one."""
+        return self._without_inertia if self._weightless else []
+
+    def _inertia(self, element: Tag, inertia: Inertia, name: str) -> bool:
+        """Write an inertia; return whether there can be one like it."""
         xx, xy, xz, yy, yz, zz = inertia.tensor
         tensor = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
         least, middle, most = np.linalg.eigvalsh(tensor).tolist()
         if inertia.mass < 0 or least < 0:
             self._remark(f"the inertia of '{name}' is left out: no body has one that is negative")
-            return
+            return False
         if least + middle < most:
             self._unbalanced = True
             self._remark(
@@ -91,10 +98,11 @@ class BodyWriter:
             xx, xy, xz, _, yy, yz, _, _, zz = (turn @ tensor @ turn.T).ravel().tolist()
             made.give("mass", inertia.mass)
             made.give("fullinertia", (xx, yy, zz, xy, xz, yz))
-            return
+            return True
         turned(made, inertia.origin.matrix)
         made.give("mass", inertia.mass)
         made.give("diaginertia", (xx, yy, zz))
+        return True
 
     def _shape(self, element: Tag, shape: Shape, name: str, *, seen: bool) -> None:
         given = self._geometry(shape.geometry, name)

@@ -1,0 +1,52 @@
+"""What MJCF has no place for as custom elements, which MuJoCo ignores and the reader knows."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Collection, Iterable
+
+from kineverse.formats.export.markup import Tag
+from kineverse.formats.export.plan import Joint, Loop
+from kineverse.symbols import parse_symbol_name
+
+from .custom import LOOP, SPEED
+
+
+def add_speeds(custom: Tag, joints: Iterable[Joint]) -> bool:
+    """Add the ranges of speeds of joints that have some; return whether there are any."""
+    found = False
+    for joint in joints:
+        slowest, fastest = joint.bounds.slowest, joint.bounds.fastest
+        if (slowest, fastest) != (-math.inf, math.inf):
+            numeric = custom.add("numeric", name=f"{SPEED}{joint.name}")
+            numeric.attributes["data"] = interval(slowest, fastest)
+            found = True
+    return found
+
+
+def add_names(custom: Tag, what: str, kind: str, names: Iterable[str]) -> None:
+    """Add that things of some kind are something, unless there are none."""
+    listed = Tag("tuple", {"name": what})
+    for name in names:
+        listed.add("element", objtype=kind, objname=name)
+    if listed.inside:
+        custom.inside.append(listed)
+
+
+def add_loop(custom: Tag, loop: Loop, equalities: Iterable[str], joints: Collection[str]) -> None:
+    """Add which coordinates of a loop follow; several of them may belong to one of the joints."""
+    listed = custom.add("tuple", name=f"{LOOP}{loop.name}")
+    for name in equalities:
+        listed.add("element", objtype="equality", objname=name)
+    for names, follows in ((loop.free, 0), (loop.dependent, 1)):
+        paths = [parse_symbol_name(name)[0] for name in names]
+        owners = [path if path in joints else path.rpartition("/")[0] for path in paths]
+        for joint in dict.fromkeys(owners):
+            listed.add("element", objtype="joint", objname=joint, prm=follows)
+
+
+def interval(lower: float, upper: float) -> str:
+    """Return the ends of an interval as text, which may be infinite."""
+    return " ".join(
+        "inf" if end == math.inf else "-inf" if end == -math.inf else repr(end) for end in (lower, upper)
+    )

@@ -1,0 +1,112 @@
+"""What is on record about closed loops: which frames they keep together, and which coordinates follow."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from kineverse.model.articulation import Articulation
+from kineverse.model.frame import WORLD
+from kineverse.model.view import ModelView
+from kineverse.symbols import symbol_name
+
+from .closing import Closed
+
+KIND = "closedloop"
+
+
+@dataclass(frozen=True)
+class LoopRecord:
+    """A loop of a model, however it came into it.
+
+    Attributes
+    ----------
+    name
+        Of the loop.
+    ends
+        Pairs of frames (frame, to) that coincide, as far as the mask says.
+    mask
+        Names out of ``x y z rx ry rz``.
+    free, dependent
+        The names of the coordinates that move by themselves, and of those that follow.
+    """
+
+    name: str
+    ends: tuple[tuple[str, str], ...]
+    mask: tuple[str, ...]
+    free: tuple[str, ...]
+    dependent: tuple[str, ...]
+
+
+def loop_record(ends: tuple[tuple[str, str], ...], mask: tuple[str, ...], closed: Closed) -> Articulation:
+    """Return what is put on record of a loop that was closed."""
+    frame, to = ends[0]
+    return Articulation(
+        KIND,
+        to,
+        frame,
+        dynamics=(
+            ("free", tuple(map(str, closed.free))),
+            ("dependent", tuple(map(str, closed.dependent))),
+            ("ends", ends),
+            ("mask", mask),
+            ("mobility", closed.mobility),
+            ("branches", closed.branches),
+            ("branch", closed.branch),
+            ("condition", closed.condition),
+            ("worst at", closed.worst),
+        ),
+    )
+
+
+def loops_of(model: ModelView) -> Iterator[LoopRecord]:
+    """Yield the loops of a model in the order in which they were closed.
+
+    Those of a document are among them, without the code that closed them; of one that says less about its
+    loops, as documents of earlier versions do, they are not.
+    """
+    followers = set(map(str, model.rates.dependent))
+    for name, record in model.articulations.items():
+        known = dict(record.dynamics)
+        if record.kind != KIND or not _is_complete(known):
+            continue
+        loop = _as_named(name, record, known)
+        if followers >= set(loop.dependent) and all(
+            frame in model.frames or frame == WORLD for pair in loop.ends for frame in pair
+        ):
+            yield loop
+
+
+def _is_complete(known: Mapping[str, Any]) -> bool:
+    """Whether a record has what it should have: documents may contain anything under these names."""
+    ends = known.get("ends")
+    texts = (known.get(key) for key in ("mask", "free", "dependent"))
+    return (
+        isinstance(ends, tuple)
+        and bool(ends)
+        and all(_is_texts(pair) and len(pair) == 2 for pair in ends)
+        and all(map(_is_texts, texts))
+    )
+
+
+def _is_texts(value: object) -> bool:
+    return isinstance(value, tuple) and all(isinstance(item, str) for item in value)
+
+
+def _as_named(name: str, record: Articulation, known: Mapping[str, Any]) -> LoopRecord:
+    """Return a record with the names that frames and coordinates have in the model.
+
+    Texts are as they were saved, the frames of the record below the prefix that a document was loaded under.
+    """
+    frame, to = known["ends"][0]
+    renamed, saved = (record.child, frame) if frame != WORLD else (record.parent, to)
+    prefix = renamed.removesuffix(saved)
+    before = symbol_name(prefix, 0)
+    ends = tuple((_below(prefix, one), _below(prefix, other)) for one, other in known["ends"])
+    free, dependent = (tuple(f"{before}{s}" for s in known[key]) for key in ("free", "dependent"))
+    return LoopRecord(name, ends, known["mask"], free, dependent)
+
+
+def _below(prefix: str, frame: str) -> str:
+    return frame if frame == WORLD else f"{prefix}{frame}"
