@@ -222,3 +222,20 @@ def test_suggestions_are_bounded():
     assert len(suggest("a", names)) < 1500
     assert len(suggest(names[0][:-1], names)) < 1500
     assert suggest("cab", ["cap"]) == "Did you mean 'cap'?"
+
+
+@pytest.mark.parametrize(
+    ("text", "reason"),
+    [
+        # Its square is infinite inside of MuJoCo, and what was left of the rotation was zero.
+        ('<body quat="1e308 2 0 0"/>', 'quat="1e308 2 0 0" has a number beyond 1e+50'),
+        ('<body quat="0x1p900 2 0 0"/>', "has a number beyond 1e+50"),
+        ('<body pos="1e150 0 0"/>', "has a number beyond 1e+50"),
+        ('<replicate count="2" offset="1e50 0 0"><body pos="1e50 0 0"/></replicate>', "too large (body_pos)"),
+    ],
+)
+def test_numbers_of_an_mjcf_that_overflow(tmp_path, text, reason):
+    message = loaded(tmp_path, f"<mujoco><worldbody>{text}</worldbody></mujoco>", "input.xml")
+    assert isinstance(message, str)
+    assert message.startswith("input.xml")
+    assert reason in message
