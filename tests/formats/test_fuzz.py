@@ -23,7 +23,7 @@ from fuzz.records import Records  # noqa: E402
 from fuzz.targets import TARGETS, Target  # noqa: E402
 from fuzz.worker import place  # noqa: E402
 
-COUNTS = {"urdf": 300, "sdf": 100, "document": 300}
+COUNTS = {"urdf": 300, "sdf": 100, "mjcf": 80, "document": 300}
 
 
 @pytest.fixture
@@ -73,15 +73,23 @@ def warning(text, folder):
 
 
 def long_message(text, folder):
-    raise kv.FormatError("x" * 2000)
+    raise kv.FormatError("input.urdf: " + "x" * 2000)
 
 
 def half_a_pair(text, folder):
-    raise kv.FormatError("\ud800")
+    raise kv.FormatError("input.urdf: \ud800")
 
 
 def no_message(text, folder):
     raise kv.FormatError("")
+
+
+def another_kind(text, folder):
+    raise kv.UnknownNameError("x")
+
+
+def nowhere(text, folder):
+    raise kv.FormatError("something is wrong")
 
 
 def opens_files(text, folder):
@@ -113,6 +121,8 @@ def far_away(text, folder):
         (no_message, "no message of FormatError"),
         (opens_files, "reaches out: open"),
         (far_away, "broken: a pose is not finite"),
+        (another_kind, "broken: an error of another kind, at"),
+        (nowhere, "broken: an error without place, at"),
         (opens_files_beside, None),
     ],
 )

@@ -140,7 +140,7 @@ def _look(target: Target, path: Path) -> int:
     data = path.read_bytes()
     with tempfile.TemporaryDirectory() as name:
         folder = place(Path(name))
-        finding = check(target, data, folder)
+        finding = check(target, data, folder) or check(target, data, folder, loops=False)
         if finding is None:
             _say("nothing is wrong")
             return 0
@@ -150,11 +150,15 @@ def _look(target: Target, path: Path) -> int:
 
 
 def _minimised(target: Target, data: bytes, signature: str, folder: Path) -> bytes:
-    def fails(candidate: bytes) -> bool:
-        finding = check(target, candidate, folder)
-        return finding is not None and finding.signature == signature
+    for loops in (False, True):
 
-    return minimise(data, target, fails) if fails(data) else data
+        def fails(candidate: bytes, loops: bool = loops) -> bool:
+            finding = check(target, candidate, folder, loops=loops)
+            return finding is not None and finding.signature == signature
+
+        if fails(data):
+            return minimise(data, target, fails)
+    return data
 
 
 def _say(text: str) -> None:

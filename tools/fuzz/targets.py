@@ -8,9 +8,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from random import Random
 
+import mujoco  # noqa: F401  - it looks about when it is imported, so before anybody watches
+
 import kineverse as kv
 from kineverse import gallery
 from kineverse.formats.document import document_of, operations_from
+from kineverse.formats.mjcf import parse_mjcf
+from kineverse.formats.mjcf.operations import scene_operations as mjcf_operations
 from kineverse.formats.sdf.operations import scene_operations
 from kineverse.formats.sdf.reader import parse_sdf
 from kineverse.formats.set_body import SetBody
@@ -18,7 +22,7 @@ from kineverse.formats.urdf import parse_urdf
 from kineverse.formats.urdf.operations import robot_operations
 
 from . import json_trees, xml_trees
-from .grammars import document, sdf, urdf
+from .grammars import document, mjcf, sdf, urdf
 
 SEEDS = Path(__file__).parent / "seeds"
 DATA = Path(__file__).resolve().parents[3] / "shared" / "data"
@@ -48,6 +52,8 @@ class Target:
         Whether poses have to be finite; where expressions are free, they may be what they like.
     examples
         Returns further inputs to begin a search with.
+    mark
+        What tells its files from others of that suffix.
     """
 
     name: str
@@ -58,21 +64,15 @@ class Target:
     reduce: Callable[[bytes], Iterator[bytes]]
     finite: bool = True
     examples: Callable[[], list[bytes]] = list
-
-    def model(self, data: bytes, folder: Path) -> kv.Model:
-        """Return the model that an input describes."""
-        model = kv.Model()
-        with model.edit() as edit:
-            for tag, operation in self.operations(data, folder):
-                edit.apply(operation, tag)
-        return model
+    mark: bytes = b""
 
     def seeds(self) -> list[bytes]:
         """Return the inputs to begin with: written for it, small files of the data beside, and examples."""
         own = sorted(SEEDS.glob(f"*{self.suffix}"))
         found = sorted(DATA.rglob(f"*{self.suffix}")) if DATA.is_dir() else []
         small = [path for path in found if path.is_file() and path.stat().st_size <= MAX_SEED]
-        return [path.read_bytes() for path in (*own, *small)] + self.examples()
+        read = [path.read_bytes() for path in (*own, *small)]
+        return [data for data in read if self.mark in data] + self.examples()
 
     def own_seeds(self) -> list[bytes]:
         """Return the inputs that were written for it."""
@@ -87,6 +87,11 @@ def _urdf(data: bytes, folder: Path) -> Operations:
 def _sdf(data: bytes, folder: Path) -> Operations:
     scene = parse_sdf(data, source="input.sdf", folder=str(folder))
     return ((None, operation) for operation in scene_operations(scene))
+
+
+def _mjcf(data: bytes, folder: Path) -> Operations:
+    scene = parse_mjcf(data, source="input.xml", folder=str(folder))
+    return ((None, operation) for operation in mjcf_operations(scene))
 
 
 def _document(data: bytes, folder: Path) -> Operations:
@@ -115,6 +120,15 @@ TARGETS = {
             "urdf", ".urdf", _urdf, urdf.generate, xml_trees.mutator(urdf.VOCABULARY), xml_trees.reductions
         ),
         Target("sdf", ".sdf", _sdf, sdf.generate, xml_trees.mutator(sdf.VOCABULARY), xml_trees.reductions),
+        Target(
+            "mjcf",
+            ".xml",
+            _mjcf,
+            mjcf.generate,
+            xml_trees.mutator(mjcf.VOCABULARY),
+            xml_trees.reductions,
+            mark=b"<mujoco",
+        ),
         Target(
             "document",
             ".kv.json",
