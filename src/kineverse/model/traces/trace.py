@@ -7,6 +7,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+import casadi as ca
+
 from kineverse.errors import KineverseError, ModelError
 from kineverse.expressions.expression import Expression, as_expression
 from kineverse.model.constraint import Constraint
@@ -16,6 +18,9 @@ from kineverse.model.reader import Cell, Reader
 
 from .answer import Answer, answers_in, entry_along, filled
 from .question import FAILED, Look, Part, Question, Reply
+
+MAX_ANSWER = 200_000
+"""How many nodes an answer may be made of."""
 
 
 class UntraceableError(ModelError):
@@ -71,6 +76,8 @@ class Trace:
                 raise now
             old.append(_reply(then))
             new.append(_like(_reply(now), old[-1]))
+            _check_size(old[-1])
+            _check_size(new[-1])
             problem = _difference(step.look, old[-1], new[-1])
             if problem:
                 asked = ", ".join(str(a) for a in step.question.arguments if isinstance(a, str))
@@ -104,6 +111,12 @@ class Trace:
             if kind == CONSTRAINTS:
                 Constraint.of(value.lower, value.expression, value.upper)  # raises where there is no range
         return Effects.of(written)
+
+
+def _check_size(reply: Reply) -> None:
+    """Refuse what has no end: each of some dozen substitutions in one another doubles what there is."""
+    if sum(ca.n_nodes(part._sx) for part in reply.parts if isinstance(part, Expression)) > MAX_ANSWER:
+        raise UntraceableError(f"an answer on the way to it is made of more than {MAX_ANSWER:,} nodes.")
 
 
 def _answered(question: Question, model: Reader) -> Reply | KineverseError:
