@@ -60,7 +60,7 @@ from .expressions import Expression, array, total_derivative
 from .expressions.functions import clip, maximum, minimum, norm, where
 from .expressions.piecewise import spline
 from .formats import load, shipped_models
-from .formats.document import document_hash
+from .formats.document import document_hash, from_bytes, to_bytes
 from .locks import blocked_unless, limit_table, unlocked_while
 from .logic import less, logic_and, logic_not, logic_or
 from .loops import CloseLoop
@@ -206,6 +206,7 @@ __all__ = [
     "spatial",
     "spline",
     "symbol",
+    "to_bytes",
     "total_derivative",
     "transform",
     "translation",

@@ -178,6 +178,8 @@ def test_nothing_is_included_from_a_document_that_fails(tmp_path):
     before = model.snapshot()
     with pytest.raises(kv.KineverseError):
         model.include(path)
+    with pytest.raises(kv.FormatError, match="its operations cannot be applied"):
+        kv.load(path)
     assert model.snapshot() == before
 
 

@@ -6,21 +6,22 @@ import hashlib
 import os
 from collections import OrderedDict
 from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 from kineverse.collection import no_collection
-from kineverse.errors import ExpressionError, FormatError, KineverseError
+from kineverse.errors import FormatError, KineverseError, MissingExtraError
 from kineverse.loops.operation import CloseLoop
 from kineverse.model.edit import Edit
 from kineverse.model.frame import WORLD
 from kineverse.model.model import Model, Snapshot
 from kineverse.model.operation import Operation
 from kineverse.shipped.bases import base_of
-from kineverse.symbols import position
 
-from .document import operations_from
+from .document import operations_from, operations_unpacked
 from .files import read_file
 from .markup import root_tag
+from .prefixes import check_prefix
 from .remarks import listening, tell
 from .sources import Source, locate_model
 from .urdf.operations import robot_operations
@@ -40,8 +41,9 @@ def load(source: str | os.PathLike[str], prefix: str | None = None) -> Model:
     Parameters
     ----------
     source
-        The path of a ``.urdf``, ``.sdf``, ``.xml`` (MJCF, or URDF) or ``.kv.json`` file, or a name such as
-        ``kitchen``, ``pr2`` or ``articulations/screw``, see :func:`kineverse.formats.sources.locate_model`.
+        The path of a ``.urdf``, ``.sdf``, ``.xml`` (MJCF, or URDF), ``.kv.json`` or ``.kv.msgpack`` file, or
+        a name such as ``kitchen``, ``pr2`` or ``articulations/screw``, see
+        :func:`kineverse.formats.sources.locate_model`.
     prefix
         Put in front of the names of all frames and degrees of freedom, with a slash. A model that ships has
         its own name as prefix unless another is given (``screw`` for ``articulations/screw``); ``""`` means
@@ -54,7 +56,7 @@ def load(source: str | os.PathLike[str], prefix: str | None = None) -> Model:
     FormatError
         If the file is not what it should be, with file, line, element and reason; or if the prefix is not.
     """
-    _check_prefix(prefix)
+    check_prefix(prefix)
     found = locate_model(source)
     content = _content(found)
     remembered = _stands_alone(found, content)
@@ -62,7 +64,7 @@ def load(source: str | os.PathLike[str], prefix: str | None = None) -> Model:
     known = _REMEMBERED.pop(key, None)
     if known is None:
         model = Model()
-        with listening() as remarks, model.edit() as edit, no_collection():
+        with listening() as remarks, _blaming(found.path), model.edit() as edit, no_collection():
             for tag, operation in _operations(found, content, prefix):
                 _apply(edit, tag, operation, found.path)
         if len(content) > LARGEST_REMEMBERED or not remembered:
@@ -75,6 +77,19 @@ def load(source: str | os.PathLike[str], prefix: str | None = None) -> Model:
     while len(_REMEMBERED) > MOST_REMEMBERED:
         _REMEMBERED.popitem(last=False)
     return model
+
+
+@contextmanager
+def _blaming(path: Path) -> Iterator[None]:
+    """Make it the fault of a document if its operations cannot be applied to the empty model."""
+    try:
+        yield
+    except (FormatError, MissingExtraError):
+        raise
+    except KineverseError as error:
+        if path.name.endswith((".kv.json", ".kv.msgpack")):
+            raise FormatError(f"{path}: its operations cannot be applied: {error}") from error
+        raise
 
 
 def _apply(edit: Edit, tag: str, operation: Operation, path: Path) -> None:
@@ -95,23 +110,9 @@ def operations_of(
     source: str | os.PathLike[str], prefix: str | None = None
 ) -> Iterator[tuple[str, Operation]]:
     """Yield the operations of a file or shipped model, each with its tag."""
-    _check_prefix(prefix)
+    check_prefix(prefix)
     found = locate_model(source)
     yield from _operations(found, _content(found), prefix)
-
-
-def _check_prefix(prefix: object) -> None:
-    if prefix is None or prefix == "":
-        return
-    if not isinstance(prefix, str):
-        raise FormatError(f"A prefix is a text that is put in front of names, not {prefix!r}.")
-    try:
-        position(prefix)
-    except ExpressionError:
-        raise FormatError(
-            f"The prefix {prefix!r} has an empty part, a control character or half of a surrogate pair. The "
-            "slash behind it comes by itself."
-        ) from None
 
 
 def _content(source: Source) -> bytes:
@@ -130,6 +131,8 @@ def _operations(source: Source, content: bytes, prefix: str | None) -> Iterator[
             yield operation.default_tag(), operation
     elif name.endswith(".kv.json"):
         yield from operations_from(content, str(path), prefix)
+    elif name.endswith(".kv.msgpack"):
+        yield from operations_unpacked(content, str(path), prefix)
     elif _is_mjcf(name, content):
         from .mjcf.operations import scene_operations as mjcf_operations
         from .mjcf.reader import parse_mjcf
@@ -155,7 +158,7 @@ def _operations(source: Source, content: bytes, prefix: str | None) -> Iterator[
     else:
         raise FormatError(
             f"{path}: this version reads URDF (.urdf, .xml), SDF (.sdf, .world), MJCF (.xml, .mjcf) and "
-            f"documents (.kv.json), not '{''.join(path.suffixes) or name}'."
+            f"documents (.kv.json, .kv.msgpack), not '{''.join(path.suffixes) or name}'."
         )
 
 

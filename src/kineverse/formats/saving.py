@@ -16,7 +16,7 @@ from kineverse.formats.remarks import tell
 from kineverse.model.view import ModelView
 from kineverse.number import real_number
 
-ENDINGS = (".kv.json", ".urdf", ".xml", ".mjcf")
+ENDINGS = (".kv.json", ".kv.msgpack", ".urdf", ".xml", ".mjcf")
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,8 +63,8 @@ def save(
     model
         The model.
     path
-        A name that ends in ``.kv.json`` for a document, which says all of the model, ``.urdf`` for URDF or
-        ``.xml`` or ``.mjcf`` for MJCF.
+        A name that ends in ``.kv.json`` for a document, which says all of the model, ``.kv.msgpack`` for the
+        same in msgpack, ``.urdf`` for URDF, or ``.xml`` or ``.mjcf`` for MJCF.
     tolerance
         How far any frame may be from where it should be, in position [m] and in angle [rad], wherever
         coordinates are within their limits. Then motions by curves are approximated. None for none.
@@ -83,7 +83,7 @@ def save(
         For a tolerance that is no positive number.
     """
     target = _target(path)
-    if target.name.endswith(".kv.json"):
+    if target.name.endswith((".kv.json", ".kv.msgpack")):
         if tuple(leave_out) or tolerance is not None:
             what = "nothing can be left out" if tolerance is None else "it has no tolerance"
             raise FormatError(f"{target.name}: a document says all of a model exactly, so {what}.")

@@ -14,7 +14,7 @@ from pathlib import Path
 from kineverse import shipped
 from kineverse.errors import FormatError, UnknownNameError, suggest
 
-SUFFIXES = (".urdf", ".sdf", ".world", ".xml", ".mjcf", ".kv.json")
+SUFFIXES = (".urdf", ".sdf", ".world", ".xml", ".mjcf", ".kv.json", ".kv.msgpack")
 MODEL_PATH = "KINEVERSE_MODEL_PATH"
 _DEPTH = 6
 _LISTED = 6

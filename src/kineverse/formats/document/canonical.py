@@ -69,7 +69,11 @@ def check_hash(claim: Any, content: bytes, given: dict[str, Any]) -> None:
     if content.endswith(end) and _digest(content[: -len(end)]) == claim:
         return
     rest = {key: value for key, value in given.items() if key != HASH}
-    if claim not in (_digest_of(rest), _digest_of(_in_order(rest))):
+    try:
+        same = claim in (_digest_of(rest), _digest_of(_in_order(rest)))
+    except (TypeError, ValueError):
+        raise RefusedError("it contains what JSON has no place for") from None
+    if not same:
         raise RefusedError(
             f"its content is not what {HASH!r} says; it was changed or damaged since it was written. Get it "
             f"anew, or, if the change is meant, delete the member {HASH!r}: it comes again when the model "

@@ -11,10 +11,21 @@ import casadi as ca
 from kineverse.expressions import layout
 from kineverse.expressions.expression import NO_NODES, Expression, make
 from kineverse.expressions.node import Node
+from kineverse.model.rates import Composed
 from kineverse.symbols import Symbol
 
 from .checks import RefusedError, exactly, listed, shown, whole
-from .limits import MAX_DIMENSIONS, MAX_ELEMENTS, MAX_LENGTH, MAX_NESTING, Budget
+from .limits import (
+    COST_OF_ELEMENT,
+    COST_OF_NODE_BELOW,
+    COST_OF_SCALAR,
+    MAX_COMPOSITIONS,
+    MAX_DIMENSIONS,
+    MAX_ELEMENTS,
+    MAX_LENGTH,
+    MAX_NESTING,
+    Budget,
+)
 
 
 class Graph:
@@ -49,6 +60,7 @@ class Graph:
         self._expressions: list[Expression | None] = []
         self._owners: dict[int, Node] = {}
         self._below: dict[Node, int] = {}
+        self._compositions: dict[Node, int] = {}
 
     # -- what is there -------------------------------------------------------------------------------------
 
@@ -64,7 +76,7 @@ class Graph:
                 owners = self._owners
                 found = (owners.get(e.element_hash()) for e in ca.symvar(sx))
                 nodes = frozenset(node for node in found if node is not None)
-                self.budget.spend(self._count(nodes))
+                self.budget.spend(COST_OF_NODE_BELOW * self._count(nodes))
             known = self._expressions[place] = make(sx, self.shapes[place], nodes)
         return known
 
@@ -113,9 +125,11 @@ class Graph:
         if len(listed(given, "a shape")) > MAX_DIMENSIONS:
             raise RefusedError(f"more than {MAX_DIMENSIONS} dimensions")
         shape = tuple(whole(length, MAX_LENGTH) for length in given)
-        if math.prod(length for length in shape if length) > MAX_LENGTH:
+        # CasADi keeps a number for each column, even where there are no rows.
+        lengths = math.prod(length for length in shape if length)
+        if lengths > (MAX_LENGTH if math.prod(shape) else MAX_ELEMENTS):
             raise RefusedError(f"the shape {shape} is too large")
-        self.budget.spend(sum(layout.rows_and_columns(shape)))
+        self.budget.spend(math.prod(shape))
         return shape
 
     # -- what comes ----------------------------------------------------------------------------------------
@@ -150,26 +164,30 @@ class Graph:
             raise RefusedError(
                 f"more than {MAX_NESTING} nodes with a gradient of their own inside one another"
             )
-        self.check_elements(shape, 1 + len(refs))
-        below = [self.expression(part)._nodes for part in parts if self.depths[part]]
+        self.check_elements(shape, len(refs))
+        below = NO_NODES.union(*(self.expression(part)._nodes for part in parts if self.depths[part]))
+        compositions = max(map(self._compositions.__getitem__, below), default=0) + (kind is Composed)
+        if compositions > MAX_COMPOSITIONS:
+            raise RefusedError(f"more than {MAX_COMPOSITIONS} compositions of compositions")
         made = kind.of(tuple(self.expression(ref) for ref in refs), shape, options)
-        self.keep(made, depth, 1 + self._count(NO_NODES.union(*below)))
+        self.keep(made, depth, 1 + self._count(below), compositions)
 
-    def keep(self, expression: Expression, depth: int, below: int = 1) -> None:
-        """Add what is a node with a gradient of its own, made of so many."""
+    def keep(self, expression: Expression, depth: int, below: int = 1, compositions: int = 0) -> None:
+        """Add what is a node with a gradient of its own, made of so many, with so many in one another."""
         (node,) = expression._nodes
         self._owners.update(dict.fromkeys(node.elements, node))
         self._below[node] = below
+        self._compositions[node] = compositions
         self.add(expression._sx, node.shape, depth, expression)
 
     def check_elements(self, shape: layout.Shape, arguments: int = 1) -> None:
-        """Refuse a node with a gradient of its own that has too many elements."""
-        size = math.prod(shape)
+        """Refuse a node with a gradient of its own that has too many elements in so many arguments."""
+        size = math.prod(shape) * max(arguments, 1)
         if size > MAX_ELEMENTS:
             raise RefusedError(
-                f"{size} elements are more than {MAX_ELEMENTS}, the most a node of its type has"
+                f"{size} elements are more than {MAX_ELEMENTS}, the most that a node like this has"
             )
-        self.budget.spend(size * arguments)
+        self.budget.spend((COST_OF_ELEMENT if shape else COST_OF_SCALAR) * size)
 
     def _count(self, nodes: Iterable[Node]) -> int:
         """Return how many nodes there are in and below these, or a little more."""

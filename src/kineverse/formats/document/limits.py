@@ -19,6 +19,8 @@ MAX_DEPTH = 100
 """Lists and objects inside one another, among data and parameters."""
 MAX_NESTING = 400
 """Nodes with a gradient of their own inside one another; what works on them follows them down."""
+MAX_COMPOSITIONS = 12
+"""Compositions inside one another; each doubles what the gradient is made of."""
 MAX_ORDER = 1000
 MAX_DIMENSIONS = 16
 MAX_LENGTH = 1 << 24
@@ -28,7 +30,21 @@ MAX_PATH = 16
 """Gradient entries of gradient entries that a ``read`` node follows."""
 MAX_QUESTIONS = 10_000
 MAX_ELEMENTS = 10_000
-"""Elements of a node with a gradient of its own."""
+"""Elements of a node with a gradient of its own, those of all its arguments together."""
+MAX_NORM = 1000
+"""Elements under a norm, each of which may have a gradient by as many symbols."""
+MAX_PIECES = 100_000
+"""Coefficients of a piecewise polynomial, counted once for each element of its argument."""
+COST_OF_SCALAR, COST_OF_ELEMENT = 5, 200
+"""What nodes with a gradient of their own cost, scalars and each element of an array."""
+COST_OF_NODE_BELOW = 20
+"""What a node costs each time that something made of it is looked at."""
+COST_OF_RATE = 20
+"""What a rate costs for each coordinate whose rate leads to it."""
+COST_OF_NAME = 10
+"""What a name costs for each operation that listed it."""
+COST_OF_STEP = 1000
+"""What a Newton step costs, beside what is in it."""
 
 
 class Budget:

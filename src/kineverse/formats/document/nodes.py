@@ -22,7 +22,7 @@ from kineverse.symbols import ROLES, Symbol
 from .checks import RefusedError, exactly, listed, name, number, numbers, shown, the, whole
 from .elementary import BINARY, UNARY
 from .graph import Graph
-from .limits import MAX_ORDER, MAX_PATH, MAX_QUESTIONS
+from .limits import MAX_NORM, MAX_ORDER, MAX_PATH, MAX_PIECES, MAX_QUESTIONS
 from .unknowns import read_implicit
 
 
@@ -146,7 +146,8 @@ def _norm(graph: Graph, node: list[Any]) -> None:
     shape = graph.shapes[graph.at(ref)]
     if len(shape) != 1 or not shape[0]:
         raise RefusedError(f"the norm is that of a vector, not of shape {shape}")
-    graph.check_elements(shape)
+    if shape[0] > MAX_NORM:
+        raise RefusedError(f"the norm of {shape[0]} elements, more than {MAX_NORM}")
     graph.add_opaque(Norm, [ref], (), ())
 
 
@@ -155,7 +156,10 @@ def _piecewise(graph: Graph, node: list[Any]) -> None:
     table = [numbers(piece) for piece in listed(pieces, "pieces")]
     options = checked_pieces(the(bool, periodic, "true or false"), numbers(knots), table)
     # All of the table is looked at for each element.
-    graph.budget.spend(sum(map(len, table)) * math.prod(graph.shapes[graph.at(ref)]))
+    work = sum(map(len, table)) * math.prod(graph.shapes[graph.at(ref)])
+    if work > MAX_PIECES:
+        raise RefusedError(f"{work} coefficients, for all elements together, more than {MAX_PIECES}")
+    graph.budget.spend(work)
     graph.add_alike(Piecewise, [ref], options)
 
 

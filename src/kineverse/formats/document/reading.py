@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Any, NoReturn
 
 from kineverse.errors import FormatError, KineverseError
@@ -19,9 +19,11 @@ from kineverse.symbols import symbol_name
 
 from .canonical import HASH, check_hash
 from .checks import RefusedError, fields, listed, name, string
+from .coupling import check_coupling
 from .graph import Graph
-from .limits import MAX_NODES, check_counts
+from .limits import COST_OF_NAME, MAX_NODES, check_counts
 from .nodes import read_node
+from .packing import unpacked
 from .parameters import read_parameter
 from .recorded import Recorded
 from .traces import check_answers, read_questions
@@ -48,14 +50,29 @@ def operations_from(
     FormatError
         With the source, the place in the document and the reason.
     """
-    if len(content) > MAX_BYTES:
-        raise FormatError(f"{source}: larger than {MAX_BYTES} bytes, the most a document has.")
+    _check_size(content, source)
     try:
         content = content.encode() if isinstance(content, str) else content
-        text = content.decode()
+        content.decode()
     except UnicodeError as error:
         raise FormatError(f"{source}: a document is UTF-8 text, and this is not: {error}.") from None
-    return _Document(source, prefix).read(text, content)
+    return _Document(source, prefix).read(_parsed, content)
+
+
+def operations_unpacked(
+    data: bytes, source: str = "document", prefix: str | None = None
+) -> list[tuple[str, Recorded]]:
+    """Return the operations of a packed document; as :func:`operations_from`.
+
+    Raises
+    ------
+    FormatError
+        With the source, the place in the document and the reason.
+    MissingExtraError
+        If the package for msgpack is not installed.
+    """
+    _check_size(data, source)
+    return _Document(source, prefix).read(unpacked, data)
 
 
 class _Document:
@@ -67,10 +84,9 @@ class _Document:
         self._cells: dict[Cell, Any] = {}
         self._names: dict[str, set[str]] = {kind: set() for kind in KINDS}
 
-    def read(self, text: str, content: bytes) -> list[tuple[str, Recorded]]:
+    def read(self, parse: Callable[[bytes], Any], content: bytes) -> list[tuple[str, Recorded]]:
         try:
-            check_counts(content)
-            given = json.loads(text, object_pairs_hook=_object, parse_constant=_no_constant)
+            given = parse(content)
             self._place = "the document"
             if type(given) is not dict or given.get("format") != FORMAT:
                 raise RefusedError(
@@ -82,20 +98,16 @@ class _Document:
                 check_hash(given[HASH], content, given)
             self._read_nodes(listed(given["nodes"], "nodes"))
             return self._read_operations(listed(given["operations"], "operations"))
-        except json.JSONDecodeError as error:
-            reason = f"{error.msg} at line {error.lineno}, column {error.colno}"
-            raise FormatError(f"{self._source} is not JSON: {reason} (of {len(text)} characters).") from None
         except RefusedError as error:
             self._refuse(str(error))
         except RecursionError:
             self._refuse("it is nested too deeply")
-        except ValueError as error:
-            # An integer of thousands of digits, which Python declines to read.
-            self._refuse(str(error))
+        except MemoryError:
+            self._refuse("there is not enough memory for it")
 
     def _refuse(self, reason: str) -> NoReturn:
         place = f", {self._place}" if self._place else ""
-        raise FormatError(f"{self._source}{place}: {reason}.") from None
+        raise FormatError(f"{self._source}{place}: {reason.removesuffix('.')}.") from None
 
     def _check_version(self, version: Any) -> None:
         if type(version) is not int or version < 1:
@@ -128,6 +140,10 @@ class _Document:
             if tag in result:
                 raise RefusedError(f"the tag {tag[:60]!r} is taken by an earlier operation")
             result[tag] = self._operation(given, f"operations[{i}] ({tag[:60]!r})")
+        self._place = "the rates"
+        check_coupling(
+            (value for (kind, _), value in self._cells.items() if kind == RATES), self._graph.budget
+        )
         before = f"{self._prefix}/" if self._prefix else ""
         return [(before + tag, operation) for tag, operation in result.items()]
 
@@ -141,6 +157,7 @@ class _Document:
                 cells[cell] = cells.get(cell, Read(0)) | how
         kinds = [_kind(kind) for kind in listed(reads.get("listing", []), "listing")]
         seen = {cell: self._cells.get(cell, ABSENT) for cell in cells}
+        self._graph.budget.spend(COST_OF_NAME * sum(len(self._names[kind]) for kind in kinds))
         names = tuple((kind, tuple(sorted(self._names[kind]))) for kind in kinds)
         writes = self._writes(given["writes"], place)
         for expression in self._expressions(writes):
@@ -172,7 +189,7 @@ class _Document:
         given = fields(given, (), KINDS)
         for kind in (kind for kind in KINDS if kind in given):
             for key, value in _members(given[kind]).items():
-                self._place = f"{place}, writes {kind}/{key[:60]}"
+                self._place = f"{place}, writes {kind}/{str(key)[:60]}"
                 cell = self._cell(kind, name(key))
                 try:
                     read = as_read(kind, value, self._graph, self._rename)
@@ -213,6 +230,25 @@ class _Document:
     def _rename(self) -> Rename:
         before = f"{self._prefix}/" if self._prefix else ""
         return lambda given: before + given
+
+
+def _check_size(content: str | bytes, source: str) -> None:
+    if len(content) > MAX_BYTES:
+        raise FormatError(f"{source}: larger than {MAX_BYTES} bytes, the most a document has.")
+
+
+def _parsed(content: bytes) -> Any:
+    """Return what a text of JSON says."""
+    check_counts(content)
+    text = content.decode()
+    try:
+        return json.loads(text, object_pairs_hook=_object, parse_constant=_no_constant)
+    except json.JSONDecodeError as error:
+        place = f"at line {error.lineno}, column {error.colno} (of {len(text)} characters)"
+        raise RefusedError(f"it is not JSON: {error.msg} {place}") from None
+    except ValueError as error:
+        # An integer of thousands of digits, which Python declines to read.
+        raise RefusedError(str(error)) from None
 
 
 def _object(pairs: list[tuple[str, Any]]) -> dict[str, Any]:

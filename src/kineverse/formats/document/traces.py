@@ -20,6 +20,7 @@ from kineverse.model.traces.question import KINDS, OF_EXPRESSIONS, OF_KIND
 
 from .checks import RefusedError, exactly, listed, whole
 from .graph import Graph
+from .limits import MAX_QUESTIONS
 from .values import Ref
 
 _KIND_OF = {question: kind for kind, question in OF_KIND.items()}
@@ -61,7 +62,9 @@ def read_questions(value: Any, graph: Graph, cell: Callable[[str, Any], Cell]) -
         For what is no question.
     """
     steps = []
-    for place, item in enumerate(listed(value, "questions")):
+    if len(listed(value, "questions")) > MAX_QUESTIONS:
+        raise RefusedError(f"{len(value)} questions, more than {MAX_QUESTIONS}")
+    for place, item in enumerate(value):
         kind, look, *arguments = listed(item, "a question") if item else [None, 0]
         if type(kind) is not str or kind not in KINDS:
             raise RefusedError(f"a question is one of {', '.join(KINDS)}")

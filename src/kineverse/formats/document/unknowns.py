@@ -15,7 +15,7 @@ from kineverse.symbols import Symbol
 
 from .checks import RefusedError, exactly, listed, name, whole
 from .graph import Graph
-from .limits import MAX_LENGTH, MAX_STEPS
+from .limits import COST_OF_STEP, MAX_LENGTH, MAX_STEPS
 
 
 def read_implicit(graph: Graph, node: list[Any]) -> None:
@@ -57,7 +57,7 @@ def _work(graph: Graph, residual: Expression, unknowns: tuple[Symbol, ...], step
         if isinstance(inner, Implicit):
             again = any(all_symbols(a).intersection(unknowns) for a in inner.arguments)
             size += graph.work[inner.function.key] if again else 0
-    return int((steps + 1) * ((n + 2) * size + n**3))
+    return int((steps + 1) * (COST_OF_STEP + (n + 2) * size + n**3))
 
 
 def _below(node: Node) -> tuple[Expression, ...]:

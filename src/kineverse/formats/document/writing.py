@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -19,6 +18,7 @@ from kineverse.model.traces import Trace, UntraceableError, trace
 from kineverse.model.view import ModelView
 
 from .canonical import dump, hash_of, sealed
+from .packing import packed
 from .parameters import expressions_among, parameters_of, written_parameter
 from .recorded import Recorded
 from .table import Table, text
@@ -27,29 +27,31 @@ from .values import written
 
 FORMAT = "kineverse"
 VERSION = 1
-SUFFIX = ".kv.json"
 
 
-def write_document(model: ModelView, path: str | os.PathLike[str]) -> None:
-    """Write a model to a ``.kv.json`` file, which is there whole or not at all.
+def write_document(model: ModelView, target: Path) -> None:
+    """Write a model to a file, which is there whole or not at all.
+
+    Parameters
+    ----------
+    model
+        A model or a snapshot.
+    target
+        A name that ends in ``.kv.json`` or ``.kv.msgpack``.
 
     Raises
     ------
     FormatError
-        If the name has another ending, the file cannot be written, or the model contains what a document
-        cannot carry; the file is then what it was before.
+        If the file cannot be written, or the model contains what a document cannot carry; the file is then
+        what it was before.
+    MissingExtraError
+        If the package for msgpack is not installed and wanted.
     """
     try:
-        target = Path(os.fsdecode(path)).expanduser()
-    except (TypeError, RuntimeError):  # "~name", and nobody has that name
-        raise FormatError(f"A model is saved to the path of a file, not to {path!r}.") from None
-    if not target.name.endswith(SUFFIX):
-        raise FormatError(f"{target}: a document has the ending {SUFFIX}, as in {target.stem + SUFFIX!r}.")
-    try:
-        content = document_of(model).encode()
+        text = document_of(model)
     except FormatError as error:
         raise FormatError(f"{target} is not written. {error}") from None
-    replace_file(target, content)
+    replace_file(target, packed(text) if target.name.endswith(".kv.msgpack") else text.encode())
 
 
 def document_of(model: ModelView) -> str:

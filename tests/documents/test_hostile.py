@@ -1,0 +1,372 @@
+"""Documents that are small as text and large as work: refused with one error, or used without harm."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import random
+import resource
+from typing import Any
+
+import numpy as np
+import pytest
+
+import kineverse as kv
+from kineverse.formats.document import operations_from
+
+ONE: list[Any] = ["constant", 1.0]
+A: list[Any] = ["symbol", "a", 0, "dof"]
+B: list[Any] = ["symbol", "b", 0, "dof"]
+AV: list[Any] = ["symbol", "a", 1, "dof"]
+POSE = [1, 0, 0, 0.5, 0, 1, 0, 0, 0, 0, 1, 0]
+STEPS = "more than 30,000,000 steps"
+
+
+def document(nodes: list[Any], operations: list[Any]) -> str:
+    return json.dumps({"format": "kineverse", "version": 1, "nodes": nodes, "operations": operations})
+
+
+def operation(tag: str, writes: Any, reads: Any = None, **others: Any) -> dict[str, Any]:
+    return {"tag": tag, "kind": "K", "reads": reads or {}, "writes": writes, **others}
+
+
+def constraint(ref: int, name: str = "c") -> dict[str, Any]:
+    return operation(name, {"constraints": {name: [0, ref, 1]}})
+
+
+def about_last(nodes: list[Any]) -> str:
+    return document(nodes, [constraint(len(nodes) - 1)])
+
+
+def repeated(levels: int, *types: Any, start: list[Any] | None = None) -> str:
+    """Return a document in which each level is made of the one before it, twice."""
+    nodes = [*(start or [ONE, A])]
+    for _ in range(levels):
+        for make in types:
+            nodes.append(make(len(nodes) - 1))
+    return about_last(nodes)
+
+
+def symbols(count: int) -> list[Any]:
+    return [ONE, *(["symbol", f"s{i}", 0, "dof"] for i in range(count))]
+
+
+def newton_in_newton(levels: int, steps: int) -> str:
+    """Return functions whose residuals have the one before them at the unknown."""
+    nodes: list[Any] = [ONE, A]
+    before: list[Any] | None = None
+    for i in range(levels):
+        x, u = len(nodes), len(nodes) + 1
+        nodes += [["symbol", f"x{i}", 0, "dof"], ["symbol", f"u{i}", 0, "dof"]]
+        nodes += [["elementary", "sin", x]] if before is None else [[*before, [x]], ["element", u + 1, 0]]
+        nodes += [["elementary", "sub", len(nodes) - 1, u], ["elementary", "add", len(nodes), x]]
+        nodes += [["matrix", [1], [len(nodes) - 1]], ["matrix", [1], [u]]]
+        before = ["implicit", f"f{i}", [x], [u], len(nodes) - 2, [0], len(nodes) - 1, steps]
+    nodes += [[*(before or []), [1]], ["element", len(nodes), 0]]
+    return about_last(nodes)
+
+
+def many_unknowns(count: int) -> str:
+    nodes = [ONE, A, *(["symbol", f"x{i}", 0, "dof"] for i in range(count))]
+    nodes += [["matrix", [count], list(range(2, 2 + count))], ["matrix", [count], [0] * count]]
+    rows, x = list(range(count)), list(range(2, 2 + count))
+    nodes += [["implicit", "f", x, [1], len(nodes) - 2, rows, len(nodes) - 1, 100, [1]]]
+    return about_last([*nodes, ["element", len(nodes) - 1, 0]])
+
+
+def composed(levels: int) -> str:
+    start = [ONE, A, ["symbol", "v", 1, "dof"], ["elementary", "sin", 1], ["carried", 1, [[1, [[2, 3]]]]]]
+    return repeated(
+        levels,
+        lambda last: ["elementary", "mul", last, last],
+        lambda last: ["composed", last - 1, [[1, last]]],
+        start=start,
+    )
+
+
+def ring_of_rates(count: int) -> str:
+    """Return rates in a chain, each row made of the next coordinate, the last of the first."""
+    nodes: list[Any] = [ONE]
+    for i in range(count):
+        nodes += [["symbol", f"x{i}", 0, "dof"], ["symbol", f"x{i}", 1, "dof"]]
+    nodes.append(["symbol", "v", 1, "dof"])
+    operations = [
+        operation(
+            f"r{i}",
+            {"rates": {f"x{i}": [1 + 2 * i, [[min(4 + 2 * i, len(nodes) - 1), 1 + 2 * ((i + 1) % count)]]]}},
+        )
+        for i in range(count)
+    ]
+    operations[-1]["writes"]["rates"][f"x{count - 1}"][1][0][0] = len(nodes) - 1
+    return document(nodes, operations)
+
+
+REFUSED = {
+    "elements of nothing": (document([["matrix", [0, 1 << 24], []]], []), "too large"),
+    "arrays again and again": (
+        document([ONE, A, ["matrix", [9000], [1] * 9000], *(["not", i] for i in range(2, 300))], []),
+        STEPS,
+    ),
+    "an array in many arguments": (
+        document([ONE, A, ["matrix", [3000], [1] * 3000], ["and", *([2] * 3000)]], []),
+        "9000000 elements are more than 10000",
+    ),
+    "a wide conjunction": (document([*symbols(20_000), ["and", *range(1, 20_001)]], []), "more than 10000"),
+    "a long norm": (
+        document([*symbols(2000), ["matrix", [2000], list(range(1, 2001))], ["norm", 2001]], []),
+        "norm of 2000 elements",
+    ),
+    "pieces for each element": (
+        document(
+            [ONE, A, ["matrix", [900], [1] * 900], ["piecewise", 2, True, list(range(901)), [[1, 2]] * 900]],
+            [],
+        ),
+        "1620000 coefficients",
+    ),
+    "Newton in Newton": (newton_in_newton(10, 8), STEPS),
+    "many unknowns": (many_unknowns(200), STEPS),
+    "compositions of compositions": (composed(13), "more than 12 compositions"),
+    "constraints about all that is below": (
+        document(
+            [
+                *symbols(600),
+                *(["less", 1, i, 10.0] for i in range(1, 601)),
+                ["and", *range(601, 1201)],
+                *(["elementary", "mul", 1201, i] for i in range(1, 3001)),
+            ],
+            [constraint(1202 + i, f"c{i}") for i in range(3000)],
+        ),
+        STEPS,
+    ),
+    "coupled rates": (ring_of_rates(1500), STEPS),
+    "listings of everything": (
+        document(
+            [], [operation(f"o{i}", {"data": {f"d{i}": i}}, {"listing": ["data"]}) for i in range(3000)]
+        ),
+        STEPS,
+    ),
+    "answers of many elements": (document([["read", 0, 0, [10_001], []]], []), "elements are more than"),
+    "a long way into a gradient": (document([A, AV, ["read", 0, 0, [], [[1, True]] * 17]], []), "up to 16"),
+    "deep parameters": (
+        document([], [operation("t", {}, parameters={"p": json.loads("[" * 200 + "]" * 200)})]),
+        "nested too deeply",
+    ),
+    "deep data": (
+        document([], [operation("t", {"data": {"x": json.loads("[" * 200 + "]" * 200)}})]),
+        "nested too deeply",
+    ),
+    "integers in plain": (document([], [operation("t", {"data": {"x": 1 << 64}})]), "more than 64 bits"),
+    "a question for a thing that is none": (
+        document([], [operation("t", {}, trace={"questions": [["frame", 0, 7]], "writes": {}})]),
+        "text is expected",
+    ),
+    "an answer to what is not asked": (
+        document(
+            [ONE, ["read", 1, 0, [], []]],
+            [
+                operation(
+                    "t",
+                    {"data": {"x": 1}},
+                    trace={"questions": [["datum", 0, "y"]], "writes": {"data": {"x": {"expression": 1}}}},
+                )
+            ],
+        ),
+        "question 1, which is not asked",
+    ),
+    "an answer outside of a trace": (
+        document([["read", 0, 0, [], []]], [operation("t", {"data": {"x": {"expression": 0}}})]),
+        "outside of a trace",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", REFUSED)
+def test_what_costs_too_much_is_refused(name: str) -> None:
+    text, reason = REFUSED[name]
+    assert len(text) < 1_000_000
+    with pytest.raises(kv.FormatError, match=reason):
+        operations_from(text)
+
+
+def test_ten_million_nodes_take_no_memory() -> None:
+    text = b'{"format":"kineverse","version":1,"nodes":[["constant",1.0]' + b',["constant",1.0]' * 10_000_000
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    with pytest.raises(kv.FormatError, match="more than 10,000,000 lists"):
+        operations_from(text + b'],"operations":[]}')
+    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 600_000  # kB; the text is 170 MB
+
+
+@pytest.mark.parametrize(
+    "text", ["[" * 100_000, '{"a":' * 100_000, '{"format":"kineverse","x":' + "[" * 100_000]
+)
+def test_a_hundred_thousand_levels(text: str) -> None:
+    with pytest.raises(kv.FormatError, match="nested too deeply"):
+        operations_from(text)
+
+
+USED = {
+    "sums of sums": repeated(50_000, lambda last: ["elementary", "add", last, last]),
+    "products of products": repeated(
+        300, lambda last: ["elementary", "mul", last, last], lambda last: ["elementary", "sin", last]
+    ),
+    "augmented again and again": repeated(
+        190,
+        lambda last: ["elementary", "mul", last, last],
+        lambda last: ["augment", last, False, False, [[2, last - 1]]],
+        start=[ONE, A, AV, ["elementary", "sin", 1]],
+    ),
+    "choices of choices": repeated(
+        190, lambda last: ["elementary", "sin", last], lambda last: ["select", last - 1, last, last - 1]
+    ),
+    "logic of logic": repeated(
+        190,
+        lambda last: ["less", last, last - 1, 1.0],
+        lambda last: ["and", last, last - 1],
+        start=[ONE, A, B],
+    ),
+    "smallest of largest": repeated(
+        190,
+        lambda last: ["extremum", "min", last, last - 1],
+        lambda last: ["extremum", "max", last - 1, last],
+        start=[ONE, A, B],
+    ),
+    "norms of norms": repeated(
+        190, lambda last: ["matrix", [3], [last, 1, last]], lambda last: ["norm", last]
+    ),
+    "profiles of profiles": repeated(
+        190, lambda last: ["piecewise", last, True, [0, 1, 2], [[1, 2, 3], [1, 2, 4]]]
+    ),
+    "compositions": composed(10),
+    "Newton in Newton": newton_in_newton(2, 3),
+    "a table of rates": ring_of_rates(60),
+}
+
+
+@pytest.mark.parametrize("name", USED)
+def test_what_is_read_can_be_used(name: str, tmp_path: Any) -> None:
+    """Poses, both gradients, evaluation, relevance, validity, saving, and an edit: nothing hangs or crashes."""
+    path = tmp_path / "hostile.kv.json"
+    path.write_text(USED[name])
+    model = kv.load(path)
+    for given in model.constraints.values():
+        e = given.expression
+        gradients = [*e.gradient().values(), *e.gradient(heuristic=False).values()]
+        f = kv.compile([e, *gradients], tier="interpreter")
+        with contextlib.suppress(kv.UnsolvedError):
+            f(np.full(len(f.inputs), 0.3))
+        assert model.constraints_for(e)
+    model.save(tmp_path / "again.kv.json")
+    assert kv.document_hash(kv.load(tmp_path / "again.kv.json")) == kv.document_hash(model)
+    with model.edit() as edit:
+        edit.replace(model.history.tags[0], kv.Write("nothing", 0))
+
+
+def growing(question: Any, count: int) -> str:
+    """Return a trace in which each question is about the answer to the one before it."""
+    nodes: list[Any] = [ONE, A, ["read", 0, 0, [], []], ["matrix", [1], [1]]]
+    questions: list[Any] = [["datum", 0, "up"]]
+    for i in range(count):
+        last = len(nodes) - 1 if i else 2
+        nodes.append(["elementary", "mul", last, last])
+        nodes.append(["matrix", [1], [len(nodes) - 1]])
+        questions.append(question(len(nodes) - 2, len(nodes) - 1))
+        nodes.append(["read", i + 1, 0, [], []])
+    writes = {"data": {"y": {"expression": len(nodes) - 1}}}
+    return document(
+        nodes,
+        [
+            operation("up", {"data": {"up": {"expression": 1}}}),
+            operation(
+                "t",
+                {"data": {"y": {"expression": 0}}},
+                {"value": ["data/up"]},
+                trace={"questions": questions, "writes": writes},
+            ),
+        ],
+    )
+
+
+@pytest.mark.parametrize("look", [0, 1, 2])
+def test_an_edit_upstream_of_a_trace_that_explodes(look: int, tmp_path: Any) -> None:
+    path = tmp_path / "hostile.kv.json"
+    path.write_text(growing(lambda e, at: ["substitute", look, e, 3, at], 60))
+    model = kv.load(path)
+    before = model.snapshot()
+    with (
+        pytest.raises(kv.EditError, match=r"made of more than 200,000 nodes|which has changed"),
+        model.edit() as edit,
+    ):
+        edit.replace("up", kv.Write("up", 2 * kv.position("z")))
+    assert model.snapshot() == before
+
+
+def test_frames_in_a_circle(tmp_path: Any) -> None:
+    path = tmp_path / "circle.kv.json"
+    circles = (
+        [operation("f", {"frames": {"f": {"parent": "f", "factors": [POSE]}}})],
+        [operation("f", {"frames": {n: {"parent": p, "factors": [POSE]} for n, p in ("fg", "gf")}})],
+        [
+            operation(n, {"frames": {n: {"parent": p, "factors": [POSE]}}})
+            for n, p in (("f", "world"), ("g", "f"))
+        ]
+        + [operation("h", {"frames": {"f": {"parent": "g", "factors": [POSE]}}})],
+        [operation("w", {"frames": {"world": {"parent": "world", "factors": [POSE]}}})],
+    )
+    for operations in circles:
+        path.write_text(document([], operations))
+        model = kv.load("shelf_door")
+        before = model.snapshot()
+        with pytest.raises(kv.KineverseError):
+            model.include(path)
+        assert model.snapshot() == before
+        with pytest.raises(kv.FormatError, match=r"circle\.kv\.json"):
+            kv.load(path)
+
+
+def test_a_very_long_arm(tmp_path: Any) -> None:
+    """Frames on frames are many, and no way down."""
+    count = 3000
+    operations = [
+        operation(
+            f"f{i}",
+            {"frames": {f"f{i}": {"parent": f"f{i - 1}" if i else "world", "factors": [POSE]}}},
+            {"existence": [f"frames/f{i - 1}"]} if i else {},
+        )
+        for i in range(count)
+    ]
+    path = tmp_path / "arm.kv.json"
+    path.write_text(document([], operations))
+    assert kv.load(path).fk(f"f{count - 1}")[0, 3]() == count / 2
+
+
+def test_random_tables_are_read_or_refused() -> None:
+    """Tables by grammar: nodes of all types over anything that came before."""
+    draw = random.Random(7)
+    for _ in range(60):
+        nodes: list[Any] = [ONE, ["constant", -0.5], A, B, ["symbol", "v", 1, "dof"]]
+        for _ in range(30):
+            ref = lambda: draw.randrange(len(nodes))  # noqa: E731, B023
+            nodes.append(
+                draw.choice(
+                    [
+                        ["elementary", draw.choice(["add", "mul", "div", "pow"]), ref(), ref()],
+                        ["elementary", draw.choice(["sin", "sqrt", "log", "floor"]), ref()],
+                        ["matrix", [2], [ref(), draw.choice([None, ref()])]],
+                        ["element", ref(), draw.randrange(3)],
+                        ["augment", ref(), draw.random() < 0.5, draw.random() < 0.5, [[4, ref()]]],
+                        ["less", ref(), ref(), 2.0],
+                        ["and", ref(), ref()],
+                        ["select", ref(), ref(), ref()],
+                        ["extremum", "min", ref(), ref()],
+                        ["norm", ref()],
+                        ["carried", 2, [[2, [[4, ref()]]]]],
+                        ["composed", ref(), [[2, ref()]]],
+                        ["dependent", ref(), 3],
+                        ["implicit", "f", [3], [2], ref(), [0], ref(), 2, [ref()]],
+                    ]
+                )
+            )
+            try:
+                operations_from(document(nodes, [constraint(len(nodes) - 1)]))
+            except kv.FormatError:
+                nodes.pop()
