@@ -72,6 +72,34 @@ def test_what_cannot_follow_stays_a_constraint():
     assert violation.value == pytest.approx(-0.5)  # x - y with y = 2x
 
 
+def test_what_stays_a_constraint_is_kept_by_controllers_as_mujoco_keeps_it():
+    three = "".join(body(b, f'<joint name="{j}"/>') for b, j in zip("abc", "xyz", strict=True))
+    follows = '<joint joint1="y" joint2="x" polycoef=".1 .8 .3 0 0"/>'
+    pair = Pair.of_text(
+        scene(three, follows + '<joint name="tie" joint1="y" joint2="z" polycoef="0 1 .2 0 0"/>')
+    )
+    x, z = kv.position("x"), kv.position("z")
+    assert pair.model.degrees_of_freedom == (x, z)
+    dt = 1e-3
+    rows = pair.model.velocity_rows(dt, subject=pair.model.fk("c"))
+    assert rows.names == ("tie",)
+    for at_x, at_z in np.random.default_rng(0).uniform(-0.5, 0.5, (5, 2)):
+        state = {x: at_x, z: at_z}
+        pair.place(state)
+        left = residuals(pair)
+        (violation,) = pair.model.violations(state)
+        assert violation.value == pytest.approx(left[1], abs=1e-12)
+        jacobian = pair.data.efc_J.reshape(-1, pair.engine.nv)[1]
+        along_x = jacobian[0] + jacobian[1] * (0.8 + 0.6 * at_x)
+        (row,), (lower,), (upper,) = (pair.value(e, state) for e in (rows.matrix, rows.lower, rows.upper))
+        np.testing.assert_allclose(row, [along_x, jacobian[2]], atol=1e-12)
+        assert lower == pytest.approx(upper) == pytest.approx(-left[1] / dt)
+        # The smallest speeds that the row allows lead back within a step, to second order.
+        step = dt * lower * row / (row @ row)
+        after = pair.model.violations({x: at_x + step[0], z: at_z + step[1]}, tolerance=0.0)
+        assert all(abs(v.value) <= left[1] ** 2 for v in after)
+
+
 def test_circles_that_agree_are_one():
     one = '<joint joint1="y" joint2="x"/>'
     model = model_of(
