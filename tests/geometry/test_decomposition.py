@@ -11,8 +11,8 @@ import sys
 
 import numpy as np
 import pytest
-from decomposed_meshes import cube, ell, fake_coacd, finger, overlapping, tray
 
+from decomposed_meshes import cube, ell, fake_coacd, finger, overlapping, tray
 from kineverse.errors import FormatError, ValueRejectedError
 from kineverse.geometry.decomposition import (
     DecompositionError,
@@ -143,6 +143,7 @@ def test_a_surface_that_is_not_closed_is_wrapped_and_said_so(file):
     assert result.accuracy.mesh_volume is None
     assert "not closed" in result.remarks[0]
     assert result.accuracy.uncovered < 1e-3
+    assert result.accuracy.volume <= result.accuracy.hull_volume * (1 + 1e-6)
 
 
 # Measuring, where the answer is known.
@@ -197,8 +198,10 @@ def test_hulls_are_joined_where_that_adds_least():
 def test_hulls_inside_of_others_and_splinters_are_left_out():
     large, small = (np.array(cube((e, e, e)).vertices) for e in (1.0, 0.5))
     line = np.outer(np.arange(4.0), [1, 0, 0])
-    (one,) = polytopes([small, line, large])
+    (one,) = polytopes([small, line, large], Polytope.of(2 * large))
     assert one.volume == pytest.approx(1.0)
+    (one,) = polytopes([small, line, 1.1 * large], Polytope.of(large))
+    np.testing.assert_allclose(np.abs(one.points), 0.5, atol=1e-6)
 
 
 def test_a_part_inside_out_is_a_hole_and_stays_with_what_is_around_it(file):

@@ -172,7 +172,7 @@ def _uncovered(mesh: Faces, hulls: list[Polytope], random: np.random.Generator) 
     points = points[beyond > _NOTHING * np.ptp(mesh.vertices, axis=0).max()]
     if not len(points):
         return 0.0
-    return float(np.min([_distances(polytope.engine, points) for polytope in hulls], axis=0).max())
+    return float(np.min([nearest(polytope.engine, points)[0] for polytope in hulls], axis=0).max())
 
 
 def _excess(mesh: Faces, hulls: list[Polytope], random: np.random.Generator) -> float:
@@ -187,7 +187,7 @@ def _excess(mesh: Faces, hulls: list[Polytope], random: np.random.Generator) -> 
     outermost = np.concatenate(points)
     if not len(outermost):
         return 0.0
-    distances = _distances(_triangles(mesh), outermost)
+    distances = nearest(_triangles(mesh), outermost)[0]
     # Beginning with the furthest, so that the first one outside of the mesh is the answer.
     order = np.argsort(-distances, kind="stable")
     order = order[distances[order] > _NOTHING * size]
@@ -225,8 +225,11 @@ def _triangles(mesh: Faces) -> Any:
     return engine
 
 
-def _distances(engine: Any, points: Floats) -> Floats:
-    """Return the distances of (N, 3) points to what coal computes with, (N,) [m]; 0 inside of a hull."""
+def nearest(engine: Any, points: Floats) -> tuple[Floats, Floats]:
+    """Return how near points are to what coal computes with, and where it is nearest.
+
+    (N, 3) -> (N,), (N, 3) [m]. Inside of a hull the distance is 0, and the place means nothing.
+    """
     import coal
 
     speck, here, there = coal.Sphere(1e-9), coal.Transform3s(), coal.Transform3s()
@@ -235,9 +238,10 @@ def _distances(engine: Any, points: Floats) -> Floats:
         coal.DistanceRequest(),
         coal.DistanceResult(),
     )
-    distances = np.empty(len(points))
+    distances, places = np.empty(len(points)), np.empty((len(points), 3))
     for k, point in enumerate(points):
         there.setTranslation(point)
         result.clear()
         distances[k] = measured(here, there, request, result)
-    return np.maximum(distances, 0.0)
+        places[k] = result.getNearestPoint1()
+    return np.maximum(distances, 0.0), places

@@ -15,7 +15,7 @@ from kineverse.geometry.mesh_files import Floats
 from kineverse.model.body import Mesh
 
 from . import store
-from .accuracy import measure
+from .accuracy import Polytope, measure
 from .merging import at_most, polytopes
 from .result import Decomposition, Settings
 from .surface import Surface, surface_of
@@ -153,7 +153,8 @@ def _made(
 ) -> Decomposition:
     start = time.perf_counter()
     error = settings.allowed(surface.size)
-    hulls = at_most(polytopes(run(surface, error, limits, stop)), settings.max_hulls)
+    found = polytopes(run(surface, error, limits, stop), Polytope.of(surface.faces.vertices))
+    hulls = at_most(found, settings.max_hulls)
     if not hulls:
         raise DecompositionError("CoACD found no hull.")
     accuracy = measure(surface.faces, hulls)

@@ -7,18 +7,22 @@ import numpy as np
 from kineverse.errors import ValueRejectedError
 from kineverse.geometry.mesh_files import Floats
 
-from .accuracy import Polytope
+from .accuracy import Polytope, nearest
 
 # A hull that stands out of another by less than this part of its size is inside of it.
 _INSIDE = 1e-9
 
 
-def polytopes(hulls: list[Floats]) -> list[Polytope]:
-    """Return the hulls of sets of points, without those that span nothing and those inside of another one."""
+def polytopes(hulls: list[Floats], whole: Polytope) -> list[Polytope]:
+    """Return the hulls of sets of points, without those that span nothing and those inside of another one.
+
+    What stands out of the hull of the whole mesh is taken back onto it: where CoACD has wrapped a surface, it
+    is a little larger all around.
+    """
     found = []
     for points in hulls:
         try:
-            found.append(Polytope.of(points))
+            found.append(Polytope.of(_within(points, whole)))
         except ValueRejectedError:  # A splinter: a cut has come upon a point or an edge.
             continue
     found.sort(key=lambda polytope: -polytope.volume)
@@ -28,6 +32,13 @@ def polytopes(hulls: list[Floats]) -> list[Polytope]:
         if not any((larger.outside(polytope.points) <= room).all() for larger in kept):
             kept.append(polytope)
     return kept
+
+
+def _within(points: Floats, whole: Polytope) -> Floats:
+    points = points.copy()
+    beyond = whole.outside(points) > 0.0
+    points[beyond] = nearest(whole.engine, points[beyond])[1]
+    return points
 
 
 def at_most(hulls: list[Polytope], count: int) -> list[Polytope]:
