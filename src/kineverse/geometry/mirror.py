@@ -33,8 +33,9 @@ class Mirror:
         What is mirrored, at whatever version it is.
     rules
         Beside those that the model keeps; they come after them.
-    triangles, leave_out
-        Patterns of bodies whose meshes stay triangles, and of bodies that do not take part.
+    triangles, decomposed, leave_out
+        Patterns of bodies whose meshes stay triangles, of those whose meshes are the hulls that they were
+        decomposed into, and of bodies that do not take part.
 
     Attributes
     ----------
@@ -49,12 +50,17 @@ class Mirror:
     """
 
     def __init__(
-        self, model: ModelView, rules: Iterable[Rule], triangles: Iterable[str], leave_out: Iterable[str]
+        self,
+        model: ModelView,
+        rules: Iterable[Rule],
+        triangles: Iterable[str],
+        decomposed: Iterable[str],
+        leave_out: Iterable[str],
     ) -> None:
         self.model = model
         self._own_rules = rules_of(rules)
         check_names(self._own_rules, model)
-        self._source = Pieces(_names(triangles), _names(leave_out))
+        self._source = Pieces(_names(triangles), _names(decomposed), _names(leave_out))
         self._version: int | None = None
         self._values: dict[Symbol, float] = {}
         self._unplaced = ""

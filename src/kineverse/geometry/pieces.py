@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
@@ -12,12 +13,16 @@ from kineverse.model.body import Body, Mesh, Shape
 from kineverse.model.frame import WORLD, Frame
 from kineverse.model.view import ModelView
 
-from .solids import Solid, solid_of
+from . import decomposition
+from .mesh_files import Floats
+from .solids import Solid, solid_of, solid_of_hull
+
+logger = logging.getLogger("kineverse.geometry")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Piece:
-    """One shape of a body.
+    """One shape of a body, or one of the hulls that a mesh is decomposed into.
 
     Attributes
     ----------
@@ -31,6 +36,8 @@ class Piece:
         Whether a mesh is kept as triangles rather than as its convex hull.
     pose
         world_T_piece, the first three rows: a (3, 4) expression.
+    hull
+        The corners of the hull, (n, 3) in the frame of the shape [m]; None if it is the shape itself.
     """
 
     body: str
@@ -38,6 +45,7 @@ class Piece:
     shape: Shape
     triangles: bool
     pose: Expression
+    hull: Floats | None = None
 
     @property
     def moves(self) -> bool:
@@ -53,6 +61,8 @@ class Piece:
             Of the kind that the cause has, naming the body and the file.
         """
         try:
+            if self.hull is not None:
+                return solid_of_hull(self.hull)
             return solid_of(self.shape.geometry, self.triangles)
         except OSError as error:
             raise FormatError(f"{self._described()}: {error}") from error
@@ -85,12 +95,15 @@ class Pieces:
 
     Parameters
     ----------
-    triangles, leave_out
-        Patterns of bodies whose meshes stay triangles, and of those that have no pieces.
+    triangles, decomposed, leave_out
+        Patterns of bodies whose meshes stay triangles, of those whose meshes are the hulls that they were
+        decomposed into, and of those that have no pieces.
     """
 
-    def __init__(self, triangles: tuple[str, ...], leave_out: tuple[str, ...]) -> None:
-        self._triangles, self._leave_out = triangles, leave_out
+    def __init__(
+        self, triangles: tuple[str, ...], decomposed: tuple[str, ...], leave_out: tuple[str, ...]
+    ) -> None:
+        self._triangles, self._decomposed, self._leave_out = triangles, decomposed, leave_out
         self._frames: Mapping[str, Frame] = {}
         self._bodies: Mapping[str, Body] = {}
         self._rates = b""
@@ -122,8 +135,28 @@ class Pieces:
     def _made(self, model: ModelView, name: str, body: Body) -> Iterator[Piece]:
         world_T_body = model.fk(name)
         triangles = matches(name, self._triangles)
+        decomposed = not triangles and matches(name, self._decomposed)
         for number, shape in enumerate(touchable(body)):
-            yield Piece(name, number, shape, triangles, (world_T_body @ shape.origin.matrix)[:3])
+            pose = (world_T_body @ shape.origin.matrix)[:3]
+            for hull in _hulls(name, shape) if decomposed else (None,):
+                yield Piece(name, number, shape, triangles, pose, hull)
+
+
+def _hulls(name: str, shape: Shape) -> tuple[Floats | None, ...]:
+    """Return the hulls that a mesh was decomposed into; None stands for the shape itself."""
+    if not isinstance(shape.geometry, Mesh):
+        return (None,)
+    try:
+        hulls = decomposition.pieces(shape.geometry)
+    except (FormatError, ValueRejectedError):  # It is said when the shape itself is needed.
+        return (None,)
+    if hulls is None:
+        uri = shape.geometry.uri
+        logger.warning(
+            "Body '%s' has its convex hull for mesh %s: kineverse decompose has not seen it.", name, uri
+        )
+        return (None,)
+    return hulls
 
 
 class _Same:

@@ -40,6 +40,10 @@ class Scene:
         :class:`Rule`.
     triangles
         Bodies, or patterns, whose meshes stay as they are: surfaces without an inside.
+    decomposed
+        Bodies, or patterns, whose meshes are the convex hulls that ``kineverse decompose`` made of them, as
+        far as they are in the cache; the log names the others, which are their one hull. Their files are read
+        at once.
     leave_out
         Bodies, or patterns, that do not take part.
 
@@ -57,10 +61,11 @@ class Scene:
         *,
         rules: Iterable[Rule] = (),
         triangles: Iterable[str] = (),
+        decomposed: Iterable[str] = (),
         leave_out: Iterable[str] = (),
     ) -> None:
         self.model = model
-        self._mirror = Mirror(model, rules, triangles, leave_out)
+        self._mirror = Mirror(model, rules, triangles, decomposed, leave_out)
         self._parameters: dict[tuple[str, str], Parameters] = {}
 
     @property

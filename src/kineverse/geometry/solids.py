@@ -95,6 +95,24 @@ def solid_of(geometry: Geometry, triangles: bool = False) -> Solid:
         return _by_content[key]
 
 
+def solid_of_hull(points: Floats) -> Solid:
+    """Return the solid that is the convex hull of (n, 3) points [m].
+
+    Raises
+    ------
+    MissingExtraError
+        If coal is not installed.
+    ValueRejectedError
+        If they span nothing.
+    """
+    coal_engine()
+    key = ("hull", points.tobytes())
+    with _making:
+        if key not in _by_content:
+            _by_content[key] = _hull(points)
+        return _by_content[key]
+
+
 def coal_engine() -> Any:
     """Return coal; raises MissingExtraError if it is not installed."""
     try:
