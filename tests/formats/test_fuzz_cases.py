@@ -239,3 +239,9 @@ def test_numbers_of_an_mjcf_that_overflow(tmp_path, text, reason):
     assert isinstance(message, str)
     assert message.startswith("input.xml")
     assert reason in message
+
+
+def test_a_model_to_attach_without_a_file(tmp_path):
+    """MuJoCo raised an exception that was unknown to itself."""
+    message = loaded(tmp_path, "<mujoco><asset><model/></asset></mujoco>", "input.xml")
+    assert message == "input.xml, line 1, <model>: names no file."

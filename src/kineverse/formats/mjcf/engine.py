@@ -62,7 +62,7 @@ def parse(prepared: Prepared, source: str) -> Any:
     engine = mujoco()
     try:
         return engine.MjSpec.from_string(prepared.text, include=prepared.models)
-    except (ValueError, engine.FatalError, engine.UnexpectedError) as error:
+    except (ValueError, RuntimeError, engine.FatalError, engine.UnexpectedError) as error:
         raise refusal(error, prepared, source) from None
 
 
@@ -77,7 +77,7 @@ def compiled(spec: Any, prepared: Prepared, source: str) -> Any:
     engine = mujoco()
     try:
         return spec.compile()
-    except (ValueError, engine.FatalError, engine.UnexpectedError) as error:
+    except (ValueError, RuntimeError, engine.FatalError, engine.UnexpectedError) as error:
         raise refusal(error, prepared, source) from None
 
 

@@ -64,7 +64,7 @@ def screen(root: Node, note: Callable[[Node, str], None]) -> dict[Node, MeshFile
     Raises
     ------
     FormatError
-        For numbers that are none.
+        For numbers that are none, and models without file.
     """
     meshdir, strips = _directory(root)
     root.children = [child for child in root.children if not _is_left_out(child, _SECTIONS, note)]
@@ -72,6 +72,8 @@ def screen(root: Node, note: Callable[[Node, str], None]) -> dict[Node, MeshFile
     for node in root.walk():
         unwanted = _ELEMENTS | _FLEXIBLE if node.tag == "equality" else _ELEMENTS
         node.children = [child for child in node.children if not _is_left_out(child, unwanted, note)]
+        if node.tag == "model" and not node.attributes.get("file"):
+            node.refuse("names no file.")
         if node.tag == "mesh" and ("file" in node.attributes or "builtin" in node.attributes):
             files[node] = _without_file(node, meshdir, strips)
         for key in _ATTRIBUTES.get(node.tag, ()):
