@@ -87,7 +87,7 @@ def test_it_is_short_and_shares_nothing_with_what_it_checks() -> None:
 
 def test_a_claim_is_looked_at_where_its_constraint_is_unknown() -> None:
     """Some of a constraint may be known: what is told of it has to be true all the same."""
-    subject = model(lock=(0, SPEED, np.sin(B) > 0.5))
+    subject = model(lock=(0, SPEED, np.sin(B * B) > 0.5))
     found = interlocks(subject)
     assert found.undecided[0].where == (Box({}),)
     assert reasoning.contradictions(subject, found) == []

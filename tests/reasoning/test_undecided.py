@@ -54,8 +54,9 @@ def test_no_numbers() -> None:
 
 def test_no_limits_and_many_thresholds() -> None:
     angle = kv.position("angle")
-    (unknown,) = undecided(-1, np.sin(angle) < 0.3)
-    assert unknown.reason == "where a condition on angle changes cannot be made certain"
+    (unknown,) = undecided(-1, np.sin(angle**2) < 0.3)
+    reason = "angle has no limits, and where a condition on angle changes cannot be made certain"
+    assert unknown.reason == reason
     assert undecided(-1, np.arctan(angle) < 0.3) == ()
 
 
@@ -88,10 +89,27 @@ def test_several_coordinates_at_once() -> None:
     assert unknown.reason == "it limits several coordinates at once, and they are not just added"
 
 
-def test_implicit_functions() -> None:
+def test_what_winds_with_the_crank() -> None:
+    """The angle between crank and coupler comes back after a turn with a turn less: there is no period."""
     four_bar = kv.load("articulations/four_bar")
-    angle = next(iter(four_bar.rates.dependent.values()))
+    angle = kv.position("four_bar/coupler")
     with four_bar.edit() as edit:
         edit.constrain("lock", -1, SPEED, angle < 0.1)
-    (unknown,) = interlocks(four_bar).undecided
-    assert "implicit function" in unknown.reason
+    found = interlocks(four_bar)
+    assert [str(lock) for lock in found] == ["a:velocity cannot increase: when four_bar/coupler > 0.1 (lock)"]
+    (unknown,) = found.undecided
+    assert unknown.reason.startswith(
+        "four_bar/coupler follows four_bar/crank, and four_bar/crank has no limits"
+    )
+    assert reasoning.contradictions(four_bar, found) == []
+
+
+def test_what_follows_several() -> None:
+    """A box of three motors cannot say it; what is known is told by the name."""
+    delta = kv.load("articulations/delta_robot")
+    with delta.edit() as edit:
+        edit.constrain("lock", -1, SPEED, kv.position("delta_robot/platform") < -0.5)
+    found = interlocks(delta)
+    assert [lock.keys for lock in found] == [(kv.position("delta_robot/platform"),)]
+    (unknown,) = found.undecided
+    assert "motor_0 and delta_robot/motor_1 and delta_robot/motor_2 occur together" in unknown.reason

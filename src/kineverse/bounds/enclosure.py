@@ -57,17 +57,17 @@ class Enclosures:
             elif term.op == "implicit":
                 node, element = term.data
                 if node not in solved:
-                    inputs = self.of([self._terms.of(a) for a in node.arguments], values)
-                    solved[node] = self._solver(node.function).over(inputs)
+                    solved[node] = self.solved(node.function, [known[a.index] for a in term.args])
                 known[term.index] = solved[node][element]
             else:
                 known[term.index] = _step(term, [known[a.index] for a in term.args])
         return [known[term.index] for term in roots]
 
-    def _solver(self, function: ImplicitFunction) -> _Solver:
+    def solved(self, function: ImplicitFunction, inputs: list[Series]) -> list[Series]:
+        """Return the series of the unknowns of an implicit function, from those of its inputs."""
         if function not in self._solvers:
             self._solvers[function] = _Solver(function, self._terms, self)
-        return self._solvers[function]
+        return self._solvers[function].over(inputs)
 
 
 class _Solver:
@@ -90,6 +90,8 @@ class _Solver:
     def over(self, inputs: list[Series]) -> list[Series]:
         """Return the series of the unknowns, from those of the inputs."""
         n = len(self._function.unknowns)
+        if not all(math.isfinite(low) and math.isfinite(high) for (low, high), *_ in inputs):
+            return [_UNKNOWN] * n
         middle = [_middle(s[0]) for s in inputs]
         x = np.array(self._solve(np.array(middle))).ravel()
         if not np.isfinite(x).all():

@@ -173,7 +173,8 @@ class Terms:
 
     def _node(self, node: Node) -> list[Term]:
         if isinstance(node, Implicit):
-            return [self._step(_SOLVED, data=(node, i)) for i in range(node.size)]
+            inputs = tuple(self.of(a) for a in node.arguments)
+            return [self._step(_SOLVED, inputs, (node, i)) for i in range(node.size)]
         if isinstance(node, Less | Select | Extremum | Piecewise):
             rows = list(zip(*(self._graph(a) for a in node.arguments), strict=True))
             return [self._choice(node, row) for row in rows]
@@ -201,9 +202,8 @@ class Terms:
 
 
 def _parts(node: Node) -> tuple[Expression, ...]:
-    if isinstance(node, Implicit):
-        return ()
-    return node.arguments if isinstance(node, Less | Select | Extremum | Piecewise) else (node.value,)
+    choices = Less | Select | Extremum | Piecewise | Implicit
+    return node.arguments if isinstance(node, choices) else (node.value,)
 
 
 def reachable(roots: tuple[Term, ...]) -> list[Term]:

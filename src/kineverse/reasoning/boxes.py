@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from fractions import Fraction
 
 from kineverse.expressions.expression import Expression
+from kineverse.expressions.functions import floor
 from kineverse.symbols import Symbol
 
 Number = float | Fraction
@@ -157,5 +158,12 @@ class Box(Mapping[Expression, Interval]):
 
 
 def axis_name(axis: Expression) -> str:
-    """Return what an axis is called: a symbol's name, or a sum."""
+    """Return what an axis is called: a symbol's name, a sum, or ``angle mod 2π``."""
+    if not isinstance(axis, Symbol) and len(axis.symbols) == 1 and axis == within_a_turn(axis.symbols[0]):
+        return f"{axis.symbols[0]} mod 2π"
     return str(axis)
+
+
+def within_a_turn(angle: Symbol) -> Expression:
+    """Return an angle less whole turns, in [0, 2π)."""
+    return angle - math.tau * floor(angle / math.tau)

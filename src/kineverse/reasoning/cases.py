@@ -10,13 +10,14 @@ import casadi as ca
 
 from kineverse.bounds import ranges
 from kineverse.bounds.terms import Term, reachable
-from kineverse.expressions.expression import Expression, as_expression
 from kineverse.symbols import Symbol
 
 from . import polynomial as exact
 from . import zeros
 from .boxes import Box, Interval
-from .polynomial import Axis, Polynomial
+from .domain import Domain
+from .polynomial import Axis, Polynomial, axis_expression
+from .solving import loops_in
 from .values import Value, evaluate, live_arguments
 
 NEGLIGIBLE = 1e-12
@@ -32,8 +33,8 @@ class Case:
     ----------
     roots
         What is evaluated.
-    limits
-        Of symbols, constant.
+    domain
+        Which configurations there are.
     axes, signs
         What is known beyond them.
     order
@@ -45,19 +46,22 @@ class Case:
     def __init__(
         self,
         roots: tuple[Term, ...],
-        limits: Mapping[Symbol, Interval],
+        domain: Domain,
         axes: Mapping[Axis, Interval] | None = None,
         signs: Mapping[int, int] | None = None,
         order: list[Term] | None = None,
         before: Mapping[int, Value] | None = None,
         narrowed: frozenset[Symbol] = frozenset(),
     ) -> None:
-        self._limits = limits
+        self._domain = domain
         self._axes = dict(axes or {})
         self._signs = dict(signs or {})
         self._found: dict[int, int | None] = {}
         self._roots = roots
-        places = {**limits, **{axis[0][0]: side for axis, side in self._axes.items() if len(axis) == 1}}
+        places = {
+            **domain.limits,
+            **{axis[0][0]: side for axis, side in self._axes.items() if len(axis) == 1},
+        }
         self._pinned = {
             s: Fraction(i.lower) for s, i in places.items() if i.lower == i.upper and not math.isinf(i.lower)
         }
@@ -93,7 +97,7 @@ class Case:
         """Return where a symbol, or a sum of several, is."""
         known = self._axes.get(axis)
         if len(axis) == 1:
-            return known if known is not None else self._limits.get(axis[0][0], Interval())
+            return known if known is not None else self._domain.of(axis[0][0])
         total = self._sum({((s, 1),): f for s, f in axis})
         return total if known is None else total.intersection(known)
 
@@ -106,7 +110,7 @@ class Case:
         """Return the conditions, without those that limits make anyway."""
         sides = {}
         for axis, side in self._axes.items():
-            limit = self._limits.get(axis[0][0], Interval()) if len(axis) == 1 else Interval()
+            limit = self._domain.of(axis[0][0]) if len(axis) == 1 else Interval()
             low = side.lower == limit.lower and side.lower_closed == limit.lower_closed
             high = side.upper == limit.upper and side.upper_closed == limit.upper_closed
             sides[axis_expression(axis)] = Interval(
@@ -141,9 +145,10 @@ class Case:
             value = evaluate(term, self._values, self.sign)
         else:
             value = Value(polynomial=Polynomial.symbol(term.data), live=frozenset((term.data,)))
-        p, live = value.polynomial, value.live
         if value.void:
             return value
+        value = self._on_spheres(value)
+        p, live = value.polynomial, value.live
         if not live.isdisjoint(self._pinned):
             live = live.difference(self._pinned)
             # A sum stays one where a part of it has one value: it is the same condition as beside that.
@@ -156,6 +161,16 @@ class Case:
         (low, _), (_, high) = ranges.enclosing(side.lower), ranges.enclosing(side.upper)
         span = (max(low, value.range[0]), min(high, value.range[1]))
         return Value(span, p, live, value.doubtful)
+
+    def _on_spheres(self, value: Value) -> Value:
+        """Return what is known beyond that where quaternions have length one."""
+        p = value.polynomial
+        if p is None or p.degree < 2 or not self._domain.spheres:
+            return value
+        p = self._domain.reduced(p)
+        low, high = self._domain.span(p) or value.range
+        span = (max(low, value.range[0]), min(high, value.range[1]))
+        return Value(span, p, p.symbols, value.doubtful)
 
     def _line(self, p: Polynomial) -> Interval:
         axis, scale = p.axis()
@@ -232,8 +247,6 @@ class Case:
         if p is not None and p.degree == 1:
             axis, scale = p.axis()
             return self._divided(term, axis, [-p.offset / scale], _SAME, lambda x: scale * x + p.offset)
-        if any(part.op == "implicit" for part in reachable((term,))):
-            return f"a condition contains an implicit function of {names}"
         if len(value.live) != 1:
             return f"{names} occur together in a condition that is not linear"
         (symbol,) = value.live
@@ -247,13 +260,16 @@ class Case:
 
         def look(low: float, high: float) -> tuple[ranges.Range, ranges.Range | None]:
             span = Interval(_exact(low), _exact(high), not math.isinf(low), not math.isinf(high))
-            inner = Case((term,), self._limits, {**self._axes, axis: span}, self._signs, order)
+            inner = Case((term,), self._domain, {**self._axes, axis: span}, self._signs, order)
             rates = zeros.slopes(order, inner._values, inner.sign, symbol)
             return inner.value(term).range, rates[term.index]
 
-        crossings = zeros.zeros(look, float(side.lower), float(side.upper))
+        # A look at a loop that stands on others takes many times as long as one at a single loop.
+        most = zeros.LOOKS_AT_MOST // max(1, len(loops_in(order))) ** 3
+        crossings = zeros.zeros(look, float(side.lower), float(side.upper), most)
         if crossings is None:
-            return f"where a condition on {names} changes cannot be made certain"
+            endless = f"{names} has no limits, and " if side.is_everything else ""
+            return f"{endless}where a condition on {names} changes cannot be made certain"
         signs = lambda x: sum(look(float(x), float(x))[0])  # noqa: E731
         return self._divided(term, axis, list(map(Fraction, crossings)), _NEAR, signs)
 
@@ -288,20 +304,9 @@ class Case:
                 signs = {**self._signs, term.index: known}
                 axes, narrowed = {**self._axes, axis: side}, frozenset(s for s, _ in axis)
                 cases.append(
-                    Case(self._roots, self._limits, axes, signs, self._order, self._values, narrowed)
+                    Case(self._roots, self._domain, axes, signs, self._order, self._values, narrowed)
                 )
         return [case for case in cases if not case.is_empty]
-
-
-def axis_expression(axis: Axis) -> Expression:
-    """Return a symbol, or a sum of several with their weights."""
-    total = as_expression(0.0)
-    for symbol, weight in axis:
-        term = symbol if weight == 1 else float(weight) * symbol
-        if len(axis) == 1:
-            return term
-        total = total + term
-    return total
 
 
 def _scaled(side: Interval, scale: Fraction, offset: Fraction) -> Interval:

@@ -4,7 +4,6 @@ import math
 import random
 from collections.abc import Iterator
 
-from kineverse.errors import UnsolvedError
 from kineverse.expressions.expression import Expression
 from kineverse.model.constraint import Constraint
 from kineverse.model.rates import plain
@@ -12,14 +11,13 @@ from kineverse.model.view import ModelView
 from kineverse.symbols import Symbol
 
 from .boxes import Box
-from .evaluating import value_at
+from .evaluating import at_rest, is_inside, settled, value_at
 from .interlock import Interlock, Interlocks
 
 Point = dict[Symbol, float]
 Room = tuple[float, float]
 Limits = dict[Expression, Room]
-ANY: Room = (-math.inf, math.inf)
-TINY, BOTH_WAYS = 1e-12, ("stands still", "has no value")
+TINY, ANY, BOTH_WAYS = 1e-12, (-math.inf, math.inf), ("stands still", "has no value")
 
 
 def contradictions(model: ModelView, found: Interlocks, points: int = 20, seed: int = 0) -> list[str]:
@@ -32,22 +30,22 @@ def contradictions(model: ModelView, found: Interlocks, points: int = 20, seed: 
             low, high = limits.get(c.expression, ANY)
             limits[c.expression] = (max(low, float(c.lower)), min(high, float(c.upper)))
     symbols = {s for c in rows.values() for s in c.symbols} | {*model.symbols, *model.rates.dependent}
-    chance, wrong = random.Random(seed), dict[str, None]()
+    chance, wrong, home = random.Random(seed), dict[str, None](), at_rest(model)
+    known = {n for k in found for n in k.constraints} | {u.constraint for u in found.undecided}
+    unmet = {c.expression for n, c in rows.items() if n not in known and not c.order} & limits.keys()
     told = [box for item in found for box in item.when] + [box for u in found.undecided for box in u.where]
     boxes = [Box({})] * 5 + list(dict.fromkeys(told))
     for box in boxes:
         for _ in range(min(points, 1 + 50 * points // len(boxes))):
             point = _point(sorted(symbols, key=str), box, limits, chance)
-            try:
-                point |= {x: value_at(e, point) for x, e in model.rates.dependent.items()}
-            except UnsolvedError:
-                continue
-            wrong |= dict.fromkeys(_compared(rows, found, limits, point))
-    return list(wrong)
+            if settled(model, point):
+                unmet -= {e for e in unmet if any(_among(value_at(e, p), limits[e]) for p in (home, point))}
+                wrong |= dict.fromkeys(_compared(rows, found, limits, point))
+    return [*wrong, *(f"{e} is never within its limits" for e in sorted(unmet, key=str))]
 
 
 def _compared(rows: dict[str, Constraint], found: Interlocks, limits: Limits, point: Point) -> Iterator[str]:
-    unknown = {u.constraint for u in found.undecided if any(_inside(box, point) for box in u.where)}
+    unknown = {u.constraint for u in found.undecided if any(is_inside(box, point) for box in u.where)}
     rooms: dict[Expression, dict[str, Room]] = {}
     for name, c in rows.items():
         about = {s for s in c.expression.symbols if s.order == c.order}
@@ -56,7 +54,7 @@ def _compared(rows: dict[str, Constraint], found: Interlocks, limits: Limits, po
         for held in {c.expression} if whole else about | claimed:
             rooms.setdefault(held, {})[name] = _room(c, held, point)
     for held, of in rooms.items():
-        claims = [k for k in found if k.held == held and any(_inside(box, point) for box in k.when)]
+        claims = [k for k in found if k.held == held and any(is_inside(box, point) for box in k.when)]
         limit = ANY if (speed := any(s.order for s in held.symbols)) else limits.get(held, ANY)
         for names in {k.constraints for k in claims} | {(n,) for n in of.keys() - unknown}:
             lows, highs = zip(limit, *(of.get(n, ANY) for n in names), strict=True)
@@ -75,9 +73,10 @@ def _compared(rows: dict[str, Constraint], found: Interlocks, limits: Limits, po
 def _room(c: Constraint, held: Expression, point: Point) -> Room:
     low, here, high = (value_at(e, point) for e in (c.lower, c.expression, c.upper))
     if isinstance(held, Symbol):
-        zero, one = (value_at(c.expression, {**point, held: x}) for x in (0.0, 1.0))
-        sides = ((low - zero) / (one - zero), (high - zero) / (one - zero)) if one != zero else ANY
-        return sides if one >= zero else sides[::-1]
+        zero, one, two = (value_at(c.expression, {**point, held: x}) for x in (0.0, 1.0, 2.0))
+        free = one == zero or not abs(two - 2 * one + zero) <= TINY * (1 + abs(two))  # or not just added
+        sides = ANY if free else ((low - zero) / (one - zero), (high - zero) / (one - zero))
+        return sides if free or one > zero else sides[::-1]
     back = value_at(c.expression, {s: -x if s.order else x for s, x in point.items()})
     if c.order and min(here, back) > 0 >= low:
         low = 0.0 if high <= 0 else -math.inf
@@ -86,19 +85,20 @@ def _room(c: Constraint, held: Expression, point: Point) -> Room:
 
 def _fits(lock: Interlock, limit: Room, room: Room, point: Point) -> bool:
     if lock.lower is None or lock.upper is None:
-        ends = {"increase": room[1] <= TINY, "decrease": room[0] >= -TINY, "value": room[0] > room[1]}
+        void = room[0] > room[1] or not (lock.held in point or _among(value_at(lock.held, point), room))
+        ends = {"increase": room[1] <= TINY, "decrease": room[0] >= -TINY, "value": void}
         return ends.get(lock.hold.split()[-1], max(map(abs, room)) <= TINY)
     low, high = value_at(lock.lower, point), value_at(lock.upper, point)
     return _same((max(low, limit[0]), min(high, limit[1])), room)
 
 
 def _same(a: Room, b: Room, finite: bool = False) -> bool:
-    ends = zip(a, b, strict=True)
-    return all(x == y or abs(x - y) <= 1e-6 * (1 + abs(x)) or (finite and math.isinf(x)) for x, y in ends)
+    near = (x == y or abs(x - y) <= 1e-6 * (1 + abs(x)) for x, y in zip(a, b, strict=True))
+    return all(n or (finite and math.isinf(x)) for n, x in zip(near, a, strict=True))
 
 
-def _inside(box: Box, point: Point) -> bool:
-    return all(value_at(axis, point) in side for axis, side in box.items())
+def _among(x: float, room: Room) -> bool:
+    return room[0] - TINY <= x <= room[1] + TINY
 
 
 def _point(symbols: list[Symbol], box: Box, limits: Limits, chance: random.Random) -> Point:

@@ -1,19 +1,58 @@
-"""Values of expressions at points, each compiled once for CasADi's interpreter."""
+"""Points: values of expressions, each compiled once for CasADi's interpreter, and conditions that hold."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from functools import lru_cache
 
 from kineverse.compile import CompiledFunction, compile  # noqa: A004
+from kineverse.errors import UnsolvedError
 from kineverse.expressions.expression import Expression
+from kineverse.model.view import ModelView
 from kineverse.symbols import Symbol
+
+from .boxes import Box
+
+_ROUNDING = 1e-9
 
 
 def value_at(expression: Expression, point: Mapping[Symbol, float]) -> float:
     """Return the value of a scalar at a point, which may say more than it needs."""
     function = _function(expression)
     return float(function({symbol: point[symbol] for symbol in function.inputs}))
+
+
+def is_inside(box: Box, point: Mapping[Symbol, float]) -> bool:
+    """Return whether the conditions of a box hold at a point."""
+    return all(value_at(axis, point) in side for axis, side in box.items())
+
+
+def at_rest(model: ModelView) -> dict[Symbol, float]:
+    """Return the default state, with what follows where it is."""
+    point = dict(model.default_state())
+    settled(model, point)
+    return point
+
+
+def settled(model: ModelView, point: dict[Symbol, float]) -> bool:
+    """Make a point one that the model can be at, and return whether that is possible.
+
+    Coordinates whose rates keep their length, as those of a quaternion, get length one. What follows other
+    coordinates is put where these are.
+    """
+    rates = model.rates
+    for speeds in {frozenset(rates[x]) for x in rates}:
+        group = [x for x in rates if rates[x].keys() == speeds]
+        growths = (sum(point[x] * value_at(rates[x][v], point) for x in group) for v in speeds)
+        size = math.hypot(*(point[x] for x in group))
+        if size and all(abs(growth) <= _ROUNDING * size**2 for growth in growths):
+            point.update({x: point[x] / size for x in group})
+    try:
+        point.update({x: value_at(e, point) for x, e in rates.dependent.items()})
+    except UnsolvedError:
+        return False
+    return True
 
 
 @lru_cache(1024)

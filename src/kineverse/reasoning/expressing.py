@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import casadi as ca
 
 from kineverse.bounds.terms import Term, reachable
@@ -9,19 +11,22 @@ from kineverse.expressions.expression import Expression, as_expression, binary, 
 from kineverse.expressions.functions import maximum, minimum, where
 from kineverse.expressions.piecewise import piecewise
 from kineverse.logic import less
+from kineverse.symbols import Symbol
 
 from .cases import Case
 from .polynomial import Polynomial
 from .values import live_arguments
 
 
-def expressed(case: Case, term: Term) -> Expression:
-    """Return what a term is in a case, as short as the case allows."""
+def expressed(case: Case, term: Term, names: Mapping[int, Symbol]) -> Expression:
+    """Return what a term is in a case, as short as the case allows; ``names`` are of terms that have one."""
     found: dict[int, Expression] = {}
     for part in reachable((term,)):
         value = case.value(part)
         if value.polynomial is not None:
             found[part.index] = _sum_of(value.polynomial)
+        elif part.index in names:
+            found[part.index] = names[part.index]
         elif part.op != "implicit" and part.op != ca.OP_CONST:
             chosen = live_arguments(part, case._values, case.sign)
             found[part.index] = _step(part, chosen, found)

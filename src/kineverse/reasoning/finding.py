@@ -12,11 +12,14 @@ from kineverse.model.rates import plain
 from kineverse.model.view import ModelView
 from kineverse.symbols import Symbol
 
-from .boxes import Box, Interval
+from .boxes import Interval
+from .domain import Domain
 from .interlock import Hold, Interlock, Interlocks, Undecided
-from .positions import Kept, on_position
+from .orientations import orientations
+from .positions import Kept
+from .reading import read
 from .regions import Region, common, merged
-from .speeds import Blocked, on_speed
+from .speeds import Blocked
 
 
 def interlocks(model: ModelView, values: Mapping[Symbol | str, float] | None = None) -> Interlocks:
@@ -29,8 +32,11 @@ def interlocks(model: ModelView, values: Mapping[Symbol | str, float] | None = N
     ``undecided``, with the constraint, the reason and the region.
 
     Everything is said about configurations within the constant limits of coordinates. Ordinary limits and
-    speed limits are no interlocks. Coordinates of closed loops, and those that wheels move, are named as the
-    constraints name them.
+    speed limits are no interlocks, and neither is a limit of one orientation, as a cone is. Conditions on
+    coordinates that follow others, in a closed loop, are told by the free ones, and what goes round without
+    limits by its angle within a turn, ``crank mod 2π``. Where several free ones would have to be told apart
+    together, they are told as the constraints name them, and listed as undecided. Coordinates that wheels
+    move are named as the constraints name them.
 
     Parameters
     ----------
@@ -53,7 +59,7 @@ def interlocks(model: ModelView, values: Mapping[Symbol | str, float] | None = N
         )
     constraints = dict(model.constraints.items())
     given = _given(constraints, values)
-    limits = constant_limits(constraints)
+    domain = Domain(constant_limits(constraints), orientations(model.rates))
     order = list(constraints)
     found: list[Interlock] = []
     undecided: list[Undecided] = []
@@ -62,17 +68,12 @@ def interlocks(model: ModelView, values: Mapping[Symbol | str, float] | None = N
     for name, constraint in constraints.items():
         if not _may_lock(constraint):
             continue
-        lower, expression, upper = (
-            plain(p) for p in (constraint.lower, constraint.expression, constraint.upper)
-        )
-        bare = Constraint(lower, expression, upper)
-        unknown: list[tuple[str, Box]] = []
-        if constraint.order:
-            blocked[name] = on_speed(bare, given, limits, unknown)
-        else:
-            kept[name] = on_position(bare, given, limits, unknown)
-        for reason in dict.fromkeys(reason for reason, _ in unknown):
-            where = merged(box for other, box in unknown if other == reason)
+        reading = read(constraint, model.rates, given, domain)
+        if reading.blocked is not None:
+            blocked[name] = reading.blocked
+        kept[name] = reading.kept
+        for reason in dict.fromkeys(reason for reason, _ in reading.unknown):
+            where = merged(box for other, box in reading.unknown if other == reason)
             undecided.append(Undecided(name, reason, where))
     for name, one in blocked.items():
         found += _of_speed(name, one)

@@ -10,6 +10,7 @@ from fractions import Fraction
 from functools import cached_property
 from typing import TypeAlias
 
+from kineverse.expressions.expression import Expression, as_expression
 from kineverse.symbols import Symbol
 
 from .boxes import Interval, Number
@@ -110,6 +111,17 @@ class Polynomial:
         for monomial, factor in self.terms.items():
             result[monomial[0][1] if monomial else 0] = factor
         return result
+
+
+def axis_expression(axis: Axis) -> Expression:
+    """Return a symbol, or a sum of several with their weights."""
+    total = as_expression(0.0)
+    for symbol, weight in axis:
+        term = symbol if weight == 1 else float(weight) * symbol
+        if len(axis) == 1:
+            return term
+        total = total + term
+    return total
 
 
 def value_at(coefficients: list[Fraction], x: Fraction) -> Fraction:

@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 
 from kineverse.bounds.terms import Term, Terms
 from kineverse.expressions.expression import Expression, as_expression
+from kineverse.expressions.substitution import apply
 from kineverse.model.constraint import Constraint
 from kineverse.symbols import Symbol
 
 from .boxes import Box, Interval
 from .cases import Case
 from .distinguishing import Unclear, Unknown, distinguish
+from .domain import Domain
 from .expressing import expressed
 from .interlock import Hold
 from .regions import merged
@@ -34,6 +36,16 @@ class Kept:
 
 
 @dataclass(frozen=True)
+class _Asked:
+    """What is common to all questions about one constraint."""
+
+    terms: Terms
+    domain: Domain
+    names: Mapping[int, Symbol]
+    unknown: list[tuple[str, Box]]
+
+
+@dataclass(frozen=True)
 class _Leaf:
     box: Box
     hold: Hold
@@ -45,15 +57,20 @@ class _Leaf:
 
 def on_position(
     constraint: Constraint,
+    follow: Mapping[Symbol, Expression],
     given: Mapping[Symbol, float],
-    limits: Mapping[Symbol, Interval],
+    domain: Domain,
     unknown: list[tuple[str, Box]],
 ) -> list[Kept]:
-    """Return how a constraint of order 0 keeps what it is about, in plain coordinates."""
+    """Return how a constraint of order 0 keeps what it is about, in plain coordinates.
+
+    ``follow`` says by what coordinates are told that follow others.
+    """
     terms = Terms(given)
+    asked = _Asked(terms, domain, {terms.of(e).index: s for s, e in follow.items()}, unknown)
     expression = terms.of(constraint.expression)
-    lower, upper = terms.of(constraint.lower), terms.of(constraint.upper)
-    form = Case((expression,), limits).value(expression).polynomial
+    lower, upper = (terms.of(apply(end, follow)) for end in (constraint.lower, constraint.upper))
+    form = Case((expression,), domain).value(expression).polynomial
     moves = bool(constraint.lower.symbols or constraint.upper.symbols)
     found: list[Kept] = []
     if form is not None and form.degree == 1 and all(s.has_derivative for s in form.symbols):
@@ -63,28 +80,54 @@ def on_position(
             for monomial, factor in form.terms.items():
                 if monomial and monomial[0][0] != symbol:
                     rest = rest + float(factor) * monomial[0][0]
-            other, scale = terms.of(rest), terms.constant(float(weight))
+            other, scale = terms.of(apply(rest, follow)), terms.constant(float(weight))
             low, high = (terms.over(terms.minus(end, other), scale) for end in (lower, upper))
             if weight < 0:
                 low, high = high, low
-            found += _kept(terms, symbol, low, high, limits, unknown)
+            found += _kept(asked, symbol, low, high)
     elif moves:
-        found += _kept(terms, constraint.expression, lower, upper, limits, unknown)
+        found += _kept(asked, constraint.expression, lower, upper)
     elif len(constraint.expression.symbols) > 1:
-        unknown.append(("it limits several coordinates at once, and they are not just added", Box({})))
+        found += _together(asked, constraint, terms.of(apply(constraint.expression, follow)))
     return found
 
 
-def _kept(
-    terms: Terms,
-    held: Expression,
-    low: Term,
-    high: Term,
-    limits: Mapping[Symbol, Interval],
-    unknown: list[tuple[str, Box]],
-) -> list[Kept]:
-    limit = limits.get(held, Interval()) if isinstance(held, Symbol) else Interval()
-    leaves = list(_leaves(terms, low, high, limit, limits, unknown))
+def _together(asked: _Asked, constraint: Constraint, expression: Term) -> list[Kept]:
+    """Return what a limit by numbers does to coordinates that are not just added.
+
+    It does nothing where it holds everywhere; and nothing worth telling where it is the limit of one
+    orientation, as a cone is, and leaves it room.
+    """
+    low, high = float(constraint.lower), float(constraint.upper)
+    value = Case((expression,), asked.domain).value(expression)
+    least, most = value.range
+    if not value.doubtful:
+        if low <= least and most <= high:
+            return []
+        if most < low or high < least:
+            return [Kept(constraint.expression, "has no value", (Box({}),), None, None, None)]
+    p = value.polynomial
+    sphere = asked.domain.sphere(value.live)
+    if p is not None and asked.domain.span(p) is not None:
+        # All values between the least and the most occur, so there is room where the limit leaves some.
+        if min(high, most) - max(low, least) > _SAME:
+            return []
+        reason = f"it leaves next to no room to the orientation of {_names(sphere)}"
+    elif sphere is not None:
+        reason = f"it limits the orientation of {_names(sphere)} by more than products of two of these"
+    else:
+        reason = "it limits several coordinates at once, and they are not just added"
+    asked.unknown.append((reason, Box({})))
+    return []
+
+
+def _names(symbols: Iterable[Symbol] | None) -> str:
+    return ", ".join(str(s) for s in symbols or ())
+
+
+def _kept(asked: _Asked, held: Expression, low: Term, high: Term) -> list[Kept]:
+    limit = asked.domain.of(held) if isinstance(held, Symbol) else Interval()
+    leaves = list(_leaves(asked, low, high, limit))
     free = _free_range(leaves, limit)
     groups: dict[tuple[Hold, Expression, Expression], list[_Leaf]] = {}
     for leaf in leaves:
@@ -134,14 +177,8 @@ def _agree(bound: Expression, other: Expression, at: dict[Symbol, float]) -> boo
     return a == b or abs(a - b) <= _SAME * max(1.0, abs(a))
 
 
-def _leaves(
-    terms: Terms,
-    low: Term,
-    high: Term,
-    limit: Interval,
-    limits: Mapping[Symbol, Interval],
-    unknown: list[tuple[str, Box]],
-) -> Iterator[_Leaf]:
+def _leaves(asked: _Asked, low: Term, high: Term, limit: Interval) -> Iterator[_Leaf]:
+    terms = asked.terms
     compared = {"room": terms.minus(high, low)}
     if not math.isinf(limit.lower):
         end = terms.constant(float(limit.lower))
@@ -165,12 +202,12 @@ def _leaves(
             signs[name] = sign
         return signs
 
-    start = Case((*bounds, *compared.values()), limits)
+    start = Case((*bounds, *compared.values()), asked.domain)
     for case, answer in distinguish(start, ask):
         if not isinstance(answer, dict):
-            unknown.append((answer.reason if isinstance(answer, Unknown) else str(answer), case.box()))
+            asked.unknown.append((answer.reason if isinstance(answer, Unknown) else str(answer), case.box()))
             continue
-        lower, upper = expressed(case, low), expressed(case, high)
+        lower, upper = (expressed(case, bound, asked.names) for bound in bounds)
         tighter = (answer.get("low above", 1) > 0, answer.get("high below", 1) > 0)
         rooms = [answer[n] for n in ("room", "high above", "low below") if n in answer]
         hold: Hold = "stays within"

@@ -8,12 +8,14 @@ from dataclasses import dataclass, field
 from kineverse.bounds.terms import SATURATED, Term, Terms, reachable
 from kineverse.expressions.expression import Expression, as_expression
 from kineverse.expressions.gradient import partial
+from kineverse.expressions.substitution import apply
 from kineverse.model.constraint import Constraint
 from kineverse.symbols import Symbol
 
-from .boxes import Box, Interval
+from .boxes import Box
 from .cases import Case
 from .distinguishing import Unclear, Unknown, distinguish
+from .domain import Domain
 from .regions import Region
 
 
@@ -30,19 +32,23 @@ class Blocked:
 
 def on_speed(
     constraint: Constraint,
+    follow: Mapping[Symbol, Expression],
     given: Mapping[Symbol, float],
-    limits: Mapping[Symbol, Interval],
+    domain: Domain,
     unknown: list[tuple[str, Box]],
 ) -> Blocked:
-    """Return what a constraint of order 1 or higher stops, in plain coordinates; note what is unknown."""
+    """Return what a constraint of order 1 or higher stops, in plain coordinates; note what is unknown.
+
+    ``follow`` says by what coordinates are told that follow others.
+    """
     terms = Terms(given)
     held, weight, offset = _alone(constraint)
-    lower, upper, rest = terms.of(constraint.lower), terms.of(constraint.upper), terms.of(offset)
-    factor = terms.of(weight)
+    ends = (constraint.lower, constraint.upper, offset, weight)
+    lower, upper, rest, factor = (terms.of(apply(part, follow)) for part in ends)
     above, below = terms.minus(upper, rest), terms.minus(rest, lower)
     blocked = Blocked(held)
     whole = terms.of(held) if not isinstance(held, Symbol) else None
-    start = Case((factor, above, below, *([] if whole is None else [whole])), limits)
+    start = Case((factor, above, below, *([] if whole is None else [whole])), domain)
     sides = [(above, below, blocked.up, blocked.up_beyond), (below, above, blocked.down, blocked.down_beyond)]
     if whole is not None and start.value(whole).range[0] >= -1e-300:
         # A norm cannot be less than 0 in the first place: if it has no room, everything stands.

@@ -15,6 +15,7 @@ from kineverse.bounds.terms import DOMAINS, Term
 from kineverse.symbols import Symbol
 
 from .polynomial import Polynomial
+from .solving import solved
 
 NOBODY: frozenset[Symbol] = frozenset()
 ZERO = Polynomial({})
@@ -74,8 +75,6 @@ def evaluate(term: Term, values: dict[int, Value], sign: Signs) -> Value:
     doubtful = any(values[a.index].doubtful for a in (*chosen, *_needed(term)))
     if term.op == ca.OP_CONST:
         return constant(term.data)
-    if term.op == "implicit":
-        return Value(live=frozenset(term.data[0].symbols))
     result = _value(term, args, values, sign)
     if result.void:
         return result
@@ -126,6 +125,8 @@ def _value(term: Term, args: list[Value], values: dict[int, Value], sign: Signs)
         if step is not None:
             return constant(step)
         return Value((0.0, 1.0), None, args[0].live)
+    if op == "implicit":
+        return Value(solved(term, [(a.range,) for a in args])[0], None, live)
     if op == "piecewise":
         return _piecewise(term, args[0], values, sign)
     if op in ("select", ca.OP_IF_ELSE_ZERO, ca.OP_FMIN, ca.OP_FMAX):

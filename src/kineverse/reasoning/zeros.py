@@ -12,12 +12,13 @@ from kineverse.bounds.ranges import ZERO, Range
 from kineverse.bounds.terms import Term
 from kineverse.symbols import Symbol
 
+from .solving import solved
 from .values import Signs, Value, live_arguments
 
 Look = Callable[[float, float], tuple[Range, Range | None]]
 """Between which numbers a function, and its slope, are on an interval."""
 
-_LOOKS_AT_MOST = 3000
+LOOKS_AT_MOST = 3000
 _WIDTH = 1e-13
 _CLOSE = 1e-9
 
@@ -67,14 +68,17 @@ def _slope(term: Term, values: dict[int, Value], sign: Signs, found: dict[int, R
         return ranges.negative(inner[0])
     if op == ca.OP_FABS:
         return ranges.hull(inner[0], ranges.negative(inner[0]))
+    if op == "implicit":
+        series = solved(term, list(zip(spans, inner, strict=True)))
+        return series[1] if len(series) > 1 else None
     if len(term.args) == 1 and isinstance(op, int):
         outer = ranges.slope(op, spans[0])
         return None if outer is None else ranges.multiply(outer, inner[0])
     return None
 
 
-def zeros(look: Look, low: float, high: float) -> list[float] | None:
-    """Return the isolated zeros in an interval, up to 1e-9; None if that cannot be made certain.
+def zeros(look: Look, low: float, high: float, most: int = LOOKS_AT_MOST) -> list[float] | None:
+    """Return the isolated zeros in an interval, up to 1e-9; None if ``most`` looks do not make that certain.
 
     Between them, and up to the ends, the sign is one and the same.
     """
@@ -95,7 +99,7 @@ def zeros(look: Look, low: float, high: float) -> list[float] | None:
                 return None
             found += zero
             continue
-        if looks > _LOOKS_AT_MOST or b - a < _CLOSE * max(1.0, abs(a), abs(b)):
+        if looks > most or b - a < _CLOSE * max(1.0, abs(a), abs(b)):
             return None
         middle = _middle(a, b)
         stack += [(a, middle), (middle, b)]

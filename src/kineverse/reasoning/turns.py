@@ -1,0 +1,115 @@
+"""Coordinates without limits that go round: where everything is the same after a turn, one turn is told."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from fractions import Fraction
+from functools import lru_cache
+from typing import TypeAlias
+
+import casadi as ca
+
+from kineverse.bounds.terms import Term, Terms, reachable
+from kineverse.expressions.expression import Expression
+from kineverse.expressions.implicit import ImplicitFunction
+from kineverse.expressions.substitution import apply
+from kineverse.symbols import Symbol, position
+
+from .boxes import Box, Interval, within_a_turn
+
+TURN = Interval(0.0, math.tau, True, False)
+Growth: TypeAlias = Fraction | None
+STAYS = Fraction(0)
+_WAVES = (ca.OP_SIN, ca.OP_COS, ca.OP_TAN)
+_SAME = 1e-12
+
+
+class Turns:
+    """Stand-ins for coordinates that go round, which stay within a turn.
+
+    Parameters
+    ----------
+    coordinates
+        Those that go round.
+    """
+
+    def __init__(self, coordinates: Iterable[Symbol]) -> None:
+        self.stand_ins = {s: position(f"{s.path} mod 2π") for s in coordinates}
+        self._back = {inner: s for s, inner in self.stand_ins.items()}
+
+    def box(self, box: Box) -> Box:
+        """Return a box about the coordinates themselves."""
+        return Box({self._told(axis): side for axis, side in box.items()})
+
+    def expression(self, expression: Expression) -> Expression:
+        """Return an expression in the coordinates themselves."""
+        return apply(expression, {s: e for s, e in self._back.items() if s in expression.symbols})
+
+    def _told(self, axis: Expression) -> Expression:
+        around = self._back.get(axis) if isinstance(axis, Symbol) else None
+        return axis if around is None else within_a_turn(around)
+
+
+def repeats(expressions: Sequence[Expression], symbol: Symbol) -> bool:
+    """Return whether expressions are certainly the same at ``symbol`` + 2π; by their form."""
+    return all(g == 0 for e in expressions for g in _growths(e, {symbol: Fraction(1)}))
+
+
+def _growths(expression: Expression, moving: Mapping[Symbol, Fraction]) -> list[Growth]:
+    """Return by how many turns elements are more after turns of symbols, None where that is not certain."""
+    terms = Terms({})
+    roots = tuple(terms.elements(expression))
+    found: dict[int, Growth] = {}
+    for term in reachable(roots):
+        args = [found[a.index] for a in term.args]
+        found[term.index] = (
+            moving.get(term.data, STAYS) if term.op == ca.OP_PARAMETER else _growth(term, args)
+        )
+    return [found[term.index] for term in roots]
+
+
+def _growth(term: Term, args: list[Growth]) -> Growth:
+    known = [arg for arg in args if arg is not None]
+    if len(known) < len(args):
+        return None
+    if not any(known):
+        return STAYS
+    if term.op == ca.OP_NEG:
+        return -known[0]
+    if term.op in (ca.OP_ADD, ca.OP_SUB):
+        return known[0] + known[1] if term.op == ca.OP_ADD else known[0] - known[1]
+    if term.op in (ca.OP_MUL, ca.OP_DIV):
+        return _scaled(term, known)
+    whole = all(arg.denominator == 1 for arg in known)
+    if term.op in _WAVES:
+        return STAYS if whole else None
+    if term.op == "piecewise":
+        periodic, knots, _ = term.data
+        periods = float(known[0]) * math.tau / (knots[-1] - knots[0])
+        return STAYS if periodic and abs(periods - round(periods)) <= _SAME * max(1.0, abs(periods)) else None
+    if term.op == "implicit":
+        node, element = term.data
+        around: Growth = _around(node.function, tuple(known))[element]
+        return around
+    return None
+
+
+def _scaled(term: Term, known: list[Fraction]) -> Growth:
+    for moving, factor in ((0, 1), (1, 0)) if term.op == ca.OP_MUL else ((0, 1),):
+        number = term.args[factor].data
+        if term.args[factor].op == ca.OP_CONST and math.isfinite(number) and number:
+            return (
+                known[moving] * Fraction(number) if term.op == ca.OP_MUL else known[moving] / Fraction(number)
+            )
+    return None
+
+
+@lru_cache(256)
+def _around(function: ImplicitFunction, inputs: tuple[Fraction, ...]) -> tuple[Growth, ...]:
+    """Return how unknowns grow with turns of the inputs: as the seed does, if the equations stay the same."""
+    moving = {s: g for s, g in zip(function.inputs, inputs, strict=True) if g}
+    by = _growths(function.seed, moving)
+    moving |= {s: g for s, g in zip(function.unknowns, by, strict=True) if g}
+    same = None not in by and all(g == 0 for g in _growths(function.chosen, moving))
+    return tuple(by) if same else (None,) * len(by)
