@@ -341,3 +341,43 @@ def test_tolerances_that_are_none(run, files, tolerance):
     assert (status, out) == (2, "")
     assert "from 0 on" in err
     assert run(*files(), "--tolerance", "much")[0] == 2
+
+
+@pytest.mark.parametrize("ending", ["urdf", "xml"])
+def test_frames_that_a_format_needs_in_between_are_no_difference(run, tmp_path, ending):
+    if ending == "xml":
+        pytest.importorskip("mujoco")
+    model, q = kv.Model(), kv.position("q")
+    with model.edit() as edit:
+        edit.add_frame("lift", parent="world", transform=kv.translation(0, 0, 0.2 * q))
+        edit.add_frame("yoke", parent="lift", transform=kv.translation(0.3 * np.cos(q), 0, 0))
+        edit.add_frame("cross", parent="yoke", transform=kv.rotation_x(q) @ kv.rotation_y(kv.position("p")))
+    one, two = tmp_path / "one.kv.json", tmp_path / f"two.{ending}"
+    model.save(one)
+    model.save(two)
+    assert len(kv.load(two).frames) > 3
+    for files in ((one, two), (two, one)):
+        status, out, _ = run(*files, "--values")
+        assert status == 0
+        assert "not counted, in between and without bodies: " in out
+    answer = json.loads(run(one, two, "--values", "--json")[1])
+    assert answer["equal"]
+    assert set(answer["frames"]["helpers"]) == set(kv.load(two).frames) - set(model.frames)
+    assert run(one, two)[0] == 1
+
+
+def test_frames_that_somebody_added_are_a_difference(run, files, tmp_path):
+    def added(name, parent, inside=""):
+        return link(name, inside) + joint(f"{name}_mount", parent, name, "fixed", " ")
+
+    upper = ARM["upper"]
+    for more in (
+        {"leaf": added("leaf", "upper")},
+        {"between": link("between") + joint("m", "upper", "between", "fixed", " ")}
+        | {"flange": joint("flange", "between", "tool", "fixed", '<origin xyz="0.3 0 0"/>')},
+        {"seen": added("tool/seen", "upper", upper[upper.index("<visual") : upper.index("</link")])}
+        | {"flange": joint("flange", "tool/seen", "tool", "fixed", '<origin xyz="0.3 0 0"/>')},
+    ):
+        status, out, _ = run(*files(**more), "--values")
+        assert status == 1
+        assert "not counted" not in out

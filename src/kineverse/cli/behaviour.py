@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
+from kineverse.formats.export.additions import added_frames
 from kineverse.model.delta import poses_apart
 from kineverse.model.samples import Array, Samples
 from kineverse.model.view import ModelView
@@ -38,6 +39,8 @@ class Behaviour:
     ----------
     frames, freedoms
         Names of frames and degrees of freedom, by whether they are ``added``, ``removed`` or ``common``.
+    helpers
+        Frames that only one has because of its format, which are not counted: neither added nor removed.
     apart
         Frames of both that are elsewhere in the world in one of the sampled states, the worst first.
     ranges
@@ -50,7 +53,10 @@ class Behaviour:
 
     def __init__(self, before: ModelView, after: ModelView, tolerance: float) -> None:
         self.tolerance = tolerance
-        self.frames = _sides(list(before.frames), list(after.frames))
+        self.helpers = [*added_frames(before, after), *added_frames(after, before)]
+        self.frames = _sides(
+            *([name for name in model.frames if name not in self.helpers] for model in (before, after))
+        )
         old, new = ({str(s): s for s in model.degrees_of_freedom} for model in (before, after))
         self.freedoms = _sides(list(old), list(new))
         samples = Samples(before, after, count=STATES)

@@ -43,6 +43,10 @@ class BehaviourReport:
                 for r in self.found.ranges
             ]
             result.append([paint("limits", "bold"), *bounded(lines, most)])
+        if self.found.helpers:
+            names = ", ".join(self.found.helpers[:most])
+            more = "" if most is None or len(self.found.helpers) <= most else ", ..."
+            result.append([f"not counted, in between and without bodies: {names}{more}"])
         if not self.found.apart:
             common = number(len(self.found.frames["common"]), "frame")
             agree = f"{common} at the same places in {self.found.states} states"
@@ -59,6 +63,7 @@ class BehaviourReport:
             "frames": {
                 "removed": self.found.frames["removed"],
                 "added": self.found.frames["added"],
+                "helpers": self.found.helpers,
                 "changed": [
                     {"name": a.frame, "distance": _finite(a.distance), "angle": _finite(a.angle)}
                     for a in self.found.apart

@@ -17,7 +17,8 @@ tolerance at sampled states count as equal. Operations are compared where most h
 tag. Meshes are compared by what they are called, not by what is in the files.
 
 With --values, what the models do is compared instead of how they are made: where their frames are in the
-world at sampled states, and the limits of their degrees of freedom.
+world at sampled states, and the limits of their degrees of freedom. Frames that a format needs in between,
+and that carry nothing, are told and not counted.
 
   +  only in B      -  only in A      ~  changed      >  comes at another place
 
