@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from linkages import at, four_bar, jansen_leg
+from linkages import at, four_bar, scene
 from loop_checks import record
 
 import kineverse as kv
@@ -13,7 +13,7 @@ crank, rocker = kv.position("crank"), kv.position("rocker")
 
 
 def test_loops_on_loops():
-    leg = jansen_leg()
+    leg = scene("jansen_leg")
     assert leg.degrees_of_freedom == (crank,)
     assert {record(leg, n)["free"] for n in ("top", "bottom", "knee")} == {("crank",)}
     assert set(leg.rates.dependent) == {
