@@ -9,14 +9,15 @@ from pathlib import Path
 import pytest
 
 from kineverse import gallery
+from kineverse.gallery import mechanisms
 
 DOCS = Path(__file__).parents[2] / "docs"
 PICTURES = DOCS / "pictures"
 
 
 def test_every_scene_has_its_picture_in_the_docs_and_the_other_way_round():
-    page = (DOCS / "articulations.md").read_text(encoding="utf-8")
-    shown = re.findall(r"!\[[^\]]+\]\(pictures/(\w+)\.png\)", page)
+    pages = "".join((DOCS / f"{p}.md").read_text(encoding="utf-8") for p in ("articulations", "mechanisms"))
+    shown = re.findall(r"!\[[^\]]+\]\(pictures/(\w+)\.png\)", pages)
     assert sorted(shown) == sorted(gallery.names())
     assert sorted(path.name for path in PICTURES.iterdir()) == sorted(
         f"{name}.png" for name in gallery.names()
@@ -30,3 +31,13 @@ def test_a_picture_is_small(name):
     assert width <= 480
     assert kind == 3  # with a palette
     assert len(data) < 25_000
+
+
+def test_mechanisms_are_shown_where_their_equations_are():
+    """In the column under a name are its picture and, below that, its equations."""
+    page = (DOCS / "mechanisms.md").read_text(encoding="utf-8")
+    for build in mechanisms.SCENES:
+        (row,) = (line for line in page.splitlines() if f"(pictures/{build.__name__}.png)" in line)
+        column = [f"/{build.__name__}.png" in cell for cell in row.split("|")].index(True)
+        equations = page[page.index(row) :].splitlines()[1].split("|")
+        assert len(equations[column].strip()) > 5
