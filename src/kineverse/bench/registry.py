@@ -20,6 +20,7 @@ BENCHMARKS: Mapping[str, str] = MappingProxyType(
         "loop": "a closed loop and its derivative at one configuration",
         "import": "importing the library, and how many packages that takes",
         "memory": "the memory of a loaded robot",
+        "document": "a robot in a kitchen, written down and read again; models of up to a million nodes",
         "edit": "models of 10 000 operations, and a robot with one joint replaced",
     }
 )

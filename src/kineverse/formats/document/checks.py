@@ -70,7 +70,12 @@ def number(value: Any) -> float:
 def numbers(value: Any, length: int | None = None) -> tuple[float, ...]:
     """Return so many numbers."""
     items = listed(value, "numbers")
-    return tuple(map(number, items if length is None else exactly(items, length)))
+    if length is not None:
+        exactly(items, length)
+    for item in items:
+        if type(item) is not float or not -math.inf < item < math.inf:
+            return tuple(map(number, items))
+    return tuple(items)
 
 
 def whole(value: Any, most: int) -> int:

@@ -6,6 +6,7 @@ import json
 from collections.abc import Callable, Iterator
 from typing import Any, NoReturn
 
+from kineverse.collection import no_collection
 from kineverse.errors import FormatError, KineverseError
 from kineverse.expressions.expression import Expression
 from kineverse.formats.files import MAX_BYTES
@@ -86,24 +87,27 @@ class _Document:
 
     def read(self, parse: Callable[[bytes], Any], content: bytes) -> list[tuple[str, Recorded]]:
         try:
-            given = parse(content)
-            self._place = "the document"
-            if type(given) is not dict or given.get("format") != FORMAT:
-                raise RefusedError(
-                    f'it does not begin with {{"format": "{FORMAT}", and so is not one of Kineverse'
-                )
-            self._check_version(given.get("version"))
-            fields(given, ("format", "version", "nodes", "operations"), (HASH,))
-            if HASH in given:
-                check_hash(given[HASH], content, given)
-            self._read_nodes(listed(given["nodes"], "nodes"))
-            return self._read_operations(listed(given["operations"], "operations"))
+            with no_collection():
+                return self._read(parse(content), content)
         except RefusedError as error:
             self._refuse(str(error))
         except RecursionError:
             self._refuse("it is nested too deeply")
         except MemoryError:
             self._refuse("there is not enough memory for it")
+
+    def _read(self, given: Any, content: bytes) -> list[tuple[str, Recorded]]:
+        self._place = "the document"
+        if type(given) is not dict or given.get("format") != FORMAT:
+            raise RefusedError(
+                f'it does not begin with {{"format": "{FORMAT}", and so is not one of Kineverse'
+            )
+        self._check_version(given.get("version"))
+        fields(given, ("format", "version", "nodes", "operations"), (HASH,))
+        if HASH in given:
+            check_hash(given[HASH], content, given)
+        self._read_nodes(listed(given["nodes"], "nodes"))
+        return self._read_operations(listed(given["operations"], "operations"))
 
     def _refuse(self, reason: str) -> NoReturn:
         place = f", {self._place}" if self._place else ""

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from functools import lru_cache
+from struct import Struct
 from typing import Any
 
 import numpy as np
@@ -34,6 +36,7 @@ _ROUND: dict[str, Callable[[float, float], Geometry]] = {
 GEOMETRIES = ("box", *_ROUND, "sphere", "ellipsoid", "mesh")
 INERTIA_NUMBERS = 6
 POSE_NUMBERS = 12
+_POSE = Struct(f"{POSE_NUMBERS}d")
 
 
 # -- writing -------------------------------------------------------------------------------------------------
@@ -191,4 +194,10 @@ def _read_vector(value: Any) -> tuple[float, float, float]:
 
 def read_pose(value: Any) -> Pose:
     """Return a pose that was written."""
-    return Pose(numbers(value, POSE_NUMBERS))
+    return _pose(_POSE.pack(*numbers(value, POSE_NUMBERS)))
+
+
+@lru_cache(1024)
+def _pose(rows: bytes) -> Pose:
+    # The same ones come again and again, and to check a rotation takes a while. As bytes, -0.0 is not 0.0.
+    return Pose(_POSE.unpack(rows))

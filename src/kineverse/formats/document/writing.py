@@ -6,6 +6,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from kineverse.collection import no_collection
 from kineverse.errors import FormatError
 from kineverse.expressions.expression import Expression
 from kineverse.formats.files import replace_file
@@ -66,11 +67,16 @@ def document_of(model: ModelView) -> str:
     if not isinstance(snapshot, Snapshot):
         raise FormatError(f"A model or a snapshot is saved, not a {type(model).__name__}.")
     try:
-        parts = [_Parts(entry, cells) for entry, cells in _in_order(snapshot._entries)]
-        table = Table(e for part in parts for e in part.expressions)
-        operations = [_operation(part, table) for part in parts]
+        with no_collection():
+            return _written(snapshot)
     except RecursionError:
         raise FormatError("The model contains data or gradients that are nested too deeply.") from None
+
+
+def _written(snapshot: Snapshot) -> str:
+    parts = [_Parts(entry, cells) for entry, cells in _in_order(snapshot._entries)]
+    table = Table(e for part in parts for e in part.expressions)
+    operations = [_operation(part, table) for part in parts]
     body = "".join(
         (
             f'{{"format":"{FORMAT}","version":{VERSION},\n"nodes":[',
