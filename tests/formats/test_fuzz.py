@@ -21,6 +21,7 @@ from fuzz.law import Tally, check  # noqa: E402
 from fuzz.minimise import minimise  # noqa: E402
 from fuzz.records import Records  # noqa: E402
 from fuzz.targets import TARGETS, Target  # noqa: E402
+from fuzz.ways import way_of  # noqa: E402
 from fuzz.worker import place  # noqa: E402
 
 COUNTS = {"urdf": 300, "sdf": 100, "mjcf": 80, "document": 300}
@@ -36,7 +37,8 @@ def test_the_law_holds_for_a_while(name, folder):
     target, tally = TARGETS[name], Tally()
     count = COUNTS.get(name, 100)
     for data in islice(inputs(target, target.own_seeds(), Random(7)), count):
-        assert check(target, data, folder, tally) is None, data
+        way = way_of(data)
+        assert check(target, data, folder, tally, way) is None, (way, data)
     # Neither all good nor all bad, or the grammars would test nothing.
     assert tally.models > count / 20
     assert tally.errors > count / 20
@@ -60,7 +62,7 @@ def test_inputs_repeat(name):
 
 
 def broken(read) -> Target:
-    return replace(TARGETS["urdf"], operations=lambda data, folder: read(data.decode(), folder))
+    return replace(TARGETS["urdf"], operations=lambda data, folder, prefix: read(data.decode(), folder))
 
 
 def other_error(text, folder):

@@ -20,6 +20,7 @@ from .law import Finding, check
 from .minimise import minimise
 from .records import Records
 from .targets import TARGETS, Target
+from .ways import Way, all_ways
 from .worker import HANG, place
 
 ROUND = 300
@@ -140,7 +141,8 @@ def _look(target: Target, path: Path) -> int:
     data = path.read_bytes()
     with tempfile.TemporaryDirectory() as name:
         folder = place(Path(name))
-        finding = check(target, data, folder) or check(target, data, folder, loops=False)
+        found = (check(target, data, folder, way=way) for way in all_ways())
+        finding = next(filter(None, found), None)
         if finding is None:
             _say("nothing is wrong")
             return 0
@@ -150,10 +152,10 @@ def _look(target: Target, path: Path) -> int:
 
 
 def _minimised(target: Target, data: bytes, signature: str, folder: Path) -> bytes:
-    for loops in (False, True):
+    for way in all_ways():
 
-        def fails(candidate: bytes, loops: bool = loops) -> bool:
-            finding = check(target, candidate, folder, loops=loops)
+        def fails(candidate: bytes, way: Way = way) -> bool:
+            finding = check(target, candidate, folder, way=way)
             return finding is not None and finding.signature == signature
 
         if fails(data):

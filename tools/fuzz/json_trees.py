@@ -1,12 +1,15 @@
-"""Mutations and reductions of JSON, value by value."""
+"""Mutations and reductions of JSON and of what says the same in other bytes, value by value."""
 
 from __future__ import annotations
 
 import copy
 import json
 from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from random import Random
 from typing import Any
+
+import msgspec.msgpack
 
 from . import bytes_mutation, values
 
@@ -19,20 +22,30 @@ _VALUES: tuple[Any, ...] = (
 _SIMPLEST: tuple[Any, ...] = (0, "a", [])
 
 
-def mutator(vocabulary: tuple[str, ...]) -> Callable[[bytes, bytes, Random], bytes]:
-    """Return the mutation of a format that is JSON."""
+@dataclass(frozen=True)
+class Notation:
+    """How bytes are read as values, None where they are none, and values written as bytes."""
+
+    read: Callable[[bytes], Any]
+    write: Callable[[Any], bytes]
+
+
+def mutator(vocabulary: tuple[str, ...], notation: Notation) -> Callable[[bytes, bytes, Random], bytes]:
+    """Return the mutation of a format that consists of values."""
 
     def mutate(data: bytes, other: bytes, random: Random) -> bytes:
-        tree = _parsed(data)
+        tree = notation.read(data)
         if not isinstance(tree, (dict, list)) or random.random() < 0.1:
             return bytes_mutation.mutate(data, other, random)
-        donor = _parsed(other) if random.random() < 0.3 else tree
+        if isinstance(tree, dict) and random.random() < 0.95:
+            tree.pop("sha256", None)  # or it would be all that is looked at
+        donor = notation.read(other) if random.random() < 0.3 else tree
         try:
             for _ in range(random.choice((1, 1, 1, 2, 3, 6))):
                 _mutate(tree, donor, vocabulary, random)
         except RecursionError:  # what is deep already cannot be copied
             pass
-        return _text(tree)
+        return notation.write(tree)
 
     return mutate
 
@@ -96,25 +109,47 @@ def _text(tree: Any) -> bytes:
         return b""
 
 
-def reductions(data: bytes) -> Iterator[bytes]:
-    """Yield inputs with a value less, or with a simpler one in its place."""
-    tree = _parsed(data)
-    if not isinstance(tree, (dict, list)):
-        return
-    for owner, key in reversed(list(_places(tree))):
-        value = owner[key]
-        if isinstance(owner, list):
-            del owner[key]
-            yield _text(tree)
-            owner.insert(key, value)
-        else:
-            items = list(owner.items())
-            del owner[key]
-            yield _text(tree)
-            owner.clear()
-            owner.update(items)
-        for simpler in _SIMPLEST:
-            if value != simpler and len(repr(simpler)) < len(repr(value)):
-                owner[key] = simpler
-                yield _text(tree)
-        owner[key] = value
+def _unpacked(data: bytes) -> Any:
+    try:
+        return msgspec.msgpack.decode(data)
+    except (ValueError, RecursionError):
+        return None
+
+
+def _packed(tree: Any) -> bytes:
+    try:
+        return msgspec.msgpack.encode(tree)
+    except (RecursionError, ValueError, OverflowError):
+        return b""
+
+
+JSON = Notation(_parsed, _text)
+MSGPACK = Notation(_unpacked, _packed)
+
+
+def reducer(notation: Notation) -> Callable[[bytes], Iterator[bytes]]:
+    """Return what yields inputs with a value less, or with a simpler one in its place."""
+
+    def reductions(data: bytes) -> Iterator[bytes]:
+        tree = notation.read(data)
+        if not isinstance(tree, (dict, list)):
+            return
+        for owner, key in reversed(list(_places(tree))):
+            value = owner[key]
+            if isinstance(owner, list):
+                del owner[key]
+                yield notation.write(tree)
+                owner.insert(key, value)
+            else:
+                items = list(owner.items())
+                del owner[key]
+                yield notation.write(tree)
+                owner.clear()
+                owner.update(items)
+            for simpler in _SIMPLEST:
+                if value != simpler and len(repr(simpler)) < len(repr(value)):
+                    owner[key] = simpler
+                    yield notation.write(tree)
+            owner[key] = value
+
+    return reductions

@@ -25,6 +25,9 @@ import numpy as np
 import kineverse as kv
 from kineverse.formats.document import document_of, operations_from
 
+from .edits import edits
+from .ways import Way
+
 if TYPE_CHECKING:
     from .targets import Target
 
@@ -35,7 +38,7 @@ ROUNDING = 1e-6
 MOST_FRAMES = 40
 """So many poses are evaluated, which is enough to see how they fail."""
 
-_FILE = re.compile(r"[\w.]+\.(urdf|sdf|xml|json|config)[,:]")
+_FILE = re.compile(r"[\w.]+\.(urdf|sdf|xml|json|msgpack|config)[,:]")
 """What errors of readers begin with."""
 
 _HERE = str(Path(__file__).parent)
@@ -69,19 +72,17 @@ class Tally:
 
 
 def check(
-    target: Target, data: bytes, folder: Path, tally: Tally | None = None, loops: bool = True
+    target: Target, data: bytes, folder: Path, tally: Tally | None = None, way: Way | None = None
 ) -> Finding | None:
-    """Return what is wrong with how a target takes an input, None if nothing is.
-
-    To close a loop takes a hundred times as long as all the rest, so it may be left open.
-    """
+    """Return what is wrong with how a target takes an input, looked at in one way; None if nothing is."""
+    way = way or Way()
     tally = tally or Tally()
     before, start = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss, time.process_time()
     finding = None
     with _watching(folder) as reached, warnings.catch_warnings():
         warnings.simplefilter("error")
         try:
-            _use(target, _model(target, data, folder, loops))
+            _use(target, _model(target, data, folder, way), way)
             tally.models += 1
         except kv.KineverseError as error:
             tally.errors += 1
@@ -102,10 +103,10 @@ def check(
     return finding
 
 
-def _model(target: Target, data: bytes, folder: Path, loops: bool) -> kv.Model:
-    """Return the model that an input describes, with its loops closed or left open."""
+def _model(target: Target, data: bytes, folder: Path, way: Way) -> kv.Model:
+    """Return the model that an input describes."""
     try:
-        operations = list(target.operations(data, folder))
+        operations = list(target.operations(data, folder, way.prefix))
     except kv.KineverseError as error:
         if not isinstance(error, kv.FormatError):
             raise BrokenError(f"an error of another kind, at {_place(error)}: {error!r}") from error
@@ -115,13 +116,28 @@ def _model(target: Target, data: bytes, folder: Path, loops: bool) -> kv.Model:
     model = kv.Model()
     with model.edit() as edit:
         for tag, operation in operations:
-            if loops or not isinstance(operation, kv.CloseLoop):
+            if way.loops or not isinstance(operation, kv.CloseLoop):
                 edit.apply(operation, tag)
     return model
 
 
-def _use(target: Target, model: kv.Model) -> None:
+def _use(target: Target, model: kv.Model, way: Way) -> None:
     """Do with a model what anybody would do first."""
+    text, loaded = _saved(model)
+    names = [*model.frames, *model.constraints, *model.data, *(s.path for s in model.symbols)]
+    if way.prefix and not all(name.startswith(f"{way.prefix}/") for name in names):
+        raise BrokenError(f"a name without the prefix: {names[:50]}")
+    _evaluate(target, model)
+    try:
+        edits(loaded, way.seed, lambda: _saved(loaded))
+    except kv.KineverseError as error:
+        raise BrokenError(f"an edit cannot be taken back, at {_place(error)}: {error}") from error
+    if document_of(loaded) != text:
+        raise BrokenError("an edit that was refused or taken back left something behind")
+
+
+def _saved(model: kv.Model) -> tuple[str, kv.Model]:
+    """Return the document of a model, and what is loaded from it, whose document is the same."""
     try:
         text = document_of(model)
         again = kv.Model()
@@ -132,6 +148,11 @@ def _use(target: Target, model: kv.Model) -> None:
             raise BrokenError("saved and loaded, the model is another one")
     except kv.KineverseError as error:
         raise BrokenError(f"it cannot be saved and loaded, at {_place(error)}: {error}") from error
+    return text, again
+
+
+def _evaluate(target: Target, model: kv.Model) -> None:
+    """Ask for positions, poses, and what is violated."""
     state = model.default_state()
     if target.finite and not all(np.isfinite(value) for value in state.values()):
         raise BrokenError(f"a position is not finite: {state}")

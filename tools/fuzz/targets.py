@@ -13,6 +13,7 @@ import mujoco  # noqa: F401  - it looks about when it is imported, so before any
 import kineverse as kv
 from kineverse import gallery
 from kineverse.formats.document import document_of, operations_from
+from kineverse.formats.document.reading import operations_unpacked
 from kineverse.formats.mjcf import parse_mjcf
 from kineverse.formats.mjcf.operations import scene_operations as mjcf_operations
 from kineverse.formats.sdf.operations import scene_operations
@@ -21,7 +22,7 @@ from kineverse.formats.set_body import SetBody
 from kineverse.formats.urdf import parse_urdf
 from kineverse.formats.urdf.operations import robot_operations
 
-from . import json_trees, xml_trees
+from . import json_trees, programs, xml_trees
 from .grammars import document, mjcf, sdf, urdf
 
 SEEDS = Path(__file__).parent / "seeds"
@@ -41,7 +42,7 @@ class Target:
     suffix
         What the names of its files end with.
     operations
-        The reader: what a text in a folder describes.
+        The reader: what a text in a folder describes, below a prefix.
     generate
         Returns an input by grammar, right or wrong.
     mutate
@@ -58,7 +59,7 @@ class Target:
 
     name: str
     suffix: str
-    operations: Callable[[bytes, Path], Operations]
+    operations: Callable[[bytes, Path, str | None], Operations]
     generate: Callable[[Random], bytes]
     mutate: Callable[[bytes, bytes, Random], bytes]
     reduce: Callable[[bytes], Iterator[bytes]]
@@ -79,23 +80,36 @@ class Target:
         return [path.read_bytes() for path in sorted(SEEDS.glob(f"*{self.suffix}"))]
 
 
-def _urdf(data: bytes, folder: Path) -> Operations:
+def _urdf(data: bytes, folder: Path, prefix: str | None) -> Operations:
     robot = parse_urdf(data, source="input.urdf", folder=str(folder))
-    return ((None, operation) for operation in robot_operations(robot))
+    return ((None, operation) for operation in robot_operations(robot, prefix))
 
 
-def _sdf(data: bytes, folder: Path) -> Operations:
+def _sdf(data: bytes, folder: Path, prefix: str | None) -> Operations:
     scene = parse_sdf(data, source="input.sdf", folder=str(folder))
-    return ((None, operation) for operation in scene_operations(scene))
+    return ((None, operation) for operation in scene_operations(scene, prefix))
 
 
-def _mjcf(data: bytes, folder: Path) -> Operations:
+def _mjcf(data: bytes, folder: Path, prefix: str | None) -> Operations:
     scene = parse_mjcf(data, source="input.xml", folder=str(folder))
-    return ((None, operation) for operation in mjcf_operations(scene))
+    return ((None, operation) for operation in mjcf_operations(scene, prefix))
 
 
-def _document(data: bytes, folder: Path) -> Operations:
-    return list(operations_from(data, "input.kv.json"))
+def _document(data: bytes, folder: Path, prefix: str | None) -> Operations:
+    return list(operations_from(data, "input.kv.json", prefix))
+
+
+def _packed(data: bytes, folder: Path, prefix: str | None) -> Operations:
+    return list(operations_unpacked(data, "input.kv.msgpack", prefix))
+
+
+def _in_msgpack(data: bytes) -> bytes:
+    return json_trees.MSGPACK.write(json_trees.JSON.read(data))
+
+
+def _examples() -> list[bytes]:
+    """Return documents of what programs did, and of scenes."""
+    return [programs.document(Random(seed)) for seed in range(40)] + _scenes()
 
 
 def _scenes() -> list[bytes]:
@@ -134,10 +148,20 @@ TARGETS = {
             ".kv.json",
             _document,
             document.generate,
-            json_trees.mutator(document.VOCABULARY),
-            json_trees.reductions,
+            json_trees.mutator(document.VOCABULARY, json_trees.JSON),
+            json_trees.reducer(json_trees.JSON),
             finite=False,
-            examples=_scenes,
+            examples=_examples,
+        ),
+        Target(
+            "packed",
+            ".kv.msgpack",
+            _packed,
+            lambda random: _in_msgpack(document.generate(random)),
+            json_trees.mutator(document.VOCABULARY, json_trees.MSGPACK),
+            json_trees.reducer(json_trees.MSGPACK),
+            finite=False,
+            examples=lambda: [_in_msgpack(data) for data in _examples()],
         ),
     )
 }

@@ -12,7 +12,6 @@ import os
 import resource
 import sys
 import tempfile
-import zlib
 from pathlib import Path
 from random import Random
 
@@ -20,8 +19,6 @@ MAX_LENGTH = 60_000
 MAX_SPACE = 6 << 30
 MAX_RESIDENT = 2048
 """[MiB]; an input may take half of that, see :mod:`.law`."""
-LOOPS = 8
-"""Of so many inputs one has its loops closed."""
 HANG = 20
 """[s] of wall clock, after which an input counts as a hang; :mod:`.law` complains of 5 s of work."""
 
@@ -45,10 +42,11 @@ def main() -> int:
 def _replay(name: str, path: Path) -> int:
     from .law import check
     from .targets import TARGETS
+    from .ways import way_of
 
+    data = path.read_bytes()
     with tempfile.TemporaryDirectory() as folder:
-        beside, data = place(Path(folder)), path.read_bytes()
-        finding = check(TARGETS[name], data, beside) or check(TARGETS[name], data, beside, loops=False)
+        finding = check(TARGETS[name], data, place(Path(folder)), way=way_of(data))
     if finding is not None:
         sys.stdout.write(f"{finding.signature}\n\n{finding.detail}\n")
     return finding is not None
@@ -62,6 +60,7 @@ def _search(name: str, folder: Path, seconds: int, seed: int) -> None:
     from .inputs import another
     from .law import Tally, check
     from .records import Records
+    from .ways import way_of
 
     target, records, tally = TARGETS[name], Records(folder / "findings"), Tally()
     beside = place(Path(tempfile.mkdtemp(prefix="fuzz-")))
@@ -69,8 +68,7 @@ def _search(name: str, folder: Path, seconds: int, seed: int) -> None:
     status = folder / "status.json"
 
     def one(data: bytes) -> None:
-        loops = zlib.crc32(data) % LOOPS == 0  # for one input always the same
-        finding = check(target, data, beside, tally, loops)
+        finding = check(target, data, beside, tally, way_of(data))
         if finding is not None and records.add(finding, data):
             sys.stderr.write(f"FOUND {finding.signature}\n")
         if (tally.models + tally.errors) % 100 == 0:
