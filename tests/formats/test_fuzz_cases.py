@@ -162,6 +162,13 @@ def built(data: bytes | str) -> kv.Model:
     return model
 
 
+def test_a_parameter_that_is_no_pose_is_refused_with_its_place():
+    tree = json.loads(document([], {}))
+    tree["operations"][0]["parameters"] = {"at": {"pose": [2, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0]}}
+    with pytest.raises(kv.FormatError, match=r"^document, operations\[0\] \('t0'\), parameters: The pose is"):
+        operations_from(json.dumps(tree))
+
+
 def test_a_carried_coordinate_that_a_composition_leaves_alone_is_plain_at_once():
     """It was after the second time that a document was written."""
     nodes = [

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from kineverse.errors import FormatError
+from kineverse.errors import FormatError, ValueRejectedError
 from kineverse.model.body import (
     Body,
     Box,
@@ -193,8 +193,18 @@ def _read_vector(value: Any) -> tuple[float, float, float]:
 
 
 def read_pose(value: Any) -> Pose:
-    """Return a pose that was written."""
-    return _pose(_POSE.pack(*numbers(value, POSE_NUMBERS)))
+    """Return a pose that was written.
+
+    Raises
+    ------
+    RefusedError
+        For what is none.
+    """
+    rows = numbers(value, POSE_NUMBERS)
+    try:
+        return _pose(_POSE.pack(*rows))
+    except ValueRejectedError as error:
+        raise RefusedError(str(error)) from None
 
 
 @lru_cache(1024)
