@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import numpy as np
@@ -219,3 +220,24 @@ def test_one_coordinate_at_one_place(tmp_path: Path) -> None:
         edit.apply(kv.Revolute(name="q", parent="world", child="q", lower=0.25, upper=0.25))
     model.save(tmp_path / "m.xml")
     np.testing.assert_allclose(kv.load(tmp_path / "m.xml").limits("q"), 0.25, rtol=1e-12)
+
+
+@pytest.mark.parametrize("name", ["mimic", "gearbox", "cam", "folding_door", "garage_door_as_published"])
+def test_documents_are_written_or_refused_as_what_they_were_saved_from(name: str, tmp_path: Path) -> None:
+    """They have the matrices of rotations only, and not the angles."""
+    model = loaded(f"articulations/{name}")
+    model.save(tmp_path / "m.kv.json")
+    document = kv.load(tmp_path / "m.kv.json")
+    for options in ({}, {"tolerance": 0.02}):
+        try:
+            report = model.save(tmp_path / "m.xml", **options)
+        except kv.FormatError as error:
+            with pytest.raises(kv.FormatError, match=f"^{re.escape(str(error))}$"):
+                document.save(tmp_path / "m.xml", **options)
+        else:
+            expected = kv.load(tmp_path / "m.xml")
+            errors = [r.error for r in (report, document.save(tmp_path / "m.xml", **options))]
+            assert errors[1].position == pytest.approx(errors[0].position, rel=1e-3)
+            assert errors[1].angle == pytest.approx(errors[0].angle, rel=1e-3)
+            if not options:  # else a sum of two motions may have been one, and names differ
+                assert_same_motion(expected, kv.load(tmp_path / "m.xml"))

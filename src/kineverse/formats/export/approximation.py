@@ -20,7 +20,7 @@ from kineverse.model.frame import WORLD
 from kineverse.symbols import Symbol
 
 from .fitting import Fit, fit, hull_of, samples
-from .motions import Motion, Placing, Turning
+from .moving import Motion, Placing, Turning
 from .plan import FrameError
 
 _ROUNDING = 1e-12

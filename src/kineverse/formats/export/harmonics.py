@@ -140,9 +140,13 @@ class Harmonic:
 
 
 class Harmonics:
-    """Turns steps of a graph into sums of powers and waves; what is neither becomes a variable."""
+    """Turns steps of a graph into sums of powers and waves; what is neither becomes a variable.
 
-    def __init__(self) -> None:
+    With ``angles``, so does what is inside of a sine or cosine and is no sum of multiples.
+    """
+
+    def __init__(self, angles: bool = False) -> None:
+        self._angles = angles
         self._known: dict[int, Harmonic] = {}
         self.variables: dict[int, Term] = {}
 
@@ -183,6 +187,8 @@ class Harmonics:
             return args[0].scaled(1.0 / divisor) if divisor else None
         if op in (ca.OP_SIN, ca.OP_COS):
             wave = args[0].wave()
+            if wave is None and self._angles:
+                wave = self._variable(term.args[0]).wave()
             return None if wave is None else _real(wave, op == ca.OP_SIN)
         if op == ca.OP_POW:
             power = args[1].number

@@ -7,9 +7,8 @@ about a line, a translation, or both. That is split off, and the rest is looked 
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
-from typing import TypeAlias
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import replace
 
 import casadi as ca
 import numpy as np
@@ -17,84 +16,15 @@ import numpy.typing as npt
 
 from kineverse.bounds.terms import Term, Terms
 from kineverse.expressions.expression import Expression
-from kineverse.model.body import Pose, Vector3
+from kineverse.model.body import Pose
 from kineverse.motions import AxisMotion
 from kineverse.spatial import snapped
 
 from .harmonics import NOISE, Harmonic, Harmonics, TooLargeError
+from .moving import NOTHING, Matrix, Motion, Moving, Placing, Turning, UnrecognisedError, rounded, vector
 from .plan import ITSELF, Polynomial
 
-Matrix: TypeAlias = npt.NDArray[np.float64]
-_NOTHING: Vector3 = (0.0, 0.0, 0.0)
 _SAME = 1e-12
-
-
-@dataclass(frozen=True)
-class Motion:
-    """A rotation about a line or a translation, by a polynomial of a variable [rad] or [m].
-
-    Attributes
-    ----------
-    turns
-        Whether it is a rotation.
-    axis
-        A unit vector.
-    point
-        On the line of a rotation [m].
-    variable
-        What moves it: a coordinate, or a curve over coordinates.
-    amount
-        The coefficients of the polynomial, constant first.
-    curve
-        The variable as an expression, if it is a curve that was given as one.
-    """
-
-    turns: bool
-    axis: Vector3
-    point: Vector3
-    variable: Term
-    amount: Polynomial
-    curve: Expression | None = None
-
-    @property
-    def curved(self) -> bool:
-        """Whether it moves by a curve over coordinates, and not by a polynomial of one."""
-        return self.variable.op != ca.OP_PARAMETER
-
-    def seen_from(self, pose: Matrix) -> Motion:
-        """Return the same motion in coordinates of a frame that is at ``pose`` where this one is in."""
-        r, p = pose[:3, :3], pose[:3, 3]
-        axis = snapped(r.T @ np.array(self.axis))
-        if not self.turns:
-            return self._with(axis, np.zeros(3))
-        point = r.T @ (np.array(self.point) - p)
-        return self._with(axis, point - axis * (axis @ point))
-
-    def _with(self, axis: Matrix, point: Matrix) -> Motion:
-        return replace(self, axis=_vector(axis), point=_vector(_rounded(point)))
-
-
-@dataclass(frozen=True)
-class Turning:
-    """A rotation by a quaternion of four coordinates (x, y, z, w) about a point [m]."""
-
-    factor: Expression
-    point: Vector3 = _NOTHING
-
-
-Moving: TypeAlias = Motion | Turning
-
-
-@dataclass(frozen=True)
-class Placing:
-    """parent_T_frame: a pose, then motions, all of them in the axes of the frame where all amounts are 0."""
-
-    pose: Matrix
-    moving: tuple[Moving, ...]
-
-
-class UnrecognisedError(Exception):
-    """A transform is no product of motions about fixed lines; the writer turns it into a refusal."""
 
 
 def placing(
@@ -138,7 +68,7 @@ def placing(
         elif isinstance(part, Turning):
             if np.abs(behind[:3, :3] - np.eye(3)).max() > 0:
                 raise UnrecognisedError("is turned by a constant behind its quaternion; add a frame for that")
-            moving.append(Turning(part.factor, _vector(_rounded(-behind[:3, 3]))))
+            moving.append(Turning(part.factor, vector(rounded(-behind[:3, 3]))))
         else:
             behind = _tidy(part @ behind)
     return Placing(behind, tuple(reversed(moving)))
@@ -153,24 +83,45 @@ def _parts(factor: Expression, terms: Terms, offsets: bool) -> list[Matrix | Mov
             found = _axis_motion(factor, amount, harmonics, terms, offsets)
             if found is not None:
                 return found
-        entries = [harmonics.of(term) for term in terms.elements(factor)]
-        matrix = [[entries[row + 4 * column] for column in range(4)] for row in range(4)]
-        return _split(matrix, harmonics)
+        try:
+            return _split(_entries(factor, terms, harmonics), harmonics)
+        except UnrecognisedError:
+            # A rotation by a curve, of which a document has the matrix only, is one by a variable.
+            angles = Harmonics(angles=True)
+            return list(_resolved(_split(_entries(factor, terms, angles), angles), angles))
     except TooLargeError:
         raise UnrecognisedError("is too long a product to be taken apart") from None
+
+
+def _entries(factor: Expression, terms: Terms, harmonics: Harmonics) -> list[list[Harmonic]]:
+    entries = [harmonics.of(term) for term in terms.elements(factor)]
+    return [[entries[row + 4 * column] for column in range(4)] for row in range(4)]
+
+
+def _resolved(parts: Iterable[Matrix | Moving], harmonics: Harmonics) -> Iterator[Matrix | Moving]:
+    """Yield the same with motions by polynomials in place of those by the variables that these are."""
+    for part in parts:
+        sums = _sums(harmonics.of(part.variable), harmonics) if isinstance(part, Motion) else None
+        if sums is None or not isinstance(part, Motion):
+            yield part
+            continue
+        polynomials, offset = sums
+        for index, coefficients in sorted(polynomials.items(), key=lambda item: -len(item[1])):
+            whole = tuple(part.amount[1] * c for c in (offset, *coefficients))
+            yield replace(part, variable=harmonics.variables[index], amount=whole)
+            offset = 0.0
 
 
 def _axis_motion(
     factor: AxisMotion, amount: Harmonic, harmonics: Harmonics, terms: Terms, offsets: bool
 ) -> list[Matrix | Moving] | None:
     """Return one by its amount; None for a translation by waves, which is one along circles."""
-    known = all(harmonics.variables[v].op == ca.OP_PARAMETER for v in amount.variables)
-    sums = amount.polynomials if known else None
+    sums = _sums(amount, harmonics)
     if sums is None:
-        if known and not factor.turns:
+        if _of_coordinates(amount, harmonics) and not factor.turns:
             return None
         curve = factor.amount
-        return [Motion(factor.turns, factor.direction, _NOTHING, terms.of(curve), ITSELF, curve)]
+        return [Motion(factor.turns, factor.direction, NOTHING, terms.of(curve), ITSELF, curve)]
     polynomials, offset = sums
     found: list[Matrix | Moving] = []
     if offset and not (offsets and polynomials):
@@ -178,9 +129,18 @@ def _axis_motion(
         offset = 0.0
     for index, coefficients in sorted(polynomials.items()):
         whole = (offset, *coefficients)
-        found.append(Motion(factor.turns, factor.direction, _NOTHING, harmonics.variables[index], whole))
+        found.append(Motion(factor.turns, factor.direction, NOTHING, harmonics.variables[index], whole))
         offset = 0.0
     return found
+
+
+def _of_coordinates(amount: Harmonic, harmonics: Harmonics) -> bool:
+    return all(harmonics.variables[v].op == ca.OP_PARAMETER for v in amount.variables)
+
+
+def _sums(amount: Harmonic, harmonics: Harmonics) -> tuple[dict[int, Polynomial], float] | None:
+    """Return an amount as polynomials of coordinates and a constant, if it is that."""
+    return amount.polynomials if _of_coordinates(amount, harmonics) else None
 
 
 def _split(matrix: list[list[Harmonic]], harmonics: Harmonics) -> list[Matrix | Moving]:
@@ -242,13 +202,13 @@ def _exponential(twist: Matrix, variable: Term) -> list[Matrix | Moving]:
     speed = float(np.linalg.norm(w))
     if speed < NOISE:
         length = float(np.linalg.norm(v))
-        return [Motion(False, _vector(snapped(v / length)), _NOTHING, variable, (0.0, length))]
+        return [Motion(False, vector(snapped(v / length)), NOTHING, variable, (0.0, length))]
     axis = snapped(w / speed)
     point, pitch = np.cross(axis, v) / speed, float(axis @ v)
-    turn = Motion(True, _vector(axis), _vector(_rounded(point)), variable, (0.0, speed))
+    turn = Motion(True, vector(axis), vector(rounded(point)), variable, (0.0, speed))
     if abs(pitch) < NOISE:
         return [turn]
-    return [Motion(False, _vector(axis), _NOTHING, variable, (0.0, pitch)), turn]
+    return [Motion(False, vector(axis), NOTHING, variable, (0.0, pitch)), turn]
 
 
 def _circles(matrix: list[list[Harmonic]], harmonics: Harmonics) -> list[Matrix | Moving]:
@@ -274,8 +234,8 @@ def _circles(matrix: list[list[Harmonic]], harmonics: Harmonics) -> list[Matrix 
     found: list[Matrix | Moving] = [constant]
     for index, direction in slides.items():
         length = float(np.linalg.norm(direction))
-        axis = _vector(snapped(direction / length))
-        found.append(Motion(False, axis, _NOTHING, harmonics.variables[index], (0.0, length)))
+        axis = vector(snapped(direction / length))
+        found.append(Motion(False, axis, NOTHING, harmonics.variables[index], (0.0, length)))
     for frequencies, amplitude in waves.items():
         found += _ellipse(frequencies, amplitude, harmonics)
     return found
@@ -301,11 +261,11 @@ def _ellipse(
         # Re(arm · (u - sign·i·v) · exp(iθ)): an arm that is turned by θ about sign · normal.
         reach = np.eye(4)
         reach[:3, 3] = arm.real * u + sign * arm.imag * v
-        axis = _vector(sign * normal)
+        axis = vector(sign * normal)
         turns = [
-            Motion(True, axis, _NOTHING, harmonics.variables[index], (0.0, w)) for index, w in frequencies
+            Motion(True, axis, NOTHING, harmonics.variables[index], (0.0, w)) for index, w in frequencies
         ]
-        back = [Motion(True, axis, _NOTHING, m.variable, (0.0, -m.amount[1])) for m in turns]
+        back = [Motion(True, axis, NOTHING, m.variable, (0.0, -m.amount[1])) for m in turns]
         found += [*turns, reach, *back]
     return found
 
@@ -313,14 +273,5 @@ def _ellipse(
 def _tidy(pose: Matrix) -> Matrix:
     """Return a pose without the noise that products leave."""
     result = np.eye(4)
-    result[:3, :3], result[:3, 3] = snapped(pose[:3, :3]), _rounded(pose[:3, 3])
+    result[:3, :3], result[:3, 3] = snapped(pose[:3, :3]), rounded(pose[:3, 3])
     return result
-
-
-def _rounded(position: Matrix) -> Matrix:
-    return np.where(np.abs(position) < NOISE, 0.0, position)
-
-
-def _vector(numbers: Matrix) -> Vector3:
-    x, y, z = (float(n) + 0.0 for n in numbers)
-    return x, y, z

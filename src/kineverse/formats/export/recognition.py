@@ -26,7 +26,8 @@ from .approximation import Approximation
 from .asking import checked_names, parents_first
 from .limits import Curve, Range, has_given_gradient, limit, limits_of, sort_constraints
 from .loops import tied
-from .motions import Motion, Placing, Turning, UnrecognisedError, placing
+from .motions import placing
+from .moving import Motion, Placing, Turning, UnrecognisedError
 from .names import Names
 from .plan import ITSELF, NO_BODY, BallJoint, FrameError, Joint, Link, Plan, Sum
 from .quaternions import quaternions
