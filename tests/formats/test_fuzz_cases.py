@@ -169,6 +169,27 @@ def test_a_parameter_that_is_no_pose_is_refused_with_its_place():
         operations_from(json.dumps(tree))
 
 
+@pytest.mark.parametrize("question", [[], ["datum"]])
+def test_a_question_without_its_parts_is_refused(question):
+    tree = json.loads(document([], {}))
+    tree["operations"][0]["trace"] = {"questions": [question], "writes": {}}
+    with pytest.raises(kv.FormatError, match="a question is its kind, how closely"):
+        operations_from(json.dumps(tree))
+
+
+def test_reasons_are_bounded_whatever_symbols_are_called():
+    nodes = [
+        ["symbol", "y" * 3000, 0, "dof"],
+        ["symbol", "a", 0, "dof"],
+        ["symbol", "b", 0, "dof"],
+        ["matrix", [1], [0]],
+        ["implicit", "i", [1], [2], 3, [0], 3, 5, [2]],
+    ]
+    with pytest.raises(kv.FormatError, match=r"nodes\[4\]: 'i': the residual is about y") as info:
+        operations_from(document(nodes))
+    assert len(str(info.value)) < 1200
+
+
 def test_a_carried_coordinate_that_a_composition_leaves_alone_is_plain_at_once():
     """It was after the second time that a document was written."""
     nodes = [

@@ -31,6 +31,8 @@ from .traces import check_answers, read_questions
 from .values import Rename, as_read
 from .writing import FORMAT, VERSION
 
+LONGEST_REASON = 1000
+
 
 def operations_from(
     content: str | bytes, source: str = "document", prefix: str | None = None
@@ -111,6 +113,8 @@ class _Document:
 
     def _refuse(self, reason: str) -> NoReturn:
         place = f", {self._place}" if self._place else ""
+        if len(reason) > LONGEST_REASON:  # there are names in it, as long as the document has them
+            reason = f"{reason[:LONGEST_REASON]} ..."
         raise FormatError(f"{self._source}{place}: {reason.removesuffix('.')}.") from None
 
     def _check_version(self, version: Any) -> None:

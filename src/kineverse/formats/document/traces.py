@@ -65,7 +65,9 @@ def read_questions(value: Any, graph: Graph, cell: Callable[[str, Any], Cell]) -
     if len(listed(value, "questions")) > MAX_QUESTIONS:
         raise RefusedError(f"{len(value)} questions, more than {MAX_QUESTIONS}")
     for place, item in enumerate(value):
-        kind, look, *arguments = listed(item, "a question") if item else [None, 0]
+        if len(listed(item, "a question")) < 2:
+            raise RefusedError("a question is its kind, how closely it was looked at, and what it is about")
+        kind, look, *arguments = item
         if type(kind) is not str or kind not in KINDS:
             raise RefusedError(f"a question is one of {', '.join(KINDS)}")
         exactly(arguments, KINDS[kind].arguments)
