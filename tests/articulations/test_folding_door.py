@@ -135,3 +135,17 @@ def test_the_angle_at_which_it_does_not_reach_may_lie_within_the_range() -> None
                 assert not closes
             else:
                 assert closes
+
+
+def test_its_spring_opens_it_beyond_a_point_and_shuts_it_before() -> None:
+    model = model_of(DOOR)
+    assert dict(model.articulations["m"].dynamics) == {"spring/stiffness": 4.0, "spring/tipping": 0.6}
+    torque = model.data["m/spring"]
+    assert [float(torque({"m": q})) for q in (0.0, 0.6, 1.84)] == pytest.approx([-2.4, 0.0, 4.96])
+    # The point between is one that the door leaves: the torque grows with the angle.
+    assert float(torque.jacobian([kv.position("m")])({"m": 0.6}).item()) == 4.0
+    for given, words in (
+        ({"stiffness": 0}, "The stiffness of the folding door 'm' is a positive, finite number, not 0"),
+        ({"tipping": math.nan}, "The tipping of the folding door 'm' is a finite number, not nan"),
+    ):
+        assert words in refused(kv.FoldingDoor, given)

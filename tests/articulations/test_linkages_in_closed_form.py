@@ -134,17 +134,29 @@ def test_the_nut_on_its_screw_is_a_screw_joint() -> None:
         np.testing.assert_allclose(found, thread.fk("t")({"t": -angle}), atol=1e-14)
 
 
-def test_a_ratchet_turns_one_way() -> None:
+def test_a_ratchet_turns_one_way_until_its_pawl_is_lifted() -> None:
     model = model_of(kv.Ratchet(**WHERE))
-    assert model.limits("m:velocity") == (0, 10)
+    wheel, pawl = kv.position("m/wheel"), kv.position("m/pawl")
     assert dict(model.articulations["m"].dynamics) == {"teeth": 24, "pitch": math.tau / 24}
-    rows = model.velocity_rows(0.1)
-    assert (rows.lower({}).tolist(), rows.matrix({}).tolist()) == ([0], [[1]])
-    assert [v.name for v in model.violations({"m": 3.0, "m:velocity": -0.1})] == ["m/pawl"]
-    assert not model.violations({"m": -100.0, "m:velocity": 0.0})
-    assert assert_rows_keep_limits(model, {q: 1.0}, {"m:velocity": -1.0}, 5, 0.1)[q] == 1.0
-    assert assert_rows_keep_limits(model, {q: 1.0}, {"m:velocity": 1.0}, 5, 0.1)[q] == pytest.approx(6.0)
-    np.testing.assert_allclose(pose(kv.Ratchet(**WHERE), "wheel", {"m": 0.7}), about_y(0.7), atol=1e-15)
+    assert model.limits("m/wheel:velocity", {pawl: 0.0}) == (0, 10)
+    assert model.limits("m/wheel:velocity", {pawl: 0.3}) == (-10, 10)
+    back = {"m/wheel": 3.0, "m/pawl": 0.0, "m/wheel:velocity": -0.1, "m/pawl:velocity": 0.0}
+    assert [v.name for v in model.violations(back)] == ["m/lock"]
+    assert not model.violations({**back, "m/pawl": 0.3})
+    assert not model.violations({**back, "m/wheel:velocity": 0.0, "m/wheel": -100.0})
+    # Its gradient says what to do: lift the pawl.
+    lock = model.constraints["m/lock"].lower
+    assert lock.gradient()[pawl.derivative()]({pawl: 0.0}) < 0
+    for held, turned_to in ((0.0, 1.0), (0.3, -4.0)):
+        assert assert_rows_keep_limits(
+            model, {wheel: 1.0, pawl: held}, {"m/wheel:velocity": -10.0, "m/pawl:velocity": 0.0}, 5, 0.1
+        )[wheel] == pytest.approx(turned_to)
+    np.testing.assert_allclose(
+        pose(kv.Ratchet(**WHERE), "wheel", {"m/wheel": 0.7, "m/pawl": 0.0}), about_y(0.7), atol=1e-15
+    )
+    # Lifted, its nose is higher.
+    up, down = (pose(kv.Ratchet(**WHERE), "pawl", {"m/wheel": 0.0, "m/pawl": p}) for p in (0.4, 0.0))
+    assert (up @ [-0.035, 0, 0, 1])[2] > (down @ [-0.035, 0, 0, 1])[2] + 0.01
 
 
 def test_a_tap_lifts_and_turns_and_knows_its_flow() -> None:
@@ -182,6 +194,7 @@ BROKEN: list[tuple[type[Mechanism], dict[str, Any], str]] = [
     (kv.ScrewAndNut, {"travel": nan}, "The travel of the screw and nut 'm' is a positive, finite number, not nan"),
     (kv.ScrewAndNut, {"velocity": -1}, "The velocity of the screw and nut 'm' is -1; it cannot be negative"),
     (kv.Ratchet, {"teeth": 2}, "The teeth of the ratchet 'm' are a whole number from 3, not 2"),
+    (kv.Ratchet, {"release": 0.5}, "The release of the ratchet 'm' lies between 0.0 and 0.4, and is not 0.5"),
     (kv.Ratchet, {"speed": 0}, "The speed of the ratchet 'm' is a positive, finite number, not 0"),
     (kv.Faucet, {"lift": kv.Limits(0)}, "The lift of the faucet 'm' has a number as its upper end, not None"),
     (kv.Faucet, {"turn": kv.Limits(-4, 4)}, "The turn of the faucet 'm' is a range within [-3.14159, 3.14159], not from -4 to 4"),

@@ -170,7 +170,7 @@ def test_every_number_is_checked(kind: type[Mechanism]) -> None:
             assert "'m'" in words
             assert repr(wrong) in words
         for wrong in (0, -1.5):
-            if field not in ("velocity", "rest", "pitch"):
+            if field not in ("velocity", "rest", "pitch", "tipping"):
                 words = refused(kind, {field: wrong})
                 assert "ValueRejectedError" in words
                 assert "'m'" in words

@@ -74,5 +74,5 @@ def test_what_some_of_them_say() -> None:
         edit.apply(mechanisms.Ratchet(name="wheel", parent="world"))
     assert str(interlocks(model)).splitlines() == [
         "garage/door:velocity stands still: when garage/bolt < 0.3 and garage/door > 1.99 (garage/lock)",
-        "wheel:velocity cannot decrease: always (wheel/pawl)",
+        "wheel/wheel:velocity cannot decrease: when wheel/pawl < 0.2 (wheel/lock)",
     ]

@@ -184,7 +184,15 @@ TAKES = {
         azimuth=BOARD,
         elevation=0.15,
     ),
-    "ratchet": Take(through("winch", 0.0, 0.5, 1.0), azimuth=BOARD, elevation=0.2),
+    "ratchet": Take(
+        (
+            {"winch/wheel": 0.0},
+            {"winch/wheel": 0.8},
+            {"winch/wheel": 0.5, "winch/pawl": 0.4},
+        ),
+        azimuth=BOARD,
+        elevation=0.2,
+    ),
     "four_bar": Take(through("crank", 0.6, 2.4, 4.4), azimuth=BOARD, elevation=0.15),
     "slider_crank": Take(through("crank", 0.4, 1.8, 3.1), azimuth=BOARD, elevation=0.15, height=110),
     "spatial_four_bar": Take(through("drive", 0.0, 2.0, 4.0), azimuth=-0.7),

@@ -32,7 +32,7 @@ def garage_door_as_published(scene: Scene) -> None:
 
 
 def folding_door(scene: Scene) -> None:
-    """Show a cupboard whose door folds while it rises."""
+    """Show a cupboard whose door folds while it rises; a spring opens it, and past a point shuts it."""
     scene.mechanism(FoldingDoor, "door")
 
 
@@ -84,7 +84,7 @@ def desk_lamp(scene: Scene) -> None:
 
 
 def ratchet(scene: Scene) -> None:
-    """Show a wheel that turns one way only."""
+    """Show a wheel that turns one way only, until its pawl is lifted."""
     scene.mechanism(Ratchet, "winch")
     # Of a disc alone one would not see that it turns.
     scene.frame("mark", box((0.006, 0.016, 0.034), (0, 0, 0.025), RED), parent="winch/wheel")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import ClassVar, TypeAlias
+from typing import Any, ClassVar, TypeAlias
 
 from kineverse.articulations.joint import checked_number
 from kineverse.articulations.limits import Limits
@@ -40,6 +40,14 @@ class FoldingDoor(Mechanism):
     which gives f1 = (u r + v (-r_z, r_x))/c² for r = C - B and (u, v) = arm_end. The arm reaches the lower
     panel from inside, so h is positive, and the panels hang one below the other at q = 0.
 
+    A spring holds the door open and, past a point, shuts it. Together with the weight of the panels it turns
+    the upper panel by
+
+        τ = stiffness (q - tipping)      [N m],
+
+    which is the datum ``name/spring``, an expression; the record has its two numbers. They are no measured
+    ones, as the authors give none.
+
     Frames are ``base``, ``upper_panel`` and ``lower_panel`` (in their middles), ``panel_hinge`` (B, on the
     upper panel), ``arm`` (at D, z towards C), ``arm_end`` (C, on the lower panel) and ``handle``. All of them
     but the base, the arm and its end have x inward, y to the side and z up when shut.
@@ -64,11 +72,14 @@ class FoldingDoor(Mechanism):
         Length of the arm [m].
     opening
         Limits of q and of its speed; numbers.
+    stiffness, tipping
+        Of the spring [N m/rad], [rad]: beyond ``tipping`` it opens the door, before it the door shuts.
 
     Raises
     ------
     ValueRejectedError
-        For lengths that are not positive, or with which the arm does not reach at some angle.
+        For lengths that are not positive, or with which the arm does not reach at some angle; for a spring
+        that pushes nothing, or nowhere.
     """
 
     main: ClassVar[str] = "lower_panel"
@@ -86,9 +97,12 @@ class FoldingDoor(Mechanism):
     handle_size: Vector3 = (0.16, 0.05, 0.012)
     arm: float = 0.372
     opening: Limits = Limits(0.0, 1.84, 0.25)
+    stiffness: float = 4.0
+    tipping: float = 0.6
 
     def __post_init__(self) -> None:
-        self.lengths("wall", "arm")
+        self.lengths("wall", "arm", "stiffness")
+        self.number("tipping")
         for field, count, positive in (
             *((field, 3, True) for field in ("size", "panel", "handle_size")),
             *((field, 2, False) for field in ("top_hinge", "arm_pivot", "upper_middle", "panel_hinge")),
@@ -102,6 +116,14 @@ class FoldingDoor(Mechanism):
     def limits(self) -> Mapping[str, Limits]:
         """That of q."""
         return {self.path(): self.opening}
+
+    def known(self) -> tuple[tuple[str, Any], ...]:
+        """Return the spring."""
+        return (("spring/stiffness", self.stiffness), ("spring/tipping", self.tipping))
+
+    def data(self) -> Mapping[str, Any]:
+        """Return the torque of the spring on q."""
+        return {"spring": self.stiffness * (self.q() - self.tipping)}
 
     def parts(self) -> Mapping[str, Part]:
         """Return the cupboard, the panels, the arm and the handle."""

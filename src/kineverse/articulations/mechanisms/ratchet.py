@@ -1,4 +1,4 @@
-"""A wheel that turns one way."""
+"""A wheel that turns one way, until its pawl is lifted."""
 
 from __future__ import annotations
 
@@ -11,7 +11,8 @@ import numpy as np
 
 from kineverse.articulations.limits import FREE, Limits
 from kineverse.errors import ValueRejectedError
-from kineverse.expressions.expression import Expression
+from kineverse.locks import unlocked_while
+from kineverse.model.constraint import ConstraintLike
 from kineverse.motions import Y, turn
 
 from .mechanism import Mechanism, Part
@@ -20,17 +21,19 @@ from .solids import DARK, RED, STEEL, box, rod, shift
 
 @dataclass(frozen=True, kw_only=True)
 class Ratchet(Mechanism):
-    """A wheel with a pawl, which does not turn back: base_T_wheel = rotation_y(q), q = ``name`` [rad].
+    """A wheel with a pawl, which does not turn back unless the pawl is lifted.
 
-    It has no end stops. What is one-sided is its speed,
+    ================  ======================================================================
+    ``name/wheel``    q [rad]: base_T_wheel = rotation_y(q), without end stops
+    ``name/pawl``     p [rad]: it turns about y by p, 0 where it lies in the teeth
+    frames            ``base``, ``wheel``, ``pawl``
+    ``name/lock``     -c·speed <= q̇ <= speed with c = (p > release)
+    record            ``teeth``, ``pitch`` = 2π/teeth [rad]
+    ================  ======================================================================
 
-        ``name/pawl``:      0 <= q̇ <= speed
-
-    so where it may be depends on where it has been, and every position is valid. The pawl is taken to hold
-    anywhere; a real one gives way by up to a tooth, and how wide that is stands in the record.
-
-    Frames are ``base``, ``wheel`` and ``pawl``, which stands still. The record has ``teeth`` and ``pitch``,
-    2π/teeth [rad].
+    What is one-sided is the speed, so where the wheel may be depends on where it has been, and every position
+    is valid. The pawl is taken to hold anywhere; a real one gives way by up to a tooth. Teeth that pass below
+    the pawl lift it, but not as far as to release the wheel, which is left out of p.
 
     Attributes
     ----------
@@ -40,11 +43,16 @@ class Ratchet(Mechanism):
         How many, at least 3.
     speed
         How fast it may turn [rad/s].
+    lift
+        Limits of p.
+    release
+        The p beyond which the wheel is free [rad].
 
     Raises
     ------
     ValueRejectedError
-        For lengths that are not positive, fewer than three teeth, or a speed of 0.
+        For lengths that are not positive, fewer than three teeth, a speed of 0, or a pawl that cannot be
+        lifted beyond its release.
     """
 
     main: ClassVar[str] = "wheel"
@@ -53,21 +61,25 @@ class Ratchet(Mechanism):
     thickness: float = 0.015
     teeth: int = 24
     speed: float = 10.0
+    lift: Limits = Limits(0.0, 0.4, 2.0)
+    release: float = 0.2
 
     def __post_init__(self) -> None:
         self.lengths("radius", "thickness", "speed")
         if isinstance(self.teeth, bool) or not isinstance(self.teeth, int) or self.teeth < 3:
             raise ValueRejectedError(f"{self.its('teeth')} are a whole number from 3, not {self.teeth!r}.")
         super().__post_init__()
+        self.check_within("release", self.lift)
 
     @property
     def limits(self) -> Mapping[str, Limits]:
-        """None of q."""
-        return {self.path(): FREE}
+        """That of the pawl; the wheel has none."""
+        return {self.path("wheel"): FREE, self.path("pawl"): self.lift}
 
-    def locks(self) -> Mapping[str, tuple[float, Expression, float]]:
+    def locks(self) -> Mapping[str, ConstraintLike]:
         """Return what the pawl does."""
-        return {"pawl": (0.0, self.q().derivative(), self.speed)}
+        lifted = self.q("pawl") > self.release
+        return {"lock": unlocked_while(self.q("wheel"), lifted, speed=self.speed, blocks="backward")}
 
     def known(self) -> tuple[tuple[str, Any], ...]:
         """Return the teeth."""
@@ -91,6 +103,6 @@ class Ratchet(Mechanism):
         nose = rod((0.0, 0.0, 0.0), (-0.7 * r, 0.0, -0.25 * r), 0.08 * r, RED)
         return {
             "base": self.base(stand),
-            "wheel": Part("base", (turn(Y, self.q()),), (disc, *teeth)),
-            "pawl": Part("base", (shift(0.8 * r, 0.0, 1.25 * r),), (nose,)),
+            "wheel": Part("base", (turn(Y, self.q("wheel")),), (disc, *teeth)),
+            "pawl": Part("base", (shift(0.8 * r, 0.0, 1.25 * r), turn(Y, self.q("pawl"))), (nose,)),
         }
