@@ -215,6 +215,21 @@ def test_one_error_names_everything_that_cannot_be_said(tmp_path: Path) -> None:
     assert not list(tmp_path.iterdir())
 
 
+def test_what_loops_hold_is_refused_for_that(tmp_path: Path) -> None:
+    model = kv.Model()
+    with model.edit() as edit:
+        for name, x in (("a", 0.0), ("b", 1.0)):
+            origin = kv.Pose.of(kv.translation(x, 0, 0))
+            edit.apply(kv.Revolute(name=name, parent="world", child=name, axis=(0, 0, 1), origin=origin))
+            edit.add_frame(f"{name}_end", parent=name, transform=kv.translation(0.8, 0, 0))
+        edit.close_loop("a_end", "b_end", home={"a": 1.0, "b": 2.0})
+    assert not model.degrees_of_freedom
+    with pytest.raises(
+        kv.FormatError, match="'a' turns by no multiple of a coordinate; loops hold it where it is"
+    ):
+        model.save(tmp_path / "m.urdf")
+
+
 def test_contradicting_limits_are_refused(tmp_path: Path) -> None:
     q = kv.position("q")
     model = kv.Model()

@@ -186,7 +186,8 @@ class Recognition:
     def _refuse(self, name: str, factors: Iterable[Pose | Expression], problem: str) -> None:
         about = dict.fromkeys(s for f in factors if isinstance(f, Expression) for s in f.symbols)
         self._lost.update(about)
-        self.refusals.add(name, f"{problem}; it moves with {', '.join(map(str, about))}")
+        moves = f"it moves with {', '.join(map(str, about))}" if about else "loops hold it where it is"
+        self.refusals.add(name, f"{problem}; {moves}")
 
     def _factor(self, factor: Pose | Expression) -> Pose | Expression:
         if isinstance(factor, Pose):
