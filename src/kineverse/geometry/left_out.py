@@ -1,0 +1,102 @@
+"""What a scene does not look at, and why: bodies that cannot be used, pairs that are ignored."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from importlib.util import find_spec
+
+from kineverse.errors import FormatError, MissingExtraError, ValueRejectedError
+from kineverse.model.body import Geometry, Mesh
+from kineverse.model.view import ModelView
+
+from .pieces import matches, touchable
+from .rules import RULES, Rule, adjacent, allowed, rules_of
+from .solids import solid_of
+from .table import Flags
+
+RIGID = "rigidly connected"
+JOINED = "joined by an articulation"
+
+
+def is_installed() -> bool:
+    """Return whether the extra ``geometry`` is there; nothing is imported to find out."""
+    return find_spec("coal") is not None
+
+
+def unusable(model: ModelView) -> dict[str, str]:
+    """Return the bodies that distances cannot be computed to, with the reason in one line.
+
+    A scene without them, ``Scene(model, leave_out=unusable(model))``, answers for all the others.
+
+    Raises
+    ------
+    MissingExtraError
+        If coal is not installed.
+    """
+    known: dict[Geometry, str] = {}
+    found: dict[str, str] = {}
+    for name, body in model.bodies.items():
+        for shape in touchable(body):
+            if shape.geometry not in known:
+                known[shape.geometry] = _problem(shape.geometry)
+            if known[shape.geometry]:
+                found.setdefault(name, known[shape.geometry])
+    return found
+
+
+def _problem(geometry: Geometry) -> str:
+    try:
+        solid_of(geometry)
+    except MissingExtraError:
+        raise
+    except (FormatError, ValueRejectedError, OSError) as error:
+        # Where a file was looked for is long, and the same for all of them.
+        reason = " ".join(str(error).partition(" Looked ")[0].split())
+        return f"mesh {geometry.uri}: {reason}" if isinstance(geometry, Mesh) else reason
+    return ""
+
+
+class Ignored:
+    """The pairs of a model's bodies that its scenes do not look at.
+
+    Parameters
+    ----------
+    model
+        The model; what is said is about its version now.
+    bodies
+        The bodies that take part.
+    """
+
+    def __init__(self, model: ModelView, bodies: Sequence[str]) -> None:
+        self._model = model
+        self._rules = rules_of(model.data.get(RULES, ()))
+        self._number = {name: k for k, name in enumerate(bodies)}
+        self._allowed = allowed(model, bodies, self._rules)
+        self._adjacent = adjacent(model, bodies)
+
+    @property
+    def counts(self) -> tuple[int, int]:
+        """How many pairs are looked at, and how many are not."""
+        looked_at, bodies = int(self._allowed.sum()) // 2, len(self._number)
+        return looked_at, bodies * (bodies - 1) // 2 - looked_at
+
+    def why(self, a: str, b: str) -> str:
+        """Return why a pair of bodies is not looked at; empty if it is."""
+        if self._of(self._allowed, a, b):
+            return ""
+        if not self._of(self._adjacent, a, b):
+            return self._rule(a, b)
+        return JOINED if self._model.fk(a, b).symbols else RIGID
+
+    def _of(self, table: Flags, a: str, b: str) -> bool:
+        return bool(table[self._number[a], self._number[b]])
+
+    def _rule(self, a: str, b: str) -> str:
+        for rule in reversed(self._rules):
+            if _is_about(rule, a, b) or _is_about(rule, b, a):
+                return f"excepted: {rule.why}" if rule.why else "excepted by a rule"
+        return ""
+
+
+def _is_about(rule: Rule, one: str, other: str) -> bool:
+    return matches(one, (rule.a,)) and matches(other, (rule.b,))

@@ -1,0 +1,87 @@
+"""What scenes do not look at, and why; and solids as triangles."""
+
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scenes import arm_among_boxes, body
+
+import kineverse as kv
+from kineverse.geometry import RULES, Rule, Scene, rules_as_data
+from kineverse.geometry.left_out import JOINED, RIGID, Ignored, unusable
+from kineverse.geometry.solids import solid_of, solid_of_hull
+from kineverse.geometry.surface import surface_of
+from kineverse.model.body import Body, Box, Mesh, Shape, Sphere
+
+spatial = pytest.importorskip("scipy.spatial")
+
+
+def with_bad_bodies(folder):
+    (folder / "empty.stl").write_bytes(b"")
+    model = arm_among_boxes(links=2, boxes=2)
+    with model.edit() as edit:
+        for name, geometry in (
+            ("lost", Mesh("nowhere.stl", folder=str(folder))),
+            ("empty", Mesh("empty.stl", folder=str(folder))),
+            ("flat", Box((1.0, 0.0, 1.0))),
+        ):
+            shapes = (Shape(Sphere(0.1)), Shape(geometry))
+            edit.add_frame(f"bad/{name}", "base", kv.translation(0, 0, 1), Body(collisions=shapes))
+    return model
+
+
+def test_bodies_that_cannot_be_used_are_named_and_the_rest_can_be_asked(tmp_path):
+    model = with_bad_bodies(tmp_path)
+    problems = unusable(model)
+    assert set(problems) == {"bad/lost", "bad/empty", "bad/flat"}
+    assert "nowhere.stl" in problems["bad/lost"]
+    assert "empty.stl" in problems["bad/empty"]
+    assert "sizes" in problems["bad/flat"]
+    assert not any("\n" in why or "Looked" in why for why in problems.values())
+    scene = Scene(model, leave_out=problems)
+    scene.update(model.default_state())
+    assert scene.within(0.1)
+    assert not set(problems) & set(scene.bodies)
+    assert unusable(arm_among_boxes()) == {}
+
+
+def test_every_pair_is_looked_at_or_there_is_a_reason():
+    model = arm_among_boxes()
+    with model.edit() as edit:
+        edit.add_frame("hand/camera", "hand", kv.translation(0, 0, 0.1), body(Sphere(0.02)))
+        rules = [
+            Rule("box*", "hand", why="it reaches between them"),
+            Rule("box1", "link?"),
+            Rule("link1", "link0", check=True),
+        ]
+        edit.write(RULES, rules_as_data(rules))
+    scene = Scene(model)
+    ignored = Ignored(model, scene.bodies)
+    pairs = list(itertools.combinations(scene.bodies, 2))
+    for a, b in pairs:
+        assert (ignored.why(a, b) == "") == scene.looks_at(a, b)
+        assert ignored.why(a, b) == ignored.why(b, a)
+    looked_at = sum(scene.looks_at(a, b) for a, b in pairs)
+    assert ignored.counts == (looked_at, len(pairs) - looked_at)
+    assert ignored.why("hand", "hand/camera") == RIGID
+    assert ignored.why("link3", "hand/camera") == JOINED
+    assert ignored.why("hand", "box3") == "excepted: it reaches between them"
+    assert ignored.why("link2", "box1") == "excepted by a rule"
+    assert ignored.why("link0", "link1") == ""
+
+
+@given(st.integers(0, 2**32 - 1), st.integers(4, 60))
+def test_hulls_are_closed_surfaces_seen_from_outside(seed, count):
+    points = np.random.default_rng(seed).normal(size=(count, 3))
+    solid = solid_of(Box((1, 1, 1)))
+    assert surface_of(solid) == Box((1, 1, 1))
+    surface = surface_of(solid_of_hull(points))
+    a, b, c = np.moveaxis(surface.vertices[surface.faces], 1, 0)
+    # By the divergence theorem; a face turned inward would take its part away.
+    volume = np.einsum("ij,ij->", a, np.cross(b, c)) / 6.0
+    assert volume == pytest.approx(spatial.ConvexHull(points).volume, rel=1e-9)
+    np.testing.assert_allclose(np.cross(b - a, c - a).sum(axis=0), 0.0, atol=1e-9)
