@@ -11,9 +11,11 @@ import numpy.typing as npt
 
 from kineverse.errors import ValueRejectedError
 from kineverse.model.view import ModelView
-from kineverse.view.axes import triad
+from kineverse.view.axes import axis_length, triad
 from kineverse.view.camera import Camera
 from kineverse.view.light import Lamp, shade, to_display, to_linear
+from kineverse.view.marks import Marks, mark_parts
+from kineverse.view.near import Near
 from kineverse.view.parts import parts
 from kineverse.view.png import write_png
 from kineverse.view.poses import Poses, complete
@@ -40,6 +42,7 @@ def picture(
     camera: Camera | None = None,
     frames: bool = False,
     collisions: bool = False,
+    near: float | None = None,
 ) -> npt.NDArray[np.uint8]:
     """Return a picture of a model as (height, width, 3) bytes.
 
@@ -56,10 +59,16 @@ def picture(
     frames
         Whether to draw the axes of all frames (x red, y green, z blue), also through the bodies.
     collisions
-        Whether to draw the collision shapes instead of the visual ones.
+        Whether to draw the collision shapes instead of the visual ones; of a body without any, hulls of what
+        is seen of it.
+    near
+        Within what distance to draw lines between bodies that are near to each other [m], green to red by the
+        distance, with arrows where they touch; through the bodies. None for no lines.
 
     Raises
     ------
+    MissingExtraError
+        If lines are wanted and the extra ``geometry`` is not installed.
     UnknownNameError
         If the state names a symbol that the model does not have.
     ValueRejectedError
@@ -68,8 +77,8 @@ def picture(
     width, height = size
     if width < 1 or height < 1 or width * height * SAMPLES**2 > LARGEST:
         raise ValueRejectedError(f"a picture of {width} x {height} pixels cannot be made")
-    poses = Poses(model)
-    at = dict(zip(poses.names, poses.at(complete(model, state)), strict=True))
+    poses, values = Poses(model), complete(model, state)
+    at = dict(zip(poses.names, poses.at(values), strict=True))
     items = parts(model, "collision" if collisions else "visual")
     scene = Surfaces.of(items, at)
     if camera is None:
@@ -79,6 +88,10 @@ def picture(
     if frames or not len(scene.corners):
         triads = Surfaces.of(triad(model, scene.corners, at), at)
         _overlay(image, triads, projection)
+    if near is not None:
+        length = axis_length(scene.corners, at)
+        marks = Marks.of(Near(model).at(values, near), length)
+        _overlay(image, Surfaces.of(mark_parts(marks, length), at), projection)
     return _shrunk(image, SAMPLES)
 
 

@@ -5,9 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import Literal
 
+from kineverse.geometry.pieces import touchable
 from kineverse.model.body import Body, Mesh, Shape
 from kineverse.model.view import ModelView
 from kineverse.view.geometry import triangles_of
+from kineverse.view.hulls import load_hull
 from kineverse.view.meshes import load
 from kineverse.view.triangles import Triangles
 
@@ -18,6 +20,9 @@ MISSING: Rgba = (0.91, 0.12, 0.55, 1.0)
 """The colour of what could not be loaded: one that no kitchen has."""
 
 COLLISION: Rgba = (0.95, 0.55, 0.15, 0.35)
+
+STAND_IN: Rgba = (0.25, 0.62, 0.66, 0.35)
+"""The colour of what stands for the collision shapes of a body that has none."""
 
 UNPAINTED: tuple[Rgba, ...] = (
     (0.72, 0.74, 0.77, 1.0),
@@ -66,13 +71,15 @@ def parts(model: ModelView, kind: Kind = "visual") -> list[Part]:
         The model.
     kind
         ``"visual"``: what is meant to be seen; of a model where nothing is, the collision shapes.
-        ``"collision"``: what is meant to be touched.
+        ``"collision"``: what is meant to be touched, or of a body without it, what is seen; meshes as the
+        hulls that distances are computed to.
     """
     found: list[Part] = []
     bare = kind == "visual" and not any(body.visuals for body in model.bodies.values())
     for number, (frame, body) in enumerate(model.bodies.items()):
         if kind == "collision":
-            found += [_part(frame, shape, "collision", COLLISION) for shape in body.collisions]
+            color = COLLISION if body.collisions else STAND_IN
+            found += [_touched(frame, shape, color) for shape in touchable(body)]
             continue
         fallback = UNPAINTED[number % len(UNPAINTED)]
         shapes = body.collisions if bare else body.visuals
@@ -99,6 +106,12 @@ def _part(frame: str, shape: Shape, kind: Kind, fallback: Rgba) -> Part:
         problem = load(shape.geometry).problem
     if problem:
         color = MISSING
-    elif kind == "collision":
-        surface, color = surface.unpainted(), COLLISION
     return Part(frame, surface.moved(shape.origin.matrix), color, kind, problem, bool(problem))
+
+
+def _touched(frame: str, shape: Shape, color: Rgba) -> Part:
+    loaded = load_hull(shape.geometry) if isinstance(shape.geometry, Mesh) else None
+    surface = (loaded.surface if loaded else triangles_of(shape.geometry)).unpainted()
+    problem = loaded.problem if loaded else ""
+    color = MISSING if problem else color
+    return Part(frame, surface.moved(shape.origin.matrix), color, "collision", problem, bool(problem))

@@ -1,0 +1,136 @@
+"""What is near to what at a state: the collision scene of a model, asked for people to look at."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+from kineverse.geometry import Closest, Rule, Scene
+from kineverse.geometry.left_out import RIGID, Ignored, unusable
+from kineverse.model.view import ModelView
+
+RADIUS = 0.1
+"""Within what distance pairs are shown unless somebody says otherwise [m]."""
+
+MOST = 40
+"""Pairs that are shown: more than these are counted, not drawn."""
+
+
+@dataclass(frozen=True, slots=True)
+class Nearness:
+    """What was found at a state.
+
+    Attributes
+    ----------
+    radius
+        Within what distance was looked [m].
+    pairs
+        The nearest pairs, nearest first, at most :data:`MOST` of them.
+    found, touching
+        How many pairs there are within the radius, and how many of them touch or penetrate.
+    ignored
+        Pairs within the radius that are not looked at although they can move with respect to each other, with
+        the reason, nearest first; at most :data:`MOST`.
+    looked_at, not_looked_at
+        How many pairs of bodies there are of either kind.
+    """
+
+    radius: float
+    pairs: Sequence[Closest] = ()
+    found: int = 0
+    touching: int = 0
+    ignored: Sequence[tuple[Closest, str]] = field(default=())
+    looked_at: int = 0
+    not_looked_at: int = 0
+
+
+class Near:
+    """Distances in a model, for one thread; bodies that cannot be used are left out.
+
+    Parameters
+    ----------
+    model
+        The model; after an edit :meth:`follow` has to be called.
+
+    Attributes
+    ----------
+    problems
+        Why bodies are left out, by name.
+
+    Raises
+    ------
+    MissingExtraError
+        If the extra ``geometry`` is not installed.
+    """
+
+    def __init__(self, model: ModelView) -> None:
+        self._model = model
+        self.problems: dict[str, str] = {}
+        self._make()
+
+    def _make(self) -> None:
+        self.problems = unusable(self._model)
+        self._scene = Scene(self._model, leave_out=self.problems)
+        self._all: Scene | None = None
+        self._ignored = Ignored(self._model, self._scene.bodies)
+
+    def follow(self) -> None:
+        """Look at the model as it is now."""
+        if unusable(self._model) != self.problems:
+            self._make()
+        else:
+            self._ignored = Ignored(self._model, self._scene.bodies)
+
+    def at(
+        self,
+        values: Mapping[str, float],
+        radius: float = RADIUS,
+        *,
+        containing: str = "",
+        ignored: bool = False,
+    ) -> Nearness:
+        """Return what is near at values of all symbols, by name.
+
+        Parameters
+        ----------
+        values
+            [m], [rad].
+        radius
+            How near [m].
+        containing
+            Only pairs of which a name contains this, whatever its case.
+        ignored
+            Whether to look at ignored pairs as well.
+
+        Raises
+        ------
+        KineverseError
+            If there are no distances at these values, as where a pose is not finite.
+        """
+        self._scene.update(values)
+        found = _named(self._scene.within(radius), containing)
+        looked_at, not_looked_at = self._ignored.counts
+        return Nearness(
+            radius,
+            found[:MOST],
+            len(found),
+            sum(pair.touches for pair in found),
+            self._not_looked_at(values, radius, containing) if ignored else (),
+            looked_at,
+            not_looked_at,
+        )
+
+    def _not_looked_at(
+        self, values: Mapping[str, float], radius: float, containing: str
+    ) -> list[tuple[Closest, str]]:
+        if self._all is None:
+            self._all = Scene(self._model, rules=[Rule("*", "*", check=True)], leave_out=self.problems)
+        self._all.update(values)
+        found = _named(self._all.within(radius), containing)
+        reasons = ((pair, self._ignored.why(pair.a, pair.b)) for pair in found)
+        return [(pair, why) for pair, why in reasons if why not in ("", RIGID)][:MOST]
+
+
+def _named(pairs: list[Closest], containing: str) -> list[Closest]:
+    text = containing.strip().lower()
+    return [pair for pair in pairs if text in pair.a.lower() or text in pair.b.lower()] if text else pairs
