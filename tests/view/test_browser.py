@@ -21,6 +21,9 @@ PATIENCE = 60_000
 
 ARGUMENTS = ["--no-sandbox", "--headless=new", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
 
+SLIDERS = "xpath=//*[@role='tablist']/following::*[@role='slider']"
+"""Those of degrees of freedom: in the tabs, not in the folder above them."""
+
 
 @pytest.fixture(scope="module")
 def browser(chromium):
@@ -40,7 +43,7 @@ def opened(browser):
         errors = []
         page.on("pageerror", lambda error: errors.append(str(error)))
         page.goto(viewer.address)
-        page.wait_for_selector("[role=slider]")
+        page.wait_for_selector(SLIDERS)
         # The picture is there once the red front of the drawer is.
         until(page, lambda: reddish(shot(page)).sum() > 300)
         yield viewer, page
@@ -77,7 +80,7 @@ def row(page, label):
 def slider(page, viewer, name):
     """The thumb of the slider of a degree of freedom; they come in the order of the model."""
     order = list(viewer._panel._sliders)
-    return page.locator("[role=slider]").nth(order.index(name))
+    return page.locator(SLIDERS).nth(order.index(name))
 
 
 def test_moving_a_slider_moves_the_part(opened, tmp_path):
@@ -156,7 +159,7 @@ def test_a_second_browser_sees_what_the_first_one_moved(opened, browser):
     other = browser.new_page(viewport={"width": 900, "height": 560})
     other.set_default_timeout(PATIENCE)
     other.goto(viewer.address)
-    other.wait_for_selector("[role=slider]")
+    other.wait_for_selector(SLIDERS)
     until(other, lambda: slider(other, viewer, "cabinet/drawer").get_attribute("aria-valuenow") == "0.4")
     until(page, lambda: slider(page, viewer, "cabinet/drawer").get_attribute("aria-valuenow") == "0.4")
     other.close()
@@ -168,7 +171,7 @@ def test_the_range_of_a_slider_follows_another_one(browser):
         page = browser.new_page(viewport={"width": 900, "height": 560})
         page.set_default_timeout(PATIENCE)
         page.goto(viewer.address)
-        page.wait_for_selector("[role=slider]")
+        page.wait_for_selector(SLIDERS)
         door, bolt = slider(page, viewer, "door"), slider(page, viewer, "bolt")
         until(page, lambda: float(door.get_attribute("aria-valuemax")) < 0.01)
         bolt.focus()
@@ -184,3 +187,30 @@ def test_the_range_of_a_slider_follows_another_one(browser):
         page.keyboard.press("Home")
         row(page, "lid [rad] · locked").wait_for()
         page.close()
+
+
+def greenish(image):
+    r, g, b = np.moveaxis(image, -1, 0)
+    return (g > 1.25 * r) & (g > 1.25 * b)
+
+
+def test_what_is_near_is_shown_and_follows_the_sliders(opened):
+    viewer, page = opened
+    viewer.move({"cabinet/door": 0.5})
+    page.get_by_text("Collisions").click()
+    assert not greenish(shot(page)).any()
+    page.get_by_label("nearest pairs").check()
+    page.get_by_text("1 pair within 0.1 m, none touches").wait_for()
+    # A line half as long as the radius is yellow, and one much shorter than it green.
+    page.get_by_text("cabinet/drawer – cabinet/door").wait_for()
+    viewer.collisions.show_near(0.055)
+    until(page, lambda: greenish(shot(page)).sum() > 10)
+    # Pulled by hand, the drawer comes right above the door.
+    thumb = slider(page, viewer, "cabinet/drawer")
+    thumb.focus()
+    page.keyboard.press("End")
+    page.get_by_text("50.0 mm").wait_for()
+    viewer.collisions.show_shapes()
+    page.get_by_label("nearest pairs").uncheck()
+    page.get_by_text("50.0 mm").wait_for(state="detached")
+    until(page, lambda: not greenish(shot(page)).any())

@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
+
+from kineverse.model.view import ModelView
+from kineverse.view.ranges import offered
 
 PERIOD = 8.0
 """Time from one limit to the other and back [s]."""
@@ -43,3 +46,36 @@ class Show:
             swing = lower + (upper - lower) * (0.5 - 0.5 * math.cos(phase))
             values[name] = (1.0 - weight) * self._start[name] + weight * swing
         return values
+
+
+def played(
+    model: ModelView,
+    limits: Mapping[str, tuple[float, float]],
+    angles: Iterable[str],
+    values: Mapping[str, float],
+    units: Mapping[str, str],
+) -> dict[str, tuple[float, float]]:
+    """Return what a show moves, and how far.
+
+    What has no limits has no range to be moved through, and a robot would drive off the page; but where
+    nothing else moves, it is what there is to see.
+
+    Parameters
+    ----------
+    model
+        The model.
+    limits
+        Of its degrees of freedom, by name, possibly infinite [m], [rad].
+    angles
+        The names of the angles by which quaternions are turned.
+    values, units
+        Of the degrees of freedom, by name.
+    """
+    found = {name: (low, high) for name, (low, high) in limits.items() if high - low < 1e6}
+    if found:
+        return found
+    rates = {str(symbol) for symbol in model.rates}
+    found = dict.fromkeys(angles, (-0.5, 0.5))
+    for name in limits.keys() - rates:
+        found[name] = offered(limits[name], values[name], units[name])
+    return found

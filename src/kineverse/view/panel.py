@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
+from kineverse.view.collisions import Collisions
 from kineverse.view.driving import Driving
 from kineverse.view.orientations import Orientations
 from kineverse.view.ranges import Ranges, offered, step
@@ -27,6 +28,8 @@ class Panel:
         The gui of a viser server.
     scene
         What is switched on and off.
+    collisions
+        What adds a folder of its own.
     ranges
         The limits of the degrees of freedom.
     orientations
@@ -49,6 +52,7 @@ class Panel:
         self,
         gui: Any,
         scene: Scene,
+        collisions: Collisions,
         ranges: Ranges,
         orientations: Orientations,
         driving: Driving,
@@ -69,6 +73,7 @@ class Panel:
         self._root = gui.add_folder(None)
         with self._root:
             self._status = gui.add_html(report(()))
+            collisions.add_folder(gui)
             tabs = gui.add_tab_group()
             with tabs.add_tab("Move"):
                 self._add_controls(reset, play)
@@ -243,8 +248,6 @@ class Panel:
             control.on_update(show_frames)
         visuals = gui.add_checkbox("bodies", True)
         visuals.on_update(lambda event: scene.show_visuals(event.target.value))
-        collisions = gui.add_checkbox("collision shapes", False)
-        collisions.on_update(lambda event: scene.show_collisions(event.target.value))
         ground = gui.add_checkbox("floor", True)
         ground.on_update(lambda event: scene.show_ground(event.target.value))
         if scene.problems:

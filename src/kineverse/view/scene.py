@@ -23,7 +23,7 @@ FIELD_OF_VIEW, ASPECT = 0.8, 1.25
 ROOT = "/model"
 
 SEE_THROUGH = 0.45
-"""How opaque bodies are while frames are shown."""
+"""How opaque bodies are while what is shown lies inside of them: frames, nearest points."""
 
 
 class Scene:
@@ -46,6 +46,8 @@ class Scene:
         (N, 4, 4): where the frames of :attr:`names` were put last.
     problems
         What could not be loaded, one line each.
+    length
+        A length that suits the size of the scene, for axes and arrows [m].
     unplaced
         The frames whose pose is not finite at the present values; what is attached to them is hidden.
     """
@@ -58,6 +60,7 @@ class Scene:
         self._lock = threading.RLock()
         self._frames_shown, self._labels_shown, self._filter = False, False, ""
         self._visuals_shown, self._collisions_shown, self._ground_shown = True, False, True
+        self._through = False
         stage.set_up(server)
         self.refresh(model, values)
 
@@ -122,16 +125,14 @@ class Scene:
             wanted = [k for k, name in enumerate(self.names) if containing.lower() in name.lower()]
             self._shown, self._labels = wanted, []
             self._axes = None
-            # Most frames lie inside of bodies.
-            for node, opacity in self._visuals:
-                node.opacity = min(opacity or 1.0, SEE_THROUGH) if axes else opacity
+            self._fade()
             if axes and wanted:
                 self._axes = self._server.scene.add_batched_axes(
                     "/axes",
                     quaternions(self.poses[wanted]),
                     self.poses[wanted, :3, 3],
-                    axes_length=self._length,
-                    axes_radius=0.035 * self._length,
+                    axes_length=self.length,
+                    axes_radius=0.035 * self.length,
                 )
             if labels:
                 add = self._server.scene.add_label
@@ -150,6 +151,17 @@ class Scene:
             for node in self._collisions:
                 node.visible = shown
 
+    @property
+    def collisions_shown(self) -> bool:
+        """Whether the collision shapes are shown."""
+        return self._collisions_shown
+
+    def show_through(self, shown: bool) -> None:
+        """Make bodies half transparent, or opaque again, for what a caller shows inside of them."""
+        with self._lock:
+            self._through = shown
+            self._fade()
+
     def show_visuals(self, shown: bool) -> None:
         """Show or hide what is meant to be seen."""
         with self._lock:
@@ -161,6 +173,13 @@ class Scene:
         """Show or hide the floor."""
         self._ground_shown = shown
         stage.set_floor(self._server, self._floor, self._extent, shown)
+
+    def _fade(self) -> None:
+        through = self._frames_shown or self._through
+        for node, opacity in self._visuals:
+            wanted = min(opacity or 1.0, SEE_THROUGH) if through else opacity
+            if node.opacity != wanted:
+                node.opacity = wanted
 
     def _add(self, items: Iterable[Part], kind: Kind) -> list[tuple[Any, float | None]]:
         """Add shapes below the nodes of their frames; return their nodes and how opaque they are."""
@@ -208,7 +227,7 @@ class Scene:
         }
         visuals = [part for part in visuals if part.frame in at]
         surfaces = Surfaces.of(visuals, at)
-        self._length = axis_length(surfaces.corners, at)
+        self.length = axis_length(surfaces.corners, at)
         points = (
             surfaces.corners.reshape(-1, 3)
             if len(surfaces.corners)

@@ -13,12 +13,13 @@ from kineverse.model.view import ModelView
 from kineverse.state import State
 from kineverse.view import server as web
 from kineverse.view.camera import Camera
+from kineverse.view.collisions import Collisions
 from kineverse.view.driving import Driving
-from kineverse.view.motion import Show
+from kineverse.view.motion import Show, played
 from kineverse.view.orientations import Orientations
 from kineverse.view.panel import Panel
 from kineverse.view.poses import complete
-from kineverse.view.ranges import Ranges, offered
+from kineverse.view.ranges import Ranges
 from kineverse.view.scene import Scene
 from kineverse.view.triangles import Floats
 from kineverse.view.units import units
@@ -50,6 +51,11 @@ class Viewer:
         The title of the page.
     camera
         Where the page is seen from at first; None for a place from which much of what moves is seen.
+
+    Attributes
+    ----------
+    collisions
+        What touches, and what nearly does.
 
     Raises
     ------
@@ -86,6 +92,7 @@ class Viewer:
             self._server.gui.main_panel.dock_right()
             self._server.gui.main_panel.set_width(PANEL)
             self._scene = Scene(self._server, model, self._values, camera)
+            self.collisions = Collisions(self._server, self._scene, model, self._values)
             self._panel = self._build_panel()
         except BaseException:
             web.stop(self._server)
@@ -181,8 +188,10 @@ class Viewer:
 
     def settled(self, timeout: float = 10.0) -> bool:
         """Wait at most ``timeout`` [s] for the page to be up to date; return whether it is."""
+        begin = time.monotonic()
         with self._change:
-            return self._change.wait_for(lambda: self._done >= self._asked, timeout)
+            drawn = self._change.wait_for(lambda: self._done >= self._asked, timeout)
+        return drawn and self.collisions.watch.settled(timeout - (time.monotonic() - begin))
 
     def wait(self) -> None:
         """Keep the page up until :meth:`stop` or Ctrl-C."""
@@ -201,6 +210,7 @@ class Viewer:
         if self._listener is not None:
             self._listener.close()
         self._worker.join(timeout=5.0)
+        self.collisions.stop()
         web.stop(self._server)
         self._ended.set()
 
@@ -219,6 +229,7 @@ class Viewer:
         return Panel(
             self._server.gui,
             self._scene,
+            self.collisions,
             self._ranges,
             self._orientations,
             self._driving,
@@ -231,20 +242,8 @@ class Viewer:
         )
 
     def _to_be_played(self) -> dict[str, tuple[float, float]]:
-        """Return what the show moves, and how far.
-
-        What has no limits has no range to be moved through, and a robot would drive off the page; but where
-        nothing else moves, it is what there is to see.
-        """
-        limits = self._ranges.at(self._values)
-        found = {name: (low, high) for name, (low, high) in limits.items() if high - low < 1e6}
-        if found:
-            return found
-        rates = {str(symbol) for symbol in self.model.rates}
-        found = dict.fromkeys(self._orientations.angles, (-0.5, 0.5))
-        for name in limits.keys() - rates:
-            found[name] = offered(limits[name], self._values[name], self._units[name])
-        return found
+        limits, angles = self._ranges.at(self._values), self._orientations.angles
+        return played(self.model, limits, angles, self._values, self._units)
 
     def _moved(self, name: str, value: float) -> None:
         """Take the value of a slider that somebody moved; what is locked stays and its slider goes back."""
@@ -326,6 +325,7 @@ class Viewer:
                 values = self._rebuild(values)
             self._panel.update(values, driven)
             self._scene.update(values)
+            self.collisions.watch.update(values, edited)
             if self.unplaced:
                 self._panel.show(failure(f"Not finite, and hidden: {', '.join(self.unplaced)}."))
                 return

@@ -1,0 +1,201 @@
+"""Collisions on the page: a folder of controls, and marks between bodies that are near to each other."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from kineverse.errors import ValueRejectedError
+from kineverse.geometry.left_out import is_installed
+from kineverse.geometry.solids import coal_engine
+from kineverse.model.view import ModelView
+from kineverse.view.marks import BALL, CONTACT, HEAD, SHAFT, TIP, Marks
+from kineverse.view.near import RADIUS, Nearness
+from kineverse.view.near_report import boxed, near_failure, near_report
+from kineverse.view.scene import Scene
+from kineverse.view.watch import Seen, Wanted, Watch
+
+WIDEST = 0.5
+"""The largest radius that is offered [m]."""
+
+LABELS = 8
+"""Depths that are written beside their arrows; more would cover what they are about."""
+
+MISSING = "Distances need the extra <code>geometry</code>: pip install 'kineverse-articulation[geometry]'"
+
+WAITING = boxed(["<b>Reading shapes …</b>"])
+
+
+class Collisions:
+    """What touches, and what nearly does.
+
+    Parameters
+    ----------
+    server
+        A viser server.
+    scene
+        What the marks are drawn in.
+    model, values
+        The model, and the values of all symbols at first, by name [m], [rad].
+    """
+
+    def __init__(self, server: Any, scene: Scene, model: ModelView, values: Mapping[str, float]) -> None:
+        self._server, self._scene = server, scene
+        self._report: Any = None
+        self._controls: tuple[Any, ...] = ()
+        self._drawn: dict[str, Any] = {}
+        self.seen = Seen()
+        # Controls and the thread that looks write the same report.
+        self._lock = threading.Lock()
+        self.watch = Watch(model, values, self._show)
+
+    def add_folder(self, gui: Any) -> None:
+        """Add the controls to a panel; what is switched on stays on."""
+        wanted = self.watch.wanted
+        with gui.add_folder("Collisions", expand_by_default=wanted.on):
+            self._shapes = gui.add_checkbox(
+                "collision shapes",
+                self._scene.collisions_shown,
+                hint="What distances are computed to; bluish where hulls of what is seen stand in.",
+            )
+            self._shapes.on_update(lambda event: self._scene.show_collisions(event.target.value))
+            if not is_installed():
+                self._report = gui.add_html(boxed([MISSING]))
+                return
+            near = gui.add_checkbox("nearest pairs", wanted.on, hint="Lines where bodies are nearest.")
+            radius = gui.add_slider(
+                "within [m]",
+                min=0.0,
+                max=max(WIDEST, wanted.radius),
+                step=0.005,
+                initial_value=wanted.radius,
+                hint="Green lines are that long; the nearer, the redder.",
+            )
+            only = gui.add_text("only", wanted.containing, hint="Only pairs with a name that contains this.")
+            ignored = gui.add_checkbox(
+                "ignored pairs", wanted.ignored, hint="Also pairs that are joined, or excepted by rules."
+            )
+            self._report = gui.add_html("")
+        self._controls = near, radius, only, ignored
+        for control in self._controls:
+            control.on_update(self._set_by_hand)
+        self._tell()
+
+    def _set_by_hand(self, event: Any) -> None:
+        # Values that this program has set come back without a client.
+        if event.client is not None:
+            self.watch.look_for(Wanted(*(control.value for control in self._controls)))
+            self._tell()
+
+    def _set(self, wanted: Wanted) -> None:
+        if not self._controls:  # Without the extra there is nothing to be set.
+            return
+        near, radius, only, ignored = self._controls
+        radius.max = max(WIDEST, wanted.radius)
+        near.value, radius.value, only.value = wanted.on, wanted.radius, wanted.containing
+        ignored.value = wanted.ignored
+        self.watch.look_for(wanted)
+        self._tell()
+
+    def show_near(
+        self, radius: float | None = RADIUS, *, containing: str = "", ignored: bool = False
+    ) -> None:
+        """Show which bodies are near to each other, as the controls do.
+
+        Parameters
+        ----------
+        radius
+            Within what distance [m]; None to show nothing.
+        containing
+            Only pairs of which a name contains this.
+        ignored
+            Also pairs that are joined by an articulation, or excepted by rules.
+
+        Raises
+        ------
+        ValueRejectedError
+            If the radius is negative or NaN.
+        MissingExtraError
+            If the extra ``geometry`` is not installed.
+        """
+        if radius is None:
+            self._set(replace(self.watch.wanted, on=False))
+            return
+        if not 0.0 <= radius < float("inf"):
+            raise ValueRejectedError(f"A radius is a distance from 0 on [m], not {radius!r}.")
+        coal_engine()
+        self._set(Wanted(True, float(radius), containing, ignored))
+
+    def show_shapes(self, shown: bool = True) -> None:
+        """Show or hide the collision shapes, half transparent."""
+        self._scene.show_collisions(shown)
+        self._shapes.value = shown
+
+    @property
+    def nearness(self) -> Nearness | None:
+        """What is near, as shown last; None if nothing is looked for, or if there are no distances."""
+        return self.seen.nearness
+
+    def stop(self) -> None:
+        """End what goes on in the background."""
+        self.watch.stop()
+
+    def _show(self, seen: Seen) -> None:
+        """Draw what was seen; called by the thread that looks."""
+        self._tell(seen)
+        self._scene.show_through(self.watch.wanted.on)
+        with self._server.atomic():
+            before = self._drawn
+            marks = None if seen.nearness is None else Marks.of(seen.nearness, self._scene.length)
+            self._drawn = self._draw(marks) if marks is not None and len(marks.lines) else {}
+            # What is added under the name of another takes its place, and does not flicker.
+            for name in before.keys() - self._drawn.keys():
+                before[name].remove()
+
+    def _tell(self, new: Seen | None = None) -> None:
+        """Write the report of what was seen last, which is ``new`` if given."""
+        with self._lock:
+            self.seen = seen = new or self.seen
+            text = ""
+            if seen.failure:
+                text = near_failure(seen.failure)
+            elif seen.nearness is not None:
+                text = near_report(seen.nearness, seen.problems or {})
+            elif self.watch.wanted.on:
+                text = WAITING
+            if self._report is not None and self._report.content != text:
+                self._report.content = text
+
+    def _draw(self, marks: Marks) -> dict[str, Any]:
+        """Add marks to the page, and return their nodes by name."""
+        scene, length = self._server.scene, self._scene.length
+        colors = np.repeat(np.round(255 * marks.colors).astype(np.uint8)[:, None], 2, axis=1)
+        nodes = [
+            scene.add_line_segments(
+                "/near/lines", marks.lines, colors, thickness=3.0, thickness_units="screen"
+            ),
+            scene.add_point_cloud(
+                "/near/ends",
+                marks.lines.reshape(-1, 3),
+                colors.reshape(-1, 3),
+                point_size=BALL * length,
+                point_shape="circle",
+                point_shading="flat",
+                precision="float32",
+            ),
+        ]
+        if len(marks.arrows):
+            shaft, head, tip = SHAFT * length, HEAD * length, TIP * length
+            red = tuple(round(255 * c) for c in CONTACT)
+            nodes.append(
+                scene.add_arrows(
+                    "/near/arrows", marks.arrows, red, shaft_radius=shaft, head_radius=head, head_length=tip
+                )
+            )
+        for k, (ends, depth) in enumerate(zip(marks.arrows[:LABELS], marks.depths, strict=False)):
+            nodes.append(scene.add_label(f"/near/depth{k}", depth, position=ends[1], font_screen_scale=0.8))
+        return {node.name: node for node in nodes}
