@@ -190,6 +190,14 @@ def test_reasons_are_bounded_whatever_symbols_are_called():
     assert len(str(info.value)) < 1200
 
 
+def test_a_frame_without_factors_is_where_its_parent_is():
+    """It could be written, and not loaded."""
+    model = built(document([], {"frames": {"f": {"parent": "world", "factors": []}}}))
+    assert (model.fk("f")() == np.eye(4)).all()
+    text = document_of(model)
+    assert document_of(built(text)) == text
+
+
 def test_a_carried_coordinate_that_a_composition_leaves_alone_is_plain_at_once():
     """It was after the second time that a document was written."""
     nodes = [

@@ -59,7 +59,7 @@ class Frame:
         """
         if isinstance(transform, Pose):
             return Frame(parent, (transform,))
-        if isinstance(transform, (list, tuple)) and transform and not np.isscalar(transform[0]):
+        if isinstance(transform, (list, tuple)) and not (transform and np.isscalar(transform[0])):
             parts: Sequence[Any] = transform
             if not all(map(_is_transform, parts)):
                 parts = [as_expression(transform)]  # a nested list of rows is one matrix
