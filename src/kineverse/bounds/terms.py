@@ -16,8 +16,8 @@ import casadi as ca
 
 from kineverse.expressions import layout
 from kineverse.expressions.expression import NODES, SYMBOLS, Expression
-from kineverse.expressions.functions import Extremum, Select
 from kineverse.expressions.implicit import Implicit
+from kineverse.expressions.kinks import Extremum, Select
 from kineverse.expressions.leaves import bottom_up, leaves
 from kineverse.expressions.node import Node
 from kineverse.expressions.piecewise import Piecewise

@@ -7,7 +7,7 @@ import math
 import casadi as ca
 
 from kineverse.expressions.expression import Expression
-from kineverse.expressions.functions import Norm
+from kineverse.expressions.kinks import Norm
 
 SIDES = 16
 

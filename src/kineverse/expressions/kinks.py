@@ -1,0 +1,122 @@
+"""Nodes with kinks: choices, extrema and the norm.
+
+They are written so that a gradient is finite wherever a derivative can be given: what was not chosen is never
+multiplied, and the norm has gradient 0 at the origin.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING
+
+import casadi as ca
+import numpy as np
+
+from .expression import Expression, as_expression, binary, make, unary, union
+from .node import Node
+
+if TYPE_CHECKING:
+    from kineverse.symbols import Symbol
+
+
+class Select(Node):
+    """``where``: its arguments are condition and branches, all of the node's shape."""
+
+    __slots__ = ()
+    kind = "select"
+    own_partials = True
+
+    @property
+    def _holds(self) -> Expression:
+        return binary(ca.OP_LE, 0.5, self.arguments[0])
+
+    def _value(self) -> Expression:
+        return self._chosen(self.arguments[1], self.arguments[2])
+
+    def _gradient(self, heuristic: bool) -> Mapping[Symbol, Expression]:
+        a, b = (argument.gradient(heuristic) for argument in self.arguments[1:])
+        zero = as_expression(np.zeros(self.shape))
+        return {key: self._chosen(a.get(key, zero), b.get(key, zero)) for key in {**a, **b}}
+
+    def _chosen(self, if_true: Expression, if_false: Expression) -> Expression:
+        from .implicit import implicit_nodes
+
+        if implicit_nodes(self.arguments[:1]):
+            # A loop that does not close here is NaN. Nothing is chosen then, and evaluation says why.
+            fails = binary(ca.OP_LT, self.arguments[0], 0.5)
+            neither = make(ca.SX.nan(*if_false._sx.shape), if_false.shape, frozenset())
+            if_false = _selected(fails, if_false, neither)
+        return _selected(self._holds, if_true, if_false)
+
+    def differentiated(self, heuristic: bool) -> tuple[Expression, ...]:
+        """Return the branches; the condition selects and has no part in the gradient."""
+        return self.arguments[1:]
+
+
+def _selected(holds: Expression, if_true: Expression, if_false: Expression) -> Expression:
+    """Return a choice by a comparison; CasADi keeps such choices free of NaN in every derivative."""
+    return make(
+        ca.if_else(holds._sx, if_true._sx, if_false._sx), holds._shape, union((holds, if_true, if_false))
+    )
+
+
+class Extremum(Node):
+    """``minimum`` and ``maximum`` of two or more arguments of the node's shape."""
+
+    __slots__ = ()
+    kind = "extremum"
+    own_partials = True
+
+    @property
+    def label(self) -> str:
+        """``minimum`` or ``maximum``."""
+        return f"{self.options[0]}imum"
+
+    def _value(self) -> Expression:
+        number = _in_rounds(ca.OP_FMIN if self.options[0] == "min" else ca.OP_FMAX, self.arguments)
+        # Where an argument is NaN this is NaN, and else a number or infinite. CasADi takes x == x for true,
+        # and 0 <= sqrt(x) too.
+        size = _in_rounds(ca.OP_ADD, [unary(ca.OP_FABS, a) for a in self.arguments])
+        unordered = unary(ca.OP_NOT, binary(ca.OP_LE, size, math.inf))
+        # Subtracted, because -0 + 0 would be another zero.
+        return number - binary(ca.OP_IF_ELSE_ZERO, unordered, size)
+
+    def _gradient(self, heuristic: bool) -> Mapping[Symbol, Expression]:
+        won = [binary(ca.OP_EQ, argument, self.value) for argument in self.arguments]
+        each = 1 / _in_rounds(ca.OP_ADD, won)
+        result: dict[Symbol, Expression] = {}
+        for argument, wins in zip(self.arguments, won, strict=True):
+            share = wins * each  # 1, 0, at a tie 1/n; of NaN 0/0, NaN as well
+            for key, entry in argument.gradient(heuristic).items():
+                # Zero times NaN would be NaN; what has no share is not looked at.
+                term = binary(ca.OP_IF_ELSE_ZERO, share, share * entry)
+                result[key] = result[key] + term if key in result else term
+        return result
+
+
+def _in_rounds(op: int, operands: Sequence[Expression]) -> Expression:
+    """Return operands joined in pairs, these again in pairs, and so on: a thousand are ten deep."""
+    joined = list(operands)
+    while len(joined) > 1:
+        odd = joined[-1:] if len(joined) % 2 else []
+        joined = [binary(op, x, y) for x, y in zip(joined[:-1:2], joined[1::2], strict=False)] + odd
+    return joined[0]
+
+
+class Norm(Node):
+    """The Euclidean norm of one vector."""
+
+    __slots__ = ()
+    kind = "norm"
+    own_partials = True
+
+    def _value(self) -> Expression:
+        (vector,) = self.arguments
+        return unary(ca.OP_SQRT, make(ca.sumsqr(vector._sx), (), vector._nodes))
+
+    def _gradient(self, heuristic: bool) -> Mapping[Symbol, Expression]:
+        (vector,) = self.arguments
+        away = binary(ca.OP_LT, 0, self.value)
+        length = Select.of((away, self.value, as_expression(1.0)), ())
+        return {key: vector @ entry / length for key, entry in vector.gradient(heuristic).items()}
