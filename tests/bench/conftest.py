@@ -22,7 +22,14 @@ def robot_file(tmp_path):
 def tiny(robot_file):
     """Settings for everything on the small robot, once."""
     return Settings(
-        robot=str(robot_file), frame="tip", rounds=2, processes=1, configurations=6, rows=40, operations=60
+        robot=str(robot_file),
+        frame="tip",
+        rounds=2,
+        processes=1,
+        configurations=6,
+        rows=40,
+        operations=60,
+        boxes=90,
     )
 
 

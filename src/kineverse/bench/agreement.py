@@ -20,7 +20,9 @@ class DisagreementError(KineverseError, ArithmeticError):
     """Those who are compared do not compute the same, so their times mean nothing."""
 
 
-def check_agreement(what: str, results: Sequence[tuple[str, Sequence[Array]]]) -> None:
+def check_agreement(
+    what: str, results: Sequence[tuple[str, Sequence[Array]]], tolerance: float = TOLERANCE
+) -> None:
     """Compare the arrays that contenders computed with those of the first one.
 
     Parameters
@@ -29,11 +31,13 @@ def check_agreement(what: str, results: Sequence[tuple[str, Sequence[Array]]]) -
         The benchmark, for the message.
     results
         Names, each with arrays.
+    tolerance
+        How far their numbers may be apart.
 
     Raises
     ------
     DisagreementError
-        If an array has another shape, or numbers that are more than :data:`TOLERANCE` off or not finite.
+        If an array has another shape, or numbers that are further off or not finite.
     """
     (first, wanted), *others = results
     if not all(np.isfinite(array).all() for array in wanted):
@@ -47,8 +51,8 @@ def check_agreement(what: str, results: Sequence[tuple[str, Sequence[Array]]]) -
         for k, (ours, theirs) in enumerate(zip(wanted, found, strict=True)):
             error = float(np.max(np.abs(np.asarray(theirs) - ours), initial=0.0))
             # Written so that NaN is refused as well.
-            if not error <= TOLERANCE:
+            if not error <= tolerance:
                 raise DisagreementError(
                     f"Benchmark {what!r}: {name!r} and {first!r} differ by {error:.3g} in result {k}, "
-                    f"more than {TOLERANCE:g}. Their times cannot be compared."
+                    f"more than {tolerance:g}. Their times cannot be compared."
                 )

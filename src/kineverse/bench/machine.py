@@ -12,7 +12,7 @@ from kineverse._version import __version__
 from kineverse.compile import CompilerInformation, compile, compiler_information  # noqa: A004
 from kineverse.compile.native import native
 
-VERSIONS = ("casadi", "numpy", "pin", "mujoco")
+VERSIONS = ("casadi", "numpy", "pin", "mujoco", "coal", "pybullet")
 
 
 @dataclass(frozen=True, slots=True)

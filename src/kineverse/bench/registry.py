@@ -18,6 +18,7 @@ BENCHMARKS: Mapping[str, str] = MappingProxyType(
         "frames": "the poses of all frames at one configuration",
         "batch": "pose and Jacobian at 100 000 configurations",
         "loop": "a closed loop and its derivative at one configuration",
+        "geometry": "what is near, and how near: an arm among boxes, a robot in a kitchen",
         "import": "importing the library, and how many packages that takes",
         "memory": "the memory of a loaded robot",
         "document": "a robot in a kitchen, written down and read again; models of up to a million nodes",

@@ -33,6 +33,8 @@ class Settings:
         How many configurations a batch has.
     operations
         How many operations and constraints the large models have.
+    boxes
+        Among how many boxes, at most, an arm is moved.
     progress
         Wraps what is worked on, like :func:`kineverse.cli.progress.progress`.
     """
@@ -44,6 +46,7 @@ class Settings:
     configurations: int = 1000
     rows: int = 100_000
     operations: int = 10_000
+    boxes: int = 3000
     progress: Progress = _silent
 
 

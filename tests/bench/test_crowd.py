@@ -1,0 +1,83 @@
+"""The arm among boxes: everybody sees the same, and who does not is found out."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from kineverse.bench import DisagreementError, measure
+from kineverse.bench.crowd import RADIUS, RULES, crowd
+from kineverse.bench.crowd_peers import Mujoco, MujocoPairs, OurScene, PlainCoal
+from kineverse.bench.measure_geometry import Entry, check
+from kineverse.geometry import Scene
+
+
+@pytest.fixture(scope="module")
+def arm():
+    return crowd(steps=40)
+
+
+@pytest.fixture
+def scene(arm, tmp_path):
+    return Scene(arm.model(tmp_path), rules=RULES)
+
+
+def names(finder, angles):
+    finder.put(angles)
+    finder.find()
+    return {frozenset(pair[:2]) for pair in finder.distances()}
+
+
+def test_peers_find_what_is_near(arm, scene):
+    pytest.importorskip("mujoco")
+    ours, *peers = OurScene(scene), PlainCoal(scene), Mujoco(arm), MujocoPairs(arm)
+    for angles in arm.angles[::8]:
+        found = names(ours, angles)
+        assert len(found) > 20
+        assert all(names(peer, angles) == found for peer in peers)
+
+
+def test_bullet_finds_what_is_near(arm, scene):
+    pytest.importorskip("pybullet")
+    from kineverse.bench.bullet_crowd import Bullet
+
+    check([Entry("ours", OurScene(scene), 0.0), Entry("bullet", Bullet(arm), 3e-3)], arm.angles)
+
+
+class Forgetful(OurScene):
+    """Misses the nearest pair, or the furthest."""
+
+    def __init__(self, scene, which):
+        super().__init__(scene)
+        self.which = which
+
+    def distances(self):
+        found = list(super().distances())
+        del found[self.which]
+        return iter(found)
+
+
+def test_who_misses_a_pair_is_found_out(arm, scene):
+    whole = Entry("whole", OurScene(scene), 0.0)
+    check([whole, whole], arm.angles)
+    with pytest.raises(DisagreementError, match="'forgetful' and 'whole' differ by"):
+        check([whole, Entry("forgetful", Forgetful(scene, 0), 1e-6)], arm.angles)
+    furthest = max(distance for *_, distance in whole.finder.distances())
+    assert furthest > 0.9 * RADIUS
+    # Next to the radius, a pair may be there or not.
+    check([whole, Entry("forgetful", Forgetful(scene, -1), 2e-2)], arm.angles[:1])
+
+
+def test_more_boxes_stay_away(arm):
+    many = crowd(300, steps=40)
+    np.testing.assert_array_equal(many.angles.shape, arm.angles.shape)
+    assert len(many.sizes) == len(many.poses) == 300
+    assert np.linalg.norm(many.poses[60:, :3, 3], axis=1).max() > 1.0
+
+
+def test_peers_that_are_not_installed_are_reported(tiny, without):
+    without("mujoco", "pybullet")
+    (result,) = measure(["geometry"], tiny)
+    assert {c.name.split(", ")[2] for c in result.comparisons if c.status == "missing"} >= {"beside mujoco"}
+    assert any("mujoco is missing" in line for line in result.missing)
+    assert any("pybullet is missing" in line for line in result.missing)
