@@ -73,7 +73,9 @@ class Symbol(Expression):
         self._text = symbol_name(path, order)
         # The name is part of what CasADi serialises, so symbols that differ have names that differ.
         kind = "" if role == "dof" else f":{role}" if value is None else f":{role}:{value!r}"
-        self._set(ca.SX.sym(f"{self._text}{kind}"), (), NO_NODES)
+        # CasADi takes what begins with a bracket for a list of names; no other name begins with a colon.
+        bracket = ":" if path.startswith("[") else ""
+        self._set(ca.SX.sym(f"{bracket}{self._text}{kind}"), (), NO_NODES)
         self._leaves = ((self,), ())
         self.path, self.order, self.role, self.value = path, order, role, value
         self.sort_key = (path, order, role, 0.0 if value is None else value)  # from here on immutable

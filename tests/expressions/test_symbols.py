@@ -240,6 +240,18 @@ def test_up_and_down_the_orders(path, order, role):
         lowest.integral()
 
 
+@pytest.mark.parametrize("path", ["[", "[a", "[a,b]", "[]", "[[a", "[a/b"])
+def test_brackets_begin_no_list_of_names(path):
+    """As they do for CasADi, to which "[a" is the name a."""
+    x, plain = position(path), position("a")
+    assert x.casadi.shape == (1, 1)
+    assert x.casadi.name() != plain.casadi.name()
+    assert str(x.derivative()) == f"{path}:velocity"
+    assert (2 * x + plain)({path: 3.0, "a": 1.0}) == 7.0
+    assert kv.compile([x * plain], [x, plain])([3.0, 2.0])[0] == 6.0
+    assert x.key != plain.key
+
+
 def test_parameters():
     assert (p.path, p.order, p.role, p.value) == ("p", 0, "parameter", 2.0)
     assert type(parameter("p", 7).value) is float
