@@ -24,7 +24,7 @@ from fuzz.targets import TARGETS, Target  # noqa: E402
 from fuzz.ways import way_of  # noqa: E402
 from fuzz.worker import place  # noqa: E402
 
-COUNTS = {"urdf": 300, "sdf": 100, "mjcf": 80, "document": 300}
+COUNTS = {"urdf": 300, "sdf": 100, "mjcf": 60, "document": 300}
 
 
 @pytest.fixture

@@ -128,6 +128,8 @@ def _use(target: Target, model: kv.Model, way: Way) -> None:
     if way.prefix and not all(name.startswith(f"{way.prefix}/") for name in names):
         raise BrokenError(f"a name without the prefix: {names[:50]}")
     _evaluate(target, model)
+    if way.seed is None:
+        return
     try:
         edits(loaded, way.seed, lambda: _saved(loaded))
     except kv.KineverseError as error:

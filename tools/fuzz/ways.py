@@ -25,22 +25,23 @@ class Way:
     prefix
         Which names get.
     seed
-        Of the edits that are tried.
+        Of the edits that are tried, None for none.
     """
 
     loops: bool = True
     prefix: str | None = None
-    seed: int = 0
+    seed: int | None = 0
 
 
 def way_of(data: bytes) -> Way:
     """Return one way, the same one for equal inputs: the search believes that they do the same."""
     random = Random(zlib.crc32(data))
     prefix = random.choice(PREFIXES) if random.random() < 0.5 else None
-    return Way(random.randrange(LOOPS) == 0, prefix, random.randrange(EDITS))
+    seed = random.randrange(EDITS) if random.random() < 0.5 else None
+    return Way(random.randrange(LOOPS) == 0, prefix, seed)
 
 
 def all_ways() -> Iterator[Way]:
     """Yield all of them, what is quick first."""
-    for loops, prefix, seed in product((False, True), PREFIXES, range(EDITS)):
+    for loops, prefix, seed in product((False, True), PREFIXES, (None, *range(EDITS))):
         yield Way(loops, prefix, seed)
