@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import sys
 import warnings
 from dataclasses import replace
@@ -12,16 +13,22 @@ from random import Random
 import pytest
 
 import kineverse as kv
+from kineverse.formats.document import document_of, operations_from
+from kineverse.formats.document.nodes import NODE_TYPES
+from kineverse.model.traces.question import KINDS as QUESTIONS
 
 TOOLS = Path(__file__).parents[2] / "tools"
 sys.path.insert(0, str(TOOLS))
 
-from fuzz.inputs import inputs  # noqa: E402  - it is no part of the package
+from fuzz import programs  # noqa: E402  - it is no part of the package
+from fuzz.edits import ATTEMPTS, edits  # noqa: E402
+from fuzz.grammars import document  # noqa: E402
+from fuzz.inputs import inputs  # noqa: E402
 from fuzz.law import Tally, check  # noqa: E402
 from fuzz.minimise import minimise  # noqa: E402
 from fuzz.records import Records  # noqa: E402
 from fuzz.targets import TARGETS, Target  # noqa: E402
-from fuzz.ways import way_of  # noqa: E402
+from fuzz.ways import Way, way_of  # noqa: E402
 from fuzz.worker import place  # noqa: E402
 
 COUNTS = {"urdf": 300, "sdf": 100, "mjcf": 60, "document": 300}
@@ -145,6 +152,46 @@ def test_inputs_are_made_small(name, text, part):
     small = minimise(text.encode(), TARGETS[name], lambda data: part in data)
     assert part in small
     assert len(small) < 20
+
+
+def test_names_without_the_prefix_are_seen(folder):
+    target = TARGETS["urdf"]
+    ignores = replace(target, operations=lambda data, folder, prefix: target.operations(data, folder, None))
+    data = b'<robot name="r"><link name="a"/></robot>'
+    assert check(target, data, folder, way=Way(prefix="p")) is None
+    finding = check(ignores, data, folder, way=Way(prefix="p"))
+    assert finding is not None
+    assert finding.signature == "broken: a name without the prefix"
+
+
+def test_documents_by_grammar_have_all_nodes_and_questions():
+    nodes, questions = set(), set()
+    for seed in range(150):
+        tree = json.loads(document.generate(Random(seed)))
+        nodes |= {node[0] for node in tree["nodes"]}
+        traces = [operation["trace"] for operation in tree["operations"] if "trace" in operation]
+        questions |= {question[0] for trace in traces for question in trace["questions"]}
+    assert nodes >= set(NODE_TYPES)
+    assert questions >= set(QUESTIONS)
+
+
+def test_edits_are_taken_and_taken_back():
+    """Some are followed by operations that have no code, some refused, and nothing remains of any."""
+    taken = 0
+    for seed in range(12):
+        model = kv.Model()
+        with model.edit() as edit:
+            for tag, operation in operations_from(programs.document(Random(seed))):
+                edit.apply(operation, tag)
+        before = document_of(model)
+
+        def changed(model: kv.Model = model, before: str = before) -> None:
+            nonlocal taken
+            taken += document_of(model) != before
+
+        edits(model, seed, changed)
+        assert document_of(model) == before
+    assert 3 < taken < 12 * ATTEMPTS
 
 
 def test_the_smallest_input_is_kept(tmp_path, folder):
