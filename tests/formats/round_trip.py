@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import cache
 from pathlib import Path
 
@@ -36,13 +37,17 @@ def loaded(name: str) -> kv.Model:
     return kv.load(name)
 
 
-def poses(model: kv.Model, frames: list[str], values: dict[str, float]) -> list[np.ndarray]:
+def posing(model: kv.Model, frames: list[str]) -> Callable[[dict[str, float]], list[np.ndarray]]:
+    """Return a function from values of coordinates to the poses of frames."""
     symbols = model.degrees_of_freedom
     parameters = [s for s in model.symbols if not s.has_derivative]
     f = kv.compile([model.fk(name) for name in frames], [*symbols, *parameters], tier="interpreter")
-    numbers = [values[str(s)] for s in symbols] + [s.value for s in parameters]
-    result = f(np.array(numbers))
-    return list(result)
+    given = [s.value for s in parameters]
+    return lambda values: list(f(np.array([values[str(s)] for s in symbols] + given)))
+
+
+def poses(model: kv.Model, frames: list[str], values: dict[str, float]) -> list[np.ndarray]:
+    return posing(model, frames)(values)
 
 
 def random_values(model: kv.Model, rng: np.random.Generator) -> dict[str, float]:
@@ -61,10 +66,10 @@ def assert_same_motion(written: kv.Model, read: kv.Model, tolerance: float = EXA
     assert set(frames) <= set(read.frames)
     assert written.degrees_of_freedom == read.degrees_of_freedom
     rng = np.random.default_rng(len(frames))
+    ours, theirs = posing(written, frames), posing(read, frames)
     for _ in range(count):
         values = random_values(written, rng)
-        ours, theirs = poses(written, frames, values), poses(read, frames, values)
-        for name, a, b in zip(frames, ours, theirs, strict=True):
+        for name, a, b in zip(frames, ours(values), theirs(values), strict=True):
             size = max(1.0, np.abs(a).max())
             np.testing.assert_allclose(b, a, rtol=0, atol=tolerance * size, err_msg=name)
     for s in written.degrees_of_freedom:

@@ -96,7 +96,7 @@ def test_what_is_left_out_on_purpose(name: str, left_out: list[str], tmp_path: P
     assert_same_motion(model, kv.load(report.path))
 
 
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=12, deadline=None)
 @given(model=trees(), seed=st.integers(0, 99))
 def test_random_trees_against_pinocchio(
     model: kv.Model, seed: int, tmp_path_factory: pytest.TempPathFactory

@@ -91,7 +91,10 @@ def test_the_branch_is_that_of_the_model(tmp_path: Path) -> None:
         with model.edit() as edit:
             for name, parent, x in (("a", "world", 0), ("b", "a", 0.4), ("c", "world", 1.0)):
                 origin = kv.Pose.of(kv.translation(x, 0, 0))
-                edit.apply(kv.Revolute(name=name, parent=parent, child=name, axis=(0, 0, 1), origin=origin))
+                limits = {"lower": -0.5, "upper": 0.5} if name == "a" else {}
+                edit.apply(
+                    kv.Revolute(name=name, parent=parent, child=name, axis=(0, 0, 1), origin=origin, **limits)
+                )
             edit.add_frame("b_end", parent="b", transform=kv.translation(1.1, 0, 0))
             edit.add_frame("c_end", parent="c", transform=kv.translation(0.8, 0, 0))
             edit.close_loop("b_end", "c_end", name="bars", branch=branch, home={"b": 0.5, "c": 1.0})
@@ -99,8 +102,9 @@ def test_the_branch_is_that_of_the_model(tmp_path: Path) -> None:
 
     found = []
     for branch in (0, 1):
-        again = read(written(bars(branch), tmp_path))
-        assert_same_motion(bars(branch), again, tolerance=1e-10)
+        model = bars(branch)
+        again = read(written(model, tmp_path))
+        assert_same_motion(model, again, tolerance=1e-10)
         found.append(again.fk("c_end")({"a": 0.3})[1, 3])
     assert found[0] * found[1] < 0
 

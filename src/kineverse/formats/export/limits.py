@@ -70,7 +70,7 @@ def sort_constraints(
             names = ", ".join(dict.fromkeys(map(str, about)))
             refusals.add(name, f"has bounds that depend on {names}")
             continue
-        lower, upper = (float(b()) for b in bounds)
+        lower, upper = map(float, bounds)
         if (lower, upper) == (-math.inf, math.inf):
             continue
         if not middle.symbols:
