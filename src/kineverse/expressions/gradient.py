@@ -55,7 +55,8 @@ def _gradient(expression: Expression, heuristic: bool) -> dict[Symbol, Expressio
     keys = sorted(
         {s.derivative() for s in moving}.union(*(entries for _, entries in opaque)), key=lambda s: s.sort_key
     )
-    elements = layout.column(expression._sx, expression._shape)
+    # The order of sums, and so the last bit, follows from what is shared: equal expressions share the same.
+    elements = ca.cse(layout.column(expression._sx, expression._shape))
     if not opaque:
         by_key = ca.jacobian(elements, ca.vertcat(*(s._sx for s in moving)))
         column_of = {s.derivative(): i for i, s in enumerate(moving)}
