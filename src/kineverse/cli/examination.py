@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import kineverse as kv
+from kineverse.cli.contacts import penetrations
 from kineverse.cli.findings import Finding, findings
 from kineverse.cli.wording import contents, number
 from kineverse.errors import KineverseError
@@ -80,8 +81,20 @@ class Examination:
         return " ".join(str(self.error).split())
 
 
-def examine(name: str, meshes: bool = True, strict: bool = False) -> Examination:
-    """Return what is found in a file; nothing is raised for what is wrong with it."""
+def examine(name: str, meshes: bool = True, strict: bool = False, touch: bool = False) -> Examination:
+    """Return what is found in a file; nothing is raised for what is wrong with it.
+
+    Parameters
+    ----------
+    name
+        The name of a model or the path of a file.
+    meshes
+        Whether to look for the files of meshes.
+    strict
+        Whether remarks are problems, too.
+    touch
+        Whether to look for bodies that penetrate each other at the default state.
+    """
     language = ""
     with listening() as remarks:
         try:
@@ -89,7 +102,7 @@ def examine(name: str, meshes: bool = True, strict: bool = False) -> Examination
             language = format_of(source)
             model = kv.load(name)
             facts = _facts(source)
-            problems = tuple(findings(model, meshes))
+            problems = (*findings(model, meshes), *(penetrations(model) if touch else ()))
         except (KineverseError, OSError) as error:
             return Examination(name, language, error=error, remarks=remarks, strict=strict)
     return Examination(name, language, model, None, facts, [*remarks, *_frozen(model)], problems, strict)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 from kineverse.cli.listing import asked_for, print_articulations
@@ -11,6 +12,7 @@ from kineverse.cli.table import figure, table
 
 if TYPE_CHECKING:
     from kineverse.cli.summary import Summary
+    from kineverse.geometry import Closest
 
 HELP = """print what a model consists of: frames, degrees of freedom, constraints, size
 
@@ -65,6 +67,8 @@ def sections(summary: Summary, frames: bool = False, constraints: bool = False) 
             else f"{len(summary.touched_as_seen)} bodies have"
         )
         lines.append(f"  {bodies} no collision shapes; distances are to hulls of what is seen")
+    if summary.contacts:
+        lines.append(_contacts(summary.contacts))
     found = ["\n".join(lines)]
     if summary.freedoms:
         rows = [
@@ -124,7 +128,21 @@ def as_json(summary: Summary) -> dict[str, Any]:
         "not_loaded": summary.problems,
         "not_finite": summary.unplaced,
         "touched_as_seen": summary.touched_as_seen,
+        "touching": None
+        if summary.contacts is None
+        else [{"a": pair.a, "b": pair.b, "distance": pair.distance} for pair in summary.contacts],
     }
+
+
+def _contacts(pairs: Sequence[Closest]) -> str:
+    """Return how many pairs touch, and which is the deepest."""
+    from kineverse.cli.contacts import TOUCHING
+
+    pair, depth = pairs[0], -pairs[0].distance
+    deepest = f"{pair.a} and {pair.b}" + (f", {figure(depth, 3)} m deep" if depth > TOUCHING else "")
+    if len(pairs) == 1:
+        return f"  1 pair of bodies touches at the default state: {deepest}"
+    return f"  {len(pairs)} pairs of bodies touch at the default state, first {deepest}"
 
 
 def _tree(frames: dict[str, str]) -> list[str]:

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
+from kineverse.cli.contacts import contacts
+from kineverse.geometry import Closest
 from kineverse.geometry.pieces import touched_by_what_is_seen
 from kineverse.model.constraint import Constraint
 from kineverse.model.view import ModelView
@@ -46,7 +49,8 @@ class Summary:
     ``frames`` are the parents by name; ``low``, ``high`` and ``extent`` the box around all shapes at the
     default state [m]; ``mass`` that of all bodies [kg]; ``problems`` what could not be loaded; ``unplaced``
     the frames whose pose there is not finite, which the box leaves out; ``interlocks`` what locks what;
-    ``touched_as_seen`` the bodies without collision shapes, for which distances are to hulls of what is seen.
+    ``touched_as_seen`` the bodies without collision shapes, for which distances are to hulls of what is seen;
+    ``contacts`` the pairs that touch at the default state, deepest first, None if nobody can say.
     """
 
     name: str
@@ -62,6 +66,7 @@ class Summary:
     unplaced: list[str]
     interlocks: Interlocks
     touched_as_seen: list[str]
+    contacts: Sequence[Closest] | None
 
 
 def summarise(name: str, model: ModelView) -> Summary:
@@ -96,6 +101,7 @@ def summarise(name: str, model: ModelView) -> Summary:
         unplaced=unplaced,
         interlocks=interlocks(model),
         touched_as_seen=touched_by_what_is_seen(model),
+        contacts=contacts(model),
     )
 
 

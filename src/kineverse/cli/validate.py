@@ -17,7 +17,9 @@ HELP = """read files strictly, and say what is wrong with them
 
 A file that can be read is looked at for limits that are broken at the default state, poses that are not
 finite and loops that do not close there or within the limits, bodies with an impossible inertia, and meshes
-whose files are missing. Remarks are what the reader left out, or took in a way that may not have been meant.
+whose files are missing. With --contacts bodies that are in each other at the default state are problems as
+well, unless they are joined; many a good model has some. Remarks are what the reader left out, or took in a
+way that may not have been meant.
 
 The exit status is 0 if nothing is wrong, 1 if something is, and 2 if a file cannot be read; of several files,
 the worst.
@@ -26,18 +28,29 @@ examples:
   kineverse validate robot.urdf
   kineverse validate robots/*.urdf worlds/*.sdf
   kineverse validate robot.urdf --no-meshes --strict
+  kineverse validate robot.urdf --contacts
   kineverse validate home.kv.json --json"""
 
 SHOWN, SHOWN_OF_SEVERAL = 10, 3
 """How many remarks, and problems of a kind, are printed of a file unless all are asked for."""
 
-TITLES = {"limit": "limits", "loop": "loops", "pose": "poses", "inertia": "inertia", "mesh": "meshes"}
+TITLES = {
+    "limit": "limits",
+    "loop": "loops",
+    "pose": "poses",
+    "inertia": "inertia",
+    "mesh": "meshes",
+    "contact": "contacts",
+}
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     parser.add_argument("files", metavar="FILE", nargs="+", help="path of a file, or name of a shipped model")
     parser.add_argument("--no-meshes", action="store_true", help="do not look for the files of meshes")
+    parser.add_argument(
+        "--contacts", action="store_true", help="bodies that penetrate each other are problems (needs coal)"
+    )
     parser.add_argument("--strict", action="store_true", help="remarks count as problems")
     parser.add_argument(
         "--all", action="store_true", help=f"print all remarks and problems, not {SHOWN} of a kind"
@@ -48,9 +61,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Examine, print, and return the worst status."""
     from kineverse.cli.examination import examine
+    from kineverse.geometry.solids import coal_engine
 
     files = progress(arguments.files, "validating", "file")
-    found = [examine(file, not arguments.no_meshes, arguments.strict) for file in files]
+    if arguments.contacts:
+        coal_engine()
+    meshes, strict, touch = not arguments.no_meshes, arguments.strict, arguments.contacts
+    found = [examine(file, meshes, strict, touch) for file in files]
     status = max(examination.status for examination in found)
     most = None if arguments.all else SHOWN if len(found) == 1 else SHOWN_OF_SEVERAL
     if arguments.json:

@@ -10,28 +10,39 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
-from kineverse.cli.assignments import add_set_option, parse_assignments
+from kineverse.cli.assignments import add_set_option, parse_assignments, parse_value
 from kineverse.cli.listing import asked_for, print_articulations
 from kineverse.cli.progress import progress
 
 if TYPE_CHECKING:
+    import kineverse as kv
     from kineverse.view.viewer import Viewer
 
 HELP = """show a model in the browser, with a slider for everything that moves
 
-The page is served to this computer only, until Ctrl-C.
+The page is served to this computer only, until Ctrl-C. With --picture there is no page: a picture of the
+state is written. That needs neither a browser nor anything beyond the core, but for meshes and --near.
 
 examples:
   kineverse view kitchen
   kineverse view articulations/folding_door      any articulation of the library
   kineverse view articulations                   the list of them
-  kineverse view my_robot.urdf --set elbow=45deg --port 8090"""
+  kineverse view my_robot.urdf --set elbow=45deg --port 8090
+  kineverse view kitchen --near 5cm              which bodies are how near to each other
+  kineverse view articulations/ratchet --near 0.1 --collisions --picture ratchet.png"""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     parser.add_argument("model", metavar="MODEL", help="name of a shipped model, or path of a file")
     add_set_option(parser)
+    parser.add_argument(
+        "--near",
+        metavar="RADIUS",
+        help="show which bodies are within 0.1 (or 5cm) of each other, green to red, with arrows in contact",
+    )
+    parser.add_argument("--collisions", action="store_true", help="show the collision shapes")
+    parser.add_argument("--picture", metavar="PATH", help="write a picture (.png) instead of opening a page")
     add_page_options(parser)
 
 
@@ -44,6 +55,7 @@ def add_page_options(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Serve the page until interrupted."""
     assigned = parse_assignments(arguments.assignments)
+    near = None if arguments.near is None else parse_value(arguments.near)
     if asked_for(arguments.model):
         return print_articulations()
 
@@ -54,8 +66,14 @@ def run(arguments: argparse.Namespace) -> int:
     label = os.path.basename(arguments.model)
     model = kv.load(arguments.model)
     for mesh in progress(meshes.seen_in(model), "reading meshes", "file"):
-        meshes.load(mesh)  # and remembered: the page finds them read
+        meshes.load(mesh)  # and remembered: whoever draws them finds them read
+    if arguments.picture is not None:
+        return _write_picture(arguments, model, assigned, near)
     with until_interrupted(), Viewer(model, assigned, port=arguments.port, label=label) as page:
+        if near is not None:
+            page.collisions.show_near(near)
+        if arguments.collisions:
+            page.collisions.show_shapes()
         note_problems(page.problems)
         if page.unplaced:
             names = ", ".join(page.unplaced)
@@ -63,6 +81,23 @@ def run(arguments: argparse.Namespace) -> int:
         announce(page, browser=not arguments.no_browser)
         print(model, flush=True)
         page.wait()
+    return 0
+
+
+def _write_picture(
+    arguments: argparse.Namespace, model: kv.Model, state: dict[str, float], near: float | None
+) -> int:
+    """Write a picture of the state, and say what it cannot show."""
+    from kineverse.geometry.left_out import unusable
+    from kineverse.view import meshes, save
+
+    save(arguments.picture, model, state, collisions=arguments.collisions, near=near)
+    problems = [f"{m.uri}: {meshes.load(m).problem}" for m in meshes.seen_in(model) if meshes.load(m).problem]
+    note_problems(problems)
+    left_out = unusable(model) if near is not None else {}
+    if left_out:
+        print(f"kineverse: note: no distances to {', '.join(left_out)}", file=sys.stderr)
+    print(f"picture: {arguments.picture}")
     return 0
 
 

@@ -79,6 +79,7 @@ def picture(
         raise ValueRejectedError(f"a picture of {width} x {height} pixels cannot be made")
     poses, values = Poses(model), complete(model, state)
     at = dict(zip(poses.names, poses.at(values), strict=True))
+    found = None if near is None else Near(model).at(values, near)
     items = parts(model, "collision" if collisions else "visual")
     scene = Surfaces.of(items, at)
     if camera is None:
@@ -88,9 +89,9 @@ def picture(
     if frames or not len(scene.corners):
         triads = Surfaces.of(triad(model, scene.corners, at), at)
         _overlay(image, triads, projection)
-    if near is not None:
+    if found is not None:
         length = axis_length(scene.corners, at)
-        marks = Marks.of(Near(model).at(values, near), length)
+        marks = Marks.of(found, length)
         _overlay(image, Surfaces.of(mark_parts(marks, length), at), projection)
     return _shrunk(image, SAMPLES)
 

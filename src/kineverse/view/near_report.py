@@ -16,6 +16,9 @@ LINES = 12
 LEFT_OUT = 5
 """Bodies that are left out and named with the reason; more are counted."""
 
+TOUCHING = 5e-6
+"""What is less deep than this is said to touch, not to be 0.00 mm deep [m]."""
+
 _GREY = "#868e96"
 
 
@@ -58,7 +61,9 @@ def _summary(found: Nearness) -> str:
 
 def _line(pair: Closest, rgb: tuple[float, float, float] | None, why: str = "") -> str:
     shade = _GREY if rgb is None else f"rgb({','.join(str(round(255 * c)) for c in rgb)})"
-    distance = f"{millimetres(-pair.distance)} deep" if pair.touches else millimetres(pair.distance)
+    distance = millimetres(pair.distance)
+    if pair.touches:
+        distance = f"{millimetres(-pair.distance)} deep" if pair.distance < -TOUCHING else "touching"
     dot = f'<span style="color:{shade}">●</span>'
     names = f"{html.escape(pair.a)} – {html.escape(pair.b)}"
     aside = f' <span style="color:{_GREY}">{html.escape(why)}</span>' if why else ""

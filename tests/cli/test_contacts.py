@@ -1,0 +1,119 @@
+"""What the commands say of bodies that touch: ``info``, ``validate --contacts``, ``view --picture --near``."""
+
+from __future__ import annotations
+
+import json
+import sys
+
+import numpy as np
+import pytest
+
+import kineverse as kv
+from kineverse.cli import contacts, main
+
+pytest.importorskip("coal", reason="distances need the extra 'geometry'")
+imaging = pytest.importorskip("PIL.Image")
+
+LINK = '<link name="{}"><collision><origin xyz="{} 0 0"/><geometry>{}</geometry></collision></link>'
+SLIDE = (
+    '<joint name="{1}_slide" type="prismatic"><parent link="{0}"/><child link="{1}"/><axis xyz="1 0 0"/>'
+    '<limit lower="0" upper="1" effort="1" velocity="1"/></joint>'
+)
+BALL, MESH = '<sphere radius="0.5"/>', '<mesh filename="lost.stl"/>'
+
+
+@pytest.fixture
+def run(capsys):
+    def call(*words):
+        status = main([str(word) for word in words])
+        captured = capsys.readouterr()
+        return status, captured.out, captured.err
+
+    return call
+
+
+@pytest.fixture
+def robot(tmp_path):
+    """Write a chain of slides with a ball each, at places along x [m]; neighbours are joined."""
+
+    def write(*places, shape=BALL):
+        links = "".join(LINK.format(f"l{k}", x, shape if k == 1 else BALL) for k, x in enumerate(places))
+        joints = "".join(SLIDE.format(f"l{k}", f"l{k + 1}") for k in range(len(places) - 1))
+        file = tmp_path / "robot.urdf"
+        file.write_text(f'<robot name="r">{links}{joints}</robot>')
+        return file
+
+    return write
+
+
+def test_info_says_what_touches(run, robot):
+    out = run("info", robot(0, 0.2, 0.9, 1.05))[1]
+    assert "2 pairs of bodies touch at the default state, first l1 and l3, 0.15 m deep" in out
+    out = run("info", robot(0, 5, 0.75))[1]
+    assert "1 pair of bodies touches at the default state: l0 and l2, 0.25 m deep" in out
+    assert "at the default state" not in run("info", robot(0, 0.2, 2))[1], "joined bodies are left alone"
+
+
+def test_info_in_json_has_the_distances_or_null(run, robot, monkeypatch):
+    file = robot(0, 5, 0.75)
+    (pair,) = json.loads(run("info", file, "--json")[1])["touching"]
+    assert (pair["a"], pair["b"]) == ("l0", "l2")
+    assert pair["distance"] == pytest.approx(-0.25)
+    assert json.loads(run("info", robot(0, 5, 10), "--json")[1])["touching"] == []
+    monkeypatch.setattr(contacts, "is_installed", lambda: False)
+    assert json.loads(run("info", file, "--json")[1])["touching"] is None
+
+
+def test_bodies_that_cannot_be_used_do_not_hide_the_others(run, robot):
+    out = run("info", robot(0, 0.1, 0.75, shape=MESH))[1]
+    assert "touches at the default state: l0 and l2, 0.25 m deep" in out
+
+
+def test_validate_takes_contacts_for_problems_only_if_asked(run, robot):
+    file = robot(0, 5, 0.75)
+    assert run("validate", file)[0] == 0
+    status, out, _ = run("validate", file, "--contacts")
+    assert status == 1
+    assert "l0: in l2 by 0.25 m at the default state" in out
+    assert run("validate", robot(0, 0.2, 2), "--contacts")[0] == 0
+    assert run("validate", robot(0, 5, 1.0), "--contacts")[0] == 0, "what only touches is in nothing"
+
+
+def test_validate_without_the_extra_names_it(run, robot, monkeypatch):
+    monkeypatch.setitem(sys.modules, "coal", None)
+    status, _, err = run("validate", robot(0, 5, 0.75), "--contacts")
+    assert status == 2
+    assert "kineverse-articulation[geometry]" in err
+
+
+def test_view_writes_pictures_of_what_is_near(run, robot, tmp_path):
+    file, path = robot(0, 5, 1.1), tmp_path / "near.png"
+    images = []
+    for words in ([], ["--near", "20cm"]):
+        status, out, err = run("view", file, "--picture", path, *words)
+        assert (status, err) == (0, "")
+        assert f"picture: {path}" in out
+        images.append(np.asarray(imaging.open(path)))
+    plain, near = images
+    assert (near != plain).any()
+
+
+def test_view_says_what_a_picture_cannot_show(run, robot, tmp_path):
+    status, _, err = run(
+        "view", robot(0, 5, 1.1, shape=MESH), "--picture", tmp_path / "p.png", "--near", "0.2"
+    )
+    assert status == 0
+    assert "no distances to l1" in err
+
+
+@pytest.mark.parametrize(("radius", "said"), [("-1", "radius"), ("wide", "not a value")])
+def test_radii_that_are_none_are_refused(run, robot, tmp_path, radius, said):
+    status, _, err = run("view", robot(0, 5), "--picture", tmp_path / "p.png", f"--near={radius}")
+    assert status == 2
+    assert said in err
+    assert not (tmp_path / "p.png").exists()
+
+
+def test_shipped_models_stand_free():
+    for name in kv.shipped_models():
+        assert not any(pair.distance < -contacts.TOUCHING for pair in contacts.contacts(kv.load(name)))
