@@ -166,10 +166,10 @@ def test_names_of_any_script(run, robot, tmp_path):
 @pytest.mark.parametrize(
     ("target", "hint"),
     [
-        ("out.txt", ".kv.json, .urdf"),
-        ("out", ".kv.json, .urdf"),
+        ("out.txt", ".urdf, .xml"),
+        ("out", ".urdf, .xml"),
         ("", "Which file"),
-        ("out.sdf", ".kv.json, .urdf"),
+        ("out.sdf", ".urdf, .xml"),
         ("nowhere/out.kv.json", "the folder nowhere does not exist"),
         ("robot.urdf/out.kv.json", "the folder robot.urdf does not exist"),
         ("folder", "folder/robot.kv.json"),
