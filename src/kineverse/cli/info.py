@@ -69,6 +69,8 @@ def sections(summary: Summary, frames: bool = False, constraints: bool = False) 
         lines.append(f"  {bodies} no collision shapes; distances are to hulls of what is seen")
     if summary.contacts:
         lines.append(_contacts(summary.contacts))
+    if summary.sha256:
+        lines.append(f"  document, sha256 {summary.sha256}")
     found = ["\n".join(lines)]
     if summary.freedoms:
         rows = [
@@ -125,6 +127,7 @@ def as_json(summary: Summary) -> dict[str, Any]:
             for c in summary.constraints
         ],
         **summary.interlocks.as_data(),
+        **({"sha256": summary.sha256} if summary.sha256 else {}),
         "not_loaded": summary.problems,
         "not_finite": summary.unplaced,
         "touched_as_seen": summary.touched_as_seen,

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from kineverse.cli.contacts import contacts
+from kineverse.formats.document import document_hash
 from kineverse.geometry import Closest
 from kineverse.geometry.pieces import touched_by_what_is_seen
 from kineverse.model.constraint import Constraint
@@ -50,7 +51,8 @@ class Summary:
     default state [m]; ``mass`` that of all bodies [kg]; ``problems`` what could not be loaded; ``unplaced``
     the frames whose pose there is not finite, which the box leaves out; ``interlocks`` what locks what;
     ``touched_as_seen`` the bodies without collision shapes, for which distances are to hulls of what is seen;
-    ``contacts`` the pairs that touch at the default state, deepest first, None if nobody can say.
+    ``contacts`` the pairs that touch at the default state, deepest first, None if nobody can say;
+    ``sha256`` the hash of the content if the model is from a document, else empty.
     """
 
     name: str
@@ -67,6 +69,7 @@ class Summary:
     interlocks: Interlocks
     touched_as_seen: list[str]
     contacts: Sequence[Closest] | None
+    sha256: str
 
 
 def summarise(name: str, model: ModelView) -> Summary:
@@ -102,6 +105,7 @@ def summarise(name: str, model: ModelView) -> Summary:
         interlocks=interlocks(model),
         touched_as_seen=touched_by_what_is_seen(model),
         contacts=contacts(model),
+        sha256=document_hash(model) if name.endswith((".kv.json", ".kv.msgpack")) else "",
     )
 
 
