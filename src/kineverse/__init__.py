@@ -182,6 +182,7 @@ __all__ = [
     "difference",
     "document_hash",
     "geometry",
+    "from_bytes",
     "inverse",
     "less",
     "limit_table",

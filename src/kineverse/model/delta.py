@@ -97,9 +97,9 @@ def _walk(what: str, a: Any, b: Any) -> Iterator[tuple[str, Any, Any]]:
         if a.factors != b.factors:
             yield "transform", transform_of(a), transform_of(b)
     elif is_dataclass(a) and not isinstance(a, type):
-        alike = ("folder",) if isinstance(a, Mesh) else ()
-        if isinstance(a, Mesh) and _file(a) == _file(b):
-            alike = ("folder", "uri")
+        alike: tuple[str, ...] = ()
+        if isinstance(a, Mesh):
+            alike = ("folder", "uri") if _file(a) == _file(b) else ("folder",)
         for field in fields(a):
             if field.name not in alike:
                 name = f"{what}.{field.name}" if what else field.name
