@@ -370,3 +370,20 @@ def test_random_tables_are_read_or_refused() -> None:
                 operations_from(document(nodes, [constraint(len(nodes) - 1)]))
             except kv.FormatError:
                 nodes.pop()
+
+
+def test_what_nobody_could_read_again_is_not_written(tmp_path: Any) -> None:
+    """The writer keeps the limits of the reader; parameters that go too deep are left out."""
+    deep: Any = 1
+    for _ in range(150):
+        deep = (deep,)
+    model = kv.Model()
+    with model.edit() as edit:
+        edit.write("deep", deep)
+    with pytest.raises(kv.FormatError, match="nested too deeply"):
+        model.save(tmp_path / "deep.kv.json")
+    wide = kv.Model()
+    with wide.edit() as edit:
+        edit.constrain("all", 0, kv.logic_and(*(kv.position(f"s{i}") for i in range(10_001))), 1)
+    with pytest.raises(kv.FormatError, match="up to 10000 elements"):
+        wide.save(tmp_path / "wide.kv.json")

@@ -176,7 +176,8 @@ def _carried(graph: Graph, node: list[Any]) -> None:
     if coordinate not in rows:
         raise RefusedError(f"the table has no row for '{coordinate}'")
     inside = [entry for _, row in table for _, entry in row]
-    graph.add_opaque(Carried, [ref], (), (Rates(rows),), inside)
+    # As a model has it, and it is written: what other rows say is put into this one, and left out then.
+    graph.add_opaque(Carried, [ref], (), (Rates(rows).closure(coordinate),), inside)
 
 
 def _composed(graph: Graph, node: list[Any]) -> None:

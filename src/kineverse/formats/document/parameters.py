@@ -21,7 +21,7 @@ from kineverse.model.reader import Cell
 
 from .checks import RefusedError, exactly, fields, listed, string
 from .graph import Graph
-from .limits import check_depth
+from .limits import MAX_DEPTH, check_depth
 from .shapes import read_pose, written_pose
 from .values import DATUM_TAGS, Ref, Rename, read_datum, written_datum
 
@@ -69,12 +69,14 @@ def expressions_among(parameter: Any, writes: Mapping[Cell, Any]) -> list[Expres
     return found
 
 
-def written_parameter(value: Any, writes: Mapping[Cell, Any], ref: Ref) -> Any:
-    """Return a parameter as JSON has it."""
+def written_parameter(value: Any, writes: Mapping[Cell, Any], ref: Ref, depth: int = 0) -> Any:
+    """Return a parameter as JSON has it, which lies in so many others."""
 
     def inner(item: Any) -> Any:
-        return written_parameter(item, writes, ref)
+        return written_parameter(item, writes, ref, depth + 1)
 
+    if depth > MAX_DEPTH:
+        return {"unwritten": type(value).__name__}
     if value is None or isinstance(value, (bool, int, float, str, Expression)):
         try:
             return written_datum(value, ref)

@@ -56,6 +56,7 @@ from kineverse.model.traces import Answer
 from kineverse.symbols import Symbol
 
 from .elementary import NAMES
+from .limits import MAX_ELEMENTS, MAX_NODES
 
 _PLAIN = (Not, And, Or, Select, Norm)
 
@@ -157,6 +158,11 @@ class Table:
             shape = ",".join(map(str, node.shape))
             path = ",".join(f"[{self.ref(key)},{str(trends).lower()}]" for key, trends in node.path)
             return self._shared(f'["read",{node.question},{node.part},[{shape}],[{path}]]')
+        if node.size * max(len(node.arguments), 1) > MAX_ELEMENTS:
+            raise FormatError(
+                f"The model has a node '{node.label}' of shape {node.shape} with {len(node.arguments)} "
+                f"arguments; a document has up to {MAX_ELEMENTS} elements in all arguments of one."
+            )
         refs = [self.ref(argument) for argument in node.arguments]
         joined = ",".join(map(str, refs))
         if type(node) is Augment:
@@ -211,6 +217,8 @@ class Table:
         return place
 
     def _add(self, line: str) -> int:
+        if len(self.lines) >= MAX_NODES:
+            raise FormatError(f"The model has more than {MAX_NODES:,} nodes, the most a document has.")
         self.lines.append(line)
         return len(self.lines) - 1
 

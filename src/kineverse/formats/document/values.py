@@ -25,7 +25,7 @@ from kineverse.symbols import Symbol
 
 from .checks import RefusedError, exactly, fields, listed, name, number, numbers, string
 from .graph import Graph
-from .limits import check_depth
+from .limits import MAX_DEPTH, check_depth
 from .shapes import (
     read_body,
     read_pose,
@@ -84,8 +84,8 @@ def written(kind: str, value: Any, ref: Ref) -> Any:
     return written_datum(value, ref)
 
 
-def written_datum(value: Any, ref: Ref) -> Any:
-    """Return a datum as JSON has it.
+def written_datum(value: Any, ref: Ref, depth: int = 0) -> Any:
+    """Return a datum as JSON has it, which lies in so many tuples.
 
     Raises
     ------
@@ -102,7 +102,9 @@ def written_datum(value: Any, ref: Ref) -> Any:
         number = float(value)
         return number if math.isfinite(number) else {"float": written_number(number)}
     if type(value) is tuple:
-        return [written_datum(item, ref) for item in value]
+        if depth > MAX_DEPTH:
+            raise FormatError(f"it is nested too deeply, in more than {MAX_DEPTH} others")
+        return [written_datum(item, ref, depth + 1) for item in value]
     if isinstance(value, Expression):
         return {"expression": ref(value)}
     raise FormatError(
