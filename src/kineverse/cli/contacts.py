@@ -45,7 +45,7 @@ def penetrations(model: ModelView) -> Iterator[Finding]:
             yield Finding("contact", pair.a, text)
 
 
-def _touching(model: ModelView) -> list[Closest]:
+def _touching(model: ModelView) -> Sequence[Closest]:
     scene = Scene(model, leave_out=unusable(model))
     scene.update(model.default_state())
     return scene.within(0.0)

@@ -40,6 +40,12 @@ class Camera:
             raise ValueRejectedError(f"field_of_view {self.field_of_view} is not between 0 and pi")
 
     @property
+    def height(self) -> float:
+        """How much of the plane through the target is in the picture, from edge to edge [m]."""
+        distance = np.linalg.norm(np.subtract(self.target, self.position))
+        return float(2.0 * distance * np.tan(self.field_of_view / 2))
+
+    @property
     def axes(self) -> Floats:
         """(3, 3): the directions to the right, up and ahead, as rows in world coordinates."""
         ahead = np.subtract(self.target, self.position)

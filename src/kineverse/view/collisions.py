@@ -22,6 +22,9 @@ from kineverse.view.watch import Seen, Wanted, Watch
 WIDEST = 0.5
 """The largest radius that is offered [m]."""
 
+LONGEST = 0.2
+"""Length of an arrow on the page at most [m]: contacts are about hands, also in a large kitchen."""
+
 LABELS = 8
 """Depths that are written beside their arrows; more would cover what they are about."""
 
@@ -150,7 +153,7 @@ class Collisions:
         self._scene.show_through(self.watch.wanted.on)
         with self._server.atomic():
             before = self._drawn
-            marks = None if seen.nearness is None else Marks.of(seen.nearness, self._scene.length)
+            marks = None if seen.nearness is None else Marks.of(seen.nearness, self._length)
             self._drawn = self._draw(marks) if marks is not None and len(marks.lines) else {}
             # What is added under the name of another takes its place, and does not flicker.
             for name in before.keys() - self._drawn.keys():
@@ -170,9 +173,13 @@ class Collisions:
             if self._report is not None and self._report.content != text:
                 self._report.content = text
 
+    @property
+    def _length(self) -> float:
+        return min(self._scene.length, LONGEST)
+
     def _draw(self, marks: Marks) -> dict[str, Any]:
         """Add marks to the page, and return their nodes by name."""
-        scene, length = self._server.scene, self._scene.length
+        scene, length = self._server.scene, self._length
         colors = np.repeat(np.round(255 * marks.colors).astype(np.uint8)[:, None], 2, axis=1)
         nodes = [
             scene.add_line_segments(

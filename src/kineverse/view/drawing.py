@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 from kineverse.errors import ValueRejectedError
 from kineverse.model.view import ModelView
-from kineverse.view.axes import axis_length, triad
+from kineverse.view.axes import triad
 from kineverse.view.camera import Camera
 from kineverse.view.light import Lamp, shade, to_display, to_linear
 from kineverse.view.marks import Marks, mark_parts
@@ -30,6 +30,9 @@ SAMPLES = 2
 
 BACKDROP = (np.array([0.93, 0.945, 0.96]), np.array([0.70, 0.745, 0.80]))
 """Display colours of the background below and above."""
+
+ARROW = 0.07
+"""The length of an arrow where bodies touch, as a part of the height of the picture."""
 
 LARGEST = 64_000_000
 """Most pixels of one picture, computed ones included."""
@@ -90,7 +93,7 @@ def picture(
         triads = Surfaces.of(triad(model, scene.corners, at), at)
         _overlay(image, triads, projection)
     if found is not None:
-        length = axis_length(scene.corners, at)
+        length = ARROW * camera.height
         marks = Marks.of(found, length)
         _overlay(image, Surfaces.of(mark_parts(marks, length), at), projection)
     return _shrunk(image, SAMPLES)

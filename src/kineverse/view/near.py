@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import takewhile
 
 from kineverse.geometry import Closest, Rule, Scene
 from kineverse.geometry.left_out import RIGID, Ignored, unusable
@@ -114,7 +115,7 @@ class Near:
             radius,
             found[:MOST],
             len(found),
-            sum(pair.touches for pair in found),
+            sum(1 for _ in takewhile(lambda pair: pair.touches, found)),  # they come first
             self._not_looked_at(values, radius, containing) if ignored else (),
             looked_at,
             not_looked_at,
@@ -131,6 +132,6 @@ class Near:
         return [(pair, why) for pair, why in reasons if why not in ("", RIGID)][:MOST]
 
 
-def _named(pairs: list[Closest], containing: str) -> list[Closest]:
+def _named(pairs: Sequence[Closest], containing: str) -> Sequence[Closest]:
     text = containing.strip().lower()
     return [pair for pair in pairs if text in pair.a.lower() or text in pair.b.lower()] if text else pairs
