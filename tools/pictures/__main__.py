@@ -1,4 +1,4 @@
-"""Draw the gallery for the docs: `python tools/pictures` draws all of it, with names some of it."""
+"""Draw the pictures of the docs: the gallery, and what is near. With names, some of them."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ import io
 import sys
 from pathlib import Path
 
+import near
 import numpy as np
 from configurations import TAKES, Take, values
 from PIL import Image
@@ -22,6 +23,7 @@ from kineverse.view.surfaces import Surfaces
 FOLDER = Path(__file__).resolve().parents[2] / "docs" / "pictures"
 WIDTH, GAP = 480, 4
 LARGEST = 24_000
+NEAR = "near"
 
 
 def main() -> int:
@@ -29,15 +31,23 @@ def main() -> int:
     parser = argparse.ArgumentParser(prog="python tools/pictures", description=__doc__)
     parser.add_argument("names", nargs="*", metavar="NAME", help="scenes (all)")
     missing = 0
-    for name in parser.parse_args().names or gallery.names():
+    for name in parser.parse_args().names or (*gallery.names(), NEAR):
+        if name == NEAR:
+            write(name, near.drawn())
+            continue
         if name not in TAKES:
             missing += 1
             sys.stderr.write(f"configurations.py does not say how '{name}' is drawn\n")
             continue
-        data = encoded(drawn(name, TAKES[name]))
-        (FOLDER / f"{name}.png").write_bytes(data)
-        sys.stdout.write(f"{name}.png: {len(data)} bytes\n")
+        write(name, drawn(name, TAKES[name]))
     return missing
+
+
+def write(name: str, pixels: np.ndarray) -> None:
+    """Write a picture to the folder of pictures, and say how large it is."""
+    data = encoded(pixels)
+    (FOLDER / f"{name}.png").write_bytes(data)
+    sys.stdout.write(f"{name}.png: {len(data)} bytes\n")
 
 
 def drawn(name: str, take: Take) -> np.ndarray:
