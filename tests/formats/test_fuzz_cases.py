@@ -198,6 +198,38 @@ def test_a_frame_without_factors_is_where_its_parent_is():
     assert document_of(built(text)) == text
 
 
+@pytest.mark.parametrize(
+    "rows",
+    [
+        [[0, []], [1, [[4, 9]]]],  # a zero, which is left out when it is written
+        [
+            [0, [[7, 10]]],
+            [1, [[4, 10], [6, 10]]],
+        ],  # a row by way of another, and another order of speeds by that
+    ],
+)
+def test_rate_tables_are_the_same_once_they_are_written(rows):
+    """The digest of the node was another one, and so was the order of nodes in the next document."""
+    nodes = [
+        *(["symbol", name, order, "dof"] for order in (0, 1) for name in "abcd"),
+        ["matrix", [3], [0, 0, 0]],
+        ["constant", 0],
+        ["constant", 1],
+        ["norm", 8],
+        ["carried", 1, rows],
+        [
+            "matrix",
+            [4, 4],
+            [12, None, None, 11, None, 12, None, None, None, None, 12, None, 10, None, None, 10],
+        ],
+    ]
+    tree = json.loads(document(nodes, {}))
+    trace = {"questions": [], "writes": {"frames": {"h": {"parent": "world", "factors": [13]}}}}
+    tree["operations"][0]["trace"] = trace
+    text = document_of(built(json.dumps(tree)))
+    assert document_of(built(text)) == text
+
+
 def test_a_carried_coordinate_that_a_composition_leaves_alone_is_plain_at_once():
     """It was after the second time that a document was written."""
     nodes = [

@@ -141,7 +141,7 @@ class Rates(Mapping[Symbol, Mapping[Symbol, Expression]]):
         for speed, factor in row:
             inner: Mapping[Symbol, ExpressionLike] = self._rows.get(speed.position, {speed: 1.0})
             _add(result, {free: factor * rate for free, rate in inner.items()})
-        return result
+        return dict(sorted(result.items(), key=lambda item: item[0].sort_key))
 
     def resolve(self, expression: Expression) -> Expression:
         """Return a plain expression in coordinates that do not depend on others."""
