@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
@@ -14,14 +15,14 @@ from kineverse.state import State
 from kineverse.symbols import Symbol
 
 from .mesh_files import Floats
-from .narrow import Narrow, Witness
+from .narrow import ACCURACY, Narrow
 from .pieces import Piece, Pieces, load
 from .rules import RULES, Rule, allowed, check_names, rules_of
 from .solids import Solid
 from .sweep_native import sweep_library
-from .table import Table
+from .table import Indices, Table
 
-_MOST_MEASURED = 200_000
+_MOST_KNOWN = 200_000
 
 
 class Mirror:
@@ -123,7 +124,7 @@ class Mirror:
         self.narrow = Narrow(self._solids, table.poses)
         self._travel = table.travel.data
         self._bounds: Any = None if table.bounds is None else table.bounds.data
-        self._measured: dict[tuple[int, int], tuple[float, float, float, Witness]] = {}
+        self._known: dict[tuple[int, int], tuple[float, float, float, Floats]] = {}
         if not same:
             self._compile([piece.pose for piece in moving])
         self._place_again()
@@ -205,34 +206,76 @@ class Mirror:
         wanted = [
             k for k in (range(len(self.pieces)) if pieces is None else pieces) if self._solids[k] is None
         ]
+        # From the first measured distance on it is C that measures, or else never: answers do not change.
+        sweep_library.prepare(wait=True)
         first = self.table.active.any()
         for k, solid in zip(wanted, load(self.pieces[k] for k in wanted), strict=True):
             self._solids[k] = solid
-            self.table.give_solid(k, solid.centre, solid.half, solid.radius)
+            self.table.give_solid(k, solid.centre, solid.half, solid.radius, solid.core)
         if wanted and (pieces is None or not first):
             self.table.choose_axis()
         self._all_loaded = pieces is None
 
-    def measured(self, i: int, j: int, limit: float) -> tuple[float, Witness | None]:
+    def measure(self, pairs: Indices, lows: Floats, limit: float) -> tuple[Floats, Floats]:
+        """Measure pairs of pieces, of each pair of bodies at least the nearest.
+
+        Parameters
+        ----------
+        pairs, lows
+            (K, 2), the smaller number first, and (K,) lower bounds of their distances [m].
+        limit
+            How far is of interest [m].
+
+        Returns
+        -------
+        distances, witnesses
+            (K,) [m], more than the limit for what is further apart, infinite for what is not the nearest;
+            (K, 9) the nearest points of both and the normal, where the distance is within the limit.
+        """
+        distances, witnesses = sweep_library.measure(self.table, pairs, limit)
+        if np.isnan(distances).any():
+            self.measure_rest(pairs, lows, limit, distances, witnesses)
+        return distances, witnesses
+
+    def measure_rest(
+        self, pairs: Indices, lows: Floats, limit: float, distances: Floats, witnesses: Floats
+    ) -> None:
+        """Have coal measure the pairs whose distance is NaN, see :meth:`measure`."""
+        owners = [(a, b) if a < b else (b, a) for a, b in self.table.body[pairs].tolist()]
+        least: dict[tuple[int, int], float] = {}
+        for key, distance in zip(owners, distances.tolist(), strict=True):
+            if distance < least.get(key, math.inf):
+                least[key] = distance
+        order = np.argsort(lows, kind="stable")
+        for k in order[np.isnan(distances[order])].tolist():
+            # Within the accuracy a pair that comes later may still be the nearest.
+            if lows[k] > least.get(owners[k], math.inf) + ACCURACY:
+                distances[k] = math.inf
+                continue
+            i, j = pairs[k].tolist()
+            distances[k], witness = self._measured(i, j, limit)
+            if witness is not None:
+                witnesses[k] = witness
+            least[owners[k]] = min(least.get(owners[k], math.inf), distances[k])
+
+    def _measured(self, i: int, j: int, limit: float) -> tuple[float, Floats | None]:
         """Return distance and witness of two pieces, i < j, from memory if neither has moved since.
 
-        There is no witness if they are further apart than a limit.
+        Beyond a limit the distance is infinite, and there is no witness.
         """
         one, other = self._travel[i], self._travel[j]
-        known = self._measured.get((i, j))
+        known = self._known.get((i, j))
         if known is not None and known[0] == one and known[1] == other:
-            return known[2], known[3]
+            return (known[2], known[3]) if known[2] <= limit else (math.inf, None)
         distance = self.narrow.distance(i, j)
         if self._bounds is not None:
             self._bounds[i, j] = distance + one + other  # as Table.remember, in a fifth of the time
         if distance > limit:
-            return distance, None
-        witness = self.narrow.witness()
-        for vector in witness:
-            vector.flags.writeable = False  # it is kept, and given out more than once
-        if len(self._measured) >= _MOST_MEASURED:
-            self._measured.clear()
-        self._measured[i, j] = one, other, distance, witness
+            return math.inf, None
+        witness = np.concatenate(self.narrow.witness())
+        if len(self._known) >= _MOST_KNOWN:
+            self._known.clear()
+        self._known[i, j] = one, other, distance, witness
         return distance, witness
 
     def number(self, body: str) -> int:

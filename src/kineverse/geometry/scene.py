@@ -17,6 +17,7 @@ from kineverse.symbols import Symbol
 
 from . import probing, queries
 from .expressions import PairDistance, Parameters, pair_distance, parameters_of
+from .found import Found
 from .mesh_files import Floats
 from .mirror import Mirror
 from .moving import Motion
@@ -130,21 +131,21 @@ class Scene:
         """Return how near others are to a body, ``a`` in the results, nearest first, within a radius [m]."""
         return queries.around(self._mirror, body, radius)
 
-    def within(self, radius: float) -> list[Closest]:
+    def within(self, radius: float) -> Found:
         """Return all pairs of bodies within a radius of each other [m], nearest first.
 
         Bounds are carried from one state to the next, so that the cost follows what is near.
         """
         return queries.within(self._mirror, radius)
 
-    def between(self, one: str, other: str, radius: float) -> list[Closest]:
+    def between(self, one: str, other: str, radius: float) -> Found:
         """Return the pairs within a radius [m] of which one body is at or below each of two frames."""
         first, second = self._below(one), self._below(other)
         return queries.within(
             self._mirror, radius, lambda a, b: (a in first and b in second) or (b in first and a in second)
         )
 
-    def inside(self, frame: str, radius: float) -> list[Closest]:
+    def inside(self, frame: str, radius: float) -> Found:
         """Return the pairs within a radius [m] that are both at or below a frame: self-collision."""
         return self.between(frame, frame, radius)
 
@@ -241,7 +242,7 @@ class Scene:
         pairs = ((bodies[i], bodies[j]) for i, j in zip(ones.tolist(), others.tolist(), strict=True))
         return tuple(pair for pair in pairs if motion.moves_between(*pair))
 
-    def near_what_moves(self, symbols: Symbol | str | Iterable[Symbol | str], radius: float) -> list[Closest]:
+    def near_what_moves(self, symbols: Symbol | str | Iterable[Symbol | str], radius: float) -> Found:
         """Return the pairs within a radius [m] whose distance depends on some symbols, nearest first."""
         motion = Motion(self.model, _several(symbols))
         return queries.within(self._mirror, radius, motion.moves_between)

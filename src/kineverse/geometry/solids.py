@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import threading
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import lru_cache
 from typing import Any, TypeAlias
 
@@ -28,6 +28,35 @@ class Hull:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class Core:
+    """What a solid is made of for our own measuring, see :mod:`.narrow_source`.
+
+    It is the sum of a hull of corners, a box about the origin, and a ball.
+
+    Attributes
+    ----------
+    half
+        (3,) half the edges of the box [m].
+    radius
+        Of the ball [m].
+    corners
+        (3, n) in the frame of the solid [m], n a multiple of 8, for which the first one is repeated; n = 0
+        stands for the origin alone.
+    """
+
+    half: Floats
+    radius: float = 0.0
+    corners: Floats = field(default_factory=lambda: np.empty((3, 0)))
+
+    @staticmethod
+    def hull(points: Floats) -> Core:
+        """Return the hull of (n, 3) corners."""
+        missing = -len(points) % 8
+        corners = np.ascontiguousarray(np.vstack([points, *missing * [points[:1]]]).T)
+        return Core(np.zeros(3), corners=corners)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class Solid:
     """A shape that distances can be computed to. Equal geometries have the same solid; it never changes.
 
@@ -43,6 +72,8 @@ class Solid:
         Of the sphere about ``centre`` that holds it [m].
     stand_in
         The same shape as coal should see it beside a cylinder; None if that is ``engine``.
+    core
+        The same shape for our own measuring; None if it is not made like that.
     """
 
     engine: Any
@@ -51,6 +82,7 @@ class Solid:
     half: Floats
     radius: float
     stand_in: Any = None
+    core: Core | None = None
 
     @property
     def is_convex(self) -> bool:
@@ -138,7 +170,7 @@ def _hull(points: Floats) -> Solid:
     corners = np.array(convex.points())
     low, high = corners.min(axis=0), corners.max(axis=0)
     surface = Hull(np.array(convex.normals()), -np.array(convex.offsets()).reshape(-1))
-    return _solid(convex, surface, (low + high) / 2, (high - low) / 2, corners)
+    return _solid(convex, surface, (low + high) / 2, (high - low) / 2, corners, Core.hull(corners))
 
 
 def _triangles(vertices: Floats, faces: Any) -> Solid:
@@ -152,9 +184,17 @@ def _triangles(vertices: Floats, faces: Any) -> Solid:
     return _solid(bvh, Faces(vertices, faces), (low + high) / 2, (high - low) / 2, used)
 
 
-def _solid(engine: Any, surface: Hull | Faces, centre: Floats, half: Floats, points: Floats) -> Solid:
+def _solid(
+    engine: Any,
+    surface: Hull | Faces,
+    centre: Floats,
+    half: Floats,
+    points: Floats,
+    core: Core | None = None,
+) -> Solid:
     engine.computeLocalAABB()
-    return Solid(engine, surface, centre, half, float(np.linalg.norm(points - centre, axis=1).max()))
+    radius = float(np.linalg.norm(points - centre, axis=1).max())
+    return Solid(engine, surface, centre, half, radius, core=core)
 
 
 @lru_cache(maxsize=65536)
@@ -167,26 +207,29 @@ def _primitive(geometry: Primitive) -> Solid:
             f"{geometry} has sizes beyond {SMALLEST_SIZE:g} m to {LARGEST_SIZE:g} m, which cannot be right."
         )
     coal = coal_engine()
-    stand_in = None
+    stand_in = core = None
     x, y, z = (*sizes, 0.0, 0.0)[:3]
     if isinstance(geometry, Box):
         engine, half = coal.Box(x, y, z), (x / 2, y / 2, z / 2)
         radius = math.hypot(*half)
+        core = Core(np.array(half))
     elif isinstance(geometry, Sphere):
         engine, half, radius = coal.Sphere(x), (x, x, x), x
         # coal looks only at the wall when the centre of a sphere is inside a cylinder, and not at its ends.
         stand_in = coal.Capsule(x, 0.0)
         stand_in.computeLocalAABB()
+        core = Core(np.zeros(3), x)
     elif isinstance(geometry, Ellipsoid):
         engine, half, radius = coal.Ellipsoid(x, y, z), (x, y, z), max(x, y, z)
     elif isinstance(geometry, Capsule):
         engine, half, radius = coal.Capsule(x, y), (x, x, x + y / 2), x + y / 2
+        core = Core(np.array([0.0, 0.0, y / 2]), x)
     elif isinstance(geometry, Cylinder):
         engine, half, radius = coal.Cylinder(x, y), (x, x, y / 2), math.hypot(x, y / 2)
     else:
         engine, half, radius = coal.Cone(x, y), (x, x, y / 2), math.hypot(x, y / 2)
     engine.computeLocalAABB()
-    return Solid(engine, geometry, np.zeros(3), np.array(half), radius, stand_in)
+    return Solid(engine, geometry, np.zeros(3), np.array(half), radius, stand_in, core)
 
 
 SMALLEST_SIZE, LARGEST_SIZE = 1e-7, 1e6

@@ -10,6 +10,7 @@ This is the whole of it in numpy; :mod:`.sweep_native` has the same in C, severa
 from __future__ import annotations
 
 import numpy as np
+import numpy.typing as npt
 
 from .mesh_files import Floats
 from .table import Indices, Table
@@ -62,3 +63,22 @@ def near(table: Table, reach: float) -> tuple[Indices, Floats]:
     lows = table.lower_bounds(ones, others)
     keep = lows <= reach
     return np.stack([ones[keep], others[keep]], axis=1), lows[keep]
+
+
+def rank(table: Table, pairs: Indices, distances: Floats, radius: float) -> npt.NDArray[np.int64]:
+    """Return which pairs are the nearest ones of their bodies and within a radius [m], nearest first.
+
+    Of equal distances that of the pieces, and then of the bodies, comes first that was there first.
+
+    Parameters
+    ----------
+    pairs, distances
+        (K, 2) pieces and (K,) how far apart they are [m].
+    """
+    owners = table.body[pairs]
+    low, high = owners.min(axis=1, initial=len(table.allowed)), owners.max(axis=1, initial=0)
+    order = np.lexsort((pairs[:, 1], pairs[:, 0], high, low, distances))
+    order = order[: np.searchsorted(distances[order], radius, side="right")]
+    bodies = low[order].astype(np.int64) * len(table.allowed) + high[order]
+    leading = np.unique(bodies, return_index=True)[1]
+    return np.asarray(order[np.sort(leading)])

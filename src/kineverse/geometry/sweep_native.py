@@ -1,13 +1,17 @@
-"""The sweep in C, compiled in the background and kept like compiled functions; numpy until then."""
+"""Sweep and measuring in C, compiled in the background and kept like compiled functions.
+
+Until then, and without a compiler, numpy and coal do it.
+"""
 
 from __future__ import annotations
 
 import ctypes
 import hashlib
 import threading
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
+import numpy.typing as npt
 
 from kineverse.compile.cache import library_cache
 from kineverse.compile.toolchain import CLOSED, toolchain
@@ -15,13 +19,21 @@ from kineverse.compile.worker import Build, request
 
 from . import sweep
 from .mesh_files import Floats
+from .narrow_source import NARROW
 from .sweep_source import SWEEP
 from .table import Indices, Table
 
 _ARRAYS = (
     "body", "allowed", "active", "centre", "half", "radius",
     "poses", "travel", "place", "low", "high", "bounds", "order",
+    "corners", "corner_count", "edges", "round",
 )  # fmt: skip
+
+
+_SOURCE = SWEEP + NARROW
+
+Search: TypeAlias = tuple[Indices, Floats, Floats, Floats, npt.NDArray[np.int64] | None]
+"""Pairs, lower bounds, distances, witnesses, and the order of the nearest ones; until the next question."""
 
 
 class _Struct(ctypes.Structure):
@@ -61,12 +73,12 @@ class SweepLibrary:
         if compiler is None:
             self._hopeless = True
             return None
-        key = hashlib.sha256(repr((SWEEP, compiler.identity)).encode()).hexdigest()[:40]
+        key = hashlib.sha256(repr((_SOURCE, compiler.identity)).encode()).hexdigest()[:40]
         path = library_cache().find(key)
         if path is not None:
             self._load(path)
             return None
-        return request(key, compiler, lambda: SWEEP, ("-O3", *CLOSED), self._built)
+        return request(key, compiler, lambda: _SOURCE, ("-O3", *CLOSED), self._built)
 
     def _built(self, build: Build) -> None:
         if build.path is not None and self._code is None:
@@ -84,6 +96,12 @@ class SweepLibrary:
         code.place.argtypes, code.place.restype = (pointer, pointer), ctypes.c_int64
         code.near.argtypes = (pointer, ctypes.c_double, pointer, pointer, ctypes.c_int64)
         code.near.restype = ctypes.c_int64
+        code.measure.argtypes = (pointer, pointer, ctypes.c_int64, ctypes.c_double, pointer, pointer)
+        code.measure.restype = None
+        code.rank.argtypes = (pointer, pointer, ctypes.c_int64, pointer, ctypes.c_double, pointer)
+        code.rank.restype = ctypes.c_int64
+        code.search.argtypes = (pointer, *(ctypes.c_double,) * 2, ctypes.c_int64, *(pointer,) * 6)
+        code.search.restype = ctypes.c_int64
         self._code = code
 
     def place(self, table: Table, fresh: Floats) -> int:
@@ -103,6 +121,48 @@ class SweepLibrary:
                 return native.pairs[:found], native.lows[:found]
             native.room(2 * found)
 
+    def measure(self, table: Table, pairs: Indices, limit: float) -> tuple[Floats, Floats]:
+        """Measure pairs of pieces, (K, 2) with the smaller number first, as far as C can.
+
+        Returns
+        -------
+        distances, witnesses
+            (K,) [m], infinite or not beyond the limit, NaN for those that are left to coal; and (K, 9) the
+            nearest points of both and the normal, where the distance is finite.
+        """
+        count = len(pairs)
+        if self._code is None or not count:
+            return np.full(count, np.nan), np.empty((count, 9))
+        distances, witnesses = np.empty(count), np.empty((count, 9))
+        where = pairs.ctypes.data, count, limit, distances.ctypes.data, witnesses.ctypes.data
+        self._code.measure(_native(table).address, *where)
+        return distances, witnesses
+
+    def rank(self, table: Table, pairs: Indices, distances: Floats, radius: float) -> npt.NDArray[np.int64]:
+        """Do what :func:`.sweep.rank` does; all arrays are contiguous."""
+        if self._code is not None:
+            order = np.empty(len(pairs), dtype=np.int64)
+            where = pairs.ctypes.data, len(pairs), distances.ctypes.data, radius, order.ctypes.data
+            found = self._code.rank(_native(table).address, *where)
+            if found >= 0:
+                return order[:found]
+        return sweep.rank(table, pairs, distances, radius)
+
+    def search(self, table: Table, reach: float, radius: float) -> Search:
+        """Do :meth:`near`, :meth:`measure` and, if that leaves nothing to coal, :meth:`rank`."""
+        if self._code is None:
+            pairs, lows = sweep.near(table, reach)
+            return pairs, lows, *self.measure(table, pairs, radius), None
+        native = _native(table)
+        while (found := self._code.search(native.address, reach, radius, *native.everything)) > len(
+            native.lows
+        ):
+            native.room(2 * found)
+        kept = native.kept.value
+        order = None if kept < 0 else native.order[:kept]
+        pairs, lows, distances, witnesses = native.pairs, native.lows, native.distances, native.witnesses
+        return pairs[:found], lows[:found], distances[:found], witnesses[:found], order
+
 
 class _Native:
     """A table as C sees it, and where the pairs go."""
@@ -121,7 +181,11 @@ class _Native:
         """Make room for so many pairs."""
         self.pairs = np.empty((count, 2), dtype=np.int32)
         self.lows = np.empty(count)
+        self.distances, self.witnesses = np.empty(count), np.empty((count, 9))
+        self.order, self.kept = np.empty(count, dtype=np.int64), ctypes.c_int64()
         self.results = self.pairs.ctypes.data, self.lows.ctypes.data, count
+        measured = (array.ctypes.data for array in (self.distances, self.witnesses, self.order))
+        self.everything = count, *self.results[:2], *measured, ctypes.addressof(self.kept)
 
 
 def _native(table: Table) -> _Native:

@@ -3,6 +3,7 @@
 SWEEP = r"""
 #include <math.h>
 #include <stdint.h>
+#include <stdlib.h>
 
 typedef struct {
   int64_t count, moving, bodies, axis;
@@ -11,6 +12,9 @@ typedef struct {
   const double *centre, *half, *radius;
   double *poses, *travel, *place, *low, *high, *bounds;
   int32_t *order;
+  const double *const *corners;
+  const int64_t *corner_count;
+  const double *edges, *round;
 } Table;
 
 #define EXPORT __attribute__((visibility("default")))

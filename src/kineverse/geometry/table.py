@@ -9,12 +9,17 @@ import numpy as np
 import numpy.typing as npt
 
 from .mesh_files import Floats
+from .solids import Core
 
 Indices: TypeAlias = npt.NDArray[np.int32]
 Flags: TypeAlias = npt.NDArray[np.uint8]
 
 MOST_CARRIED = 6000
 """Bounds are carried for so many pieces at most; memory is touched only for pairs that were measured."""
+
+_TAKEN_OVER = (
+    "active", "centre", "half", "radius", "poses", "travel", "corners", "corner_count", "edges", "round"
+)  # fmt: skip
 
 
 @dataclass(eq=False)
@@ -39,6 +44,9 @@ class Table:
         (M,) by how much any point of a piece can have moved since the beginning, at most [m].
     place, low, high
         (M, 3) each: the centre in the world, and the corners of the box around the piece there [m].
+    corners, corner_count, edges, round
+        (M,) the address of a piece's corners, how many these are, -1 for a piece without a core; (M, 3) and
+        (M,) the box and the ball of its core [m]. See :class:`.solids.Core`, which has to outlive this.
     order
         (M,) the moving pieces and then the others, each sorted along ``axis`` when that was last done.
     bounds
@@ -58,6 +66,10 @@ class Table:
     place: Floats = field(init=False)
     low: Floats = field(init=False)
     high: Floats = field(init=False)
+    corners: npt.NDArray[np.uintp] = field(init=False)
+    corner_count: npt.NDArray[np.int64] = field(init=False)
+    edges: Floats = field(init=False)
+    round: Floats = field(init=False)
     order: Indices = field(init=False)
     bounds: Floats | None = field(init=False)
     axis: int = 0
@@ -70,6 +82,8 @@ class Table:
         self.radius, self.travel = np.zeros(count), np.zeros(count)
         self.poses = np.tile(np.eye(4)[:3], (count, 1, 1))
         self.place, self.low, self.high = (np.zeros((count, 3)) for _ in range(3))
+        self.corners, self.corner_count = np.zeros(count, dtype=np.uintp), np.full(count, -1, dtype=np.int64)
+        self.edges, self.round = np.zeros((count, 3)), np.zeros(count)
         self.order = np.arange(count, dtype=np.int32)
         self.bounds = np.zeros((count, count)) if count <= MOST_CARRIED else None
 
@@ -78,9 +92,14 @@ class Table:
         """How many pieces there are."""
         return len(self.body)
 
-    def give_solid(self, piece: int, centre: Floats, half: Floats, radius: float) -> None:
-        """Enter what encloses a piece."""
+    def give_solid(
+        self, piece: int, centre: Floats, half: Floats, radius: float, core: Core | None = None
+    ) -> None:
+        """Enter what encloses a piece, and what it is."""
         self.centre[piece], self.half[piece], self.radius[piece] = centre, half, radius
+        if core is not None:
+            self.corners[piece], self.corner_count[piece] = core.corners.ctypes.data, core.corners.shape[1]
+            self.edges[piece], self.round[piece] = core.half, core.radius
         self.active[piece] = 1
         self.put(np.array([piece]))
 
@@ -94,7 +113,7 @@ class Table:
     def take_over(self, old: Table, kept: npt.NDArray[np.integer[Any]]) -> None:
         """Enter what another table knew of pieces: (K, 2) their numbers here and there."""
         here, there = kept[:, 0], kept[:, 1]
-        for name in ("active", "centre", "half", "radius", "poses", "travel"):
+        for name in _TAKEN_OVER:
             getattr(self, name)[here] = getattr(old, name)[there]
         self.axis = old.axis
         if self.bounds is None or old.bounds is None:
