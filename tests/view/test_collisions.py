@@ -108,6 +108,21 @@ def test_what_is_switched_on_stays_on_over_edits(page):
     assert "40.0 mm" in report(page)
 
 
+def test_edits_while_it_looks_leave_no_trace(page, caplog):
+    page.collisions.show_near(0.3)
+    for k in range(12):
+        with page.model.edit() as edit:
+            cube = Body(collisions=(Shape(Box((0.1, 0.1, 0.1))),))
+            place = kv.translation(0.11 * k, 2, kv.position(f"lift{k}"))
+            edit.add_frame(f"cube{k}", "world", place, cube)
+        page.move({f"lift{k}": 0.01 * k})
+        page.collisions.show_near(0.01 + 0.001 * k, containing="cube")
+    assert page.settled()
+    assert caplog.records == []
+    assert page.collisions.nearness.found == 11
+    assert page.collisions.seen.failure == ""
+
+
 def test_bodies_with_missing_meshes_are_said_to_have_no_distances(tmp_path):
     model = with_mesh("nowhere.stl", str(tmp_path))
     with view(model, port=0) as page:

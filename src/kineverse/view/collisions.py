@@ -28,7 +28,7 @@ LONGEST = 0.2
 LABELS = 8
 """Depths that are written beside their arrows; more would cover what they are about."""
 
-MISSING = "Distances need the extra <code>geometry</code>: pip install 'kineverse-articulation[geometry]'"
+MISSING = boxed(["Distances need the extra <b>geometry</b>: pip install 'kineverse-articulation[geometry]'"])
 
 WAITING = boxed(["<b>Reading shapes …</b>"])
 
@@ -49,60 +49,24 @@ class Collisions:
     def __init__(self, server: Any, scene: Scene, model: ModelView, values: Mapping[str, float]) -> None:
         self._server, self._scene = server, scene
         self._report: Any = None
+        self._shapes: Any = None
         self._controls: tuple[Any, ...] = ()
         self._drawn: dict[str, Any] = {}
         self.seen = Seen()
-        # Controls and the thread that looks write the same report.
-        self._lock = threading.Lock()
+        # Programs, controls and the thread that looks all write to a folder that edits of the model replace.
+        self._lock = threading.RLock()
         self.watch = Watch(model, values, self._show)
 
     def add_folder(self, gui: Any) -> None:
         """Add the controls to a panel; what is switched on stays on."""
-        wanted = self.watch.wanted
-        with gui.add_folder("Collisions", expand_by_default=wanted.on):
-            self._shapes = gui.add_checkbox(
-                "collision shapes",
-                self._scene.collisions_shown,
-                hint="What distances are computed to; bluish where hulls of what is seen stand in.",
-            )
-            self._shapes.on_update(lambda event: self._scene.show_collisions(event.target.value))
-            if not is_installed():
-                self._report = gui.add_html(boxed([MISSING]))
-                return
-            near = gui.add_checkbox("nearest pairs", wanted.on, hint="Lines where bodies are nearest.")
-            radius = gui.add_slider(
-                "within [m]",
-                min=0.0,
-                max=max(WIDEST, wanted.radius),
-                step=0.005,
-                initial_value=wanted.radius,
-                hint="Green lines are that long; the nearer, the redder.",
-            )
-            only = gui.add_text("only", wanted.containing, hint="Only pairs with a name that contains this.")
-            ignored = gui.add_checkbox(
-                "ignored pairs", wanted.ignored, hint="Also pairs that are joined, or excepted by rules."
-            )
-            self._report = gui.add_html("")
-        self._controls = near, radius, only, ignored
-        for control in self._controls:
-            control.on_update(self._set_by_hand)
-        self._tell()
-
-    def _set_by_hand(self, event: Any) -> None:
-        # Values that this program has set come back without a client.
-        if event.client is not None:
-            self.watch.look_for(Wanted(*(control.value for control in self._controls)))
+        with self._lock:
+            self._add_controls(gui, self.watch.wanted)
             self._tell()
 
-    def _set(self, wanted: Wanted) -> None:
-        if not self._controls:  # Without the extra there is nothing to be set.
-            return
-        near, radius, only, ignored = self._controls
-        radius.max = max(WIDEST, wanted.radius)
-        near.value, radius.value, only.value = wanted.on, wanted.radius, wanted.containing
-        ignored.value = wanted.ignored
-        self.watch.look_for(wanted)
-        self._tell()
+    def forget_folder(self) -> None:
+        """Take note that the folder is about to be removed with its panel."""
+        with self._lock:
+            self._report, self._shapes, self._controls = None, None, ()
 
     def show_near(
         self, radius: float | None = RADIUS, *, containing: str = "", ignored: bool = False
@@ -135,8 +99,10 @@ class Collisions:
 
     def show_shapes(self, shown: bool = True) -> None:
         """Show or hide the collision shapes, half transparent."""
-        self._scene.show_collisions(shown)
-        self._shapes.value = shown
+        with self._lock:
+            self._scene.show_collisions(shown)
+            if self._shapes is not None:
+                self._shapes.value = shown
 
     @property
     def nearness(self) -> Nearness | None:
@@ -146,6 +112,51 @@ class Collisions:
     def stop(self) -> None:
         """End what goes on in the background."""
         self.watch.stop()
+
+    def _add_controls(self, gui: Any, wanted: Wanted) -> None:
+        with gui.add_folder("Collisions", expand_by_default=wanted.on):
+            self._shapes = gui.add_checkbox(
+                "collision shapes",
+                self._scene.collisions_shown,
+                hint="What distances are computed to; bluish where hulls of what is seen stand in.",
+            )
+            self._shapes.on_update(lambda event: self._scene.show_collisions(event.target.value))
+            if not is_installed():
+                self._report = gui.add_html("")
+                return
+            near = gui.add_checkbox("nearest pairs", wanted.on, hint="Lines where bodies are nearest.")
+            radius = gui.add_slider(
+                "within [m]",
+                min=0.0,
+                max=max(WIDEST, wanted.radius),
+                step=0.005,
+                initial_value=wanted.radius,
+                hint="Green lines are that long; the nearer, the redder.",
+            )
+            only = gui.add_text("only", wanted.containing, hint="Only pairs with a name that contains this.")
+            ignored = gui.add_checkbox(
+                "ignored pairs", wanted.ignored, hint="Also pairs that are joined, or excepted by rules."
+            )
+            self._report = gui.add_html("")
+        self._controls = near, radius, only, ignored
+        for control in self._controls:
+            control.on_update(self._set_by_hand)
+
+    def _set_by_hand(self, event: Any) -> None:
+        # Values that this program has set come back without a client.
+        if event.client is not None:
+            self.watch.look_for(Wanted(*(control.value for control in self._controls)))
+            self._tell()
+
+    def _set(self, wanted: Wanted) -> None:
+        with self._lock:
+            self.watch.look_for(wanted)
+            if self._controls:
+                near, radius, only, ignored = self._controls
+                radius.max = max(WIDEST, wanted.radius)
+                near.value, radius.value = wanted.on, wanted.radius
+                only.value, ignored.value = wanted.containing, wanted.ignored
+            self._tell()
 
     def _show(self, seen: Seen) -> None:
         """Draw what was seen; called by the thread that looks."""
@@ -163,7 +174,7 @@ class Collisions:
         """Write the report of what was seen last, which is ``new`` if given."""
         with self._lock:
             self.seen = seen = new or self.seen
-            text = ""
+            text = "" if is_installed() else MISSING
             if seen.failure:
                 text = near_failure(seen.failure)
             elif seen.nearness is not None:

@@ -65,7 +65,7 @@ class Panel:
         play: Callable[[bool], None],
     ) -> None:
         self._gui, self._ranges, self._units, self._moved = gui, ranges, units, moved
-        self._orientations, self._driving = orientations, driving
+        self._orientations, self._driving, self._collisions = orientations, driving, collisions
         self._limits = {**ranges.at(values), **orientations.limits}
         self._sliders: dict[str, Any] = {}
         self._speeds: dict[str, Any] = {}
@@ -86,6 +86,7 @@ class Panel:
 
     def remove(self) -> None:
         """Take everything off the page."""
+        self._collisions.forget_folder()
         self._root.remove()
 
     def show(self, status: str) -> None:
