@@ -49,6 +49,7 @@ class Collisions:
     def __init__(self, server: Any, scene: Scene, model: ModelView, values: Mapping[str, float]) -> None:
         self._server, self._scene = server, scene
         self._report: Any = None
+        self._folder: Any = None
         self._shapes: Any = None
         self._controls: tuple[Any, ...] = ()
         self._drawn: dict[str, Any] = {}
@@ -114,7 +115,8 @@ class Collisions:
         self.watch.stop()
 
     def _add_controls(self, gui: Any, wanted: Wanted) -> None:
-        with gui.add_folder("Collisions", expand_by_default=wanted.on):
+        self._folder = gui.add_folder("Collisions", expand_by_default=wanted.on)
+        with self._folder:
             self._shapes = gui.add_checkbox(
                 "collision shapes",
                 self._scene.collisions_shown,
@@ -153,6 +155,7 @@ class Collisions:
             self.watch.look_for(wanted)
             if self._controls:
                 near, radius, only, ignored = self._controls
+                self._folder.expand_by_default = wanted.on  # for whoever opens the page from now on
                 radius.max = max(WIDEST, wanted.radius)
                 near.value, radius.value = wanted.on, wanted.radius
                 only.value, ignored.value = wanted.containing, wanted.ignored
