@@ -34,7 +34,9 @@ NAMES = (
     *words(
         "/ // a/b /a a/ . .. ../x world __model__ __root__ a::b :: a:: ::a % %25 :velocity a:velocity a:5"
     ),
-    *words("ü {} {0} %s a\\b ' \" < & # name None free loop closed first a/free a/x a/qw a/first a_joint"),
+    *words(
+        "ü [ [a] {} {0} %s a\\b ' \" < & # name None free loop closed first a/free a/x a/qw a/first a_joint"
+    ),
     *words("package://p/a.stl file:///etc/passwd model://part http://x/y"),
     *("", " ", "a b", "a\tb", "\n", "\x7f", "\x85", "\u200b", "\u2028", "\u202e", "\ufffe", "$(find x)"),
     *("x" * 90, "y" * 3000, "é" * 100, "\U000e0001" * 400),
