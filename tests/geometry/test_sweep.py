@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from kineverse.geometry import sweep
+from kineverse.geometry.standing import tree_of
 from kineverse.geometry.sweep_native import SweepLibrary
 from kineverse.geometry.table import Table
 
@@ -138,3 +139,38 @@ def test_carried_bounds_spare_the_measuring():
     poses[1, 0, 3] -= 0.3  # back where it was, but that is not known
     sweep.place(table, poses)
     assert len(sweep.near(table, 0.1)[0]) == 1
+
+
+@settings(max_examples=60)
+@given(seed=st.integers(0, 10**6), count=st.integers(0, 70))
+def test_a_tree_has_every_piece_once_below_boxes_that_hold_it(seed, count):
+    rng = np.random.default_rng(seed)
+    low = rng.normal(size=(80, 3)).round(1)  # with some in the same place
+    high = low + rng.uniform(0, 1, (80, 3))
+    pieces = rng.permutation(80)[:count].astype(np.int32)
+    boxes, leaves = tree_of(low, high, pieces)
+    assert len(boxes) == 2 * len(leaves) - 1
+    assert sorted(leaves[leaves >= 0].tolist()) == sorted(pieces.tolist())
+    for number, leaf in enumerate(leaves):
+        assert (np.diff((leaf < 0).astype(int)) >= 0).all()  # those that are none come last
+        node = len(leaves) - 1 + number
+        for piece in leaf[leaf >= 0]:
+            above = node
+            while True:
+                assert (boxes[above, :3] <= low[piece]).all()
+                assert (boxes[above, 3:] >= high[piece]).all()
+                if above == 0:
+                    break
+                above = (above - 1) // 2
+
+
+@pytest.mark.compiler
+def test_what_stands_is_found_where_it_was_put_last(library):
+    cloud = Cloud(5, 12, 2)
+    table = cloud.table
+    for _ in range(3):
+        standing = np.arange(2, 12)
+        table.poses[standing] = cloud.random_poses(10)
+        table.put(standing)
+        found, expected = (_sorted(*way(table, 0.3))[0] for way in (library.near, sweep.near))
+        np.testing.assert_array_equal(found, expected)

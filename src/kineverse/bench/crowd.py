@@ -28,10 +28,11 @@ CAPSULE = 0.03, 0.06
 BOX = 0.06, 0.07, 0.09
 """The edges of a link that is a box [m]."""
 
-# Boxes beyond the first ones stay so far from where the arm is [m].
-_AWAY = 0.6
+# The first boxes stay so far from the middles of the links that nothing touches, others further [m].
+_CLEAR, _AWAY = 0.12, 0.6
 _NEAR_ARM = 60
-_STEP = 0.01
+# Each joint swings by so much, in steps of a tenth of it [rad].
+_SWAY = 0.02
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,24 +103,25 @@ def crowd(boxes: int = _NEAR_ARM, steps: int = 200, seed: int = 0) -> Crowd:
     rng = np.random.default_rng(seed)
     corners = [_rounded(rng.normal(size=(24, 3)) * (0.02, 0.02, 0.028)) for _ in range(LINKS)]
     home = rng.uniform(-0.35, 0.35, LINKS)
-    steps_of_joints = np.cumsum(rng.normal(size=(steps, LINKS)) * _STEP / 3, axis=0)
-    angles = home + np.clip(steps_of_joints, -0.1, 0.1)
-    arm = _positions(home)
-    sizes = _rounded(rng.uniform(0.05, 0.2, (boxes, 3)))
-    rotations = [(rotation_z(a) @ rotation_x(b))() for a, b in rng.uniform(-3, 3, (boxes, 2)).tolist()]
-    places: list[Array] = []
+    phases = rng.uniform(0, 2 * np.pi, LINKS) + np.outer(np.arange(steps), rng.uniform(0.05, 0.15, LINKS))
+    angles = home + _SWAY * np.sin(phases)
+    arm, random = _positions(home), np.random.default_rng(seed + 1)
     span = 1.0 + 0.2 * boxes ** (1 / 3)
-    while len(places) < boxes:
-        if len(places) < _NEAR_ARM:
-            way = rng.normal(size=3)
-            place = arm[rng.integers(LINKS)] + way / np.linalg.norm(way) * rng.uniform(0.17, 0.4)
-        else:
-            place = rng.uniform(-span, span, 3) + arm.mean(axis=0)
-        nearest = float(np.linalg.norm(arm - place, axis=1).min())
-        if nearest > (0.16 if len(places) < _NEAR_ARM else _AWAY):
-            places.append(place)
-    poses = np.array(rotations)
-    poses[:, :3, 3] = places
+    sizes, poses = np.empty((boxes, 3)), np.empty((boxes, 4, 4))
+    for k in range(boxes):
+        clear = _CLEAR if k < _NEAR_ARM else _AWAY
+        while True:
+            size, (yaw, roll) = _rounded(random.uniform(0.05, 0.2, 3)), random.uniform(-3, 3, 2).tolist()
+            pose = (rotation_z(yaw) @ rotation_x(roll))()
+            if k < _NEAR_ARM:
+                way = random.normal(size=3)
+                way *= random.uniform(0.15, 0.28) / np.linalg.norm(way)
+                pose[:3, 3] = arm[random.integers(LINKS)] + way
+            else:
+                pose[:3, 3] = arm.mean(axis=0) + random.uniform(-span, span, 3)
+            if _clearance(arm, size, pose) > clear:
+                break
+        sizes[k], poses[k] = size, pose
     return Crowd(corners, sizes, poses, angles)
 
 
@@ -131,6 +133,12 @@ def _positions(angles: Array) -> Array:
         pose = pose @ translation(0, 0, LINK_LENGTH if link else 0.0)() @ turn()
         found.append(pose[:3] @ (*CENTRE, 1.0))
     return np.array(found)
+
+
+def _clearance(points: Array, size: Array, pose: Array) -> float:
+    """Return how near the nearest of some points is to a box."""
+    inside = (points - pose[:3, 3]) @ pose[:3, :3]
+    return float(np.linalg.norm(np.maximum(np.abs(inside) - size / 2, 0.0), axis=1).min())
 
 
 def _rounded(numbers: Array) -> Array:

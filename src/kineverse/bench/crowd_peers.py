@@ -52,7 +52,7 @@ class OurScene:
 
 
 class PlainCoal:
-    """What one writes around coal: boxes around everything compared in numpy, a functor for each pair.
+    """What one writes around coal: boxes and spheres compared in numpy, a functor for each pair.
 
     Poses come from our compiled function, in place.
     """
@@ -64,6 +64,7 @@ class PlainCoal:
         mirror.ready()
         self._table = table = mirror.table
         self._looked_at = np.triu(table.allowed[table.body[: table.moving, None], table.body] == 1)
+        self._reach = (table.radius[: table.moving, None] + table.radius + RADIUS) ** 2
         self._solids = [mirror.solid(k) for k in range(table.count)]
         self._names = [piece.body for piece in mirror.pieces]
         self._transforms = [coal.Transform3s(pose[:, :3], pose[:, 3]) for pose in table.poses]
@@ -103,7 +104,10 @@ class PlainCoal:
         here = table.low[moving, None] - table.high
         apart = np.maximum(np.maximum(here, table.low - table.high[moving, None]), 0.0)
         gaps = np.einsum("ijk,ijk->ij", apart, apart)
-        first, second = np.nonzero(self._looked_at & (gaps <= RADIUS * RADIUS))
+        between = table.place[moving, None] - table.place
+        centres = np.einsum("ijk,ijk->ij", between, between)
+        near = (gaps <= RADIUS * RADIUS) & (centres <= self._reach) & self._looked_at
+        first, second = np.nonzero(near)
         return zip(first.tolist(), second.tolist(), strict=True)
 
 

@@ -19,7 +19,8 @@ from .robot import PR2
 KITCHENS = ("iai_kitchen/urdf_obj/kitchen.urdf", "kitchen")
 """The kitchen with meshes from the model path, else the one that ships."""
 
-_PLACE = {"base/x": 0.4, "base/y": 1.6}
+# In front of the counters, so that hands are near and nothing is hit.
+_PLACE = {"base/x": 0.2, "base/y": 0.8}
 _STEP, _RANGE = 0.003, 0.3
 
 

@@ -70,7 +70,7 @@ def measure(settings: Settings) -> Result:
         name="geometry",
         work=(
             f"an arm of {LINKS} hulls, boxes and capsules among 60 boxes: all pairs within {RADIUS} m with "
-            f"distance, points and normal, {steps} steps of about 0.003 rad a joint; a query is what comes "
+            f"distance, points and normal, {steps} steps of about 0.002 rad a joint; a query is what comes "
             "after the update of the poses"
         ),
         measurements=tuple(measured.values()),

@@ -20,6 +20,7 @@ from kineverse.compile.worker import Build, request
 from . import sweep
 from .mesh_files import Floats
 from .narrow_source import NARROW
+from .standing import tree_of
 from .sweep_source import SWEEP
 from .table import Indices, Table
 
@@ -39,7 +40,8 @@ Search: TypeAlias = tuple[Indices, Floats, Floats, Floats, npt.NDArray[np.int64]
 class _Struct(ctypes.Structure):
     _fields_ = (
         *((name, ctypes.c_int64) for name in ("count", "moving", "bodies", "axis")),
-        *((name, ctypes.c_void_p) for name in _ARRAYS),
+        *((name, ctypes.c_void_p) for name in (*_ARRAYS, "boxes", "leaves")),
+        ("leaf_count", ctypes.c_int64),
     )
 
 
@@ -177,6 +179,14 @@ class _Native:
         self.address = ctypes.addressof(self.struct)
         self.room(256)
 
+    def stand(self, table: Table) -> None:
+        """Take notice of where the pieces are that stand."""
+        standing = np.arange(table.moving, table.count, dtype=np.int32)
+        self.boxes, self.leaves = tree_of(table.low, table.high, standing)
+        self.struct.boxes, self.struct.leaves = self.boxes.ctypes.data, self.leaves.ctypes.data
+        self.struct.leaf_count = len(self.leaves)
+        table.standing_changed = False
+
     def room(self, count: int) -> None:
         """Make room for so many pairs."""
         self.pairs = np.empty((count, 2), dtype=np.int32)
@@ -193,6 +203,8 @@ def _native(table: Table) -> _Native:
     if native is None:
         native = table.native = _Native(table)
     native.struct.axis = table.axis
+    if table.standing_changed:
+        native.stand(table)
     return native
 
 

@@ -14,7 +14,9 @@ typedef struct {
   int32_t *order;
   const double *const *corners;
   const int64_t *corner_count;
-  const double *edges, *round;
+  const double *edges, *round, *boxes;
+  const int32_t *leaves;
+  int64_t leaf_count;
 } Table;
 
 #define EXPORT __attribute__((visibility("default")))
@@ -112,33 +114,40 @@ static void consider(const Table *t, int64_t one, int64_t other, Answer *answer)
   answer->found++;
 }
 
-/* Considers the pairs of a piece with those of a list, from a place of it on, that begin inside the piece. */
-static void considered(
-    const Table *t, int64_t one, const int32_t *list, int64_t from, int64_t n, Answer *answer) {
-  const double end = t->high[3 * one + t->axis] + answer->reach;
-  for (int64_t k = from; k < n && t->low[3 * list[k] + t->axis] <= end; k++)
-    consider(t, one, list[k], answer);
+/* Considers the pairs of a piece with what stands, going down a tree of boxes; see standing.py. */
+static void considered_standing(const Table *t, int64_t one, Answer *answer) {
+  const double *low = t->low + 3 * one, *high = t->high + 3 * one, reach = answer->reach;
+  int64_t waiting[64] = {0};
+  int depth = 1;
+  while (depth) {
+    const int64_t node = waiting[--depth];
+    const double *box = t->boxes + 6 * node;
+    double gap = 0.0;
+    for (int r = 0; r < 3; r++)
+      gap += square(larger(larger(low[r] - box[3 + r], box[r] - high[r]), 0.0));
+    if (gap > reach * reach) continue;
+    if (node < t->leaf_count - 1) {
+      waiting[depth++] = 2 * node + 1;
+      waiting[depth++] = 2 * node + 2;
+      continue;
+    }
+    const int32_t *leaf = t->leaves + 4 * (node - t->leaf_count + 1);
+    for (int k = 0; k < 4 && leaf[k] >= 0; k++) consider(t, one, leaf[k], answer);
+  }
 }
 
-/* Returns how many pairs there are; only the first `room` of them are written. */
+/* Returns how many pairs there are; only the first `room` of them are written. Of two moving pieces, the one
+   that begins first finds the other. Two that stand still are of no interest. */
 EXPORT int64_t near(Table *t, double reach, int32_t *pairs, double *lows, int64_t room) {
-  const int64_t standing = t->count - t->moving;
-  int32_t *movers = t->order, *rest = t->order + t->moving;
-  sort(t, movers, t->moving);
-  sort(t, rest, standing);
+  sort(t, t->order, t->moving);
   Answer answer = {reach, pairs, lows, room, 0};
-  /* Of two pieces, the one that begins first finds the other. Two that stand still are of no interest. */
-  for (int64_t k = 0, at = 0; k < t->moving; k++) {
-    const double low = t->low[3 * movers[k] + t->axis];
-    while (at < standing && t->low[3 * rest[at] + t->axis] < low) at++;
-    if (!t->active[movers[k]]) continue;
-    considered(t, movers[k], movers, k + 1, t->moving, &answer);
-    considered(t, movers[k], rest, at, standing, &answer);
-  }
-  for (int64_t k = 0, at = 0; k < standing; k++) {
-    const double low = t->low[3 * rest[k] + t->axis];
-    while (at < t->moving && t->low[3 * movers[at] + t->axis] <= low) at++;
-    if (t->active[rest[k]]) considered(t, rest[k], movers, at, t->moving, &answer);
+  for (int64_t k = 0; k < t->moving; k++) {
+    const int32_t one = t->order[k];
+    if (!t->active[one]) continue;
+    const double end = t->high[3 * one + t->axis] + reach;
+    for (int64_t m = k + 1; m < t->moving && t->low[3 * t->order[m] + t->axis] <= end; m++)
+      consider(t, one, t->order[m], &answer);
+    if (t->moving < t->count) considered_standing(t, one, &answer);
   }
   return answer.found;
 }

@@ -48,7 +48,9 @@ class Table:
         (M,) the address of a piece's corners, how many these are, -1 for a piece without a core; (M, 3) and
         (M,) the box and the ball of its core [m]. See :class:`.solids.Core`, which has to outlive this.
     order
-        (M,) the moving pieces and then the others, each sorted along ``axis`` when that was last done.
+        (M,) the moving pieces sorted along ``axis`` when that was last done, and then the others.
+    standing_changed
+        Whether any of the others was put somewhere since somebody took notice.
     bounds
         (M, M) for i < j, the distance when it was measured, plus the travel of both at that time; 0 if it
         never was. Less their travel now it is a lower bound of the distance. None for too many pieces.
@@ -74,6 +76,7 @@ class Table:
     bounds: Floats | None = field(init=False)
     axis: int = 0
     native: Any = None
+    standing_changed: bool = True
 
     def __post_init__(self) -> None:
         count = len(self.body)
@@ -105,6 +108,7 @@ class Table:
 
     def put(self, pieces: npt.NDArray[np.integer[Any]]) -> None:
         """Compute where pieces are from their poses."""
+        self.standing_changed |= bool((pieces >= self.moving).any())
         rotation, position = self.poses[pieces, :, :3], self.poses[pieces, :, 3]
         place = np.einsum("kij,kj->ki", rotation, self.centre[pieces]) + position
         extent = np.einsum("kij,kj->ki", np.abs(rotation), self.half[pieces])
