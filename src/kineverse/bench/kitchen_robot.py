@@ -16,11 +16,10 @@ from kineverse.model.model import Model
 from .agreement import Array
 from .robot import PR2
 
-KITCHENS = ("iai_kitchen/urdf_obj/kitchen.urdf", "kitchen")
-"""The kitchen with meshes from the model path, else the one that ships."""
+KITCHENS = {"iai_kitchen/urdf_obj/kitchen.urdf": (0.3, 1.5), "kitchen": (0.2, 0.8)}
+"""The kitchen with meshes from the model path, else the one that ships; and where the robot stands in it [m]:
+before the counters, so that much is near and hardly anything is hit."""
 
-# In front of the counters, so that hands are near and nothing is hit.
-_PLACE = {"base/x": 0.2, "base/y": 0.8}
 _STEP, _RANGE = 0.003, 0.3
 
 
@@ -49,7 +48,7 @@ class KitchenRobot:
 
 def kitchen_robot(steps: int) -> KitchenRobot:
     """Return the first PR2 and the first kitchen that are found here, with their meshes as hulls."""
-    robot, kitchen = _first(PR2), _first(KITCHENS)
+    robot, kitchen = _first(PR2), _first(tuple(KITCHENS))
     model = Model()
     with model.edit() as edit:
         edit.include(kitchen, "kitchen")
@@ -58,7 +57,8 @@ def kitchen_robot(steps: int) -> KitchenRobot:
         root = next(name for name, frame in model.frames.items() if _is_root(name, frame.parent))
         edit.attach(root, "base", np.eye(4))
     scene = _scene(model)
-    home = {**model.default_state(), **{model.symbol(name): value for name, value in _PLACE.items()}}
+    x, y = KITCHENS[kitchen]
+    home = {**model.default_state(), model.symbol("base/x"): x, model.symbol("base/y"): y}
     start = np.array([home[symbol] for symbol in scene.inputs])
     moving = np.array([symbol.path.startswith("robot/") for symbol in scene.inputs])
     random = np.random.default_rng(0)
