@@ -112,6 +112,10 @@ def opens_files_beside(text, folder):
     return ()
 
 
+def taken_twice(text, folder):
+    return [(None, kv.Fixed(name="j", parent="world", child="l")) for _ in range(2)]
+
+
 def far_away(text, folder):
     far = {"axis": (1, 0, 0), "lower": 1e308, "upper": 1.1e308}
     return [
@@ -132,6 +136,7 @@ def far_away(text, folder):
         (far_away, "broken: a pose is not finite"),
         (another_kind, "broken: an error of another kind, at"),
         (nowhere, "broken: an error without place, at"),
+        (taken_twice, "broken: what was read cannot be applied, at"),
         (opens_files_beside, None),
     ],
 )

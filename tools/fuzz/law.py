@@ -113,11 +113,18 @@ def _model(target: Target, data: bytes, folder: Path, way: Way) -> kv.Model:
         if str(error) and not _FILE.match(str(error)):
             raise BrokenError(f"an error without place, at {_place(error)}: {error}") from error
         raise
+    if not way.loops:
+        operations = [(tag, o) for tag, o in operations if not isinstance(o, kv.CloseLoop)]
     model = kv.Model()
-    with model.edit() as edit:
-        for tag, operation in operations:
-            if way.loops or not isinstance(operation, kv.CloseLoop):
+    try:
+        with model.edit() as edit:
+            for tag, operation in operations:
                 edit.apply(operation, tag)
+    except kv.KineverseError as error:
+        # The reader of a description has seen all of it; of a loop it cannot know whether it closes.
+        if target.finite and not isinstance(operation, kv.CloseLoop):
+            raise BrokenError(f"what was read cannot be applied, at {_place(error)}: {error!r}") from error
+        raise
     return model
 
 
