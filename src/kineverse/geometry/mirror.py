@@ -7,6 +7,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from kineverse.compile.function import compile as compile_expressions
 from kineverse.errors import KineverseError, UnknownNameError, ValueRejectedError, suggest
@@ -241,22 +242,21 @@ class Mirror:
         self, pairs: Indices, lows: Floats, limit: float, distances: Floats, witnesses: Floats
     ) -> None:
         """Have coal measure the pairs whose distance is NaN, see :meth:`measure`."""
-        owners = [(a, b) if a < b else (b, a) for a, b in self.table.body[pairs].tolist()]
-        least: dict[tuple[int, int], float] = {}
-        for key, distance in zip(owners, distances.tolist(), strict=True):
-            if distance < least.get(key, math.inf):
-                least[key] = distance
-        order = np.argsort(lows, kind="stable")
-        for k in order[np.isnan(distances[order])].tolist():
-            # Within the accuracy a pair that comes later may still be the nearest.
-            if lows[k] > least.get(owners[k], math.inf) + ACCURACY:
+        owners = self.table.body[pairs]
+        keys = owners.min(axis=1).astype(np.int64) * len(self.bodies) + owners.max(axis=1)
+        unsolved = np.flatnonzero(np.isnan(distances))
+        # Most bodies have one piece, and then there is nobody to be nearer.
+        nearest = _Nearest(keys, distances) if len(np.unique(keys)) < len(keys) else None
+        for k in unsolved[np.argsort(lows[unsolved], kind="stable")].tolist():
+            if nearest is not None and nearest.is_nearer(k, lows[k]):
                 distances[k] = math.inf
                 continue
             i, j = pairs[k].tolist()
             distances[k], witness = self._measured(i, j, limit)
             if witness is not None:
                 witnesses[k] = witness
-            least[owners[k]] = min(least.get(owners[k], math.inf), distances[k])
+            if nearest is not None:
+                nearest.note(k, distances[k])
 
     def _measured(self, i: int, j: int, limit: float) -> tuple[float, Floats | None]:
         """Return distance and witness of two pieces, i < j, from memory if neither has moved since.
@@ -298,6 +298,25 @@ class Mirror:
         solid = self._solids[piece]
         assert solid is not None
         return solid
+
+
+class _Nearest:
+    """How near the nearest pieces are that are known, by the key of their bodies."""
+
+    def __init__(self, keys: npt.NDArray[np.int64], distances: Floats) -> None:
+        self._keys = keys.tolist()
+        self._least: dict[int, float] = {}
+        for k in np.flatnonzero(~np.isnan(distances)).tolist():
+            self.note(k, distances[k])
+
+    def note(self, k: int, distance: float) -> None:
+        """Take notice of a distance."""
+        key = self._keys[k]
+        self._least[key] = min(self._least.get(key, math.inf), distance)
+
+    def is_nearer(self, k: int, low: float) -> bool:
+        """Whether others are nearer; within the accuracy a pair that comes later may still be the nearest."""
+        return low > self._least.get(self._keys[k], math.inf) + ACCURACY
 
 
 def _names(names: Iterable[str]) -> tuple[str, ...]:
