@@ -299,6 +299,7 @@ def test_suggestions_are_bounded():
         ('<body quat="1e308 2 0 0"/>', 'quat="1e308 2 0 0" has a number beyond 1e+50'),
         ('<body quat="0x1p900 2 0 0"/>', "has a number beyond 1e+50"),
         ('<body pos="1e150 0 0"/>', "has a number beyond 1e+50"),
+        ('<body pos="0 -Infinity 0"/>', "has a number beyond 1e+50"),
         ('<replicate count="2" offset="1e50 0 0"><body pos="1e50 0 0"/></replicate>', "too large (body_pos)"),
     ],
 )
@@ -313,3 +314,17 @@ def test_a_model_to_attach_without_a_file(tmp_path):
     """MuJoCo raised an exception that was unknown to itself."""
     message = loaded(tmp_path, "<mujoco><asset><model/></asset></mujoco>", "input.xml")
     assert message == "input.xml, line 1, <model>: names no file."
+
+
+def test_a_tendon_of_infinite_length(tmp_path):
+    """What its length differs from that at rest was no number."""
+    joint = '<body><joint name="{}"/><geom size="1"/></body>'
+    text = (
+        "<mujoco><worldbody>{}</worldbody><tendon><fixed name='t'><joint joint='{}' coef='{}'/></fixed></tendon>"
+        "<equality><tendon tendon1='t'/></equality></mujoco>"
+    )
+    message = loaded(tmp_path, text.format(joint.format("j"), "j", "Infinity"), "input.xml")
+    assert message == ('input.xml, line 1, <joint>: coef="Infinity" has a number beyond 1e+50.')
+    model = loaded(tmp_path, text.format(joint.format("inf"), "inf", "1"), "input.xml")
+    assert isinstance(model, kv.Model)
+    assert [str(s) for s in model.degrees_of_freedom] == ["inf"]

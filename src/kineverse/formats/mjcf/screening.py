@@ -46,9 +46,27 @@ _ATTRIBUTES = {
     "mesh": ("file", "builtin", "params", "content_type"),
 }
 _INLINE = ("vertex", "normal", "texcoord", "face")
-_NAMES = frozenset(("name", "class", "childclass", "prefix", "file"))
+_NAMES = frozenset(
+    (
+        *(
+            "name",
+            "class",
+            "childclass",
+            "prefix",
+            "file",
+            "model",
+            "mesh",
+            "material",
+            "body",
+            "body1",
+            "body2",
+        ),
+        *("joint", "joint1", "joint2", "jointinparent", "tendon", "tendon1", "tendon2", "geom", "actuator"),
+        *("site", "site1", "site2", "sidesite", "refsite", "cranksite", "slidersite", "target"),
+    )
+)
 _NOT_NUMBERS = frozenset(("nan", "+nan", "-nan"))
-_LARGE = re.compile(r"e\+?\d\d|\d{40}|0x", re.IGNORECASE)
+_LARGE = re.compile(r"e\+?\d\d|\d{40}|0x|inf", re.IGNORECASE)
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,13 +105,10 @@ def screen(root: Node, note: Callable[[Node, str], None]) -> dict[Node, MeshFile
 def _check_numbers(node: Node, key: str, value: str) -> None:
     if not _NOT_NUMBERS.isdisjoint(value.lower().split()):
         node.refuse(f"{key}={quote(value)} has a NaN, where a number is expected.")
-    # Squares of larger ones overflow inside of MuJoCo. As a limit they may say that there is none.
-    if (
-        key != "count"
-        and not key.endswith("range")
-        and _LARGE.search(value)
-        and any(map(_is_large, value.split()))
-    ):
+    if key == "count" or key.endswith("range"):  # as a limit they may say that there is none
+        return
+    # Squares of larger ones overflow inside of MuJoCo.
+    if _LARGE.search(value) and any(map(_is_large, value.split())):
         node.refuse(f"{key}={quote(value)} has a number beyond {LARGEST:g}.")
 
 
@@ -104,7 +119,8 @@ def _is_large(word: str) -> bool:
         return True
     except ValueError:  # MuJoCo says so
         return False
-    return LARGEST < abs(number) < math.inf
+    # What is only too long a number MuJoCo refuses itself.
+    return abs(number) > LARGEST and (number < math.inf or "inf" in word.lower())
 
 
 def _is_left_out(node: Node, unwanted: frozenset[str], note: Callable[[Node, str], None]) -> bool:
