@@ -153,8 +153,8 @@ static double measured(const Table *t, int64_t i, int64_t j, double limit, doubl
   const double *p = t->place + 3 * i, *q = t->place + 3 * j;
   Vector v = turned(at_a, 1, 4, (Vector){{q[0] - p[0], q[1] - p[1], q[2] - p[2]}});
   Simplex s;
-  Part part;
-  s.n = part.n = 0;
+  Part part = {0};
+  s.n = 0;
   double high = INFINITY, best = -INFINITY;
   for (int step = 0; step < STEPS; step++) {
     const double length = sqrt(dot(v, v));
