@@ -299,6 +299,12 @@ def test_suggestions_are_bounded():
         ('<body quat="1e308 2 0 0"/>', 'quat="1e308 2 0 0" has a number beyond 1e+50'),
         ('<body quat="0x1p900 2 0 0"/>', "has a number beyond 1e+50"),
         ('<body pos="1e150 0 0"/>', "has a number beyond 1e+50"),
+        # The first position within the limits was so far away that the pose of the body was infinite.
+        (
+            '<body><joint type="slide" range="1e300 1e305"/><geom size="1"/></body>',
+            "all of its numbers beyond",
+        ),
+        ('<body><joint range="-1e305 -1e300"/><geom size="1"/></body>', "all of its numbers beyond 1e+50"),
         ('<body pos="0 -Infinity 0"/>', "has a number beyond 1e+50"),
         ('<replicate count="2" offset="1e50 0 0"><body pos="1e50 0 0"/></replicate>', "too large (body_pos)"),
     ],
@@ -314,6 +320,14 @@ def test_a_model_to_attach_without_a_file(tmp_path):
     """MuJoCo raised an exception that was unknown to itself."""
     message = loaded(tmp_path, "<mujoco><asset><model/></asset></mujoco>", "input.xml")
     assert message == "input.xml, line 1, <model>: names no file."
+
+
+def test_the_largest_double_is_no_range_to_speak_of(tmp_path):
+    joint = '<joint type="slide" range="-1.7e308 1.7e308"/>'
+    text = f"<mujoco><worldbody><body name='a'>{joint}<geom size='1'/></body></worldbody></mujoco>"
+    model = loaded(tmp_path, text, "input.xml")
+    assert isinstance(model, kv.Model)
+    assert (model.fk("a")(model.default_state()) == np.eye(4)).all()
 
 
 def test_a_tendon_of_infinite_length(tmp_path):

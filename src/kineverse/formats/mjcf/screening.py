@@ -105,10 +105,15 @@ def screen(root: Node, note: Callable[[Node, str], None]) -> dict[Node, MeshFile
 def _check_numbers(node: Node, key: str, value: str) -> None:
     if not _NOT_NUMBERS.isdisjoint(value.lower().split()):
         node.refuse(f"{key}={quote(value)} has a NaN, where a number is expected.")
-    if key == "count" or key.endswith("range"):  # as a limit they may say that there is none
+    if key == "count" or not _LARGE.search(value):
         return
+    words = value.split()
+    if key.endswith("range"):  # the largest numbers may say that there is no limit
+        above = not words[0].startswith("-") and _is_large(words[0])
+        if above or (words[-1].startswith("-") and _is_large(words[-1])):
+            node.refuse(f"{key}={quote(value)} has all of its numbers beyond {LARGEST:g}.")
     # Squares of larger ones overflow inside of MuJoCo.
-    if _LARGE.search(value) and any(map(_is_large, value.split())):
+    elif any(map(_is_large, words)):
         node.refuse(f"{key}={quote(value)} has a number beyond {LARGEST:g}.")
 
 
