@@ -85,9 +85,12 @@ def number(random: Random) -> str:
 
 def numbers(random: Random, count: int) -> str:
     """Return the texts of so many numbers."""
-    if random.random() < 0.1:
+    if random.random() < 0.05:
         return values.numbers(random, count)
-    return " ".join(f"{random.uniform(-2, 2):.3g}" for _ in range(count))
+    usual = [f"{random.uniform(-2, 2):.3g}" for _ in range(count)]
+    if random.random() < 0.03:
+        usual[random.randrange(count)] = random.choice(values.EXTREME)
+    return " ".join(usual)
 
 
 def size(random: Random) -> str:
@@ -183,7 +186,7 @@ def _body(random: Random, body: str, inside: str) -> str:
 def _joint_settings(random: Random) -> dict[str, str]:
     low, high = sorted((random.uniform(-3, 3), random.uniform(-3, 3)))
     choices = {
-        "range": f"{low} {high}" if random.random() < 0.95 else numbers(random, 2),
+        "range": f"{low} {high}" if random.random() < 0.9 else _range(random),
         "ref": number(random),
         "damping": size(random),
         "stiffness": size(random),
@@ -194,6 +197,11 @@ def _joint_settings(random: Random) -> dict[str, str]:
         "actuatorfrcrange": f"-1 {size(random)}",
     }
     return {k: v for k, v in choices.items() if random.random() < (0.4 if k == "range" else 0.07)}
+
+
+def _range(random: Random) -> str:
+    """Return two numbers of any size, the smaller one first."""
+    return " ".join(sorted(random.choices((*values.EXTREME, "-inf", "inf", "2"), k=2), key=float))
 
 
 def _joint(random: Random, joint: str) -> str:
