@@ -342,3 +342,15 @@ def test_a_tendon_of_infinite_length(tmp_path):
     model = loaded(tmp_path, text.format(joint.format("inf"), "inf", "1"), "input.xml")
     assert isinstance(model, kv.Model)
     assert [str(s) for s in model.degrees_of_freedom] == ["inf"]
+
+
+def test_a_coordinate_that_depends_on_itself_in_a_gradient_only():
+    """To carry it never ended."""
+    nodes = [
+        ["symbol", "x", 0, "dof"],
+        ["symbol", "y", 0, "dof"],
+        ["symbol", "y", 1, "dof"],
+        ["augment", 1, False, False, [[2, 0]]],
+    ]
+    with pytest.raises(kv.ModelError, match="Coordinates that depend on themselves: x -> x"):
+        built(document(nodes, {"rates": {"x": [0, 3]}}))

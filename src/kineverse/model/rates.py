@@ -110,9 +110,9 @@ class Rates(Mapping[Symbol, Mapping[Symbol, Expression]]):
         self._carried: dict[Symbol, Expression] = {}
         expressions = {x: e for x, e in self._given.items() if isinstance(e, Expression)}
         self.dependent = dict[Symbol, Expression]()
-        for x in _in_order(
-            expressions, lambda x: [s for s in expressions[x].symbols if s in expressions], _DEPENDING
-        ):
+        # Symbols of gradients count, too: what is carried is carried in them.
+        made_of = {x: sorted(all_symbols(e) & expressions.keys(), key=str) for x, e in expressions.items()}
+        for x in _in_order(expressions, made_of.__getitem__, _DEPENDING):
             self.dependent[x] = self.resolve(expressions[x])
         rows = {x: self._expanded(e) for x, e in self._given.items() if not isinstance(e, Expression)}
         paths = {x.path for x in rows}
