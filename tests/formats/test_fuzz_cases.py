@@ -15,6 +15,7 @@ import kineverse as kv
 from kineverse.errors import suggest
 from kineverse.formats.document import document_of, operations_from
 from kineverse.formats.markup import abbreviate, quote
+from kineverse.formats.packages import locate
 
 INVISIBLE = "\U000e0001"
 """A character of ten in the escaped form that messages show."""
@@ -354,3 +355,27 @@ def test_a_coordinate_that_depends_on_itself_in_a_gradient_only():
     ]
     with pytest.raises(kv.ModelError, match="Coordinates that depend on themselves: x -> x"):
         built(document(nodes, {"rates": {"x": [0, 3]}}))
+
+
+@pytest.mark.parametrize(
+    ("name", "text"),
+    [
+        ("input.sdf", '<sdf version="1.7"><include><uri>{}</uri></include></sdf>'),
+        ("input.sdf", '<sdf version="1.7"><include><uri>model://{}/a.sdf</uri></include></sdf>'),
+        ("input.xml", '<mujoco><worldbody><include file="{}"/></worldbody></mujoco>'),
+        ("input.xml", '<mujoco><asset><model file="{}.xml"/></asset></mujoco>'),
+    ],
+)
+def test_files_whose_names_are_too_long_for_any(tmp_path, name, text):
+    message = loaded(tmp_path, text.format("9" * 300), name)
+    assert isinstance(message, str)
+    assert message.startswith(f"{name}, line 1, <")
+    assert len(message) < 2000
+
+
+def test_a_mesh_file_whose_name_is_too_long_for_any(tmp_path):
+    mesh = f'<asset><mesh name="m" file="{"9" * 300}.stl"/></asset>'
+    body = '<worldbody><body name="b"><geom type="mesh" mesh="m"/></body></worldbody>'
+    assert isinstance(loaded(tmp_path, f"<mujoco>{mesh}{body}</mujoco>", "input.xml"), kv.Model)
+    with pytest.raises(kv.FormatError, match="there is no such file"):
+        locate("9" * 300 + ".stl", tmp_path)

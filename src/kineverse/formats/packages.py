@@ -114,7 +114,7 @@ def _packaged(uri: str, rest: str, folder: Folder, search: Sequence[Folder]) -> 
         for package in _folders_of(name, Path(folder), search, trail):
             for parts in insides:
                 path = package.joinpath(*parts)
-                if path.is_file():
+                if os.path.isfile(path):
                     return path
             trail.without_file.append(package)
     raise FormatError(_miss(uri, name, inside, trail))
@@ -251,14 +251,14 @@ def _file(uri: str, folder: Folder, search: Sequence[Folder]) -> Path:
         )
     literal = uri.partition("://")[2].removeprefix("localhost")
     path = Path(literal)
-    return path if path.is_file() else _plain(unquote(literal), folder, search)
+    return path if os.path.isfile(path) else _plain(unquote(literal), folder, search)
 
 
 def _plain(text: str, folder: Folder, search: Sequence[Folder]) -> Path:
     path = Path(text)
     tried = [Path(folder).absolute() / path, *(Path(place).absolute() / path for place in search)]
     for candidate in tried:
-        if candidate.is_file():
+        if os.path.isfile(candidate):  # which is no for a name that is too long, and no error
             return candidate
     where = ", ".join(str(candidate) for candidate in dict.fromkeys(tried))
     hint = "" if path.is_absolute() else " Paths are relative to the folder of the description."

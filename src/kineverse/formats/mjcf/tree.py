@@ -6,6 +6,7 @@ folder of the file and nowhere else.
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -130,7 +131,7 @@ def find_below(node: Node, name: str, top: str, *places: str) -> Path:
         path = (Path(place) / name).resolve()
         if not path.is_relative_to(Path(top).resolve()):
             outside = True
-        elif path.is_file():
+        elif os.path.isfile(path):  # which is no for a name that is too long, and no error
             return path
     return node.refuse(
         f"names {quote(name)}, which leads out of the folder of the file. That is refused."

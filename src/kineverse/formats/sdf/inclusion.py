@@ -77,9 +77,9 @@ def find_included(uri: str, folder: str) -> Path:
 
 
 def _is_model(path: Path) -> bool:
-    if path.is_dir():
+    if os.path.isdir(path):  # which is no for a name that is too long, and no error
         return (path / "model.config").is_file() or (path / "model.sdf").is_file()
-    return path.suffix in _FILES and path.is_file()
+    return path.suffix in _FILES and os.path.isfile(path)
 
 
 def _model_file(folder: Path) -> Path:
@@ -95,7 +95,7 @@ def _model_file(folder: Path) -> Path:
     path = folder / name
     if not path.resolve().is_relative_to(folder.resolve()):
         raise FormatError(f"{quote(str(manifest))} names {quote(name)}, which is outside of its folder.")
-    if not path.is_file():
+    if not os.path.isfile(path):
         raise FormatError(f"{quote(str(manifest))} names {quote(name)}, and there is no such file.")
     return path
 
