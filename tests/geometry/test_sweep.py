@@ -174,3 +174,11 @@ def test_what_stands_is_found_where_it_was_put_last(library):
         table.put(standing)
         found, expected = (_sorted(*way(table, 0.3))[0] for way in (library.near, sweep.near))
         np.testing.assert_array_equal(found, expected)
+
+
+def test_a_tree_of_nothing_holds_nothing():
+    """A scene may have no piece that can be used."""
+    corners = np.empty((0, 3))
+    boxes, leaves = tree_of(corners, corners, np.empty(0, dtype=np.int32))
+    assert (leaves == -1).all()
+    assert (boxes[:, :3] > boxes[:, 3:]).all()

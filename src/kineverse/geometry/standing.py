@@ -43,9 +43,10 @@ def tree_of(low: Floats, high: Floats, pieces: Indices) -> tuple[Floats, Indices
         half = (len(some) + 1) // 2
         parts += [(order[:half], first, width // 2), (order[half:], first + width // 2, width // 2)]
     boxes = np.empty((2 * count - 1, 6))
-    there = (leaves >= 0)[:, :, None]
-    boxes[count - 1 :, :3] = np.where(there, low[leaves], np.inf).min(axis=1)
-    boxes[count - 1 :, 3:] = np.where(there, high[leaves], -np.inf).max(axis=1)
+    # A row more, which -1 finds: the box around nothing. There may be no piece at all.
+    nothing = np.full((1, 3), np.inf)
+    boxes[count - 1 :, :3] = np.concatenate([low, nothing])[leaves].min(axis=1)
+    boxes[count - 1 :, 3:] = np.concatenate([high, -nothing])[leaves].max(axis=1)
     for k in range(count - 2, -1, -1):
         one, other = boxes[2 * k + 1], boxes[2 * k + 2]
         boxes[k, :3], boxes[k, 3:] = np.minimum(one[:3], other[:3]), np.maximum(one[3:], other[3:])
