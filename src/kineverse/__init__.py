@@ -60,7 +60,6 @@ from .expressions import Expression, array, total_derivative
 from .expressions.functions import clip, maximum, minimum, norm, where
 from .expressions.piecewise import spline
 from .formats import load, shipped_models
-from .formats.document import document_hash, from_bytes, to_bytes
 from .locks import blocked_unless, limit_table, unlocked_while
 from .logic import less, logic_and, logic_not, logic_or
 from .loops import CloseLoop
@@ -104,6 +103,7 @@ from .symbols import Symbol, parameter, position, symbol, velocity
 
 if TYPE_CHECKING:
     from . import geometry, reasoning
+    from .formats.document import document_hash, from_bytes, to_bytes
 
 __all__ = [
     "Ackermann",
@@ -219,8 +219,14 @@ __all__ = [
 
 
 def __getattr__(name: str) -> object:
-    if name in ("geometry", "reasoning"):
-        import importlib
+    import importlib
 
+    if name in ("geometry", "reasoning"):
         return importlib.import_module(f"kineverse.{name}")
+    if name in ("document_hash", "from_bytes", "to_bytes"):
+        return getattr(importlib.import_module("kineverse.formats.document"), name)
     raise AttributeError(f"module 'kineverse' has no attribute {name!r}")
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

@@ -18,7 +18,6 @@ from kineverse.model.model import Model, Snapshot
 from kineverse.model.operation import Operation
 from kineverse.shipped.bases import base_of
 
-from .document import operations_from, operations_unpacked
 from .files import read_file
 from .markup import root_tag
 from .prefixes import check_prefix
@@ -130,8 +129,12 @@ def _operations(source: Source, content: bytes, prefix: str | None) -> Iterator[
         for operation in gallery.operations(name, prefix):
             yield operation.default_tag(), operation
     elif name.endswith(".kv.json"):
+        from .document import operations_from  # nor does every process read a document
+
         yield from operations_from(content, str(path), prefix)
     elif name.endswith(".kv.msgpack"):
+        from .document import operations_unpacked
+
         yield from operations_unpacked(content, str(path), prefix)
     elif _is_mjcf(name, content):
         from .mjcf.operations import scene_operations as mjcf_operations
