@@ -2,7 +2,8 @@
 
 ``import kineverse as kv`` gives the whole public face: symbols and expressions (layer 1), :func:`compile`
 (layer 2), models, operations and :func:`load` (layer 3). Articulations are in :mod:`kineverse.articulations`;
-:mod:`kineverse.geometry` (layer 4) and :mod:`kineverse.reasoning` (layer 5) are imported when they are used.
+:mod:`kineverse.geometry` (layer 4), :mod:`kineverse.estimation` and :mod:`kineverse.reasoning` (layer 5) are
+imported when they are used.
 """
 
 from typing import TYPE_CHECKING
@@ -102,7 +103,7 @@ from .state import State
 from .symbols import Symbol, parameter, position, symbol, velocity
 
 if TYPE_CHECKING:
-    from . import geometry, reasoning
+    from . import estimation, geometry, reasoning
     from .formats.document import document_hash, from_bytes, to_bytes
 
 __all__ = [
@@ -181,6 +182,7 @@ __all__ = [
     "compile",
     "difference",
     "document_hash",
+    "estimation",
     "from_bytes",
     "geometry",
     "inverse",
@@ -221,7 +223,7 @@ __all__ = [
 def __getattr__(name: str) -> object:
     import importlib
 
-    if name in ("geometry", "reasoning"):
+    if name in ("estimation", "geometry", "reasoning"):
         return importlib.import_module(f"kineverse.{name}")
     if name in ("document_hash", "from_bytes", "to_bytes"):
         return getattr(importlib.import_module("kineverse.formats.document"), name)

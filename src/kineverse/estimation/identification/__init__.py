@@ -1,0 +1,1 @@
+"""The model of parts that move, from noisy poses."""

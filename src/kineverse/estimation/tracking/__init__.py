@@ -1,0 +1,1 @@
+"""The state of a model that is known, from noisy observations."""
