@@ -1,0 +1,155 @@
+"""What was seen of parts: their poses or positions, in the order in which they were seen."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from kineverse.errors import FormatError, UnknownNameError, suggest
+from kineverse.model.frame import WORLD
+
+Array = npt.NDArray[np.float64]
+Indices = npt.NDArray[np.intp]
+
+
+@dataclass(frozen=True, eq=False)
+class Track:
+    """What was seen of one part.
+
+    Attributes
+    ----------
+    poses
+        (N, 4, 4) in the observer's frame [m]; (N, 3) where only positions were seen.
+    rows
+        (N,) which rows of the table these were: parts of one row were seen at one time.
+    lines
+        (N,) the lines of the file.
+    times
+        (N,) [s], None if the table has none.
+    """
+
+    poses: Array
+    rows: Indices
+    lines: Indices
+    times: Array | None = None
+
+    @property
+    def has_orientation(self) -> bool:
+        """Whether whole poses were seen, rather than positions."""
+        return self.poses.ndim == 3
+
+    def __len__(self) -> int:
+        return len(self.poses)
+
+
+@dataclass(frozen=True, eq=False)
+class Pair:
+    """Two parts at the times when both were seen.
+
+    Attributes
+    ----------
+    parent, child
+        Their names.
+    parent_poses
+        (N, 4, 4); None for the world, which is known exactly.
+    child_poses
+        (N, 4, 4) or (N, 3).
+    lines
+        (N,) where the child's are in the file.
+    alone
+        How often one of them was seen without the other.
+    """
+
+    parent: str
+    child: str
+    parent_poses: Array | None
+    child_poses: Array
+    lines: Indices
+    alone: int = 0
+
+
+@dataclass(frozen=True, eq=False)
+class Recording:
+    """The tracks of a table.
+
+    Attributes
+    ----------
+    source
+        What the file is called in messages.
+    tracks
+        By the name of the part; a table that names none has one, called "".
+    ignored
+        Columns that mean nothing here.
+    """
+
+    source: str
+    tracks: Mapping[str, Track]
+    ignored: tuple[str, ...] = ()
+
+    def pair(self, parent: str = WORLD, child: str | None = None) -> Pair:
+        """Return two parts at the times when both were seen.
+
+        Parameters
+        ----------
+        parent
+            Its name; ``world``, unless a part is called so, for the frame in which everything was seen.
+        child
+            Its name; None for the only other part. A table that names no part has one, of any name.
+
+        Raises
+        ------
+        UnknownNameError
+            If there is no such part, or several could be meant.
+        FormatError
+            If the parent's orientation was not seen, or the two were never seen together.
+        """
+        others = [name for name in self.tracks if name != parent]
+        if child is None:
+            if len(others) != 1:
+                raise UnknownNameError(
+                    f"{self.source}: which part moves? There are {_listed(others)}; name one as the child."
+                )
+            child = others[0]
+        track = self._track(child)
+        if child == parent and parent in self.tracks:
+            raise UnknownNameError(f"{self.source}: parent and child are both '{parent}'.")
+        name = child or "part"
+        if parent == WORLD and WORLD not in self.tracks:
+            return Pair(parent, name, None, track.poses, track.lines)
+        return self._together(parent, name, self._track(parent), track)
+
+    def _track(self, name: str) -> Track:
+        if list(self.tracks) == [""] and name != WORLD:
+            return self.tracks[""]
+        if name not in self.tracks:
+            raise UnknownNameError(
+                f"{self.source} has no part '{name}'. {suggest(name, self.tracks, 'part')}"
+            )
+        return self.tracks[name]
+
+    def _together(self, parent: str, child: str, a: Track, b: Track) -> Pair:
+        if not a.has_orientation:
+            raise FormatError(
+                f"{self.source}: only positions of the parent '{parent}' were seen. How something moves in a "
+                "part's frame can only be told if its orientation is known."
+            )
+        # Times where there are some; else the rows, which in a table of a part per row pair nothing.
+        timed = a.times is not None and b.times is not None
+        keys = [np.asarray(track.times if timed else track.rows) for track in (a, b)]
+        _, of_a, of_b = np.intersect1d(keys[0], keys[1], assume_unique=True, return_indices=True)
+        if not len(of_a) and not timed and len(a) == len(b):
+            of_a = of_b = np.arange(len(a))
+        if not len(of_a):
+            raise FormatError(
+                f"{self.source}: '{parent}' and '{child}' were never seen at the same time; "
+                "a pose of both with the same time is expected."
+            )
+        alone = len(a) + len(b) - 2 * len(of_a)
+        return Pair(parent, child, a.poses[of_a], b.poses[of_b], b.lines[of_b], alone)
+
+
+def _listed(names: list[str]) -> str:
+    return ", ".join(f"'{name}'" for name in names[:12]) or "none"
