@@ -101,6 +101,7 @@ def test_the_command_answers_with_one_object(tmp_path, monkeypatch, capsys):
     [
         (["reproduce"], "There are: fig3"),
         (["reproduce", "fig"], "Did you mean 'fig3'"),
+        (["reproduce", "fig3", "--quick"], "'fig3' takes no --quick. It takes none."),
         (["reproduce", "fig3", "--figure", "nowhere/door.png"], "cannot be written to 'nowhere/door.png'"),
         (["reproduce", "fig3", "--figure", "door.what"], "cannot be written to 'door.what'"),
     ],

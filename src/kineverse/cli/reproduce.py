@@ -27,6 +27,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     parser.add_argument("name", metavar="NAME", nargs="?", help="which experiment, see --list")
     parser.add_argument("--list", action="store_true", help="say what each experiment is about, and end")
+    parser.add_argument("--quick", action="store_true", help="a part of it, in seconds")
+    parser.add_argument("--data", metavar="FOLDER", type=Path, help="where the recordings are that it needs")
+    parser.add_argument("--model", metavar="MODEL", help="the model that it is about, a name or path")
     parser.add_argument("--figure", metavar="FILE", type=Path, help="where the figure goes (NAME.png)")
     parser.add_argument("--no-figure", action="store_true", help="draw nothing")
     parser.add_argument("--json", action="store_true", help="one JSON object on standard output")
@@ -34,7 +37,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Run the experiment, print its tables, write its figure."""
-    from kineverse.experiments import EXPERIMENTS, reproduce
+    from kineverse.experiments import EXPERIMENTS, Options, reproduce
 
     if arguments.list:
         listing = dict(EXPERIMENTS)
@@ -42,7 +45,8 @@ def run(arguments: argparse.Namespace) -> int:
         return 0
     if arguments.name is None:
         raise UnknownNameError(f"Which experiment? There are: {', '.join(EXPERIMENTS)}.")
-    report = reproduce(arguments.name, progress)
+    options = Options(quick=arguments.quick, data=arguments.data, model=arguments.model)
+    report = reproduce(arguments.name, progress, options)
     drawn = None
     if not arguments.no_figure:
         drawn = arguments.figure or Path(f"{report.name}.png")

@@ -20,6 +20,7 @@ from kineverse.model.frame import WORLD
 from kineverse.model.model import Model
 from kineverse.spatial import point
 
+from .options import Options
 from .registry import Progress
 from .report import Figure, Report, Table
 
@@ -27,6 +28,8 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure as Canvas
 
 Array = npt.NDArray[np.float64]
+
+OPTIONS = ()
 
 LENGTH = 2.0
 PARTS = {"A": 0.0, "25 %": 0.25, "50 %": 0.5, "75 %": 0.75, "B": 1.0}
@@ -58,7 +61,7 @@ class Measured:
     regular: Array
 
 
-def run(progress: Progress) -> Report:
+def run(progress: Progress, options: Options) -> Report:
     """Evaluate the door and its lock where the paper does."""
     published, regular = _door("published"), _door("regular")
     paths = {
