@@ -89,10 +89,25 @@ def test_the_command_prints_tables_and_writes_the_figure(tmp_path, monkeypatch, 
 
 def test_the_command_answers_with_one_object(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
-    assert main(["reproduce", "fig3", "--json", "--no-figure"]) == 0
+    assert main(["reproduce", "fig3", "--json"]) == 0
     answer = json.loads(capsys.readouterr().out)
     assert answer["figure"] is None
     assert answer["length"] == 2
+    assert not list(tmp_path.iterdir())
+
+
+def test_with_json_a_figure_is_written_where_it_is_said(tmp_path, monkeypatch, capsys):
+    pytest.importorskip("matplotlib")
+    monkeypatch.chdir(tmp_path)
+    assert main(["reproduce", "fig3", "--json", "--figure", "door.svg"]) == 0
+    assert json.loads(capsys.readouterr().out)["figure"] == "door.svg"
+    assert [file.name for file in tmp_path.iterdir()] == ["door.svg"]
+
+
+def test_without_a_figure_nothing_is_written(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    assert main(["reproduce", "fig3", "--no-figure"]) == 0
+    assert "The figure" not in capsys.readouterr().out
     assert not list(tmp_path.iterdir())
 
 

@@ -20,7 +20,7 @@ examples:
   kineverse reproduce --list
   kineverse reproduce fig3
   kineverse reproduce fig3 --figure door.svg
-  kineverse reproduce fig3 --json --no-figure"""
+  kineverse reproduce fig3 --json"""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -30,8 +30,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--quick", action="store_true", help="a part of it, in seconds")
     parser.add_argument("--data", metavar="FOLDER", type=Path, help="where the recordings are that it needs")
     parser.add_argument("--model", metavar="MODEL", help="the model that it is about, a name or path")
-    parser.add_argument("--figure", metavar="FILE", type=Path, help="where the figure goes (NAME.png)")
-    parser.add_argument("--no-figure", action="store_true", help="draw nothing")
+    figure = parser.add_mutually_exclusive_group()
+    figure.add_argument(
+        "--figure", metavar="FILE", type=Path, help="where the figure goes (NAME.png; with --json: nowhere)"
+    )
+    figure.add_argument("--no-figure", action="store_true", help="draw nothing")
     parser.add_argument("--json", action="store_true", help="one JSON object on standard output")
 
 
@@ -47,9 +50,8 @@ def run(arguments: argparse.Namespace) -> int:
         raise UnknownNameError(f"Which experiment? There are: {', '.join(EXPERIMENTS)}.")
     options = Options(quick=arguments.quick, data=arguments.data, model=arguments.model)
     report = reproduce(arguments.name, progress, options)
-    drawn = None
-    if not arguments.no_figure:
-        drawn = arguments.figure or Path(f"{report.name}.png")
+    drawn = _where(arguments, report.name)
+    if drawn:
         report.figure.save(drawn)
     if arguments.json:
         answer = {
@@ -64,6 +66,14 @@ def run(arguments: argparse.Namespace) -> int:
     if drawn:
         print(f"\nThe figure is in {drawn}.")
     return 0
+
+
+def _where(arguments: argparse.Namespace, name: str) -> Path | None:
+    """Return where the figure goes: a program that asks for numbers gets no files it did not ask for."""
+    if arguments.no_figure:
+        return None
+    given: Path | None = arguments.figure
+    return given if given or arguments.json else Path(f"{name}.png")
 
 
 def as_text(report: Report) -> str:
