@@ -148,23 +148,19 @@ class PublishedFilter:
         ShapeError
             If the poses have another shape.
         ValueRejectedError
-            If they contain NaN, if there is no R yet, or if S is singular. The authors' code passes over an
-            observation then. Nothing has changed in all three cases.
+            If they contain NaN, if there is no R yet, if S is singular (the authors' code passes over an
+            observation then), or if the model has no value at q. The belief is what it was before.
         """
         z = self._taken(poses, self._lead)
-        if not self._started:
-            self._step_towards(z)
-            self._started = True
-            return self.q.copy()
-        q, covariances = self.q.copy(), []
-        for group, h, H in self._measured(q):
-            gain = group.gain(H)
-            y = z[..., group.rows] - h
-            q[..., group.columns] += (gain @ y[..., None])[..., 0]
-            covariances.append(group.covariance - gain @ H @ group.covariance)
+        q, covariances = self._updated(z) if self._started else self._begun(z)
+        if not np.isfinite(q).all():
+            raise ValueRejectedError(
+                f"The step from {', '.join(map(str, self.symbols))} = {self.q} leads nowhere: this filter is "
+                "not kept within limits, and beyond them the model need not mean anything."
+            )
         for group, covariance in zip(self._groups, covariances, strict=True):
             group.covariance = covariance
-        self.q = q
+        self.q, self._started = q, True
         return q.copy()
 
     @property
@@ -176,11 +172,22 @@ class PublishedFilter:
             found[..., group.columns[:, None], group.columns] = group.covariance
         return found
 
-    def _step_towards(self, z: Array) -> None:
+    def _begun(self, z: Array) -> tuple[Array, list[Array]]:
+        q = self.q.copy()
         for _ in range(self._steps):
-            for group, h, H in self._measured(self.q):
+            for group, h, H in self._measured(q):
                 y = z[..., group.rows] - h
-                self.q[..., group.columns] += STEP_SIZE * (np.swapaxes(H, -1, -2) @ y[..., None])[..., 0]
+                q[..., group.columns] += STEP_SIZE * (np.swapaxes(H, -1, -2) @ y[..., None])[..., 0]
+        return q, [group.covariance for group in self._groups]
+
+    def _updated(self, z: Array) -> tuple[Array, list[Array]]:
+        q, covariances = self.q.copy(), []
+        for group, h, H in self._measured(q):
+            gain = group.gain(H)
+            y = z[..., group.rows] - h
+            q[..., group.columns] += (gain @ y[..., None])[..., 0]
+            covariances.append(group.covariance - gain @ H @ group.covariance)
+        return q, covariances
 
     def _measured(self, q: Array) -> list[tuple[_Group, Array, Array]]:
         """Return each group with h and H at q."""
