@@ -1,0 +1,150 @@
+"""Two parts with a joint between them, seen with noise: the samples of the estimation grid.
+
+In the parent's frame lies an axis of any direction, half a metre from its origin; the child's origin is .4 m
+off it at the joint's zero. The child's pose in the parent is ``motion(q) · C``, with a motion about or along
+that axis. The observer stands somewhere else each time, and sees both poses with errors in the observer's
+axes: ``(p + δp, Exp(δθ) R)``.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+import numpy.typing as npt
+
+Array = npt.NDArray[np.float64]
+Joint = Literal["prismatic", "revolute"]
+
+TO_AXIS, LEVER = 0.5, 0.4
+"""From the parent's origin to the axis, and from the axis to the child's origin [m]."""
+
+
+@dataclass(frozen=True)
+class Cell:
+    """What the samples of one cell of the grid have in common.
+
+    Attributes
+    ----------
+    joint
+        What the joint is.
+    position, orientation
+        Standard deviations of each coordinate of both poses [m], [rad].
+    count
+        How many observations there are.
+    range
+        How far the joint moves [rad] or [m].
+    """
+
+    joint: Joint
+    position: float
+    orientation: float
+    count: int
+    range: float
+
+
+@dataclass(frozen=True, eq=False)
+class Samples:
+    """Several recordings of different objects, and what is true of them.
+
+    Attributes
+    ----------
+    cell
+        What they have in common.
+    axis
+        Directions of length one in the parent's frame, (S, 3).
+    point
+        Of the axis, the nearest to the middle of the child's way, (S, 3) [m]. A slider has no place, and this
+        is the middle itself.
+    zero
+        Poses of the child in the parent at the joint's zero, (S, 4, 4).
+    joint_values
+        (S, N), evenly over the range.
+    parents
+        True poses of the parent in the observer's frame, (S, N, 4, 4).
+    seen_parents, seen_children
+        What was seen of both, (S, N, 4, 4).
+    """
+
+    cell: Cell
+    axis: Array
+    point: Array
+    zero: Array
+    joint_values: Array
+    parents: Array
+    seen_parents: Array
+    seen_children: Array
+
+
+def draw(cell: Cell, count: int, rng: np.random.Generator) -> Samples:
+    """Return so many samples of a cell."""
+    axis, zero = _units(rng, count), np.tile(np.eye(4), (count, 1, 1))
+    to_axis, lever = _across(rng, axis), _across(rng, axis)
+    point = TO_AXIS * to_axis
+    zero[:, :3, :3] = rotations(rng.uniform(-math.pi, math.pi, (count, 1)) * _units(rng, count))
+    zero[:, :3, 3] = point + LEVER * lever
+    values = np.tile(np.linspace(0.0, cell.range, cell.count), (count, 1))
+    parents = _poses_anywhere(rng, (count, cell.count))
+    children = parents @ motions(cell.joint, axis, point, values) @ zero[:, None]
+    if cell.joint == "prismatic":
+        point = zero[:, :3, 3] + 0.5 * cell.range * axis
+    seen = [_seen(poses, cell, rng) for poses in (parents, children)]
+    return Samples(cell, axis, point, zero, values, parents, seen[0], seen[1])
+
+
+def motions(joint: Joint, axis: Array, point: Array, values: Array) -> Array:
+    """Return how joints have moved things, (S, N, 4, 4), by axes (S, 3), points on them and values (S, N)."""
+    moved = np.tile(np.eye(4), (*values.shape, 1, 1))
+    along = values[..., None] * axis[:, None]
+    if joint == "prismatic":
+        moved[..., :3, 3] = along
+        return moved
+    turned = rotations(along)
+    moved[..., :3, :3] = turned
+    moved[..., :3, 3] = point[:, None] - (turned @ point[:, None, :, None])[..., 0]
+    return moved
+
+
+def rotations(vectors: Array) -> Array:
+    """Return Exp of rotation vectors [rad], (..., 3, 3), by Rodrigues' formula."""
+    angle = np.linalg.norm(vectors, axis=-1)[..., None, None]
+    cross = np.zeros((*vectors.shape, 3))
+    x, y, z = np.moveaxis(vectors, -1, 0)
+    cross[..., 0, 1], cross[..., 0, 2], cross[..., 1, 2] = -z, y, -x
+    cross -= np.swapaxes(cross, -1, -2)
+    # sin(φ)/φ, and (1 - cos φ)/φ² as a square, which loses nothing near 0.
+    first, second = np.sinc(angle / math.pi), 0.5 * np.sinc(0.5 * angle / math.pi) ** 2
+    turned: Array = np.eye(3) + first * cross + second * cross @ cross
+    return turned
+
+
+def _seen(poses: Array, cell: Cell, rng: np.random.Generator) -> Array:
+    seen, shape = poses.copy(), (*poses.shape[:2], 3)
+    seen[..., :3, 3] += cell.position * rng.standard_normal(shape)
+    seen[..., :3, :3] = rotations(cell.orientation * rng.standard_normal(shape)) @ seen[..., :3, :3]
+    return seen
+
+
+def _units(rng: np.random.Generator, count: int) -> Array:
+    found = rng.standard_normal((count, 3))
+    units: Array = found / np.linalg.norm(found, axis=1, keepdims=True)
+    return units
+
+
+def _across(rng: np.random.Generator, axis: Array) -> Array:
+    """Return directions across axes, (S, 3)."""
+    found = np.cross(axis, _units(rng, len(axis)))
+    across: Array = found / np.linalg.norm(found, axis=1, keepdims=True)
+    return across
+
+
+def _poses_anywhere(rng: np.random.Generator, shape: tuple[int, int]) -> Array:
+    poses = np.tile(np.eye(4), (*shape, 1, 1))
+    q = rng.standard_normal((*shape, 4))
+    w, v = q[..., :1], q[..., 1:]
+    length = np.linalg.norm(v, axis=-1, keepdims=True)
+    poses[..., :3, :3] = rotations(2.0 * np.arctan2(length, w) * v / length)
+    poses[..., :3, 3] = rng.uniform(-1.0, 1.0, (*shape, 3))
+    return poses
