@@ -50,6 +50,37 @@ def test_what_is_near_is_what_brute_force_finds(model, either_sweep):
         assert scene.in_collision == any(d <= 0 for d in expected.values())
 
 
+@pytest.mark.parametrize("jump", [1e5, 1e12])
+def test_after_a_jump_of_any_size_answers_are_as_before(model, either_sweep, jump):
+    scene = Scene(model)
+    state = model.default_state()
+    for rail in (0.0, jump, *(np.arange(8) * 3e-5).tolist()):
+        there = state.updated({"rail": rail})
+        scene.update(there)
+        near = by_names(scene.within(0.3))
+    expected = brute_force(scene, there)
+    want = {frozenset(names): pytest.approx(d, abs=1e-6) for names, d in expected.items() if d <= 0.3}
+    assert near == want
+    assert scene.distance("base", "box0").distance == pytest.approx(expected["base", "box0"], abs=1e-6)
+
+
+def test_what_is_beyond_all_measure_is_refused_with_its_name(model, either_sweep):
+    scene = Scene(model)
+    state = model.default_state()
+    scene.update(state)
+    near = by_names(scene.within(0.3))
+    for rail in (1e13, 1e200):
+        with pytest.raises(kv.ValueRejectedError, match=r"'base', .*1e\+12 m away; nothing was moved"):
+            scene.update(state.updated({"rail": rail}))
+    assert by_names(scene.within(0.3)) == near
+    far = kv.Model()
+    with far.edit() as edit:
+        edit.add_frame("post", "world", kv.translation(1e50, 0, 0), body(Sphere(0.1)))
+    with pytest.raises(kv.ValueRejectedError, match="'post' stands further"):
+        Scene(far)
+    assert Scene(far, leave_out=["post"]).bodies == ()
+
+
 def test_most_pairs_are_settled_without_measuring(model):
     scene = Scene(model)
     state = model.default_state()
@@ -227,6 +258,16 @@ def test_what_is_picked_up_goes_with_the_hand():
     assert by_names(scene.within(0.3)) == {
         frozenset(n): pytest.approx(d, abs=1e-6) for n, d in brute_force(scene, other).items() if d <= 0.3
     }
+
+
+def test_a_pose_is_that_of_now_also_right_after_an_edit():
+    model = arm_among_boxes(boxes=1)
+    scene = Scene(model)
+    state = model.default_state()
+    scene.update(state)
+    with model.edit() as edit:
+        edit.attach("box0", "hand", kv.translation(0, 0, 0.3))
+    np.testing.assert_allclose(scene.pose("box0"), model.fk("box0")(state), atol=1e-12)
 
 
 def test_after_an_edit_a_new_symbol_needs_a_value():

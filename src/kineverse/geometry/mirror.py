@@ -20,6 +20,7 @@ from .narrow import ACCURACY, Narrow
 from .pieces import Piece, Pieces, load
 from .rules import RULES, Rule, allowed, check_names, rules_of
 from .solids import Solid
+from .sweep import FURTHEST, GONE_TOO_FAR
 from .sweep_native import sweep_library
 from .table import Indices, Table
 
@@ -119,7 +120,7 @@ class Mirror:
         known = {new for new, _ in kept}
         for k in range(len(moving), len(self.pieces)):
             if k not in known:
-                table.poses[k] = self.pieces[k].pose({})
+                table.poses[k] = _standing(self.pieces[k])
         table.put(np.arange(table.count))
         self._all_loaded = all(solid is not None for solid in self._solids)
         self.narrow = Narrow(self._solids, table.poses)
@@ -161,16 +162,20 @@ class Mirror:
         return {key: value for key, value in state.items() if key in inputs}
 
     def _place(self) -> None:
-        bad = sweep_library.place(self.table, self._evaluator.outputs[0])
-        if bad >= 0:
+        outcome = sweep_library.place(self.table, self._evaluator.outputs[0])
+        if outcome >= 0:
             names = dict.fromkeys(
                 piece.body
                 for piece, pose in zip(self.pieces, self._evaluator.outputs[0], strict=False)
-                if not np.isfinite(pose).all()
+                if not (np.abs(pose) <= FURTHEST).all()
             )
             raise ValueRejectedError(
-                f"At this state the pose of {', '.join(map(repr, names))} is not finite; nothing was moved."
+                f"At this state the pose of {', '.join(map(repr, names))} is not finite, or further than "
+                f"{FURTHEST:g} m away; nothing was moved."
             )
+        if outcome == GONE_TOO_FAR:
+            self.table.forget_travel()
+            self._known.clear()
         self.narrow.moved(self.table.moving)
 
     def _place_again(self) -> None:
@@ -317,6 +322,17 @@ class _Nearest:
     def is_nearer(self, k: int, low: float) -> bool:
         """Whether others are nearer; within the accuracy a pair that comes later may still be the nearest."""
         return low > self._least.get(self._keys[k], math.inf) + ACCURACY
+
+
+def _standing(piece: Piece) -> Floats:
+    """Return the (3, 4) pose of a piece that never moves."""
+    pose: Floats = piece.pose({})
+    if not (np.abs(pose) <= FURTHEST).all():
+        raise ValueRejectedError(
+            f"Body '{piece.body}' stands further than {FURTHEST:g} m away. Mend the model, or leave it out: "
+            "Scene(model, leave_out=[...])."
+        )
+    return pose
 
 
 def _names(names: Iterable[str]) -> tuple[str, ...]:

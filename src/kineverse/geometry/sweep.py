@@ -2,7 +2,8 @@
 
 A point of a piece at c from its centre moves by ``|Δcentre + ΔR c| <= |Δcentre| + r ‖ΔR‖``, with r the radius
 of its sphere. The sum of this over all updates is its *travel* s. Two pieces that were at a distance d when
-they had travelled s_i and s_j are therefore at least ``d + s_i + s_j`` less their present travel apart.
+they had travelled s_i and s_j are therefore at least ``d + s_i + s_j`` less their present travel apart. What
+has gone too far for that to be exact in floating point begins again at 0.
 
 This is the whole of it in numpy; :mod:`.sweep_native` has the same in C, several times as fast.
 """
@@ -15,13 +16,22 @@ import numpy.typing as npt
 from .mesh_files import Floats
 from .table import Indices, Table
 
+FURTHEST = 1e12
+"""Nothing is put further than this from the origin, where numbers are 0.1 mm apart [m]."""
+
+LONGEST_TRAVEL = 1e4
+"""Up to this, bounds are right to some 1e-12 m [m]."""
+
+PLACED, GONE_TOO_FAR = -1, -2
+
 
 def place(table: Table, fresh: Floats) -> int:
     """Put the moving pieces at new poses (moving, 3, 4) and add to their travel.
 
-    Returns the first piece whose pose is not finite, and then nothing has happened; -1 if all is well.
+    Returns the first piece whose pose is not finite or too far away, and then nothing has happened; otherwise
+    :data:`PLACED`, or :data:`GONE_TOO_FAR` if a piece's travel is above :data:`LONGEST_TRAVEL`.
     """
-    bad = ~np.isfinite(fresh).all(axis=(1, 2))
+    bad = ~(np.abs(fresh) <= FURTHEST).all(axis=(1, 2))
     if bad.any():
         return int(np.argmax(bad))
     moving = np.arange(table.moving)
@@ -32,7 +42,7 @@ def place(table: Table, fresh: Floats) -> int:
     turned = np.sqrt(((fresh[:, :, :3] - old) ** 2).sum(axis=(1, 2)) / 2)
     shifted = np.sqrt(((table.place[moving] - before) ** 2).sum(axis=1))
     table.travel[moving] += shifted + table.radius[moving] * turned
-    return -1
+    return GONE_TOO_FAR if (table.travel[moving] > LONGEST_TRAVEL).any() else PLACED
 
 
 def near(table: Table, reach: float) -> tuple[Indices, Floats]:

@@ -26,9 +26,16 @@ static inline double square(double x) { return x * x; }
 /* fmax is a call, for the sake of NaN, and there is none here. */
 static inline double larger(double x, double y) { return x > y ? x : y; }
 
+/* Both in [m], and what is returned, as in sweep.py. */
+#define FURTHEST 1e12
+#define LONGEST_TRAVEL 1e4
+#define PLACED -1
+#define GONE_TOO_FAR -2
+
 EXPORT int64_t place(Table *t, const double *fresh) {
+  int64_t outcome = PLACED;
   for (int64_t k = 0; k < 12 * t->moving; k++)
-    if (!isfinite(fresh[k])) return k / 12;
+    if (!(fabs(fresh[k]) <= FURTHEST)) return k / 12; /* NaN is not either */
   for (int64_t k = 0; k < t->moving; k++) {
     const double *new = fresh + 12 * k, *c = t->centre + 3 * k, *h = t->half + 3 * k;
     double *old = t->poses + 12 * k, turned = 0.0, shifted = 0.0;
@@ -44,8 +51,9 @@ EXPORT int64_t place(Table *t, const double *fresh) {
       for (int i = 0; i < 4; i++) old[4 * r + i] = row[i];
     }
     t->travel[k] += sqrt(shifted) + t->radius[k] * sqrt(turned / 2);
+    if (t->travel[k] > LONGEST_TRAVEL) outcome = GONE_TOO_FAR;
   }
-  return -1;
+  return outcome;
 }
 
 /* The distance of the sphere of one piece from the box of another; -inf from inside of it. */

@@ -128,6 +128,12 @@ class Table:
         rows, columns = np.meshgrid(here, here, indexing="ij")
         self.bounds[np.minimum(rows, columns), np.maximum(rows, columns)] = known
 
+    def forget_travel(self) -> None:
+        """Begin to count again, with nothing known of any pair."""
+        self.travel[:] = 0.0
+        if self.bounds is not None:
+            self.bounds[self.bounds != 0.0] = 0.0
+
     def choose_axis(self) -> None:
         """Sort along the axis on which the pieces are spread the most, from now on."""
         there = self.active.astype(bool)
