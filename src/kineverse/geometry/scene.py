@@ -97,15 +97,16 @@ class Scene:
         ShapeError
             If a vector has another length.
         ValueRejectedError
-            If a value is NaN or a pose is not finite, naming the bodies; then everything stays where it was.
+            If a value is NaN or a pose is not finite or 1e12 m away, naming the bodies; then everything stays
+            where it was.
         """
         self._mirror.update(state)
 
     def pose(self, body: str) -> npt.NDArray[np.float64]:
         """Return where a body was put, world_T_body, (4, 4) [m]."""
         mirror = self._mirror
-        piece = mirror.members[mirror.number(body)][0]
         mirror.ready(())
+        piece = mirror.members[mirror.number(body)][0]
         world_T_piece = np.vstack([mirror.table.poses[piece], [0.0, 0.0, 0.0, 1.0]])
         return np.asarray(world_T_piece @ np.linalg.inv(mirror.pieces[piece].shape.origin.matrix))
 
