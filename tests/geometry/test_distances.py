@@ -10,7 +10,7 @@ import trimesh
 from convex_shapes import EXACT, KINDS, MujocoPairs, gap, random_pose, random_shape
 
 from kineverse.geometry.narrow import Narrow
-from kineverse.geometry.solids import _triangles, solid_of
+from kineverse.geometry.solids import _triangles, enlarged, solid_of
 from kineverse.model.body import Box, Sphere
 
 EACH = 4
@@ -98,6 +98,23 @@ def test_centre_on_centre_there_is_a_way_out(one, other, shapes):
     assert np.linalg.norm(normal) == pytest.approx(1, abs=1e-6)
     assert normal @ (point_b - point_a) == pytest.approx(distance, abs=1e-6)
     assert gap(a, b, poses, normal) == pytest.approx(distance, abs=3e-4)
+
+
+@pytest.mark.parametrize(("one", "other"), PAIRS)
+def test_what_is_small_or_large_is_as_near_as_its_enlargement(one, other, shapes):
+    rng = np.random.default_rng([4, KINDS.index(one), KINDS.index(other)])
+    a, b = shapes[one][0], shapes[other][1]
+    for factor in (2.0**-9, 2.0**-7, 2.0**-5, 2.0**10):
+        small = [enlarged(shape.solid, factor) for shape in (a, b)]
+        for spread in (0.05, 0.3):
+            poses = np.stack([random_pose(rng, spread), random_pose(rng, spread)])
+            distance, *_ = measured(a, b, poses)
+            there = poses * (1, 1, 1, factor)
+            narrow = Narrow(small, there)
+            assert narrow.distance(0, 1) / factor == pytest.approx(distance, abs=3e-5)
+            point_a, point_b, normal = narrow.witness()
+            assert normal @ (point_b - point_a) == pytest.approx(factor * distance, abs=3e-5 * factor)
+            assert gap(a, b, poses, normal) == pytest.approx(distance, abs=1e-4)
 
 
 def test_triangles_have_distances_and_in_touch_a_normal():

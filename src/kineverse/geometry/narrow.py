@@ -9,6 +9,7 @@ which in penetration is minus the shortest translation that separates them.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any, TypeAlias
@@ -18,7 +19,7 @@ import numpy as np
 from kineverse.model.body import Sphere
 
 from .mesh_files import Floats
-from .solids import Solid, coal_engine, solid_of
+from .solids import Solid, coal_engine, enlarged, solid_of
 
 APART_TOLERANCE, DEPTH_TOLERANCE = 1e-8, 1e-6
 """What coal's iterations stop at, between things apart and in penetration [m].
@@ -33,6 +34,8 @@ ACCURACY = 1e-4
 _TOUCH = 1e-6
 # So far things are moved apart to see in which direction they touch, and no further than this part of them.
 _APART, _APART_OF_RADIUS = 1e-4, 1e-3
+# What coal is asked about is made at least so large: the tolerances in it are made for decimetres [m].
+_SMALL, _LARGE_ENOUGH, _TOO_LARGE = 5e-3, 0.1, 1e3
 _CONTACTS = 256
 # The radius of a ball that is taken for a point [m].
 _SPECK = 1e-7
@@ -63,6 +66,7 @@ class Narrow:
         self._kept: list[tuple[Solid, Solid]] = []
         # Pairs of triangle meshes, for which coal leaves the normal as it was in memory.
         self._surfaces: set[tuple[int, int]] = set()
+        self._small: dict[tuple[int, int], tuple[float, Floats, Narrow]] = {}
         self._request, *self._rougher = (_request(coal, factor) for factor in (1.0, 10.0, 100.0))
         self._result = coal.DistanceResult()
         self._mended: Witness | None = None
@@ -81,6 +85,8 @@ class Narrow:
                 self._transforms[k].setTransform(*self._parts[k])
                 placed[k] = 1
         functor = self._functors.get((i, j)) or self._functor(i, j)
+        if self._small and (i, j) in self._small:
+            return self._enlarged(i, j)
         at_a, at_b, result = self._transforms[i], self._transforms[j], self._result
         result.clear()
         self._mended = None
@@ -130,7 +136,22 @@ class Narrow:
         self._kept.append((a, b))  # coal does not keep what it computes with
         if not (a.is_convex or b.is_convex):
             self._surfaces.add((i, j))
+        factor = _enlargement(a, b)
+        if factor > 1.0:
+            poses = np.tile(np.eye(4)[:3], (2, 1, 1))
+            self._small[i, j] = factor, poses, Narrow([enlarged(a, factor), enlarged(b, factor)], poses)
         return functor
+
+    def _enlarged(self, i: int, j: int) -> float:
+        """Measure two convex solids of which one is small as if both were larger."""
+        factor, poses, narrow = self._small[i, j]
+        (poses[0, :, :3], start), (poses[1, :, :3], end) = self._parts[i], self._parts[j]
+        poses[1, :, 3] = factor * (end - start)
+        narrow.moved(2)
+        distance = narrow.distance(0, 1) / factor
+        point_a, point_b, normal = narrow.witness()
+        self._mended = start + point_a / factor, start + point_b / factor, normal
+        return distance
 
     def _normal_is_right(self) -> bool:
         x, y, z = self._result.normal.tolist()
@@ -217,6 +238,14 @@ def _request(coal: Any, factor: float) -> Any:
     request.gjk_tolerance, request.epa_tolerance = factor * APART_TOLERANCE, factor * DEPTH_TOLERANCE
     request.gjk_max_iterations = request.epa_max_iterations = 256
     return request
+
+
+def _enlargement(a: Solid, b: Solid) -> float:
+    """Return by which power of two a pair is enlarged; 1 for what is large enough, and for triangles."""
+    small, large = sorted((a.radius, b.radius))
+    if small >= _SMALL or not (a.is_convex and b.is_convex):
+        return 1.0
+    return float(2.0 ** math.floor(math.log2(min(2 * _LARGE_ENOUGH / small, _TOO_LARGE / large))))
 
 
 def _unit(vector: Floats) -> Floats:

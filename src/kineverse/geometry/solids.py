@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import threading
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from typing import Any, TypeAlias
 
@@ -145,6 +145,18 @@ def solid_of_hull(points: Floats) -> Solid:
         return _by_content[key]
 
 
+@lru_cache(maxsize=4096)
+def enlarged(solid: Solid, factor: float) -> Solid:
+    """Return a convex solid times a factor; what was given for its radius is kept to."""
+    if isinstance(solid.surface, Hull):
+        assert solid.core is not None
+        made = _hull(factor * solid.core.corners.T)
+    else:
+        assert not isinstance(solid.surface, Faces)
+        made = _of_primitive(_scaled(solid.surface, factor))
+    return replace(made, radius=factor * solid.radius)
+
+
 def coal_engine() -> Any:
     """Return coal; raises MissingExtraError if it is not installed."""
     try:
@@ -206,9 +218,13 @@ def _primitive(geometry: Primitive) -> Solid:
         raise ValueRejectedError(
             f"{geometry} has sizes beyond {SMALLEST_SIZE:g} m to {LARGEST_SIZE:g} m, which cannot be right."
         )
+    return _of_primitive(geometry)
+
+
+def _of_primitive(geometry: Primitive) -> Solid:
     coal = coal_engine()
     stand_in = core = None
-    x, y, z = (*sizes, 0.0, 0.0)[:3]
+    x, y, z = (*_sizes(geometry), 0.0, 0.0)[:3]
     if isinstance(geometry, Box):
         engine, half = coal.Box(x, y, z), (x / 2, y / 2, z / 2)
         radius = math.hypot(*half)
@@ -234,6 +250,14 @@ def _primitive(geometry: Primitive) -> Solid:
 
 SMALLEST_SIZE, LARGEST_SIZE = 1e-7, 1e6
 """Beyond these sizes a primitive is taken for a mistake [m]."""
+
+
+def _scaled(geometry: Primitive, factor: float) -> Primitive:
+    sizes = [factor * size for size in _sizes(geometry)]
+    if isinstance(geometry, Box | Ellipsoid):
+        x, y, z = sizes
+        return type(geometry)((x, y, z))
+    return type(geometry)(*sizes)
 
 
 def _sizes(geometry: Primitive) -> tuple[float, ...]:
