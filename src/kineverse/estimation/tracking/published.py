@@ -24,6 +24,7 @@ Array = npt.NDArray[np.float64]
 
 STEPS = 10
 STEP_SIZE = 0.1
+SPREAD = 0.5
 
 
 class PublishedFilter:
@@ -47,6 +48,8 @@ class PublishedFilter:
         The frames that are observed.
     steps
         How many gradient steps the first observation makes. The authors' code makes one.
+    spread
+        The standard deviation at the start, as a share of the width of the limits. The authors' code has 1.
     copies
         How many beliefs run side by side on the same R, each on poses of its own; None for one, whose arrays
         have no leading axis.
@@ -61,6 +64,8 @@ class PublishedFilter:
         The coordinates of each group.
     limits
         Lower and upper limits of the coordinates, (n, 2).
+    function
+        What evaluates h and H of each group.
     q
         The estimate, (n,) or (copies, n).
 
@@ -77,10 +82,11 @@ class PublishedFilter:
         model: ModelView,
         frames: Iterable[str],
         steps: int = STEPS,
+        spread: float = SPREAD,
         copies: int | None = None,
     ) -> None:
         self.frames = tuple(frames)
-        self._steps = steps
+        self._steps, self._spread = steps, spread
         self._lead = () if copies is None else (copies,)
         self._groups = _groups(model, self.frames)
         self.groups = tuple(group.symbols for group in self._groups)
@@ -88,8 +94,8 @@ class PublishedFilter:
         self.limits = _limits(model, self.symbols)
         self._entries = np.concatenate([group.entries for group in self._groups])
         outputs = [part for group in self._groups for part in (group.h, group.h.jacobian(group.symbols))]
-        self._function = compile(outputs, self.symbols)
-        self._bound = self._function.bind()
+        self.function = compile(outputs, self.symbols)
+        self._bound = self.function.bind()
         self.reset()
 
     def reset(self) -> None:
@@ -98,7 +104,8 @@ class PublishedFilter:
         self.q = np.broadcast_to((lower + upper) / 2, (*self._lead, len(self.symbols))).copy()
         for group in self._groups:
             width = (upper - lower)[group.columns]
-            group.covariance = np.broadcast_to(np.diag((width / 2) ** 2), (*self._lead, *[len(width)] * 2))
+            covariance = np.diag((self._spread * width) ** 2)
+            group.covariance = np.broadcast_to(covariance, (*self._lead, *covariance.shape))
         self._started = False
 
     def learn_noise(self, poses: npt.ArrayLike) -> None:
@@ -192,7 +199,7 @@ class PublishedFilter:
     def _measured(self, q: Array) -> list[tuple[_Group, Array, Array]]:
         """Return each group with h and H at q."""
         if self._lead:
-            values = self._function.batch(q)
+            values = self.function.batch(q)
         else:
             self._bound(q)
             values = self._bound.outputs
