@@ -89,6 +89,18 @@ def test_in_touch_the_normal_is_still_right(one, other, shapes):
         assert normal @ (point_b - point_a) == pytest.approx(distance, abs=1e-9)
 
 
+def test_where_coal_fails_altogether_there_is_still_a_way_out(shapes, monkeypatch):
+    monkeypatch.setattr(Narrow, "_normal_is_right", lambda narrow: False)
+    rng = np.random.default_rng(13)
+    for one, other in PAIRS:
+        a, b = shapes[one][0], shapes[other][1]
+        poses = np.stack([random_pose(rng, 0.02), random_pose(rng, 0.02)])
+        distance, point_a, point_b, normal = measured(a, b, poses)
+        assert distance <= gap(a, b, poses, normal) + 1e-9
+        assert distance < 0
+        assert normal @ (point_b - point_a) == pytest.approx(distance, abs=1e-9)
+
+
 @pytest.mark.parametrize(("one", "other"), PAIRS)
 def test_centre_on_centre_there_is_a_way_out(one, other, shapes):
     a, b = shapes[one][0], shapes[other][1]

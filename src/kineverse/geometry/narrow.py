@@ -174,11 +174,15 @@ class Narrow:
                     point_a, point_b, normal = self.witness()
                     self._mended = point_a, point_b - shift, normal
                     return distance - float(normal @ shift)
-        # Nothing is left but the line between the centres, along which they overlap for certain.
+        # Nothing is left but a way out that is long enough for certain: that of the boxes around them.
         start, end = self._centres(i, j)
         normal = _unit(end - start)
-        self._mended = start, end, normal
-        return float(normal @ (end - start))
+        a, b = (
+            float(np.abs(normal @ self._parts[k][0]) @ solid.half)
+            for k, solid in zip((i, j), self._pair(i, j), strict=True)
+        )
+        self._mended = start + a * normal, end - b * normal, normal
+        return float(normal @ (end - start)) - a - b
 
     def _ways_apart(self, i: int, j: int) -> list[Floats]:
         far = min(_APART, _APART_OF_RADIUS * min(solid.radius for solid in self._pair(i, j)))
