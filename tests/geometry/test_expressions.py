@@ -101,3 +101,24 @@ def test_its_symbols_are_the_same_every_time():
     assert scene.expression("hand", "box0").parameters == one.parameters
     assert set(scene.expression_values([one])) == {s for row in one.parameters for s in row}
     assert not any(key.path.startswith("distance/") for key in one.expression.gradient())
+
+
+def test_another_scene_takes_over_the_parameters_that_the_model_has(tmp_path):
+    """A program that reads its own document again speaks of the same distance, at whatever state it begins."""
+    model = kv.load("kitchen")
+    pair = "kitchen/fridge_door_handle", "kitchen/sink_area"
+    scene = Scene(model)
+    scene.update(model.default_state())
+    with model.edit() as edit:
+        edit.constrain("clear", 0.02, scene.expression(*pair).expression, float("inf"))
+    model.save(tmp_path / "kitchen.kv.json")
+    for again in (model, kv.load(tmp_path / "kitchen.kv.json")):
+        other = Scene(again)
+        state = again.default_state().updated({"kitchen/fridge_door": 0.4})
+        other.update(state)
+        distance = other.expression(*pair)
+        kept = again.constraints["clear"].expression
+        values = state.updated(other.expression_values(distance))
+        assert (kept - distance.expression)(values) == pytest.approx(0, abs=1e-12)
+        assert kept(values) == pytest.approx(other.distance(*pair).distance, abs=1e-9)
+        kv.compile([kept, distance.expression])

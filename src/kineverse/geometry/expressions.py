@@ -66,13 +66,19 @@ class PairDistance:
 Parameters = tuple[tuple[Symbol, ...], ...]
 
 
-def parameters_of(closest: Closest, world_T_a: Floats, world_T_b: Floats) -> Parameters:
-    """Return symbols for the nearest points and the normal of two bodies, with their values now."""
+def parameters_of(model: ModelView, closest: Closest, world_T_a: Floats, world_T_b: Floats) -> Parameters:
+    """Return symbols for the nearest points and the normal of two bodies.
+
+    Those that the model has already, of a scene before or from its document; others have their values now.
+    """
+    known = {symbol.path: symbol for symbol in model.symbols}
+
+    def of(path: str, value: float) -> Symbol:
+        return known[path] if path in known else parameter(path, value)
+
     path = f"distance/{closest.a}/to/{closest.b}"
     return tuple(
-        tuple(
-            parameter(f"{path}/{name}/{axis}", float(value)) for axis, value in zip("xyz", row, strict=True)
-        )
+        tuple(of(f"{path}/{name}/{axis}", float(value)) for axis, value in zip("xyz", row, strict=True))
         for name, row in zip(_ROWS, _rows(closest, world_T_a, world_T_b), strict=True)
     )
 

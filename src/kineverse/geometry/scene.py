@@ -153,11 +153,12 @@ class Scene:
     def expression(self, a: str, b: str) -> PairDistance:
         """Return the signed distance of two bodies as an expression, exact to first order at the state now.
 
-        At other states give it :meth:`expression_values` of there; the symbols are the same every time.
+        At other states give it :meth:`expression_values` of there. The symbols are the same every time, and
+        those that the model has, if it keeps a distance of these two.
         """
         closest, *poses = self._with_poses(a, b)
         if (a, b) not in self._parameters:
-            self._parameters[a, b] = parameters_of(closest, *poses)
+            self._parameters[a, b] = parameters_of(self.model, closest, *poses)
         return pair_distance(self.model, a, b, self._parameters[a, b])
 
     def expression_values(self, pairs: PairDistance | Iterable[PairDistance]) -> dict[Symbol, float]:
