@@ -1,0 +1,113 @@
+"""What is believed of a state: a Gaussian in the tangent at a point, in information form."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+import numpy.typing as npt
+
+from kineverse.estimation.noise import Array
+
+Indices = npt.NDArray[np.int64]
+
+
+def symmetric(matrix: Array) -> Array:
+    """Return the symmetric part, which rounding has not moved."""
+    return (matrix + matrix.T) / 2
+
+
+def inverse(matrix: Array) -> Array:
+    """Return the inverse of a positive definite matrix, symmetric."""
+    return symmetric(np.asarray(np.linalg.inv(matrix), dtype=np.float64))
+
+
+@dataclass(frozen=True, eq=False)
+class Quadratic:
+    """The cost ``cost - vectorᵀ ξ + ½ ξᵀ matrix ξ`` of steps ξ in a tangent.
+
+    Attributes
+    ----------
+    matrix
+        Λ, positive definite (t, t).
+    vector
+        η (t,).
+    cost
+        At ξ = 0.
+    """
+
+    matrix: Array
+    vector: Array
+    cost: float
+
+    @staticmethod
+    def of_density(matrix: Array, vector: Array) -> Quadratic:
+        """Return the one whose least cost is 0."""
+        return Quadratic(matrix, vector, float(vector @ np.linalg.solve(matrix, vector)) / 2)
+
+    def with_seen(self, seen: Iterable[tuple[Array, Array]]) -> Quadratic:
+        """Return it with the squares of errors e - S ξ added, given as pairs (e, S)."""
+        matrix, vector, cost = self.matrix.copy(), self.vector.copy(), self.cost
+        for error, slope in seen:
+            matrix += slope.T @ slope
+            vector += slope.T @ error
+            cost += float(error @ error) / 2
+        return Quadratic(matrix, vector, cost)
+
+    def carried(self, step: Array, turn: Array | None) -> Quadratic:
+        """Return the same in the tangent at the end of a step, which is turned by ``turn`` on the way."""
+        moved = self.matrix @ step
+        cost = self.cost - float(self.vector @ step) + float(step @ moved) / 2
+        found = replace(self, vector=self.vector - moved, cost=cost)
+        if turn is None:
+            return found
+        back = np.linalg.inv(turn)
+        return Quadratic(symmetric(back.T @ self.matrix @ back), back.T @ found.vector, cost)
+
+    @cached_property
+    def least(self) -> float:
+        """The least cost."""
+        return self.cost - float(self.vector @ np.linalg.solve(self.matrix, self.vector)) / 2
+
+    @cached_property
+    def log_determinant(self) -> float:
+        """Of the matrix."""
+        return float(np.linalg.slogdet(self.matrix)[1])
+
+
+@dataclass(slots=True, eq=False)
+class Belief:
+    """A point and a Gaussian about it, as it would be without limits.
+
+    With ξ in the tangent at ``x``, the density is exp(-½ξᵀΛξ + ηᵀξ) up to a factor. Its mean Λ⁻¹η need not be
+    0, as the point stays inside the limits and the Gaussian does not.
+
+    Attributes
+    ----------
+    x
+        The coordinates (n,).
+    information, vector
+        Λ (t, t), zero between groups, and η (t,).
+    evidence
+        For each group, the logarithm of the density of all it has seen.
+    """
+
+    x: Array
+    information: Array
+    vector: Array
+    evidence: Array
+
+    def copy(self) -> Belief:
+        """Return one of its own."""
+        return Belief(self.x.copy(), self.information.copy(), self.vector.copy(), self.evidence.copy())
+
+    def part(self, t: Indices) -> Quadratic:
+        """Return what is believed of a group, with its places in the tangent."""
+        return Quadratic.of_density(self.information[np.ix_(t, t)], self.vector[t])
+
+    def put(self, t: Indices, quadratic: Quadratic) -> None:
+        """Believe something else of a group."""
+        self.information[np.ix_(t, t)] = quadratic.matrix
+        self.vector[t] = quadratic.vector

@@ -1,0 +1,100 @@
+"""What a tracker says after a step."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from types import MappingProxyType
+
+import numpy as np
+
+from kineverse.estimation.noise import Array
+from kineverse.state import State
+from kineverse.symbols import Symbol
+
+from .belief import Belief
+from .charted import Charted
+from .layout import Layout
+
+
+@dataclass(frozen=True, eq=False)
+class Estimate:
+    """The most probable state inside the limits, and how far it may be off.
+
+    Attributes
+    ----------
+    nis, dof
+        The normalised innovation squared of the last update and the number of its parts: χ² distributed, if
+        noise is what the covariances say.
+    outliers
+        The names of observations that were held for wrong.
+    rounds
+        How many times the model was evaluated.
+    stamp
+        [s]; None if the tracker has not heard of time.
+    """
+
+    _belief: Belief
+    _layout: Layout
+    _charted: Charted
+    _known: Array
+    nis: float
+    dof: int
+    outliers: tuple[str, ...]
+    rounds: int
+    stamp: float | None
+
+    @cached_property
+    def state(self) -> State:
+        """The most probable state inside the limits."""
+        values = dict(zip(self._layout.chart.coordinates, self._belief.x.tolist(), strict=True))
+        return State(values, stamp=self.stamp, source="tracker")
+
+    @property
+    def tangent(self) -> tuple[Symbol, ...]:
+        """The rows and columns of the covariance: the directions in which the state may be off, as speeds."""
+        return self._layout.chart.tangent
+
+    @cached_property
+    def information(self) -> Array:
+        """The inverse of the covariance."""
+        return self._belief.information.copy()
+
+    @cached_property
+    def covariance(self) -> Array:
+        """The covariance of the Gaussian without limits, in the tangent (t, t) [m²], [rad²]."""
+        found = np.zeros_like(self._belief.information)
+        for group in self._layout.groups:
+            block = np.ix_(group.t, group.t)
+            found[block] = np.linalg.inv(self._belief.information[block])
+        return found
+
+    @cached_property
+    def mean(self) -> Array:
+        """The mean of the Gaussian without limits, as a step from the state in the tangent (t,)."""
+        found: Array = self.covariance @ self._belief.vector
+        return found
+
+    @cached_property
+    def deviation(self) -> Mapping[Symbol | str, float]:
+        """The standard deviation of each coordinate, by symbol and by name [m], [rad]."""
+        found: dict[Symbol | str, float] = {}
+        for number, group in enumerate(self._layout.groups):
+            basis = self._charted.basis(number, self._belief.x[group.x], self._known)
+            block = self.covariance[np.ix_(group.t, group.t)]
+            variances = np.einsum("ij,jk,ik->i", basis, block, basis)
+            for x, variance in zip(group.coordinates, variances.tolist(), strict=True):
+                found[x] = found[str(x)] = float(np.sqrt(variance))
+        return MappingProxyType(found)
+
+    @property
+    def evidence(self) -> Mapping[tuple[Symbol, ...], float]:
+        """The log density of all that was seen, by the coordinates of each group."""
+        names = (group.coordinates for group in self._layout.groups)
+        return MappingProxyType(dict(zip(names, self._belief.evidence.tolist(), strict=True)))
+
+    @property
+    def log_evidence(self) -> float:
+        """The log density of all that was seen."""
+        return float(self._belief.evidence.sum())

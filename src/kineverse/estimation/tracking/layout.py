@@ -1,0 +1,198 @@
+"""Where the numbers of a tracker are: coordinates, tangent, groups, and what one evaluation gives."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from kineverse.compile import CompiledFunction, compile  # noqa: A004
+from kineverse.errors import ValueRejectedError
+from kineverse.expressions.expression import Expression, array, as_expression
+from kineverse.model.constraint import Constraint
+from kineverse.symbols import Symbol
+
+from .belief import Indices
+from .chart import Chart, connected
+from .observed import Observation
+
+
+@dataclass(frozen=True, eq=False)
+class Group:
+    """Coordinates that share observations or limits, and nothing with others.
+
+    Attributes
+    ----------
+    coordinates, tangent
+        Its symbols.
+    x, t
+        Where they are among all coordinates and in the whole tangent.
+    seen
+        The numbers of its observations.
+    limits
+        The numbers of its curved limits.
+    by_speeds
+        Whether some of the coordinates move by others' speeds.
+    """
+
+    coordinates: tuple[Symbol, ...]
+    tangent: tuple[Symbol, ...]
+    x: Indices
+    t: Indices
+    seen: tuple[int, ...]
+    limits: tuple[int, ...]
+    by_speeds: bool
+
+
+@dataclass(frozen=True, eq=False)
+class Layout:
+    """How the state of a tracker is arranged.
+
+    Attributes
+    ----------
+    chart
+        Coordinates and tangent.
+    observations
+        What is observed.
+    limits
+        The curved limits: those that are not bounds of one free coordinate alone.
+    known
+        What is handed in: coordinates that are measured elsewhere, and parameters.
+    groups
+        In the order of their first observation.
+    """
+
+    chart: Chart
+    observations: tuple[Observation, ...]
+    limits: tuple[Constraint, ...]
+    known: tuple[Symbol, ...]
+    groups: tuple[Group, ...]
+
+    @cached_property
+    def group_of(self) -> tuple[int, ...]:
+        """The number of each observation's group."""
+        found = {i: number for number, group in enumerate(self.groups) for i in group.seen}
+        return tuple(found[i] for i in range(len(self.observations)))
+
+    @cached_property
+    def inputs(self) -> tuple[Symbol, ...]:
+        """What is evaluated at."""
+        return (*self.chart.coordinates, *self.known)
+
+    @cached_property
+    def value_slices(self) -> tuple[slice, ...]:
+        """Where each observation's value is: rotation row by row, then position, or a vector."""
+        return self._slices[0]
+
+    @cached_property
+    def slope_slices(self) -> tuple[slice, ...]:
+        """Where each observation's derivatives are, rows by columns of its group's tangent."""
+        return self._slices[1]
+
+    @cached_property
+    def limit_slices(self) -> tuple[slice, ...]:
+        """Where each curved limit's value, bounds and derivatives are."""
+        return self._slices[2]
+
+    @cached_property
+    def _slices(self) -> tuple[tuple[slice, ...], tuple[slice, ...], tuple[slice, ...]]:
+        at = 0
+        found: tuple[list[slice], list[slice], list[slice]] = [], [], []
+        sizes = []
+        for one, number in zip(self.observations, self.group_of, strict=True):
+            width = len(self.groups[number].tangent)
+            sizes += [(0, 12 if one.is_pose else one.size), (1, one.size * width)]
+        for number in range(len(self.limits)):
+            group = next(g for g in self.groups if number in g.limits)
+            sizes.append((2, 3 + len(group.tangent)))
+        for kind, size in sizes:
+            found[kind].append(slice(at, at + size))
+            at += size
+        return tuple(found[0]), tuple(found[1]), tuple(found[2])
+
+    def compiled(self) -> CompiledFunction:
+        """Return values and derivatives of all observations, and of limits, as one function."""
+        parts: list[Expression] = []
+        for one, number in zip(self.observations, self.group_of, strict=True):
+            value = self.chart.plain(one.value)
+            parts += [_flat(value) if one.is_pose else value, self._slope(one, value, self.groups[number])]
+        for number, limit in enumerate(self.limits):
+            group = next(g for g in self.groups if number in g.limits)
+            slopes = self.chart.gradient(limit.expression)
+            columns = [slopes.get(v, as_expression(0.0)) for v in group.tangent]
+            parts.append(array([limit.expression, limit.lower, limit.upper, *columns]))
+        return compile(np.concatenate(parts), self.inputs)
+
+    def _slope(self, one: Observation, value: Expression, group: Group) -> Expression:
+        """Return the derivatives of a value, one column after the other in each row, flat.
+
+        Those of a pose are the geometric Jacobian: velocity of the origin and angular velocity.
+        """
+        gradient = self.chart.gradient(value)
+        columns = []
+        for speed in group.tangent:
+            entry = gradient.get(speed)
+            if entry is None:
+                columns.append(as_expression(np.zeros(one.size)))
+            elif one.is_pose:
+                spin = entry[:3, :3] @ value[:3, :3].T
+                columns.append(array([*entry[:3, 3], spin[2, 1], spin[0, 2], spin[1, 0]]))
+            else:
+                columns.append(entry)
+        return array(columns).T.reshape(-1)
+
+
+def _flat(pose: Expression) -> Expression:
+    return array([*pose[:3, :3].reshape(9), *pose[:3, 3]])
+
+
+def layout_of(
+    chart: Chart,
+    observations: tuple[Observation, ...],
+    limits: tuple[Constraint, ...],
+    known: Sequence[Symbol],
+) -> Layout:
+    """Return the arrangement of observations and limits, in groups.
+
+    Raises
+    ------
+    ValueRejectedError
+        If an observation depends on nothing that could be estimated.
+    """
+    speeds = {x: frozenset(chart.row(x)) for x in chart.coordinates}
+    watched: list[frozenset[Symbol]] = []
+    for one in observations:
+        symbols = [s for s in chart.plain(one.value).symbols if s in speeds]
+        if not symbols:
+            raise ValueRejectedError(
+                f"'{one.label}' does not move with any coordinate that is estimated: nothing can be learnt "
+                "from observing it."
+            )
+        watched.append(frozenset().union(*(speeds[s] for s in symbols)))
+    limited = [frozenset[Symbol]().union(*(speeds[s] for s in c.symbols if s in speeds)) for c in limits]
+    # What a rate looks at is carried along with what it moves.
+    rated = [
+        frozenset().union(
+            speeds[x], *(speeds[s] for e in chart.rates[x].values() for s in e.symbols if s in speeds)
+        )
+        for x in chart.coordinates
+        if x in chart.rates
+    ]
+    groups = []
+    for union in connected([*watched, *limited, *rated]):
+        tangent = tuple(v for v in chart.tangent if v in union)
+        coordinates = tuple(x for x in chart.coordinates if speeds[x] & union)
+        groups.append(
+            Group(
+                coordinates,
+                tangent,
+                np.array([chart.coordinates.index(x) for x in coordinates]),
+                np.array([chart.tangent.index(v) for v in tangent]),
+                tuple(i for i, w in enumerate(watched) if w & union),
+                tuple(i for i, w in enumerate(limited) if w & union),
+                bool(chart.by_speeds & set(coordinates)),
+            )
+        )
+    return Layout(chart, observations, limits, tuple(known), tuple(groups))

@@ -1,0 +1,88 @@
+"""Errors of what was seen against what the model says, and their derivatives."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from kineverse.compile import CompiledFunction
+from kineverse.errors import ValueRejectedError
+from kineverse.estimation.noise import Array
+
+from .layout import Layout
+from .reading import Reading
+from .rotations import logarithms, slopes_of_logarithms
+
+
+class Residuals:
+    """Whitened errors of observations: of a pose (p_seen - p, log(R_seen Rᵀ)), in the axes of the observer.
+
+    Parameters
+    ----------
+    layout, function
+        Where numbers are, and what computes them.
+    """
+
+    def __init__(self, layout: Layout, function: CompiledFunction) -> None:
+        self._layout = layout
+        self._function = function
+        self._widths = [len(layout.groups[number].tangent) for number in layout.group_of]
+
+    def evaluate(self, x: Array, known: Array) -> Array:
+        """Return values and derivatives of everything at a state, not whitened."""
+        found: Array = self._function(np.concatenate([x, known]))
+        return found
+
+    def errors(self, out: Array, reading: Reading, which: Sequence[int]) -> dict[int, tuple[Array, Array]]:
+        """Return for each observation seen its whitened error (d,), and derivative of the model (d, t).
+
+        Parameters
+        ----------
+        out
+            What :meth:`evaluate` gave.
+        which
+            The observations that are wanted.
+        """
+        layout = self._layout
+        values = {i: value for i in which if (value := reading.values[i]) is not None}
+        seen = list(values)
+        errors: dict[int, Array] = {}
+        slopes: dict[int, Array] = {}
+        for i in seen:
+            size = layout.observations[i].size
+            slopes[i] = out[layout.slope_slices[i]].reshape(size, self._widths[i])
+        poses = [i for i in seen if layout.observations[i].is_pose]
+        if poses:
+            said = np.stack([out[layout.value_slices[i]] for i in poses])
+            found = np.stack([values[i] for i in poses])
+            turned = found[:, :9].reshape(-1, 3, 3) @ np.swapaxes(said[:, :9].reshape(-1, 3, 3), 1, 2)
+            vectors = logarithms(turned)
+            back = slopes_of_logarithms(vectors)
+            errors.update(
+                zip(poses, np.concatenate([found[:, 9:] - said[:, 9:], vectors], axis=1), strict=True)
+            )
+            for i, turn in zip(poses, back, strict=True):
+                slope = slopes[i]
+                slopes[i] = np.concatenate([slope[:3], turn @ slope[3:]])
+        for i in seen:
+            if i not in errors:
+                errors[i] = values[i] - out[layout.value_slices[i]]
+        return {i: (reading.whitening[i] @ errors[i], reading.whitening[i] @ slopes[i]) for i in seen}
+
+    def check(self, out: Array, which: Sequence[int]) -> None:
+        """Raise an error that names an observation whose value or derivative is not finite.
+
+        Raises
+        ------
+        ValueRejectedError
+            Naming it.
+        """
+        for i in which:
+            one = self._layout.observations[i]
+            for where in (self._layout.value_slices[i], self._layout.slope_slices[i]):
+                if not np.isfinite(out[where]).all():
+                    raise ValueRejectedError(
+                        f"The model says nothing finite about '{one.label}' or its derivative at the present "
+                        "estimate. Give start= a state where it does, or the model limits."
+                    )

@@ -1,0 +1,119 @@
+"""Whatever a model can be made of is tracked: doors, mechanisms, bases, free bodies, cameras."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from seeing import Eyes
+
+import kineverse as kv
+from kineverse.estimation import ObservedExpression, ObservedPose, ObservedPosition, Tracker
+
+
+def moving(model: kv.Model) -> list[str]:
+    return [name for name in model.frames if model.speeds_of(name)]
+
+
+def within(estimate, truth, deviations=4.0):
+    """Whether all coordinates are right, as far as the estimate says it knows."""
+    return {
+        str(s): (estimate.state[s], truth[str(s)], estimate.deviation[s])
+        for s in estimate.state
+        if abs(estimate.state[s] - truth[str(s)]) > deviations * estimate.deviation[s]
+    }
+
+
+@pytest.mark.parametrize(
+    ("mechanism", "truth"),
+    [
+        (kv.FoldingDoor(name="m", parent="world"), {"m": 1.5}),
+        (kv.FoldingDoor(name="m", parent="world"), {"m": 0.02}),
+        (kv.GarageDoor(name="m", parent="world"), {"m/door": 0.7, "m/bolt": 0.2}),
+        (kv.GarageDoor(name="m", parent="world", form="published"), {"m/door": 0.7, "m/bolt": 0.2}),
+        (kv.GarageDoor(name="m", parent="world", form="published"), {"m/door": 1.9, "m/bolt": 0.2}),
+    ],
+)
+def test_mechanisms(mechanism, truth):
+    model = kv.Model()
+    with model.edit() as edit:
+        edit.apply(mechanism)
+    eyes = Eyes(model, moving(model), 0.02, np.radians(2))
+    tracker = Tracker(model, [ObservedPose(f, covariance=eyes.covariance) for f in eyes.frames])
+    for _ in range(25):
+        estimate = tracker.update(eyes(truth))
+    assert not within(estimate, truth)
+    assert max(estimate.deviation.values()) < 0.02
+
+
+def test_a_kitchen_by_name_in_groups():
+    model = kv.load("kitchen")
+    eyes = Eyes(model, moving(model))
+    tracker = Tracker(model, eyes.frames)
+    assert tracker.symbols == model.degrees_of_freedom
+    assert len(tracker.groups) == 23
+    assert tracker.limits[model.symbol("kitchen/fridge_door")] == (0.0, pytest.approx(np.pi / 2))
+    rng = np.random.default_rng(1)
+    truth = {str(s): rng.uniform(*model.limits(s)) for s in tracker.symbols}
+    for _ in range(5):
+        estimate = tracker.update(eyes(truth))
+    assert not within(estimate, truth)
+    assert estimate.dof == 6 * len(eyes.frames)
+
+
+def test_a_free_body_with_a_joint_on_it():
+    model = kv.Model()
+    with model.edit() as edit:
+        edit.apply(kv.Floating(name="box", parent="world", child="box"))
+        edit.apply(kv.Revolute(name="lid", parent="box", child="lid", axis=(0, 0, 1), lower=-1, upper=1))
+    eyes = Eyes(model, ["box", "lid"])
+    tracker = Tracker(model, eyes.frames, uncertainty={"box/x": 3, "box/y": 3, "box/z": 3})
+    truth = dict(
+        zip(
+            ("box/x", "box/y", "box/z", "box/qx", "box/qy", "box/qz", "box/qw", "lid"),
+            (1, 2, 3, 0.5, 0.5, -0.5, 0.5, 0.7),
+            strict=True,
+        )
+    )
+    for _ in range(20):
+        estimate = tracker.update(eyes(truth))
+    assert not within(estimate, truth)
+    assert len(estimate.tangent) == 7  # six of the body, not seven
+
+
+def test_wheels_get_anywhere_and_move_by_their_own_rates():
+    model = kv.Model()
+    with model.edit() as edit:
+        edit.apply(kv.DifferentialDrive(name="base", parent="world", child="base", radius=0.06, track=0.37))
+    left, right = model.speeds
+    eyes = Eyes(model, ["base"])
+    tracker = Tracker(model, ["base"], process_noise={left: 0.01, right: 0.01})
+    state = kv.State({"base/x": 1.0, "base/y": -1.0, "base/angle": 2.0})
+    for _ in range(30):
+        state = model.integrate(state, {left: 5.0, right: 3.0}, 0.1)
+        tracker.predict(0.1, {left: 5.0, right: 3.0})
+        estimate = tracker.update(eyes(state))
+    assert not within(estimate, {str(s): v for s, v in state.items()})
+    assert [str(v) for v in estimate.tangent] == ["base/angle:velocity", "base/x:velocity", "base/y:velocity"]
+
+
+def test_positions_and_expressions_and_a_camera_that_moves():
+    model = kv.load("kitchen")
+    with model.edit() as edit:
+        pan = kv.position("pan")
+        edit.add_frame("camera", parent="world", transform=kv.translation(0, 0, 1.5) @ kv.rotation_z(pan))
+    door, handle = "kitchen/fridge_door", "kitchen/fridge_door_handle"
+    tracker = Tracker(
+        model,
+        [
+            ObservedPosition(handle, (0.1, 0.0, 0.0), relative_to="camera", covariance=1e-4 * np.eye(3)),
+            ObservedExpression("potentiometer", 2 * kv.position(door), covariance=0.01),
+        ],
+        known=["pan"],
+    )
+    point = model.fk(handle, "camera") @ [0.1, 0, 0, 1]
+    for pan_now in np.linspace(0, 1, 10):
+        truth = {door: 0.9, "pan": pan_now}
+        seen = {handle: point(truth)[:3], "potentiometer": 1.8}
+        estimate = tracker.update(seen, given={"pan": pan_now})
+    assert estimate.state[door] == pytest.approx(0.9, abs=1e-3)
+    assert estimate.dof == 4
