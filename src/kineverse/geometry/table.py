@@ -122,11 +122,14 @@ class Table:
         self.axis = old.axis
         if self.bounds is None or old.bounds is None:
             return
-        known = old.bounds[np.ix_(there, there)]
-        # Kept for the smaller number first, 0 for the other way round; numbers may have changed places.
-        known = known + known.T
-        rows, columns = np.meshgrid(here, here, indexing="ij")
-        self.bounds[np.minimum(rows, columns), np.maximum(rows, columns)] = known
+        number = np.full(old.count, -1)
+        number[there] = here
+        measured = np.nonzero(old.bounds)
+        ones, others = (number[pieces] for pieces in measured)
+        both = (ones >= 0) & (others >= 0)
+        ones, others = ones[both], others[both]
+        # Kept for the smaller number first; numbers may have changed places.
+        self.bounds[np.minimum(ones, others), np.maximum(ones, others)] = old.bounds[measured][both]
 
     def forget_travel(self) -> None:
         """Begin to count again, with nothing known of any pair."""
