@@ -350,6 +350,44 @@ def test_rules_are_data_and_the_last_one_decides(tmp_path):
     assert again.looks_at("link1", "link0")
 
 
+def test_rules_come_along_where_a_model_is_included(tmp_path):
+    part = arm_among_boxes(boxes=2)
+    rules = (Rule("hand", why="whatever it meets"), Rule("hand", "box1", check=True))
+    with part.edit() as edit:
+        edit.write(kv.geometry.RULES, kv.geometry.rules_as_data(rules))
+    part.save(tmp_path / "part.kv.json")
+    model = kv.Model()
+    with model.edit() as edit:
+        edit.include(tmp_path / "part.kv.json", "one")
+        edit.include(tmp_path / "part.kv.json", "two")
+        edit.write(kv.geometry.RULES, kv.geometry.rules_as_data([Rule("two/hand", "two/box0", check=True)]))
+    scene = Scene(model)
+    assert not scene.looks_at("one/hand", "one/box0")
+    assert scene.looks_at("one/hand", "one/box1")
+    assert scene.looks_at("two/hand", "two/box0")  # what the whole says comes last
+    assert scene.looks_at("one/hand", "two/box0")  # the part knows nothing of the other
+
+
+@pytest.mark.parametrize(
+    "entry", [("hand", "box0", "no"), ("hand", "box0", 1), ("hand", 3), (), 7, ("", "*")]
+)
+def test_what_is_no_rule_is_refused(model, entry):
+    with pytest.raises(kv.ValueRejectedError, match="A rule is"):
+        Scene(model, rules=[entry])
+
+
+def test_rules_mean_what_their_patterns_match(model):
+    """A rule for each pair, or a pattern for all of them: the same."""
+    scene = Scene(model)
+    named = [Rule(a, b) for a in scene.bodies if a.startswith("link") for b in scene.bodies if b[:3] == "box"]
+    named.append(Rule("box0", "link0", check=True))
+    one = Scene(model, rules=named)
+    other = Scene(model, rules=[Rule("link?", "box*"), Rule("link0", "box0", check=True)])
+    np.testing.assert_array_equal(one._mirror.table.allowed, other._mirror.table.allowed)
+    assert one.looks_at("link0", "box0")
+    assert not one.looks_at("box1", "link0")
+
+
 def test_pairs_that_never_touched_are_a_rule(model):
     rng = np.random.default_rng(0)
     states = [random_state(model, rng) for _ in range(30)]
@@ -362,6 +400,8 @@ def test_pairs_that_never_touched_are_a_rule(model):
             s.update(state)
         assert by_names(scene.within(0.0)) == by_names(quiet.within(0.0))
         assert len(quiet.within(0.5)) <= len(scene.within(0.5))
+    with pytest.raises(kv.ValueRejectedError, match="none is given"):
+        scene.never_touching([])
 
 
 def test_bodies_without_collision_shapes_are_what_is_seen_of_them():

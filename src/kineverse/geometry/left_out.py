@@ -10,7 +10,7 @@ from kineverse.model.body import Geometry, Mesh
 from kineverse.model.view import ModelView
 
 from .pieces import matches, touchable
-from .rules import RULES, Rule, adjacent, allowed, rules_of
+from .rules import Rule, adjacent, allowed, rules_in
 from .solids import solid_of
 from .table import Flags
 
@@ -69,7 +69,7 @@ class Ignored:
 
     def __init__(self, model: ModelView, bodies: Sequence[str]) -> None:
         self._model = model
-        self._rules = rules_of(model.data.get(RULES, ()))
+        self._rules = rules_in(model)
         self._number = {name: k for k, name in enumerate(bodies)}
         self._allowed = allowed(model, bodies, self._rules)
         self._adjacent = adjacent(model, bodies)

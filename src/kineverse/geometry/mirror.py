@@ -18,7 +18,7 @@ from kineverse.symbols import Symbol
 from .mesh_files import Floats
 from .narrow import ACCURACY, Narrow
 from .pieces import Piece, Pieces, load
-from .rules import RULES, Rule, allowed, check_names, rules_of
+from .rules import Rule, allowed, check_names, rules_in, rules_of
 from .solids import Solid
 from .sweep import FURTHEST, GONE_TOO_FAR
 from .sweep_native import sweep_library
@@ -85,7 +85,7 @@ class Mirror:
         if self._version == self.model.version:
             return
         version = self.model.version
-        rules = (*rules_of(self.model.data.get(RULES, ())), *self._own_rules)
+        rules = (*rules_in(self.model), *self._own_rules)
         if self._source.follow(self.model):
             try:
                 self._rebuild(rules)

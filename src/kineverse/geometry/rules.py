@@ -20,9 +20,10 @@ from .pieces import matches
 from .table import Flags
 
 RULES = "geometry/rules"
-"""Where a model keeps its rules."""
+"""Where a model keeps its rules; what it includes below a prefix has them below that prefix."""
 
 _FREE = 6
+_SIGNS = "*?["
 
 
 class Rule(NamedTuple):
@@ -60,10 +61,27 @@ def rules_of(entries: Any) -> tuple[Rule, ...]:
             rule = Rule(*entry)
         except TypeError:
             rule = Rule("")
-        if not (rule.a and all(isinstance(x, str) for x in (rule.a, rule.b, rule.why))):
+        texts = all(isinstance(x, str) for x in (rule.a, rule.b, rule.why))
+        if not (rule.a and texts and isinstance(rule.check, bool | np.bool_)):
             raise ValueRejectedError(f"A rule is (a, b, check, why), as kv.geometry.Rule, not {entry!r}.")
         rules.append(Rule(rule.a, rule.b, bool(rule.check), rule.why))
     return tuple(rules)
+
+
+def rules_in(model: ModelView) -> tuple[Rule, ...]:
+    """Return the rules that a model keeps: those of what it includes, about bodies there, and then its own.
+
+    Raises
+    ------
+    ValueRejectedError
+        If an entry is no ``(a, b, check, why)``.
+    """
+    found: list[Rule] = []
+    for name, entries in model.data.items():
+        if name.endswith(f"/{RULES}"):
+            prefix = name.removesuffix(RULES)
+            found += [rule._replace(a=prefix + rule.a, b=prefix + rule.b) for rule in rules_of(entries)]
+    return (*found, *rules_of(model.data.get(RULES, ())))
 
 
 def rules_as_data(rules: Iterable[Rule]) -> tuple[tuple[str, str, bool, str], ...]:
@@ -73,22 +91,36 @@ def rules_as_data(rules: Iterable[Rule]) -> tuple[tuple[str, str, bool, str], ..
 
 def check_names(rules: Sequence[Rule], model: ModelView) -> None:
     """Raise an error for rules about a body by a name that no frame has; patterns may match nothing."""
-    for name in (name for rule in rules for name in (rule.a, rule.b)):
-        if not any(sign in name for sign in "*?[") and name not in model.frames and name != WORLD:
+    frames = model.frames
+    for name in dict.fromkeys(name for rule in rules for name in (rule.a, rule.b)):
+        if not any(sign in name for sign in _SIGNS) and name not in frames and name != WORLD:
             raise UnknownNameError(
-                f"A rule is about '{name}', which is no frame. {suggest(name, model.frames, 'frame')}"
+                f"A rule is about '{name}', which is no frame. {suggest(name, frames, 'frame')}"
             )
 
 
 def allowed(model: ModelView, bodies: Sequence[str], rules: Sequence[Rule]) -> Flags:
     """Return (B, B) flags, 1 for pairs that are looked at."""
     table = 1 - adjacent(model, bodies)
+    place = {name: k for k, name in enumerate(bodies)}
+    meant: dict[str, list[int]] = {}
     for rule in rules:
-        ones = np.array([matches(name, (rule.a,)) for name in bodies], dtype=bool)
-        others = np.array([matches(name, (rule.b,)) for name in bodies], dtype=bool)
-        table[np.outer(ones, others) | np.outer(others, ones)] = rule.check
+        ones, others = (_numbers(name, place, meant) for name in (rule.a, rule.b))
+        if len(ones) == len(others) == 1:  # of which there may be one for each pair
+            table[ones[0], others[0]] = table[others[0], ones[0]] = rule.check
+        else:
+            table[np.ix_(ones, others)] = table[np.ix_(others, ones)] = rule.check
     np.fill_diagonal(table, 0)
     return np.ascontiguousarray(table)
+
+
+def _numbers(name: str, place: Mapping[str, int], meant: dict[str, list[int]]) -> list[int]:
+    """Return the bodies that a name or pattern means, and remember it."""
+    if name not in meant:
+        is_pattern = any(sign in name for sign in _SIGNS)
+        some = place if is_pattern else (name,) if name in place else ()
+        meant[name] = [place[body] for body in some if matches(body, (name,))]
+    return meant[name]
 
 
 def adjacent(model: ModelView, bodies: Sequence[str]) -> Flags:

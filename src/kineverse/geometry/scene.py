@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from kineverse.errors import UnknownNameError, suggest
+from kineverse.errors import UnknownNameError, ValueRejectedError, suggest
 from kineverse.model.frame import WORLD
 from kineverse.model.kinematics import ancestors
 from kineverse.model.view import ModelView
@@ -189,9 +189,16 @@ class Scene:
         """Return rules that except the pairs which are within a margin [m] at none of some states.
 
         That is an observation and no proof: choose states over the whole range. The scene stays at the last.
+
+        Raises
+        ------
+        ValueRejectedError
+            If there are no states.
         """
         met: set[frozenset[str]] = set()
         every = list(states)
+        if not every:
+            raise ValueRejectedError("What never touches is seen at states, and none is given.")
         for state in every:
             self.update(state)
             met.update(frozenset((found.a, found.b)) for found in self.within(margin))
