@@ -4,6 +4,18 @@
 :mod:`kineverse.estimation.identification` the model of parts whose poses are known.
 """
 
+from .identification import Fit, Found, identify
 from .noise import pose_covariance
+from .tracking import Estimate, ObservedExpression, ObservedPose, ObservedPosition, Tracker
 
-__all__ = ["pose_covariance"]
+__all__ = [
+    "Estimate",
+    "Fit",
+    "Found",
+    "ObservedExpression",
+    "ObservedPose",
+    "ObservedPosition",
+    "Tracker",
+    "identify",
+    "pose_covariance",
+]

@@ -1,1 +1,6 @@
 """The model of parts that move, from noisy poses."""
+
+from .fit import Fit, Found
+from .identify import identify
+
+__all__ = ["Fit", "Found", "identify"]

@@ -1,0 +1,66 @@
+"""One way to write each member of a family, of the many there are."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from .groups import VZ, WZ, GroupMotion
+from .rigid import Array, exponential, frame_along, pose
+from .solving import Solution
+
+
+def canonical(solution: Solution[GroupMotion]) -> Solution[GroupMotion]:
+    """Return the same motion with the axis towards its largest component and joint values around 0.
+
+    The origin of the joint's frame is the point of the axis that is nearest to the child at 0; on a slider it
+    is the child's origin.
+    """
+    motion = solution.motion
+    name = motion.group.name
+    if name in ("rigid", "free", "spherical"):
+        return solution
+    values = solution.values
+    shift = values.mean(axis=0)
+    if name == "planar":
+        shift[2:] = 0.0  # turns and slides do not commute
+    middle = np.zeros(6)
+    middle[list(motion.freedom.joints)] = shift
+    middle[VZ] += motion.pitch * middle[WZ]
+    motion = replace(motion, left=motion.left @ pose(exponential(middle[3:]), middle[:3]))
+    values = values - shift
+    motion = _origin(motion)
+    axis = motion.left[:3, 2]
+    flip = bool(axis[np.argmax(np.abs(axis))] < 0.0)
+    if motion.rows == 6:
+        motion, values = _axes(motion, values, flip)
+    elif flip:
+        motion, values = _gauged(motion, values, np.diag([1.0, -1.0, -1.0]))
+    return replace(solution, motion=motion, values=values, linear=motion.at(values))
+
+
+def _origin(motion: GroupMotion) -> GroupMotion:
+    """Move the joint's origin to the point nearest to the child that the family leaves open."""
+    place = motion.right[:3, 3]
+    free = (1, 1, 1) if motion.group.name == "prismatic" else (0, 0, 1)
+    way = place * free
+    to, back = np.eye(4), np.eye(4)
+    to[:3, 3], back[:3, 3] = way, -way
+    return replace(motion, left=motion.left @ to, right=back @ motion.right)
+
+
+def _axes(motion: GroupMotion, values: Array, flip: bool) -> tuple[GroupMotion, Array]:
+    """Turn the joint's frame about its axis to the one that only depends on the axis."""
+    wanted = frame_along(-motion.left[:3, 2] if flip else motion.left[:3, 2])
+    return _gauged(motion, values, motion.left[:3, :3].T @ wanted)
+
+
+def _gauged(motion: GroupMotion, values: Array, turn: Array) -> tuple[GroupMotion, Array]:
+    change = pose(turn, np.zeros(3))
+    joints = list(motion.freedom.joints)
+    twist = np.zeros((len(values), 6))
+    twist[:, joints] = values
+    twist[:, :3], twist[:, 3:] = twist[:, :3] @ turn, twist[:, 3:] @ turn
+    left, right = motion.left @ change, change.T @ motion.right
+    return replace(motion, left=left, right=right), twist[:, joints]

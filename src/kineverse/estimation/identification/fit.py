@@ -1,0 +1,178 @@
+"""What was found: every family with its probability, and the best of them as an operation."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from kineverse.errors import UnknownNameError, ValueRejectedError, suggest
+from kineverse.model.operation import Operation
+
+from .groups import WX, GroupMotion
+from .operations import joint_operation
+from .rigid import Array
+
+SURE = 0.95
+"""From this probability on, a family is called the right one."""
+
+
+@dataclass(frozen=True)
+class Fit:
+    """The most likely member of one family.
+
+    Attributes
+    ----------
+    family
+        Its name.
+    probability
+        Of the family, among those that were tried.
+    log_evidence
+        Natural logarithm; differences between families count.
+    parameters
+        By name, in the parent's axes: ``axis`` (3,), a ``point`` on it (3,) [m], the ``pitch``
+        [m/revolution], the ``centre`` of a sphere (3,), the ``normal`` of a plane (3,), and ``reference``,
+        the child's pose at joint values 0, (4, 4).
+    covariance
+        Of ``coordinates``, (n, n).
+    coordinates
+        What the rows of the covariance are: ``axis.x`` and ``axis.y`` [rad] are turns of the axis about the
+        first two columns of :attr:`frame`, ``point.x`` and ``point.y`` [m] shift it along them, ``pitch``
+        [m/revolution]; the rest, ``child.…``, moves the child in the joint's frame.
+    frame
+        The joint's frame in the parent, (4, 4): its z axis is the axis, its origin the point.
+    joint_values
+        (N, k), [m] and [rad].
+    deviations
+        Their standard deviations, (N, k).
+    residuals
+        What is left of the relative poses, in the parent's axes, (N, m) [m] and [rad].
+    told
+        Whether the data carry what the family has beyond a pose.
+    reason
+        If not, why.
+    """
+
+    family: str
+    probability: float
+    log_evidence: float
+    parameters: Mapping[str, Array | float]
+    covariance: Array
+    coordinates: tuple[str, ...]
+    frame: Array
+    joint_values: Array
+    deviations: Array
+    residuals: Array
+    told: bool
+    reason: str
+    motion: GroupMotion
+
+    @property
+    def range(self) -> Array:
+        """The least and the largest of each joint value that was seen, (k, 2)."""
+        if not self.joint_values.shape[1]:
+            return np.zeros((0, 2))
+        return np.column_stack([self.joint_values.min(axis=0), self.joint_values.max(axis=0)])
+
+    @property
+    def poses(self) -> Array:
+        """The poses of the child in the parent at the joint values, (N, 4, 4)."""
+        return self.motion.at(self.joint_values).pose
+
+    @property
+    def rms(self) -> tuple[float, float]:
+        """What is left of positions [m] and orientations [rad], root mean square over observations."""
+        squares = np.mean(self.residuals**2, axis=0)
+        return math.sqrt(float(squares[:3].sum())), math.sqrt(float(squares[3:].sum()))
+
+    def deviation(self, coordinate: str) -> float:
+        """Return the standard deviation of a coordinate.
+
+        Raises
+        ------
+        UnknownNameError
+            If there is no such coordinate.
+        """
+        if coordinate not in self.coordinates:
+            raise UnknownNameError(
+                f"A {self.family} fit has no coordinate {coordinate!r}. "
+                f"{suggest(coordinate, self.coordinates, 'coordinate')}"
+            )
+        k = self.coordinates.index(coordinate)
+        return math.sqrt(float(self.covariance[k, k]))
+
+    def operation(self, name: str, parent: str, child: str | None = None) -> Operation:
+        """Return the joint as an operation, with the range that was seen as its limits.
+
+        Parameters
+        ----------
+        name, parent, child
+            Of the articulation and its frames; the child is called like the articulation if None.
+
+        Raises
+        ------
+        ValueRejectedError
+            If only positions of the child were seen, so that its orientation is not known.
+        """
+        if self.motion.rows == 3:
+            raise ValueRejectedError(
+                f"Only positions of the child were seen, so how it is turned on '{name}' is not known."
+            )
+        limits = [(float(low), float(high)) for low, high in self.range]
+        return joint_operation(self.motion, limits, name, parent, name if child is None else child)
+
+    def __str__(self) -> str:
+        words = [f"{self.family}, {self.probability:.1%}"]
+        for (low, high), joint in zip(self.range, self.motion.freedom.joints, strict=True):
+            words.append(f"{math.degrees(high - low):.1f}°" if joint >= WX else f"{high - low:.3g} m")
+        return ", ".join(words)
+
+
+@dataclass(frozen=True)
+class Found:
+    """Every family that was tried, the most probable first.
+
+    Attributes
+    ----------
+    fits
+        One for each family.
+    noise_scale
+        By how much the standard deviations of the noise were scaled; 1 where it was given.
+    """
+
+    fits: tuple[Fit, ...]
+    noise_scale: float = 1.0
+
+    @property
+    def best(self) -> Fit:
+        """The most probable one."""
+        return self.fits[0]
+
+    @property
+    def cannot_tell(self) -> bool:
+        """Whether no family stands out, or what the best one is about is not known."""
+        return self.best.probability < SURE or not self.best.told
+
+    def __getitem__(self, family: str) -> Fit:
+        for fit in self.fits:
+            if fit.family == family:
+                return fit
+        raise UnknownNameError(
+            f"The family {family!r} was not tried. {suggest(family, (f.family for f in self.fits), 'family')}"
+        )
+
+    def __iter__(self) -> Iterator[Fit]:
+        return iter(self.fits)
+
+    def __len__(self) -> int:
+        return len(self.fits)
+
+    def __str__(self) -> str:
+        if not self.cannot_tell:
+            return str(self.best)
+        if self.best.probability >= SURE:
+            return f"cannot tell: {self.best.family}, but {self.best.reason}"
+        likely = [f for f in self.fits if f.probability > 1.0 - SURE]
+        return "cannot tell: " + " or ".join(f"{f.family} ({f.probability:.0%})" for f in likely)

@@ -1,0 +1,238 @@
+"""The families of joints: motions g of a subgroup of SE(3), between parent and child.
+
+    parent_T_child = L · g(a) · R,        g(a) = translation(v(a)) · Exp(ω(a))
+
+A joint value is one of the six components of (v, ω), and the subgroup is said by which of them there are; for
+a screw v_z is the pitch times ω_z besides. So a hinge turns about the z axis of L, and a slider moves along
+it. Of the twelve parameters of L and R those stay that are no gauge: what commutes with the subgroup can be
+moved from L to R, and what is in it is a shift of joint values.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from types import MappingProxyType
+from typing import Self
+
+import numpy as np
+
+from .motion import Linear, Prior
+from .rigid import Array, exponential, pose, right_jacobian, skew
+
+VX, VY, VZ, WX, WY, WZ = range(6)
+
+
+@dataclass(frozen=True, slots=True)
+class Freedom:
+    """Which components are joint values and parameters.
+
+    Attributes
+    ----------
+    joints
+        Components of (v, ω) that are joint values.
+    left
+        Components of the twist that moves L, in L.
+    right
+        Components of the twist that moves R, in front of it.
+    """
+
+    joints: tuple[int, ...]
+    left: tuple[int, ...]
+    right: tuple[int, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Group:
+    """A family of joints.
+
+    Attributes
+    ----------
+    name
+        As in ``found["revolute"]``.
+    poses
+        Its freedom if poses of the child are seen.
+    positions
+        Its freedom if only positions are: how the child is turned is no parameter then.
+    pitch
+        Whether it moves along z by a pitch [m/rad] as it turns.
+    reach
+        How many components of the child's place in the joint's frame are a lever: beforehand they are
+        believed to be within reach.
+    """
+
+    name: str
+    poses: Freedom
+    positions: Freedom
+    pitch: bool = False
+    reach: int = 0
+
+    def freedom(self, rows: int) -> Freedom:
+        """Return the freedom for poses (6) or positions (3)."""
+        return self.poses if rows == 6 else self.positions
+
+
+_LINE = (VX, VY, WX, WY)
+GROUPS: Mapping[str, Group] = MappingProxyType(
+    {
+        group.name: group
+        for group in (
+            Group("rigid", Freedom((), (), (VX, VY, VZ, WX, WY, WZ)), Freedom((), (), (VX, VY, VZ))),
+            Group(
+                "prismatic",
+                Freedom((VZ,), (WX, WY), (VX, VY, WX, WY, WZ)),
+                Freedom((VZ,), (WX, WY), (VX, VY)),
+            ),
+            Group(
+                "revolute",
+                Freedom((WZ,), _LINE, (VX, VY, VZ, WX, WY)),
+                Freedom((WZ,), _LINE, (VX, VZ)),
+                reach=2,
+            ),
+            Group(
+                "screw",
+                Freedom((WZ,), _LINE, (VX, VY, VZ, WX, WY)),
+                Freedom((WZ,), _LINE, (VX, VZ)),
+                pitch=True,
+                reach=2,
+            ),
+            Group(
+                "cylindrical",
+                Freedom((VZ, WZ), _LINE, (VX, VY, WX, WY)),
+                Freedom((VZ, WZ), _LINE, (VX,)),
+                reach=2,
+            ),
+            Group(
+                "spherical",
+                Freedom((WX, WY, WZ), (VX, VY, VZ), (VX, VY, VZ)),
+                Freedom((WY, WZ), (VX, VY, VZ), (VX,)),
+                reach=3,
+            ),
+            Group(
+                "planar",
+                Freedom((VX, VY, WZ), (WX, WY), (VZ, WX, WY)),
+                Freedom((VX, VY), (WX, WY), (VZ,)),
+            ),
+            Group("free", Freedom((VX, VY, VZ, WX, WY, WZ), (), ()), Freedom((VX, VY, VZ), (), ())),
+        )
+    }
+)
+"""The families by name. ``rigid`` has no joint values, and ``free`` has nothing else."""
+
+REACH = 3.0
+"""The standard deviation of each component of a lever, beforehand [m]."""
+
+
+@dataclass(frozen=True, slots=True)
+class GroupMotion:
+    """A member of a group, see the module.
+
+    Attributes
+    ----------
+    group
+        The family.
+    rows
+        6, or 3 for positions only.
+    left, right
+        L and R, 4×4.
+    pitch
+        [m/rad]; 0 for what has none.
+    """
+
+    group: Group
+    rows: int
+    left: Array
+    right: Array
+    pitch: float = 0.0
+
+    @property
+    def freedom(self) -> Freedom:
+        """Which components are joint values and parameters."""
+        return self.group.freedom(self.rows)
+
+    @property
+    def size(self) -> int:
+        """Number of parameters."""
+        freedom = self.freedom
+        return len(freedom.left) + len(freedom.right) + self.group.pitch
+
+    @property
+    def joints(self) -> int:
+        """Number of joint values."""
+        return len(self.freedom.joints)
+
+    def at(self, values: Array) -> Linear:
+        """Return the poses at joint values (N, k)."""
+        freedom = self.freedom
+        twist = np.zeros((len(values), 6))
+        twist[:, freedom.joints] = values
+        if self.group.pitch:
+            twist[:, VZ] += self.pitch * twist[:, WZ]
+        turn, slide = exponential(twist[:, 3:]), twist[:, :3]
+        l_R, r_p = self.left[:3, :3], self.right[:3, 3]
+        parent_R_joint = l_R @ turn
+        lever = parent_R_joint @ r_p
+        way = slide @ l_R.T
+        parent_T_child = pose(parent_R_joint @ self.right[:3, :3], self.left[:3, 3] + way + lever)
+        moved = _columns(parent_R_joint, lever)
+        blocks = [_columns(np.broadcast_to(l_R, turn.shape), way + lever)[:, :, freedom.left]]
+        blocks.append(moved[:, :, freedom.right])
+        if self.group.pitch:
+            along = np.zeros((len(values), 6, 1))
+            along[:, :3, 0] = l_R[:, 2] * twist[:, WZ, None]
+            blocks.append(along)
+        by_joints = self._by_joints(moved, twist)[:, :, freedom.joints]
+        rows = self.rows
+        return Linear(parent_T_child, np.concatenate(blocks, axis=2)[:, :rows], by_joints[:, :rows])
+
+    def _by_joints(self, moved: Array, twist: Array) -> Array:
+        result = np.empty_like(moved)
+        # Slides come before the turn, so they are along the axes of L.
+        result[:, :3, :3] = self.left[:3, :3]
+        result[:, 3:, :3] = 0.0
+        joints = self.freedom.joints
+        if WX in joints or WY in joints:
+            result[:, :, 3:] = moved[:, :, 3:] @ right_jacobian(twist[:, 3:])
+        else:
+            result[:, :, 3:] = moved[:, :, 3:]
+        if self.group.pitch:
+            result[:, :3, WZ] += self.pitch * self.left[:3, 2]
+        return result
+
+    def moved(self, step: Array) -> Self:
+        """Return the member that a step in the parameters leads to."""
+        freedom = self.freedom
+        left, right = np.zeros(6), np.zeros(6)
+        ends = len(freedom.left), len(freedom.left) + len(freedom.right)
+        left[list(freedom.left)] = step[: ends[0]]
+        right[list(freedom.right)] = step[ends[0] : ends[1]]
+        l_T_l = pose(exponential(left[3:]), left[:3])
+        r_T_r = pose(exponential(right[3:]), right[:3])
+        pitch = self.pitch + (float(step[-1]) if self.group.pitch else 0.0)
+        return replace(self, left=self.left @ l_T_l, right=r_T_r @ self.right, pitch=pitch)
+
+    def bounded(self, values: Array, step: Array) -> Array:
+        """Return joint values after a step: at most half a radian at once."""
+        turning = [j >= WX for j in self.freedom.joints]
+        step = step.copy()
+        step[:, turning] = np.clip(step[:, turning], -0.5, 0.5)
+        result: Array = values + step
+        return result
+
+    def prior(self) -> Prior:
+        """Return that levers are within reach."""
+        reach, freedom = self.group.reach, self.freedom
+        r_p = self.right[:3, 3]
+        moves = np.concatenate([np.eye(3), -skew(r_p)], axis=1)[:reach, freedom.right]
+        derivatives = np.zeros((reach, self.size))
+        start = len(freedom.left)
+        derivatives[:, start : start + len(freedom.right)] = moves
+        return Prior(r_p[:reach] / REACH, derivatives / REACH)
+
+
+def _columns(parent_R_frame: Array, lever: Array) -> Array:
+    """Return twists of the child, about its origin, per unit twist of a frame that carries it by a lever."""
+    result = np.zeros((len(lever), 6, 6))
+    result[:, :3, :3] = result[:, 3:, 3:] = parent_R_frame
+    result[:, :3, 3:] = -skew(lever) @ parent_R_frame
+    return result

@@ -1,0 +1,63 @@
+"""What a family of motions is to the solver: poses by parameters and joint values, with derivatives."""
+
+from __future__ import annotations
+
+from typing import NamedTuple, Protocol, Self
+
+from .rigid import Array
+
+
+class Linear(NamedTuple):
+    """Relative poses and what changes them.
+
+    Attributes
+    ----------
+    pose
+        parent_T_child, (N, 4, 4).
+    by_parameters
+        Twists of the child in the parent's axes, about the child's origin, per unit of each parameter: (N, 6,
+        n), linear rows first.
+    by_joints
+        The same per unit of each joint value, (N, 6, k).
+    """
+
+    pose: Array
+    by_parameters: Array
+    by_joints: Array
+
+
+class Prior(NamedTuple):
+    """What is believed of parameters beforehand, as whitened residuals (m,) and their derivatives (m, n)."""
+
+    residuals: Array
+    by_parameters: Array
+
+
+class Motion(Protocol):
+    """A member of a family: its n parameters have values, its k joint values are still free."""
+
+    @property
+    def size(self) -> int:
+        """Number of parameters."""
+        ...
+
+    @property
+    def joints(self) -> int:
+        """Number of joint values."""
+        ...
+
+    def at(self, values: Array) -> Linear:
+        """Return the poses at joint values (N, k)."""
+        ...
+
+    def moved(self, step: Array) -> Self:
+        """Return the member that a step (n,) in the parameters leads to."""
+        ...
+
+    def bounded(self, values: Array, step: Array) -> Array:
+        """Return joint values (N, k) after a step, kept where they mean something."""
+        ...
+
+    def prior(self) -> Prior:
+        """Return what is believed of the parameters."""
+        ...

@@ -1,0 +1,179 @@
+"""Poses of two parts as they were observed, checked."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+import numpy.typing as npt
+
+from kineverse.errors import ShapeError, ValueRejectedError
+
+from .rigid import Array, inverse
+
+_RIGID = 1e-4
+
+
+@dataclass(frozen=True)
+class Observations:
+    """Poses of a parent and a child in one frame, with the covariances of their errors.
+
+    Attributes
+    ----------
+    parent
+        world_T_parent, (N, 4, 4); identities if the parent is the world.
+    child
+        world_T_child, (N, 4, 4); if only positions were seen, with rotations that mean nothing.
+    parent_covariance
+        (N, 6, 6), see :mod:`kineverse.estimation.noise`; None if the parent's pose is exactly known.
+    child_covariance
+        (N, m, m) with m = 6, or m = 3 if only positions were seen.
+    """
+
+    parent: Array
+    child: Array
+    parent_covariance: Array | None
+    child_covariance: Array
+
+    def __len__(self) -> int:
+        return len(self.child)
+
+    @property
+    def rows(self) -> int:
+        """6, or 3 if only positions of the child were seen."""
+        return int(self.child_covariance.shape[-1])
+
+    @cached_property
+    def relative(self) -> Array:
+        """parent_T_child as observed, (N, 4, 4)."""
+        return inverse(self.parent) @ self.child
+
+
+def observations(
+    parent: npt.ArrayLike | None,
+    child: npt.ArrayLike,
+    parent_covariance: npt.ArrayLike | None,
+    child_covariance: npt.ArrayLike,
+) -> Observations:
+    """Return observations, checked.
+
+    Raises
+    ------
+    ShapeError
+        For arrays of other shapes than (N, 4, 4), or (N, 3) for positions of the child, and for numbers of
+        poses that differ.
+    ValueRejectedError
+        For fewer than two poses, NaN, matrices that are not rigid, and covariances that are not positive
+        definite.
+    """
+    b = _numbers(child, "The poses of the child")
+    positions = b.ndim == 2 and b.shape[1:] == (3,)
+    if not positions and b.shape[1:] != (4, 4):
+        raise ShapeError(
+            f"The poses of the child are an array of shape (N, 4, 4), or (N, 3) for positions, not {b.shape}."
+        )
+    if len(b) < 2:
+        raise ValueRejectedError(
+            f"There {'is one pose' if len(b) else 'are no poses'} of the child. How something moves takes "
+            "at least two to see."
+        )
+    if positions:
+        _check_finite(b, "child")
+        matrices = np.tile(np.eye(4), (len(b), 1, 1))
+        matrices[:, :3, 3] = b
+        b = matrices
+    else:
+        check_rigid(b, "child")
+    if parent is None:
+        a = np.tile(np.eye(4), (len(b), 1, 1))
+    else:
+        a = _numbers(parent, "The poses of the parent")
+        if a.shape == (4, 4):
+            a = np.tile(a, (len(b), 1, 1))
+        if a.shape[1:] != (4, 4):
+            raise ShapeError(f"The poses of the parent are an array of shape (N, 4, 4), not {a.shape}.")
+        if len(a) != len(b):
+            raise ShapeError(
+                f"There are {len(a)} poses of the parent and {len(b)} of the child. They come in pairs."
+            )
+        check_rigid(a, "parent")
+    rows = 3 if positions else 6
+    of_parent = None
+    if parent is not None and parent_covariance is not None:
+        of_parent = covariances(parent_covariance, len(b), 6, "parent")
+    given = _numbers(child_covariance, "The covariance of the child")
+    if positions and given.shape[-2:] == (6, 6):
+        given = given[..., :3, :3]
+    return Observations(a, b, of_parent, covariances(given, len(b), rows, "child"))
+
+
+def check_rigid(poses: Array, part: str) -> None:
+    """Look whether matrices (N, 4, 4) are rigid transforms.
+
+    Raises
+    ------
+    ValueRejectedError
+        Naming the first that is not, and by how much.
+    """
+    _check_finite(poses.reshape(len(poses), -1), part)
+    rotations = poses[:, :3, :3]
+    off = np.abs(np.swapaxes(rotations, 1, 2) @ rotations - np.eye(3)).max(axis=(1, 2))
+    last = np.abs(poses[:, 3] - (0.0, 0.0, 0.0, 1.0)).max(axis=1)
+    mirrored = np.linalg.det(rotations) < 0.0
+    wrong = np.flatnonzero((off > _RIGID) | (last > _RIGID) | mirrored)
+    if len(wrong):
+        k = int(wrong[0])
+        how = "mirrors" if mirrored[k] else f"is off by {max(off[k], last[k]):.2g}"
+        raise ValueRejectedError(
+            f"Pose {k} of the {part} is no rigid transform: its matrix {how}. "
+            "Quaternions have to be of unit length before they become matrices."
+        )
+
+
+def covariances(given: npt.ArrayLike, count: int, rows: int, part: str) -> Array:
+    """Return covariances (N, m, m) of one for all, or of one for each pose.
+
+    Raises
+    ------
+    ShapeError, ValueRejectedError
+        If they are something else, or not symmetric and positive definite.
+    """
+    matrices = _numbers(given, f"The covariance of the {part}")
+    if matrices.shape == (rows, rows):
+        matrices = np.broadcast_to(matrices, (count, rows, rows))
+    if matrices.shape != (count, rows, rows):
+        raise ShapeError(
+            f"The covariance of the {part} has shape ({rows}, {rows}), or ({count}, {rows}, {rows}) with one "
+            f"for each pose, not {matrices.shape}."
+        )
+    _check_finite(matrices.reshape(count, -1), part, "Covariance")
+    scale = np.sqrt(np.abs(np.einsum("nii->ni", matrices)))
+    scale[scale == 0.0] = 1.0
+    relative = matrices / (scale[:, :, None] * scale[:, None, :])
+    symmetric = np.abs(relative - np.swapaxes(relative, 1, 2)).max(axis=(1, 2)) < 1e-8
+    smallest = np.linalg.eigvalsh(relative)[:, 0]
+    wrong = np.flatnonzero(~symmetric | (smallest < 1e-12))
+    if len(wrong):
+        k = int(wrong[0])
+        how = "positive definite" if symmetric[k] else "symmetric"
+        raise ValueRejectedError(
+            f"The covariance of the {part} is not {how} (at pose {k}). "
+            "kv.estimation.pose_covariance(position, orientation) makes one of standard deviations."
+        )
+    return matrices
+
+
+def _numbers(given: npt.ArrayLike, what: str) -> Array:
+    try:
+        return np.asarray(given, dtype=np.float64)
+    except (TypeError, ValueError):
+        raise ShapeError(f"{what} are no array of numbers.") from None
+
+
+def _check_finite(rows: Array, part: str, what: str = "Pose") -> None:
+    wrong = np.flatnonzero(~np.isfinite(rows).all(axis=1))
+    if len(wrong):
+        raise ValueRejectedError(
+            f"{what} {int(wrong[0])} of the {part} is not finite. Leave out what was not seen."
+        )

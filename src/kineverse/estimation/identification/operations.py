@@ -1,0 +1,121 @@
+"""Fits as operations.
+
+A joint of :mod:`kineverse.articulations` carries its child frame on the axis. A part that was observed has
+its frame somewhere else, so the joints here have a mount: joint_T_child = motion(q) · mount.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from kineverse.articulations import (
+    Ball,
+    Cylindrical,
+    Fixed,
+    Floating,
+    Joint,
+    Limits,
+    Planar,
+    Prismatic,
+    Revolute,
+    Screw,
+)
+from kineverse.model.body import Pose
+from kineverse.model.operation import Effects, Operation
+from kineverse.model.reader import Reader
+
+from .groups import GroupMotion
+from .rigid import Array, mean_rotation
+
+_Z = (0.0, 0.0, 1.0)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Mounted(Joint):
+    """Base of joints whose child frame is not on the axis.
+
+    Attributes
+    ----------
+    mount
+        joint_T_child at coordinate 0.
+    """
+
+    mount: Pose = Pose()
+
+    @property
+    def kind(self) -> str:
+        """The kind of the joint, as without a mount."""
+        return re.sub("^mounted", "", super().kind)
+
+    def apply(self, model: Reader) -> Effects:
+        """Write the child frame and what the joint writes."""
+        effects = super().apply(model)  # type: ignore[safe-super]
+        parent, factors = effects.frames[self.child]  # type: ignore[misc]
+        frames = {**effects.frames, self.child: (parent, (*factors, self.mount))}  # type: ignore[misc]
+        return replace(effects, frames=frames)
+
+
+@dataclass(frozen=True, kw_only=True)
+class MountedRevolute(Mounted, Revolute):
+    """A hinge and a part on it: parent_T_child = origin · rotation(axis, q) · mount."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class MountedScrew(Mounted, Screw):
+    """A thread and a part on it: parent_T_child = origin · screw(axis, q) · mount."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class MountedCylindrical(Mounted, Cylindrical):
+    """A rod in a sleeve and a part on it: parent_T_child = origin · cylindrical(axis, s, φ) · mount."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class MountedBall(Mounted, Ball):
+    """A ball in a socket and a part on it: parent_T_child = origin · rotation(quaternion) · mount."""
+
+
+def joint_operation(
+    motion: GroupMotion, limits: Sequence[tuple[float, float]], name: str, parent: str, child: str
+) -> Operation:
+    """Return a member of a family as an operation, with limits for its joint values."""
+    names: dict[str, Any] = {"name": name, "parent": parent, "child": child}
+    family = motion.group.name
+    origin, mount = rigid_pose(motion.left), rigid_pose(motion.right)
+    whole = rigid_pose(motion.left @ motion.right)
+    # A direction of L in the child, where nothing turns.
+    x, y, z = (float(c) for c in motion.right[2, :3])
+    axis = x, y, z
+    if family == "rigid":
+        return Fixed(**names, origin=whole)
+    if family == "prismatic":
+        (low, high), *_ = limits
+        return Prismatic(**names, origin=whole, axis=axis, lower=low, upper=high)
+    if family == "revolute":
+        (low, high), *_ = limits
+        return MountedRevolute(**names, origin=origin, mount=mount, axis=_Z, lower=low, upper=high)
+    if family == "screw":
+        (low, high), *_ = limits
+        pitch = 2.0 * np.pi * motion.pitch
+        return MountedScrew(**names, origin=origin, mount=mount, axis=_Z, lower=low, upper=high, pitch=pitch)
+    if family == "cylindrical":
+        slide, turn = (Limits(low, high) for low, high in limits)
+        return MountedCylindrical(**names, origin=origin, mount=mount, axis=_Z, slide=slide, turn=turn)
+    if family == "spherical":
+        return MountedBall(**names, origin=origin, mount=mount)
+    if family == "planar":
+        most = max(max(-low, high) for low, high in limits[:2])
+        return Planar(**names, origin=whole, axis=axis, lower=-most, upper=most)
+    return Floating(**names, origin=whole)
+
+
+def rigid_pose(matrix: Array) -> Pose:
+    """Return a pose whose rotation is one to the last digits, after all steps that made it."""
+    exact = matrix.copy()
+    exact[:3, :3] = mean_rotation(matrix[None, :3, :3])
+    return Pose.of(exact)

@@ -1,0 +1,112 @@
+"""Rigid transforms by the row: arrays (N, 4, 4), rotations (N, 3, 3), vectors (N, 3)."""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+
+Array = npt.NDArray[np.float64]
+
+
+def pose(rotation: Array, position: Array) -> Array:
+    """Return transforms of rotations (..., 3, 3) and positions (..., 3)."""
+    result = np.zeros((*np.broadcast_shapes(rotation.shape[:-2], position.shape[:-1]), 4, 4))
+    result[..., :3, :3] = rotation
+    result[..., :3, 3] = position
+    result[..., 3, 3] = 1.0
+    return result
+
+
+def inverse(a_T_b: Array) -> Array:
+    """Return b_T_a."""
+    b_R_a = np.swapaxes(a_T_b[..., :3, :3], -1, -2)
+    return pose(b_R_a, -(b_R_a @ a_T_b[..., :3, 3:])[..., 0])
+
+
+def skew(v: Array) -> Array:
+    """Return [v]×, so that ``skew(v) @ w`` is v × w."""
+    result = np.zeros((*v.shape, 3))
+    x, y, z = v[..., 0], v[..., 1], v[..., 2]
+    result[..., 0, 1], result[..., 0, 2], result[..., 1, 2] = -z, y, -x
+    result[..., 1, 0], result[..., 2, 0], result[..., 2, 1] = z, -y, x
+    return result
+
+
+def exponential(v: Array) -> Array:
+    """Return rotations by the length of v [rad] about v."""
+    squared = np.einsum("...i,...i->...", v, v)
+    angle = np.sqrt(squared)
+    small = squared < 1e-10
+    divisor = np.where(small, 1.0, squared)
+    s = np.where(small, 1.0 - squared / 6.0, np.sin(angle) / np.sqrt(divisor))
+    c = np.where(small, 0.5 - squared / 24.0, (1.0 - np.cos(angle)) / divisor)
+    k = skew(v)
+    result: Array = s[..., None, None] * k + c[..., None, None] * (k @ k)
+    result[..., (0, 1, 2), (0, 1, 2)] += 1.0
+    return result
+
+
+def logarithm(rotation: Array) -> Array:
+    """Return rotation vectors, of a length of at most π [rad]."""
+    v = 0.5 * np.stack(
+        [
+            rotation[..., 2, 1] - rotation[..., 1, 2],
+            rotation[..., 0, 2] - rotation[..., 2, 0],
+            rotation[..., 1, 0] - rotation[..., 0, 1],
+        ],
+        axis=-1,
+    )
+    cosine = 0.5 * (rotation[..., 0, 0] + rotation[..., 1, 1] + rotation[..., 2, 2] - 1.0)
+    sine = np.sqrt(np.einsum("...i,...i->...", v, v))
+    angle = np.arctan2(sine, cosine)
+    tiny = sine < 1e-9
+    result: Array = v * np.where(tiny, 1.0, angle / np.where(tiny, 1.0, sine))[..., None]
+    far = cosine < -0.99
+    if np.any(far):
+        # The sine carries no direction near half a turn; R + Rᵀ does: it is 2(1 - cos) nnᵀ + 2 cos I.
+        result[far] = _near_half_turn(rotation[far], v[far], angle[far])
+    return result
+
+
+def _near_half_turn(rotation: Array, v: Array, angle: Array) -> Array:
+    outer = 0.5 * (rotation + np.swapaxes(rotation, -1, -2))
+    cosine = np.cos(angle)[..., None]
+    outer[..., (0, 1, 2), (0, 1, 2)] -= cosine
+    largest = np.argmax(np.einsum("...ii->...i", outer), axis=-1)
+    axis = np.take_along_axis(outer, largest[..., None, None], axis=-1)[..., 0]
+    axis /= np.linalg.norm(axis, axis=-1, keepdims=True)
+    sign = np.where(np.einsum("...i,...i->...", axis, v) < 0.0, -1.0, 1.0)
+    result: Array = axis * (sign * angle)[..., None]
+    return result
+
+
+def right_jacobian(v: Array) -> Array:
+    """Return J with Exp(v + δ) = Exp(v) Exp(J δ) to first order, (..., 3, 3)."""
+    squared = np.einsum("...i,...i->...", v, v)
+    angle = np.sqrt(squared)
+    small = squared < 1e-6
+    divisor = np.where(small, 1.0, squared)
+    c = np.where(small, 0.5 - squared / 24.0, (1.0 - np.cos(angle)) / divisor)
+    d = np.where(small, 1.0 / 6.0 - squared / 120.0, (angle - np.sin(angle)) / (divisor * np.sqrt(divisor)))
+    k = skew(v)
+    result: Array = d[..., None, None] * (k @ k) - c[..., None, None] * k
+    result[..., (0, 1, 2), (0, 1, 2)] += 1.0
+    return result
+
+
+def frame_along(z: Array) -> Array:
+    """Return a rotation (3, 3) whose last column is a direction z (3,)."""
+    z = z / np.linalg.norm(z)
+    helper = np.eye(3)[int(np.argmin(np.abs(z)))]
+    x = np.cross(helper, z)
+    x /= np.linalg.norm(x)
+    return np.column_stack([x, np.cross(z, x), z])
+
+
+def mean_rotation(rotations: Array) -> Array:
+    """Return the rotation nearest to the mean of matrices (N, 3, 3), as one matrix."""
+    u, _, vt = np.linalg.svd(rotations.mean(axis=0))
+    if np.linalg.det(u @ vt) < 0.0:
+        u[:, 2] *= -1.0
+    result: Array = u @ vt
+    return result

@@ -1,0 +1,224 @@
+"""Maximum likelihood of parameters, joint values and true poses of the parent, at once.
+
+With the true poses Â_k of the parent as unknowns too, the errors of an observation, in the axes of Â_k, are
+
+    e_A = (Â⁻¹A),      e_B = (Â⁻¹B) against H(θ, a)
+
+and to first order a step (ε, δθ, δa) leaves e_A - ε and e_B - M ε - J_θ δθ - J_a δa, where M carries ε over
+the lever between the parts. Eliminating ε leaves e_B - M e_A with the covariance S = Σ_B + M Σ_A Mᵀ;
+eliminating δa by its Schur complement leaves a system in θ alone. As Â_k is moved after every step, the
+linearisation is that at the estimate, and what is found is the maximum of the full likelihood, with all true
+poses as unknowns.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Generic, Self, TypeVar
+
+import numpy as np
+
+from .matrices import inverted, times
+from .motion import Linear, Motion, Prior
+from .observations import Observations
+from .rigid import Array, exponential, logarithm, pose, skew
+
+M = TypeVar("M", bound=Motion)
+
+_STEPS = 60
+_CLOSE = 1e-9
+# Beforehand, joint values are believed within so much [m] or [rad]: they stay finite where nothing tells
+# them.
+_JOINT_PRECISION = 1e-4
+
+
+@dataclass(frozen=True)
+class Solution(Generic[M]):
+    """What maximises the likelihood, and the quadratic around it.
+
+    Attributes
+    ----------
+    motion
+        The member of the family.
+    values
+        The joint values, (N, k).
+    cost
+        Twice the negative logarithm of likelihood and prior, without constants.
+    residuals
+        Of the child's pose in the parent, in the parent's axes, (N, m): what neither the motion nor the
+        parent's errors explain to first order, with covariance ``covariance``.
+    covariance
+        S, (N, m, m).
+    linear
+        Derivatives at the solution.
+    converged
+        Whether steps became small; else the best that was found.
+    """
+
+    motion: M
+    values: Array
+    cost: float
+    residuals: Array
+    covariance: Array
+    linear: Linear
+    converged: bool
+
+    def scaled(self, factor: float) -> Self:
+        """Return the solution for noise whose standard deviations are larger by a factor."""
+        return replace(self, covariance=factor**2 * self.covariance, cost=self.cost / factor**2)
+
+
+@dataclass(frozen=True)
+class _Point(Generic[M]):
+    """A place in the space of all unknowns, linearised."""
+
+    motion: M
+    values: Array
+    parent: Array
+    linear: Linear
+    prior: Prior
+    own: Array
+    residuals: Array
+    lever: Array
+    parent_covariance: Array | None
+    weights: Array
+    covariance: Array
+    cost: float
+
+
+def solve(seen: Observations, motion: M, values: Array, steps: int = _STEPS) -> Solution[M]:
+    """Return the most likely member of a family, from a start.
+
+    Parameters
+    ----------
+    seen
+        What was observed.
+    motion, values
+        Where to start: a member, and joint values (N, k).
+    steps
+        After so many the best so far is returned.
+    """
+    point = _point(seen, motion, values, seen.parent)
+    damping, converged = 0.0, False
+    for _ in range(steps):
+        reduced = _step(seen, point, damping)
+        if reduced is None:
+            damping = max(10.0 * damping, 1e-6)
+            continue
+        trial, gain = reduced
+        if trial.cost <= point.cost + 1e-12 * abs(point.cost):
+            converged = gain < _CLOSE
+            point, damping = trial, 0.1 * damping if damping > 1e-6 else 0.0
+            if converged:
+                break
+        else:
+            if gain < _CLOSE:
+                converged = True
+                break
+            damping = max(10.0 * damping, 1e-4)
+            if damping > 1e8:
+                break
+    return Solution(
+        point.motion, point.values, point.cost, point.residuals, point.covariance, point.linear, converged
+    )
+
+
+def _point(seen: Observations, motion: M, values: Array, parent: Array) -> _Point[M]:
+    linear = motion.at(values)
+    prior = motion.prior()
+    rows = seen.rows
+    p_R_w = np.swapaxes(parent[:, :3, :3], 1, 2)
+    by_child = linear.pose[:, :3, :3]
+    offset = (p_R_w @ (seen.child[:, :3, 3] - parent[:, :3, 3])[:, :, None])[:, :, 0]
+    error = offset - linear.pose[:, :3, 3]
+    if rows == 6:
+        turned = logarithm(p_R_w @ seen.child[:, :3, :3] @ np.swapaxes(by_child, 1, 2))
+        error = np.concatenate([error, turned], axis=1)
+    covariance = _turned(seen.child_covariance, p_R_w)
+    cost = _squared(error, covariance)
+    own, of_parent = np.zeros((len(seen), 6)), None
+    lever = _lever(linear.pose[:, :3, 3], rows)
+    residuals = error
+    if seen.parent_covariance is not None:
+        moved = (p_R_w @ (seen.parent[:, :3, 3] - parent[:, :3, 3])[:, :, None])[:, :, 0]
+        own = np.concatenate([moved, logarithm(p_R_w @ seen.parent[:, :3, :3])], axis=1)
+        of_parent = _turned(seen.parent_covariance, p_R_w)
+        cost += _squared(own, of_parent)
+        residuals = error - times(lever, own)
+        covariance = covariance + lever @ of_parent @ np.swapaxes(lever, 1, 2)
+    weights = inverted(covariance)
+    cost += float(prior.residuals @ prior.residuals) + _JOINT_PRECISION * float(np.sum(values**2))
+    return _Point(
+        motion, values, parent, linear, prior, own, residuals, lever, of_parent, weights, covariance, cost
+    )
+
+
+def _step(seen: Observations, point: _Point[M], damping: float) -> tuple[_Point[M], float] | None:
+    """Return where a step leads, and by how much it promises to reduce the cost; None if there is no step."""
+    by_parameters, by_joints = point.linear.by_parameters, point.linear.by_joints
+    projected = point.weights
+    moving = by_joints.shape[2] > 0
+    if moving:
+        weighted = np.swapaxes(by_joints, 1, 2) @ point.weights
+        curvature = weighted @ by_joints
+        diagonal = np.einsum("nii->ni", curvature)
+        diagonal += _JOINT_PRECISION + damping * diagonal
+        slope = times(weighted, point.residuals) - _JOINT_PRECISION * point.values
+        inverse = inverted(curvature)
+        projected = point.weights - np.swapaxes(weighted, 1, 2) @ inverse @ weighted
+    rotated = np.swapaxes(by_parameters, 1, 2) @ projected
+    prior = point.prior
+    normal = np.einsum("nir,nrj->ij", rotated, by_parameters) + prior.by_parameters.T @ prior.by_parameters
+    right = np.einsum("nir,nr->i", rotated, point.residuals) - prior.by_parameters.T @ prior.residuals
+    if moving:
+        # What the prior of joint values adds, carried to the parameters.
+        pull = times(inverse, _JOINT_PRECISION * point.values)
+        right += np.einsum("nrj,nrk,nk->j", by_parameters, np.swapaxes(weighted, 1, 2), pull)
+    normal[np.diag_indices_from(normal)] *= 1.0 + damping
+    try:
+        step = np.linalg.solve(normal, right) if len(right) else right
+    except np.linalg.LinAlgError:
+        return None
+    gain = float(step @ right)
+    left = (by_parameters @ step) if len(step) else np.zeros_like(point.residuals)
+    values = point.values
+    if moving:
+        back = slope - times(weighted, left)
+        change = times(inverse, back)
+        gain += float(np.sum(slope * times(inverse, slope)))
+        left = left + times(by_joints, change)
+        values = point.motion.bounded(values, change)
+    parent = point.parent
+    if point.parent_covariance is not None:
+        rest = point.weights @ (point.residuals - left)[:, :, None]
+        blame = point.parent_covariance @ np.swapaxes(point.lever, 1, 2) @ rest
+        error = point.own + blame[:, :, 0]
+        parent = parent @ pose(exponential(error[:, 3:]), error[:, :3])
+        gain += float(np.sum(error**2 / np.einsum("nii->ni", point.parent_covariance)))
+    if not (np.isfinite(step).all() and np.isfinite(values).all() and np.isfinite(parent).all()):
+        return None
+    trial = _point(seen, point.motion.moved(step), values, parent)
+    return (trial, gain) if np.isfinite(trial.cost) else None
+
+
+def _lever(offset: Array, rows: int) -> Array:
+    """Return M: how the child moves with an error of the parent."""
+    result = np.zeros((len(offset), rows, 6))
+    result[:, :, :rows] = np.eye(rows)
+    result[:, :3, 3:] = -skew(offset)
+    return result
+
+
+def _turned(covariance: Array, rotation: Array) -> Array:
+    """Return covariances in other axes."""
+    turned = np.empty_like(covariance) if covariance.flags.writeable else np.empty(covariance.shape)
+    back = np.swapaxes(rotation, 1, 2)
+    for i in range(0, covariance.shape[1], 3):
+        for j in range(0, covariance.shape[2], 3):
+            turned[:, i : i + 3, j : j + 3] = rotation @ covariance[:, i : i + 3, j : j + 3] @ back
+    return turned
+
+
+def _squared(errors: Array, covariance: Array) -> float:
+    solved = np.linalg.solve(covariance, errors[:, :, None])
+    return float(np.sum(errors * solved[:, :, 0]))

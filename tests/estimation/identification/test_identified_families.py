@@ -1,0 +1,40 @@
+"""Every family is found from what it makes, and is an operation that makes it again."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from part_recordings import JOINTS, recording
+
+import kineverse as kv
+from kineverse.estimation import identify, pose_covariance
+
+COVARIANCE = pose_covariance(0.002, 0.01)
+
+
+@pytest.mark.parametrize("family", [*JOINTS])
+def test_a_family_is_recognised(family: str) -> None:
+    seen = recording(family, count=30, position=0.002, orientation=0.01, seed=3)
+    found = identify(seen.parent, seen.child, noise=COVARIANCE)
+    assert found.best.family == family
+    assert found.best.probability > 0.9
+    assert sum(fit.probability for fit in found) == pytest.approx(1.0)
+
+
+@pytest.mark.parametrize("family", [*JOINTS])
+def test_the_operation_moves_as_the_fit_does(family: str) -> None:
+    seen = recording(family, count=30, position=0.002, orientation=0.01, seed=4)
+    fit = identify(seen.parent, seen.child, noise=COVARIANCE)[family]
+    model = kv.Model()
+    with model.edit() as edit:
+        edit.add_frame("body", parent="world", transform=np.eye(4))
+        edit.apply(fit.operation("joint", parent="body", child="part"), tag="learned")
+    joint = model.articulations["joint"]
+    pose = model.fk("part", "body")
+    home = dict(zip(joint.coordinates, joint.home, strict=True))
+    np.testing.assert_allclose(pose(home), fit.parameters["reference"], atol=1e-9)
+    if family in ("prismatic", "revolute", "screw", "cylindrical"):
+        for k in (0, 7):
+            values = dict(zip(joint.coordinates, fit.joint_values[k], strict=True))
+            np.testing.assert_allclose(pose(values), fit.poses[k], atol=1e-9)
+            assert not model.violations(values)
