@@ -12,7 +12,7 @@ from scenes import arm_among_boxes, body
 
 import kineverse as kv
 from kineverse.geometry import RULES, Rule, Scene, rules_as_data
-from kineverse.geometry.left_out import JOINED, RIGID, Ignored, unusable
+from kineverse.geometry.left_out import JOINED, RIGID, Ignored, remarks, unusable
 from kineverse.geometry.solids import solid_of, solid_of_hull
 from kineverse.geometry.surface import surface_of
 from kineverse.model.body import Body, Box, Mesh, Shape, Sphere
@@ -29,24 +29,52 @@ def with_bad_bodies(folder):
             ("empty", Mesh("empty.stl", folder=str(folder))),
             ("flat", Box((1.0, 0.0, 1.0))),
         ):
-            shapes = (Shape(Sphere(0.1)), Shape(geometry))
+            shapes = (Shape(Sphere(0.1)), *[Shape(geometry)] * (2 if name == "flat" else 1))
             edit.add_frame(f"bad/{name}", "base", kv.translation(0, 0, 1), Body(collisions=shapes))
+        edit.add_frame("bad/all", "base", np.eye(4), Body(visuals=(Shape(Mesh("nowhere.stl")),)))
     return model
 
 
-def test_bodies_that_cannot_be_used_are_named_and_the_rest_can_be_asked(tmp_path):
+def test_shapes_that_cannot_be_used_are_named_and_the_rest_can_be_asked(tmp_path):
     model = with_bad_bodies(tmp_path)
     problems = unusable(model)
-    assert set(problems) == {"bad/lost", "bad/empty", "bad/flat"}
-    assert "nowhere.stl" in problems["bad/lost"]
-    assert "empty.stl" in problems["bad/empty"]
-    assert "sizes" in problems["bad/flat"]
+    assert set(problems) == {
+        ("bad/lost", 1),
+        ("bad/empty", 1),
+        ("bad/flat", 1),
+        ("bad/flat", 2),
+        ("bad/all", 0),
+    }
+    assert "nowhere.stl" in problems["bad/lost", 1]
+    assert "empty.stl" in problems["bad/empty", 1]
+    assert "sizes" in problems["bad/flat", 1]
     assert not any("\n" in why or "Looked" in why for why in problems.values())
+    assert list(remarks(model, problems)) == [
+        "shape 1 of bad/lost",
+        "shape 1 of bad/empty",
+        "shape 1 of bad/flat",
+        "shape 2 of bad/flat",
+        "bad/all",
+    ]
     scene = Scene(model, leave_out=problems)
     scene.update(model.default_state())
     assert scene.within(0.1)
-    assert not set(problems) & set(scene.bodies)
+    assert "bad/all" not in scene.bodies
+    # The ball, at (0, 0, 1) of the base, is there, in each of them.
+    for name in ("lost", "empty", "flat"):
+        found = scene.distance(f"bad/{name}", "box0")
+        only = Scene(model, leave_out=[f"bad/{name}", *problems])
+        assert f"bad/{name}" not in only.bodies
+        assert found.piece_a == 0
     assert unusable(arm_among_boxes()) == {}
+
+
+@pytest.mark.parametrize("option", ["leave_out", "triangles", "decomposed"])
+def test_names_that_mean_no_body_are_refused(option):
+    model = arm_among_boxes(boxes=1)
+    with pytest.raises(kv.UnknownNameError, match=f"{option}= names 'hnad'.*hand"):
+        Scene(model, **{option: ["hnad"]})
+    assert Scene(model, **{option: ["nothing*"]}).bodies == Scene(model).bodies
 
 
 def test_every_pair_is_looked_at_or_there_is_a_reason():

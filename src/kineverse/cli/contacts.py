@@ -19,7 +19,7 @@ TOUCHING = 1e-5
 def contacts(model: ModelView) -> Sequence[Closest] | None:
     """Return the pairs that touch or penetrate at the default state, deepest first; None if nobody can say.
 
-    Bodies whose shapes cannot be used are left out. Nobody can say without the extra ``geometry``, or where
+    Shapes that cannot be used are left out. Nobody can say without the extra ``geometry``, or where
     there are no poses at the default state.
     """
     if not is_installed():

@@ -88,13 +88,13 @@ def _write_picture(
     arguments: argparse.Namespace, model: kv.Model, state: dict[str, float], near: float | None
 ) -> int:
     """Write a picture of the state, and say what it cannot show."""
-    from kineverse.geometry.left_out import unusable
+    from kineverse.geometry.left_out import remarks, unusable
     from kineverse.view import meshes, save
 
     save(arguments.picture, model, state, collisions=arguments.collisions, near=near)
     problems = [f"{m.uri}: {meshes.load(m).problem}" for m in meshes.seen_in(model) if meshes.load(m).problem]
     note_problems(problems)
-    left_out = unusable(model) if near is not None else {}
+    left_out = remarks(model, unusable(model)) if near is not None else {}
     if left_out:
         print(f"kineverse: note: no distances to {', '.join(left_out)}", file=sys.stderr)
     print(f"picture: {arguments.picture}")

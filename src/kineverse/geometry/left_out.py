@@ -1,8 +1,9 @@
-"""What a scene does not look at, and why: bodies that cannot be used, pairs that are ignored."""
+"""What a scene does not look at, and why: shapes that cannot be used, pairs that are ignored."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections import Counter
+from collections.abc import Mapping, Sequence
 from importlib.util import find_spec
 
 from kineverse.errors import FormatError, MissingExtraError, ValueRejectedError
@@ -23,10 +24,11 @@ def is_installed() -> bool:
     return find_spec("coal") is not None
 
 
-def unusable(model: ModelView) -> dict[str, str]:
-    """Return the bodies that distances cannot be computed to, with the reason in one line.
+def unusable(model: ModelView) -> dict[tuple[str, int], str]:
+    """Return the shapes that distances cannot be computed to, with the reason in one line.
 
-    A scene without them, ``Scene(model, leave_out=unusable(model))``, answers for all the others.
+    They are known by their body and number. A scene without them answers for all the others:
+    ``Scene(model, leave_out=unusable(model))``.
 
     Raises
     ------
@@ -34,13 +36,23 @@ def unusable(model: ModelView) -> dict[str, str]:
         If coal is not installed.
     """
     known: dict[Geometry, str] = {}
-    found: dict[str, str] = {}
+    found: dict[tuple[str, int], str] = {}
     for name, body in model.bodies.items():
-        for shape in touchable(body):
+        for number, shape in enumerate(touchable(body)):
             if shape.geometry not in known:
                 known[shape.geometry] = _problem(shape.geometry)
             if known[shape.geometry]:
-                found.setdefault(name, known[shape.geometry])
+                found[name, number] = known[shape.geometry]
+    return found
+
+
+def remarks(model: ModelView, problems: Mapping[tuple[str, int], str]) -> dict[str, str]:
+    """Return what to call shapes that are left out, with the reason; without a number if no other is left."""
+    count = Counter(name for name, _ in problems)
+    found: dict[str, str] = {}
+    for (name, number), why in problems.items():
+        stays = count[name] < len(touchable(model.bodies[name]))
+        found.setdefault(f"shape {number} of {name}" if stays else name, why)
     return found
 
 

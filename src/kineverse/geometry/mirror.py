@@ -17,7 +17,7 @@ from kineverse.symbols import Symbol
 
 from .mesh_files import Floats
 from .narrow import ACCURACY, Narrow
-from .pieces import Piece, Pieces, load
+from .pieces import Left, Piece, Pieces, load
 from .rules import Rule, allowed, check_names, rules_in, rules_of
 from .solids import Solid
 from .sweep import FURTHEST, GONE_TOO_FAR
@@ -38,7 +38,7 @@ class Mirror:
         Beside those that the model keeps; they come after them.
     triangles, decomposed, leave_out
         Patterns of bodies whose meshes stay triangles, of those whose meshes are the hulls that they were
-        decomposed into, and of bodies that do not take part.
+        decomposed into, and of bodies that do not take part, or bodies with the number of a shape.
 
     Attributes
     ----------
@@ -58,12 +58,16 @@ class Mirror:
         rules: Iterable[Rule],
         triangles: Iterable[str],
         decomposed: Iterable[str],
-        leave_out: Iterable[str],
+        leave_out: Iterable[Left],
     ) -> None:
         self.model = model
         self._own_rules = rules_of(rules)
-        check_names(self._own_rules, model)
-        self._source = Pieces(_names(triangles), _names(decomposed), _names(leave_out))
+        check_names("A rule is about", (name for rule in self._own_rules for name in rule[:2]), model)
+        patterns = tuple(_names(names) for names in (triangles, decomposed, leave_out))
+        for what, names in zip(("triangles", "decomposed", "leave_out"), patterns, strict=True):
+            bodies = (name if isinstance(name, str) else name[0] for name in names)
+            check_names(f"{what}= names", bodies, model)
+        self._source = Pieces(*patterns)
         self._version: int | None = None
         self._values: dict[Symbol, float] = {}
         self._unplaced = ""
@@ -335,5 +339,5 @@ def _standing(piece: Piece) -> Floats:
     return pose
 
 
-def _names(names: Iterable[str]) -> tuple[str, ...]:
+def _names(names: Iterable[Any]) -> tuple[Any, ...]:
     return (names,) if isinstance(names, str) else tuple(names)

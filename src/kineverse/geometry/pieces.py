@@ -6,6 +6,7 @@ import logging
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
+from typing import TypeAlias
 
 from kineverse.errors import FormatError, ValueRejectedError
 from kineverse.expressions.expression import Expression
@@ -18,6 +19,9 @@ from .mesh_files import Floats
 from .solids import Solid, solid_of, solid_of_hull
 
 logger = logging.getLogger("kineverse.geometry")
+
+Left: TypeAlias = str | tuple[str, int]
+"""What is left out: bodies by a name or pattern, or the shape of a body that has a number."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -97,13 +101,15 @@ class Pieces:
     ----------
     triangles, decomposed, leave_out
         Patterns of bodies whose meshes stay triangles, of those whose meshes are the hulls that they were
-        decomposed into, and of those that have no pieces.
+        decomposed into, and of those that have no pieces, or bodies with the number of a shape that has none.
     """
 
     def __init__(
-        self, triangles: tuple[str, ...], decomposed: tuple[str, ...], leave_out: tuple[str, ...]
+        self, triangles: tuple[str, ...], decomposed: tuple[str, ...], leave_out: tuple[Left, ...]
     ) -> None:
-        self._triangles, self._decomposed, self._leave_out = triangles, decomposed, leave_out
+        self._triangles, self._decomposed = triangles, decomposed
+        self._leave_out = tuple(name for name in leave_out if isinstance(name, str))
+        self._without = frozenset(leave_out) - frozenset(self._leave_out)
         self._frames: Mapping[str, Frame] = {}
         self._bodies: Mapping[str, Body] = {}
         self._rates = b""
@@ -127,7 +133,8 @@ class Pieces:
             kept = self.by_body.get(name)
             if kept is None or self._bodies[name] is not body or same is None or not same.pose_of(name):
                 kept = tuple(self._made(model, name, body))
-            found[name] = kept
+            if kept:
+                found[name] = kept
         changed = list(found.items()) != list(self.by_body.items())
         self._frames, self._bodies, self._rates, self.by_body = frames, bodies, rates, found
         return changed
@@ -137,6 +144,8 @@ class Pieces:
         triangles = matches(name, self._triangles)
         decomposed = not triangles and matches(name, self._decomposed)
         for number, shape in enumerate(touchable(body)):
+            if (name, number) in self._without:
+                continue
             pose = (world_T_body @ shape.origin.matrix)[:3]
             for hull in _hulls(name, shape) if decomposed else (None,):
                 yield Piece(name, number, shape, triangles, pose, hull)

@@ -89,14 +89,12 @@ def rules_as_data(rules: Iterable[Rule]) -> tuple[tuple[str, str, bool, str], ..
     return tuple((rule.a, rule.b, rule.check, rule.why) for rule in rules_of(rules))
 
 
-def check_names(rules: Sequence[Rule], model: ModelView) -> None:
-    """Raise an error for rules about a body by a name that no frame has; patterns may match nothing."""
+def check_names(what: str, names: Iterable[str], model: ModelView) -> None:
+    """Raise an error for a name that no frame has, given for ``what``; patterns may match nothing."""
     frames = model.frames
-    for name in dict.fromkeys(name for rule in rules for name in (rule.a, rule.b)):
+    for name in dict.fromkeys(names):
         if not any(sign in name for sign in _SIGNS) and name not in frames and name != WORLD:
-            raise UnknownNameError(
-                f"A rule is about '{name}', which is no frame. {suggest(name, frames, 'frame')}"
-            )
+            raise UnknownNameError(f"{what} '{name}', which is no frame. {suggest(name, frames, 'frame')}")
 
 
 def allowed(model: ModelView, bodies: Sequence[str], rules: Sequence[Rule]) -> Flags:

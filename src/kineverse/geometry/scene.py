@@ -21,6 +21,7 @@ from .found import Found
 from .mesh_files import Floats
 from .mirror import Mirror
 from .moving import Motion
+from .pieces import Left
 from .results import Closest, Hit, Nearby
 from .rules import Rule
 
@@ -46,14 +47,14 @@ class Scene:
         far as they are in the cache; the log names the others, which are their one hull. Their files are read
         at once.
     leave_out
-        Bodies, or patterns, that do not take part.
+        Bodies, or patterns, that do not take part; or ``(body, number)``, the shape of a body that does not.
 
     Raises
     ------
     MissingExtraError
         If coal is not installed.
     UnknownNameError
-        If a rule is about a frame that does not exist.
+        If a rule, or another argument, is about a frame that does not exist.
     """
 
     def __init__(
@@ -63,7 +64,7 @@ class Scene:
         rules: Iterable[Rule] = (),
         triangles: Iterable[str] = (),
         decomposed: Iterable[str] = (),
-        leave_out: Iterable[str] = (),
+        leave_out: Iterable[Left] = (),
     ) -> None:
         self.model = model
         self._mirror = Mirror(model, rules, triangles, decomposed, leave_out)

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from itertools import takewhile
 
 from kineverse.geometry import Closest, Rule, Scene
-from kineverse.geometry.left_out import RIGID, Ignored, unusable
+from kineverse.geometry.left_out import RIGID, Ignored, remarks, unusable
 from kineverse.model.view import ModelView
 
 RADIUS = 0.1
@@ -46,7 +46,7 @@ class Nearness:
 
 
 class Near:
-    """Distances in a model, for one thread; bodies that cannot be used are left out.
+    """Distances in a model, for one thread; shapes that cannot be used are left out.
 
     Parameters
     ----------
@@ -56,7 +56,7 @@ class Near:
     Attributes
     ----------
     problems
-        Why bodies are left out, by name.
+        Why bodies, or shapes of bodies, are left out, by what people call them.
 
     Raises
     ------
@@ -66,18 +66,18 @@ class Near:
 
     def __init__(self, model: ModelView) -> None:
         self._model = model
-        self.problems: dict[str, str] = {}
         self._make()
 
     def _make(self) -> None:
-        self.problems = unusable(self._model)
-        self._scene = Scene(self._model, leave_out=self.problems)
+        self._unusable = unusable(self._model)
+        self.problems = remarks(self._model, self._unusable)
+        self._scene = Scene(self._model, leave_out=self._unusable)
         self._all: Scene | None = None
         self._ignored = Ignored(self._model, self._scene.bodies)
 
     def follow(self) -> None:
         """Look at the model as it is now."""
-        if unusable(self._model) != self.problems:
+        if unusable(self._model) != self._unusable:
             self._make()
         else:
             self._ignored = Ignored(self._model, self._scene.bodies)
@@ -125,7 +125,7 @@ class Near:
         self, values: Mapping[str, float], radius: float, containing: str
     ) -> list[tuple[Closest, str]]:
         if self._all is None:
-            self._all = Scene(self._model, rules=[Rule("*", "*", check=True)], leave_out=self.problems)
+            self._all = Scene(self._model, rules=[Rule("*", "*", check=True)], leave_out=self._unusable)
         self._all.update(values)
         found = _named(self._all.within(radius), containing)
         reasons = ((pair, self._ignored.why(pair.a, pair.b)) for pair in found)

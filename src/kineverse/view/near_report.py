@@ -14,7 +14,7 @@ LINES = 12
 """Lines of the list: more than these are counted, not listed."""
 
 LEFT_OUT = 5
-"""Bodies that are left out and named with the reason; more are counted."""
+"""Bodies, and shapes of them, that are left out and named with the reason; more are counted."""
 
 TOUCHING = 5e-6
 """What is less deep than this is said to touch, not to be 0.00 mm deep [m]."""
@@ -81,8 +81,7 @@ def _more(count: int) -> list[str]:
 def _left_out(problems: Mapping[str, str]) -> list[str]:
     if not problems:
         return []
-    title = f"No distances to {len(problems)} bod{'y' if len(problems) == 1 else 'ies'}"
-    lines = [f'<div style="margin-top:5px"><b>{title}</b></div>']
+    lines = ['<div style="margin-top:5px"><b>No distances to</b></div>']
     for name, why in list(problems.items())[:LEFT_OUT]:
         lines.append(f"<div>{html.escape(name)}: {html.escape(why)}</div>")
     return lines + _more(len(problems) - LEFT_OUT)

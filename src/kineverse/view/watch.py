@@ -33,7 +33,7 @@ class Wanted:
 
 @dataclass(frozen=True, slots=True)
 class Seen:
-    """What was seen last: what is near, why bodies are left out, by name, and what went wrong if it did."""
+    """What was seen last: what is near, why bodies and shapes are left out, and what went wrong if it did."""
 
     nearness: Nearness | None = None
     problems: Mapping[str, str] | None = None
