@@ -148,3 +148,20 @@ def test_a_ray_from_nowhere_is_refused(origin):
             ask()
     with pytest.raises(kv.ValueRejectedError, match="direction"):
         scene.ray((0, 0, 0), (0, 0, 0))
+
+
+def test_rays_of_any_direction_and_from_far_away():
+    model = kv.Model()
+    with model.edit() as edit:
+        edit.add_frame("speck", "world", kv.translation(1.0, 0, 0), body(Sphere(1e-4)))
+    scene = Scene(model)
+    scene.update({})
+    for size in (1e-300, 1e-160, 1e160, 1e300):
+        assert scene.ray((0, 0, 0), (size, 0, 0)).distance == pytest.approx(1 - 1e-4)
+    for away in (1e3, 1e5, 1e7):
+        way = np.array([0.6, 0.48, 0.64])
+        assert scene.ray((1, 0, 0) - away * way, way).body == "speck"
+        assert scene.ray((1, 0, 2e-4) - away * way, way) is None
+    for ask in (lambda: scene.point((1e200, 0, 0)), lambda: scene.ray((0, 1e200, 0), (1, 0, 0))):
+        with pytest.raises(kv.ValueRejectedError, match="further than"):
+            ask()

@@ -14,23 +14,25 @@ from .mirror import Mirror
 from .narrow import ACCURACY, distance_to_point
 from .rays import enter
 from .results import Hit, Nearby
+from .sweep import FURTHEST
 
 
 def cast(mirror: Mirror, origin: npt.ArrayLike, direction: npt.ArrayLike, length: float) -> Hit | None:
     """Return what a ray meets first within a length [m], None if nothing."""
-    start, way = _vector(origin, "origin"), _vector(direction, "direction")
-    size = float(np.linalg.norm(way))
+    start, way = _place(origin, "origin"), _vector(direction, "direction")
+    size = float(np.abs(way).max())
     if size == 0.0:
         raise ValueRejectedError("The direction of a ray is a vector other than 0.")
     if not length > 0.0:
         raise ValueRejectedError(f"The length of a ray is positive [m], not {length!r}.")
-    way = way / size
+    way = way / size  # first, so that squares neither overflow nor vanish
+    way /= np.linalg.norm(way)
     mirror.ready()
     table = mirror.table
     # How far along the ray each sphere begins, if the ray goes through it.
     to_centre = table.place - start
     along = to_centre @ way
-    aside = (to_centre**2).sum(axis=1) - along**2
+    aside = ((to_centre - np.outer(along, way)) ** 2).sum(axis=1)
     through = np.flatnonzero((aside <= (table.radius * (1 + 1e-9)) ** 2) & (along >= -table.radius))
     begins = np.maximum(along[through] - table.radius[through], 0.0)
     best: tuple[float, int, Floats] | None = None
@@ -52,7 +54,7 @@ def cast(mirror: Mirror, origin: npt.ArrayLike, direction: npt.ArrayLike, length
 
 def locate(mirror: Mirror, point: npt.ArrayLike, radius: float) -> Nearby | None:
     """Return what is nearest to a point within a radius [m], deepest if it is inside; None if nothing is."""
-    place = _vector(point, "point")
+    place = _place(point, "point")
     if not radius >= 0.0:
         raise ValueRejectedError(f"A radius is a distance from 0 on [m], not {radius!r}.")
     mirror.ready()
@@ -71,6 +73,13 @@ def locate(mirror: Mirror, point: npt.ArrayLike, radius: float) -> Nearby | None
             piece = mirror.pieces[k]
             best = Nearby(piece.body, piece.number, distance, nearest, normal)
     return best
+
+
+def _place(values: npt.ArrayLike, what: str) -> Floats:
+    place = _vector(values, what)
+    if np.abs(place).max() > FURTHEST:
+        raise ValueRejectedError(f"The {what} {place} is further than {FURTHEST:g} m away.")
+    return place
 
 
 def _vector(values: npt.ArrayLike, what: str) -> Floats:
