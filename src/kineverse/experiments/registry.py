@@ -15,7 +15,12 @@ from .report import Report
 Progress: TypeAlias = Callable[[Iterable[Any], str, str], Iterable[Any]]
 
 EXPERIMENTS: Mapping[str, str] = MappingProxyType(
-    {"fig3": "the garage door and its lock (2022 paper, Fig. 3 and Eqs. 11-13)"}
+    {
+        "fig3": "the garage door and its lock (2022 paper, Fig. 3 and Eqs. 11-13)",
+        "fig4": "a kitchen tracked from poses of its parts (2022 paper, Fig. 4; 2020 paper, IV-A)",
+        "sturm": "hinges and sliders learned from recordings of doors and drawers (--data FOLDER)",
+        "estimation-grid": "hinges and sliders learned from noisy poses, against the Cramér-Rao bound",
+    }
 )
 """What there is; each name is that of a module of this package, with an underscore for a dash."""
 

@@ -1,0 +1,57 @@
+"""``fig4``: tracking a kitchen from poses of its parts (2020 paper, IV-A; 2022 paper, IV-B, Fig. 4).
+
+The papers' filter and :class:`kineverse.estimation.Tracker` see the same observations. Beside what the papers
+plot stands what their noise cannot show: whether a filter is as good as the Cramér-Rao bound allows, and
+whether its covariance is true.
+"""
+
+from __future__ import annotations
+
+from kineverse.experiments.options import Options
+from kineverse.experiments.registry import Progress
+from kineverse.experiments.report import Figure, Report
+from kineverse.formats import load
+
+from .accuracy import measure_errors, measure_variants
+from .consistency import measure_consistency
+from .durations import durations, durations_by_size
+from .mechanisms import measure_mechanisms
+from .picture import SIZE, draw
+from .protocol import CONFIGURATIONS, LEVELS, scene_of
+from .results import Results
+from .tables import tables
+
+OPTIONS = ("quick", "model")
+
+
+def run(progress: Progress, options: Options) -> Report:
+    """Track the model with both filters, by the papers' protocol and beyond it.
+
+    With ``quick`` one seed instead of four, and a tenth of the configurations.
+    """
+    model = options.model or "kitchen"
+    scene = scene_of(load(model))
+    seeds = range(1) if options.quick else range(4)
+    configurations = CONFIGURATIONS // 10 if options.quick else CONFIGURATIONS
+    timed = 3 if options.quick else 40
+    results = Results(
+        model=model,
+        scene=scene,
+        seeds=tuple(seeds),
+        configurations=configurations,
+        errors=measure_errors(scene, seeds, configurations, progress),
+        variants=measure_variants(scene, seeds, configurations, progress),
+        by_size=durations_by_size(scene, timed, progress),
+        by_noise=[
+            (noise, durations(scene, noise, timed)) for noise in progress(LEVELS, "fig4: time", "level")
+        ],
+        consistency=measure_consistency(scene, seeds, configurations, progress),
+        mechanisms=measure_mechanisms(configurations // 3, progress),
+    )
+    return Report(
+        name="fig4",
+        title=f"Tracking {len(scene.symbols)} degrees of freedom of '{model}' (2022 paper, Fig. 4)",
+        tables=tables(results),
+        numbers=results.numbers(),
+        figure=Figure(lambda canvas: draw(canvas, results), SIZE),
+    )

@@ -1,0 +1,131 @@
+"""How far both filters end from the truth, after 25 observations of each configuration."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from kineverse.experiments.registry import Progress
+
+from .protocol import (
+    LEVELS,
+    OBSERVATIONS,
+    TRAINING,
+    Array,
+    Directions,
+    Noise,
+    Scene,
+    published_noise,
+)
+from .runs import run_proper, run_published
+
+FILTERS = ("published", "proper")
+"""The papers' own, and :class:`kineverse.estimation.Tracker`."""
+
+REPORTED_MEAN = (0.0067, 0.0137, 0.0201, 0.0256)
+"""Mean errors of the authors' filter run again with ten gradient steps, mean of four seeds."""
+REPORTED_MAX = (0.065, 0.115, 0.156, 0.247)
+"""The largest errors of one of these runs."""
+
+
+@dataclass(frozen=True)
+class Errors:
+    """Errors |q̂ - q| at one level of noise.
+
+    Attributes
+    ----------
+    noise
+        The level.
+    by_filter
+        By filter, (seeds, C, n): for each seed and configuration those of all coordinates [m] or [rad].
+    """
+
+    noise: Noise
+    by_filter: dict[str, Array]
+
+    def summary(self, who: str, coordinates: Any = slice(None)) -> dict[str, Any]:
+        """Return mean, standard deviation and maximum over all, and means and maxima by seed."""
+        errors = self.by_filter[who][:, :, coordinates]
+        return {
+            "mean": float(errors.mean()),
+            "sd": float(errors.std()),
+            "max": float(errors.max()),
+            "means": errors.mean(axis=(1, 2)).tolist(),
+            "maxima": errors.max(axis=(1, 2)).tolist(),
+        }
+
+    def rms(self, who: str, coordinates: Any) -> float:
+        """Return the root of the mean square of some coordinates' errors."""
+        return float(np.sqrt((self.by_filter[who][:, :, coordinates] ** 2).mean()))
+
+
+@dataclass(frozen=True)
+class Variant:
+    """The published filter with something about it or about the noise changed."""
+
+    name: str
+    steps: int = 10
+    spread: float = 0.5
+    directions: Directions = "published"
+
+
+VARIANTS = (
+    Variant("as published"),
+    Variant("start: sd = width, as in the authors' code", spread=1.0),
+    Variant("directions of noise over all of the sphere", directions="uniform"),
+    Variant("one gradient step, as in the authors' code", steps=1),
+    Variant("no gradient steps", steps=0),
+)
+
+
+def measure_errors(
+    scene: Scene, seeds: Sequence[int], configurations: int, progress: Progress
+) -> tuple[Errors, ...]:
+    """Return the errors of both filters on the same observations, at the papers' levels."""
+    errors: dict[Noise, dict[str, list[Array]]] = {noise: {who: [] for who in FILTERS} for noise in LEVELS}
+    jobs = [(noise, seed) for noise in LEVELS for seed in seeds]
+    for noise, seed in progress(jobs, "fig4: errors", "run"):
+        truth, seen, training = observed(scene, noise, seed, configurations)
+        for who, run in (
+            ("published", run_published(scene, seen, training)),
+            ("proper", run_proper(scene, seen, noise.on_axes)),
+        ):
+            errors[noise][who].append(np.abs(run.q - truth))
+    return tuple(
+        Errors(noise, {who: np.stack(runs) for who, runs in by_filter.items()})
+        for noise, by_filter in errors.items()
+    )
+
+
+def measure_variants(
+    scene: Scene, seeds: Sequence[int], configurations: int, progress: Progress
+) -> dict[str, list[float]]:
+    """Return the mean error of each variant at the papers' levels."""
+    found = {}
+    for variant in progress(VARIANTS, "fig4: variants", "variant"):
+        means = []
+        for noise in LEVELS:
+            errors = []
+            for seed in seeds:
+                truth, seen, training = observed(scene, noise, seed, configurations, variant.directions)
+                run = run_published(scene, seen, training, variant.steps, variant.spread)
+                errors.append(np.abs(run.q - truth).mean())
+            means.append(float(np.mean(errors)))
+        found[variant.name] = means
+    return found
+
+
+def observed(
+    scene: Scene, noise: Noise, seed: int, configurations: int, directions: Directions = "published"
+) -> tuple[Array, Array, Array]:
+    """Return the truth (C, n), what is seen of it (25, C, m, 4, 4), and what R is learnt from (400, …)."""
+    rng = np.random.default_rng([seed, LEVELS.index(noise)])
+    still = scene.poses(scene.configurations(rng, 1))
+    training = published_noise(np.repeat(still, TRAINING, axis=0), noise, rng, directions)
+    truth = scene.configurations(rng, configurations)
+    true = scene.poses(truth)
+    seen = [published_noise(true, noise, rng, directions) for _ in range(OBSERVATIONS)]
+    return truth, np.stack(seen), training

@@ -1,0 +1,148 @@
+"""Whether a filter is as good as it can be, and knows how good it is.
+
+The noise is Gaussian on each axis here, so that there is a bound: of all unbiased estimators from K poses of
+m frames none has a smaller covariance than the inverse of K Σ Jᵀ W J (Cramér and Rao), with the frames'
+Jacobians J at the truth and the inverse covariance W of a pose. J comes from differences of poses: nothing
+that a filter uses is in it.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from kineverse.experiments.registry import Progress
+
+from .protocol import OBSERVATIONS, TRAINING, Array, Noise, Scene, gaussian_noise
+from .runs import Run, run_proper, run_published
+
+LEVELS = (
+    Noise(0.01, math.radians(1.0)),
+    Noise(0.05, math.radians(5.0)),
+    Noise(0.10, math.radians(10.0)),
+)
+INSIDE = 3.0
+"""A truth is inside when it is so many of the bound's standard deviations away from its limits."""
+
+_STEP = 1e-5
+
+
+@dataclass(frozen=True)
+class Consistency:
+    """What a filter makes of one level of noise.
+
+    Attributes
+    ----------
+    nees_inside, nees
+        The mean over all states of (q̂ - q)²/σ², of truths inside the limits and of all; 1 is right.
+    nis, nis_band
+        Innovation squared over its degrees of freedom, and where it lies 95 times in 100 if the filter is
+        right; NaN if it was not counted.
+    over_bound
+        The root of the mean of (q̂ - q)² over the bound, over truths inside the limits.
+    rms, bound
+        By ``"shifting"`` [m] and ``"turning"`` [rad] coordinates: the root mean square error and bound.
+    states
+        How many states are inside.
+    """
+
+    nees_inside: float
+    nees: float
+    nis: float
+    nis_band: tuple[float, float]
+    over_bound: float
+    rms: dict[str, float]
+    bound: dict[str, float]
+    states: int
+
+    def plain(self) -> dict[str, Any]:
+        """Return it as JSON has it: null where nothing was counted."""
+        found: dict[str, Any] = {
+            "nees_inside": self.nees_inside,
+            "nees_all": self.nees,
+            "rmse_over_cramer_rao": self.over_bound,
+            "rms": self.rms,
+            "cramer_rao": self.bound,
+            "states_inside": self.states,
+        }
+        if not math.isnan(self.nis):
+            found |= {"nis": self.nis, "nis_band": list(self.nis_band)}
+        return found
+
+
+def measure_consistency(
+    scene: Scene, seeds: Sequence[int], configurations: int, progress: Progress
+) -> dict[Noise, dict[str, Consistency]]:
+    """Return what both filters make of each level."""
+    found = {}
+    for noise in progress(LEVELS, "fig4: consistency", "level"):
+        truths, runs = [], []
+        for seed in seeds:
+            rng = np.random.default_rng([seed, LEVELS.index(noise), 1])
+            still = np.repeat(scene.poses(scene.configurations(rng, 1)), TRAINING, axis=0)
+            truth = scene.configurations(rng, configurations)
+            true = scene.poses(truth)
+            seen = np.stack([gaussian_noise(true, noise, rng) for _ in range(OBSERVATIONS)])
+            truths.append(truth)
+            training = gaussian_noise(still, noise, rng)
+            runs.append(
+                {"published": run_published(scene, seen, training), "proper": run_proper(scene, seen, noise)}
+            )
+        truth = np.concatenate(truths)
+        bound = cramer_rao(scene, truth, noise)
+        found[noise] = {who: _judged(scene, truth, bound, [run[who] for run in runs]) for who in runs[0]}
+    return found
+
+
+def cramer_rao(scene: Scene, q: Array, noise: Noise, observations: int = OBSERVATIONS) -> Array:
+    """Return the least variance of each coordinate at configurations (C, n), (C, n)."""
+    information = np.zeros((*q.shape, q.shape[1]))
+    jacobian = np.stack([_derivative(scene, q, i) for i in range(q.shape[1])], axis=-1)
+    for rows, sigma in ((slice(0, 3), noise.position), (slice(3, 6), noise.orientation)):
+        scaled = jacobian[:, :, rows] / sigma
+        information += observations * np.einsum("cmri,cmrj->cij", scaled, scaled)
+    bound: Array = np.diagonal(np.linalg.inv(information), axis1=-2, axis2=-1)
+    return bound
+
+
+def _derivative(scene: Scene, q: Array, i: int) -> Array:
+    """Return the twists (C, m, 6) of all frames per unit of a coordinate."""
+    ahead, behind = q.copy(), q.copy()
+    ahead[:, i] += _STEP
+    behind[:, i] -= _STEP
+    after, before = scene.poses(ahead), scene.poses(behind)
+    turned = after[..., :3, :3] @ np.swapaxes(before[..., :3, :3], -1, -2)
+    rotation = np.stack([turned[..., a, b] - turned[..., b, a] for a, b in ((2, 1), (0, 2), (1, 0))], axis=-1)
+    shifted = after[..., :3, 3] - before[..., :3, 3]
+    found: Array = np.concatenate([shifted, rotation / 2], axis=-1) / (2 * _STEP)
+    return found
+
+
+def _judged(scene: Scene, truth: Array, bound: Array, runs: list[Run]) -> Consistency:
+    lower, upper = scene.limits.T
+    error = np.concatenate([run.q for run in runs]) - truth
+    nees = error**2 / np.concatenate([run.variance for run in runs])
+    inside = np.minimum(truth - lower, upper - truth) >= INSIDE * np.sqrt(bound)
+    kinds = {"shifting": inside & ~scene.turning, "turning": inside & scene.turning}
+    dof = sum(run.dof for run in runs)
+    # χ² of so many degrees of freedom is as good as Gaussian.
+    margin = 1.96 * math.sqrt(2 / dof) if dof else math.nan
+    return Consistency(
+        nees_inside=float(nees[inside].mean()),
+        nees=float(nees.mean()),
+        nis=sum(run.nis for run in runs) / dof if dof else math.nan,
+        nis_band=(1 - margin, 1 + margin),
+        over_bound=float(np.sqrt((error**2 / bound)[inside].mean())),
+        rms={kind: _root_mean(error**2, where) for kind, where in kinds.items() if where.any()},
+        bound={kind: _root_mean(bound, where) for kind, where in kinds.items() if where.any()},
+        states=int(inside.sum()),
+    )
+
+
+def _root_mean(squares: Array, where: npt.NDArray[np.bool_]) -> float:
+    return float(np.sqrt(squares[where].mean()))

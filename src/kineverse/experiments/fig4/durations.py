@@ -1,0 +1,92 @@
+"""How long one prediction and update of all groups takes, one configuration at a time."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from copy import copy
+from dataclasses import dataclass
+from time import perf_counter
+from typing import TypeAlias
+
+import numpy as np
+
+from kineverse.collection import no_collection
+from kineverse.estimation.tracking.published import PublishedFilter
+from kineverse.experiments.registry import Progress
+
+from .accuracy import observed
+from .protocol import DT, LEVELS, Array, Noise, Scene
+from .runs import tracker_of
+
+Step: TypeAlias = Callable[[Array], None]
+
+REPORTED = 4.0
+"""What the papers stay below with all 23 degrees of freedom [ms]."""
+
+
+@dataclass(frozen=True)
+class Duration:
+    """Mean and standard deviation [ms], and how many updates that is."""
+
+    mean: float
+    sd: float
+    updates: int
+
+
+def durations_by_size(
+    scene: Scene, configurations: int, progress: Progress
+) -> list[tuple[int, dict[str, Duration]]]:
+    """Return degrees of freedom and times of the first group, of the first two, and so on."""
+    found = []
+    for groups in progress(range(1, len(scene.sizes) + 1), "fig4: time", "size"):
+        part = scene.first(groups)
+        found.append((len(part.symbols), durations(part, LEVELS[-1], configurations)))
+    return found
+
+
+def durations(scene: Scene, noise: Noise, configurations: int) -> dict[str, Duration]:
+    """Return how long both filters take for the updates after the first."""
+    _, seen, training = observed(scene, noise, 0, configurations)
+    published = PublishedFilter(scene.model, scene.frames)
+    published.learn_noise(training)
+    published.function.wait()
+    unused = tracker_of(scene, noise.on_axes)
+
+    def publish() -> Step:
+        published.reset()
+
+        def step(poses: Array) -> None:
+            published.predict(DT)
+            published.update(poses)
+
+        return step
+
+    def proper() -> Step:
+        tracker = copy(unused)
+
+        def step(poses: Array) -> None:
+            tracker.predict(DT)
+            tracker.update_poses(poses)
+
+        return step
+
+    return {"published": _timed(publish, seen), "proper": _timed(proper, seen)}
+
+
+def _timed(begin: Callable[[], Step], seen: Array) -> Duration:
+    """Time steps on observations (K, C, m, 4, 4); each configuration's first is not counted."""
+    _run(begin(), seen[:, 0])  # warms caches up
+    with no_collection():
+        times = [t for c in range(seen.shape[1]) for t in _run(begin(), seen[:, c])]
+    found = 1e3 * np.array(times)
+    return Duration(float(found.mean()), float(found.std()), len(found))
+
+
+def _run(step: Step, seen: Array) -> list[float]:
+    step(seen[0])
+    times = []
+    for poses in seen[1:]:
+        before = perf_counter()
+        step(poses)
+        times.append(perf_counter() - before)
+    return times

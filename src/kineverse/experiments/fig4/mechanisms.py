@@ -1,0 +1,113 @@
+"""Both filters on mechanisms that have no joint type: a folding door, and a garage door in both forms."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from kineverse.articulations import FoldingDoor, GarageDoor
+from kineverse.errors import ValueRejectedError
+from kineverse.estimation.tracking.published import PublishedFilter
+from kineverse.experiments.registry import Progress
+from kineverse.model.frame import WORLD
+from kineverse.model.model import Model
+from kineverse.model.operation import Operation
+
+from .consistency import LEVELS
+from .protocol import DT, OBSERVATIONS, TRAINING, Array, Noise, Scene, gaussian_noise, scene_of
+from .runs import Run, run_proper
+
+MECHANISMS: dict[str, tuple[Operation, str]] = {
+    "folding door": (FoldingDoor(name="door", parent=WORLD), "door"),
+    "garage door, by its angle": (GarageDoor(name="garage", parent=WORLD), "garage/door"),
+    "garage door, by a as published": (
+        GarageDoor(name="garage", parent=WORLD, form="published"),
+        "garage/door",
+    ),
+}
+"""The operation, and the coordinate that is looked at."""
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """How a filter followed a coordinate.
+
+    Attributes
+    ----------
+    mean, max
+        Of |q̂ - q| [rad] or [m], over the configurations that were not lost; NaN if all were.
+    nees
+        The mean of (q̂ - q)²/σ² over these; 1 is right.
+    lost_percent
+        The share of configurations in which the filter stepped to where the model has no value.
+    """
+
+    mean: float
+    max: float
+    nees: float
+    lost_percent: float
+
+
+@dataclass(frozen=True)
+class Followed:
+    """How both filters followed a mechanism at one level of noise."""
+
+    mechanism: str
+    noise: Noise
+    by_filter: dict[str, Outcome]
+
+
+def measure_mechanisms(configurations: int, progress: Progress) -> list[Followed]:
+    """Return how both filters follow each mechanism at each level."""
+    jobs = [(name, noise) for name in MECHANISMS for noise in LEVELS]
+    return [
+        _followed(name, noise, configurations) for name, noise in progress(jobs, "fig4: mechanisms", "run")
+    ]
+
+
+def _followed(name: str, noise: Noise, configurations: int) -> Followed:
+    operation, coordinate = MECHANISMS[name]
+    model = Model()
+    with model.edit() as edit:
+        edit.apply(operation)
+    scene = scene_of(model)
+    column = [str(s) for s in scene.symbols].index(coordinate)
+    rng = np.random.default_rng([list(MECHANISMS).index(name), LEVELS.index(noise)])
+    still = np.repeat(scene.poses(scene.configurations(rng, 1)), TRAINING, axis=0)
+    truth = scene.configurations(rng, configurations)
+    true = scene.poses(truth)
+    seen = np.stack([gaussian_noise(true, noise, rng) for _ in range(OBSERVATIONS)])
+    runs = {
+        "published": _published(scene, seen, gaussian_noise(still, noise, rng)),
+        "proper": run_proper(scene, seen, noise),
+    }
+    return Followed(name, noise, {who: _outcome(run, truth, column) for who, run in runs.items()})
+
+
+def _outcome(run: Run, truth: Array, column: int) -> Outcome:
+    kept = np.isfinite(run.q[:, column])
+    lost = 100 * float(1 - kept.mean())
+    if not kept.any():
+        return Outcome(np.nan, np.nan, np.nan, lost)
+    error = np.abs(run.q - truth)[kept, column]
+    nees = error**2 / run.variance[kept, column]
+    return Outcome(float(error.mean()), float(error.max()), float(nees.mean()), lost)
+
+
+def _published(scene: Scene, seen: Array, training: Array) -> Run:
+    """Run the papers' filter on one configuration after the other, as a step of one may lead nowhere."""
+    published = PublishedFilter(scene.model, scene.frames)
+    published.learn_noise(training)
+    q = np.full((seen.shape[1], len(scene.symbols)), np.nan)
+    variance = q.copy()
+    for c in range(seen.shape[1]):
+        published.reset()
+        try:
+            for poses in seen[:, c]:
+                published.predict(DT)
+                published.update(poses)
+        except ValueRejectedError:
+            continue
+        q[c], variance[c] = published.q, np.diag(published.covariance)
+    return Run(q, variance)
