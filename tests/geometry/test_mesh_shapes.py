@@ -101,6 +101,9 @@ BAD_SHAPES = [
     Cone(0.1, -1.0),
     Ellipsoid((1, 1, 0)),
     Sphere(1e12),
+    Sphere("large"),
+    Box((1, 1)),
+    Ellipsoid(3),
 ]
 
 
@@ -142,6 +145,26 @@ def test_a_bad_mesh_is_named_with_its_body(tmp_path, name):
     if BAD_MESHES[name] is not None:
         (tmp_path / name).write_bytes(BAD_MESHES[name])
     check(with_a_bad_one(Mesh(name, folder=str(tmp_path))), name)
+
+
+@pytest.mark.parametrize("name", BAD_MESHES)
+def test_a_bad_mesh_is_also_none_as_triangles(tmp_path, name):
+    if BAD_MESHES[name] is not None:
+        (tmp_path / name).write_bytes(BAD_MESHES[name])
+    scene = Scene(with_a_bad_one(Mesh(name, folder=str(tmp_path))), triangles=["bad"])
+    scene.update({"x": 0.0})
+    with pytest.raises(kv.KineverseError, match=f"'bad'.*{name}"):
+        scene.distance("good", "bad")
+
+
+def test_triangles_without_an_area_are_not_there(tmp_path):
+    """For coal one that is a point or a line touches everything."""
+    corners, degenerate = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nv .5 0 0\n", "f 1 1 2\nf 2 2 2\nf 1 2 5\n"
+    (tmp_path / "open.obj").write_text(corners + "f 1 2 3\nf 1 2 4\n" + degenerate)
+    scene = Scene(with_a_bad_one(Mesh("open.obj", folder=str(tmp_path))), triangles=["bad"])
+    scene.update({"x": 0.0})
+    assert scene.distance("bad", "fine").distance == pytest.approx(1.5)
+    assert scene.distance("bad", "good").distance == pytest.approx(4.5)
 
 
 @pytest.mark.parametrize("shape", BAD_SHAPES, ids=str)

@@ -14,7 +14,7 @@ from kineverse.errors import MissingExtraError, ValueRejectedError
 from kineverse.model.body import Box, Capsule, Cone, Cylinder, Ellipsoid, Geometry, Mesh, Sphere
 
 from .hulls import check_extent, hull
-from .mesh_files import Faces, Floats, MeshFile, find, read_faces
+from .mesh_files import Faces, Floats, Integers, MeshFile, find, read_faces
 
 Primitive: TypeAlias = Box | Sphere | Cylinder | Capsule | Cone | Ellipsoid
 
@@ -185,7 +185,8 @@ def _hull(points: Floats) -> Solid:
     return _solid(convex, surface, (low + high) / 2, (high - low) / 2, corners, Core.hull(corners))
 
 
-def _triangles(vertices: Floats, faces: Any) -> Solid:
+def _triangles(vertices: Floats, faces: Integers) -> Solid:
+    faces = _with_area(vertices, faces)
     bvh = coal_engine().BVHModelOBBRSS()
     bvh.beginModel(len(faces), len(vertices))
     bvh.addVertices(vertices)
@@ -194,6 +195,17 @@ def _triangles(vertices: Floats, faces: Any) -> Solid:
     used = vertices[np.unique(faces)]
     low, high = used.min(axis=0), used.max(axis=0)
     return _solid(bvh, Faces(vertices, faces), (low + high) / 2, (high - low) / 2, used)
+
+
+def _with_area(vertices: Floats, faces: Integers) -> Integers:
+    """Leave out triangles that are lines or points: for coal such a one touches everything."""
+    a, b, c = np.moveaxis(vertices[faces], 1, 0)
+    longest = np.max([((p - q) ** 2).sum(axis=1) for p, q in ((a, b), (b, c), (c, a))], axis=0)
+    there = np.linalg.norm(np.cross(b - a, c - a), axis=1) > 1e-14 * longest
+    if not there.any():
+        raise ValueRejectedError("all its triangles are lines or points, so that there is nothing to touch.")
+    kept: Integers = faces[there]
+    return kept
 
 
 def _solid(
@@ -261,12 +273,14 @@ def _scaled(geometry: Primitive, factor: float) -> Primitive:
 
 
 def _sizes(geometry: Primitive) -> tuple[float, ...]:
-    if isinstance(geometry, Box):
-        return tuple(map(float, geometry.size))
-    if isinstance(geometry, Ellipsoid):
-        return tuple(map(float, geometry.radii))
-    if isinstance(geometry, Sphere):
-        return (float(geometry.radius),)
-    if isinstance(geometry, Cylinder | Capsule | Cone):
-        return (float(geometry.radius), float(geometry.length))
+    try:
+        if isinstance(geometry, Box | Ellipsoid):
+            x, y, z = geometry.size if isinstance(geometry, Box) else geometry.radii
+            return (float(x), float(y), float(z))
+        if isinstance(geometry, Sphere):
+            return (float(geometry.radius),)
+        if isinstance(geometry, Cylinder | Capsule | Cone):
+            return (float(geometry.radius), float(geometry.length))
+    except (TypeError, ValueError) as error:
+        raise ValueRejectedError(f"{geometry} has sizes that are not positive numbers [m].") from error
     raise ValueRejectedError(f"{geometry!r} is no geometry that a body can have.")
