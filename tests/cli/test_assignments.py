@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from kineverse.cli.assignments import parse_assignments, parse_value
+from kineverse.cli.assignments import parse_assignments, parse_length, parse_value
 from kineverse.errors import NameTakenError, ValueRejectedError
 
 
@@ -91,3 +91,14 @@ def test_what_is_no_assignment_is_refused(text):
 def test_a_name_is_given_once():
     with pytest.raises(NameTakenError, match="--set a is given twice"):
         parse_assignments(["a=1", "b=2", " a =1"])
+
+
+@pytest.mark.parametrize(("text", "value"), [("0.05", 0.05), ("5 cm", 0.05), ("2mm", 0.002), ("1/4 m", 0.25)])
+def test_lengths(text, value):
+    assert parse_length(text) == pytest.approx(value)
+
+
+@pytest.mark.parametrize("text", ["30deg", "1rad", "pi", "3°", "", "far", "nan", "inf", "1e400", "1/0"])
+def test_what_is_no_length(text):
+    with pytest.raises(ValueRejectedError):
+        parse_length(text)

@@ -24,6 +24,7 @@ UNITS = {
     "cm": 0.01,
     "mm": 0.001,
 }
+LENGTHS = (None, "m", "cm", "mm")
 
 
 def add_set_option(parser: argparse.ArgumentParser) -> None:
@@ -58,6 +59,20 @@ def parse_assignments(texts: Iterable[str]) -> dict[str, float]:
             raise NameTakenError(f"--set {name.strip()} is given twice.")
         values[name.strip()] = parse_value(value)
     return values
+
+
+def parse_length(text: str) -> float:
+    """Return the number [m] of a text such as ``0.05``, ``5cm``, ``2 mm``.
+
+    Raises
+    ------
+    ValueRejectedError
+        If it is none, not finite, or an angle.
+    """
+    match = _VALUE.fullmatch(text.strip())
+    if match is None or match["unit"] not in LENGTHS or match["pi"]:
+        raise ValueRejectedError(f"{text.strip()!r} is not a length; write a number of m (0.05), or 5cm, 2mm")
+    return parse_value(text)
 
 
 def parse_value(text: str) -> float:

@@ -11,7 +11,7 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from kineverse.cli.assignments import parse_value
+from kineverse.cli.assignments import parse_length
 from kineverse.cli.paint import paint
 from kineverse.cli.progress import doing, progress
 from kineverse.cli.table import figure, table
@@ -114,7 +114,7 @@ def _settings(arguments: argparse.Namespace) -> tuple[Any, Any, int]:
 
     asked: dict[str, Any] = {}
     if arguments.error is not None:
-        asked["error"] = parse_value(arguments.error)
+        asked["error"] = parse_length(arguments.error)
     if arguments.max_hulls is not None:
         asked["max_hulls"] = arguments.max_hulls
     limits: dict[str, Any] = {}

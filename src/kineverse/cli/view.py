@@ -10,7 +10,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
-from kineverse.cli.assignments import add_set_option, parse_assignments, parse_value
+from kineverse.cli.assignments import add_set_option, parse_assignments, parse_length
 from kineverse.cli.listing import asked_for, print_articulations
 from kineverse.cli.progress import progress
 
@@ -55,7 +55,7 @@ def add_page_options(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Serve the page until interrupted."""
     assigned = parse_assignments(arguments.assignments)
-    near = None if arguments.near is None else parse_value(arguments.near)
+    near = None if arguments.near is None else parse_length(arguments.near)
     if asked_for(arguments.model):
         return print_articulations()
 
