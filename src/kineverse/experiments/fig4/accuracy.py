@@ -41,10 +41,13 @@ class Errors:
         The level.
     by_filter
         By filter, (seeds, C, n): for each seed and configuration those of all coordinates [m] or [rad].
+    nees
+        By filter, the mean over all states of (q̂ - q)²/σ²; 1 is right.
     """
 
     noise: Noise
     by_filter: dict[str, Array]
+    nees: dict[str, float]
 
     def summary(self, who: str, coordinates: Any = slice(None)) -> dict[str, Any]:
         """Return mean, standard deviation and maximum over all, and means and maxima by seed."""
@@ -85,18 +88,23 @@ def measure_errors(
     scene: Scene, seeds: Sequence[int], configurations: int, progress: Progress
 ) -> tuple[Errors, ...]:
     """Return the errors of both filters on the same observations, at the papers' levels."""
-    errors: dict[Noise, dict[str, list[Array]]] = {noise: {who: [] for who in FILTERS} for noise in LEVELS}
     jobs = [(noise, seed) for noise in LEVELS for seed in seeds]
+    found: dict[Noise, dict[str, list[tuple[Array, Array]]]] = {n: {w: [] for w in FILTERS} for n in LEVELS}
     for noise, seed in progress(jobs, "fig4: errors", "run"):
         truth, seen, training = observed(scene, noise, seed, configurations)
         for who, run in (
             ("published", run_published(scene, seen, training)),
             ("proper", run_proper(scene, seen, noise.on_axes)),
         ):
-            errors[noise][who].append(np.abs(run.q - truth))
+            error = np.abs(run.q - truth)
+            found[noise][who].append((error, error**2 / run.variance))
     return tuple(
-        Errors(noise, {who: np.stack(runs) for who, runs in by_filter.items()})
-        for noise, by_filter in errors.items()
+        Errors(
+            noise,
+            {who: np.stack([error for error, _ in runs]) for who, runs in by_filter.items()},
+            {who: float(np.mean([nees for _, nees in runs])) for who, runs in by_filter.items()},
+        )
+        for noise, by_filter in found.items()
     )
 
 

@@ -53,7 +53,7 @@ class Results:
             "errors": [
                 {
                     **_plain(errors.noise),
-                    **{who: errors.summary(who) for who in FILTERS},
+                    **{who: {**errors.summary(who), "nees": errors.nees[who]} for who in FILTERS},
                     "reported_mean": mean,
                     "reported_max": largest,
                 }

@@ -52,10 +52,11 @@ def _against_noise(results: Results) -> Table:
         for who in FILTERS:
             found = errors.summary(who)
             values = (_fixed(found[key]) for key in ("mean", "sd", "max"))
-            rows.append((str(errors.noise), NAMES[who], *values, *_ms(times[who])))
+            nees = f"{errors.nees[who]:.2f}"
+            rows.append((str(errors.noise), NAMES[who], *values, nees, *_ms(times[who])))
     return Table(
         "Errors against noise, and the time of one prediction and update",
-        ("noise", "filter", "mean", "sd", "max", "time [ms]", "sd [ms]"),
+        ("noise", "filter", "mean", "sd", "max", "NEES", "time [ms]", "sd [ms]"),
         tuple(rows),
     )
 

@@ -1,0 +1,250 @@
+"""Fig. 4 of the papers: its noise, its order, its bounds, and what the published filter's errors are."""
+
+from __future__ import annotations
+
+import json
+import math
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+import kineverse as kv
+from kineverse.cli import main
+from kineverse.errors import ModelError
+from kineverse.experiments import Options, fig4, reproduce
+from kineverse.experiments.fig4.accuracy import REPORTED_MEAN, observed
+from kineverse.experiments.fig4.consistency import _judged, cramer_rao
+from kineverse.experiments.fig4.mechanisms import _outcome
+from kineverse.experiments.fig4.protocol import (
+    LEVELS,
+    Noise,
+    gaussian_noise,
+    published_noise,
+    rotations,
+    scene_of,
+)
+from kineverse.experiments.fig4.runs import Run, run_published
+
+NOISE = Noise(0.1, 0.05)
+
+
+@pytest.fixture(scope="module")
+def kitchen():
+    return scene_of(kv.load("kitchen"))
+
+
+def errors_in(frame, noisy, true):
+    """Return position and rotation vector of the errors, in axes of the frame or of the world."""
+    R = true[:3, :3]
+    turns = np.swapaxes(R, -1, -2) @ noisy[:, :3, :3] if frame == "own" else noisy[:, :3, :3] @ R.T
+    shift = noisy[:, :3, 3] - true[:3, 3]
+    return (shift @ R if frame == "own" else shift), Rotation.from_matrix(turns).as_rotvec()
+
+
+@pytest.fixture(scope="module")
+def pose():
+    found = np.eye(4)
+    found[:3, :3] = Rotation.from_rotvec([0.5, -1.0, 0.3]).as_matrix()
+    found[:3, 3] = 1.0, 2.0, 3.0
+    return found
+
+
+def test_published_noise_is_along_and_about_the_frames_own_axes(pose):
+    """Directions over a quarter of the sphere correlate y and z, as 2/π says."""
+    noisy = published_noise(np.broadcast_to(pose, (40_000, 4, 4)), NOISE, np.random.default_rng(1))
+    per_axis = np.eye(3) / 3
+    per_axis[1, 2] = per_axis[2, 1] = 2 / (3 * math.pi)
+    for errors, sigma in zip(errors_in("own", noisy, pose), (NOISE.position, NOISE.orientation), strict=True):
+        np.testing.assert_allclose(np.cov(errors, rowvar=False) / sigma**2, per_axis, atol=0.012)
+        np.testing.assert_allclose(errors.mean(axis=0) / sigma, 0, atol=0.012)
+
+
+def test_directions_over_all_of_the_sphere_correlate_nothing(pose):
+    many = np.broadcast_to(pose, (40_000, 4, 4))
+    noisy = published_noise(many, NOISE, np.random.default_rng(2), "uniform")
+    for errors, sigma in zip(errors_in("own", noisy, pose), (NOISE.position, NOISE.orientation), strict=True):
+        np.testing.assert_allclose(np.cov(errors, rowvar=False) / sigma**2, np.eye(3) / 3, atol=0.012)
+        # Amplitudes are Gaussian, so lengths have the mean of a folded normal distribution.
+        assert np.linalg.norm(errors, axis=1).mean() / sigma == pytest.approx(
+            math.sqrt(2 / math.pi), abs=0.01
+        )
+
+
+def test_gaussian_noise_is_in_the_observers_axes(pose):
+    noisy = gaussian_noise(np.broadcast_to(pose, (40_000, 4, 4)), NOISE, np.random.default_rng(3))
+    for errors, sigma in zip(
+        errors_in("world", noisy, pose), (NOISE.position, NOISE.orientation), strict=True
+    ):
+        np.testing.assert_allclose(np.cov(errors, rowvar=False) / sigma**2, np.eye(3), atol=0.03)
+
+
+def test_rotations_are_those_of_scipy():
+    vectors = np.random.default_rng(4).normal(0, 1.5, (50, 3))
+    vectors[:3] = [[0, 0, 0], [1e-9, 0, 0], [0, math.pi, 0]]
+    np.testing.assert_allclose(rotations(vectors), Rotation.from_rotvec(vectors).as_matrix(), atol=1e-14)
+
+
+def test_all_that_moves_is_observed_and_drawers_come_first(kitchen):
+    model = kitchen.model
+    assert set(kitchen.frames) == {f for f in model.frames if model.fk(f).symbols}
+    assert len(kitchen.symbols) == 23
+    assert kitchen.turning.sum() == 8
+    assert kitchen.turning[:8].tolist() == [False] * 7 + [True]
+
+
+def test_the_first_groups_are_a_scene_of_their_own(kitchen):
+    part = kitchen.first(8)
+    assert part.symbols == kitchen.symbols[:8]
+    assert {s for f in part.frames for s in kitchen.model.fk(f).symbols} == set(part.symbols)
+    q = kitchen.configurations(np.random.default_rng(5), 3)
+    np.testing.assert_array_equal(part.poses(q[:, :8]), kitchen.poses(q)[:, : len(part.frames)])
+
+
+def test_a_model_in_which_nothing_moves_cannot_be_tracked():
+    with pytest.raises(ModelError, match="Nothing moves"):
+        scene_of(kv.Model())
+
+
+def test_the_bound_is_that_of_the_models_own_jacobians(kitchen):
+    noise = Noise(0.05, 0.1)
+    q = kitchen.configurations(np.random.default_rng(6), 2)
+    expected = np.zeros_like(q)
+    weight = np.diag([noise.position**-2.0] * 3 + [noise.orientation**-2.0] * 3)
+    for frame in kitchen.frames:
+        (speed,) = kitchen.model.speeds_of(frame)
+        column = kitchen.symbols.index(speed.position)
+        jacobian = kitchen.model.jacobian(frame)
+        for row, x in zip(expected, q[:, column], strict=True):
+            J = jacobian(dict.fromkeys(jacobian.symbols, x))
+            row[column] += 25 * (J.T @ weight @ J)[0, 0]
+    np.testing.assert_allclose(cramer_rao(kitchen, q, noise), 1 / expected, rtol=1e-6)
+
+
+def test_the_published_filter_is_within_5_percent_of_the_authors_code():
+    """On their kitchen, by their noise, mean of four seeds."""
+    from formats.robots import shared
+
+    scene = scene_of(kv.load(shared("iai_kitchen", "iai_kitchen", "urdf_obj", "IAI_kitchen.urdf")))
+    for noise, reported in zip(LEVELS, REPORTED_MEAN, strict=True):
+        means = []
+        for seed in range(4):
+            truth, seen, training = observed(scene, noise, seed, 300)
+            means.append(np.abs(run_published(scene, seen, training).q - truth).mean())
+        assert np.mean(means) == pytest.approx(reported, rel=0.05)
+
+
+def test_consistency_is_judged_right(kitchen):
+    """Errors as large as a filter says give 1; of one that thinks it is three times better, 9."""
+    rng = np.random.default_rng(7)
+    truth = kitchen.configurations(rng, 400)
+    bound = cramer_rao(kitchen, truth, Noise(0.01, 0.02))
+    q = truth + rng.normal(0, np.sqrt(bound))
+    honest = _judged(kitchen, truth, bound, [Run(q, bound, nis=1010.0, dof=1000)])
+    assert honest.nees_inside == pytest.approx(1, abs=0.05)
+    assert honest.over_bound == pytest.approx(1, abs=0.03)
+    assert honest.rms == pytest.approx(honest.bound, rel=0.04)
+    assert honest.nis == pytest.approx(1.01)
+    assert honest.nis_band == pytest.approx((1 - 1.96 * math.sqrt(0.002), 1 + 1.96 * math.sqrt(0.002)))
+    lower, upper = kitchen.limits.T
+    near = np.minimum(truth - lower, upper - truth) < 3 * np.sqrt(bound)
+    assert honest.states == (~near).sum() < truth.size
+    proud = _judged(kitchen, truth, bound, [Run(q, bound / 9)])
+    assert proud.nees == pytest.approx(9 * honest.nees)
+    assert "nis" not in proud.plain()
+
+
+def test_who_is_lost_is_counted_and_left_out():
+    q = np.array([[0.5], [math.nan], [0.7], [math.nan]])
+    found = _outcome(Run(q, np.full((4, 1), 0.01)), np.full((4, 1), 0.6), 0)
+    assert (found.mean, found.max, found.nees, found.lost_percent) == pytest.approx((0.1, 0.1, 1.0, 50.0))
+    nowhere = _outcome(Run(q * math.nan, q), q, 0)
+    assert nowhere.lost_percent == 100
+    assert math.isnan(nowhere.mean)
+
+
+@pytest.fixture(scope="module")
+def cupboard(tmp_path_factory):
+    """Return the document of a door and a drawer."""
+    model = kv.Model()
+    with model.edit() as edit:
+        edit.apply(kv.Revolute(name="door", parent="world", child="door", axis=(0, 0, 1), lower=0, upper=1.5))
+        edit.apply(kv.Prismatic(name="drawer", parent="world", child="drawer", lower=0, upper=0.4))
+    path = tmp_path_factory.mktemp("fig4") / "cupboard.kv.json"
+    model.save(path)
+    return path
+
+
+@pytest.fixture(scope="module")
+def few():
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(fig4, "CONFIGURATIONS", 60)
+        patch.setattr(fig4, "TIMED", 1)
+        yield
+
+
+@pytest.fixture(scope="module")
+def report(cupboard, few):
+    return reproduce("fig4", options=Options(quick=True, model=str(cupboard)))
+
+
+def test_the_report_says_all_that_was_measured(report):
+    numbers = json.loads(json.dumps(dict(report.numbers), allow_nan=False))
+    assert numbers == report.numbers
+    assert numbers["symbols"] == ["drawer", "door"]
+    assert (numbers["seeds"], numbers["configurations"]) == ([0], 6)
+    assert [level["reported_mean"] for level in numbers["errors"]] == list(REPORTED_MEAN)
+    for level in numbers["errors"]:
+        for who in ("published", "proper"):
+            assert 0 < level[who]["mean"] < level[who]["max"]
+    sizes = numbers["by_degrees_of_freedom"]
+    assert [size["degrees_of_freedom"] for size in sizes] == [1, 2]
+    assert sizes[-1]["proper"]["errors"][0]["mean"] == numbers["errors"][0]["proper"]["mean"]
+    assert sizes[0]["published"]["milliseconds"]["updates"] == 24
+    assert [round(math.degrees(c["orientation"])) for c in numbers["consistency"]] == [1, 5, 10]
+    for level in numbers["consistency"]:
+        assert {"nees_inside", "nees_all", "nis", "nis_band", "rmse_over_cramer_rao"} <= set(level["proper"])
+    assert len({m["mechanism"] for m in numbers["mechanisms"]}) == 3
+
+
+def test_it_comes_out_the_same_again(report, cupboard, few):
+    """But for last digits: compiled code may have been ready earlier."""
+    again = reproduce("fig4", options=Options(quick=True, model=str(cupboard)))
+    for key in ("errors", "variants", "consistency", "mechanisms"):
+        assert leaves(again.numbers[key]) == pytest.approx(leaves(report.numbers[key]), rel=1e-6)
+
+
+def leaves(value):
+    """Return all numbers in lists and mappings."""
+    inside = value.values() if isinstance(value, dict) else value if isinstance(value, list) else None
+    if inside is None:
+        return [value] if isinstance(value, float) else []
+    return [number for part in inside for number in leaves(part)]
+
+
+def test_the_figure_is_drawn(report, tmp_path):
+    pytest.importorskip("matplotlib")
+    report.figure.save(tmp_path / "fig4.png")
+    assert (tmp_path / "fig4.png").stat().st_size > 20_000
+
+
+def test_the_command_prints_tables_about_any_model(cupboard, few, capsys, monkeypatch, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    assert main(["reproduce", "fig4", "--quick", "--no-figure", "--model", str(cupboard)]) == 0
+    printed = capsys.readouterr().out
+    for part in ("Tracking 2 degrees of freedom", "authors' code", "NEES", "Cramér-Rao", "folding door"):
+        assert part in printed
+
+
+@pytest.mark.parametrize(
+    ("words", "says"),
+    [
+        (["--model", "nowhere.urdf"], "nowhere.urdf"),
+        (["--data", "."], "'fig4' takes no --data. It takes --quick, --model"),
+    ],
+)
+def test_nonsense_is_answered_in_a_line(words, says, capsys):
+    assert main(["reproduce", "fig4", *words]) == 2
+    error = capsys.readouterr().err
+    assert says in error
+    assert error.count("\n") == 1
