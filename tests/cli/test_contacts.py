@@ -106,7 +106,7 @@ def test_view_says_what_a_picture_cannot_show(run, robot, tmp_path):
     assert "no distances to l1" in err
 
 
-@pytest.mark.parametrize(("radius", "said"), [("-1", "radius"), ("wide", "not a value")])
+@pytest.mark.parametrize(("radius", "said"), [("-1", "radius"), ("wide", "not a length")])
 def test_radii_that_are_none_are_refused(run, robot, tmp_path, radius, said):
     status, _, err = run("view", robot(0, 5), "--picture", tmp_path / "p.png", f"--near={radius}")
     assert status == 2
