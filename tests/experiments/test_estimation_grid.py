@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from kineverse.experiments.estimation_grid_bound import across, bound
-from kineverse.experiments.estimation_grid_samples import LEVER, TO_AXIS, Cell, draw
+from kineverse.experiments.estimation_grid.bound import across, bound
+from kineverse.experiments.estimation_grid.samples import LEVER, TO_AXIS, Cell, draw
 
 DEG = np.pi / 180
 CELLS = [

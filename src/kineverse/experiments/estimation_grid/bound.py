@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from kineverse.experiments.estimation_grid_samples import Cell, Samples, motions, rotations
+from kineverse.experiments.estimation_grid.samples import Cell, Samples, motions, rotations
 
 Array = npt.NDArray[np.float64]
 

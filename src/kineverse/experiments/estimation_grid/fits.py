@@ -1,0 +1,168 @@
+"""The cells of the estimation grid, fitted one after the other or on all cores."""
+
+from __future__ import annotations
+
+import math
+import multiprocessing
+import os
+from collections.abc import Iterator, Sequence
+from concurrent.futures import Future, ProcessPoolExecutor
+from contextlib import contextmanager
+from itertools import product
+
+import numpy as np
+import numpy.typing as npt
+
+from kineverse.errors import KineverseError
+from kineverse.estimation import identify, pose_covariance
+from kineverse.estimation.identification.fit import Fit
+from kineverse.experiments.estimation_grid.bound import Bound, bound
+from kineverse.experiments.estimation_grid.results import Result
+from kineverse.experiments.estimation_grid.samples import Cell, Joint, Samples, draw
+from kineverse.experiments.registry import Progress
+
+Array = npt.NDArray[np.float64]
+
+SEED = 2011
+SAMPLES = 50
+
+POSITIONS = (0.001, 0.03, 0.1)
+ORIENTATIONS = tuple(math.radians(degrees) for degrees in (1.0, 3.0, 10.0))
+COUNTS = (5, 10, 20, 40, 80, 160, 320)
+RANGES: dict[Joint, tuple[float, ...]] = {
+    "prismatic": (0.05, 0.2, 0.4),
+    "revolute": tuple(math.radians(degrees) for degrees in (15.0, 45.0, 90.0)),
+}
+
+
+def grid() -> list[Cell]:
+    """Return all cells."""
+    return [
+        Cell(joint, position, orientation, count, reach)
+        for joint, ranges in RANGES.items()
+        for position, orientation, count, reach in product(POSITIONS, ORIENTATIONS, COUNTS, ranges)
+    ]
+
+
+def quick_grid() -> list[Cell]:
+    """Return a few cells from all over the grid."""
+    return [
+        Cell(joint, position, orientation, count, reach)
+        for joint, ranges in RANGES.items()
+        for position, orientation in zip(POSITIONS, ORIENTATIONS, strict=True)
+        for count, reach in product((10, 40), ranges[1:])
+    ]
+
+
+def fit_all(
+    cells: Sequence[Cell], samples: int, progress: Progress, workers: int | None = None
+) -> list[Result]:
+    """Return what came out of cells, in their order.
+
+    Parameters
+    ----------
+    cells
+        What to fit.
+    samples
+        How many of each.
+    progress
+        Wraps the cells.
+    workers
+        How many processes; None for one on each core.
+    """
+    workers = workers or os.cpu_count() or 1
+    if workers == 1:
+        return [fit_cell(cell, samples) for cell in progress(cells, "estimation-grid", "cell")]
+    # Fresh processes, since forks of one that compiles in the background may hang. Long cells first, so that
+    # all end at about the same time.
+    order = sorted(range(len(cells)), key=lambda k: -cells[k].count)
+    with _workers(workers) as pool:
+        jobs: list[tuple[int, Future[Result]]] = [
+            (k, pool.submit(fit_cell, cells[k], samples)) for k in order
+        ]
+        done = {k: job.result() for k, job in progress(jobs, "estimation-grid", "cell")}
+    return [done[k] for k in range(len(cells))]
+
+
+def fit_cell(cell: Cell, count: int) -> Result:
+    """Fit so many samples of a cell; the same ones each time."""
+    samples = draw(cell, count, np.random.default_rng(_seed(cell)))
+    limit = bound(samples)
+    fits = [_fit(samples, k) for k in range(count)]
+    return Result(
+        cell=cell,
+        degrees=np.array([_degrees(fit, samples.axis[k]) for k, (fit, _, _) in enumerate(fits)]),
+        metres=np.array([_metres(fit, samples, k) for k, (fit, _, _) in enumerate(fits)]),
+        bound_degrees=limit.degrees,
+        bound_metres=limit.metres,
+        spread=_spread(limit),
+        right=np.array([called == cell.joint for _, called, _ in fits]),
+        told=np.array([told for _, _, told in fits]),
+        called=tuple(called for _, called, _ in fits),
+    )
+
+
+def _fit(samples: Samples, k: int) -> tuple[Fit | None, str, bool]:
+    """Return the fit of the true family if there is one, the most probable family, and if that is told."""
+    cell = samples.cell
+    covariance = pose_covariance(cell.position, cell.orientation)
+    try:
+        found = identify(
+            samples.seen_parents[k],
+            samples.seen_children[k],
+            covariance_a=covariance,
+            covariance_b=covariance,
+        )
+        return found[cell.joint], found.best.family, not found.cannot_tell
+    except KineverseError as error:
+        return None, f"refused: {error}", False
+
+
+def _degrees(fit: Fit | None, axis: Array) -> float:
+    """Return the angle between the true axis and the one found; an axis has no sign."""
+    if fit is None:
+        return math.nan
+    found = np.asarray(fit.parameters["axis"])
+    return math.degrees(math.atan2(float(np.linalg.norm(np.cross(axis, found))), abs(float(axis @ found))))
+
+
+def _metres(fit: Fit | None, samples: Samples, k: int) -> float:
+    """Return how far the axis found is off the true one in the plane across it, at the middle of the way."""
+    if fit is None or samples.cell.joint == "prismatic":
+        return math.nan
+    axis, point = samples.axis[k], samples.point[k]
+    found, through = np.asarray(fit.parameters["axis"]), np.asarray(fit.parameters["point"])
+    slope = float(axis @ found)
+    if abs(slope) < 1e-9:
+        return math.inf
+    crossing = through + (float(axis @ (point - through)) / slope) * found
+    return float(np.linalg.norm(crossing - point))
+
+
+def _spread(limit: Bound) -> float:
+    """Return the relative variance of the sum of squared angles, if they are what the bound says."""
+    squares = np.trace(limit.direction @ limit.direction, axis1=1, axis2=2).sum()
+    return float(2.0 * squares / np.trace(limit.direction, axis1=1, axis2=2).sum() ** 2)
+
+
+def _seed(cell: Cell) -> list[int]:
+    """Return a seed of a cell's own, whatever other cells there are."""
+    micro = (round(1e6 * value) for value in (cell.position, cell.orientation, cell.range))
+    return [SEED, cell.joint == "revolute", cell.count, *micro]
+
+
+@contextmanager
+def _workers(count: int) -> Iterator[ProcessPoolExecutor]:
+    """Yield processes that use a core each."""
+    names = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
+    before = {name: os.environ.get(name) for name in names}
+    os.environ.update(dict.fromkeys(names, "1"))
+    try:
+        with ProcessPoolExecutor(count, multiprocessing.get_context("spawn")) as pool:
+            yield pool
+    finally:
+        for name, value in before.items():
+            if value is None:
+                os.environ.pop(name, None)
+            else:
+                os.environ[name] = value

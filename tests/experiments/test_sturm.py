@@ -1,0 +1,118 @@
+"""Recorded doors and drawers: read by their names, taken for what they are, and what is missed is drawn."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from kineverse.cli import main
+from kineverse.errors import FormatError
+from kineverse.experiments import Options, reproduce
+from kineverse.experiments.sturm.figure import draw_recordings, size_of
+from kineverse.experiments.sturm.recordings import POSITION, THINNED, Labelled, labelled_recordings
+from kineverse.experiments.sturm.report import judge, report
+
+TRACKS = Path(__file__).parents[3] / "shared" / "data" / "sturm_tracks"
+RNG = np.random.default_rng(0)
+
+
+def arc(radius, angle, count=60):
+    angles = np.linspace(0, angle, count)
+    points = np.column_stack([radius * np.cos(angles), radius * np.sin(angles), np.full(count, 0.3)])
+    return points + 0.002 * RNG.standard_normal(points.shape)
+
+
+def line(travel, count=60):
+    points = np.linspace(0, travel, count)[:, None] * [0.6, 0.0, 0.8] + [1, 2, 3]
+    return points + 0.002 * RNG.standard_normal(points.shape)
+
+
+@pytest.fixture
+def folder(tmp_path):
+    for name, points in {"cabinet_one/001": arc(0.4, 1.5), "drawer_one/001": line(0.45)}.items():
+        file = tmp_path / "tracks" / f"{name}.log"
+        file.parent.mkdir(parents=True)
+        np.savetxt(file, points)
+    rows = [[*arc(0.4, 1.5)[k], 0, 0, np.sin(k / 80), np.cos(k / 80), 0.5, 0.6] for k in range(60)]
+    (tmp_path / "tracks" / "models_data").mkdir()
+    np.savetxt(tmp_path / "tracks" / "models_data" / "door.txt", rows)
+    return tmp_path / "tracks"
+
+
+def test_recordings_are_known_by_their_names(folder):
+    found = list(labelled_recordings(folder))
+    assert [(r.name, r.label, r.poses.shape) for r in found] == [
+        ("cabinet_one/001", "revolute", (THINNED, 3)),
+        ("drawer_one/001", "prismatic", (THINNED, 3)),
+        ("models_data/door", "revolute", (THINNED, 4, 4)),
+    ]
+    assert [r.covariance.shape for r in found] == [(3, 3), (3, 3), (6, 6)]
+    np.testing.assert_array_equal(found[0].covariance, POSITION**2 * np.eye(3))
+
+
+def test_what_is_written_beside_poses_is_left_out(folder):
+    door = list(labelled_recordings(folder))[-1]
+    np.testing.assert_allclose(door.poses[-1, :2, 0], [np.cos(59 / 40), np.sin(59 / 40)])
+
+
+def test_arcs_are_hinges_and_lines_are_drawers():
+    assert judge(Labelled("an arc", "revolute", arc(0.4, 1.5, 20))).right
+    assert judge(Labelled("a line", "prismatic", line(0.45, 20))).right
+
+
+def test_what_is_missed_is_named_and_drawn(tmp_path):
+    pytest.importorskip("matplotlib")
+    judged = [
+        judge(Labelled("kitchen/door", "revolute", arc(0.4, 1.5, 20))),
+        judge(Labelled("kitchen/no drawer", "prismatic", arc(0.4, 1.5, 20))),
+    ]
+    found = report(judged)
+    assert found.numbers["missed"] == ["kitchen/no drawer"]
+    assert found.numbers["right"] == 0.5
+    assert json.loads(json.dumps(found.numbers, allow_nan=False)) == found.numbers
+    assert found.tables[2].rows[0][0] == "kitchen/no drawer"
+    all_right = size_of(judged[:1])
+    assert size_of(judged)[1] > all_right[1] + 3
+    found.figure.save(tmp_path / "missed.png")
+    assert (tmp_path / "missed.png").stat().st_size > 20_000
+
+
+def test_the_missed_one_is_shown_with_both_explanations():
+    figure = pytest.importorskip("matplotlib.figure").Figure(layout="constrained")
+    draw_recordings(figure, [judge(Labelled("no drawer", "prismatic", arc(0.4, 1.5, 20)))])
+    below = figure.subfigs[1]
+    titles = " ".join(axes.get_title() for axes in below.axes)
+    assert "missed: no drawer" in below.get_suptitle()
+    assert "prismatic" in titles
+    assert "revolute" in titles
+
+
+def test_without_recordings_it_says_what_and_where(tmp_path, monkeypatch):
+    with pytest.raises(FormatError, match=r"nowhere: there is no such folder.*cabinet_one/001\.log.*--data"):
+        labelled_recordings(tmp_path / "nowhere")
+    with pytest.raises(FormatError, match="none of them is there"):
+        labelled_recordings(tmp_path)
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(FormatError, match="sturm_tracks: there is no such folder"):
+        reproduce("sturm")
+
+
+def test_the_command_takes_the_folder(folder, capsys):
+    assert main(["reproduce", "sturm", "--data", str(folder), "--json", "--no-figure"]) == 0
+    answer = json.loads(capsys.readouterr().out)
+    assert [r["name"] for r in answer["recordings"]] == [
+        "cabinet_one/001",
+        "drawer_one/001",
+        "models_data/door",
+    ]
+    assert answer["recordings"][0]["radius"] == pytest.approx(0.4, abs=0.02)
+
+
+@pytest.mark.skipif(not TRACKS.exists(), reason=f"no {TRACKS}")
+def test_at_least_95_percent_of_the_published_recordings_are_right():
+    found = reproduce("sturm", options=Options(data=TRACKS))
+    assert len(found.numbers["recordings"]) == 60
+    assert found.numbers["right"] >= 0.95
