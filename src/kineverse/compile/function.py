@@ -244,6 +244,12 @@ class CompiledFunction:
             raise CompileError(f"The function cannot be compiled: {self._library.error}.")
         return there
 
+    @property
+    def address(self) -> int | None:
+        """Where the C is, for other C to call; None while there is none. It lives as long as the function."""
+        code = self._library.code if self._library is not None else None
+        return None if code is None else code.address
+
     def _ready(self) -> None:
         """Let C take over, or the extension that calls it, in whichever thread it was loaded."""
         if self._library is not None and self._library.code is not None:
