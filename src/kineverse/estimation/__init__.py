@@ -6,15 +6,25 @@
 
 from .identification import Fit, Found, identify
 from .noise import pose_covariance
-from .tracking import Estimate, ObservedExpression, ObservedPose, ObservedPosition, Tracker
+from .tracking import (
+    Estimate,
+    Hypotheses,
+    ObservedExpression,
+    ObservedPose,
+    ObservedPosition,
+    Outliers,
+    Tracker,
+)
 
 __all__ = [
     "Estimate",
     "Fit",
     "Found",
+    "Hypotheses",
     "ObservedExpression",
     "ObservedPose",
     "ObservedPosition",
+    "Outliers",
     "Tracker",
     "identify",
     "pose_covariance",

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
@@ -47,24 +47,24 @@ class Quadratic:
         """Return the one whose least cost is 0."""
         return Quadratic(matrix, vector, float(vector @ np.linalg.solve(matrix, vector)) / 2)
 
-    def with_seen(self, seen: Iterable[tuple[Array, Array]]) -> Quadratic:
-        """Return it with the squares of errors e - S ξ added, given as pairs (e, S)."""
+    def with_seen(self, seen: Iterable[tuple[Array, Array, float]]) -> Quadratic:
+        """Return it with the squares of errors e - S ξ added, given as (e, S, weight)."""
         matrix, vector, cost = self.matrix.copy(), self.vector.copy(), self.cost
-        for error, slope in seen:
-            matrix += slope.T @ slope
-            vector += slope.T @ error
-            cost += float(error @ error) / 2
+        for error, slope, weight in seen:
+            matrix += weight * (slope.T @ slope)
+            vector += weight * (slope.T @ error)
+            cost += weight * float(error @ error) / 2
         return Quadratic(matrix, vector, cost)
 
     def carried(self, step: Array, turn: Array | None) -> Quadratic:
         """Return the same in the tangent at the end of a step, which is turned by ``turn`` on the way."""
         moved = self.matrix @ step
         cost = self.cost - float(self.vector @ step) + float(step @ moved) / 2
-        found = replace(self, vector=self.vector - moved, cost=cost)
+        vector = self.vector - moved
         if turn is None:
-            return found
+            return Quadratic(self.matrix, vector, cost)
         back = np.linalg.inv(turn)
-        return Quadratic(symmetric(back.T @ self.matrix @ back), back.T @ found.vector, cost)
+        return Quadratic(symmetric(back.T @ self.matrix @ back), back.T @ vector, cost)
 
     @cached_property
     def least(self) -> float:
@@ -77,31 +77,43 @@ class Quadratic:
         return float(np.linalg.slogdet(self.matrix)[1])
 
 
-@dataclass(slots=True, eq=False)
 class Belief:
     """A point and a Gaussian about it, as it would be without limits.
 
     With ξ in the tangent at ``x``, the density is exp(-½ξᵀΛξ + ηᵀξ) up to a factor. Its mean Λ⁻¹η need not be
     0, as the point stays inside the limits and the Gaussian does not.
 
+    Parameters
+    ----------
+    sizes
+        How many coordinates, directions and groups there are.
+    numbers
+        All of it, one after the other; zeros if None.
+
     Attributes
     ----------
     x
         The coordinates (n,).
-    information, vector
-        Λ (t, t), zero between groups, and η (t,).
+    vector, information
+        η (t,), and Λ (t, t), zero between groups.
     evidence
         For each group, the logarithm of the density of all it has seen.
     """
 
-    x: Array
-    information: Array
-    vector: Array
-    evidence: Array
+    __slots__ = ("evidence", "information", "numbers", "sizes", "vector", "x")
+
+    def __init__(self, sizes: tuple[int, int, int], numbers: Array | None = None) -> None:
+        n, t, groups = sizes
+        self.sizes = sizes
+        self.numbers = np.zeros(n + t + groups + t * t) if numbers is None else numbers
+        self.x = self.numbers[:n]
+        self.vector = self.numbers[n : n + t]
+        self.evidence = self.numbers[n + t : n + t + groups]
+        self.information = self.numbers[n + t + groups :].reshape(t, t)
 
     def copy(self) -> Belief:
         """Return one of its own."""
-        return Belief(self.x.copy(), self.information.copy(), self.vector.copy(), self.evidence.copy())
+        return Belief(self.sizes, self.numbers.copy())
 
     def part(self, t: Indices) -> Quadratic:
         """Return what is believed of a group, with its places in the tangent."""

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from functools import cached_property
 from types import MappingProxyType
 
@@ -13,43 +12,46 @@ from kineverse.estimation.noise import Array
 from kineverse.state import State
 from kineverse.symbols import Symbol
 
-from .belief import Belief
-from .charted import Charted
-from .layout import Layout
+from .filtering import Filter, Outcome
+from .modes import Modes
 
 
-@dataclass(frozen=True, eq=False)
 class Estimate:
     """The most probable state inside the limits, and how far it may be off.
+
+    Parameters
+    ----------
+    outcome, filter_, known, stamp
+        What it is read off.
 
     Attributes
     ----------
     nis, dof
         The normalised innovation squared of the last update and the number of its parts: χ² distributed, if
         noise is what the covariances say.
-    outliers
-        The names of observations that were held for wrong.
     rounds
         How many times the model was evaluated.
     stamp
         [s]; None if the tracker has not heard of time.
     """
 
-    _belief: Belief
-    _layout: Layout
-    _charted: Charted
-    _known: Array
-    nis: float
-    dof: int
-    outliers: tuple[str, ...]
-    rounds: int
-    stamp: float | None
+    def __init__(
+        self, outcome: Outcome, modes: Modes, filter_: Filter, known: Array, stamp: float | None
+    ) -> None:
+        self._modes, self._belief = modes, modes.best
+        self._outcome, self._filter, self._layout, self._known = outcome, filter_, filter_.layout, known
+        self.nis, self.dof, self.rounds, self.stamp = outcome.nis, outcome.dof, outcome.rounds, stamp
 
     @cached_property
     def state(self) -> State:
         """The most probable state inside the limits."""
         values = dict(zip(self._layout.chart.coordinates, self._belief.x.tolist(), strict=True))
         return State(values, stamp=self.stamp, source="tracker")
+
+    @property
+    def outliers(self) -> tuple[str, ...]:
+        """The names of the observations that were not believed."""
+        return tuple(self._layout.observations[i].name for i in self._outcome.outliers)
 
     @property
     def tangent(self) -> tuple[Symbol, ...]:
@@ -81,20 +83,23 @@ class Estimate:
         """The standard deviation of each coordinate, by symbol and by name [m], [rad]."""
         found: dict[Symbol | str, float] = {}
         for number, group in enumerate(self._layout.groups):
-            basis = self._charted.basis(number, self._belief.x[group.x], self._known)
+            basis = self._filter.charted.basis(number, self._belief.x[group.x], self._known)
             block = self.covariance[np.ix_(group.t, group.t)]
             variances = np.einsum("ij,jk,ik->i", basis, block, basis)
             for x, variance in zip(group.coordinates, variances.tolist(), strict=True):
                 found[x] = found[str(x)] = float(np.sqrt(variance))
         return MappingProxyType(found)
 
-    @property
-    def evidence(self) -> Mapping[tuple[Symbol, ...], float]:
-        """The log density of all that was seen, by the coordinates of each group."""
-        names = (group.coordinates for group in self._layout.groups)
-        return MappingProxyType(dict(zip(names, self._belief.evidence.tolist(), strict=True)))
+    @cached_property
+    def confidence(self) -> Mapping[tuple[Symbol, ...], float]:
+        """The probability of each group's explanation, of those that are still considered."""
+        found = {}
+        for number, group in enumerate(self._layout.groups):
+            evidence = self._modes.evidence(number)
+            found[group.coordinates] = float(np.exp(evidence[0] - np.logaddexp.reduce(evidence)))
+        return MappingProxyType(found)
 
-    @property
+    @cached_property
     def log_evidence(self) -> float:
         """The log density of all that was seen."""
-        return float(self._belief.evidence.sum())
+        return self._modes.log_evidence

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import accumulate, pairwise
 
 import numpy as np
 
@@ -97,6 +98,16 @@ class Layout:
         return self._slices[2]
 
     @cached_property
+    def seen_slices(self) -> tuple[slice, ...]:
+        """Where each observation is in a reading: 4×4 row by row, or a vector."""
+        return _one_after_the_other(16 if one.is_pose else one.size for one in self.observations)
+
+    @cached_property
+    def white_slices(self) -> tuple[slice, ...]:
+        """Where what whitens each observation is in a reading."""
+        return _one_after_the_other(one.size**2 for one in self.observations)
+
+    @cached_property
     def _slices(self) -> tuple[tuple[slice, ...], tuple[slice, ...], tuple[slice, ...]]:
         at = 0
         found: tuple[list[slice], list[slice], list[slice]] = [], [], []
@@ -142,6 +153,11 @@ class Layout:
             else:
                 columns.append(entry)
         return array(columns).T.reshape(-1)
+
+
+def _one_after_the_other(sizes: Iterable[int]) -> tuple[slice, ...]:
+    ends = [0, *accumulate(sizes)]
+    return tuple(slice(a, b) for a, b in pairwise(ends))
 
 
 def _flat(pose: Expression) -> Expression:

@@ -73,36 +73,35 @@ def _is_box(constraint: Constraint, chart: Chart) -> bool:
     return constraint.expression.symbols[0] not in chart.by_speeds
 
 
-def beginning(
-    model: ModelView, chart: Chart, limits: Limits, given: Mapping[Symbol, float], turning: frozenset[Symbol]
-) -> tuple[Array, Array]:
-    """Return where a tracker begins without a word about it, and the variances there.
-
-    In the middle of the limits, ± half their width. What has no limits begins at its default, ± π for what
-    comes back after a turn and for the turning of quaternions, else ± 10 [m].
-
-    Returns
-    -------
-    values, deviations
-        Of the coordinates, and of the tangent.
-    """
+def first_place(model: ModelView, chart: Chart, limits: Limits, given: Mapping[Symbol, float]) -> Array:
+    """Return where a tracker begins: where it is told, else in the middle of limits, else at the default."""
     default = model.default_state()
-    values = np.array([given.get(x, default.get(x, 0.0)) for x in chart.coordinates])
-    deviations = {}
-    for i, x in enumerate(chart.coordinates):
-        low, high = limits.lower[i], limits.upper[i]
+    values = []
+    for x, low, high in zip(chart.coordinates, limits.lower, limits.upper, strict=True):
+        middle = (low + high) / 2 if np.isfinite(high - low) else default.get(x, 0.0)
+        values.append(given.get(x, float(middle)))
+    return np.clip(values, limits.lower, limits.upper)
+
+
+def first_deviations(chart: Chart, limits: Limits, turning: frozenset[Symbol]) -> Array:
+    """Return how uncertain the tangent is then.
+
+    Half the width of the limits; without limits π for what comes back after a turn and for the turning of
+    quaternions, else 10 m.
+    """
+    found = np.full(len(chart.tangent), np.pi)
+    for x, low, high in zip(chart.coordinates, limits.lower, limits.upper, strict=True):
+        if x in chart.by_speeds:
+            continue
         width = high - low
-        if np.isfinite(width):
-            if x not in given:
-                values[i] = (low + high) / 2
-            # Limits that leave nothing leave it known; the information stays finite.
-            deviation = max(width / 2, 1e-9)
-        else:
-            deviation = np.pi if x in turning else UNLIMITED
-        if x not in chart.by_speeds:
-            deviations[x.derivative()] = deviation
-    return values, np.array([deviations.get(v, np.pi) for v in chart.tangent])
+        usual = np.pi if x in turning else UNLIMITED
+        # Limits that leave nothing leave it known; the information stays finite.
+        found[chart.tangent.index(x.derivative())] = max(width / 2, LEAST) if np.isfinite(width) else usual
+    return found
 
 
 UNLIMITED = 10.0
-"""The deviation of a length without limits [m]."""
+"""The deviation at the start of a length without limits [m]."""
+
+LEAST = 1e-9
+"""That of a coordinate whose limits leave nothing."""

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -12,28 +11,31 @@ import numpy.typing as npt
 from kineverse.errors import ShapeError, UnknownNameError, ValueRejectedError, suggest
 from kineverse.estimation.noise import Array
 
+from .layout import Layout
 from .observed import Observation, checked_covariance
 
 RIGID = 1e-4
 """How far RᵀR may be from the identity; a pose in single precision is off by 1e-6."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Reading:
-    """What was seen.
+class Reading(NamedTuple):
+    """What was seen, as arrays; where each observation is in them, the layout knows.
 
     Attributes
     ----------
     values
-        For each observation its (12,) rotation row by row and position, or its vector; None if it is missing.
+        Poses 4×4 row by row, and vectors; anything for what is missing.
+    seen
+        A mask of what was seen (m,).
     whitening
-        For each the matrix that makes errors independent and of deviation 1.
+        For each a lower triangle W with Wᵀ W = R⁻¹, row by row.
     log_scale
         For each ½ log |2πR|.
     """
 
-    values: list[Array | None]
-    whitening: list[Array]
+    values: Array
+    seen: npt.NDArray[np.bool_]
+    whitening: Array
     log_scale: Array
 
 
@@ -42,76 +44,113 @@ class Reader:
 
     Parameters
     ----------
-    observations
-        What may be seen.
+    layout
+        What may be seen, and where it is put.
     """
 
-    def __init__(self, observations: tuple[Observation, ...]) -> None:
-        self._observations = observations
+    def __init__(self, layout: Layout) -> None:
+        self._layout = layout
+        observations = layout.observations
         self._index = {one.name: i for i, one in enumerate(observations)}
-        self.whitening = [whitening(one.covariance) for one in observations]
-        self.log_scale = np.array([log_scale(one.covariance) for one in observations])
+        self._whitening = np.concatenate([whitening(one.covariance).reshape(-1) for one in observations])
+        self._log_scale = np.array([log_scale(one.covariance) for one in observations])
+        self._size = layout.seen_slices[-1].stop
+        self._vectors = [one.label for one in observations if not one.is_pose]
+        self._all = np.ones(len(observations), dtype=bool)
 
-    def read(self, seen: Mapping[str, Any]) -> Reading:
+    def nothing(self) -> Reading:
+        """Return a reading of which all is missing."""
+        return Reading(np.zeros(self._size), ~self._all, self._whitening, self._log_scale)
+
+    def values_of(self, said: Array) -> Array:
+        """Return what a model says, as if it had been seen."""
+        values = np.zeros(self._size)
+        for i, one in enumerate(self._layout.observations):
+            value = said[self._layout.value_slices[i]]
+            if one.is_pose:
+                pose = np.eye(4)
+                pose[:3, :3], pose[:3, 3] = value[:9].reshape(3, 3), value[9:]
+                value = pose.reshape(-1)
+            values[self._layout.seen_slices[i]] = value
+        return values
+
+    def read(self, given: Mapping[str, Any]) -> Reading:
         """Return what was seen, from a mapping by name; what is absent is missing.
+
+        Whether poses are rigid is not looked at yet, see :meth:`check_poses`.
 
         Raises
         ------
         UnknownNameError, ShapeError, ValueRejectedError
-            For other names, shapes, numbers that are not finite, poses that are not rigid and covariances
-            that are not positive.
+            For other names, shapes, vectors that are not finite and covariances that are not positive.
         """
-        if not isinstance(seen, Mapping):
-            raise ValueRejectedError(f"What was seen is a mapping {{frame: pose}}, not {seen!r:.80}.")
-        values: list[Array | None] = [None] * len(self._observations)
-        whitenings, scales = list(self.whitening), self.log_scale.copy()
-        for name, given in seen.items():
+        if not isinstance(given, Mapping):
+            raise ValueRejectedError(f"What was seen is a mapping {{frame: pose}}, not {given!r:.80}.")
+        values, seen, whitenings, scales = self.nothing()
+        for name, value in given.items():
             i = self._index.get(name)
             if i is None:
-                raise UnknownNameError(
-                    f"'{name}' is not observed. {suggest(str(name), self._index, 'observation')}"
-                )
-            one = self._observations[i]
-            if isinstance(given, tuple) and len(given) == 2:
-                given, covariance = given
-                if covariance is not None:
-                    checked = checked_covariance(covariance, one.size, one.label)
-                    whitenings[i], scales[i] = whitening(checked), log_scale(checked)
-            values[i] = pose_of(given, one.label) if one.is_pose else _vector_of(given, one)
-        return Reading(values, whitenings, scales)
+                hint = suggest(str(name), self._index, "observation")
+                raise UnknownNameError(f"'{name}' is not observed. {hint}")
+            one = self._layout.observations[i]
+            if isinstance(value, tuple) and len(value) == 2:
+                value, covariance = value
+                checked = checked_covariance(covariance, one.size, one.label)
+                if whitenings is self._whitening:
+                    whitenings, scales = whitenings.copy(), scales.copy()
+                whitenings[self._layout.white_slices[i]] = whitening(checked).reshape(-1)
+                scales[i] = log_scale(checked)
+            values[self._layout.seen_slices[i]] = (
+                _pose_like(value, one.label).reshape(-1) if one.is_pose else _checked_vector(value, one)
+            )
+            seen[i] = True
+        return Reading(values, seen, whitenings, scales)
 
-    def read_poses(self, poses: npt.ArrayLike, seen: npt.ArrayLike | None) -> Reading:
-        """Return what was seen, from an array of poses in the order of the observations."""
-        if not all(one.is_pose for one in self._observations):
-            others = ", ".join(one.label for one in self._observations if not one.is_pose)
+    def read_poses(self, poses: npt.ArrayLike, mask: npt.ArrayLike | None) -> Reading:
+        """Return what was seen, from an array of poses in the order of the observations.
+
+        They are not looked at yet, see :meth:`check_poses`.
+
+        Raises
+        ------
+        ShapeError, ValueRejectedError
+            If there are others than poses, or for other shapes.
+        """
+        if self._vectors:
             raise ValueRejectedError(
-                f"update_poses is for poses alone; of these none is seen: {others}. Use update."
+                f"update_poses is for poses alone, which {', '.join(self._vectors)} is not. Use update."
             )
         given = _numbers(poses, "The poses")
-        count = len(self._observations)
+        count = len(self._all)
         if given.shape != (count, 4, 4):
             raise ShapeError(f"The poses are an array of shape {(count, 4, 4)}, not {given.shape}.")
-        mask = np.ones(count, dtype=bool) if seen is None else np.asarray(seen)
-        if mask.dtype != bool or mask.shape != (count,):
-            raise ShapeError(f"seen= is a mask of {count} booleans, not {seen!r:.80}.")
-        values = [
-            pose_of(pose, one.label) if is_seen else None
-            for pose, one, is_seen in zip(given, self._observations, mask.tolist(), strict=True)
-        ]
-        return Reading(values, self.whitening, self.log_scale)
+        seen = self._all if mask is None else np.ascontiguousarray(mask)
+        if seen.dtype != bool or seen.shape != (count,):
+            raise ShapeError(f"seen= is a mask of {count} booleans, not {mask!r:.80}.")
+        values = np.ascontiguousarray(given).reshape(-1)
+        return Reading(values, seen, self._whitening, self._log_scale)
+
+    def check_poses(self, reading: Reading) -> None:
+        """Check the poses that were seen.
+
+        Raises
+        ------
+        ValueRejectedError
+            Naming the first that is not rigid.
+        """
+        for i, one in enumerate(self._layout.observations):
+            if one.is_pose and reading.seen[i]:
+                check_pose(reading.values[self._layout.seen_slices[i]].reshape(4, 4), one.label)
 
 
-def pose_of(given: npt.ArrayLike, label: str) -> Array:
-    """Return a pose as (12,), rotation row by row, then position.
+def check_pose(pose: Array, label: str) -> None:
+    """Check a 4×4 matrix.
 
     Raises
     ------
-    ShapeError, ValueRejectedError
-        If it is no rigid transform; by how much it is off.
+    ValueRejectedError
+        If it is no rigid transform, saying by how much it is off.
     """
-    pose = _numbers(given, f"The pose of '{label}'")
-    if pose.shape != (4, 4):
-        raise ShapeError(f"The pose of '{label}' is a 4×4 transform, not of shape {pose.shape}.")
     if not np.isfinite(pose).all():
         raise ValueRejectedError(f"The pose of '{label}' is not finite.")
     rotation = pose[:3, :3]
@@ -121,31 +160,34 @@ def pose_of(given: npt.ArrayLike, label: str) -> Array:
             f"The pose of '{label}' is not rigid: RᵀR is off from the identity by {off:.3g}."
         )
     if np.linalg.det(rotation) < 0:
-        raise ValueRejectedError(
-            f"The pose of '{label}' is a reflection: the determinant of its rotation is -1."
-        )
+        raise ValueRejectedError(f"The pose of '{label}' is a reflection: its rotation has determinant -1.")
     last = float(np.abs(pose[3] - [0, 0, 0, 1]).max())
     if last > RIGID:
         raise ValueRejectedError(
-            f"The pose of '{label}' has a last row that is off from (0, 0, 0, 1) by {last:.3g}."
+            f"The last row of the pose of '{label}' is off from (0, 0, 0, 1) by {last:.3g}."
         )
-    return np.concatenate([rotation.reshape(9), pose[:3, 3]])
+
+
+def _pose_like(given: npt.ArrayLike, label: str) -> Array:
+    pose = _numbers(given, f"The pose of '{label}'")
+    if pose.shape != (4, 4):
+        raise ShapeError(f"The pose of '{label}' is a 4×4 transform, not of shape {pose.shape}.")
+    return pose
 
 
 def whitening(covariance: Array) -> Array:
-    """Return W with Wᵀ W = R⁻¹."""
+    """Return the lower triangle W with Wᵀ W = R⁻¹."""
     found: Array = np.linalg.inv(np.linalg.cholesky(covariance))
-    return found
+    return np.tril(found)
 
 
 def log_scale(covariance: Array) -> float:
     """Return ½ log |2πR|."""
-    return float(
-        np.log(np.diag(np.linalg.cholesky(covariance))).sum() + len(covariance) * np.log(2 * np.pi) / 2
-    )
+    logarithms = np.log(np.diag(np.linalg.cholesky(covariance)))
+    return float(logarithms.sum() + len(covariance) * np.log(2 * np.pi) / 2)
 
 
-def _vector_of(given: Any, one: Observation) -> Array:
+def _checked_vector(given: Any, one: Observation) -> Array:
     vector = _numbers(given, f"The value of '{one.label}'")
     if vector.shape == () and one.size == 1:
         vector = vector.reshape(1)
@@ -160,4 +202,4 @@ def _numbers(given: npt.ArrayLike, what: str) -> Array:
     try:
         return np.asarray(given, dtype=np.float64)
     except (TypeError, ValueError):
-        raise ValueRejectedError(f"{what} are not numbers: {given!r:.80}.") from None
+        raise ValueRejectedError(f"{what}: these are no numbers: {given!r:.80}.") from None

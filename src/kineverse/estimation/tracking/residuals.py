@@ -45,8 +45,8 @@ class Residuals:
             The observations that are wanted.
         """
         layout = self._layout
-        values = {i: value for i in which if (value := reading.values[i]) is not None}
-        seen = list(values)
+        seen = [i for i in which if reading.seen[i]]
+        values = {i: reading.values[layout.seen_slices[i]] for i in seen}
         errors: dict[int, Array] = {}
         slopes: dict[int, Array] = {}
         for i in seen:
@@ -55,12 +55,12 @@ class Residuals:
         poses = [i for i in seen if layout.observations[i].is_pose]
         if poses:
             said = np.stack([out[layout.value_slices[i]] for i in poses])
-            found = np.stack([values[i] for i in poses])
-            turned = found[:, :9].reshape(-1, 3, 3) @ np.swapaxes(said[:, :9].reshape(-1, 3, 3), 1, 2)
+            found = np.stack([values[i] for i in poses]).reshape(-1, 4, 4)
+            turned = found[:, :3, :3] @ np.swapaxes(said[:, :9].reshape(-1, 3, 3), 1, 2)
             vectors = logarithms(turned)
             back = slopes_of_logarithms(vectors)
             errors.update(
-                zip(poses, np.concatenate([found[:, 9:] - said[:, 9:], vectors], axis=1), strict=True)
+                zip(poses, np.concatenate([found[:, :3, 3] - said[:, 9:], vectors], axis=1), strict=True)
             )
             for i, turn in zip(poses, back, strict=True):
                 slope = slopes[i]
@@ -68,7 +68,12 @@ class Residuals:
         for i in seen:
             if i not in errors:
                 errors[i] = values[i] - out[layout.value_slices[i]]
-        return {i: (reading.whitening[i] @ errors[i], reading.whitening[i] @ slopes[i]) for i in seen}
+        pairs = {}
+        for i in seen:
+            size = layout.observations[i].size
+            white = reading.whitening[layout.white_slices[i]].reshape(size, size)
+            pairs[i] = white @ errors[i], white @ slopes[i]
+        return pairs
 
     def check(self, out: Array, which: Sequence[int]) -> None:
         """Raise an error that names an observation whose value or derivative is not finite.

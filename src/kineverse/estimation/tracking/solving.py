@@ -2,13 +2,15 @@
 
 Minimised is ½ξᵀΛξ - ηᵀξ + ½ Σ |W r|² over the state. Every group takes its own steps, but the model is
 evaluated for all of them at once. A step that makes the cost larger is taken back and damped (Levenberg,
-Marquardt).
+Marquardt). Where observations may be wrong, each square is weighted anew at each place, and what is minimised
+is their density with outliers.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Literal, TypeAlias
 
 import numpy as np
 
@@ -16,9 +18,11 @@ from kineverse.errors import ModelError
 from kineverse.estimation.noise import Array
 
 from .belief import Belief, Quadratic, inverse
+from .box import Box, Room
 from .charted import Charted
 from .layout import Layout
 from .limits import Limits
+from .outliers import Outliers, heavy_tails
 from .quadratic import smallest_between
 from .reading import Reading
 from .residuals import Residuals
@@ -27,6 +31,10 @@ from .residuals import Residuals
 _CONVERGED = 1e-5
 _MOST_ROUNDS = 50
 _MOST_DAMPING = 1e9
+_OUTSIDE = 1e-9
+
+Trust: TypeAlias = Outliers | Literal["all", "most"]
+"""Who is believed: all, most of them (heavy tails), or each as far as it is no outlier."""
 
 
 @dataclass(slots=True, eq=False)
@@ -41,12 +49,15 @@ class Found:
         For each group the normalised innovation squared, and of how many numbers.
     rounds
         How many times the model was evaluated.
+    weights
+        How far each observation was believed; None if all were.
     """
 
     belief: Belief
     nis: Array
     dof: Array
     rounds: int
+    weights: Array | None = None
 
 
 @dataclass(slots=True, eq=False)
@@ -57,19 +68,24 @@ class _Work:
     ----------
     x, prior, posterior, cost
         The best place so far: coordinates, belief without and with what was seen, and the cost.
+    beyond
+        By how much the cost is more than that of the posterior, which has weighted squares.
     trial, trial_prior
         Where it is evaluated next.
+    room
+        What the limits allow at the best place; None before there is one.
     """
 
     x: Array
     prior: Quadratic
     posterior: Quadratic
-    cost: float
     trial: Array
     trial_prior: Quadratic
-    between: tuple[Array, Array, Array] | None = None
+    cost: float = np.inf
+    beyond: float = 0.0
+    room: Room | None = None
     damping: float = 0.0
-    is_done: bool = False
+    settled: Quadratic | None = None
 
 
 class Solver:
@@ -82,10 +98,12 @@ class Solver:
     """
 
     def __init__(self, layout: Layout, residuals: Residuals, charted: Charted, limits: Limits) -> None:
-        self._layout, self._residuals, self._charted, self._limits = layout, residuals, charted, limits
-        self._boxes = [_Box(number, layout, limits) for number in range(len(layout.groups))]
+        self._layout, self._residuals, self._charted = layout, residuals, charted
+        self._boxes = [Box(number, layout, limits) for number in range(len(layout.groups))]
 
-    def update(self, belief: Belief, reading: Reading, known: Array, groups: Sequence[int]) -> Found:
+    def update(
+        self, belief: Belief, reading: Reading, known: Array, groups: Sequence[int], trust: Trust = "all"
+    ) -> Found:
         """Return the belief after a reading; what is handed in stays as it is.
 
         Parameters
@@ -98,6 +116,8 @@ class Solver:
             Values of what is known.
         groups
             The numbers of the groups that take part.
+        trust
+            Who is believed.
 
         Raises
         ------
@@ -106,112 +126,133 @@ class Solver:
         ModelError
             If limits leave nothing between them.
         """
+        works, weights, rounds = self._run(belief, reading, known, groups, trust)
+        return self._found(belief, works, reading, rounds, trust, weights)
+
+    def inside(self, belief: Belief, nothing: Reading, known: Array) -> Belief:
+        """Return the same belief, about the most probable point inside the limits."""
+        return self.update(belief, nothing, known, range(len(self._layout.groups))).belief
+
+    def where_most_agree(
+        self, belief: Belief, reading: Reading, known: Array, groups: Sequence[int]
+    ) -> Belief:
+        """Return the same belief, about a point from which outliers look like outliers."""
+        works, *_ = self._run(belief, reading, known, groups, "most")
+        moved = belief.copy()
+        for number, work in works.items():
+            group = self._layout.groups[number]
+            moved.x[group.x] = work.x
+            moved.put(group.t, work.prior)
+        return moved
+
+    def _run(
+        self, belief: Belief, reading: Reading, known: Array, groups: Sequence[int], trust: Trust
+    ) -> tuple[dict[int, _Work], Array, int]:
+        """Take steps until all groups have settled; return them, weights and the number of evaluations."""
         works = {number: self._begun(belief, number) for number in groups}
+        weights = np.ones(len(self._layout.observations))
         x, rounds = belief.x.copy(), 0
-        while rounds < _MOST_ROUNDS and not all(work.is_done for work in works.values()):
+        while rounds < _MOST_ROUNDS and any(work.settled is None for work in works.values()):
             for number, work in works.items():
                 x[self._layout.groups[number].x] = work.trial
             out = self._residuals.evaluate(x, known)
             rounds += 1
             for number, work in works.items():
-                if not work.is_done:
-                    self._judge(number, work, out, reading)
+                if work.settled is None:
+                    self._judge(number, work, out, reading, trust, weights)
                     self._go_on(number, work, known)
-        return self._found(belief, works, reading, rounds)
-
-    def inside(self, belief: Belief, known: Array) -> Belief:
-        """Return the same belief, about the most probable point inside the limits."""
-        nothing = Reading([None] * len(self._layout.observations), [], np.empty(0))
-        return self.update(belief, nothing, known, range(len(self._layout.groups))).belief
+        return works, weights, rounds
 
     def _begun(self, belief: Belief, number: int) -> _Work:
         group = self._layout.groups[number]
-        prior = belief.part(group.t)
-        x = belief.x[group.x]
-        return _Work(x, prior, prior, np.inf, x, prior)
+        prior, x = belief.part(group.t), belief.x[group.x]
+        return _Work(x, prior, prior, x, prior)
 
-    def _judge(self, number: int, work: _Work, out: Array, reading: Reading) -> None:
+    def _judge(
+        self, number: int, work: _Work, out: Array, reading: Reading, trust: Trust, weights: Array
+    ) -> None:
         """Make the trial the best place, if it is better."""
         group = self._layout.groups[number]
         with np.errstate(invalid="ignore"):  # a trial may be where a slope is infinite; it is not taken
             seen = self._residuals.errors(out, reading, group.seen)
-        cost = work.trial_prior.cost + sum(float(e @ e) for e, _ in seen.values()) / 2
+        squares = {i: float(e @ e) for i, (e, _) in seen.items()}
+        judged = {i: self._trusted(i, square, reading, trust) for i, square in squares.items()}
+        cost = work.trial_prior.cost + sum(each for _, each in judged.values())
         is_finite = np.isfinite(cost) and all(np.isfinite(s).all() for _, s in seen.values())
-        if not is_finite and work.between is None:
+        if not is_finite and work.room is None:
             self._residuals.check(out, group.seen)
-        if not is_finite or cost > work.cost + 1e-10 * (1 + abs(work.cost)):
+        room = self._boxes[number].room(work.trial, out)
+        if not is_finite or not _is_better(work, cost, room):
             work.damping = max(10 * work.damping, 1e-3)
             return
-        work.x, work.prior, work.cost = work.trial, work.trial_prior, cost
-        work.posterior = work.prior.with_seen(seen.values())
-        work.between = self._boxes[number].between(work.x, out)
+        work.x, work.prior, work.cost, work.room = work.trial, work.trial_prior, cost, room
+        weights[list(judged)] = [weight for weight, _ in judged.values()]
+        work.posterior = work.prior.with_seen((e, s, judged[i][0]) for i, (e, s) in seen.items())
+        work.beyond = cost - work.posterior.cost
         work.damping = work.damping / 10 if work.damping > 1e-6 else 0.0
+
+    def _trusted(self, i: int, square: float, reading: Reading, trust: Trust) -> tuple[float, float]:
+        """Return how much an observation counts, and what it costs."""
+        if trust == "all" or not np.isfinite(square):
+            return 1.0, square / 2
+        if trust == "most":
+            size = self._layout.observations[i].size
+            return heavy_tails(square, size), (1 + size) / 2 * float(np.log1p(square))
+        density = trust.log_density(self._layout.observations[i])
+        return trust.judge(square, float(reading.log_scale[i]), density)
 
     def _go_on(self, number: int, work: _Work, known: Array) -> None:
         """Find the next trial, or settle where it is."""
-        assert work.between is not None
+        assert work.room is not None
         matrix = work.posterior.matrix
         if work.damping:
             matrix = matrix + work.damping * np.diag(np.diag(matrix))
-        step = smallest_between(inverse(matrix), -work.posterior.vector, *work.between)
+        step = smallest_between(inverse(matrix), -work.posterior.vector, *work.room)
         if step is None:
             names = ", ".join(map(str, self._layout.groups[number].coordinates))
             raise ModelError(f"The limits of {names} leave no state between them.")
         x, turn = self._charted.step(number, work.x, step, known)
         x = self._boxes[number].clipped(x)
         if float(step @ matrix @ step) <= _CONVERGED**2 or work.damping > _MOST_DAMPING:
-            work.x, work.posterior = x, work.posterior.carried(step, turn)
-            work.is_done = True
+            work.x, work.settled = x, work.posterior.carried(step, turn)
+            work.prior = work.prior.carried(step, turn)
         else:
             work.trial, work.trial_prior = x, work.prior.carried(step, turn)
 
-    def _found(self, belief: Belief, works: dict[int, _Work], reading: Reading, rounds: int) -> Found:
+    def _found(
+        self,
+        belief: Belief,
+        works: dict[int, _Work],
+        reading: Reading,
+        rounds: int,
+        trust: Trust,
+        weights: Array,
+    ) -> Found:
         after = belief.copy()
         count = len(self._layout.groups)
         nis, dof = np.zeros(count), np.zeros(count)
         for number, work in works.items():
             group = self._layout.groups[number]
-            seen = [i for i in group.seen if reading.values[i] is not None]
-            before, posterior = belief.part(group.t), work.posterior
+            seen = [i for i in group.seen if reading.seen[i]]
             after.x[group.x] = work.x
+            posterior = work.settled or work.posterior
             after.put(group.t, posterior)
             # What the cost would be without limits; for what is linear, this is the innovation in S⁻¹.
-            nis[number] = max(2 * posterior.least, 0.0)
-            dof[number] = sum(self._layout.observations[i].size for i in seen)
+            least = posterior.least
+            nis[number] = max(2 * least, 0.0)
+            dof[number] = sum(self._layout.observations[i].size for i in seen if weights[i] >= 0.5)
             after.evidence[number] += (
-                -posterior.least
-                + (before.log_determinant - posterior.log_determinant) / 2
-                - sum(reading.log_scale[i] for i in seen)
+                (work.prior.log_determinant - posterior.log_determinant) / 2
+                - least
+                - work.beyond
+                - float(reading.log_scale[seen].sum())
             )
-        return Found(after, nis, dof, rounds)
+        return Found(after, nis, dof, rounds, None if trust == "all" else weights)
 
 
-class _Box:
-    """The limits of one group, as rows in its tangent."""
-
-    def __init__(self, number: int, layout: Layout, limits: Limits) -> None:
-        group = layout.groups[number]
-        by_speeds = layout.chart.by_speeds
-        self._own = [k for k, x in enumerate(group.coordinates) if x not in by_speeds]
-        places = group.x[self._own]
-        self._lower, self._upper = limits.lower[places], limits.upper[places]
-        self._curved = [layout.limit_slices[k] for k in group.limits]
-        self._rows = np.zeros((len(self._own), len(group.tangent)))
-        for row, k in enumerate(self._own):
-            self._rows[row, group.tangent.index(group.coordinates[k].derivative())] = 1.0
-
-    def between(self, x: Array, out: Array) -> tuple[Array, Array, Array]:
-        """Return rows, and between what they may change, at a place."""
-        own = x[self._own]
-        rows, lower, upper = self._rows, self._lower - own, self._upper - own
-        if self._curved:
-            curved = np.stack([out[where] for where in self._curved])
-            rows = np.concatenate([rows, curved[:, 3:]])
-            lower = np.concatenate([lower, curved[:, 1] - curved[:, 0]])
-            upper = np.concatenate([upper, curved[:, 2] - curved[:, 0]])
-        return rows, lower, upper
-
-    def clipped(self, x: Array) -> Array:
-        """Return a place that rounding has not led out of the bounds of single coordinates."""
-        x[self._own] = np.clip(x[self._own], self._lower, self._upper)
-        return x
+def _is_better(work: _Work, cost: float, room: Room) -> bool:
+    """Whether a trial is better than the best place: nearer to the limits it is outside of, or cheaper."""
+    if work.room is not None and work.room.violation > _OUTSIDE:
+        if room.violation < work.room.violation / 2:
+            return True
+    return cost <= work.cost + 1e-10 * (1 + abs(work.cost))

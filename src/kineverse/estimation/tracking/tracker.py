@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import math
 from collections.abc import Iterable, Mapping
 from typing import TYPE_CHECKING, Any
@@ -11,19 +12,23 @@ import numpy.typing as npt
 
 from kineverse.errors import UnknownNameError, ValueRejectedError, suggest
 from kineverse.estimation.noise import Array
+from kineverse.model.rates import plain
 from kineverse.state import State
 from kineverse.symbols import Symbol
 
 from .belief import Belief
 from .chart import chart_of
-from .charted import Charted
 from .estimate import Estimate
-from .layout import layout_of
-from .limits import beginning, limits_of
-from .observed import ObservedLike, observations
-from .reading import Reader, Reading
-from .residuals import Residuals
-from .solving import Solver
+from .filtering import Filter, Outcome
+from .layout import Layout, layout_of
+from .limits import Limits, first_deviations, first_place, limits_of
+from .locks import Locks
+from .modes import Modes
+from .native import native_library
+from .observed import Observation, ObservedLike, observations
+from .outliers import Outliers, as_outliers
+from .reading import Reading
+from .starts import starts, turning
 
 if TYPE_CHECKING:
     from kineverse.model.view import ModelView
@@ -48,6 +53,10 @@ class Tracker:
         coordinate's; by default half the width of the limits, π for angles, 10 m.
     process_noise
         Variances by speed and second, of what moves without being told.
+    outliers
+        How observations may be wrong: :class:`Outliers`, or True for the usual ones. None if they never are.
+    locks
+        Whether what a lock of the model holds at the estimate stays, whatever noise and commands say.
     known
         Coordinates that are measured elsewhere, such as a robot's joints, and handed in as ``given`` at each
         step.
@@ -61,53 +70,46 @@ class Tracker:
         start: Mapping[Any, float] | None = None,
         uncertainty: Mapping[Any, float] | None = None,
         process_noise: Mapping[Any, float] | None = None,
+        outliers: Outliers | bool | None = None,
+        locks: bool = False,
         known: Iterable[Symbol | str] = (),
     ) -> None:
-        handed = {k if isinstance(k, Symbol) else model.symbol(k) for k in known}
-        seen = observations(model, observed)
-        values = [one.value for one in seen]
-        rates = model.rates
-        chart = chart_of(rates, (s for v in values for s in v.symbols), handed)
-        found = limits_of(model, chart, frozenset(handed))
-        looked_at = {s for v in values for s in v.symbols}
-        looked_at |= {s for c in found.curved for s in c.symbols}
-        looked_at |= {
-            s for x in chart.coordinates if x in rates for e in rates[x].values() for s in e.symbols
-        }
-        inputs = sorted(looked_at - set(chart.coordinates), key=lambda s: s.sort_key)
-        self._layout = layout = layout_of(chart, seen, found.curved, inputs)
-        self._limits = found
-        self._charted = Charted(layout)
-        self._residuals = Residuals(layout, layout.compiled())
-        self._reader = Reader(seen)
-        self._solver = Solver(layout, self._residuals, self._charted, found)
-        self._noise = {self._charted.speed(k): _positive(k, v) for k, v in (process_noise or {}).items()}
-        self._known = np.array([s.value if s.value is not None else np.nan for s in inputs])
-        self._belief = self._first(model, start or {}, uncertainty or {})
+        handed = frozenset(k if isinstance(k, Symbol) else model.symbol(k) for k in known)
+        layout, limits = _arranged(model, observations(model, observed), handed)
+        self._layout = layout
+        self._filter = Filter(layout, limits, as_outliers(outliers))
+        charted = self._filter.charted
+        self._noise = {charted.speed(k): _positive(k, v) for k, v in (process_noise or {}).items()}
+        self._known = np.array([np.nan if s.value is None else s.value for s in layout.known])
+        self._locks = Locks(model, layout, charted) if locks else None
         self._stamp: float | None = getattr(start, "stamp", None)
+        self._modes = self._first(model, start or {}, uncertainty or {})
+        self._outcome = Outcome(self._modes, 0.0, 0, (), 0)
 
-    def _first(
-        self, model: ModelView, start: Mapping[Any, float], uncertainty: Mapping[Any, float]
-    ) -> Belief:
-        chart = self._layout.chart
+    def _first(self, model: ModelView, start: Mapping[Any, float], uncertainty: Mapping[Any, float]) -> Modes:
+        layout, chart = self._layout, self._layout.chart
+        filter_ = self._filter
         state = start if isinstance(start, State) else State(start)
         given = {x: state[x] for x in chart.coordinates if x in state}
-        if not isinstance(start, State):
-            strange = [str(s) for s in state if s not in given]
-            if strange:
-                hint = suggest(strange[0], map(str, chart.coordinates), "coordinate")
-                raise UnknownNameError(f"'{strange[0]}' is not estimated. {hint}")
-        x, deviations = beginning(model, chart, self._limits, given, frozenset())
+        strange = [] if isinstance(start, State) else [str(s) for s in state if s not in given]
+        if strange:
+            hint = suggest(strange[0], map(str, chart.coordinates), "coordinate")
+            raise UnknownNameError(f"'{strange[0]}' is not estimated. {hint}")
+        x = first_place(model, chart, filter_.limits, given)
+        known = np.nan_to_num(self._known)
+        filter_.turns = turning(layout, filter_.limits, filter_.residuals, x, known)
+        deviations = first_deviations(chart, filter_.limits, filter_.turns)
         names = {str(v): i for i, v in enumerate(chart.tangent)}
-        names.update(
-            {str(v.position): i for i, v in enumerate(chart.tangent) if v.position in chart.coordinates}
-        )
+        own = [v for v in chart.tangent if v.position in chart.coordinates]
+        names.update({str(v.position): chart.tangent.index(v) for v in own})
         for key, value in uncertainty.items():
             if str(key) not in names:
                 raise UnknownNameError(f"'{key}' is not estimated. {suggest(str(key), names, 'coordinate')}")
             deviations[names[str(key)]] = _positive(key, value)
-        count = len(self._layout.groups)
-        return Belief(x, np.diag(deviations**-2.0), np.zeros(len(deviations)), np.zeros(count))
+        belief = Belief((len(x), len(deviations), len(layout.groups)))
+        belief.x[:] = x
+        belief.information[:] = np.diag(deviations**-2.0)
+        return starts(layout, filter_.limits, filter_.charted, belief, known, filter_.turns)
 
     # -- what it is about ----------------------------------------------------------------------------------
 
@@ -124,12 +126,12 @@ class Tracker:
     @property
     def limits(self) -> dict[Symbol, tuple[float, float]]:
         """The bounds of single coordinates; ±inf where there are none, or only others that move."""
-        return self._limits.by_symbol(self._layout.chart)
+        return self._filter.limits.by_symbol(self._layout.chart)
 
     @property
     def constraints(self) -> tuple[str, ...]:
         """The names of the constraints that limit the state."""
-        return self._limits.names
+        return self._filter.limits.names
 
     @property
     def observed(self) -> tuple[str, ...]:
@@ -138,8 +140,17 @@ class Tracker:
 
     @property
     def estimate(self) -> Estimate:
-        """What is believed now, without another observation."""
-        return self._estimate(np.zeros(1), np.zeros(1), 0)
+        """What is believed now; innovations and outliers are those of the last update."""
+        return Estimate(self._outcome, self._modes, self._filter, self._known, self._stamp)
+
+    @property
+    def log_evidence(self) -> float:
+        """The log density of all that was seen so far, given what this tracker assumes."""
+        return self._modes.log_evidence
+
+    def copy(self) -> Tracker:
+        """Return another one that goes on from here; compiled functions are shared, for use in one thread."""
+        return copy.copy(self)
 
     # -- steps ---------------------------------------------------------------------------------------------
 
@@ -170,18 +181,26 @@ class Tracker:
             )
         speeds = {}
         for key, value in (commands or {}).items():
-            speeds[self._charted.speed(key)] = float(value)
+            speeds[self._filter.charted.speed(key)] = float(value)
             if not math.isfinite(value):
                 raise ValueRejectedError(f"The commanded speed '{key}' is {value!r}; it must be finite.")
-        known = self._values_of_known(given)
-        belief = self._belief.copy()
-        self._charted.predict(belief, known, dt, speeds, self._noise)
-        if speeds or self._noise:
-            belief = self._solver.inside(belief, known)
-        self._belief, self._known = belief, known
+        self._known, self._modes = self._predicted(dt, speeds, self._values_of_known(given))
         if self._stamp is not None:
             self._stamp += dt
         return self.estimate
+
+    def _predicted(self, dt: float, speeds: Mapping[Symbol, float], known: Array) -> tuple[Array, Modes]:
+        if not speeds and not self._noise:
+            return known, self._modes
+
+        def moved(belief: Belief) -> Belief:
+            belief = belief.copy()
+            free = self._locks.free(belief, known) if self._locks else None
+            moving, noise = (_only(values, free) for values in (speeds, self._noise))
+            self._filter.charted.predict(belief, known, dt, moving, noise)
+            return self._filter.inside(belief, known)
+
+        return known, self._modes.each(moved)
 
     def update(
         self,
@@ -210,7 +229,7 @@ class Tracker:
         UnknownNameError, ShapeError, ValueRejectedError
             For what was not seen right, naming it, or if time goes backwards. The belief stays as it was.
         """
-        return self._take(self._reader.read(seen), at, commands, given)
+        return self._take(self._filter.reader.read(seen), at, commands, given)
 
     def update_poses(
         self,
@@ -232,7 +251,21 @@ class Tracker:
         at, commands, given
             As in :meth:`update`.
         """
-        return self._take(self._reader.read_poses(poses, seen), at, commands, given)
+        return self._take(self._filter.reader.read_poses(poses, seen), at, commands, given)
+
+    def wait(self, timeout: float | None = None) -> bool:
+        """Wait until updates run in compiled code, as far as they can; return whether they do.
+
+        Parameters
+        ----------
+        timeout
+            For the compiler, in seconds; as long as it takes if None.
+        """
+        if self._filter.native is None:
+            return False
+        self._filter.function.wait(timeout)
+        native_library.prepare(wait=True)
+        return self._filter.is_native
 
     def _take(
         self,
@@ -241,21 +274,19 @@ class Tracker:
         commands: Mapping[Any, float] | None,
         given: Mapping[Any, float] | None,
     ) -> Estimate:
-        before = self._belief, self._known, self._stamp
+        native = self._filter.native
+        if native is None or not native.are_rigid(reading):
+            self._filter.reader.check_poses(reading)
+        before = self._modes, self._known, self._stamp
         try:
             self._advance(at, commands)
             self._known = self._values_of_known(given)
-            groups = [
-                number
-                for number, group in enumerate(self._layout.groups)
-                if any(reading.values[i] is not None for i in group.seen)
-            ]
-            found = self._solver.update(self._belief, reading, self._known, groups)
+            outcome = self._filter.update(self._modes, reading, self._known)
         except BaseException:
-            self._belief, self._known, self._stamp = before
+            self._modes, self._known, self._stamp = before
             raise
-        self._belief = found.belief
-        return self._estimate(found.nis, found.dof, found.rounds)
+        self._modes, self._outcome = outcome.modes, outcome
+        return self.estimate
 
     def _advance(self, at: float | None, commands: Mapping[Any, float] | None) -> None:
         if at is None:
@@ -288,19 +319,6 @@ class Tracker:
             raise ValueRejectedError(f"There is no finite value of '{missing[0]}'; hand it in as given=.")
         return values
 
-    def _estimate(self, nis: Array, dof: Array, rounds: int) -> Estimate:
-        return Estimate(
-            self._belief,
-            self._layout,
-            self._charted,
-            self._known,
-            float(nis.sum()),
-            int(dof.sum()),
-            (),
-            rounds,
-            self._stamp,
-        )
-
     def __repr__(self) -> str:
         sizes = f"{len(self.symbols)} coordinates in {len(self.groups)} groups"
         return f"<Tracker: {sizes}, {len(self.observed)} observed>"
@@ -311,3 +329,21 @@ def _positive(key: object, value: float) -> float:
     if not (math.isfinite(number) and number > 0):
         raise ValueRejectedError(f"The uncertainty of '{key}' is positive and finite, not {value!r}.")
     return number
+
+
+def _arranged(
+    model: ModelView, seen: tuple[Observation, ...], handed: frozenset[Symbol]
+) -> tuple[Layout, Limits]:
+    """Return what is estimated, and the limits of that."""
+    rates = model.rates
+    looked_at = {s for one in seen for s in rates.resolve(plain(one.value)).symbols}
+    chart = chart_of(rates, looked_at, handed)
+    limits = limits_of(model, chart, handed)
+    looked_at |= {s for c in limits.curved for s in c.symbols}
+    looked_at |= {s for x in chart.coordinates if x in rates for e in rates[x].values() for s in e.symbols}
+    inputs = sorted(looked_at - set(chart.coordinates), key=lambda s: s.sort_key)
+    return layout_of(chart, seen, limits.curved, inputs), limits
+
+
+def _only(values: Mapping[Symbol, float], free: frozenset[Symbol] | None) -> Mapping[Symbol, float]:
+    return values if free is None else {v: value for v, value in values.items() if v in free}

@@ -1,0 +1,169 @@
+"""One step of a tracker: from beliefs and a reading to other beliefs."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from kineverse.estimation.noise import Array
+from kineverse.symbols import Symbol
+
+from .belief import Belief
+from .charted import Charted
+from .layout import Group, Layout
+from .limits import Limits
+from .modes import Candidate, Modes
+from .native import NativeSolver, native_library
+from .outliers import Outliers
+from .reading import Reader, Reading
+from .residuals import Residuals
+from .solving import Solver
+
+# Explanations whose predictions are so few deviations apart are one.
+_SAME = 0.3
+
+
+@dataclass(slots=True, eq=False)
+class Outcome:
+    """What an update found.
+
+    Attributes
+    ----------
+    modes
+        After it.
+    nis, dof
+        The normalised innovation squared, and of how many numbers it is the sum.
+    outliers
+        The numbers of the observations that were not believed.
+    rounds
+        How many times the model was evaluated, at most for one explanation.
+    """
+
+    modes: Modes
+    nis: float
+    dof: int
+    outliers: tuple[int, ...]
+    rounds: int
+
+
+class Filter:
+    """What is fixed about a tracker.
+
+    Parameters
+    ----------
+    layout, limits
+        What is estimated.
+    outliers
+        How observations may be wrong; None if they never are.
+
+    Attributes
+    ----------
+    turns
+        The coordinates that come back after a turn.
+    """
+
+    def __init__(self, layout: Layout, limits: Limits, outliers: Outliers | None) -> None:
+        self.layout, self.limits, self.outliers = layout, limits, outliers
+        self.function = layout.compiled()
+        self.charted = Charted(layout)
+        self.residuals = Residuals(layout, self.function)
+        self.reader = Reader(layout)
+        self.solver = Solver(layout, self.residuals, self.charted, limits)
+        self.native = NativeSolver(layout, limits, self.function) if NativeSolver.suits(layout) else None
+        self.turns: frozenset[Symbol] = frozenset()
+        if self.native:
+            native_library.prepare()
+
+    @property
+    def is_native(self) -> bool:
+        """Whether C does the work where nothing is ambiguous."""
+        return self.native is not None and self.native.is_ready
+
+    def update(self, modes: Modes, reading: Reading, known: Array) -> Outcome:
+        """Return what is believed after a reading; see :meth:`.solving.Solver.update`."""
+        if modes.is_single and self.outliers is None:
+            found = None
+            if self.native is not None and self.native.is_ready:
+                found = self.native.update(modes.best, reading, known)
+            if found is None:
+                found = self.solver.update(modes.best, reading, known, self._seen(reading))
+            self._wrap(found.belief)
+            after = Modes(self.layout, [found.belief], modes.alive)
+            return Outcome(after, float(found.nis.sum()), int(found.dof.sum()), (), found.rounds)
+        return self._weighed(modes, reading, known)
+
+    def inside(self, belief: Belief, known: Array) -> Belief:
+        """Return the same belief, about the most probable point inside the limits."""
+        found = self.solver.inside(belief, self.reader.nothing(), known)
+        self._wrap(found)
+        return found
+
+    def _seen(self, reading: Reading) -> list[int]:
+        return [n for n, group in enumerate(self.layout.groups) if reading.seen[list(group.seen)].any()]
+
+    def _wrap(self, belief: Belief) -> None:
+        """Bring back what has gone more than half a turn."""
+        for x in self.turns:
+            i = self.layout.chart.coordinates.index(x)
+            belief.x[i] = math.remainder(belief.x[i], 2 * math.pi)
+
+    def _weighed(self, modes: Modes, reading: Reading, known: Array) -> Outcome:
+        """Explain a reading in all ways, and keep the best."""
+        candidates: list[Candidate] = []
+        rounds = 0
+        for mode, belief in enumerate(modes.beliefs):
+            groups = modes.groups(mode, self._seen(reading))
+            if groups:
+                new, took = self._explanations(belief, reading, known, groups)
+                candidates += new
+                rounds = max(rounds, took)
+        after, best = modes.ranked(candidates, self._is_same)
+        nis = sum(float(c.nis[n]) for n, c in enumerate(best) if c)
+        dof = sum(int(c.dof[n]) for n, c in enumerate(best) if c)
+        doubted = [
+            i
+            for i, number in enumerate(self.layout.group_of)
+            if reading.seen[i] and (c := best[number]) and c.weights is not None and c.weights[i] < 0.5
+        ]
+        return Outcome(after, nis, dof, tuple(doubted), rounds)
+
+    def _explanations(
+        self, belief: Belief, reading: Reading, known: Array, groups: list[int]
+    ) -> tuple[list[Candidate], int]:
+        """Return a belief after a reading: if all is right, and in ways in which some of it is wrong."""
+        if self.outliers is None:
+            found = self.solver.update(belief, reading, known, groups)
+            return [self._candidate(found.belief, None, found.nis, found.dof, groups, known)], found.rounds
+        nearby = self.solver.where_most_agree(belief, reading, known, groups)
+        explained, rounds = [], 0
+        for start in (belief, nearby):
+            found = self.solver.update(start, reading, known, groups, self.outliers)
+            explained.append(
+                self._candidate(found.belief, found.weights, found.nis, found.dof, groups, known)
+            )
+            rounds = max(rounds, found.rounds)
+        nothing = belief.copy()
+        none = np.zeros(len(self.layout.groups))
+        for number in groups:
+            seen = [i for i in self.layout.groups[number].seen if reading.seen[i]]
+            wrong = sum(self.outliers.log_density(self.layout.observations[i]) for i in seen)
+            nothing.evidence[number] += wrong
+        weights = np.zeros(len(self.layout.observations))
+        explained.append(self._candidate(nothing, weights, none, none, groups, known))
+        return explained, rounds
+
+    def _candidate(
+        self, belief: Belief, weights: Array | None, nis: Array, dof: Array, groups: list[int], known: Array
+    ) -> Candidate:
+        self._wrap(belief)
+        return Candidate(belief, self.residuals.evaluate(belief.x, known), weights, nis, dof, groups)
+
+    def _is_same(self, group: Group, one: Candidate, other: Candidate) -> bool:
+        """Whether two explanations predict the same of a group, compared with the noise."""
+        values = self.reader.values_of(other.said)
+        nothing = self.reader.nothing()
+        as_seen = nothing._replace(values=values, seen=~nothing.seen)
+        errors = self.residuals.errors(one.said, as_seen, group.seen)
+        return all(float(e @ e) < _SAME**2 for e, _ in errors.values())

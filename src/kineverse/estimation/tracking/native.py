@@ -1,0 +1,202 @@
+"""Updates in C, compiled in the background and kept like compiled functions.
+
+Until then, without a compiler, and where coordinates are driven or limits curved, numpy does the same.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import hashlib
+import threading
+from typing import Any
+
+import numpy as np
+
+from kineverse.compile import CompiledFunction
+from kineverse.compile.cache import library_cache
+from kineverse.compile.toolchain import CLOSED, toolchain
+from kineverse.compile.worker import Build, request
+from kineverse.estimation.noise import Array
+
+from .belief import Belief, Indices
+from .layout import Layout
+from .limits import Limits
+from .native_quadratic import QUADRATIC
+from .native_source import UPDATE
+from .reading import RIGID, Reading
+from .solving import Found
+
+# What the C has room for.
+_SOURCE = QUADRATIC + UPDATE
+_MOST_UNKNOWNS, _MOST_NUMBERS = 64, 64
+
+_COUNTS = ("observations", "groups", "coordinates")
+_INDICES = (
+    "is_pose", "size", "value", "slope", "seen", "white", "first", "place", "first_watch", "watch",
+)  # fmt: skip
+_NUMBERS = ("lower", "upper", "input", "output", "work")
+
+
+class _Problem(ctypes.Structure):
+    _fields_ = (
+        ("compute", ctypes.c_void_p),
+        *((name, ctypes.c_int64) for name in _COUNTS),
+        *((name, ctypes.c_void_p) for name in (*_INDICES, *_NUMBERS)),
+    )
+
+
+class NativeLibrary:
+    """The compiled update, once there is one; for all trackers of the process."""
+
+    def __init__(self) -> None:
+        self.code: Any = None
+        self._build: Build | None = None
+        self._hopeless = False
+        self._lock = threading.Lock()
+
+    def prepare(self, wait: bool = False) -> bool:
+        """Take it from the cache or have it compiled in the background; return whether it is there."""
+        with self._lock:
+            if self._build is None and self.code is None and not self._hopeless:
+                self._build = self._seek()
+            build = self._build
+        if wait and build is not None:
+            build.wait(None)
+            self._built(build)
+        return self.code is not None
+
+    def _seek(self) -> Build | None:
+        compiler = toolchain()
+        if compiler is None:
+            self._hopeless = True
+            return None
+        key = hashlib.sha256(repr((_SOURCE, compiler.identity)).encode()).hexdigest()[:40]
+        path = library_cache().find(key)
+        if path is not None:
+            self._load(path)
+            return None
+        return request(key, compiler, lambda: _SOURCE, ("-O3", *CLOSED), self._built)
+
+    def _built(self, build: Build) -> None:
+        if build.path is not None and self.code is None:
+            self._load(build.path)
+        self._hopeless = self.code is None and not build.forgotten
+        self._build = None
+
+    def _load(self, path: str) -> None:
+        try:
+            code = ctypes.CDLL(path)
+        except OSError:
+            self._hopeless = True
+            return
+        pointer = ctypes.c_void_p
+        code.update.argtypes, code.update.restype = (pointer,) * 8, ctypes.c_int64
+        code.first_broken.argtypes = (pointer, pointer, pointer, ctypes.c_double)
+        code.first_broken.restype = ctypes.c_int64
+        self.code = code
+
+
+native_library = NativeLibrary()
+
+
+class NativeSolver:
+    """What :class:`.solving.Solver` does for one tracker, in C.
+
+    It has memory of its own, so it is for one thread.
+
+    Parameters
+    ----------
+    layout, limits, function
+        The parts of a tracker.
+    """
+
+    def __init__(self, layout: Layout, limits: Limits, function: CompiledFunction) -> None:
+        self._function = function
+        self._layout = layout
+        count, size = len(layout.groups), len(layout.chart.coordinates)
+        self._input = np.zeros(len(layout.inputs))
+        self._size = size
+        widths = [len(group.tangent) for group in layout.groups]
+        kept = {
+            "is_pose": [one.is_pose for one in layout.observations],
+            "size": [one.size for one in layout.observations],
+            "value": [where.start for where in layout.value_slices],
+            "slope": [where.start for where in layout.slope_slices],
+            "seen": [where.start for where in layout.seen_slices],
+            "white": [where.start for where in layout.white_slices],
+            "first": np.cumsum([0, *widths]),
+            "place": np.concatenate([group.x for group in layout.groups]),
+            "first_watch": np.cumsum([0, *(len(group.seen) for group in layout.groups)]),
+            "watch": [i for group in layout.groups for i in group.seen],
+        }
+        self._indices: dict[str, Indices] = {name: np.array(v, dtype=np.int64) for name, v in kept.items()}
+        self._numbers = {
+            "lower": limits.lower,
+            "upper": limits.upper,
+            "input": self._input,
+            "output": np.zeros(function.shapes[0]),
+            "work": np.zeros(sum(5 * w + w * w for w in widths)),
+        }
+        self._problem = _Problem(observations=len(layout.observations), groups=count, coordinates=size)
+        for name, array in (*self._indices.items(), *self._numbers.items()):
+            setattr(self._problem, name, array.ctypes.data)
+        self._results = np.zeros((2, count))
+        # Buffers that stay where they are: asking an array for its address takes longer than copying it.
+        self._belief = np.zeros(Belief((size, size, count)).numbers.shape)
+        self._reading = Reading(
+            np.zeros(layout.seen_slices[-1].stop),
+            np.zeros(len(layout.observations), dtype=bool),
+            np.zeros(layout.white_slices[-1].stop),
+            np.zeros(len(layout.observations)),
+        )
+        self._loaded: Reading | None = None
+        self._where = ctypes.addressof(self._problem)
+        self._seen = [array.ctypes.data for array in self._reading]
+        self._written = [self._belief.ctypes.data, *self._seen, *(row.ctypes.data for row in self._results)]
+
+    @staticmethod
+    def suits(layout: Layout) -> bool:
+        """Whether C can do it: coordinates that are their own tangent, limits of single ones."""
+        return (
+            not layout.chart.by_speeds
+            and not layout.limits
+            and all(len(group.tangent) <= _MOST_UNKNOWNS for group in layout.groups)
+            and all(one.size <= _MOST_NUMBERS for one in layout.observations)
+        )
+
+    @property
+    def is_ready(self) -> bool:
+        """Whether both the update and the model are compiled."""
+        if native_library.code is None or self._function.address is None:
+            return False
+        self._problem.compute = self._function.address
+        return True
+
+    def update(self, belief: Belief, reading: Reading, known: Array) -> Found | None:
+        """Do what :meth:`.solving.Solver.update` does for all groups that are seen; None if that is not easy.
+
+        Then numpy finds out why.
+        """
+        self._load(reading)
+        self._belief[:] = belief.numbers
+        self._input[self._size :] = known
+        rounds = native_library.code.update(self._where, *self._written)
+        if rounds < 0:
+            return None
+        nis, dof = self._results.copy()
+        return Found(Belief(belief.sizes, self._belief.copy()), nis, dof, rounds)
+
+    def are_rigid(self, reading: Reading) -> bool:
+        """Whether all poses that were seen are rigid; False if that is not known."""
+        code = native_library.code
+        if code is None:
+            return False
+        self._load(reading)
+        return bool(code.first_broken(self._where, *self._seen[:2], RIGID) < 0)
+
+    def _load(self, reading: Reading) -> None:
+        if self._loaded is reading:
+            return
+        for mine, theirs in zip(self._reading, reading, strict=True):
+            mine[:] = theirs
+        self._loaded = reading
