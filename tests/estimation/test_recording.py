@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from kineverse.errors import FormatError, UnknownNameError
+from kineverse.errors import FormatError, UnknownNameError, ValueRejectedError
 from kineverse.estimation.recording import read_recording
 
 ORIENTATIONS = {
@@ -204,6 +204,34 @@ def test_parts_that_were_never_seen_together_are_refused(tmp_path):
     recording = read_recording(written(tmp_path, "time,part,x,y,z,rx,ry,rz\n" + rows))
     with pytest.raises(FormatError, match="never seen at the same time"):
         recording.pair("table", "door")
+
+
+def test_a_table_without_names_is_one_part_in_the_world(tmp_path):
+    with pytest.raises(UnknownNameError, match=r"names no parts.*no 'table'"):
+        read_recording(written(tmp_path, "1 2 3\n4 5 7\n")).pair("table", "door")
+
+
+def test_relative_poses_are_those_in_the_parent(tmp_path):
+    a, b = poses_of(1), poses_of(2)
+    rows = [[*x, *y] for x, y in zip(numbers_of(a, "rx,ry,rz"), numbers_of(b, "rx,ry,rz"), strict=True)]
+    head = ",".join(f"{part}.{name}" for part in "AB" for name in ("x", "y", "z", "rx", "ry", "rz"))
+    text = "\n".join([head, *(",".join(map(str, row)) for row in rows)])
+    recording = read_recording(written(tmp_path, text))
+    np.testing.assert_allclose(recording.pair("A", "B").relative, np.linalg.inv(a) @ b, atol=1e-12)
+    positions = read_recording(written(tmp_path, text), ",".join([*head.split(",")[:9], "-", "-", "-"])).pair(
+        "A", "B"
+    )
+    np.testing.assert_allclose(positions.relative, (np.linalg.inv(a) @ b)[:, :3, 3], atol=1e-12)
+
+
+def test_thinned_recordings_keep_both_ends_and_their_pairs(tmp_path):
+    pair = read_recording(written(tmp_path, "\n".join(f"{k} 0 0" for k in range(100)))).pair()
+    few = pair.thinned(5)
+    np.testing.assert_array_equal(few.child_poses[:, 0], [0, 25, 50, 74, 99])
+    np.testing.assert_array_equal(few.lines, [1, 26, 51, 75, 100])
+    assert len(pair.thinned(1000).child_poses) == 100
+    with pytest.raises(ValueRejectedError, match="at least two"):
+        pair.thinned(1)
 
 
 def test_a_rotation_vector_of_any_length_is_read(tmp_path):

@@ -11,7 +11,7 @@ from contextlib import contextmanager
 from typing import TextIO
 
 from kineverse._version import __version__
-from kineverse.cli import bench, convert, decompose, demo, diff, fk, info, reproduce, validate, view
+from kineverse.cli import bench, convert, decompose, demo, diff, fit, fk, info, reproduce, validate, view
 from kineverse.errors import KineverseError
 
 WRONG, INTERRUPTED, PIPE_CLOSED = 2, 130, 141
@@ -29,6 +29,7 @@ examples:
   kineverse view kitchen                              move it in the browser
   kineverse convert kitchen kitchen.kv.json           write it in another format
   kineverse diff kitchen kitchen.kv.json              what two models differ in
+  kineverse fit poses.csv --child door                learn a joint from recorded poses
   kineverse demo --headless                           a picture of kitchen and robot
 """
 
@@ -77,7 +78,7 @@ def parser() -> argparse.ArgumentParser:
     top.add_argument("--version", action="version", version=f"kineverse {__version__}")
     top.add_argument("-v", "--verbose", action="store_true", help="say more on standard error")
     commands = top.add_subparsers(title="commands", metavar="COMMAND", required=True)
-    for command in (info, fk, view, convert, diff, validate, decompose, demo, bench, reproduce):
+    for command in (info, fk, view, convert, diff, validate, decompose, fit, demo, bench, reproduce):
         name = command.__name__.rpartition(".")[2]
         summary, _, description = command.HELP.partition("\n")
         sub = commands.add_parser(

@@ -150,11 +150,16 @@ def draw_side(axes: Axes, looked: Looked) -> None:
 def draw_values(axes: Axes, fit: Fit) -> None:
     """Draw joint values over the observations, with their standard deviations."""
     number = np.arange(len(fit.joint_values))
-    for k in range(fit.joint_values.shape[1]):
-        value, spread = fit.joint_values[:, k], SIGMAS * fit.deviations[:, k]
+    turning = [component >= 3 for component in fit.motion.freedom.joints]
+    for k, turns in enumerate(turning):
+        scale = np.degrees(1.0) if turns else 1.0
+        value, spread = scale * fit.joint_values[:, k], scale * SIGMAS * fit.deviations[:, k]
         axes.fill_between(number, value - spread, value + spread, alpha=0.25, linewidth=0)
         axes.plot(number, value, ".-", markersize=3, linewidth=0.8)
-    axes.set(title=f"joint values, ±{SIGMAS:g} σ", ylabel="[rad], [m]")
+    axes.set(
+        title=f"joint values, ±{SIGMAS:g} σ",
+        ylabel=", ".join(sorted({"[deg]" if t else "[m]" for t in turning})),
+    )
     axes.tick_params(labelbottom=False)
 
 

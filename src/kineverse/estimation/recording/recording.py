@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
 
-from kineverse.errors import FormatError, UnknownNameError, suggest
+from kineverse.errors import FormatError, UnknownNameError, ValueRejectedError, suggest
 from kineverse.model.frame import WORLD
 
 Array = npt.NDArray[np.float64]
@@ -70,6 +70,32 @@ class Pair:
     lines: Indices
     alone: int = 0
 
+    @property
+    def relative(self) -> Array:
+        """Poses of the child in the parent (N, 4, 4), or its positions (N, 3), with the errors of both."""
+        if self.parent_poses is None:
+            return self.child_poses
+        if self.child_poses.ndim == 3:
+            return np.asarray(np.linalg.solve(self.parent_poses, self.child_poses))
+        offsets = self.child_poses - self.parent_poses[:, :3, 3]
+        return np.asarray(np.einsum("nji,nj->ni", self.parent_poses[:, :3, :3], offsets))
+
+    def thinned(self, count: int) -> Pair:
+        """Return at most so many of the observations, evenly over all.
+
+        Raises
+        ------
+        ValueRejectedError
+            If that is less than two.
+        """
+        if count < 2:
+            raise ValueRejectedError(f"{count} of the poses: how something moves takes at least two to see.")
+        chosen = np.unique(np.linspace(0, len(self.lines) - 1, count).round().astype(np.intp))
+        parents = None if self.parent_poses is None else self.parent_poses[chosen]
+        return replace(
+            self, parent_poses=parents, child_poses=self.child_poses[chosen], lines=self.lines[chosen]
+        )
+
 
 @dataclass(frozen=True, eq=False)
 class Recording:
@@ -116,6 +142,10 @@ class Recording:
         track = self._track(child)
         if child == parent and parent in self.tracks:
             raise UnknownNameError(f"{self.source}: parent and child are both '{parent}'.")
+        if parent != WORLD and "" in self.tracks:
+            raise UnknownNameError(
+                f"{self.source} names no parts, so it is one part in the world. There is no '{parent}'."
+            )
         name = child or "part"
         if parent == WORLD and WORLD not in self.tracks:
             return Pair(parent, name, None, track.poses, track.lines)

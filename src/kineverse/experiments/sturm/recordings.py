@@ -113,6 +113,5 @@ def labelled_recordings(folder: Path | None) -> Iterator[Labelled]:
 
 def _read(file: Path, name: Path, label: Label) -> Labelled:
     recording = read_recording(file, COLUMNS.get(name.as_posix()))
-    poses = recording.pair().child_poses
-    chosen = np.unique(np.linspace(0, len(poses) - 1, THINNED).round().astype(int))
-    return Labelled(name.with_suffix("").as_posix(), label, poses[chosen])
+    poses = recording.pair().thinned(THINNED).child_poses
+    return Labelled(name.with_suffix("").as_posix(), label, poses)

@@ -1,0 +1,225 @@
+"""``kineverse fit``: tables of poses in, the joint they show out, in words, as JSON, as a picture, as a model."""
+
+from __future__ import annotations
+
+import json
+import math
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+import kineverse as kv
+from kineverse.cli import main
+
+AXIS, POINT = np.array([0.0, 0.6, 0.8]), np.array([0.5, 0.1, -0.2])
+
+
+def turned(vectors):
+    return Rotation.from_rotvec(vectors).as_matrix()
+
+
+def pose(rotation=None, position=(0.0, 0.0, 0.0)):
+    made = np.eye(4)
+    made[:3, :3], made[:3, 3] = np.eye(3) if rotation is None else rotation, position
+    return made
+
+
+def hinge(angles):
+    """A door's poses in its cupboard: half a metre wide, its own axes anyhow."""
+    rotations = turned(np.outer(angles, AXIS))
+    moved = [pose(r, POINT - r @ POINT) for r in rotations]
+    return np.array(moved) @ pose(turned([0.3, 0.2, 0.1]), POINT + np.cross(AXIS, [0.5, 0, 0]))
+
+
+def slider(ways):
+    return np.array([pose(turned([0.3, 0.2, 0.1]), way * AXIS + POINT) for way in ways])
+
+
+def noisy(poses, rng, position=0.002, orientation=0.009):
+    seen = poses.copy()
+    seen[:, :3, 3] += position * rng.standard_normal((len(poses), 3))
+    seen[:, :3, :3] = turned(orientation * rng.standard_normal((len(poses), 3))) @ seen[:, :3, :3]
+    return seen
+
+
+def write(path, parts, positions_only=()):
+    """A table with a part in each row."""
+    lines = ["time,part,x,y,z,qx,qy,qz,qw"]
+    for k in range(len(next(iter(parts.values())))):
+        for name, poses in parts.items():
+            numbers = [*poses[k, :3, 3], *Rotation.from_matrix(poses[k, :3, :3]).as_quat()]
+            lines.append(",".join(map(str, [0.1 * k, name, *numbers])))
+    path.write_text("\n".join(lines) + "\n")
+    return str(path)
+
+
+@pytest.fixture(scope="module")
+def door(tmp_path_factory):
+    """A door in a cupboard, both before a camera that moves."""
+    rng = np.random.default_rng(1)
+    angles = np.linspace(0.0, math.radians(80), 30)
+    cupboard = np.array([pose(turned(rng.normal(size=3)), rng.normal(size=3)) for _ in angles])
+    parts = {"cupboard": noisy(cupboard, rng), "door": noisy(cupboard @ hinge(angles), rng)}
+    return write(tmp_path_factory.mktemp("door") / "poses.csv", parts)
+
+
+def answer(words, capsys, status=0):
+    assert main(["fit", *words, "--json"]) == status
+    return json.loads(capsys.readouterr().out)
+
+
+def test_a_door_is_a_hinge_with_its_axis(door, capsys):
+    found = answer([door, "--parent", "cupboard", "--child", "door", "--noise", "2mm,0.5deg"], capsys)
+    assert (found["family"], found["told"], found["count"]) == ("revolute", True, 30)
+    best = found["fits"][0]
+    axis, point = (np.array(best["parameters"][name]) for name in ("axis", "point"))
+    assert abs(axis @ AXIS) == pytest.approx(1, abs=1e-3)
+    assert np.linalg.norm(np.cross(point - POINT, AXIS)) < 0.01
+    assert 0 < best["deviations"]["axis.x"] < math.radians(1)
+    (seen,) = best["ranges"]
+    assert seen["upper"] - seen["lower"] == pytest.approx(math.radians(80), abs=0.03)
+    assert seen["unit"] == "rad"
+    assert sum(fit["probability"] for fit in found["fits"]) == pytest.approx(1)
+
+
+def test_what_is_found_is_said(door, capsys):
+    assert main(["fit", door, "--parent", "cupboard", "--child", "door", "--noise", "2mm,0.5deg"]) == 0
+    out = capsys.readouterr().out
+    assert "door in cupboard: 30 poses" in out
+    assert "noise: 2 mm and 0.5 deg, as given" in out
+    assert "revolute, 9" in out
+    for part in ("axis ", "point ", "seen ", "left over"):
+        assert any(line.strip().startswith(part) for line in out.splitlines())
+    assert "probability" in out
+    assert "not: " in out
+
+
+def test_the_noise_is_estimated_if_it_is_not_given(door, capsys):
+    noise = answer([door, "--parent", "cupboard", "--child", "door"], capsys)["noise"]
+    assert noise["given"] is False
+    # Of 2 mm and .5 deg: the two are estimated together, at a ratio of 5 mm to 1 deg.
+    assert noise["position"] == pytest.approx(0.0025, rel=0.3)
+    assert noise["orientation"] == pytest.approx(math.radians(0.5), rel=0.3)
+
+
+def test_the_document_is_the_joint(door, tmp_path, capsys):
+    file = str(tmp_path / "door.kv.json")
+    words = [door, "--parent", "cupboard", "--child", "door", "--noise", "2mm,0.5deg", "--document", file]
+    found = answer(words, capsys)
+    assert found["document"] == file
+    model = kv.load(file)
+    assert list(map(str, model.symbols)) == ["door"]
+    limits = model.constraints["door/position"]
+    low, high = found["fits"][0]["ranges"][0]["lower"], found["fits"][0]["ranges"][0]["upper"]
+    assert (float(limits.lower), float(limits.upper)) == pytest.approx((low, high))
+    # From one end to the other it moves as the door did.
+    first, last = (model.fk("door", "cupboard")({"door": q}) for q in (low, high))
+    way = np.linalg.inv(first) @ last
+    truth = hinge(np.radians([0, 80]))
+    there = np.linalg.inv(truth[0]) @ truth[1]
+    back = np.linalg.inv(there)
+    assert min(np.abs(way - there).max(), np.abs(way - back).max()) < 0.03
+    assert main(["view", file, "--picture", str(tmp_path / "door.png")]) == 0
+    assert (tmp_path / "door.png").stat().st_size > 10_000
+
+
+@pytest.mark.parametrize("suffix", ["png", "svg"])
+def test_the_picture_is_drawn(door, tmp_path, capsys, suffix):
+    pytest.importorskip("matplotlib")
+    file = tmp_path / f"door.{suffix}"
+    words = [door, "--parent", "cupboard", "--child", "door", "--noise", "2mm,0.5deg", "--picture", str(file)]
+    assert main(["fit", *words]) == 0
+    assert f"picture: {file}" in capsys.readouterr().out
+    assert file.stat().st_size > 20_000
+
+
+def test_a_drawer_of_positions_alone(tmp_path, capsys):
+    pytest.importorskip("matplotlib")
+    rng = np.random.default_rng(2)
+    table, picture, document = (tmp_path / name for name in ("handle.log", "handle.png", "handle.kv.json"))
+    points = noisy(slider(np.linspace(0, 0.4, 25)), rng)[:, :3, 3]
+    np.savetxt(table, points)
+    words = [str(table), "--noise", "2mm", "--picture", str(picture), "--document", str(document)]
+    found = answer(words, capsys)
+    assert found["family"] == "prismatic"
+    assert found["noise"]["orientation"] is None
+    model = kv.load(document)
+    low, high = (found["fits"][0]["ranges"][0][end] for end in ("lower", "upper"))
+    ends = np.array([model.fk("part")({"part": q}) for q in (low, high)])
+    # There is no orientation to be known: the part's axes are those of the world.
+    np.testing.assert_allclose(ends[:, :3, :3], [np.eye(3)] * 2, atol=1e-9)
+    expected = points[[0, -1]] if np.linalg.norm(ends[0, :3, 3] - points[0]) < 0.1 else points[[-1, 0]]
+    np.testing.assert_allclose(ends[:, :3, 3], expected, atol=0.01)
+
+
+def test_the_hinge_of_a_handle_alone_is_where_it_is(tmp_path, capsys):
+    rng = np.random.default_rng(3)
+    table, document = tmp_path / "handle.log", tmp_path / "handle.kv.json"
+    points = noisy(hinge(np.radians(np.linspace(0, 80, 30))), rng)[:, :3, 3]
+    np.savetxt(table, points)
+    found = answer([str(table), "--child", "door", "--noise", "2mm", "--document", str(document)], capsys)
+    assert found["family"] == "revolute"
+    model = kv.load(document)
+    values = [found["fits"][0]["ranges"][0][end] for end in ("lower", "upper")]
+    ends = np.array([model.fk("door")({"door": q})[:3, 3] for q in values])
+    off = min(np.abs(ends - points[[0, -1]]).max(), np.abs(ends - points[[-1, 0]]).max())
+    assert off < 0.01
+    np.testing.assert_allclose(model.fk("door")({"door": 0.0})[:3, :3], np.eye(3), atol=1e-9)
+
+
+def test_only_the_families_asked_for_are_tried(door, capsys):
+    words = [door, "--parent", "cupboard", "--child", "door", "--families", "rigid, prismatic"]
+    found = answer(words, capsys)
+    assert {fit["family"] for fit in found["fits"]} == {"rigid", "prismatic"}
+
+
+def test_poses_that_do_not_tell_are_not_told(tmp_path, capsys):
+    rng = np.random.default_rng(4)
+    still = noisy(np.tile(hinge([0.0]), (3, 1, 1)), rng, 0.05, 0.3)
+    words = [write(tmp_path / "still.csv", {"lid": still}), "--noise", "5cm,0.3"]
+    assert main(["fit", *words]) in (0, 1)  # as identify says, and the status goes with the words
+    out = capsys.readouterr().out
+    found = answer(words, capsys, status=0 if "cannot tell" not in out else 1)
+    assert found["told"] == ("cannot tell" not in out)
+
+
+def test_what_means_nothing_is_noted(tmp_path, capsys):
+    points = noisy(slider(np.linspace(0, 0.4, 10)), np.random.default_rng(5))[:, :3, 3]
+    table = tmp_path / "handle.csv"
+    table.write_text("x,y,z,force\n" + "\n".join(",".join(map(str, [*p, 1.0])) for p in points))
+    main(["fit", str(table), "--noise", "2mm"])
+    assert "columns that mean nothing here: force" in capsys.readouterr().err
+
+
+def test_thinned_recordings_are_shorter(door, capsys):
+    words = [door, "--parent", "cupboard", "--child", "door", "--noise", "2mm,0.5deg", "--thin", "10"]
+    assert answer(words, capsys)["count"] == 10
+
+
+@pytest.mark.parametrize(
+    ("rows", "words", "says"),
+    [
+        ("", [], "the file is empty"),
+        ("0 0 0\n", [], "one pose"),
+        ("0 0 0\n0 nan 0\n", [], "line 2: y is 'nan'"),
+        ("0 0 0 0 0 0 2\n", [], "line 1: the quaternion has the length 2, which is off by 1"),
+        ("0 0 0\n0 0 1\n", ["--noise", "3deg"], "write two positive numbers"),
+        ("0 0 0\n0 0 1\n", ["--noise", "3mm,2cm"], "write two positive numbers"),
+        ("0 0 0\n0 0 1\n", ["--noise", "0"], "write two positive numbers"),
+        ("0 0 0 0 0 0 1\n0 0 1 0 0 0 1\n", ["--noise", "3mm"], "poses have two"),
+        ("0 0 0\n0 0 1\n", ["--families", "hinge"], "There is no family 'hinge'"),
+        ("0 0 0\n0 0 1\n", ["--parent", "cupboard"], "names no parts"),
+        ("0 0 0\n0 0 1\n", ["--thin", "1"], "takes at least two"),
+        ("part,x,y,z\na,0,0,0\nb,0,0,1\n", [], "which part moves?"),
+        ("part,x,y,z\na,0,0,0\nb,0,0,1\n", ["--child", "c"], "has no part 'c'"),
+        ("0 0 0\n0 0 1\n", ["--columns", "x,y"], "2 names were given"),
+    ],
+)
+def test_what_cannot_be_is_answered_in_a_line(rows, words, says, tmp_path, capsys):
+    table = tmp_path / "poses.csv"
+    table.write_text(rows)
+    assert main(["fit", str(table), *words]) == 2
+    error = capsys.readouterr().err
+    assert says in error
+    assert error.count("\n") == 1
