@@ -1,0 +1,255 @@
+"""Laws of a tracker: what it must agree with, and what must not matter."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.optimize import least_squares
+from scipy.spatial.transform import Rotation
+from seeing import Eyes, noisy
+
+import kineverse as kv
+from kineverse.estimation import ObservedExpression, ObservedPose, Tracker, pose_covariance
+
+
+def slides() -> kv.Model:
+    """Two coordinates of which linear expressions are seen."""
+    model = kv.Model()
+    a, b = kv.position("a"), kv.position("b")
+    with model.edit() as edit:
+        edit.add_frame("cart", parent="world", transform=kv.translation(a, b, 0))
+    return model
+
+
+def arm(tilt: object = None) -> kv.Model:
+    """Two hinges one after the other, possibly in a world that lies elsewhere."""
+    model = kv.Model()
+    with model.edit() as edit:
+        edit.add_frame("foot", parent="world", transform=kv.translation(0, 0, 0) if tilt is None else tilt)
+        edit.apply(
+            kv.Revolute(name="one", parent="foot", child="upper", axis=(0, 0, 1), lower=-1.5, upper=1.5)
+        )
+        edit.add_frame("elbow", parent="upper", transform=kv.translation(0.5, 0, 0))
+        edit.apply(
+            kv.Revolute(name="two", parent="elbow", child="lower", axis=(0, 1, 0), lower=-1.5, upper=1.5)
+        )
+        edit.add_frame("tip", parent="lower", transform=kv.translation(0.4, 0, 0.1))
+    return model
+
+
+def test_what_is_linear_is_a_kalman_filter():
+    a, b = kv.position("a"), kv.position("b")
+    R = np.array([[0.04, 0.01], [0.01, 0.09]])
+    seen = ObservedExpression("z", kv.array([a + 2 * b, a - b]), R)
+    tracker = Tracker(
+        slides(),
+        [seen],
+        start={"a": 0.3, "b": -0.2},
+        uncertainty={"a": 0.5, "b": 2.0},
+        process_noise={"a:velocity": 0.02, "b:velocity": 0.3},
+    )
+    H = np.array([[1.0, 2.0], [1.0, -1.0]])
+    x, P = np.array([0.3, -0.2]), np.diag([0.25, 4.0])
+    rng, log_density = np.random.default_rng(0), 0.0
+    for _ in range(10):
+        z, u = rng.standard_normal(2), rng.standard_normal(2)
+        x, P = x + 0.1 * u, P + 0.1 * np.diag([0.02, 0.3])
+        S = H @ P @ H.T + R
+        gain, innovation = P @ H.T @ np.linalg.inv(S), z - H @ x
+        nis = innovation @ np.linalg.solve(S, innovation)
+        log_density -= (nis + np.log(np.linalg.det(2 * np.pi * S))) / 2
+        x, P = x + gain @ innovation, P - gain @ S @ gain.T
+        tracker.predict(0.1, {"a:velocity": u[0], "b:velocity": u[1]})
+        estimate = tracker.update({"z": z})
+        assert [estimate.state["a"], estimate.state["b"]] == pytest.approx(x.tolist(), abs=1e-9)
+        assert np.allclose(estimate.covariance, P, atol=1e-12)
+        assert estimate.nis == pytest.approx(nis)
+        assert tracker.log_evidence == pytest.approx(log_density)
+
+
+def test_two_observations_are_one_with_the_sum_of_their_information():
+    a, b = kv.position("a"), kv.position("b")
+    first, second = np.diag([0.04, 0.01]), np.array([[0.02, 0.01], [0.01, 0.05]])
+    together = np.linalg.inv(np.linalg.inv(first) + np.linalg.inv(second))
+    z1, z2 = np.array([0.1, 0.2]), np.array([0.3, -0.1])
+    both = together @ (np.linalg.solve(first, z1) + np.linalg.solve(second, z2))
+    once = Tracker(slides(), [ObservedExpression("z", kv.array([a, b]), together)])
+    twice = once.copy()
+    merged = once.update({"z": both})
+    twice.update({"z": (z2, second)})
+    apart = twice.update({"z": (z1, first)})
+    assert np.allclose(merged.information, apart.information, rtol=1e-12)
+    assert np.allclose(list(merged.state.values()), list(apart.state.values()), atol=1e-9)
+
+
+def test_the_order_of_observations_does_not_matter_much():
+    model = arm()
+    eyes = Eyes(model, ["lower", "tip"], 0.002, np.radians(0.2))
+    readings = [eyes({"one": 0.4, "two": -0.7}) for _ in range(6)]
+    observed = [ObservedPose(f, covariance=eyes.covariance) for f in eyes.frames]
+    results = []
+    for order in (readings, readings[::-1]):
+        tracker = Tracker(
+            model, observed, uncertainty={"one": 0.01, "two": 0.01}, start={"one": 0.4, "two": -0.7}
+        )
+        for seen in order:
+            estimate = tracker.update(seen)
+        results.append(np.array([estimate.state["one"], estimate.state["two"]]))
+    # What is left comes from where things were linear: second order in the noise.
+    assert np.abs(results[0] - results[1]).max() < 0.02 * min(estimate.deviation.values())
+
+
+def test_the_world_may_lie_anywhere():
+    place = np.array(kv.translation(3, -2, 1)() @ kv.rpy(0.3, -1.1, 2.0)())
+    plain, moved = arm(), arm(kv.translation(3, -2, 1) @ kv.rpy(0.3, -1.1, 2.0))
+    eyes = Eyes(plain, ["lower", "tip"], 0.05, np.radians(5))
+    covariance = np.diag([0.01, 0.02, 0.03, 0.004, 0.005, 0.006])
+    turn = np.kron(np.eye(2), place[:3, :3])
+    here = Tracker(plain, [ObservedPose(f, covariance=covariance) for f in eyes.frames])
+    there = Tracker(moved, [ObservedPose(f, covariance=turn @ covariance @ turn.T) for f in eyes.frames])
+    for _ in range(4):
+        seen = eyes({"one": 0.4, "two": -0.7})
+        a, b = here.update(seen), there.update({f: place @ T for f, T in seen.items()})
+        assert np.allclose(list(a.state.values()), list(b.state.values()), atol=1e-7)
+        assert np.allclose(a.covariance, b.covariance, rtol=1e-5)
+        assert a.nis == pytest.approx(b.nis, rel=1e-6)
+
+
+def residuals(x, model, seen, covariance, prior):
+    """The whitened errors of a state, written anew with scipy."""
+    parts = [(x - prior[0]) / prior[1]]
+    whiten = np.linalg.inv(np.linalg.cholesky(covariance))
+    for frame, T in seen.items():
+        said = model.fk(frame)(
+            {str(s): v for s, v in zip(model.symbols, x, strict=True) if s in model.fk(frame).symbols}
+        )
+        turned = Rotation.from_matrix(T[:3, :3] @ said[:3, :3].T).as_rotvec()
+        parts.append(whiten @ np.concatenate([T[:3, 3] - said[:3, 3], turned]))
+    return np.concatenate(parts)
+
+
+@pytest.mark.parametrize("truth", [(0.4, -0.7), (1.5, 1.5), (1.45, -1.5)])
+def test_the_estimate_is_the_most_probable_state_inside_the_limits(truth):
+    model = arm()
+    covariance = pose_covariance(0.1, np.radians(10))
+    eyes = Eyes(model, ["lower", "tip"], 0.1, np.radians(10), seed=3)
+    prior = np.zeros(2), np.full(2, 1.5)
+    for _ in range(3):
+        seen = eyes(dict(zip(("one", "two"), truth, strict=True)))
+        tracker = Tracker(model, [ObservedPose(f, covariance=covariance) for f in eyes.frames])
+        estimate = tracker.update(seen)
+        found = least_squares(
+            residuals,
+            [0.0, 0.0],
+            bounds=(-1.5, 1.5),
+            args=(model, seen, covariance, prior),
+            xtol=1e-12,
+            ftol=1e-12,
+            gtol=1e-12,
+        )
+        assert [estimate.state["one"], estimate.state["two"]] == pytest.approx(found.x.tolist(), abs=2e-6)
+
+
+def test_derivatives_are_those_of_the_residual():
+    """The geometric Jacobian and Jr⁻¹ are what finite differences of the residual say, far from zero as well."""
+    model = arm()
+    tracker = Tracker(model, ["tip"])
+    rng = np.random.default_rng(0)
+    filter_ = tracker._filter
+    for _ in range(20):
+        x = rng.uniform(-1.4, 1.4, 2)
+        seen = noisy(model.fk("tip")(dict(zip(("one", "two"), x, strict=True))), 0.3, 0.8, rng)
+        reading = filter_.reader.read({"tip": seen})
+
+        def error(at, reading=reading):
+            return filter_.residuals.errors(filter_.residuals.evaluate(at, np.empty(0)), reading, [0])[0]
+
+        _, slope = error(x)
+        h = 1e-6
+        numeric = np.stack([(error(x + h * e)[0] - error(x - h * e)[0]) / (2 * h) for e in np.eye(2)], axis=1)
+        assert np.allclose(slope, -numeric, atol=1e-4 * np.abs(slope).max())
+
+
+def test_turns_wrap_and_several_starts_find_them():
+    model = kv.Model()
+    with model.edit() as edit:
+        edit.apply(kv.Continuous(name="wheel", parent="world", child="wheel", axis=(0, 0, 1)))
+    at = kv.estimation.ObservedPosition("wheel", (1.0, 0.0, 0.0))
+    rng = np.random.default_rng(0)
+    for start in np.linspace(-3, 3, 7):
+        tracker = Tracker(model, [at])
+        for k in range(40):
+            angle = start + 0.1 * k
+            estimate = tracker.update(
+                {"wheel": [np.cos(angle), np.sin(angle), 0] + 0.01 * rng.standard_normal(3)}
+            )
+            assert -np.pi <= estimate.state["wheel"] <= np.pi
+            off = np.angle(np.exp(1j * (estimate.state["wheel"] - angle)))
+            assert abs(off) < 5 * estimate.deviation["wheel"]
+            tracker.predict(1.0, {"wheel:velocity": 0.1})
+
+
+def test_nothing_is_asked_outside_of_limits():
+    """The published garage door is arccos(a/l): beyond its limit it says nothing at all."""
+    model = kv.Model()
+    with model.edit() as edit:
+        edit.apply(kv.GarageDoor(name="g", parent="world", form="published"))
+    eyes = Eyes(model, ["g/door", "g/upper_edge"], 0.1, np.radians(10), seed=1)
+    tracker = Tracker(model, [ObservedPose(f, covariance=eyes.covariance) for f in eyes.frames])
+    for _ in range(20):
+        estimate = tracker.update(eyes({"g/door": 1.999, "g/bolt": 0.1}))
+        assert 0 <= estimate.state["g/door"] <= 2
+        assert np.isfinite(estimate.covariance).all()
+
+
+def test_limits_may_be_about_several_coordinates():
+    model = slides()
+    a, b = kv.position("a"), kv.position("b")
+    with model.edit() as edit:
+        edit.constrain("circle", 0, a * a + b * b, 1)
+        edit.constrain("a/position", -2, a, 2)
+    tracker = Tracker(model, [ObservedExpression("a", a, 0.01), ObservedExpression("b", b, 0.01)])
+    assert tracker.groups == ((a, b),)
+    for _ in range(10):
+        estimate = tracker.update({"a": 1.2, "b": 0.9})
+    x = np.array([estimate.state["a"], estimate.state["b"]])
+    assert np.linalg.norm(x) == pytest.approx(1.0, abs=1e-6)
+    assert x == pytest.approx(np.array([0.8, 0.6]), abs=1e-2)
+    # The belief itself knows nothing of the circle, so news can lead away from it again.
+    assert x + estimate.mean == pytest.approx(np.array([1.2, 0.9]), abs=2e-2)
+
+
+def test_information_comes_back_from_a_limit():
+    a = kv.position("a")
+    model = slides()
+    with model.edit() as edit:
+        edit.constrain("a/position", 0, a, 1)
+    tracker = Tracker(model, [ObservedExpression("z", a, 1.0)], uncertainty={"a": 100.0})
+    for z in (1.5, 1.5, 0.6, 0.6):
+        estimate = tracker.update({"z": z})
+    assert estimate.state["a"] == pytest.approx(1.0)
+    for z in (0.6, 0.6):
+        estimate = tracker.update({"z": z})
+    assert estimate.state["a"] == pytest.approx(0.9, abs=1e-3)
+
+
+@pytest.mark.compiler
+def test_compiled_and_numpy_do_the_same():
+    model = kv.load("kitchen")
+    eyes = Eyes(model, [f for f in model.frames if model.speeds_of(f)], 0.1, np.radians(10))
+    observed = [ObservedPose(f, covariance=eyes.covariance) for f in eyes.frames]
+    fast, slow = Tracker(model, observed), Tracker(model, observed)
+    slow._filter.native = None
+    assert fast.wait()
+    rng = np.random.default_rng(2)
+    for _ in range(3):
+        truth = {str(s): rng.choice([*fast.limits[s], rng.uniform(*fast.limits[s])]) for s in fast.symbols}
+        one, other = fast.copy(), slow.copy()
+        for _ in range(4):
+            seen, mask = eyes.array(truth), rng.random(len(eyes.frames)) < 0.7
+            a, b = one.update_poses(seen, mask), other.update_poses(seen, mask)
+            assert np.allclose(list(a.state.values()), list(b.state.values()), rtol=0, atol=1e-12)
+            assert np.allclose(a.information, b.information, rtol=1e-12)
+            assert np.allclose(a.mean, b.mean, rtol=0, atol=1e-9)
+            assert (a.nis, a.dof, a.rounds) == (pytest.approx(b.nis), b.dof, b.rounds)
+            assert one.log_evidence == pytest.approx(other.log_evidence)
