@@ -8,7 +8,9 @@ import pytest
 from kineverse.bench import DisagreementError, measure
 from kineverse.bench.crowd import RADIUS, RULES, crowd
 from kineverse.bench.crowd_peers import Mujoco, MujocoPairs, OurScene, PlainCoal
+from kineverse.bench.kitchen_robot import kitchen_robot
 from kineverse.bench.measure_geometry import Entry, check
+from kineverse.bench.room_peers import BulletInRoom, MujocoInRoom, Room
 from kineverse.geometry import Scene
 
 
@@ -42,6 +44,26 @@ def test_bullet_finds_what_is_near(arm, scene):
     from kineverse.bench.bullet_crowd import Bullet
 
     check([Entry("ours", OurScene(scene), 0.0), Entry("bullet", Bullet(arm), 3e-3)], arm.angles)
+
+
+@pytest.fixture(scope="module")
+def robot():
+    return kitchen_robot(steps=40)
+
+
+def test_mujoco_finds_what_is_near_a_robot_in_a_kitchen(robot):
+    pytest.importorskip("mujoco")
+    ours = Entry("ours", OurScene(robot.scene()), 0.0)
+    room = Room(robot.scene(), robot.values[0], "robot/")
+    assert len(names(ours.finder, robot.values[0])) > 20
+    check([ours, Entry("mujoco", MujocoInRoom(room), 1e-5)], robot.values)
+
+
+def test_bullet_finds_what_is_near_a_robot_in_a_kitchen(robot):
+    pytest.importorskip("pybullet")
+    room = Room(robot.scene(), robot.values[0], "robot/")
+    entries = [Entry("ours", OurScene(robot.scene()), 0.0), Entry("bullet", BulletInRoom(room), 3e-3)]
+    check(entries, robot.values[::4])
 
 
 class Forgetful(OurScene):

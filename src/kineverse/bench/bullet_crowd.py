@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
+
+from kineverse.view.rotation import quaternions
 
 from .agreement import Array
 from .crowd import BOX, CAPSULE, CENTRE, LINK_LENGTH, LINKS, RADIUS, Crowd
@@ -26,26 +27,15 @@ class Bullet:
         self._client = pybullet.connect(pybullet.DIRECT)
         shapes = [_link(pybullet, crowd, link, self._client) for link in range(LINKS)]
         links = [[0.0, 0.0, LINK_LENGTH if link else 0.0] for link in range(LINKS)]
-        self._arm = _body(pybullet, shapes, links, None, crowd, range(LINKS), self._client)
+        axes = [list(crowd.axis(link)) for link in range(LINKS)]
+        self._arm = _body(pybullet, shapes, links, None, axes, self._client)
         boxes = [
             pybullet.createCollisionShape(
                 pybullet.GEOM_BOX, halfExtents=(size / 2).tolist(), physicsClientId=self._client
             )
             for size in crowd.sizes
         ]
-        self._bodies = {}
-        for first in range(0, len(boxes), _LINKS):
-            some = slice(first, first + _LINKS)
-            body = _body(
-                pybullet,
-                boxes[some],
-                crowd.poses[some, :3, 3].tolist(),
-                _quaternions(crowd.poses[some]),
-                crowd,
-                None,
-                self._client,
-            )
-            self._bodies[body] = first
+        self._bodies = standing(pybullet, boxes, crowd.poses, self._client)
         self._joints = list(range(LINKS))
         self.found: list[Any] = []
 
@@ -71,6 +61,21 @@ class Bullet:
         self._bullet.disconnect(self._client)
 
 
+def standing(pybullet: Any, shapes: list[int], poses: Array, client: int) -> dict[int, int]:
+    """Make bodies of shapes that stand at poses, (N, 3, 4) or larger, each shape a link.
+
+    Returns
+    -------
+    By the number of the body, which shape its first link is.
+    """
+    bodies = {}
+    for first in range(0, len(shapes), _LINKS):
+        some = slice(first, first + _LINKS)
+        positions, turns = poses[some, :3, 3].tolist(), scalar_last(poses[some])
+        bodies[_body(pybullet, shapes[some], positions, turns, None, client)] = first
+    return bodies
+
+
 def _link(pybullet: Any, crowd: Crowd, link: int, client: int) -> int:
     kind = crowd.kind(link)
     at = {"collisionFramePosition": list(CENTRE), "physicsClientId": client}
@@ -88,37 +93,31 @@ def _body(
     shapes: list[int],
     positions: list[list[float]],
     quaternions: list[list[float]] | None,
-    crowd: Crowd,
-    joints: Iterable[int] | None,
+    axes: list[list[int]] | None,
     client: int,
 ) -> int:
+    """Make a chain of links that turn about axes, or links that stand if there are none."""
     count, nothing, upright = len(shapes), [0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]
     fixed, turning = pybullet.JOINT_FIXED, pybullet.JOINT_REVOLUTE
     return int(
         pybullet.createMultiBody(
             baseMass=0,
-            linkMasses=[0.0 if joints is None else 1.0] * count,
+            linkMasses=[0.0 if axes is None else 1.0] * count,
             linkCollisionShapeIndices=shapes,
             linkVisualShapeIndices=[-1] * count,
             linkPositions=positions,
             linkOrientations=quaternions or [upright] * count,
             linkInertialFramePositions=[nothing] * count,
             linkInertialFrameOrientations=[upright] * count,
-            linkParentIndices=[0] * count if joints is None else list(range(count)),
-            linkJointTypes=[fixed if joints is None else turning] * count,
-            linkJointAxis=[[0, 0, 1]] * count if joints is None else [list(crowd.axis(k)) for k in joints],
+            linkParentIndices=[0] * count if axes is None else list(range(count)),
+            linkJointTypes=[fixed if axes is None else turning] * count,
+            linkJointAxis=axes or [[0, 0, 1]] * count,
             physicsClientId=client,
         )
     )
 
 
-def _quaternions(poses: Array) -> list[list[float]]:
-    """Return (x, y, z, w) of (N, 4, 4) poses."""
-    import mujoco
-
-    found = []
-    for pose in poses:
-        w_first = np.empty(4)
-        mujoco.mju_mat2Quat(w_first, pose[:3, :3].ravel())
-        found.append([*w_first[1:].tolist(), float(w_first[0])])
+def scalar_last(poses: Array) -> list[list[float]]:
+    """Return (x, y, z, w) of (N, 3, 4) or larger poses."""
+    found: list[list[float]] = np.roll(quaternions(poses), -1, axis=1).tolist()
     return found

@@ -119,10 +119,13 @@ class Mujoco:
     """
 
     def __init__(self, crowd: Crowd) -> None:
+        self._start(_mujoco_text(crowd))
+
+    def _start(self, text: str) -> None:
         import mujoco
 
         self._mujoco: Any = mujoco
-        self.model: Any = mujoco.MjModel.from_xml_string(_mujoco_text(crowd))
+        self.model: Any = mujoco.MjModel.from_xml_string(text)
         self.data: Any = mujoco.MjData(self.model)
         self.names = [self.model.geom(k).name for k in range(self.model.ngeom)]
         self.found: Any = None
@@ -178,31 +181,40 @@ class MujocoPairs(Mujoco):
 def _mujoco_text(crowd: Crowd) -> str:
     """Return the arm as nested bodies, and the boxes as geoms of the world."""
     assets, arm, world = [], "", []
-    corners_of_a_box = np.array(list(itertools.product((-0.5, 0.5), repeat=3)))
-    here = _words(CENTRE)
+    here = words(CENTRE)
     for link in reversed(range(LINKS)):
         kind = crowd.kind(link)
         if kind == "capsule":
             radius, length = CAPSULE
             shape = f'type="capsule" size="{radius!r} {length / 2!r}" pos="{here}"'
         else:
-            corners = corners_of_a_box * BOX if kind == "box" else crowd.corners[link]
-            assets.append(f'<mesh name="link{link}" vertex="{_words(corners)}" maxhullvert="-1"/>')
+            corners = CORNERS_OF_A_BOX * BOX if kind == "box" else crowd.corners[link]
+            assets.append(f'<mesh name="link{link}" vertex="{words(corners)}" maxhullvert="-1"/>')
             shape = f'type="mesh" mesh="link{link}" pos="{here}"'
         arm = (
-            f'<body pos="0 0 {LINK_LENGTH if link else 0.0}"><joint axis="{_words(crowd.axis(link))}"/>'
+            f'<body pos="0 0 {LINK_LENGTH if link else 0.0}"><joint axis="{words(crowd.axis(link))}"/>'
             f'<geom name="link{link}" {shape} margin="{RADIUS}" contype="1" conaffinity="0"/>{arm}</body>'
         )
     for k, (size, pose) in enumerate(zip(crowd.sizes, crowd.poses, strict=True)):
-        assets.append(f'<mesh name="box{k}" vertex="{_words(corners_of_a_box * size)}"/>')
-        axes = f'pos="{_words(pose[:3, 3])}" xyaxes="{_words(pose[:3, :2].T)}"'
+        assets.append(f'<mesh name="box{k}" vertex="{words(CORNERS_OF_A_BOX * size)}"/>')
+        axes = f'pos="{words(pose[:3, 3])}" xyaxes="{words(pose[:3, :2].T)}"'
         world.append(f'<geom name="box{k}" type="mesh" mesh="box{k}" {axes} contype="0" conaffinity="1"/>')
+    return mujoco_text(assets, [*world, arm])
+
+
+def mujoco_text(assets: Iterable[str], world: Iterable[str]) -> str:
+    """Return the MJCF of assets and what is in the world, with distances as exact as MuJoCo has them."""
     return (
         '<mujoco><size memory="64M"/><compiler angle="radian"/>'
         '<option ccd_tolerance="1e-8" ccd_iterations="100"><flag multiccd="disable"/></option>'
-        f"<asset>{''.join(assets)}</asset><worldbody>{''.join(world)}{arm}</worldbody></mujoco>"
+        f"<asset>{''.join(assets)}</asset><worldbody>{''.join(world)}</worldbody></mujoco>"
     )
 
 
-def _words(numbers: Any) -> str:
+CORNERS_OF_A_BOX = np.array(list(itertools.product((-0.5, 0.5), repeat=3)))
+"""(8, 3), of a box of 1 m."""
+
+
+def words(numbers: Any) -> str:
+    """Return numbers as MJCF has them."""
     return " ".join(map(repr, np.asarray(numbers, dtype=float).ravel().tolist()))

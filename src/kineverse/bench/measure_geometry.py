@@ -16,9 +16,10 @@ from kineverse.geometry.sweep_native import sweep_library
 from .agreement import Array, check_agreement
 from .crowd import LINKS, RADIUS, RULES, crowd
 from .crowd_peers import Finder, Mujoco, MujocoPairs, OurScene, PlainCoal
-from .kitchen_robot import kitchen_robot
+from .kitchen_robot import KitchenRobot, kitchen_robot
 from .peers import Field, installed
 from .result import Bar, Comparison, Measurement, Result, at_most, faster
+from .room_peers import BulletInRoom, MujocoInRoom, Room
 from .settings import Settings
 from .timing import Contender, race
 
@@ -51,10 +52,7 @@ def measure(settings: Settings) -> Result:
     with tempfile.TemporaryDirectory(prefix="kineverse-bench-") as folder:
         arm = list(_among_boxes(field, Path(folder), steps))
         robot = kitchen_robot(steps)
-        rooms = [
-            Entry(f"{robot.name}: {OURS}", OurScene(robot.scene()), _CURVED),
-            Entry(f"{robot.name}: {COAL}", PlainCoal(robot.scene()), _CURVED),
-        ]
+        rooms = list(_in_a_room(robot))
         angles = crowd(steps=steps).angles
         check(arm, angles)
         check(rooms, robot.values)
@@ -65,7 +63,7 @@ def measure(settings: Settings) -> Result:
         field.contenders += [*_timed(arm, angles), *_timed(many, angles), *_timed(rooms, robot.values)]
         measured = race("geometry", field.contenders, settings.rounds, settings.progress)
     peers = (SEARCH, PAIRS, BULLET, COAL)
-    ours, coal = (f"{robot.name}: {name}, {QUERY}" for name in (OURS, COAL))
+    room = {name: f"{robot.name}: {name}, {QUERY}" for name in (OURS, SEARCH, BULLET, COAL)}
     return Result(
         name="geometry",
         work=(
@@ -78,7 +76,8 @@ def measure(settings: Settings) -> Result:
             at_most(measured[f"{OURS}, {QUERY}"], 40e-6),
             *(faster(measured, f"{OURS}, {QUERY}", f"{peer}, {QUERY}", 1.0) for peer in peers),
             *(faster(measured, f"{OURS}, {UPDATE}", f"{peer}, {UPDATE}") for peer in peers),
-            faster(measured, ours, coal, 1.0),
+            faster(measured, room[OURS], room[SEARCH]),
+            *(faster(measured, room[OURS], room[peer], 1.0) for peer in (BULLET, COAL)),
             _growth(measured, sizes),
         ),
         missing=tuple(field.missing),
@@ -130,6 +129,20 @@ def _among_boxes(field: Field, folder: Path, steps: int) -> Iterator[Entry]:
         yield Entry(BULLET, Bullet(arm), _MARGINS)
     else:
         field.missing.append("pybullet is missing: pip install pybullet brings it, where there is a wheel")
+
+
+def _in_a_room(robot: KitchenRobot) -> Iterator[Entry]:
+    """Yield who takes part where a robot moves; who does not is missed by :func:`_among_boxes`."""
+    yield Entry(f"{robot.name}: {OURS}", OurScene(robot.scene()), _CURVED)
+    yield Entry(f"{robot.name}: {COAL}", PlainCoal(robot.scene()), _CURVED)
+    if installed("mujoco"):
+        yield Entry(f"{robot.name}: {SEARCH}", MujocoInRoom(_room(robot)), _CURVED)
+    if installed("pybullet"):
+        yield Entry(f"{robot.name}: {BULLET}", BulletInRoom(_room(robot)), _MARGINS)
+
+
+def _room(robot: KitchenRobot) -> Room:
+    return Room(robot.scene(), robot.values[0], "robot/")
 
 
 def _scene(folder: Path, boxes: int, steps: int) -> Scene:
