@@ -56,7 +56,7 @@ def _against_noise(results: Results) -> Table:
             rows.append((str(errors.noise), NAMES[who], *values, nees, *_ms(times[who])))
     return Table(
         "Errors against noise, and the time of one prediction and update",
-        ("noise", "filter", "mean", "sd", "max", "NEES", "time [ms]", "sd [ms]"),
+        ("noise", "filter", "mean", "sd", "max", "NEES", "time [ms]", "sd", "median"),
         tuple(rows),
     )
 
@@ -86,7 +86,7 @@ def _against_size(results: Results) -> Table:
     for dof, times in results.by_size:
         means = (_fixed(strongest.summary(who, slice(dof))["mean"]) for who in FILTERS)
         rows.append((str(dof), *means, *(cell for who in FILTERS for cell in _ms(times[who]))))
-    titles = (title for who in FILTERS for title in (f"{NAMES[who]} [ms]", "sd"))
+    titles = (title for who in FILTERS for title in (f"{NAMES[who]} [ms]", "sd", "median"))
     return Table(
         f"Against degrees of freedom, at {strongest.noise}; the papers stay below {REPORTED:g} ms",
         ("DoF", *(f"{NAMES[who]}: mean error" for who in FILTERS), *titles),
@@ -158,5 +158,5 @@ def _fixed(value: float) -> str:
     return "-" if math.isnan(value) else f"{value:.4f}"
 
 
-def _ms(duration: Duration) -> tuple[str, str]:
-    return f"{duration.mean:.3f}", f"{duration.sd:.3f}"
+def _ms(duration: Duration) -> tuple[str, ...]:
+    return f"{duration.mean:.3f}", f"{duration.sd:.3f}", f"{duration.median:.3f}"
