@@ -42,6 +42,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="show which bodies are within 0.1 (or 5cm) of each other, green to red, with arrows in contact",
     )
     parser.add_argument("--collisions", action="store_true", help="show the collision shapes")
+    parser.add_argument(
+        "--decomposed", action="store_true", help="both with meshes as the hulls of kineverse decompose"
+    )
     parser.add_argument("--picture", metavar="PATH", help="write a picture (.png) instead of opening a page")
     add_page_options(parser)
 
@@ -72,6 +75,8 @@ def run(arguments: argparse.Namespace) -> int:
     with until_interrupted(), Viewer(model, assigned, port=arguments.port, label=label) as page:
         if near is not None:
             page.collisions.show_near(near)
+        if arguments.decomposed:
+            page.collisions.show_decomposed()
         if arguments.collisions:
             page.collisions.show_shapes()
         note_problems(page.problems)
@@ -91,7 +96,8 @@ def _write_picture(
     from kineverse.geometry.left_out import remarks, unusable
     from kineverse.view import meshes, save
 
-    save(arguments.picture, model, state, collisions=arguments.collisions, near=near)
+    shown = {"collisions": arguments.collisions, "near": near, "decomposed": arguments.decomposed}
+    save(arguments.picture, model, state, **shown)
     problems = [f"{m.uri}: {meshes.load(m).problem}" for m in meshes.seen_in(model) if meshes.load(m).problem]
     note_problems(problems)
     left_out = remarks(model, unusable(model)) if near is not None else {}

@@ -96,7 +96,7 @@ class Collisions:
         if not 0.0 <= radius < float("inf"):
             raise ValueRejectedError(f"A radius is a distance from 0 on [m], not {radius!r}.")
         coal_engine()
-        self._set(Wanted(True, float(radius), containing, ignored))
+        self._set(Wanted(True, float(radius), containing, ignored, self.watch.wanted.decomposed))
 
     def show_shapes(self, shown: bool = True) -> None:
         """Show or hide the collision shapes, half transparent."""
@@ -104,6 +104,19 @@ class Collisions:
             self._scene.show_collisions(shown)
             if self._shapes is not None:
                 self._shapes.value = shown
+
+    def show_decomposed(self, shown: bool = True) -> None:
+        """Take meshes as the hulls that ``kineverse decompose`` made of them, for shapes and distances.
+
+        Those that it has not seen stay one hull; the log says which.
+
+        Raises
+        ------
+        MissingExtraError
+            If the extra ``geometry`` is not installed.
+        """
+        coal_engine()
+        self._set(replace(self.watch.wanted, decomposed=shown))
 
     @property
     def nearness(self) -> Nearness | None:
@@ -139,26 +152,33 @@ class Collisions:
             ignored = gui.add_checkbox(
                 "ignored pairs", wanted.ignored, hint="Also pairs that are joined, or excepted by rules."
             )
+            decomposed = gui.add_checkbox(
+                "decomposed meshes", wanted.decomposed, hint="Meshes as the hulls of kineverse decompose."
+            )
             self._report = gui.add_html("")
-        self._controls = near, radius, only, ignored
+        self._controls = near, radius, only, ignored, decomposed
         for control in self._controls:
             control.on_update(self._set_by_hand)
 
     def _set_by_hand(self, event: Any) -> None:
         # Values that this program has set come back without a client.
         if event.client is not None:
-            self.watch.look_for(Wanted(*(control.value for control in self._controls)))
+            wanted = Wanted(*(control.value for control in self._controls))
+            self._scene.decompose(wanted.decomposed)
+            self.watch.look_for(wanted)
             self._tell()
 
     def _set(self, wanted: Wanted) -> None:
         with self._lock:
+            self._scene.decompose(wanted.decomposed)
             self.watch.look_for(wanted)
             if self._controls:
-                near, radius, only, ignored = self._controls
+                near, radius, only, ignored, decomposed = self._controls
                 self._folder.expand_by_default = wanted.on  # for whoever opens the page from now on
                 radius.max = max(WIDEST, wanted.radius)
                 near.value, radius.value = wanted.on, wanted.radius
                 only.value, ignored.value = wanted.containing, wanted.ignored
+                decomposed.value = wanted.decomposed
             self._tell()
 
     def _show(self, seen: Seen) -> None:

@@ -46,6 +46,7 @@ def picture(
     frames: bool = False,
     collisions: bool = False,
     near: float | None = None,
+    decomposed: bool = False,
 ) -> npt.NDArray[np.uint8]:
     """Return a picture of a model as (height, width, 3) bytes.
 
@@ -67,6 +68,8 @@ def picture(
     near
         Within what distance to draw lines between bodies that are near to each other [m], green to red by the
         distance, with arrows where they touch; through the bodies. None for no lines.
+    decomposed
+        Whether collision shapes and lines are those of the hulls that meshes were decomposed into.
 
     Raises
     ------
@@ -82,8 +85,8 @@ def picture(
         raise ValueRejectedError(f"a picture of {width} x {height} pixels cannot be made")
     poses, values = Poses(model), complete(model, state)
     at = dict(zip(poses.names, poses.at(values), strict=True))
-    found = None if near is None else Near(model).at(values, near)
-    items = parts(model, "collision" if collisions else "visual")
+    found = None if near is None else Near(model, decomposed).at(values, near)
+    items = parts(model, "collision" if collisions else "visual", decomposed)
     scene = Surfaces.of(items, at)
     if camera is None:
         camera = automatic(scene, importance(model, items), at, width / height)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import takewhile
 
@@ -52,6 +52,8 @@ class Near:
     ----------
     model
         The model; after an edit :meth:`follow` has to be called.
+    decomposed
+        Whether meshes are the hulls that they were decomposed into, as far as they were.
 
     Attributes
     ----------
@@ -64,16 +66,21 @@ class Near:
         If the extra ``geometry`` is not installed.
     """
 
-    def __init__(self, model: ModelView) -> None:
+    def __init__(self, model: ModelView, decomposed: bool = False) -> None:
         self._model = model
+        self.decomposed = decomposed
         self._make()
 
     def _make(self) -> None:
         self._unusable = unusable(self._model)
         self.problems = remarks(self._model, self._unusable)
-        self._scene = Scene(self._model, leave_out=self._unusable)
+        self._scene = self._scene_with(())
         self._all: Scene | None = None
         self._ignored = Ignored(self._model, self._scene.bodies)
+
+    def _scene_with(self, rules: Iterable[Rule]) -> Scene:
+        decomposed = ("*",) if self.decomposed else ()
+        return Scene(self._model, rules=rules, decomposed=decomposed, leave_out=self._unusable)
 
     def follow(self) -> None:
         """Look at the model as it is now."""
@@ -125,7 +132,7 @@ class Near:
         self, values: Mapping[str, float], radius: float, containing: str
     ) -> list[tuple[Closest, str]]:
         if self._all is None:
-            self._all = Scene(self._model, rules=[Rule("*", "*", check=True)], leave_out=self._unusable)
+            self._all = self._scene_with([Rule("*", "*", check=True)])
         self._all.update(values)
         found = _named(self._all.within(radius), containing)
         reasons = ((pair, self._ignored.why(pair.a, pair.b)) for pair in found)

@@ -9,8 +9,8 @@ from kineverse.geometry.pieces import touchable
 from kineverse.model.body import Body, Mesh, Shape
 from kineverse.model.view import ModelView
 from kineverse.view.geometry import triangles_of
-from kineverse.view.hulls import load_hull
-from kineverse.view.meshes import load
+from kineverse.view.hulls import load_hull, load_hulls
+from kineverse.view.meshes import Loaded, load
 from kineverse.view.triangles import Triangles
 
 Kind = Literal["visual", "collision"]
@@ -23,6 +23,9 @@ COLLISION: Rgba = (0.95, 0.55, 0.15, 0.35)
 
 STAND_IN: Rgba = (0.25, 0.62, 0.66, 0.35)
 """The colour of what stands for the collision shapes of a body that has none."""
+
+SHADES = (1.0, 0.7, 0.85, 0.55)
+"""How bright the hulls of one mesh are, in turns."""
 
 UNPAINTED: tuple[Rgba, ...] = (
     (0.72, 0.74, 0.77, 1.0),
@@ -62,7 +65,7 @@ class Part:
     placeholder: bool = False
 
 
-def parts(model: ModelView, kind: Kind = "visual") -> list[Part]:
+def parts(model: ModelView, kind: Kind = "visual", decomposed: bool = False) -> list[Part]:
     """Return everything a model has to show, in the order of its bodies.
 
     Parameters
@@ -73,13 +76,16 @@ def parts(model: ModelView, kind: Kind = "visual") -> list[Part]:
         ``"visual"``: what is meant to be seen; of a model where nothing is, the collision shapes.
         ``"collision"``: what is meant to be touched, or of a body without it, what is seen; meshes as the
         hulls that distances are computed to.
+    decomposed
+        Whether meshes to be touched are the hulls that they were decomposed into, as far as they were.
     """
     found: list[Part] = []
     bare = kind == "visual" and not any(body.visuals for body in model.bodies.values())
     for number, (frame, body) in enumerate(model.bodies.items()):
         if kind == "collision":
             color = COLLISION if body.collisions else STAND_IN
-            found += [_touched(frame, shape, color) for shape in touchable(body)]
+            for shape in touchable(body):
+                found += _touched(frame, shape, color, decomposed)
             continue
         fallback = UNPAINTED[number % len(UNPAINTED)]
         shapes = body.collisions if bare else body.visuals
@@ -109,9 +115,21 @@ def _part(frame: str, shape: Shape, kind: Kind, fallback: Rgba) -> Part:
     return Part(frame, surface.moved(shape.origin.matrix), color, kind, problem, bool(problem))
 
 
-def _touched(frame: str, shape: Shape, color: Rgba) -> Part:
-    loaded = load_hull(shape.geometry) if isinstance(shape.geometry, Mesh) else None
-    surface = (loaded.surface if loaded else triangles_of(shape.geometry)).unpainted()
-    problem = loaded.problem if loaded else ""
-    color = MISSING if problem else color
-    return Part(frame, surface.moved(shape.origin.matrix), color, "collision", problem, bool(problem))
+def _touched(frame: str, shape: Shape, color: Rgba, decomposed: bool) -> list[Part]:
+    if not isinstance(shape.geometry, Mesh):
+        loaded = [Loaded(triangles_of(shape.geometry))]
+    else:
+        loaded = load_hulls(shape.geometry) if decomposed else [load_hull(shape.geometry)]
+    found = []
+    for number, (surface, problem) in enumerate((one.surface, one.problem) for one in loaded):
+        own = MISSING if problem else _shaded(color, number)
+        placed = surface.unpainted().moved(shape.origin.matrix)
+        found.append(Part(frame, placed, own, "collision", problem, bool(problem)))
+    return found
+
+
+def _shaded(color: Rgba, number: int) -> Rgba:
+    """Return a colour that tells a hull from its neighbours; that of the first is the colour itself."""
+    red, green, blue, alpha = color
+    factor = SHADES[number % len(SHADES)]
+    return (factor * red, factor * green, factor * blue, alpha)

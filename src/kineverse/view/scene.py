@@ -60,7 +60,7 @@ class Scene:
         self._lock = threading.RLock()
         self._frames_shown, self._labels_shown, self._filter = False, False, ""
         self._visuals_shown, self._collisions_shown, self._ground_shown = True, False, True
-        self._through = False
+        self._decomposed, self._through = False, False
         stage.set_up(server)
         self.refresh(model, values)
 
@@ -146,10 +146,21 @@ class Scene:
         with self._lock:
             self._collisions_shown = shown
             if shown and not self._collisions:
-                added = self._add(parts(self._model, "collision"), "collision")
+                added = self._add(parts(self._model, "collision", self._decomposed), "collision")
                 self._collisions = [node for node, _ in added]
             for node in self._collisions:
                 node.visible = shown
+
+    def decompose(self, wanted: bool) -> None:
+        """Show meshes to be touched as the hulls that they were decomposed into, or as one hull again."""
+        with self._lock:
+            if wanted == self._decomposed:
+                return
+            self._decomposed = wanted
+            for node in self._collisions:
+                node.remove()
+            self._collisions = []
+            self.show_collisions(self._collisions_shown)
 
     @property
     def collisions_shown(self) -> bool:

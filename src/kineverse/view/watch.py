@@ -23,12 +23,16 @@ SHARE = 3.0
 
 @dataclass(frozen=True, slots=True)
 class Wanted:
-    """What to look for: whether at all, within what radius [m], names containing what, ignored pairs too."""
+    """What to look for: whether at all, within what radius [m], names containing what, what else.
+
+    ``ignored``: also pairs that are not looked at. ``decomposed``: meshes as the hulls of their parts.
+    """
 
     on: bool = False
     radius: float = RADIUS
     containing: str = ""
     ignored: bool = False
+    decomposed: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -123,8 +127,8 @@ class Watch:
         if not wanted.on:
             return Seen()
         try:
-            if self._near is None:
-                self._near = Near(self._model)
+            if self._near is None or self._near.decomposed != wanted.decomposed:
+                self._near = Near(self._model, wanted.decomposed)
             elif edited:
                 self._near.follow()
             found = self._near.at(values, wanted.radius, containing=wanted.containing, ignored=wanted.ignored)
