@@ -16,9 +16,10 @@ from .canonical import canonical
 from .evidence import Evidence, evidence
 from .fit import Fit, Found
 from .groups import WX, GroupMotion
+from .native import solver
 from .observations import Observations, observations
 from .rigid import Array
-from .solving import Solution, solve
+from .solving import Solution
 from .starts import Overview, starts
 
 WEIGHTS: Mapping[str, float] = MappingProxyType(
@@ -92,6 +93,7 @@ def identify(
         noise if covariance_a is None else covariance_a,
         noise if covariance_b is None else covariance_b,
     )
+    solver.prepare()
     overview = Overview(seen)
     solutions = {name: _best(seen, name, overview) for name in weights}
     return weighed(solutions, weights, stated)
@@ -118,7 +120,7 @@ def family_weights(families: Iterable[str] | Mapping[str, float] | None) -> dict
 
 
 def _best(seen: Observations, name: str, overview: Overview) -> Solution[GroupMotion]:
-    found = [solve(seen, start.motion, start.values) for start in starts(name, overview)]
+    found = [solver.solve(seen, start.motion, start.values) for start in starts(name, overview)]
     best = min(found, key=lambda solution: solution.cost)
     return canonical(best)
 

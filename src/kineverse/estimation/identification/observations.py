@@ -105,6 +105,7 @@ def observations(
     given = _numbers(child_covariance, "The covariance of the child")
     if positions and given.shape[-2:] == (6, 6):
         given = given[..., :3, :3]
+    a, b = np.ascontiguousarray(a), np.ascontiguousarray(b)
     return Observations(a, b, of_parent, covariances(given, len(b), rows, "child"))
 
 
@@ -161,7 +162,7 @@ def covariances(given: npt.ArrayLike, count: int, rows: int, part: str) -> Array
             f"The covariance of the {part} is not {how} (at pose {k}). "
             "kv.estimation.pose_covariance(position, orientation) makes one of standard deviations."
         )
-    return matrices
+    return np.ascontiguousarray(matrices)
 
 
 def _numbers(given: npt.ArrayLike, what: str) -> Array:

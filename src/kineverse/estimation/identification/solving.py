@@ -25,11 +25,11 @@ from .rigid import Array, exponential, logarithm, pose, skew
 
 M = TypeVar("M", bound=Motion)
 
-_STEPS = 60
-_CLOSE = 1e-9
+STEPS = 60
+CLOSE = 1e-9
 # Beforehand, joint values are believed within so much [m] or [rad]: they stay finite where nothing tells
 # them.
-_JOINT_PRECISION = 1e-4
+JOINT_PRECISION = 1e-4
 
 
 @dataclass(frozen=True)
@@ -51,6 +51,8 @@ class Solution(Generic[M]):
         S, (N, m, m).
     linear
         Derivatives at the solution.
+    parent
+        The most likely true poses of the parent, (N, 4, 4).
     converged
         Whether steps became small; else the best that was found.
     """
@@ -61,6 +63,7 @@ class Solution(Generic[M]):
     residuals: Array
     covariance: Array
     linear: Linear
+    parent: Array
     converged: bool
 
     def scaled(self, factor: float) -> Self:
@@ -86,7 +89,7 @@ class _Point(Generic[M]):
     cost: float
 
 
-def solve(seen: Observations, motion: M, values: Array, steps: int = _STEPS) -> Solution[M]:
+def solve(seen: Observations, motion: M, values: Array, parent: Array | None = None) -> Solution[M]:
     """Return the most likely member of a family, from a start.
 
     Parameters
@@ -95,31 +98,40 @@ def solve(seen: Observations, motion: M, values: Array, steps: int = _STEPS) -> 
         What was observed.
     motion, values
         Where to start: a member, and joint values (N, k).
-    steps
-        After so many the best so far is returned.
+    parent
+        True poses of the parent to start from, (N, 4, 4); those observed if None.
     """
-    point = _point(seen, motion, values, seen.parent)
+    point = _point(seen, motion, values, seen.parent if parent is None else parent)
     damping, converged = 0.0, False
-    for _ in range(steps):
+    for _ in range(STEPS):
         reduced = _step(seen, point, damping)
         if reduced is None:
             damping = max(10.0 * damping, 1e-6)
+            if damping > 1e8:
+                break
             continue
         trial, gain = reduced
         if trial.cost <= point.cost + 1e-12 * abs(point.cost):
-            converged = gain < _CLOSE
+            converged = gain < CLOSE
             point, damping = trial, 0.1 * damping if damping > 1e-6 else 0.0
             if converged:
                 break
         else:
-            if gain < _CLOSE:
+            if gain < CLOSE:
                 converged = True
                 break
             damping = max(10.0 * damping, 1e-4)
             if damping > 1e8:
                 break
     return Solution(
-        point.motion, point.values, point.cost, point.residuals, point.covariance, point.linear, converged
+        point.motion,
+        point.values,
+        point.cost,
+        point.residuals,
+        point.covariance,
+        point.linear,
+        point.parent,
+        converged,
     )
 
 
@@ -147,7 +159,7 @@ def _point(seen: Observations, motion: M, values: Array, parent: Array) -> _Poin
         residuals = error - times(lever, own)
         covariance = covariance + lever @ of_parent @ np.swapaxes(lever, 1, 2)
     weights = inverted(covariance)
-    cost += float(prior.residuals @ prior.residuals) + _JOINT_PRECISION * float(np.sum(values**2))
+    cost += float(prior.residuals @ prior.residuals) + JOINT_PRECISION * float(np.sum(values**2))
     return _Point(
         motion, values, parent, linear, prior, own, residuals, lever, of_parent, weights, covariance, cost
     )
@@ -162,8 +174,8 @@ def _step(seen: Observations, point: _Point[M], damping: float) -> tuple[_Point[
         weighted = np.swapaxes(by_joints, 1, 2) @ point.weights
         curvature = weighted @ by_joints
         diagonal = np.einsum("nii->ni", curvature)
-        diagonal += _JOINT_PRECISION + damping * diagonal
-        slope = times(weighted, point.residuals) - _JOINT_PRECISION * point.values
+        diagonal += JOINT_PRECISION + damping * diagonal
+        slope = times(weighted, point.residuals) - JOINT_PRECISION * point.values
         inverse = inverted(curvature)
         projected = point.weights - np.swapaxes(weighted, 1, 2) @ inverse @ weighted
     rotated = np.swapaxes(by_parameters, 1, 2) @ projected
@@ -172,7 +184,7 @@ def _step(seen: Observations, point: _Point[M], damping: float) -> tuple[_Point[
     right = np.einsum("nir,nr->i", rotated, point.residuals) - prior.by_parameters.T @ prior.residuals
     if moving:
         # What the prior of joint values adds, carried to the parameters.
-        pull = times(inverse, _JOINT_PRECISION * point.values)
+        pull = times(inverse, JOINT_PRECISION * point.values)
         right += np.einsum("nrj,nrk,nk->j", by_parameters, np.swapaxes(weighted, 1, 2), pull)
     normal[np.diag_indices_from(normal)] *= 1.0 + damping
     try:

@@ -1,0 +1,151 @@
+"""The solver in C, compiled in the background and kept like compiled functions.
+
+Until then, and without a compiler, numpy takes the same steps.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import hashlib
+import threading
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from kineverse.compile.cache import library_cache
+from kineverse.compile.toolchain import CLOSED, toolchain
+from kineverse.compile.worker import Build, request
+
+from .groups import REACH, GroupMotion
+from .native_source import SOLVE
+from .observations import Observations
+from .rigid import Array, pose
+from .solving import CLOSE, JOINT_PRECISION, STEPS, Solution, solve
+
+_FLAGS = ("-O3", "-lm", *CLOSED)
+_COUNTS = ("count", "rows", "joints", "lefts", "rights", "pitched", "reach", "known")
+_ARRAYS = ("parent", "child", "parent_covariance", "child_covariance")
+
+
+class _Problem(ctypes.Structure):
+    _fields_ = (
+        *((name, ctypes.c_int64) for name in _COUNTS),
+        *((name, ctypes.c_int64 * 6) for name in ("joint", "left", "right")),
+        *((name, ctypes.c_void_p) for name in _ARRAYS),
+        *((name, ctypes.c_double) for name in ("reach_scale", "joint_precision", "close")),
+    )
+
+
+class SolverLibrary:
+    """The compiled solver, once there is one; for the whole process."""
+
+    def __init__(self) -> None:
+        self._code: Any = None
+        self._build: Build | None = None
+        self._hopeless = False
+        self._lock = threading.Lock()
+
+    @property
+    def is_native(self) -> bool:
+        """Whether C does the work."""
+        return self._code is not None
+
+    def prepare(self, wait: bool = False) -> bool:
+        """Take it from the cache or have it compiled in the background; return whether it is there."""
+        if self._code is not None:
+            return True
+        with self._lock:
+            if self._build is None and self._code is None:
+                self._build = self._seek()
+            build = self._build
+        if wait and build is not None:
+            build.wait(None)
+            self._built(build)
+        return self.is_native
+
+    def _seek(self) -> Build | None:
+        compiler = None if self._hopeless else toolchain()
+        if compiler is None:
+            self._hopeless = True
+            return None
+        key = hashlib.sha256(repr((SOLVE, compiler.identity)).encode()).hexdigest()[:40]
+        path = library_cache().find(key)
+        if path is not None:
+            self._load(path)
+            return None
+        return request(key, compiler, lambda: SOLVE, _FLAGS, self._built)
+
+    def _built(self, build: Build) -> None:
+        if build.path is not None and self._code is None:
+            self._load(build.path)
+        self._hopeless = self._code is None and not build.forgotten
+        self._build = None
+
+    def _load(self, path: str) -> None:
+        try:
+            code = ctypes.CDLL(path)
+        except OSError:
+            self._hopeless = True
+            return
+        pointer = ctypes.c_void_p
+        code.solve.argtypes = (*(pointer,) * 4, ctypes.c_int64, *(pointer,) * 3)
+        code.solve.restype = ctypes.c_int64
+        self._code = code
+
+    def solve(
+        self, seen: Observations, motion: GroupMotion, values: Array, parent: Array | None = None
+    ) -> Solution[GroupMotion]:
+        """Do what :func:`.solving.solve` does."""
+        if self._code is None:
+            return solve(seen, motion, values, parent)
+        count, rows = len(seen), seen.rows
+        moved = np.empty(25)
+        moved[:9], moved[9:12] = motion.left[:3, :3].ravel(), motion.left[:3, 3]
+        moved[12:21], moved[21:24] = motion.right[:3, :3].ravel(), motion.right[:3, 3]
+        moved[24] = motion.pitch
+        values = np.array(values, dtype=np.float64, order="C")
+        parents = np.array(seen.parent if parent is None else parent, order="C")
+        cost = ctypes.c_double()
+        residuals, covariances = np.empty((count, rows)), np.empty((count, rows, rows))
+        problem = _problem(seen, motion)
+        converged = self._code.solve(
+            ctypes.addressof(problem),
+            moved.ctypes.data,
+            values.ctypes.data,
+            parents.ctypes.data,
+            STEPS,
+            ctypes.addressof(cost),
+            residuals.ctypes.data,
+            covariances.ctypes.data,
+        )
+        if converged < 0:
+            raise MemoryError("There is no memory for so many observations.")
+        motion = replace(
+            motion,
+            left=pose(moved[:9].reshape(3, 3), moved[9:12]),
+            right=pose(moved[12:21].reshape(3, 3), moved[21:24]),
+            pitch=float(moved[24]),
+        )
+        return Solution(
+            motion, values, cost.value, residuals, covariances, motion.at(values), parents, converged == 1
+        )
+
+
+def _problem(seen: Observations, motion: GroupMotion) -> _Problem:
+    freedom = motion.freedom
+    problem = _Problem()
+    problem.count, problem.rows, problem.joints = len(seen), seen.rows, motion.joints
+    problem.lefts, problem.rights = len(freedom.left), len(freedom.right)
+    problem.pitched, problem.reach = motion.group.pitch, motion.group.reach
+    problem.known = seen.parent_covariance is None
+    for name, components in (("joint", freedom.joints), ("left", freedom.left), ("right", freedom.right)):
+        getattr(problem, name)[: len(components)] = components
+    for name in _ARRAYS:
+        array = getattr(seen, name)
+        setattr(problem, name, None if array is None else array.ctypes.data)
+    problem.reach_scale, problem.joint_precision, problem.close = REACH, JOINT_PRECISION, CLOSE
+    return problem
+
+
+solver = SolverLibrary()

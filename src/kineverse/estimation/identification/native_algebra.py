@@ -1,0 +1,145 @@
+"""C text: rotations and small matrices, as in :mod:`.rigid` and :mod:`.matrices`."""
+
+ALGEBRA = r"""
+#include <math.h>
+#include <stdint.h>
+#include <stdlib.h>
+#include <string.h>
+
+static void times33(const double *a, const double *b, double *c) {
+  for (int i = 0; i < 3; i++)
+    for (int j = 0; j < 3; j++)
+      c[3 * i + j] = a[3 * i] * b[j] + a[3 * i + 1] * b[3 + j] + a[3 * i + 2] * b[6 + j];
+}
+
+static void transposed_times33(const double *a, const double *b, double *c) {
+  for (int i = 0; i < 3; i++)
+    for (int j = 0; j < 3; j++) c[3 * i + j] = a[i] * b[j] + a[3 + i] * b[3 + j] + a[6 + i] * b[6 + j];
+}
+
+static void times_transposed33(const double *a, const double *b, double *c) {
+  for (int i = 0; i < 3; i++)
+    for (int j = 0; j < 3; j++)
+      c[3 * i + j] = a[3 * i] * b[3 * j] + a[3 * i + 1] * b[3 * j + 1] + a[3 * i + 2] * b[3 * j + 2];
+}
+
+static void apply(const double *a, const double *v, double *w) {
+  for (int i = 0; i < 3; i++) w[i] = a[3 * i] * v[0] + a[3 * i + 1] * v[1] + a[3 * i + 2] * v[2];
+}
+
+static void apply_transposed(const double *a, const double *v, double *w) {
+  for (int i = 0; i < 3; i++) w[i] = a[i] * v[0] + a[3 + i] * v[1] + a[6 + i] * v[2];
+}
+
+static void cross(const double *a, const double *b, double *c) {
+  c[0] = a[1] * b[2] - a[2] * b[1];
+  c[1] = a[2] * b[0] - a[0] * b[2];
+  c[2] = a[0] * b[1] - a[1] * b[0];
+}
+
+/* I + s [v]x + c [v]x^2 */
+static void series(const double *v, double s, double c, double *r) {
+  double square = v[0] * v[0] + v[1] * v[1] + v[2] * v[2];
+  for (int i = 0; i < 3; i++)
+    for (int j = 0; j < 3; j++) r[3 * i + j] = c * v[i] * v[j] + (i == j ? 1.0 - c * square : 0.0);
+  r[1] -= s * v[2]; r[2] += s * v[1]; r[5] -= s * v[0];
+  r[3] += s * v[2]; r[6] -= s * v[1]; r[7] += s * v[0];
+}
+
+static void exponential(const double *v, double *r) {
+  double square = v[0] * v[0] + v[1] * v[1] + v[2] * v[2], angle = sqrt(square);
+  if (square < 1e-10) series(v, 1.0 - square / 6.0, 0.5 - square / 24.0, r);
+  else series(v, sin(angle) / angle, (1.0 - cos(angle)) / square, r);
+}
+
+static void right_jacobian(const double *v, double *r) {
+  double square = v[0] * v[0] + v[1] * v[1] + v[2] * v[2], angle = sqrt(square);
+  if (square < 1e-6) series(v, square / 24.0 - 0.5, 1.0 / 6.0 - square / 120.0, r);
+  else series(v, (cos(angle) - 1.0) / square, (angle - sin(angle)) / (square * angle), r);
+}
+
+static void logarithm(const double *r, double *v) {
+  v[0] = 0.5 * (r[7] - r[5]);
+  v[1] = 0.5 * (r[2] - r[6]);
+  v[2] = 0.5 * (r[3] - r[1]);
+  double sine = sqrt(v[0] * v[0] + v[1] * v[1] + v[2] * v[2]), cosine = 0.5 * (r[0] + r[4] + r[8] - 1.0);
+  double angle = atan2(sine, cosine), factor = sine < 1e-9 ? 1.0 : angle / sine;
+  if (cosine >= -0.99) {
+    for (int i = 0; i < 3; i++) v[i] *= factor;
+    return;
+  }
+  /* Near half a turn R + R^T carries the direction. */
+  double c = cos(angle), axis[3], sign = 0.0, length = 0.0;
+  int most = 0;
+  for (int i = 1; i < 3; i++)
+    if (r[4 * i] > r[4 * most]) most = i;
+  for (int i = 0; i < 3; i++) {
+    axis[i] = 0.5 * (r[3 * i + most] + r[3 * most + i]) - (i == most ? c : 0.0);
+    length += axis[i] * axis[i];
+    sign += axis[i] * v[i];
+  }
+  factor = (sign < 0.0 ? -angle : angle) / sqrt(length);
+  for (int i = 0; i < 3; i++) v[i] = factor * axis[i];
+}
+
+/* The lower factor of a positive definite matrix in its place; 0 if it is none. */
+static int factorise(double *a, int n) {
+  for (int j = 0; j < n; j++) {
+    for (int k = 0; k < j; k++)
+      for (int i = j; i < n; i++) a[n * i + j] -= a[n * i + k] * a[n * j + k];
+    if (!(a[n * j + j] > 0.0)) return 0;
+    double d = a[n * j + j] = sqrt(a[n * j + j]);
+    for (int i = j + 1; i < n; i++) a[n * i + j] /= d;
+  }
+  return 1;
+}
+
+static void forward(const double *l, int n, double *x) {
+  for (int i = 0; i < n; i++) {
+    for (int k = 0; k < i; k++) x[i] -= l[n * i + k] * x[k];
+    x[i] /= l[n * i + i];
+  }
+}
+
+static void backward(const double *l, int n, double *x) {
+  for (int i = n - 1; i >= 0; i--) {
+    for (int k = i + 1; k < n; k++) x[i] -= l[n * k + i] * x[k];
+    x[i] /= l[n * i + i];
+  }
+}
+
+static int invert(const double *a, int n, double *inverse) {
+  double l[36], x[6];
+  memcpy(l, a, n * n * sizeof(double));
+  if (!factorise(l, n)) return 0;
+  for (int j = 0; j < n; j++) {
+    for (int i = 0; i < n; i++) x[i] = i == j;
+    forward(l, n, x);
+    backward(l, n, x);
+    for (int i = 0; i < n; i++) inverse[n * i + j] = x[i];
+  }
+  return 1;
+}
+
+static double squared(const double *error, const double *covariance, int n) {
+  double l[36], x[6], sum = 0.0;
+  memcpy(l, covariance, n * n * sizeof(double));
+  memcpy(x, error, n * sizeof(double));
+  if (!factorise(l, n)) return NAN;
+  forward(l, n, x);
+  for (int i = 0; i < n; i++) sum += x[i] * x[i];
+  return sum;
+}
+
+/* A covariance in the axes whose columns are R's. */
+static void turn(const double *covariance, const double *R, int n, double *turned) {
+  for (int i = 0; i < n; i += 3)
+    for (int j = 0; j < n; j += 3) {
+      double block[9], half[9], whole[9];
+      for (int r = 0; r < 9; r++) block[r] = covariance[n * (i + r / 3) + j + r % 3];
+      transposed_times33(R, block, half);
+      times33(half, R, whole);
+      for (int r = 0; r < 9; r++) turned[n * (i + r / 3) + j + r % 3] = whole[r];
+    }
+}
+"""
