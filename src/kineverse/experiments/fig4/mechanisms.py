@@ -87,7 +87,7 @@ def _followed(name: str, noise: Noise, configurations: int) -> Followed:
 
 def _outcome(run: Run, truth: Array, column: int) -> Outcome:
     kept = np.isfinite(run.q[:, column])
-    lost = 100 * float(1 - kept.mean())
+    lost = 100.0 * float((~kept).sum()) / len(kept)
     if not kept.any():
         return Outcome(np.nan, np.nan, np.nan, lost)
     error = np.abs(run.q - truth)[kept, column]
