@@ -29,8 +29,8 @@ def test_a_benchmark_measures_everybody_who_is_there(name, tiny):
         assert len(measurement.samples) in (1, tiny.rounds, tiny.processes)
     assert result.comparisons
     if HAS_PEERS:
-        # Pinocchio has no closed loops, and no search for what is near.
-        peer = {"loop": "casadi", "geometry": "mujoco"}.get(name, "pinocchio")
+        # Pinocchio has no closed loops, no search for what is near, and no filters.
+        peer = {"loop": "casadi", "geometry": "mujoco", "tracking": "numpy,"}.get(name, "pinocchio")
         assert any(peer in n or "pin" in n.split() for n in names)
         # There is no wheel of Bullet for every Python.
         assert all(c.value is not None for c in result.comparisons if "bullet" not in c.name)

@@ -19,6 +19,7 @@ BENCHMARKS: Mapping[str, str] = MappingProxyType(
         "batch": "pose and Jacobian at 100 000 configurations",
         "loop": "a closed loop and its derivative at one configuration",
         "geometry": "what is near, and how near: an arm among boxes, a robot in a kitchen",
+        "tracking": "a kitchen's coordinates from noisy poses of its doors and drawers",
         "import": "importing the library, and how many packages that takes",
         "memory": "the memory of a loaded robot",
         "document": "a robot in a kitchen, written down and read again; models of up to a million nodes",

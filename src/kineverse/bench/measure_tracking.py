@@ -1,0 +1,124 @@
+"""``tracking``: the shipped kitchen's 23 coordinates from the noisy poses of all that moves in it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+
+import numpy as np
+
+from kineverse.compile import compile  # noqa: A004
+from kineverse.estimation import ObservedPose, Tracker, pose_covariance
+from kineverse.formats import load
+from kineverse.model.model import Model
+
+from .agreement import Array
+from .peers import Field
+from .result import Result, at_most, faster
+from .settings import Settings
+from .timing import Contender, race, timed
+from .tracking_numpy import Form, NumpyFilter
+
+ARRAY, MAPPING = "kineverse, poses as one array", "kineverse, poses by frame"
+GAIN, INFORMATION = "numpy, textbook gain", "numpy, information form"
+
+POSITION, ORIENTATION = 0.01, math.radians(1.0)
+LONGEST = 1e-4
+"""What an update may take [s]; the papers' took 4 ms."""
+
+_UPDATES = 25
+# So many are compared, and done with the textbook gain, each of which takes as long as a hundred of ours.
+_CHECKED = 3
+
+
+def measure(settings: Settings) -> Result:
+    """Measure updates of a tracker beside filters written in numpy."""
+    model = load("kitchen")
+    frames = [name for name in model.frames if model.speeds_of(name)]
+    readings = _readings(model, frames, min(_UPDATES, settings.configurations))
+    covariance = pose_covariance(POSITION, ORIENTATION)
+    field = Field(
+        [*_ours(model, frames, covariance, readings), *_theirs(model, frames, covariance, readings)]
+    )
+    measured = race("tracking", field.contenders, settings.rounds, settings.progress)
+    return Result(
+        name="tracking",
+        work=(
+            f"an update of the {len(model.degrees_of_freedom)} coordinates of the shipped kitchen from the "
+            f"poses of {len(frames)} frames, iterated until it stands still; mean of {len(readings)} in a row, "
+            f"with the textbook gain of the first {len(readings[:_CHECKED])}"
+        ),
+        measurements=tuple(measured.values()),
+        comparisons=(
+            at_most(measured[ARRAY], LONGEST),
+            at_most(measured[MAPPING], 3 * LONGEST),
+            faster(measured, ARRAY, INFORMATION),
+            faster(measured, ARRAY, GAIN),
+        ),
+    )
+
+
+def _readings(model: Model, frames: list[str], count: int) -> list[Array]:
+    """Return what is seen of a kitchen whose doors are far from their limits, where limits change nothing."""
+    rng = np.random.default_rng(0)
+    symbols = model.degrees_of_freedom
+    low, high = np.array([model.limits(s) for s in symbols]).T
+    truth = low + rng.uniform(0.4, 0.6, len(symbols)) * (high - low)
+    poses = np.array(compile([model.fk(f) for f in frames], symbols)(truth))
+    return [_noisy(poses, rng) for _ in range(count)]
+
+
+def _noisy(poses: Array, rng: np.random.Generator) -> Array:
+    seen = poses.copy()
+    seen[:, :3, 3] += POSITION * rng.standard_normal((len(poses), 3))
+    vectors = ORIENTATION * rng.standard_normal((len(poses), 3))
+    angles = np.linalg.norm(vectors, axis=1)[:, None, None]
+    k = np.cross(np.eye(3), vectors[:, None, :]) / angles
+    turns = np.eye(3) + np.sin(angles) * k + (1 - np.cos(angles)) * (k @ k)
+    seen[:, :3, :3] = turns @ seen[:, :3, :3]
+    return seen
+
+
+def _ours(model: Model, frames: list[str], covariance: Array, readings: list[Array]) -> Iterator[Contender]:
+    first = Tracker(model, [ObservedPose(f, covariance=covariance) for f in frames])
+    first.wait()
+    mappings = [dict(zip(frames, seen, strict=True)) for seen in readings]
+
+    def by_array() -> None:
+        tracker = first.copy()
+        for seen in readings:
+            tracker.update_poses(seen)
+
+    def by_frame() -> None:
+        tracker = first.copy()
+        for seen in mappings:
+            tracker.update(seen)
+
+    def results() -> list[Array]:
+        tracker = first.copy()
+        estimates = [tracker.update_poses(seen) for seen in readings[:_CHECKED]]
+        states = np.array([[e.state[s] for s in tracker.symbols] for e in estimates])
+        return [states, np.array([np.diag(e.covariance) for e in estimates])]
+
+    yield Contender(ARRAY, timed(by_array, len(readings)), results)
+    yield Contender(MAPPING, timed(by_frame, len(readings)), results)
+
+
+def _theirs(model: Model, frames: list[str], covariance: Array, readings: list[Array]) -> Iterator[Contender]:
+    low, high = np.array([model.limits(s) for s in model.degrees_of_freedom]).T
+    forms: tuple[tuple[str, Form, int], ...] = (
+        (GAIN, "gain", _CHECKED),
+        (INFORMATION, "information", len(readings)),
+    )
+    for name, form, count in forms:
+        other = NumpyFilter(model, frames, covariance, (low + high) / 2, (high - low) ** 2 / 4, form)
+        some = readings[:count]
+
+        def results(other: NumpyFilter = other) -> list[Array]:
+            found = other.run(readings[:_CHECKED])
+            return [np.array([x for x, _ in found]), np.array([np.diag(P) for _, P in found])]
+
+        def run(other: NumpyFilter = other, some: list[Array] = some) -> None:
+            other.run(some)
+
+        yield Contender(name, timed(run, len(some)), results)
