@@ -2,11 +2,17 @@
 
 from __future__ import annotations
 
+import json
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from scipy.stats import norm
 
-from kineverse.experiments.estimation_grid.bound import across, bound
+from kineverse.experiments.estimation_grid.bound import across, attainable, bound
+from kineverse.experiments.estimation_grid.fits import SAMPLES, fit_all, fit_cell, grid, quick_grid
+from kineverse.experiments.estimation_grid.report import report
+from kineverse.experiments.estimation_grid.results import Result, summarise
 from kineverse.experiments.estimation_grid.samples import LEVER, TO_AXIS, Cell, draw
 
 DEG = np.pi / 180
@@ -123,6 +129,30 @@ def test_the_bound_is_that_of_all_unknowns_at_once(cell):
         np.testing.assert_allclose(found.point[0], sides.T @ covariance[3:6, 3:6] @ sides, rtol=1e-3)
 
 
+def test_short_motions_tell_as_much_as_joint_values_drawn_from_a_gaussian_would():
+    """The direction of a Gaussian cloud of variance s² along, with noise σ² all around, is known to σ²(s² + σ²)/(N s⁴)."""
+    # Only positions matter where orientations are exact; the errors of both poses add up.
+    cell = Cell("prismatic", 0.05, 1e-7, 50, 0.1)
+    samples = draw(cell, 2, np.random.default_rng(4))
+    spread, noise = samples.joint_values[0].var(), 2 * 0.05**2
+    expected = noise * (spread + noise) / (50 * spread**2)
+    np.testing.assert_allclose(
+        attainable(samples).direction, [expected * np.eye(2)] * 2, rtol=1e-3, atol=1e-6
+    )
+    np.testing.assert_allclose(
+        bound(samples).direction, [noise / spread / 50 * np.eye(2)] * 2, rtol=1e-3, atol=1e-6
+    )
+
+
+@by_cell
+def test_what_can_be_attained_is_the_bound_where_noise_is_small(cell):
+    exact = Cell(cell.joint, 1e-5, 1e-5, cell.count, cell.range)
+    samples = draw(exact, 3, np.random.default_rng(5))
+    np.testing.assert_allclose(attainable(samples).degrees, bound(samples).degrees, rtol=1e-4)
+    noisy = draw(cell, 3, np.random.default_rng(5))
+    assert (attainable(noisy).degrees > bound(noisy).degrees).all()
+
+
 def test_more_observations_and_longer_ways_tell_more():
     def degrees(count, reach):
         cell = Cell("revolute", 0.01, 3 * DEG, count, reach * DEG)
@@ -130,3 +160,79 @@ def test_more_observations_and_longer_ways_tell_more():
 
     assert degrees(40, 45) < degrees(20, 45) < degrees(20, 15)
     assert degrees(160, 45) == pytest.approx(degrees(40, 45) / 2, rel=0.05)
+
+
+def test_a_cell_is_fitted_the_same_way_each_time():
+    cell = Cell("revolute", 0.001, 1 * DEG, 10, 90 * DEG)
+    first, again = fit_cell(cell, 3), fit_cell(cell, 3)
+    np.testing.assert_array_equal(first.degrees, again.degrees)
+    assert first.right.all()
+    assert (first.degrees < 5 * first.bound_degrees).all()
+    assert (first.metres < 5 * first.bound_metres).all()
+    np.testing.assert_array_equal(fit_cell(cell, 2).degrees, fit_cell(cell, 2).degrees)
+
+
+def test_the_grid_has_18900_fits():
+    assert len(grid()) * SAMPLES == 18_900
+    assert set(quick_grid()) <= set(grid())
+
+
+def made_up(cell, ratio, right=True, count=40):
+    """A result whose errors are at so many times what can be attained, which is 1.2 times the bound."""
+    bounds = np.full(count, 2.0)
+    errors = ratio * 1.2 * bounds
+    turns = cell.joint == "revolute"
+    return Result(
+        cell=cell,
+        degrees=errors,
+        metres=errors / 100 if turns else np.full(count, np.nan),
+        bound_degrees=bounds,
+        bound_metres=bounds / 100 if turns else np.full(count, np.nan),
+        attainable_degrees=1.2 * bounds,
+        attainable_metres=1.2 * bounds / 100,
+        spread=1 / count,
+        right=np.full(count, right),
+        told=np.full(count, True),
+        called=(cell.joint if right else "rigid",) * count,
+    )
+
+
+def test_ratios_are_told_apart_from_chance():
+    hinge, slider = CELLS[0], CELLS[2]
+    good = summarise([made_up(hinge, 1.0), made_up(slider, 1.0)])
+    assert good.attainable.direction == pytest.approx(1.0)
+    assert good.attainable.place == pytest.approx(1.0)
+    assert good.bound.direction == pytest.approx(1.2)
+    assert (good.attainable.over, good.bound.over, good.right, good.told_wrong) == (0, 2, 1.0, 0)
+    # A Gaussian of 40 samples, two components each, exceeds 1.21 times its mean square so often.
+    assert good.over_by_chance == pytest.approx(2 * norm.sf(0.21 * np.sqrt(40)))
+    bad = summarise([made_up(hinge, 1.3, right=False), made_up(slider, 1.0)])
+    assert (bad.attainable.over, bad.right, bad.told_wrong) == (1, 0.5, 40)
+
+
+def test_divergences_are_what_is_far_off_and_what_is_not_there():
+    far = made_up(CELLS[0], 1.0)
+    far.degrees[3] = 60.0
+    far.degrees[4] = np.nan
+    assert far.diverged == 2
+    assert made_up(CELLS[0], 1.0).diverged == 0
+
+
+def test_the_report_says_which_bars_hold(tmp_path):
+    made = report([made_up(CELLS[0], 1.0), made_up(CELLS[2], 1.0)])
+    holds = {row[0]: row[3] for row in made.tables[0].rows}
+    assert holds["RMS of the direction over what can be attained, that below 10 deg"] == "yes"
+    assert holds["RMS of the direction over the Cramér-Rao bound, that below 10 deg"] == "no"
+    assert json.loads(json.dumps(made.numbers, allow_nan=False)) == made.numbers
+    pytest.importorskip("matplotlib")
+    made.figure.save(tmp_path / "grid.png")
+    assert (tmp_path / "grid.png").stat().st_size > 10_000
+
+
+def test_processes_give_what_one_gives():
+    cells = [Cell("prismatic", 0.001, 1 * DEG, n, 0.4) for n in (5, 6)]
+    alone = fit_all(cells, 2, lambda items, what, unit: items, workers=1)
+    together = fit_all(cells, 2, lambda items, what, unit: items, workers=2)
+    for one, other in zip(alone, together, strict=True):
+        assert one.cell == other.cell
+        np.testing.assert_array_equal(one.degrees, other.degrees)

@@ -4,12 +4,19 @@ Unknown are the axis, the child's pose at zero, and for each observation the joi
 true pose. Seen are both poses, twelve numbers with independent errors. Their derivatives by all unknowns give
 the Fisher information; joint values and parents' poses are eliminated one observation at a time. Nothing here
 comes from the estimator.
+
+A motion that is short beside the noise is not known so well by anyone. What tells the axis is the spread s²
+of the joint values, and these are known themselves with a variance c² only; of the spread s⁴/(s² + c²) is
+left, as in any regression with errors in both variables. :func:`attainable` is the bound with the joint values
+drawn together by that. For a slider with equal noise all around it is exactly that of joint values drawn from
+a Gaussian; as N grows the maximum of the likelihood reaches it, and not the other one.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -55,8 +62,7 @@ def bound(samples: Samples) -> Bound:
     """Return the Cramér-Rao bound of samples."""
     cell = samples.cell
     shared = 8 if cell.joint == "prismatic" else 10
-    derivative = np.stack([_difference(samples, shared, k) for k in range(shared + OWN)], axis=-1)
-    weighed = derivative / _deviations(cell)[:, None]
+    weighed = _derivatives(samples, shared, range(shared + OWN))
     # The joint's zero is a matter of choice: without a loss the first joint value is taken as known.
     weighed[:, 0, :, -1] = 0.0
     of_shared, of_own = weighed[..., :shared], weighed[..., shared:]
@@ -70,12 +76,30 @@ def bound(samples: Samples) -> Bound:
     return Bound(covariance[:, :2, :2], covariance[:, 2:4, 2:4] if cell.joint == "revolute" else nowhere)
 
 
+def attainable(samples: Samples) -> Bound:
+    """Return the bound with joint values as near to each other as they can be told apart, see the module."""
+    shared = 8 if samples.cell.joint == "prismatic" else 10
+    own = _derivatives(samples, shared, range(shared, shared + OWN))
+    variance = np.linalg.inv(_transposed(own) @ own)[..., -1, -1]
+    values = samples.joint_values
+    middle, spread = values.mean(axis=1, keepdims=True), values.var(axis=1, keepdims=True)
+    left = np.sqrt(spread / (spread + variance))
+    return bound(replace(samples, joint_values=middle + left * (values - middle)))
+
+
 def across(axis: Array) -> Array:
     """Return two directions across each axis (S, 3), and each other, (S, 3, 2)."""
     least = np.eye(3)[np.argmin(np.abs(axis), axis=1)]
     first = np.cross(axis, least)
     first /= np.linalg.norm(first, axis=1, keepdims=True)
     return np.stack([first, np.cross(axis, first)], axis=-1)
+
+
+def _derivatives(samples: Samples, shared: int, unknowns: Sequence[int]) -> Array:
+    """Return the derivatives of what is seen by some unknowns, in standard deviations: (S, N, 12, n)."""
+    found = np.stack([_difference(samples, shared, k) for k in unknowns], axis=-1)
+    weighed: Array = found / _deviations(samples.cell)[:, None]
+    return weighed
 
 
 def _difference(samples: Samples, shared: int, k: int) -> Array:

@@ -1,54 +1,64 @@
-"""The estimation grid as a picture: errors and types against the bound."""
+"""The estimation grid as a picture: errors and types against what can be known."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
-import numpy as np
-
-from kineverse.experiments.estimation_grid.results import LEAST_RIGHT, MOST_OVER, NEAR, TELLING, Result
+from kineverse.experiments.estimation_grid.results import (
+    LEAST_RIGHT,
+    MOST_OVER,
+    NEAR,
+    TELLING,
+    Result,
+    rms,
+)
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure as Canvas
 
 SIZE = (13.0, 8.0)
 COLORS = {"revolute": "tab:blue", "prismatic": "tab:orange"}
 NAMES = {"revolute": "hinge", "prismatic": "slider"}
+TOP = 2.5
+"""Larger ratios are drawn at the edge."""
 
 
 def draw_grid(canvas: Canvas, results: Sequence[Result]) -> None:
-    """Draw a point for each cell: errors over bounds, and how many types are right, against the bound."""
-    (error, place), (ratio, right) = canvas.subplots(2, 2)
-    for joint, color in COLORS.items():
-        chosen = [r for r in results if r.cell.joint == joint]
-        bounds = [r.bound for r in chosen]
-        style = {"color": color, "s": 14, "alpha": 0.7, "label": NAMES[joint]}
-        error.scatter(bounds, [_rms(r.degrees) for r in chosen], **style)
-        ratio.scatter(bounds, [r.ratio for r in chosen], **style)
-        right.scatter(bounds, [100.0 * float(r.right.mean()) for r in chosen], **style)
-        if joint == "revolute":
-            limits = [1e3 * _rms(r.bound_metres) for r in chosen]
-            place.scatter(limits, [1e3 * _rms(r.metres) for r in chosen], **style)
-            place.plot([min(limits), max(limits)], [min(limits), max(limits)], color="0.5", linewidth=1)
-    ends = [min(r.bound for r in results), max(r.bound for r in results)]
-    error.plot(ends, ends, color="0.5", linewidth=1, label="the bound")
-    ratio.axhline(1.0, color="0.5", linewidth=1)
-    ratio.axhline(MOST_OVER, color="tab:red", linewidth=1, linestyle="--")
-    ratio.axvline(NEAR, color="tab:red", linewidth=1, linestyle="--")
-    right.axhline(100.0 * LEAST_RIGHT, color="tab:red", linewidth=1, linestyle="--")
-    right.axvline(TELLING, color="tab:red", linewidth=1, linestyle="--")
-    for axes in (error, ratio, right):
-        axes.set(xlabel="bound of the direction of the axis [deg]", xscale="log")
-    error.set(title="direction of the axis", ylabel="RMS [deg]", yscale="log")
-    ratio.set(title="direction of the axis over its bound", ylabel="RMS / bound", ylim=(0.0, 2.0))
-    right.set(title="most probable type is right", ylabel="of the fits [%]", ylim=(-3.0, 103.0))
-    place.set(
-        title="place of a hinge's axis", xlabel="bound [mm]", ylabel="RMS [mm]", xscale="log", yscale="log"
-    )
-    error.legend()
+    """Draw a point for each cell: errors over both bounds, and how many types are right."""
+    (bound, attained), (place, right) = canvas.subplots(2, 2)
+    _ratios(bound, results, [r.bound for r in results], [r.ratio for r in results])
+    bound.set(title="direction, over the Cramér-Rao bound", xlabel="the bound [deg]")
+    _ratios(attained, results, [r.attainable for r in results], [r.attained for r in results])
+    attained.set(title="direction, over what can be attained", xlabel="what can be attained [deg]")
+    turning = [r for r in results if r.cell.joint == "revolute"]
+    reach = [rms(r.attainable_metres) for r in turning]
+    over = [rms(r.metres) / best for r, best in zip(turning, reach, strict=True)]
+    _ratios(place, turning, [r.attainable for r in turning], over)
+    place.set(title="place of a hinge's axis, over what can be attained", xlabel="attainable direction [deg]")
+    _scatter(right, results, [r.bound for r in results], [100.0 * float(r.right.mean()) for r in results])
+    _bars(right, TELLING, 100.0 * LEAST_RIGHT)
+    right.set(title="the most probable type is right", ylabel="of the fits [%]", ylim=(-3.0, 103.0))
+    right.set(xlabel="the Cramér-Rao bound of the direction [deg]", xscale="log")
     right.legend(loc="lower left")
 
 
-def _rms(values: np.ndarray[tuple[int, ...], np.dtype[np.float64]]) -> float:
-    return float(np.sqrt(np.mean(values**2)))
+def _ratios(axes: Axes, results: Sequence[Result], across: Sequence[float], ratios: Sequence[float]) -> None:
+    _scatter(axes, results, across, [min(ratio, TOP) for ratio in ratios])
+    axes.axhline(1.0, color="0.5", linewidth=1.0)
+    _bars(axes, NEAR, MOST_OVER)
+    axes.set(ylabel="RMS / bound", ylim=(0.0, 1.02 * TOP), xscale="log")
+
+
+def _bars(axes: Axes, across: float, up: float) -> None:
+    axes.axhline(up, color="tab:red", linewidth=1.0, linestyle="--")
+    axes.axvline(across, color="tab:red", linewidth=1.0, linestyle="--")
+
+
+def _scatter(axes: Axes, results: Sequence[Result], across: Sequence[float], up: Sequence[float]) -> None:
+    for joint, color in COLORS.items():
+        chosen = [k for k, r in enumerate(results) if r.cell.joint == joint]
+        if chosen:
+            xs, ys = [across[k] for k in chosen], [up[k] for k in chosen]
+            axes.scatter(xs, ys, s=14.0, alpha=0.7, color=color, label=NAMES[joint])

@@ -16,7 +16,7 @@ import numpy.typing as npt
 from kineverse.errors import KineverseError
 from kineverse.estimation import identify, pose_covariance
 from kineverse.estimation.identification.fit import Fit
-from kineverse.experiments.estimation_grid.bound import Bound, bound
+from kineverse.experiments.estimation_grid.bound import Bound, attainable, bound
 from kineverse.experiments.estimation_grid.results import Result
 from kineverse.experiments.estimation_grid.samples import Cell, Joint, Samples, draw
 from kineverse.experiments.registry import Progress
@@ -87,7 +87,7 @@ def fit_all(
 def fit_cell(cell: Cell, count: int) -> Result:
     """Fit so many samples of a cell; the same ones each time."""
     samples = draw(cell, count, np.random.default_rng(_seed(cell)))
-    limit = bound(samples)
+    limit, reach = bound(samples), attainable(samples)
     fits = [_fit(samples, k) for k in range(count)]
     return Result(
         cell=cell,
@@ -95,7 +95,9 @@ def fit_cell(cell: Cell, count: int) -> Result:
         metres=np.array([_metres(fit, samples, k) for k, (fit, _, _) in enumerate(fits)]),
         bound_degrees=limit.degrees,
         bound_metres=limit.metres,
-        spread=_spread(limit),
+        attainable_degrees=reach.degrees,
+        attainable_metres=reach.metres,
+        spread=_spread(reach),
         right=np.array([called == cell.joint for _, called, _ in fits]),
         told=np.array([told for _, _, told in fits]),
         called=tuple(called for _, called, _ in fits),

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
-from typing import Any
+from collections.abc import Callable, Hashable, Iterable, Sequence
+from dataclasses import asdict
+from typing import Any, TypeVar
 
 from kineverse.experiments.estimation_grid.figure import SIZE, draw_grid
 from kineverse.experiments.estimation_grid.fits import SAMPLES, SEED, fit_all, grid, quick_grid
@@ -13,8 +14,10 @@ from kineverse.experiments.estimation_grid.results import (
     MOST_OVER,
     NEAR,
     TELLING,
+    Ratios,
     Result,
     Summary,
+    rms,
     summarise,
 )
 from kineverse.experiments.estimation_grid.samples import LEVER, TO_AXIS, Cell
@@ -26,6 +29,9 @@ OPTIONS = ("quick",)
 
 QUICK_SAMPLES = 10
 WORST = 10
+
+Key = TypeVar("Key", bound=Hashable)
+Cells = tuple[float | str, ...]
 
 
 def run(progress: Progress, options: Options) -> Report:
@@ -40,12 +46,12 @@ def report(results: Sequence[Result]) -> Report:
     return Report(
         name="estimation-grid",
         title=f"Hinges and sliders from noisy poses: {total.fits} fits in {total.cells} cells",
-        tables=(_bars(total), _by_noise(results), _by_range(results), _worst(results)),
+        tables=(_bars(total), _by_noise(results), _by_range(results), _by_count(results), _worst(results)),
         numbers={
             "seed": SEED,
             "geometry": {"parent_to_axis": TO_AXIS, "axis_to_child": LEVER},
             "bars": {"near_deg": NEAR, "telling_deg": TELLING, "ratio": MOST_OVER, "right": LEAST_RIGHT},
-            "summary": {name: _plain(getattr(total, name)) for name in Summary.__dataclass_fields__},
+            "summary": _plain(asdict(total)),
             "cells": [_numbers(result) for result in results],
         },
         figure=Figure(lambda canvas: draw_grid(canvas, results), SIZE),
@@ -53,80 +59,102 @@ def report(results: Sequence[Result]) -> Report:
 
 
 def _bars(total: Summary) -> Table:
+    by_chance = total.over_by_chance
+    chance = f"{by_chance:.1f} by chance"
     return Table(
         "What is asked for, and what came out",
         ("", "measured", "asked for", "holds"),
         (
+            *_errors("the Cramér-Rao bound", total.bound),
+            *_errors("what can be attained", total.attainable),
             (
-                f"RMS of the direction over its bound, where that is below {NEAR:g} deg",
-                total.ratio,
-                f"<= {MOST_OVER:g}",
-                _holds(total.ratio <= MOST_OVER),
-            ),
-            (
-                "RMS of the place over its bound, in the same cells",
-                total.place_ratio,
-                f"<= {MOST_OVER:g}",
-                _holds(total.place_ratio <= MOST_OVER),
-            ),
-            (
-                f"cells above {MOST_OVER:g}, of {total.near}",
-                float(total.over),
-                f"{total.over_by_chance:.1f} by chance",
-                _holds(total.over <= total.over_by_chance + 3.0 * math.sqrt(total.over_by_chance)),
+                f"cells over {MOST_OVER:g} of what can be attained",
+                float(total.attainable.over),
+                chance,
+                _holds(total.attainable.over <= by_chance + 3.0 * math.sqrt(by_chance)),
             ),
             ("divergences", float(total.diverged), "0", _holds(total.diverged == 0)),
-            (
-                f"right type, where the bound is below {TELLING:g} deg",
-                total.right,
-                f">= {LEAST_RIGHT:g}",
-                _holds(total.right >= LEAST_RIGHT),
-            ),
-            ('told rather than "cannot tell", in the same cells', total.told, "-", "-"),
-            ("told, and wrong, in all cells", float(total.told_wrong), "-", "-"),
+            _right("right type, the Cramér-Rao bound", total.right),
+            _right("right type, what can be attained", total.right_attainable),
+            (f'told rather than "cannot tell", the bound below {TELLING:g} deg', _dash(total.told), "-", "-"),
+            ("told, and wrong, anywhere", float(total.told_wrong), "-", "-"),
         ),
     )
 
 
-def _by_noise(results: Sequence[Result]) -> Table:
-    rows = [
-        (joint, 1e3 * position, math.degrees(orientation), *_cells(chosen))
-        for (joint, position, orientation), chosen in _grouped(
-            results, lambda cell: (cell.joint, cell.position, cell.orientation)
+def _errors(what: str, ratios: Ratios) -> tuple[Cells, ...]:
+    """Return the rows on errors over a bound."""
+    asked = f"<= {MOST_OVER:g}"
+    return tuple(
+        (
+            f"RMS of the {part} over {what}, that below {NEAR:g} deg",
+            _dash(ratio),
+            asked,
+            _holds(ratio <= MOST_OVER),
         )
-    ]
-    return Table("By noise of both poses", ("joint", "noise [mm]", "noise [deg]", *_HEAD), tuple(rows))
+        for part, ratio in (("direction", ratios.direction), ("place", ratios.place))
+    )
+
+
+def _right(what: str, part: float) -> Cells:
+    return (f"{what} below {TELLING:g} deg", _dash(part), f">= {LEAST_RIGHT:g}", _holds(part >= LEAST_RIGHT))
+
+
+_HEAD = ("fits", "RMS/bound", "RMS/attainable", "place/attainable", "right", "told", "diverged")
+
+
+def _by_noise(results: Sequence[Result]) -> Table:
+    return Table(
+        f"By noise of both poses; errors where what they are held against is below {NEAR:g} deg",
+        ("joint", "noise [mm]", "noise [deg]", *_HEAD),
+        tuple(
+            (joint, 1e3 * position, math.degrees(orientation), *_cells(chosen))
+            for (joint, position, orientation), chosen in _grouped(
+                results, lambda cell: (cell.joint, cell.position, cell.orientation)
+            )
+        ),
+    )
 
 
 def _by_range(results: Sequence[Result]) -> Table:
-    rows = [
-        (joint, said(joint, reach), *_cells(chosen))
-        for (joint, reach), chosen in _grouped(results, lambda cell: (cell.joint, cell.range))
-    ]
-    return Table("By range of the motion", ("joint", "range", *_HEAD), tuple(rows))
+    groups = _grouped(results, lambda cell: (cell.joint, cell.range))
+    rows = tuple((joint, said(joint, reach), *_cells(chosen)) for (joint, reach), chosen in groups)
+    return Table("By range of the motion", ("joint", "range", *_HEAD), rows)
 
 
-_HEAD = ("fits", "near", "RMS/bound", "place", "worst cell", "right", "told", "diverged")
+def _by_count(results: Sequence[Result]) -> Table:
+    groups = _grouped(results, lambda cell: (cell.joint, cell.count))
+    rows = tuple((joint, float(count), *_cells(chosen)) for (joint, count), chosen in groups)
+    return Table("By number of observations", ("joint", "N", *_HEAD), rows)
 
 
-def _cells(results: Sequence[Result]) -> tuple[float | str, ...]:
+def _cells(results: Sequence[Result]) -> Cells:
     part = summarise(results)
-    near = f"{part.near} of {part.cells}"
-    ratios = (
-        _dash(part.ratio),
-        _dash(part.place_ratio),
-        _dash(part.worst),
-        _dash(part.right),
-        _dash(part.told),
+    numbers = (
+        part.bound.direction,
+        part.attainable.direction,
+        part.attainable.place,
+        part.right,
+        part.told,
     )
-    return (float(part.fits), near, *ratios, float(part.diverged))
+    return (float(part.fits), *map(_dash, numbers), float(part.diverged))
 
 
 def _worst(results: Sequence[Result]) -> Table:
-    near = sorted((r for r in results if r.bound < NEAR), key=lambda r: -r.ratio)[:WORST]
+    near = sorted((r for r in results if r.attainable < NEAR), key=lambda r: -r.attained)[:WORST]
     return Table(
-        f"The cells farthest above their bounds, of those below {NEAR:g} deg",
-        ("joint", "noise [mm]", "noise [deg]", "N", "range", "bound [deg]", "RMS/bound", "right"),
+        f"The cells farthest above what can be attained, where that is below {NEAR:g} deg",
+        (
+            "joint",
+            "noise [mm]",
+            "noise [deg]",
+            "N",
+            "range",
+            "bound [deg]",
+            "attainable",
+            "RMS [deg]",
+            "right",
+        ),
         tuple(
             (
                 r.cell.joint,
@@ -135,7 +163,8 @@ def _worst(results: Sequence[Result]) -> Table:
                 float(r.cell.count),
                 said(r.cell.joint, r.cell.range),
                 r.bound,
-                r.ratio,
+                r.attainable,
+                rms(r.degrees),
                 float(r.right.mean()),
             )
             for r in near
@@ -148,16 +177,15 @@ def said(joint: str, reach: float) -> str:
     return f"{math.degrees(reach):.0f} deg" if joint == "revolute" else f"{100 * reach:.0f} cm"
 
 
-def _grouped(results: Iterable[Result], key: Any) -> Iterable[tuple[Any, list[Result]]]:
-    groups: dict[Any, list[Result]] = {}
+def _grouped(results: Iterable[Result], key: Callable[[Cell], Key]) -> Iterable[tuple[Key, list[Result]]]:
+    groups: dict[Key, list[Result]] = {}
     for result in results:
         groups.setdefault(key(result.cell), []).append(result)
     return groups.items()
 
 
 def _numbers(result: Result) -> dict[str, Any]:
-    cell: Cell = result.cell
-    taken = {name: result.called.count(name) for name in sorted(set(result.called))}
+    cell = result.cell
     return {
         "joint": cell.joint,
         "position_noise": cell.position,
@@ -166,19 +194,25 @@ def _numbers(result: Result) -> dict[str, Any]:
         "range": cell.range,
         "samples": len(result.degrees),
         "bound_deg": result.bound,
-        "ratio": _plain(result.ratio),
-        "place_ratio": _plain(result.place_ratio),
+        "attainable_deg": result.attainable,
+        "rms_deg": _plain(rms(result.degrees)),
+        "bound_m": _plain(rms(result.bound_metres)),
+        "attainable_m": _plain(rms(result.attainable_metres)),
+        "rms_m": _plain(rms(result.metres)),
         "above_by_chance": result.by_chance,
         "right": float(result.right.mean()),
         "told": float(result.told.mean()),
         "told_wrong": int((result.told & ~result.right).sum()),
-        "taken_for": taken,
+        "taken_for": {name: result.called.count(name) for name in sorted(set(result.called))},
         "diverged": result.diverged,
     }
 
 
-def _plain(value: float) -> float | None:
-    return value if math.isfinite(value) else None
+def _plain(value: Any) -> Any:
+    """Return values as JSON has them: nothing for what is not finite."""
+    if isinstance(value, dict):
+        return {name: _plain(inner) for name, inner in value.items()}
+    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def _dash(value: float) -> float | str:

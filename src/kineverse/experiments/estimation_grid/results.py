@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,13 +15,13 @@ Array = npt.NDArray[np.float64]
 Flags = npt.NDArray[np.bool_]
 
 NEAR, TELLING = 10.0, 5.0
-"""Where the bound is below these [deg], errors are held against it, and types have to be right."""
+"""Where a bound is below these [deg], errors are held against it, and types have to be right."""
 
 MOST_OVER, LEAST_RIGHT = 1.1, 0.99
-"""How much errors may exceed the bound, and how many types have to be right."""
+"""How much errors may exceed a bound, and how many types have to be right."""
 
 FAR_OFF = 6.0
-"""An error of so many times its bound is a divergence: by chance one in some hundred millions is."""
+"""An error of so many times what can be attained is a divergence: by chance, hardly one in a million is."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,9 +36,11 @@ class Result:
         How far the axis found is off in direction and place, (S,); NaN where there is none, as the place of a
         slider.
     bound_degrees, bound_metres
-        The bounds of these, (S,).
+        The Cramér-Rao bounds of these, (S,), see :func:`.bound.bound`.
+    attainable_degrees, attainable_metres
+        What can be attained at best, (S,), see :func:`.bound.attainable`.
     spread
-        The relative variance of the sum of squares of ``degrees`` by chance, if they are at the bound.
+        The relative variance of the sum of squares of ``degrees`` by chance, at what can be attained.
     right
         Whether the most probable family is the true one, (S,).
     told
@@ -52,6 +54,8 @@ class Result:
     metres: Array
     bound_degrees: Array
     bound_metres: Array
+    attainable_degrees: Array
+    attainable_metres: Array
     spread: float
     right: Flags
     told: Flags
@@ -59,32 +63,60 @@ class Result:
 
     @property
     def bound(self) -> float:
-        """The bound of the root mean square of the direction's error [deg]."""
-        return _rms(self.bound_degrees)
+        """The Cramér-Rao bound of the root mean square of the direction's error [deg]."""
+        return rms(self.bound_degrees)
+
+    @property
+    def attainable(self) -> float:
+        """What can be attained at best of it [deg]."""
+        return rms(self.attainable_degrees)
 
     @property
     def ratio(self) -> float:
-        """Root mean square of the direction's error over its bound."""
-        return _rms(self.degrees) / self.bound
+        """Root mean square of the direction's error over its Cramér-Rao bound."""
+        return rms(self.degrees) / self.bound
 
     @property
-    def place_ratio(self) -> float:
-        """Root mean square of the place's error over its bound; NaN for sliders."""
-        return _rms(self.metres) / _rms(self.bound_metres)
+    def attained(self) -> float:
+        """Root mean square of the direction's error over what can be attained."""
+        return rms(self.degrees) / self.attainable
 
     @property
     def diverged(self) -> int:
-        """How many have no axis, or where the bound is near, one that is far off."""
+        """How many have no axis, or where it can be known, one that is far off."""
         lost = ~np.isfinite(self.degrees)
-        if self.bound < NEAR:
-            lost |= self.degrees > FAR_OFF * self.bound_degrees
+        if self.attainable < NEAR:
+            lost |= self.degrees > FAR_OFF * self.attainable_degrees
         return int(lost.sum())
 
     @property
     def by_chance(self) -> float:
-        """How probable it is that errors at the bound exceed it by too much, with so many samples."""
+        """How probable it is that errors at what can be attained exceed it by too much all the same."""
         excess = (MOST_OVER**2 - 1.0) / math.sqrt(self.spread)
         return 0.5 * math.erfc(excess / math.sqrt(2.0))
+
+
+@dataclass(frozen=True)
+class Ratios:
+    """Errors over a bound, in the cells where that is near.
+
+    Attributes
+    ----------
+    near
+        How many cells these are.
+    direction, place
+        Root mean squares over the bounds, all fits together; NaN if there are none.
+    worst
+        The largest ratio of the direction in a cell.
+    over
+        In how many cells that is more than it may be.
+    """
+
+    near: int
+    direction: float
+    place: float
+    worst: float
+    over: int
 
 
 @dataclass(frozen=True)
@@ -95,20 +127,16 @@ class Summary:
     ----------
     cells, fits
         How many there are.
-    near
-        In how many cells the bound is near.
-    ratio, place_ratio
-        Root mean square of errors over their bounds there, all fits together; NaN if there are none.
-    worst
-        The largest ratio of a cell there.
-    over, over_by_chance
-        How many cells there exceed the bound by too much, and how many would by chance.
+    bound, attainable
+        Errors over the Cramér-Rao bound, and over what can be attained.
+    over_by_chance
+        In how many cells errors would be too much above what can be attained by chance.
     right
-        How many types are right, as a part, where the bound tells; NaN if it does nowhere.
-    least_right
-        The same in the worst cell.
+        How many types are right, as a part, where the Cramér-Rao bound tells; NaN if it does nowhere.
+    right_attainable
+        The same where what can be attained tells.
     told
-        How many were told, rather than answered by "cannot tell", as a part, in the same cells.
+        How many were told, rather than answered by "cannot tell", as a part, in the cells of ``right``.
     told_wrong
         How many of all fits were told, and wrong.
     diverged
@@ -117,14 +145,11 @@ class Summary:
 
     cells: int
     fits: int
-    near: int
-    ratio: float
-    place_ratio: float
-    worst: float
-    over: int
+    bound: Ratios
+    attainable: Ratios
     over_by_chance: float
     right: float
-    least_right: float
+    right_attainable: float
     told: float
     told_wrong: int
     diverged: int
@@ -132,33 +157,39 @@ class Summary:
 
 def summarise(results: Sequence[Result]) -> Summary:
     """Return several cells together."""
-    near = [r for r in results if r.bound < NEAR]
     telling = [r for r in results if r.bound < TELLING]
-    turning = [r for r in near if r.cell.joint == "revolute"]
     return Summary(
         cells=len(results),
         fits=sum(len(r.degrees) for r in results),
-        near=len(near),
-        ratio=_pooled(near, lambda r: r.degrees / r.bound_degrees),
-        place_ratio=_pooled(turning, lambda r: r.metres / r.bound_metres),
-        worst=max((r.ratio for r in near), default=math.nan),
-        over=sum(not r.ratio <= MOST_OVER for r in near),
-        over_by_chance=sum(r.by_chance for r in near),
+        bound=_ratios([(r, r.bound_degrees, r.bound_metres) for r in results]),
+        attainable=_ratios([(r, r.attainable_degrees, r.attainable_metres) for r in results]),
+        over_by_chance=sum(r.by_chance for r in results if r.attainable < NEAR),
         right=_part([r.right for r in telling]),
-        least_right=min((float(r.right.mean()) for r in telling), default=math.nan),
+        right_attainable=_part([r.right for r in results if r.attainable < TELLING]),
         told=_part([r.told for r in telling]),
         told_wrong=sum(int((r.told & ~r.right).sum()) for r in results),
         diverged=sum(r.diverged for r in results),
     )
 
 
-def _pooled(results: Sequence[Result], relative: Callable[[Result], Array]) -> float:
-    return _rms(np.concatenate([relative(r) for r in results])) if results else math.nan
+def rms(values: Array) -> float:
+    """Return a root mean square."""
+    return float(np.sqrt(np.mean(values**2)))
+
+
+def _ratios(results: Sequence[tuple[Result, Array, Array]]) -> Ratios:
+    near = [entry for entry in results if rms(entry[1]) < NEAR]
+    cells = [rms(result.degrees) / rms(degrees) for result, degrees, _ in near]
+    directions = [result.degrees / degrees for result, degrees, _ in near]
+    places = [result.metres / metres for result, _, metres in near if result.cell.joint == "revolute"]
+    return Ratios(
+        near=len(near),
+        direction=rms(np.concatenate(directions)) if directions else math.nan,
+        place=rms(np.concatenate(places)) if places else math.nan,
+        worst=max(cells, default=math.nan),
+        over=sum(not ratio <= MOST_OVER for ratio in cells),
+    )
 
 
 def _part(flags: Sequence[Flags]) -> float:
     return float(np.concatenate(flags).mean()) if flags else math.nan
-
-
-def _rms(values: Array) -> float:
-    return float(np.sqrt(np.mean(values**2)))
