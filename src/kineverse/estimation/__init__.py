@@ -1,11 +1,13 @@
 """Layer 5: where things are, from noisy observations, and how they move.
 
 :mod:`kineverse.estimation.tracking` estimates the state of a model that is known,
-:mod:`kineverse.estimation.identification` the model of parts whose poses are known.
+:mod:`kineverse.estimation.identification` the model of parts whose poses are known, and
+:mod:`kineverse.estimation.rating` says whether a model explains what is seen.
 """
 
 from .identification import Fit, Found, identify
 from .noise import pose_covariance
+from .rating import ImplausibleError, Plausibility, PlausibilityMonitor, Rating, plausibility
 from .tracking import (
     Estimate,
     Hypotheses,
@@ -21,11 +23,16 @@ __all__ = [
     "Fit",
     "Found",
     "Hypotheses",
+    "ImplausibleError",
     "ObservedExpression",
     "ObservedPose",
     "ObservedPosition",
     "Outliers",
+    "Plausibility",
+    "PlausibilityMonitor",
+    "Rating",
     "Tracker",
     "identify",
+    "plausibility",
     "pose_covariance",
 ]

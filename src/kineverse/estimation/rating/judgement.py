@@ -1,0 +1,129 @@
+"""One articulation beside what else could be there, and what is proposed instead."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from types import MappingProxyType
+
+import numpy as np
+import numpy.typing as npt
+
+from kineverse.errors import KineverseError
+from kineverse.estimation.identification.fit import SURE, Found
+from kineverse.estimation.identification.identify import identify
+from kineverse.estimation.identification.observations import Observations
+from kineverse.model.model import Model
+from kineverse.model.operation import Operation
+
+from .evidence import LOG_ANYWHERE, log_evidence
+from .links import Link
+from .misfit import Misfit
+from .proposal import proposal
+from .report import Rating
+from .served import Served
+
+BELIEFS: Mapping[str, float] = MappingProxyType({"served": 0.8, "rigid": 0.1, "other": 0.1})
+"""How probable it is beforehand that an articulation is as served, does not move, or is something else."""
+
+# Fewer observations do not show how something moves.
+_ENOUGH = 5
+
+Families = Iterable[str] | Mapping[str, float] | None
+
+
+@dataclass(frozen=True)
+class Seen:
+    """A link and how it was seen.
+
+    Attributes
+    ----------
+    observations
+        Of both frames.
+    misfit
+        What of them the articulation does not explain.
+    times
+        The numbers of the observations, (N,).
+    """
+
+    link: Link
+    served: Served
+    observations: Observations
+    misfit: Misfit
+    times: npt.NDArray[np.int_]
+
+    def since(self, number: int) -> Seen:
+        """Return how it was seen from an observation on."""
+        first = int(np.searchsorted(self.times, number))
+        o = self.observations
+        later = Observations(
+            o.parent[first:],
+            o.child[first:],
+            None if o.parent_covariance is None else o.parent_covariance[first:],
+            o.child_covariance[first:],
+        )
+        return Seen(self.link, self.served, later, self.misfit.since(first), self.times[first:])
+
+
+def judged(model: Model, seen: Seen, stopped: int | None, families: Families) -> Rating:
+    """Return the rating of an articulation, given since when it does not explain what is seen."""
+    since = seen if stopped is None else seen.since(stopped)
+    instead = _identified(since.observations, families) if len(since.times) >= 2 else None
+    probabilities = _probabilities(since, instead)
+    operation, reason = None, ""
+    if stopped is not None:
+        operation, reason = _proposed(model, since, instead)
+    else:
+        reason = _doubt(probabilities, len(since.times))
+    squares = np.mean(since.misfit.residuals**2, axis=0)
+    rms = math.sqrt(float(squares[:3].sum())), math.sqrt(float(squares[3:].sum()))
+    return Rating(seen.link, probabilities, rms, len(seen.times), stopped, instead, operation, reason)
+
+
+def _identified(seen: Observations, families: Families) -> Found:
+    exact = seen.parent_covariance is None
+    return identify(
+        None if exact else seen.parent,
+        seen.relative if exact else seen.child,
+        covariance_a=seen.parent_covariance,
+        covariance_b=seen.child_covariance,
+        families=families,
+    )
+
+
+def _probabilities(seen: Seen, instead: Found | None) -> dict[str, float]:
+    served, left = seen.served, seen.misfit
+    logs = {"served": math.log(BELIEFS["served"]) + log_evidence(served, left), "rigid": -math.inf}
+    if served.joints:
+        logs["rigid"] = math.log(BELIEFS["rigid"]) + log_evidence(served, left, still=True)
+    # A family's probability is its evidence times its belief beforehand, up to what is common to all.
+    for fit in instead or ():
+        if fit.probability > 0.0 and instead is not None:
+            odds = math.log(BELIEFS["other"] * fit.probability / instead.best.probability)
+            log = odds + instead.best.log_evidence + LOG_ANYWHERE
+            logs[fit.family] = float(np.logaddexp(logs.get(fit.family, -math.inf), log))
+    total = float(np.logaddexp.reduce(list(logs.values())))
+    return {"free": 0.0, **{name: math.exp(log - total) for name, log in logs.items()}}
+
+
+def _doubt(probabilities: Mapping[str, float], count: int) -> str:
+    """Return what speaks against an articulation that explains what is seen."""
+    if probabilities["served"] >= SURE:
+        return ""
+    if count < _ENOUGH:
+        return f"both were seen {count} time{'s' if count > 1 else ''} only"
+    other = max((name for name in probabilities if name != "served"), key=lambda name: probabilities[name])
+    return "it hardly moved" if other == "rigid" else f"it may be {other} as well"
+
+
+def _proposed(model: Model, seen: Seen, instead: Found | None) -> tuple[Operation | None, str]:
+    if instead is None or len(seen.times) < _ENOUGH:
+        return None, "it was seen too seldom since to say what it is instead"
+    if not instead.best.told:
+        return None, f"what it is instead is not known yet, {instead}"
+    try:
+        coordinates = seen.served.beyond_limits(seen.observations, seen.misfit.coordinates)
+        return proposal(model, seen.link, seen.served, coordinates, instead.best), ""
+    except KineverseError as error:
+        return None, f"what it is instead is no operation. {error}"

@@ -1,0 +1,109 @@
+"""What of an observation a served articulation cannot explain, whatever its joint values are.
+
+The whitened residual of a relative pose has six components of deviation 1. Those along the joint directions
+are taken up by the joint values; the other 6 - k, ρ, do not depend on them, and if the articulation is as
+served they are independent standard normal numbers. Joint values that lie beyond their limits say the rest.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Self
+
+import numpy as np
+
+from kineverse.estimation.identification.matrices import inverted
+from kineverse.estimation.identification.observations import Observations
+from kineverse.estimation.identification.rigid import Array, skew
+
+from .served import Served
+
+# Joint values that nothing tells are believed within 100 [m] or [rad].
+_PRECISION = 1e-4
+
+
+@dataclass(frozen=True)
+class Misfit:
+    """N observations beside a served articulation.
+
+    Attributes
+    ----------
+    coordinates
+        The most likely coordinates inside the limits, (N, n).
+    values
+        The most likely joint values without limits, by linearisation, (N, k).
+    covariances
+        Of them, (N, k, k).
+    normal
+        ρ, (N, 6 - k).
+    by_place
+        How ρ changes if the articulation sits elsewhere in the parent and the child elsewhere on it: per unit
+        of a twist of either, in their axes and about the child in the default state, (N, 6 - k, 12).
+    beyond
+        How far values are below the lower and above the upper limits, in standard deviations; -∞ without
+        limits, (N, 2 k).
+    residuals
+        Of the relative pose in the parent's axes, with the best joint values inside the limits, (N, 6).
+    log_scale
+        ½ log |2πS| of each observation less ½ log |2πC| of its joint values: with ½ |ρ|², what is left when
+        joint values are integrated out, (N,).
+    """
+
+    coordinates: Array
+    values: Array
+    covariances: Array
+    normal: Array
+    by_place: Array
+    beyond: Array
+    residuals: Array
+    log_scale: Array
+
+    def __len__(self) -> int:
+        return len(self.normal)
+
+    def since(self, first: int) -> Self:
+        """Return the misfit of the observations from one on."""
+        return type(self)(*(getattr(self, name)[first:] for name in self.__dataclass_fields__))
+
+
+def misfit(served: Served, seen: Observations) -> Misfit:
+    """Return what of the observations is left unexplained."""
+    coordinates, solution = served.solve(seen)
+    whitening = np.linalg.inv(np.linalg.cholesky(solution.covariance))
+    error = (whitening @ solution.residuals[:, :, None])[:, :, 0]
+    directions = whitening @ solution.linear.by_joints
+    transposed = np.swapaxes(directions, 1, 2)
+    joints = served.joints
+    covariances = inverted(transposed @ directions + _PRECISION * np.eye(joints))
+    # At a limit the best value without limits is a step away.
+    step = (covariances @ transposed @ error[:, :, None])[:, :, 0]
+    values = solution.values + step
+    basis = np.linalg.qr(directions, mode="complete")[0]
+    across = np.swapaxes(basis[:, :, joints:], 1, 2)
+    deviations = np.sqrt(np.einsum("nii->ni", covariances))
+    beyond = np.concatenate([served.lower - values, values - served.upper], axis=1)
+    pose = solution.linear.pose
+    return Misfit(
+        coordinates,
+        values,
+        covariances,
+        (across @ error[:, :, None])[:, :, 0],
+        across @ whitening @ _moved(pose, served.middle),
+        beyond / np.tile(deviations, (1, 2)),
+        solution.residuals,
+        0.5 * (_log_determinants(solution.covariance) - _log_determinants(covariances)),
+    )
+
+
+def _moved(pose: Array, middle: Array) -> Array:
+    """Return twists of the child per unit twist of the articulation in the parent, and of the child on it."""
+    result = np.zeros((len(pose), 6, 12))
+    result[:, :3, :3] = result[:, 3:, 3:6] = np.eye(3)
+    result[:, :3, 3:6] = -skew(pose[:, :3, 3] - middle)
+    result[:, :3, 6:9] = result[:, 3:, 9:] = pose[:, :3, :3]
+    return result
+
+
+def _log_determinants(matrices: Array) -> Array:
+    logs: Array = np.linalg.slogdet(2.0 * np.pi * matrices)[1]
+    return logs

@@ -1,0 +1,119 @@
+"""Rating the articulations of a served model by what is seen (2020 paper, III-D)."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+
+import numpy as np
+import numpy.typing as npt
+
+from kineverse.errors import KineverseError, ValueRejectedError
+from kineverse.model.frame import WORLD
+from kineverse.model.model import Model
+
+from .judgement import Families, Seen, judged
+from .links import Link, find_links
+from .misfit import misfit
+from .observed import Poses, Track, between, exactly, tracks
+from .report import Plausibility, Rating
+from .served import Served
+from .watch import Watch
+
+FALSE_ALARMS = 1e-3
+"""The default probability of calling an articulation implausible that is as served."""
+
+
+def plausibility(
+    model: Model,
+    observations: Mapping[str, Poses],
+    *,
+    noise: npt.ArrayLike | None = None,
+    relative_to: str | None = WORLD,
+    families: Families = None,
+    false_alarms: float = FALSE_ALARMS,
+    strict: bool = False,
+) -> Plausibility:
+    """Return whether the articulations of a model still explain what is seen, and what would if they do not.
+
+    Each articulation between frames that were seen is judged as it is served, with its own parameters and
+    limits and unknown joint values, beside a rigid connection, none at all, and what
+    :func:`~kineverse.estimation.identify` finds.
+
+    Parameters
+    ----------
+    model
+        The model.
+    observations
+        From names of frames to their poses over time, (N, 4, 4), or pairs of poses and covariance, (6, 6) or
+        (N, 6, 6); a pose that was not seen is NaN throughout.
+    noise
+        The covariance, (6, 6), of what comes with none, see :mod:`kineverse.estimation.noise`.
+    relative_to
+        The frame in which poses are given. It is taken as exactly known and is compared with what is seen
+        where nothing else on its part is; None for an observer that is no part of the model.
+    families
+        What is tried instead, see :func:`~kineverse.estimation.identify`.
+    false_alarms
+        The probability with which an articulation may be called implausible though it is as served.
+    strict
+        Whether to raise if one is.
+
+    Raises
+    ------
+    UnknownNameError
+        For a frame or a family that does not exist.
+    ShapeError, ValueRejectedError
+        For poses or covariances that are none, and if it is not known how well a frame is seen.
+    ImplausibleError
+        If ``strict``, and an articulation stopped explaining what is seen.
+    """
+    check_false_alarms(false_alarms)
+    seen = tracks(observations, noise)
+    found = find_links(model, observations, relative_to)
+    if relative_to is not None:
+        seen[relative_to] = exactly(max((len(track.poses) for track in seen.values()), default=0))
+    ratings = [_rated(model, link, seen, families, false_alarms) for link in found.links]
+    result = Plausibility(tuple(ratings), found.left_out, false_alarms)
+    if strict:
+        result.raise_if_implausible()
+    return result
+
+
+def check_false_alarms(probability: float) -> None:
+    """Look whether a probability of false alarms is one.
+
+    Raises
+    ------
+    ValueRejectedError
+        If it is not between 0 and 1.
+    """
+    if not 0.0 < probability < 1.0:
+        raise ValueRejectedError(
+            f"The probability of a false alarm is between 0 and 1, and not {probability}."
+        )
+
+
+def untold(link: Link, count: int, reason: str) -> Rating:
+    """Return the rating of an articulation about which nothing can be said."""
+    return Rating(link, {}, (math.nan, math.nan), count, reason=reason)
+
+
+def _rated(
+    model: Model, link: Link, seen: Mapping[str, Track], families: Families, false_alarms: float
+) -> Rating:
+    parent, child = seen[link.parent], seen[link.child]
+    times = np.flatnonzero(parent.seen & child.seen)
+    if not len(times):
+        return untold(link, 0, f"'{link.parent}' and '{link.child}' were never seen together")
+    poses = between(parent, child, times)
+    try:
+        served = Served(model, link.child, link.parent)
+        left = misfit(served, poses)
+    except KineverseError as error:
+        return untold(link, len(times), f"its pose cannot be computed. {error}")
+    watch = Watch(false_alarms)
+    for row in zip(left.normal, left.by_place, left.beyond, strict=True):
+        watch.add(*row)
+    stopped = None if watch.stopped is None else int(times[watch.stopped])
+    return judged(model, Seen(link, served, poses, left, times), stopped, families)

@@ -1,0 +1,162 @@
+"""What was identified, as an operation in the place of the one that stopped explaining what is seen.
+
+Whoever hangs below or looks at a coordinate goes on working: frames keep their names, and so does the
+coordinate where there is one before and one after. It keeps its direction and its zero as well, as far as it
+has them: joint values are aligned with those of the served articulation. What the old operation wrote beside
+the joint stays.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from kineverse.articulations import Joint
+from kineverse.estimation.identification.fit import Fit
+from kineverse.estimation.identification.groups import WX, GroupMotion
+from kineverse.estimation.identification.operations import joint_operation
+from kineverse.estimation.identification.rigid import Array, exponential, inverse, pose
+from kineverse.model.model import Model
+from kineverse.model.operation import (
+    ARTICULATIONS,
+    CONSTRAINTS,
+    FRAMES,
+    RATES,
+    Effects,
+    Operation,
+)
+from kineverse.model.reader import Reader
+
+from .links import Link
+from .served import Served
+
+
+@dataclass(frozen=True)
+class Relearned(Operation):
+    """A joint that was learned, and what the operation that it stands in for wrote beside its joint.
+
+    Attributes
+    ----------
+    joint
+        The joint.
+    record
+        The name under which the articulation is on record; that of the joint if None.
+    kept
+        The rest, as pairs of a cell (kind, name) and a value.
+    """
+
+    joint: Operation
+    record: str | None = None
+    kept: tuple[tuple[tuple[str, str], Any], ...] = ()
+
+    def apply(self, model: Reader) -> Effects:
+        """Write the joint and the rest."""
+        writes = self.joint.apply(model).writes()
+        if self.record is not None:
+            writes = {
+                (kind, self.record if kind == ARTICULATIONS else name): value
+                for (kind, name), value in writes.items()
+            }
+        return Effects.of({**dict(self.kept), **writes})
+
+    def default_tag(self) -> str:
+        """Return that of the joint."""
+        return self.joint.default_tag()
+
+
+def proposal(model: Model, link: Link, served: Served, coordinates: Array, fit: Fit) -> Operation:
+    """Return the operation to replace the link's one by.
+
+    Parameters
+    ----------
+    model, link, served
+        The model as it is served, and the articulation in question.
+    coordinates
+        The served articulation's coordinates at the fit's observations, (N, n).
+    fit
+        What was identified between the frames that were seen, of one of the families of joints.
+    """
+    motion, values = fit.motion, fit.joint_values
+    old = coordinates[:, 0] if served.joints == 1 and len(served.coordinates) == 1 else None
+    alike = False
+    if motion.joints == 1:
+        turns = motion.freedom.joints[0] >= WX
+        alike = old is not None and bool(served.turning[0]) == turns
+        if old is not None:
+            motion, values = _aligned(motion, values, old, alike)
+    limits = [
+        (float(low), float(high)) for low, high in zip(values.min(axis=0), values.max(axis=0), strict=True)
+    ]
+    if alike:
+        # Nothing was seen that contradicts the old limits; those that were left are wider now.
+        (low, high), *_ = limits
+        limits = [(min(low, float(served.lower[0])), max(high, float(served.upper[0])))]
+    base_T_parent = _constant(model, link.parent, link.base)
+    frame_T_child = _constant(model, link.child, link.frame)
+    motion = replace(motion, left=base_T_parent @ motion.left, right=motion.right @ inverse(frame_T_child))
+    writes = model.history.entry(link.tag).writes
+    records = {
+        name: value
+        for (kind, name), value in writes.items()
+        if kind == ARTICULATIONS and value.child == link.frame
+    }
+    record = next(iter(records), None)
+    name = record or link.frame
+    if old is not None and motion.joints == 1:
+        name = served.coordinates[0].path
+    joint = joint_operation(motion, limits, name, link.base, link.frame)
+    if record is not None and isinstance(joint, Joint):
+        joint = replace(joint, dynamics=records[record].dynamics)
+    kept = _kept(writes, link, served, alike, set(records))
+    if record in (None, name) and not kept:
+        return joint
+    return Relearned(joint, None if record == name else record, kept)
+
+
+def _kept(
+    writes: dict[tuple[str, str], Any], link: Link, served: Served, alike: bool, records: set[str]
+) -> tuple[tuple[tuple[str, str], Any], ...]:
+    """Return what has nothing to do with the pose between both frames."""
+    own = set(served.coordinates)
+    kept = []
+    for (kind, name), value in writes.items():
+        if (kind == FRAMES and name == link.frame) or (kind == ARTICULATIONS and name in records):
+            continue
+        if kind == RATES and value[0] in own:
+            continue
+        if kind == CONSTRAINTS:
+            about = {s.position for s in value.expression.symbols}
+            # Limits are new; a speed limit or a lock means something as long as its unit is the same.
+            if about <= own and not (alike and any(s.order for s in value.symbols)):
+                continue
+        kept.append(((kind, name), value))
+    return tuple(kept)
+
+
+def _aligned(motion: GroupMotion, values: Array, old: Array, alike: bool) -> tuple[GroupMotion, Array]:
+    """Return the same motion with joint values that grow with the old ones, and are 0 where those are."""
+    new = values[:, 0]
+    slope = float(np.mean((old - old.mean()) * (new - new.mean())))
+    if slope < 0.0:
+        flip = np.diag([1.0, -1.0, -1.0, 1.0])
+        motion = replace(motion, left=motion.left @ flip, right=flip @ motion.right)
+        new, slope = -new, -slope
+    variance = float(np.var(old))
+    if alike:
+        slope = 1.0
+    else:
+        slope = slope / variance if variance > 0.0 else 0.0
+    shift = float(new.mean()) - slope * float(old.mean())
+    twist = np.zeros(6)
+    twist[motion.freedom.joints[0]] = shift
+    twist[2] += motion.pitch * twist[5]
+    motion = replace(motion, left=motion.left @ pose(exponential(twist[3:]), twist[:3]))
+    return motion, (new - shift)[:, None]
+
+
+def _constant(model: Model, frame: str, relative_to: str) -> Array:
+    transform = model.fk(frame, relative_to)
+    values: Array = transform({s: s.value or 0.0 for s in transform.symbols})
+    return values

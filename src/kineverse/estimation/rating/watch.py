@@ -1,0 +1,139 @@
+"""Whether an articulation explains what is seen, judged after every observation.
+
+Under the articulation as served, ρ of each observation is standard normal. Against it stand alternatives:
+
+- it, or the child on it, sits elsewhere: ρ = G δ + noise with an unknown δ, believed within some size;
+- nothing holds the child: ρ is normal with a larger deviation;
+- joint values beyond their limits, by z standard deviations: exp(λ z - λ²/2) is 1 on average at a limit, and
+  less inside.
+
+Each may begin to hold at any observation j, the j-th with the weight 1/(j (j+1)). The ratio M of the
+densities of all that was seen, under the mixture of alternatives and under the articulation as served, is a
+supermartingale that begins at 1 if the latter is right, whatever joint values do. So by Ville's inequality
+the probability that M ever reaches 1/α is at most α, however long one watches. To first order, that is: poses
+are linearised around the best joint values.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from kineverse.estimation.identification.rigid import Array
+
+_SIZES = np.array([0.01, 0.05, 0.3])
+_DEVIATIONS = np.array([1.0, 3.0, 10.0, 30.0, 100.0])
+_SLOPES = np.array([2.0, 5.0])
+# As many beginnings of a displacement are followed; dropping some only makes M smaller.
+_FOLLOWED = 12
+
+
+class Watch:
+    """Follows one articulation.
+
+    Parameters
+    ----------
+    false_alarms
+        The probability α that an articulation which is as served is ever said not to be.
+
+    Attributes
+    ----------
+    count
+        Observations so far.
+    stopped
+        The observation, from 0, from which on it probably does not explain what is seen; None as long as it
+        does. Never taken back.
+    noticed
+        The observation at which that was noticed.
+    """
+
+    def __init__(self, false_alarms: float) -> None:
+        self._threshold = -math.log(false_alarms)
+        self.count = 0
+        self.stopped: int | None = None
+        self.noticed: int | None = None
+        self._elsewhere = _Elsewhere()
+        self._loose = _Beginnings(len(_DEVIATIONS))
+        self._beyond = _Beginnings(0)
+
+    def add(self, normal: Array, by_place: Array, beyond: Array) -> None:
+        """Take one observation: the rows of a :class:`.misfit.Misfit` of that name."""
+        self.count += 1
+        weight = -math.log(self.count * (self.count + 1.0))
+        if self.count == 1:
+            self._limited = np.isfinite(beyond)
+            self._beyond = _Beginnings(int(self._limited.sum()) * len(_SLOPES))
+        parts: list[tuple[float, float, int]] = []
+        if len(normal):
+            parts.append((0.5, *self._elsewhere.add(weight, self.count - 1, normal, by_place)))
+            squares = float(normal @ normal)
+            grown = 1.0 + _DEVIATIONS**2
+            log = -0.5 * len(normal) * np.log(grown) + 0.5 * squares * (1.0 - 1.0 / grown)
+            parts.append((0.3, *self._loose.add(weight, self.count - 1, log)))
+        if self._limited.any():
+            z = np.maximum(beyond[self._limited], -1e3)
+            log = (_SLOPES[:, None] * z - 0.5 * _SLOPES[:, None] ** 2).ravel()
+            parts.append((0.2, *self._beyond.add(weight, self.count - 1, log)))
+        if not parts or self.stopped is not None:
+            return
+        total = sum(p for p, _, _ in parts)
+        logs = [math.log(p / total) + log for p, log, _ in parts]
+        if float(np.logaddexp.reduce([*logs, -math.log(self.count + 1.0)])) >= self._threshold:
+            self.noticed = self.count - 1
+            self.stopped = parts[int(np.argmax(logs))][2]
+
+
+class _Beginnings:
+    """Alternatives whose observations are independent: all beginnings are summed up exactly."""
+
+    def __init__(self, count: int) -> None:
+        self._logs = np.full(count, -np.inf)
+        self._best = np.full(count, -np.inf)
+        self._start = np.zeros(count, dtype=int)
+
+    def add(self, weight: float, index: int, log: Array) -> tuple[float, int]:
+        """Return the logarithm of the mixture over all, and the likeliest beginning."""
+        self._logs = np.logaddexp(self._logs, weight) + log
+        newer = self._best < weight
+        self._start[newer] = index
+        self._best = np.maximum(self._best, weight) + log
+        mean = float(np.logaddexp.reduce(self._logs)) - math.log(len(log))
+        return mean, int(self._start[np.argmax(self._best)])
+
+
+class _Elsewhere:
+    """Displacements δ ~ N(0, s² I) for some sizes s, followed from some beginnings each."""
+
+    def __init__(self) -> None:
+        self._starts = np.zeros(0, dtype=int)
+        self._logs = np.zeros((0, len(_SIZES)))
+        self._means = np.zeros((0, len(_SIZES), 12))
+        self._covariances = np.zeros((0, len(_SIZES), 12, 12))
+
+    def add(self, weight: float, index: int, normal: Array, by_place: Array) -> tuple[float, int]:
+        """Return the logarithm of the mixture over sizes and beginnings, and the likeliest beginning."""
+        sizes = len(_SIZES)
+        self._starts = np.append(self._starts, index)
+        self._logs = np.concatenate([self._logs, np.full((1, sizes), weight)])
+        self._means = np.concatenate([self._means, np.zeros((1, sizes, 12))])
+        prior = _SIZES[:, None, None] ** 2 * np.eye(12)
+        self._covariances = np.concatenate([self._covariances, prior[None]])
+        error = normal - self._means @ by_place.T
+        carried = self._covariances @ by_place.T
+        spread = by_place @ carried + np.eye(len(normal))
+        gain = np.swapaxes(np.linalg.solve(spread, np.swapaxes(carried, 2, 3)), 2, 3)
+        solved = np.linalg.solve(spread, error[..., None])[..., 0]
+        ratio = 0.5 * (normal @ normal - np.sum(error * solved, axis=2))
+        self._logs += ratio - 0.5 * np.linalg.slogdet(spread)[1]
+        self._means += (gain @ error[..., None])[..., 0]
+        self._covariances -= gain @ np.swapaxes(carried, 2, 3)
+        result = float(np.logaddexp.reduce(self._logs, axis=None)) - math.log(sizes)
+        best = int(self._starts[np.argmax(self._logs.max(axis=1))])
+        if len(self._starts) > _FOLLOWED:
+            # The newest have had no time yet to show anything.
+            older = np.argsort(-self._logs[:-3].max(axis=1))[: _FOLLOWED - 3]
+            kept = np.sort(np.append(older, np.arange(len(self._starts) - 3, len(self._starts))))
+            self._starts, self._logs = self._starts[kept], self._logs[kept]
+            self._means, self._covariances = self._means[kept], self._covariances[kept]
+        return result, best
