@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +16,7 @@ from kineverse.view.camera import Camera
 from kineverse.view.light import Lamp, shade, to_display, to_linear
 from kineverse.view.marks import Marks, mark_parts
 from kineverse.view.near import Near
-from kineverse.view.parts import parts
+from kineverse.view.parts import Part, parts
 from kineverse.view.png import write_png
 from kineverse.view.poses import Poses, complete
 from kineverse.view.raster import Projection, visible
@@ -90,15 +90,44 @@ def picture(
     scene = Surfaces.of(items, at)
     if camera is None:
         camera = automatic(scene, importance(model, items), at, width / height)
-    projection = Projection.of(camera, width * SAMPLES, height * SAMPLES)
-    image = _render(scene, projection, camera)
+    over: list[Part] = []
     if frames or not len(scene.corners):
-        triads = Surfaces.of(triad(model, scene.corners, at), at)
-        _overlay(image, triads, projection)
+        over += triad(model, scene.corners, at)
     if found is not None:
         length = ARROW * camera.height
-        marks = Marks.of(found, length)
-        _overlay(image, Surfaces.of(mark_parts(marks, length), at), projection)
+        over += mark_parts(Marks.of(found, length), length)
+    return _drawn(scene, Surfaces.of(over, at), size, camera)
+
+
+def drawn(
+    items: Sequence[Part],
+    poses: Mapping[str, Floats],
+    size: tuple[int, int],
+    camera: Camera,
+    over: Sequence[Part] = (),
+) -> npt.NDArray[np.uint8]:
+    """Return a picture of any parts as (height, width, 3) bytes.
+
+    Parameters
+    ----------
+    items
+        What to draw, on a floor.
+    poses
+        Where the frames of all parts are, 4×4.
+    size
+        Width and height in pixels.
+    camera
+        Where to stand.
+    over
+        What is drawn over that, also where it is behind.
+    """
+    return _drawn(Surfaces.of(items, poses), Surfaces.of(over, poses), size, camera)
+
+
+def _drawn(scene: Surfaces, over: Surfaces, size: tuple[int, int], camera: Camera) -> npt.NDArray[np.uint8]:
+    projection = Projection.of(camera, size[0] * SAMPLES, size[1] * SAMPLES)
+    image = _render(scene, projection, camera)
+    _overlay(image, over, projection)
     return _shrunk(image, SAMPLES)
 
 
@@ -180,7 +209,7 @@ def _overlay(image: Singles, scene: Surfaces, projection: Projection) -> None:
     """Draw axes over everything, faintly shaded, so that frames inside of bodies are seen too."""
     if not len(scene.corners):
         return
-    seen, _ = visible(projection, scene.corners, scene.closed)
+    seen, _ = visible(projection, scene.corners, scene.closed, scene.colors[:, 3])
     pixel = np.flatnonzero(seen >= 0)
     flat = image.reshape(-1, 3)
     facing = np.abs(scene.normals[seen[pixel], 0] @ projection.axes[2])
