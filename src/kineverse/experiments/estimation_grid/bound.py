@@ -8,8 +8,8 @@ comes from the estimator.
 A motion that is short beside the noise is not known so well by anyone. What tells the axis is the spread s²
 of the joint values, and these are known themselves with a variance c² only; of the spread s⁴/(s² + c²) is
 left, as in any regression with errors in both variables. :func:`attainable` is the bound with the joint
-values drawn together by that. For a slider with equal noise all around it is exactly that of joint values drawn
-from a Gaussian; as N grows the maximum of the likelihood reaches it, and not the other one.
+values drawn together by that. For a slider with equal noise all around it is exactly that of joint values
+drawn from a Gaussian; as N grows the maximum of the likelihood reaches it, and not the other one.
 """
 
 from __future__ import annotations
