@@ -45,8 +45,8 @@ def measure(settings: Settings) -> Result:
         name="tracking",
         work=(
             f"an update of the {len(model.degrees_of_freedom)} coordinates of the shipped kitchen from the "
-            f"poses of {len(frames)} frames, iterated until it stands still; mean of {len(readings)} in a row, "
-            f"with the textbook gain of the first {len(readings[:_CHECKED])}"
+            f"poses of {len(frames)} frames, iterated until it stands still; mean of {len(readings)} in "
+            f"a row, with the textbook gain of the first {len(readings[:_CHECKED])}"
         ),
         measurements=tuple(measured.values()),
         comparisons=(

@@ -64,7 +64,7 @@ class NumpyFilter:
 
     def _update(self, prior: Array, P: Array, seen: Array) -> tuple[Array, Array]:
         x = prior
-        information: Array = np.asarray(np.linalg.inv(P)) if self._form == "information" else P
+        information = np.linalg.inv(P) if self._form == "information" else P
         while True:
             error, H = self._linear(x, seen)
             if self._form == "gain":
@@ -76,7 +76,7 @@ class NumpyFilter:
                     1, 0, 2
                 )
                 weighted = weighted.reshape(len(x), -1)
-                covariance = np.linalg.inv(information + weighted @ H)
+                covariance = np.asarray(np.linalg.inv(information + weighted @ H), dtype=np.float64)
                 after = x + covariance @ (weighted @ error + information @ (prior - x))
             moved = (after - x) / np.sqrt(np.diag(covariance))
             x = after
