@@ -16,7 +16,8 @@ from kineverse.geometry.table import Table
 
 pytestmark = pytest.mark.compiler
 
-kinds = st.sampled_from(EXACT)
+CORED = [kind for kind in KINDS if kind != "cone"]
+kinds = st.sampled_from(CORED)
 seeds = st.integers(0, 10**6)
 
 
@@ -53,14 +54,16 @@ def test_a_distance_is_certain(kind, other, seed, spread):
     if np.isnan(distance):
         assert slow < 1e-4  # only what touches is left to coal
         return
-    assert distance == pytest.approx(slow, abs=2e-8 * (1 + spread))
+    exact = kind in EXACT and other in EXACT
+    assert distance == pytest.approx(slow, abs=(2e-8 if exact else 1e-6) * (1 + spread))
     assert np.linalg.norm(normal) == pytest.approx(1.0, abs=1e-12)
     assert normal @ (point_b - point_a) == pytest.approx(distance, abs=1e-12 * (1 + spread))
     np.testing.assert_allclose(np.cross(normal, point_b - point_a), 0.0, atol=1e-12 * (1 + spread))
     a, b = shapes
-    assert gap(a, b, np.stack(poses), normal) == pytest.approx(distance, abs=2e-9 * (1 + spread))
+    small = (2e-9 if exact else 2e-8) * (1 + spread)
+    assert gap(a, b, np.stack(poses), normal) == pytest.approx(distance, abs=small)
     # Each point is on the plane that holds its body.
-    assert a.support(normal, poses[0]) == pytest.approx(normal @ point_a, abs=2e-9 * (1 + spread))
+    assert a.support(normal, poses[0]) == pytest.approx(normal @ point_a, abs=small)
 
 
 @settings(max_examples=100)
@@ -95,11 +98,14 @@ def test_a_limit_changes_no_distance_within_it(kind, other, seed, limit):
         assert limit + (distance - limit) / 2 - 1e-9 <= low <= distance + 1e-9
 
 
-@pytest.mark.parametrize("kind", sorted(set(KINDS) - set(EXACT)))
-def test_what_is_not_made_of_corners_is_left_to_coal(kind):
+@pytest.mark.parametrize("kind", KINDS)
+def test_only_cones_are_left_to_coal_where_nothing_touches(kind):
     rng = np.random.default_rng(0)
-    shapes = random_shape(kind, rng), random_shape("box", rng)
-    assert np.isnan(measured(placed(shapes, [random_pose(rng, 2.0) for _ in shapes]))[0])
+    for other in CORED:
+        shapes = random_shape(kind, rng), random_shape(other, rng)
+        poses = [random_pose(rng, 0.05), random_pose(rng, 0.05)]
+        poses[1][0, 3] += 2.0
+        assert np.isnan(measured(placed(shapes, poses))[0]) == (kind == "cone")
 
 
 def test_parallel_faces_edges_and_what_touches():

@@ -1,11 +1,12 @@
-"""C text: distances of polytopes and of what is round about them, after the table of :mod:`.sweep_source`.
+"""C text: distances of all convex solids but cones, after the table of :mod:`.sweep_source`.
 
-A box, hull, sphere or capsule is a *core*, a hull plus a box (of a capsule a line), and all within a radius.
-With v = b - a the nearest point to the origin of {b - a}, found by the iteration of Gilbert, Johnson and
-Keerthi (IEEE J. Robotics and Automation 4, 1988), the distance of two is ``|v|`` less their radii, also where
-these overlap. Every step has a support point w in direction v, and ``vᵀw / |v| <= distance of the cores <=
-|v|``: an answer is given only once the two meet, so it is right however the steps went. Everything else is
-left to coal. Nothing is remembered from one call to the next: an answer follows from the poses alone.
+They are a *core*, a hull plus a box plus an ellipsoid, all within a radius: a capsule is a line within one, a
+cylinder a line plus a disc. With v = b - a the nearest point to the origin of {b - a}, found by the iteration
+of Gilbert, Johnson and Keerthi (IEEE J. Robotics and Automation 4, 1988), the distance of two is ``|v|`` less
+their radii, also where these overlap. Every step has a support point w in direction v, and ``vᵀw / |v| <=
+distance of the cores <= |v|``: an answer is given only once the two meet, so it is right however the steps
+went. Everything else is left to coal. Nothing is remembered from one call to the next: an answer follows from
+the poses alone.
 """
 
 NARROW = r"""
@@ -60,6 +61,13 @@ static inline Vector furthest(const Table *t, int64_t piece, Vector way) {
   const int64_t n = t->corner_count[piece];
   Vector out = n ? corner(t->corners[piece], n, way) : (Vector){{0.0, 0.0, 0.0}};
   for (int r = 0; r < 3; r++) out.x[r] += way.x[r] > 0.0 ? edges[r] : -edges[r];
+  const double *radii = t->radii + 3 * piece;
+  if (radii[0] > 0.0) {
+    double reach = 0.0;
+    for (int r = 0; r < 3; r++) reach += square(radii[r] * way.x[r]);
+    if (reach > 0.0) /* not along the axis of a disc */
+      for (int r = 0; r < 3; r++) out.x[r] += square(radii[r]) * way.x[r] / sqrt(reach);
+  }
   return out;
 }
 

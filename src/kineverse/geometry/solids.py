@@ -31,7 +31,7 @@ class Hull:
 class Core:
     """What a solid is made of for our own measuring, see :mod:`.narrow_source`.
 
-    It is the sum of a hull of corners, a box about the origin, and a ball.
+    It is the sum of a hull of corners, and about the origin of a box, an ellipsoid, and a ball.
 
     Attributes
     ----------
@@ -39,6 +39,8 @@ class Core:
         (3,) half the edges of the box [m].
     radius
         Of the ball [m].
+    radii
+        (3,) of the ellipsoid, which is a disc if the last is 0 [m].
     corners
         (3, n) in the frame of the solid [m], n a multiple of 8, for which the first one is repeated; n = 0
         stands for the origin alone.
@@ -46,6 +48,7 @@ class Core:
 
     half: Floats
     radius: float = 0.0
+    radii: Floats = field(default_factory=lambda: np.zeros(3))
     corners: Floats = field(default_factory=lambda: np.empty((3, 0)))
 
     @staticmethod
@@ -249,11 +252,13 @@ def _of_primitive(geometry: Primitive) -> Solid:
         core = Core(np.zeros(3), x)
     elif isinstance(geometry, Ellipsoid):
         engine, half, radius = coal.Ellipsoid(x, y, z), (x, y, z), max(x, y, z)
+        core = Core(np.zeros(3), radii=np.array([x, y, z]))
     elif isinstance(geometry, Capsule):
         engine, half, radius = coal.Capsule(x, y), (x, x, x + y / 2), x + y / 2
         core = Core(np.array([0.0, 0.0, y / 2]), x)
     elif isinstance(geometry, Cylinder):
         engine, half, radius = coal.Cylinder(x, y), (x, x, y / 2), math.hypot(x, y / 2)
+        core = Core(np.array([0.0, 0.0, y / 2]), radii=np.array([x, x, 0.0]))
     else:
         engine, half, radius = coal.Cone(x, y), (x, x, y / 2), math.hypot(x, y / 2)
     engine.computeLocalAABB()

@@ -27,7 +27,7 @@ from .table import Indices, Table
 _ARRAYS = (
     "body", "allowed", "active", "centre", "half", "radius",
     "poses", "travel", "place", "low", "high", "bounds", "order",
-    "corners", "corner_count", "edges", "round",
+    "corners", "corner_count", "edges", "radii", "round",
 )  # fmt: skip
 
 

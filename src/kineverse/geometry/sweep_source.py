@@ -14,7 +14,7 @@ typedef struct {
   int32_t *order;
   const double *const *corners;
   const int64_t *corner_count;
-  const double *edges, *round, *boxes;
+  const double *edges, *radii, *round, *boxes;
   const int32_t *leaves;
   int64_t leaf_count;
 } Table;

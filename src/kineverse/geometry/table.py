@@ -18,7 +18,8 @@ MOST_CARRIED = 6000
 """Bounds are carried for so many pieces at most; memory is touched only for pairs that were measured."""
 
 _TAKEN_OVER = (
-    "active", "centre", "half", "radius", "poses", "travel", "corners", "corner_count", "edges", "round"
+    "active", "centre", "half", "radius", "poses", "travel",
+    "corners", "corner_count", "edges", "radii", "round",
 )  # fmt: skip
 
 
@@ -44,9 +45,10 @@ class Table:
         (M,) by how much any point of a piece can have moved since the beginning, at most [m].
     place, low, high
         (M, 3) each: the centre in the world, and the corners of the box around the piece there [m].
-    corners, corner_count, edges, round
-        (M,) the address of a piece's corners, how many these are, -1 for a piece without a core; (M, 3) and
-        (M,) the box and the ball of its core [m]. See :class:`.solids.Core`, which has to outlive this.
+    corners, corner_count, edges, radii, round
+        (M,) the address of a piece's corners, how many these are, -1 for a piece without a core; the (M, 3)
+        box, (M, 3) ellipsoid and (M,) ball of its core [m]. See :class:`.solids.Core`, which has to outlive
+        this.
     order
         (M,) the moving pieces sorted along ``axis`` when that was last done, and then the others.
     standing_changed
@@ -71,6 +73,7 @@ class Table:
     corners: npt.NDArray[np.uintp] = field(init=False)
     corner_count: npt.NDArray[np.int64] = field(init=False)
     edges: Floats = field(init=False)
+    radii: Floats = field(init=False)
     round: Floats = field(init=False)
     order: Indices = field(init=False)
     bounds: Floats | None = field(init=False)
@@ -86,7 +89,7 @@ class Table:
         self.poses = np.tile(np.eye(4)[:3], (count, 1, 1))
         self.place, self.low, self.high = (np.zeros((count, 3)) for _ in range(3))
         self.corners, self.corner_count = np.zeros(count, dtype=np.uintp), np.full(count, -1, dtype=np.int64)
-        self.edges, self.round = np.zeros((count, 3)), np.zeros(count)
+        self.edges, self.radii, self.round = np.zeros((count, 3)), np.zeros((count, 3)), np.zeros(count)
         self.order = np.arange(count, dtype=np.int32)
         self.bounds = np.zeros((count, count)) if count <= MOST_CARRIED else None
 
@@ -102,7 +105,7 @@ class Table:
         self.centre[piece], self.half[piece], self.radius[piece] = centre, half, radius
         if core is not None:
             self.corners[piece], self.corner_count[piece] = core.corners.ctypes.data, core.corners.shape[1]
-            self.edges[piece], self.round[piece] = core.half, core.radius
+            self.edges[piece], self.radii[piece], self.round[piece] = core.half, core.radii, core.radius
         self.active[piece] = 1
         self.put(np.array([piece]))
 
