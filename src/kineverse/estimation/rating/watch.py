@@ -57,8 +57,8 @@ class Watch:
         self._loose = _Beginnings(len(_DEVIATIONS))
         self._beyond = _Beginnings(0)
 
-    def add(self, normal: Array, by_place: Array, beyond: Array) -> None:
-        """Take one observation: the rows of a :class:`.misfit.Misfit` of that name."""
+    def add(self, normal: Array, by_place: Array, beyond: Array) -> float:
+        """Take one observation, the rows of a :class:`.misfit.Misfit` of that name; return log M."""
         self.count += 1
         weight = -math.log(self.count * (self.count + 1.0))
         if self.count == 1:
@@ -75,13 +75,16 @@ class Watch:
             z = np.maximum(beyond[self._limited], -1e3)
             log = (_SLOPES[:, None] * z - 0.5 * _SLOPES[:, None] ** 2).ravel()
             parts.append((0.2, *self._beyond.add(weight, self.count - 1, log)))
-        if not parts or self.stopped is not None:
-            return
+        if not parts:
+            return 0.0
         total = sum(p for p, _, _ in parts)
         logs = [math.log(p / total) + log for p, log, _ in parts]
-        if float(np.logaddexp.reduce([*logs, -math.log(self.count + 1.0)])) >= self._threshold:
+        # Of all beginnings 1/(n + 1) are still to come.
+        ratio = float(np.logaddexp.reduce([*logs, -math.log(self.count + 1.0)]))
+        if self.stopped is None and ratio >= self._threshold:
             self.noticed = self.count - 1
             self.stopped = parts[int(np.argmax(logs))][2]
+        return ratio
 
 
 class _Beginnings:
