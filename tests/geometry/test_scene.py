@@ -334,6 +334,20 @@ def test_a_door_is_joined_to_what_it_hangs_on_and_not_to_the_wall():
     assert scene.looks_at("kitchen/fridge_door", "kitchen/wall")
 
 
+def test_where_a_loop_is_closed_its_ends_are_joined(tmp_path):
+    model = kv.load("articulations/four_bar")
+    model.save(tmp_path / "four_bar.kv.json")
+    parts = kv.Model()
+    with parts.edit() as edit:
+        edit.include(tmp_path / "four_bar.kv.json", "here")
+    for each, prefix in ((model, "four_bar/"), (parts, "here/four_bar/")):
+        scene = Scene(each)
+        assert not scene.looks_at(f"{prefix}coupler", f"{prefix}rocker")
+        assert scene.looks_at(f"{prefix}crank", f"{prefix}rocker")
+        scene.update(each.default_state())
+        assert not scene.in_collision
+
+
 def test_rules_are_data_and_the_last_one_decides(tmp_path):
     model = arm_among_boxes()
     scene = Scene(model)

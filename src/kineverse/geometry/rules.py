@@ -6,12 +6,14 @@ Rules are data: a model keeps them under the name :data:`RULES`, for whoever mak
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
+import numpy.typing as npt
 
 from kineverse.errors import UnknownNameError, ValueRejectedError, suggest
+from kineverse.loops.record import loops_of
 from kineverse.model.body import Pose
 from kineverse.model.frame import WORLD, Frame
 from kineverse.model.view import ModelView
@@ -125,7 +127,8 @@ def adjacent(model: ModelView, bodies: Sequence[str]) -> Flags:
     """Return (B, B) flags, 1 for pairs that are rigidly connected or joined by one articulation.
 
     What hangs on something that does not move at all is joined only to the body that it hangs on: a door to
-    its cupboard, and not to the wall. What moves freely, with six speeds, is joined to nothing.
+    its cupboard, and not to the wall. What moves freely, with six speeds, is joined to nothing. The ends of a
+    loop are joined where it is closed.
     """
     frames = dict(model.frames)
     groups = {name: _group(name, frames) for name in bodies}
@@ -133,21 +136,28 @@ def adjacent(model: ModelView, bodies: Sequence[str]) -> Flags:
     number = np.array([numbers[groups[name]] for name in bodies], dtype=int)
     table: Flags = (number[:, None] == number[None, :]).astype(np.uint8)
     place = {name: k for k, name in enumerate(bodies)}
-    for group, own in numbers.items():
+
+    def those_at(frame: str) -> npt.NDArray[np.bool_]:
+        group = _group(frame, frames)
         if group == WORLD:
-            continue
-        parent = frames[group].parent
-        parent_group = _group(parent, frames)
-        if len(model.speeds_of(group, parent)) >= _FREE:
-            continue
-        if parent_group == WORLD:
-            carrier = _carrier(parent, frames, place)
-            joined = number == -1 if carrier is None else np.arange(len(bodies)) == carrier
-        else:
-            joined = number == numbers.get(parent_group, -1)
-        members = number == own
+            return np.asarray(np.arange(len(bodies)) == _carrier(frame, frames, place))
+        return np.asarray(number == numbers.get(group, -1))
+
+    for one, other in _joints(model, frames, numbers):
+        members, joined = those_at(one), those_at(other)
         table[np.outer(members, joined) | np.outer(joined, members)] = 1
     return table
+
+
+def _joints(
+    model: ModelView, frames: Mapping[str, Frame], groups: Iterable[str]
+) -> Iterator[tuple[str, str]]:
+    """Yield pairs of frames that an articulation joins: groups and their parents, and the ends of loops."""
+    for group in groups:
+        if group != WORLD and len(model.speeds_of(group, frames[group].parent)) < _FREE:
+            yield group, frames[group].parent
+    for loop in loops_of(model):
+        yield from loop.ends
 
 
 def _group(name: str, frames: Mapping[str, Frame]) -> str:
@@ -157,8 +167,8 @@ def _group(name: str, frames: Mapping[str, Frame]) -> str:
     return name
 
 
-def _carrier(name: str, frames: Mapping[str, Frame], place: Mapping[str, int]) -> int | None:
-    """Return the number of the nearest body at or above a frame that does not move."""
+def _carrier(name: str, frames: Mapping[str, Frame], place: Mapping[str, int]) -> int:
+    """Return the number of the nearest body at or above a frame that does not move; -1 if there is none."""
     while name not in place and name != WORLD:
         name = frames[name].parent
-    return place.get(name)
+    return place.get(name, -1)
