@@ -5,7 +5,7 @@
 :mod:`kineverse.estimation.rating` says whether a model explains what is seen.
 """
 
-from .identification import Fit, Found, identify
+from .identification import Fit, Found, Identifier, identify
 from .noise import pose_covariance
 from .rating import ImplausibleError, Plausibility, PlausibilityMonitor, Rating, plausibility
 from .tracking import (
@@ -22,6 +22,7 @@ __all__ = [
     "Estimate",
     "Fit",
     "Found",
+    "Identifier",
     "Hypotheses",
     "ImplausibleError",
     "ObservedExpression",

@@ -21,8 +21,8 @@ def canonical(solution: Solution[GroupMotion]) -> Solution[GroupMotion]:
     name = motion.group.name
     if name in ("rigid", "free", "spherical"):
         return solution
-    values = solution.values
-    shift = values.mean(axis=0)
+    values = np.concatenate([solution.values, solution.belief.mean[None]])
+    shift = solution.values.mean(axis=0)
     if name == "planar":
         shift[2:] = 0.0  # turns and slides do not commute
     middle = np.zeros(6)
@@ -37,7 +37,9 @@ def canonical(solution: Solution[GroupMotion]) -> Solution[GroupMotion]:
         motion, values = _axes(motion, values, flip)
     elif flip:
         motion, values = _gauged(motion, values, np.diag([1.0, -1.0, -1.0]))
-    return replace(solution, motion=motion, values=values, linear=motion.at(values))
+    belief = replace(solution.belief, mean=values[-1])
+    values = values[:-1]
+    return replace(solution, motion=motion, values=values, belief=belief, linear=motion.at(values))
 
 
 def _origin(motion: GroupMotion) -> GroupMotion:

@@ -119,6 +119,9 @@ GROUPS: Mapping[str, Group] = MappingProxyType(
 )
 """The families by name. ``rigid`` has no joint values, and ``free`` has nothing else."""
 
+PITCHES = 0.1
+"""The standard deviation of a pitch, beforehand [m/rad]."""
+
 REACH = 3.0
 """The standard deviation of each component of a lever, beforehand [m]."""
 
@@ -220,14 +223,19 @@ class GroupMotion:
         return result
 
     def prior(self) -> Prior:
-        """Return that levers are within reach."""
+        """Return that levers are within reach, and pitches ordinary."""
         reach, freedom = self.group.reach, self.freedom
         r_p = self.right[:3, 3]
         moves = np.concatenate([np.eye(3), -skew(r_p)], axis=1)[:reach, freedom.right]
         derivatives = np.zeros((reach, self.size))
         start = len(freedom.left)
         derivatives[:, start : start + len(freedom.right)] = moves
-        return Prior(r_p[:reach] / REACH, derivatives / REACH)
+        if not self.group.pitch:
+            return Prior(r_p[:reach] / REACH, derivatives / REACH)
+        steep = np.zeros((1, self.size))
+        steep[0, -1] = 1.0 / PITCHES
+        residuals = np.append(r_p[:reach] / REACH, self.pitch / PITCHES)
+        return Prior(residuals, np.concatenate([derivatives / REACH, steep]))
 
 
 def _columns(parent_R_frame: Array, lever: Array) -> Array:

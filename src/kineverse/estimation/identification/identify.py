@@ -13,11 +13,13 @@ from kineverse.errors import UnknownNameError, ValueRejectedError, suggest
 from kineverse.estimation.noise import pose_covariance
 
 from .canonical import canonical
-from .evidence import Evidence, evidence
-from .fit import Fit, Found
-from .groups import WX, GroupMotion
+from .evidence import evidence
+from .fit import Found
+from .groups import GroupMotion
 from .native import solver
 from .observations import Observations, observations
+from .refining import refined
+from .reporting import fit_of
 from .rigid import Array
 from .solving import Solution
 from .starts import Overview, starts
@@ -27,11 +29,11 @@ WEIGHTS: Mapping[str, float] = MappingProxyType(
         "rigid": 1.0,
         "prismatic": 1.0,
         "revolute": 1.0,
-        "screw": 0.05,
-        "cylindrical": 0.05,
-        "spherical": 0.1,
-        "planar": 0.1,
-        "free": 0.1,
+        "screw": 0.02,
+        "cylindrical": 0.02,
+        "spherical": 0.05,
+        "planar": 0.05,
+        "free": 0.05,
     }
 )
 """How probable families are beforehand, beside each other."""
@@ -40,8 +42,6 @@ _UNKNOWN_NOISE = (0.005, math.radians(1.0))
 # By what the unknown noise is multiplied, and how that is believed to be spread: a factor of 5 either way.
 _SCALES = np.geomspace(0.01, 100.0, 33)
 _SCALE_SPREAD = math.log(5.0)
-# A direction that is known no better than this is not known [rad].
-_KNOWN = math.radians(20.0)
 
 
 def identify(
@@ -58,13 +58,12 @@ def identify(
     Parameters
     ----------
     a
-        Poses of the parent, (N, 4, 4), in any frame, such as a camera's; None if the parent is that frame
-        itself.
+        Poses of the parent, (N, 4, 4), in any frame, such as a camera's; None if the parent is that frame.
     b
         Poses of the child in the same frame, (N, 4, 4), or only its positions, (N, 3) [m].
     covariance_a, covariance_b
         Covariances of their errors, (6, 6) for all or (N, 6, 6) for each, see
-        :mod:`kineverse.estimation.noise`.
+        :mod:`kineverse.estimation.noise`; (3, 3) or (N, 3, 3) for positions.
     families
         Which families are tried, all of :data:`WEIGHTS` if None; a mapping also says how probable they are
         beforehand.
@@ -80,23 +79,34 @@ def identify(
         For a family that does not exist.
     """
     weights = family_weights(families)
-    stated = not (covariance_a is None and covariance_b is None and noise is None)
-    if noise is None:
-        if stated and (covariance_b is None or (a is not None and covariance_a is None)):
-            raise ValueRejectedError(
-                "One part has a covariance and the other has none. Give both, or the same for both as noise."
-            )
-        noise = pose_covariance(*_UNKNOWN_NOISE)
-    seen = observations(
-        a,
-        b,
-        noise if covariance_a is None else covariance_a,
-        noise if covariance_b is None else covariance_b,
-    )
-    solver.prepare()
-    overview = Overview(seen)
-    solutions = {name: _best(seen, name, overview) for name in weights}
-    return weighed(solutions, weights, stated)
+    of_a, of_b, stated = noise_of(a is not None, covariance_a, covariance_b, noise)
+    seen = observations(a, b, of_a, of_b)
+    return weighed(solutions(seen, weights), weights, stated)
+
+
+def noise_of(
+    has_parent: bool,
+    covariance_a: npt.ArrayLike | None,
+    covariance_b: npt.ArrayLike | None,
+    noise: npt.ArrayLike | None,
+) -> tuple[npt.ArrayLike, npt.ArrayLike, bool]:
+    """Return the covariances of parent and child, and whether they were stated at all.
+
+    Raises
+    ------
+    ValueRejectedError
+        If only one of them is.
+    """
+    if noise is not None or (covariance_b is not None and (covariance_a is not None or not has_parent)):
+        missing: npt.ArrayLike = np.eye(6) if noise is None else noise
+        of_a, of_b = (missing if c is None else c for c in (covariance_a, covariance_b))
+        return of_a, of_b, True
+    if covariance_a is not None or covariance_b is not None:
+        raise ValueRejectedError(
+            "One part has a covariance and the other has none. Give both, or the same for both as noise."
+        )
+    unknown = pose_covariance(*_UNKNOWN_NOISE)
+    return unknown, unknown, False
 
 
 def family_weights(families: Iterable[str] | Mapping[str, float] | None) -> dict[str, float]:
@@ -106,105 +116,57 @@ def family_weights(families: Iterable[str] | Mapping[str, float] | None) -> dict
     ------
     UnknownNameError
         For a family that does not exist.
+    ValueRejectedError
+        For a weight that is not positive, or if there is no family.
     """
     if families is None:
         return dict(WEIGHTS)
     if isinstance(families, str):
         families = [families]
-    for name in families:
+    given = dict(families) if isinstance(families, Mapping) else dict.fromkeys(families)
+    if not given:
+        raise ValueRejectedError("There is no family to try.")
+    for name, weight in given.items():
         if name not in WEIGHTS:
             raise UnknownNameError(f"There is no family {name!r}. {suggest(str(name), WEIGHTS, 'family')}")
-    if isinstance(families, Mapping):
-        return {name: float(weight) for name, weight in families.items()}
-    return {name: WEIGHTS[name] for name in families}
+        if weight is not None and not (math.isfinite(weight) and weight > 0.0):
+            raise ValueRejectedError(f"The weight of the family {name!r} is positive, not {weight!r}.")
+    return {name: WEIGHTS[name] if weight is None else float(weight) for name, weight in given.items()}
 
 
-def _best(seen: Observations, name: str, overview: Overview) -> Solution[GroupMotion]:
+def solutions(seen: Observations, names: Iterable[str]) -> dict[str, Solution[GroupMotion]]:
+    """Return the most likely member of each family."""
+    solver.prepare()
+    overview = Overview(seen)
+    return {name: canonical(refined(seen, _most_likely(seen, name, overview))) for name in names}
+
+
+def _most_likely(seen: Observations, name: str, overview: Overview) -> Solution[GroupMotion]:
     found = [solver.solve(seen, start.motion, start.values) for start in starts(name, overview)]
-    best = min(found, key=lambda solution: solution.cost)
-    return canonical(best)
+    return min(found, key=lambda solution: solution.cost)
 
 
-def weighed(
-    solutions: Mapping[str, Solution[GroupMotion]], weights: Mapping[str, float], stated: bool
-) -> Found:
+def weighed(found: Mapping[str, Solution[GroupMotion]], weights: Mapping[str, float], stated: bool) -> Found:
     """Return the fits of all families, weighed by their evidence."""
+    beforehand = {name: math.log(weights[name]) for name in found}
     if stated:
-        evidences = {name: evidence(solution) for name, solution in solutions.items()}
+        evidences = {name: evidence(solution) for name, solution in found.items()}
         logs = {name: e.log_evidence for name, e in evidences.items()}
         scale = 1.0
     else:
-        grid = {name: [evidence(s.scaled(c)) for c in _SCALES] for name, s in solutions.items()}
-        beforehand = -0.5 * (np.log(_SCALES) / _SCALE_SPREAD) ** 2
-        beforehand -= np.log(np.sum(np.exp(beforehand)))
-        joint = {name: np.array([e.log_evidence for e in es]) + beforehand for name, es in grid.items()}
+        grid = {name: [evidence(s.scaled(c)) for c in _SCALES] for name, s in found.items()}
+        spread = -0.5 * (np.log(_SCALES) / _SCALE_SPREAD) ** 2
+        spread -= np.logaddexp.reduce(spread)
+        joint = {name: spread + [e.log_evidence for e in es] for name, es in grid.items()}
         logs = {name: float(np.logaddexp.reduce(j)) for name, j in joint.items()}
-        best = max(logs, key=lambda name: logs[name] + math.log(weights[name]))
+        best = max(logs, key=lambda name: logs[name] + beforehand[name])
         top = int(np.argmax(joint[best]))
         scale = float(_SCALES[top])
         evidences = {name: es[top] for name, es in grid.items()}
-    total = np.array([logs[name] + math.log(weights[name]) for name in logs])
+    total: Array = np.array([logs[name] + beforehand[name] for name in found])
     probabilities = np.exp(total - np.logaddexp.reduce(total))
     fits = [
-        _fit(solutions[name], evidences[name], logs[name], float(p))
-        for name, p in zip(logs, probabilities, strict=True)
+        fit_of(found[name], evidences[name], logs[name], float(p))
+        for name, p in zip(found, probabilities, strict=True)
     ]
     return Found(tuple(sorted(fits, key=lambda fit: -fit.probability)), scale)
-
-
-def _fit(solution: Solution[GroupMotion], known: Evidence, log: float, probability: float) -> Fit:
-    motion = solution.motion
-    names = coordinates(motion)
-    covariance = known.covariance.copy()
-    if motion.group.pitch:
-        covariance[-1] *= math.tau
-        covariance[:, -1] *= math.tau
-    reason = ""
-    turns = [i for i, name in enumerate(names) if name.startswith("axis.")]
-    if turns:
-        worst = math.sqrt(float(np.linalg.eigvalsh(covariance[np.ix_(turns, turns)])[-1]))
-        if worst > _KNOWN:
-            reason = f"its axis is known to {math.degrees(min(worst, math.pi)):.0f}° only"
-    deviations = np.sqrt(np.einsum("nii->ni", known.value_covariances))
-    return Fit(
-        family=motion.group.name,
-        probability=probability,
-        log_evidence=log,
-        parameters=parameters(motion),
-        covariance=covariance,
-        coordinates=names,
-        frame=motion.left,
-        joint_values=solution.values,
-        deviations=deviations,
-        residuals=solution.residuals,
-        told=not reason,
-        reason=reason,
-        motion=motion,
-    )
-
-
-def parameters(motion: GroupMotion) -> dict[str, Array | float]:
-    """Return what a member of a family is, by name."""
-    name = motion.group.name
-    result: dict[str, Array | float] = {}
-    axis, point = motion.left[:3, 2].copy(), motion.left[:3, 3].copy()
-    if name == "planar":
-        result["normal"] = axis
-    elif name == "spherical":
-        result["centre"] = point
-    elif name not in ("rigid", "free"):
-        result["axis"] = axis
-        if name != "prismatic":
-            result["point"] = point
-    if motion.group.pitch:
-        result["pitch"] = math.tau * motion.pitch
-    result["reference"] = motion.left @ motion.right
-    return result
-
-
-def coordinates(motion: GroupMotion) -> tuple[str, ...]:
-    """Return the names of the parameters, in their order."""
-    letters = "xyz"
-    left = [f"point.{letters[j]}" if j < WX else f"axis.{letters[j - WX]}" for j in motion.freedom.left]
-    right = [f"child.{letters[j]}" if j < WX else f"child.r{letters[j - WX]}" for j in motion.freedom.right]
-    return (*left, *right, *(["pitch"] if motion.group.pitch else []))

@@ -17,14 +17,14 @@ from kineverse.compile.cache import library_cache
 from kineverse.compile.toolchain import CLOSED, toolchain
 from kineverse.compile.worker import Build, request
 
-from .groups import REACH, GroupMotion
+from .groups import PITCHES, REACH, GroupMotion
 from .native_source import SOLVE
 from .observations import Observations
 from .rigid import Array, pose
-from .solving import CLOSE, JOINT_PRECISION, STEPS, Solution, solve
+from .solving import CLOSE, STEPS, Belief, Solution, solve
 
 _FLAGS = ("-O3", "-lm", *CLOSED)
-_COUNTS = ("count", "rows", "joints", "lefts", "rights", "pitched", "reach", "known")
+_COUNTS = ("count", "rows", "joints", "lefts", "rights", "pitched", "reach", "known", "marginal")
 _ARRAYS = ("parent", "child", "parent_covariance", "child_covariance")
 
 
@@ -33,7 +33,8 @@ class _Problem(ctypes.Structure):
         *((name, ctypes.c_int64) for name in _COUNTS),
         *((name, ctypes.c_int64 * 6) for name in ("joint", "left", "right")),
         *((name, ctypes.c_void_p) for name in _ARRAYS),
-        *((name, ctypes.c_double) for name in ("reach_scale", "joint_precision", "close")),
+        *((name, ctypes.c_double) for name in ("reach_scale", "pitch_scale", "close")),
+        *((name, ctypes.c_double * 6) for name in ("mean", "precision")),
     )
 
 
@@ -94,11 +95,16 @@ class SolverLibrary:
         self._code = code
 
     def solve(
-        self, seen: Observations, motion: GroupMotion, values: Array, parent: Array | None = None
+        self,
+        seen: Observations,
+        motion: GroupMotion,
+        values: Array,
+        parent: Array | None = None,
+        belief: Belief | None = None,
     ) -> Solution[GroupMotion]:
         """Do what :func:`.solving.solve` does."""
         if self._code is None:
-            return solve(seen, motion, values, parent)
+            return solve(seen, motion, values, parent, belief)
         count, rows = len(seen), seen.rows
         moved = np.empty(25)
         moved[:9], moved[9:12] = motion.left[:3, :3].ravel(), motion.left[:3, 3]
@@ -108,7 +114,8 @@ class SolverLibrary:
         parents = np.array(seen.parent if parent is None else parent, order="C")
         cost = ctypes.c_double()
         residuals, covariances = np.empty((count, rows)), np.empty((count, rows, rows))
-        problem = _problem(seen, motion)
+        belief = belief or Belief.vague(motion.joints)
+        problem = _problem(seen, motion, belief)
         converged = self._code.solve(
             ctypes.addressof(problem),
             moved.ctypes.data,
@@ -127,12 +134,11 @@ class SolverLibrary:
             right=pose(moved[12:21].reshape(3, 3), moved[21:24]),
             pitch=float(moved[24]),
         )
-        return Solution(
-            motion, values, cost.value, residuals, covariances, motion.at(values), parents, converged == 1
-        )
+        linear, settled = motion.at(values), converged == 1
+        return Solution(motion, values, cost.value, residuals, covariances, linear, parents, belief, settled)
 
 
-def _problem(seen: Observations, motion: GroupMotion) -> _Problem:
+def _problem(seen: Observations, motion: GroupMotion, belief: Belief) -> _Problem:
     freedom = motion.freedom
     problem = _Problem()
     problem.count, problem.rows, problem.joints = len(seen), seen.rows, motion.joints
@@ -144,7 +150,10 @@ def _problem(seen: Observations, motion: GroupMotion) -> _Problem:
     for name in _ARRAYS:
         array = getattr(seen, name)
         setattr(problem, name, None if array is None else array.ctypes.data)
-    problem.reach_scale, problem.joint_precision, problem.close = REACH, JOINT_PRECISION, CLOSE
+    problem.reach_scale, problem.pitch_scale, problem.close = REACH, PITCHES, CLOSE
+    problem.marginal = belief.marginal
+    problem.mean[: motion.joints] = belief.mean.tolist()
+    problem.precision[: motion.joints] = belief.precision.tolist()
     return problem
 
 

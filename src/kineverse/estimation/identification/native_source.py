@@ -9,17 +9,18 @@ SOLVE = (
 #define MOST 11 /* parameters of a family */
 
 typedef struct {
-  int64_t count, rows, joints, lefts, rights, pitched, reach, known;
+  int64_t count, rows, joints, lefts, rights, pitched, reach, known, marginal;
   int64_t joint[6], left[6], right[6];
   const double *parent, *child, *parent_covariance, *child_covariance;
-  double reach_scale, joint_precision, close;
+  double reach_scale, pitch_scale, close, mean[6], precision[6]; /* what is believed of joint values */
 } Problem;
 
 typedef struct { double left_R[9], left_p[3], right_R[9], right_p[3], pitch; } Motion;
 
 typedef struct {
   double parent_R[9], parent_p[3], values[6];
-  double own[6], residual[6], lever[3], of_parent[36], weights[36], covariance[36];
+  double own[6], residual[6], lever[3], H_R[9];
+  double of_parent[36], of_child[36], weights[36], covariance[36];
   double by_parameters[6 * MOST], by_joints[36];
 } Observation;
 
@@ -37,21 +38,21 @@ static void column(const double *R, int64_t component, const double *lever, doub
 
 static int64_t size_of(const Problem *p) { return p->lefts + p->rights + p->pitched; }
 
-/* Linearise one observation; return its cost. */
-static double look(const Problem *p, const Motion *m, int64_t k, Observation *o) {
+/* The child's pose in the parent at joint values, and its derivatives. */
+static void place(const Problem *p, const Motion *m, Observation *o) {
   int rows = (int)p->rows;
   int64_t n = size_of(p), joints = p->joints;
-  double twist[6] = {0}, G[9], PJ[9], lever[3], way[3], whole[3], H_R[9], H_p[3];
+  double twist[6] = {0}, G[9], PJ[9], lever[3], way[3], whole[3];
   for (int64_t j = 0; j < joints; j++) twist[p->joint[j]] = o->values[j];
   if (p->pitched) twist[2] += m->pitch * twist[5];
   exponential(twist + 3, G);
   times33(m->left_R, G, PJ);
   apply(PJ, m->right_p, lever);
   apply(m->left_R, twist, way);
-  times33(PJ, m->right_R, H_R);
+  times33(PJ, m->right_R, o->H_R);
   for (int i = 0; i < 3; i++) {
     whole[i] = way[i] + lever[i];
-    H_p[i] = m->left_p[i] + whole[i];
+    o->lever[i] = m->left_p[i] + whole[i];
   }
   int64_t at = 0;
   for (int64_t j = 0; j < p->lefts; j++)
@@ -75,21 +76,61 @@ static double look(const Problem *p, const Motion *m, int64_t k, Observation *o)
       for (int i = 0; i < 3; i++) o->by_joints[i * joints + j] += m->pitch * m->left_R[3 * i + 2];
   }
 
-  const double *A = p->parent + 16 * k, *B = p->child + 16 * k;
+}
+
+/* S = Σ_B + M Σ_A Mᵀ with M = (I, -[h]x; 0, I). */
+static void combine(const Problem *p, Observation *o) {
+  int rows = (int)p->rows;
+  const double *h = o->lever;
+  memcpy(o->covariance, o->of_child, rows * rows * sizeof(double));
+  if (p->known) return;
+  double M[18] = {0, 0, 0, 0, h[2], -h[1], 0, 0, 0, -h[2], 0, h[0], 0, 0, 0, h[1], -h[0], 0}, half[36];
+  for (int i = 0; i < rows; i++)
+    for (int j = 0; j < 6; j++) {
+      half[6 * i + j] = o->of_parent[6 * i + j];
+      if (i < 3)
+        for (int l = 3; l < 6; l++) half[6 * i + j] += M[6 * i + l] * o->of_parent[6 * l + j];
+    }
+  for (int i = 0; i < rows; i++)
+    for (int j = 0; j < rows; j++) {
+      o->covariance[rows * i + j] += half[6 * i + j];
+      if (j < 3)
+        for (int l = 3; l < 6; l++) o->covariance[rows * i + j] += half[6 * i + l] * M[6 * j + l];
+    }
+}
+
+/* log |S + J_a P^-1 J_a'|: what the width of what is seen costs, with joint values as believed. */
+static double spread(const Problem *p, Observation *o) {
+  int rows = (int)p->rows, joints = (int)p->joints;
+  double whole[36], sum = 0.0;
+  memcpy(whole, o->covariance, rows * rows * sizeof(double));
+  for (int i = 0; i < rows; i++)
+    for (int j = 0; j < rows; j++)
+      for (int l = 0; l < joints; l++)
+        whole[rows * i + j] += o->by_joints[i * joints + l] * o->by_joints[j * joints + l] / p->precision[l];
+  if (!factorise(whole, rows)) return NAN;
+  for (int i = 0; i < rows; i++) sum += log(whole[(rows + 1) * i]);
+  return 2.0 * sum;
+}
+
+/* Linearise one observation; return its cost. */
+static double look(const Problem *p, const Motion *m, int64_t k, Observation *o) {
+  int rows = (int)p->rows;
+  place(p, m, o);
+  const double *A = p->parent + 16 * k, *B = p->child + 16 * k, *h = o->lever;
   double R[9], S[9], T[9], offset[3], error[6], cost;
   for (int i = 0; i < 9; i++) R[i] = B[4 * (i / 3) + i % 3];
   for (int i = 0; i < 3; i++) offset[i] = B[4 * i + 3] - o->parent_p[i];
   apply_transposed(o->parent_R, offset, error);
-  for (int i = 0; i < 3; i++) error[i] -= H_p[i];
+  for (int i = 0; i < 3; i++) error[i] -= h[i];
   if (rows == 6) {
     transposed_times33(o->parent_R, R, S);
-    times_transposed33(S, H_R, T);
+    times_transposed33(S, o->H_R, T);
     logarithm(T, error + 3);
   }
-  turn(p->child_covariance + rows * rows * k, o->parent_R, rows, o->covariance);
-  cost = squared(error, o->covariance, rows);
+  turn(p->child_covariance + rows * rows * k, o->parent_R, rows, o->of_child);
+  cost = squared(error, o->of_child, rows);
   memcpy(o->residual, error, sizeof error);
-  memcpy(o->lever, H_p, sizeof H_p);
   if (!p->known) {
     for (int i = 0; i < 9; i++) R[i] = A[4 * (i / 3) + i % 3];
     for (int i = 0; i < 3; i++) offset[i] = A[4 * i + 3] - o->parent_p[i];
@@ -98,37 +139,23 @@ static double look(const Problem *p, const Motion *m, int64_t k, Observation *o)
     logarithm(S, o->own + 3);
     turn(p->parent_covariance + 36 * k, o->parent_R, 6, o->of_parent);
     cost += squared(o->own, o->of_parent, 6);
-    /* M = (I, -[h]x; 0, I); first M Σ, then its product with Mᵀ. */
-    double M[36] = {0}, half[36];
-    for (int i = 0; i < 6; i++) M[7 * i] = 1.0;
-    M[4] = H_p[2]; M[5] = -H_p[1]; M[9] = -H_p[2]; M[11] = H_p[0]; M[15] = H_p[1]; M[16] = -H_p[0];
-    for (int i = 0; i < rows; i++) {
-      double sum = 0.0;
-      for (int j = 0; j < 6; j++) sum += M[6 * i + j] * o->own[j];
-      o->residual[i] -= sum;
-      for (int j = 0; j < 6; j++) {
-        half[6 * i + j] = o->of_parent[6 * i + j];
-        if (i < 3)
-          for (int l = 3; l < 6; l++) half[6 * i + j] += M[6 * i + l] * o->of_parent[6 * l + j];
-      }
-    }
-    for (int i = 0; i < rows; i++)
-      for (int j = 0; j < rows; j++) {
-        double sum = half[6 * i + j];
-        if (j < 3)
-          for (int l = 3; l < 6; l++) sum += half[6 * i + l] * M[6 * j + l];
-        o->covariance[rows * i + j] += sum;
-      }
+    cross(o->own + 3, h, offset);
+    for (int i = 0; i < rows; i++) o->residual[i] -= o->own[i] + (i < 3 ? offset[i] : 0.0);
   }
+  combine(p, o);
   if (!invert(o->covariance, rows, o->weights)) return NAN;
-  for (int64_t j = 0; j < joints; j++) cost += p->joint_precision * o->values[j] * o->values[j];
-  return cost;
+  for (int64_t j = 0; j < p->joints; j++) {
+    double off = o->values[j] - p->mean[j];
+    cost += p->precision[j] * off * off;
+  }
+  return p->marginal ? cost + spread(p, o) : cost;
 }
 
 static double look_at_all(const Problem *p, const Motion *m, Observation *all) {
   double cost = 0.0;
   for (int64_t i = 0; i < p->reach; i++)
     cost += m->right_p[i] * m->right_p[i] / (p->reach_scale * p->reach_scale);
+  if (p->pitched) cost += m->pitch * m->pitch / (p->pitch_scale * p->pitch_scale);
   for (int64_t k = 0; k < p->count; k++) cost += look(p, m, k, all + k);
   return cost;
 }
@@ -139,7 +166,7 @@ static int own_part(const Problem *p, const Observation *o, double damping, doub
   int rows = (int)p->rows, joints = (int)p->joints;
   double curvature[36];
   for (int i = 0; i < joints; i++) {
-    slope[i] = -p->joint_precision * o->values[i];
+    slope[i] = -p->precision[i] * (o->values[i] - p->mean[i]);
     for (int r = 0; r < rows; r++) {
       double sum = 0.0;
       for (int s = 0; s < rows; s++) sum += o->by_joints[s * joints + i] * o->weights[rows * s + r];
@@ -154,8 +181,51 @@ static int own_part(const Problem *p, const Observation *o, double damping, doub
       curvature[joints * i + j] = sum;
     }
   for (int i = 0; i < joints; i++)
-    curvature[(joints + 1) * i] += p->joint_precision + damping * curvature[(joints + 1) * i];
+    curvature[(joints + 1) * i] += p->precision[i] + damping * curvature[(joints + 1) * i];
   return invert(curvature, joints, inverse);
+}
+
+static void advance(const Problem *p, const Motion *m, const double *step, Motion *to) {
+  double l[6] = {0}, r[6] = {0}, turned[9], moved[3];
+  for (int i = 0; i < p->lefts; i++) l[p->left[i]] = step[i];
+  for (int i = 0; i < p->rights; i++) r[p->right[i]] = step[p->lefts + i];
+  to->pitch = m->pitch + (p->pitched ? step[p->lefts + p->rights] : 0.0);
+  exponential(l + 3, turned);
+  times33(m->left_R, turned, to->left_R);
+  apply(m->left_R, l, moved);
+  for (int i = 0; i < 3; i++) to->left_p[i] = m->left_p[i] + moved[i];
+  exponential(r + 3, turned);
+  times33(turned, m->right_R, to->right_R);
+  apply(turned, m->right_p, moved);
+  for (int i = 0; i < 3; i++) to->right_p[i] = moved[i] + r[i];
+}
+
+#define DIFFERENCE 1e-5
+
+/* How the width of what is seen changes with each parameter, joint values following. */
+static int widen(const Problem *p, const Motion *m, const Observation *all, double *slope) {
+  int rows = (int)p->rows, joints = (int)p->joints, n = (int)size_of(p);
+  for (int i = 0; i < n; i++) {
+    double step[MOST] = {0};
+    Motion moved;
+    step[i] = DIFFERENCE;
+    advance(p, m, step, &moved);
+    slope[i] = 0.0;
+    for (int64_t k = 0; k < p->count; k++) {
+      Observation o = all[k];
+      double inverse[36], weighted[36], own[6], before = spread(p, &o);
+      if (!own_part(p, &o, 0.0, inverse, weighted, own)) return 0;
+      for (int j = 0; j < joints; j++)
+        for (int l = 0; l < joints; l++)
+          for (int r = 0; r < rows; r++)
+            o.values[j] -= DIFFERENCE * inverse[joints * j + l] * weighted[rows * l + r] *
+            all[k].by_parameters[r * n + i];
+      place(p, &moved, &o);
+      combine(p, &o);
+      slope[i] += (spread(p, &o) - before) / DIFFERENCE;
+    }
+  }
+  return 1;
 }
 
 /* Where a step leads; 0 if there is none. */
@@ -213,6 +283,16 @@ static int move(const Problem *p, const Motion *m, const Observation *all, doubl
       for (int l = 0; l <= j; l++) normal[n * j + l] += scale * row[j] * row[l];
     }
   }
+  if (p->pitched) {
+    double scale = 1.0 / (p->pitch_scale * p->pitch_scale);
+    right[n - 1] -= scale * m->pitch;
+    normal[n * n - 1] += scale;
+  }
+  if (p->marginal) {
+    double slope[MOST];
+    if (!widen(p, m, all, slope)) return 0;
+    for (int i = 0; i < n; i++) right[i] -= 0.5 * slope[i];
+  }
   for (int i = 0; i < n; i++) normal[(n + 1) * i] *= 1.0 + damping;
   memcpy(step, right, sizeof step);
   if (!factorise(normal, n)) return 0;
@@ -233,7 +313,7 @@ static int move(const Problem *p, const Motion *m, const Observation *all, doubl
       double change[6] = {0}, back[6], own_gain = 0.0;
       if (!own_part(p, o, damping, inverse, weighted, slope)) return 0;
       for (int i = 0; i < joints; i++) {
-        back[i] = -p->joint_precision * o->values[i];
+        back[i] = -p->precision[i] * (o->values[i] - p->mean[i]);
         for (int r = 0; r < rows; r++) back[i] += weighted[rows * i + r] * left[r];
       }
       for (int i = 0; i < joints; i++)
@@ -273,18 +353,7 @@ static int move(const Problem *p, const Motion *m, const Observation *all, doubl
     }
   }
 
-  double l[6] = {0}, r[6] = {0}, turned[9], moved[3];
-  for (int i = 0; i < p->lefts; i++) l[p->left[i]] = step[i];
-  for (int i = 0; i < p->rights; i++) r[p->right[i]] = step[p->lefts + i];
-  to->pitch = m->pitch + (p->pitched ? step[n - 1] : 0.0);
-  exponential(l + 3, turned);
-  times33(m->left_R, turned, to->left_R);
-  apply(m->left_R, l, moved);
-  for (int i = 0; i < 3; i++) to->left_p[i] = m->left_p[i] + moved[i];
-  exponential(r + 3, turned);
-  times33(turned, m->right_R, to->right_R);
-  apply(turned, m->right_p, moved);
-  for (int i = 0; i < 3; i++) to->right_p[i] = moved[i] + r[i];
+  advance(p, m, step, to);
   return 1;
 }
 

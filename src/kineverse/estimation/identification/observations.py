@@ -55,6 +55,7 @@ def observations(
     child: npt.ArrayLike,
     parent_covariance: npt.ArrayLike | None,
     child_covariance: npt.ArrayLike,
+    fewest: int = 2,
 ) -> Observations:
     """Return observations, checked.
 
@@ -73,7 +74,7 @@ def observations(
         raise ShapeError(
             f"The poses of the child are an array of shape (N, 4, 4), or (N, 3) for positions, not {b.shape}."
         )
-    if len(b) < 2:
+    if len(b) < fewest:
         raise ValueRejectedError(
             f"There {'is one pose' if len(b) else 'are no poses'} of the child. How something moves takes "
             "at least two to see."

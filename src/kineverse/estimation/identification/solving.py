@@ -18,7 +18,7 @@ from typing import Generic, Self, TypeVar
 
 import numpy as np
 
-from .matrices import inverted, times
+from .matrices import inverted, log_determinants, times
 from .motion import Linear, Motion, Prior
 from .observations import Observations
 from .rigid import Array, exponential, logarithm, pose, skew
@@ -27,9 +27,31 @@ M = TypeVar("M", bound=Motion)
 
 STEPS = 60
 CLOSE = 1e-9
-# Beforehand, joint values are believed within so much [m] or [rad]: they stay finite where nothing tells
-# them.
-JOINT_PRECISION = 1e-4
+_DIFFERENCE = 1e-5
+
+
+@dataclass(frozen=True)
+class Belief:
+    """What is believed of joint values beforehand: independent Gaussians.
+
+    Attributes
+    ----------
+    mean, precision
+        For each joint value, (k,).
+    marginal
+        Whether joint values are integrated out: the cost then has log |S + J_a P⁻¹ J_aᵀ| of each observation
+        too. Without, directions are preferred in which little is seen, as soon as the noise is as large as
+        the motion.
+    """
+
+    mean: Array
+    precision: Array
+    marginal: bool = False
+
+    @staticmethod
+    def vague(joints: int) -> Belief:
+        """Return the belief that keeps joint values finite where nothing tells them, and nothing else."""
+        return Belief(np.zeros(joints), np.full(joints, 1e-4))
 
 
 @dataclass(frozen=True)
@@ -53,6 +75,8 @@ class Solution(Generic[M]):
         Derivatives at the solution.
     parent
         The most likely true poses of the parent, (N, 4, 4).
+    belief
+        What was believed of joint values.
     converged
         Whether steps became small; else the best that was found.
     """
@@ -64,6 +88,7 @@ class Solution(Generic[M]):
     covariance: Array
     linear: Linear
     parent: Array
+    belief: Belief
     converged: bool
 
     def scaled(self, factor: float) -> Self:
@@ -89,7 +114,13 @@ class _Point(Generic[M]):
     cost: float
 
 
-def solve(seen: Observations, motion: M, values: Array, parent: Array | None = None) -> Solution[M]:
+def solve(
+    seen: Observations,
+    motion: M,
+    values: Array,
+    parent: Array | None = None,
+    belief: Belief | None = None,
+) -> Solution[M]:
     """Return the most likely member of a family, from a start.
 
     Parameters
@@ -100,11 +131,14 @@ def solve(seen: Observations, motion: M, values: Array, parent: Array | None = N
         Where to start: a member, and joint values (N, k).
     parent
         True poses of the parent to start from, (N, 4, 4); those observed if None.
+    belief
+        What is believed of joint values; next to nothing if None.
     """
-    point = _point(seen, motion, values, seen.parent if parent is None else parent)
+    belief = belief or Belief.vague(motion.joints)
+    point = _point(seen, motion, values, seen.parent if parent is None else parent, belief)
     damping, converged = 0.0, False
     for _ in range(STEPS):
-        reduced = _step(seen, point, damping)
+        reduced = _step(seen, point, damping, belief)
         if reduced is None:
             damping = max(10.0 * damping, 1e-6)
             if damping > 1e8:
@@ -131,11 +165,12 @@ def solve(seen: Observations, motion: M, values: Array, parent: Array | None = N
         point.covariance,
         point.linear,
         point.parent,
+        belief,
         converged,
     )
 
 
-def _point(seen: Observations, motion: M, values: Array, parent: Array) -> _Point[M]:
+def _point(seen: Observations, motion: M, values: Array, parent: Array, belief: Belief) -> _Point[M]:
     linear = motion.at(values)
     prior = motion.prior()
     rows = seen.rows
@@ -159,23 +194,29 @@ def _point(seen: Observations, motion: M, values: Array, parent: Array) -> _Poin
         residuals = error - times(lever, own)
         covariance = covariance + lever @ of_parent @ np.swapaxes(lever, 1, 2)
     weights = inverted(covariance)
-    cost += float(prior.residuals @ prior.residuals) + JOINT_PRECISION * float(np.sum(values**2))
+    cost += float(prior.residuals @ prior.residuals)
+    cost += float(np.sum(belief.precision * (values - belief.mean) ** 2))
+    if belief.marginal:
+        cost += _spread(covariance, linear, belief)
     return _Point(
         motion, values, parent, linear, prior, own, residuals, lever, of_parent, weights, covariance, cost
     )
 
 
-def _step(seen: Observations, point: _Point[M], damping: float) -> tuple[_Point[M], float] | None:
+def _step(
+    seen: Observations, point: _Point[M], damping: float, belief: Belief
+) -> tuple[_Point[M], float] | None:
     """Return where a step leads, and by how much it promises to reduce the cost; None if there is no step."""
     by_parameters, by_joints = point.linear.by_parameters, point.linear.by_joints
     projected = point.weights
     moving = by_joints.shape[2] > 0
     if moving:
+        pulled = belief.precision * (belief.mean - point.values)
         weighted = np.swapaxes(by_joints, 1, 2) @ point.weights
         curvature = weighted @ by_joints
         diagonal = np.einsum("nii->ni", curvature)
-        diagonal += JOINT_PRECISION + damping * diagonal
-        slope = times(weighted, point.residuals) - JOINT_PRECISION * point.values
+        diagonal += belief.precision + damping * diagonal
+        slope = times(weighted, point.residuals) + pulled
         inverse = inverted(curvature)
         projected = point.weights - np.swapaxes(weighted, 1, 2) @ inverse @ weighted
     rotated = np.swapaxes(by_parameters, 1, 2) @ projected
@@ -184,8 +225,10 @@ def _step(seen: Observations, point: _Point[M], damping: float) -> tuple[_Point[
     right = np.einsum("nir,nr->i", rotated, point.residuals) - prior.by_parameters.T @ prior.residuals
     if moving:
         # What the prior of joint values adds, carried to the parameters.
-        pull = times(inverse, JOINT_PRECISION * point.values)
-        right += np.einsum("nrj,nrk,nk->j", by_parameters, np.swapaxes(weighted, 1, 2), pull)
+        pull = times(inverse, pulled)
+        right -= np.einsum("nrj,nrk,nk->j", by_parameters, np.swapaxes(weighted, 1, 2), pull)
+        if belief.marginal:
+            right -= 0.5 * _widening(point, inverse @ weighted, belief)
     normal[np.diag_indices_from(normal)] *= 1.0 + damping
     try:
         step = np.linalg.solve(normal, right) if len(right) else right
@@ -209,8 +252,36 @@ def _step(seen: Observations, point: _Point[M], damping: float) -> tuple[_Point[
         gain += float(np.sum(error**2 / np.einsum("nii->ni", point.parent_covariance)))
     if not (np.isfinite(step).all() and np.isfinite(values).all() and np.isfinite(parent).all()):
         return None
-    trial = _point(seen, point.motion.moved(step), values, parent)
+    trial = _point(seen, point.motion.moved(step), values, parent, belief)
     return (trial, gain) if np.isfinite(trial.cost) else None
+
+
+def _spread(covariance: Array, linear: Linear, belief: Belief) -> float:
+    """Return the sum of log |S + J_a P⁻¹ J_aᵀ|."""
+    by_joints = linear.by_joints
+    return log_determinants(covariance + (by_joints / belief.precision) @ np.swapaxes(by_joints, 1, 2))
+
+
+def _widening(point: _Point[M], gains: Array, belief: Belief) -> Array:
+    """Return the derivatives of the spread by each parameter, with joint values following."""
+    size = point.motion.size
+    result = np.zeros(size)
+    before = _spread(point.covariance, point.linear, belief)
+    own = point.covariance - _carried(point.lever, point.parent_covariance)
+    for i in range(size):
+        step = np.zeros(size)
+        step[i] = _DIFFERENCE
+        values = point.values - _DIFFERENCE * times(gains, point.linear.by_parameters[:, :, i])
+        linear = point.motion.moved(step).at(values)
+        lever = _lever(linear.pose[:, :3, 3], point.residuals.shape[1])
+        covariance = own + _carried(lever, point.parent_covariance)
+        result[i] = (_spread(covariance, linear, belief) - before) / _DIFFERENCE
+    return result
+
+
+def _carried(lever: Array, covariance: Array | None) -> Array | float:
+    """Return M Σ_A Mᵀ."""
+    return 0.0 if covariance is None else lever @ covariance @ np.swapaxes(lever, 1, 2)
 
 
 def _lever(offset: Array, rows: int) -> Array:

@@ -1,0 +1,150 @@
+"""Identification while poses come in."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+
+import numpy as np
+import numpy.typing as npt
+
+from kineverse.errors import ShapeError, ValueRejectedError
+
+from .canonical import canonical
+from .fit import Found
+from .groups import GroupMotion
+from .identify import family_weights, noise_of, solutions, weighed
+from .native import solver
+from .observations import Observations, observations
+from .refining import refined
+from .rigid import Array
+from .solving import Solution
+
+# A family that is less probable than this rests until there are twice as many observations.
+_NO_CHANCE = 1e-6
+
+
+class Identifier:
+    """How a part moves against another, learned while it moves.
+
+    It gives what :func:`.identify.identify` gives of all poses so far, at a fraction of the cost: each family
+    goes on from where it was. A family that has no chance rests until there are twice as many observations,
+    and is not among what was found meanwhile.
+
+    Parameters
+    ----------
+    covariance_a, covariance_b
+        Covariances of the errors of all poses that come without their own, (6, 6).
+    families, noise
+        As for :func:`.identify.identify`.
+
+    Raises
+    ------
+    UnknownNameError
+        For a family that does not exist.
+    """
+
+    def __init__(
+        self,
+        *,
+        covariance_a: npt.ArrayLike | None = None,
+        covariance_b: npt.ArrayLike | None = None,
+        families: Iterable[str] | Mapping[str, float] | None = None,
+        noise: npt.ArrayLike | None = None,
+    ) -> None:
+        self._weights = family_weights(families)
+        self._noise = covariance_a, covariance_b, noise
+        self._stated = True
+        self._seen: list[Observations] = []
+        self._solutions: dict[str, Solution[GroupMotion]] = {}
+        self._found: Found | None = None
+        self._whole = 0
+
+    def __len__(self) -> int:
+        return len(self._seen)
+
+    def add(
+        self,
+        a: npt.ArrayLike | None,
+        b: npt.ArrayLike,
+        covariance_a: npt.ArrayLike | None = None,
+        covariance_b: npt.ArrayLike | None = None,
+    ) -> None:
+        """Take notice of a pose of each part, (4, 4); of the child perhaps only its position, (3,).
+
+        Raises
+        ------
+        ShapeError, ValueRejectedError
+            For poses or covariances that are none, or of another kind than those before; nothing has changed
+            then.
+        """
+        of_a, of_b, noise = self._noise
+        of_a, of_b, stated = noise_of(
+            a is not None,
+            of_a if covariance_a is None else covariance_a,
+            of_b if covariance_b is None else covariance_b,
+            noise,
+        )
+        one = observations(
+            None if a is None else np.asarray(a)[None], np.asarray(b)[None], of_a, of_b, fewest=1
+        )
+        if self._seen:
+            first = self._seen[0]
+            if one.rows != first.rows or (one.parent_covariance is None) != (first.parent_covariance is None):
+                raise ShapeError(
+                    "Poses and positions do not mix, nor a parent that is the world with another."
+                )
+        self._stated = stated
+        self._seen.append(one)
+        self._found = None
+
+    @property
+    def found(self) -> Found:
+        """What all poses so far tell.
+
+        Raises
+        ------
+        ValueRejectedError
+            For fewer than two poses.
+        """
+        if len(self._seen) < 2:
+            raise ValueRejectedError(
+                f"There are {len(self._seen)} poses so far. How something moves takes at least two to see."
+            )
+        if self._found is None:
+            self._found = self._find()
+        return self._found
+
+    def _find(self) -> Found:
+        seen = _joined(self._seen)
+        if len(seen) >= 2 * self._whole:
+            self._whole = len(seen)
+            self._solutions = solutions(seen, self._weights)
+        else:
+            self._solutions = {name: _continued(seen, s) for name, s in self._solutions.items()}
+        found = weighed(self._solutions, self._weights, self._stated)
+        chances = {fit.family for fit in found if fit.probability > _NO_CHANCE}
+        self._solutions = {name: s for name, s in self._solutions.items() if name in chances}
+        return found
+
+
+def _joined(parts: list[Observations]) -> Observations:
+    parents = [p.parent_covariance for p in parts if p.parent_covariance is not None]
+    return Observations(
+        np.concatenate([p.parent for p in parts]),
+        np.concatenate([p.child for p in parts]),
+        np.concatenate(parents) if parents else None,
+        np.concatenate([p.child_covariance for p in parts]),
+    )
+
+
+def _continued(seen: Observations, before: Solution[GroupMotion]) -> Solution[GroupMotion]:
+    """Return the solution of a family for more observations than it was found from."""
+    known = len(before.values)
+    values: list[Array] = [before.values]
+    for k in range(known, len(seen)):
+        # The new joint value is near that of the observation that looks most alike.
+        apart = np.sum((seen.relative[:known] - seen.relative[k]) ** 2, axis=(1, 2))
+        values.append(before.values[int(np.argmin(apart))][None])
+    parent = np.concatenate([before.parent, seen.parent[known:]])
+    solution = solver.solve(seen, before.motion, np.concatenate(values), parent, before.belief)
+    return canonical(refined(seen, solution))

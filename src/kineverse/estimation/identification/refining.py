@@ -1,0 +1,40 @@
+"""From the maximum of the likelihood to the maximum with joint values integrated out.
+
+Where a motion is short beside the noise, the likelihood prefers joint values that are noise: its maximum is
+then several times as far from the truth as need be. So joint values are believed as wide as the motion is,
+see :mod:`.evidence`, and are integrated out; how wide that is follows from what was seen, in turns with the
+rest.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from .groups import GroupMotion
+from .native import solver
+from .observations import Observations
+from .rigid import Array
+from .solving import Belief, Solution
+from .widths import alone, widths
+
+_TURNS = 8
+# A width that changes by less has settled.
+_SETTLED = 0.01
+_NARROWEST = 1e-4
+
+
+def refined(seen: Observations, solution: Solution[GroupMotion]) -> Solution[GroupMotion]:
+    """Return the solution with joint values integrated out."""
+    if not solution.motion.joints or not solution.motion.size:
+        return solution
+    known = solution.belief
+    before: Array | None = known.precision**-0.5 if known.marginal else None
+    for _ in range(_TURNS):
+        found = widths(solution.motion, alone(solution))
+        wide = np.maximum(found.deviations, _NARROWEST)
+        if before is not None and np.all(np.abs(np.log(wide / before)) < _SETTLED):
+            break
+        before = wide
+        belief = Belief(found.mean, wide**-2.0, marginal=True)
+        solution = solver.solve(seen, solution.motion, solution.values, solution.parent, belief)
+    return solution

@@ -1,0 +1,103 @@
+"""How wide a motion is, from joint values that are known so and so well.
+
+Joint values are drawn from Gaussians of a mean μ and a width s of their own, one width for all slides and one
+for all turns. With the maximum â_k of the likelihood of each observation and its covariance C_k, which know
+nothing of each other, â_k is from N(μ, s² + C_k).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from .groups import WX, GroupMotion
+from .matrices import inverted, log_determinants, times
+from .rigid import Array
+from .solving import Solution
+
+# From hardly anything to more than there is [m], [rad].
+_GRID = np.geomspace(1e-5, 10.0, 61)
+_STEP = math.log(float(_GRID[1] / _GRID[0]))
+
+
+@dataclass(frozen=True)
+class Alone:
+    """Joint values of each observation by itself, whatever was believed of them when they were found.
+
+    Attributes
+    ----------
+    values, covariances
+        (N, k) and (N, k, k).
+    log_likelihood
+        Of all observations, with the joint values integrated over all there is.
+    """
+
+    values: Array
+    covariances: Array
+    log_likelihood: float
+
+
+def alone(solution: Solution[GroupMotion]) -> Alone:
+    """Return joint values by the observations alone, by the quadratic at the solution."""
+    weights, by_joints = inverted(solution.covariance), solution.linear.by_joints
+    weighted = np.swapaxes(by_joints, 1, 2) @ weights
+    covariances = inverted(weighted @ by_joints)
+    change = times(covariances, times(weighted, solution.residuals))
+    left = solution.residuals - times(by_joints, change)
+    log = -0.5 * float(np.sum(left * times(weights, left))) + 0.5 * log_determinants(math.tau * covariances)
+    return Alone(
+        solution.values + change, covariances, log - 0.5 * log_determinants(math.tau * solution.covariance)
+    )
+
+
+@dataclass(frozen=True)
+class Widths:
+    """How wide a motion is.
+
+    Attributes
+    ----------
+    deviations, mean
+        s and μ for each joint value, (k,).
+    log_density
+        log ∫ Π N(â_k; μ, s² + C_k) ds at this μ, with s anywhere between hardly anything and metres or whole
+        turns, all orders of magnitude alike.
+    """
+
+    deviations: Array
+    mean: Array
+    log_density: float
+
+
+def widths(motion: GroupMotion, seen: Alone) -> Widths:
+    """Return the most likely widths of the motion."""
+    turning = np.array([j >= WX for j in motion.freedom.joints])
+    deviations, occam = np.zeros(len(turning)), 0.0
+    variances = np.einsum("nii->ni", seen.covariances)
+    for block in (turning, ~turning):
+        if block.any():
+            deviations[block], part = _width(seen.values[:, block], variances[:, block])
+            occam += part
+    total = seen.covariances + np.diag(deviations**2)
+    weights = inverted(total)
+    mean: Array = np.linalg.solve(weights.sum(axis=0), times(weights, seen.values).sum(axis=0))
+    off = seen.values - mean
+    log = -0.5 * float(np.sum(off * times(weights, off))) - 0.5 * log_determinants(math.tau * total)
+    return Widths(deviations, mean, log + occam)
+
+
+def _width(values: Array, variances: Array) -> tuple[float, float]:
+    """Return the best s, and the logarithm of the mean over all s relative to the best."""
+    total = variances + _GRID[:, None, None] ** 2
+    weights = 1.0 / total
+    mean = (weights * values).sum(axis=1) / weights.sum(axis=1)
+    squares = (values - mean[:, None, :]) ** 2 * weights
+    # With the mean integrated out, or a few values would seem narrower than they are.
+    logs = -0.5 * (np.log(total) + squares).sum(axis=(1, 2)) - 0.5 * np.log(weights.sum(axis=1)).sum(axis=1)
+    top = int(np.argmax(logs))
+    best = math.log(float(_GRID[top]))
+    if 0 < top < len(logs) - 1:
+        before, here, after = logs[top - 1 : top + 2]
+        best += 0.5 * _STEP * float((after - before) / (2.0 * here - before - after))
+    return math.exp(best), math.log(float(np.mean(np.exp(logs - logs[top]))))
