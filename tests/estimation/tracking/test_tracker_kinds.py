@@ -117,3 +117,41 @@ def test_positions_and_expressions_and_a_camera_that_moves():
         estimate = tracker.update(seen, given={"pan": pan_now})
     assert estimate.state[door] == pytest.approx(0.9, abs=1e-3)
     assert estimate.dof == 4
+
+
+@pytest.mark.parametrize(
+    ("name", "truth"),
+    [
+        (
+            "differential_drive",
+            {
+                "base/x": 0.5,
+                "base/y": -0.3,
+                "base/angle": 2.0,
+                "base/left_wheel": 0.7,
+                "base/right_wheel": -0.4,
+            },
+        ),
+        ("screw_and_nut", {"vise": 20.9}),
+        ("ball", {"stick/qx": 0.1, "stick/qy": -0.2, "stick/qz": 0.1, "stick/qw": 0.97}),
+        ("jansen_leg", None),
+    ],
+)
+def test_what_has_more_coordinates_than_ways_to_move_or_many_turns(name, truth):
+    """Wheels that are seen to turn, threads of many turns, quaternions within a cone, closed loops."""
+    model = kv.load(f"articulations/{name}")
+    eyes = Eyes(model, moving(model))
+    tracker = Tracker(model, eyes.frames)
+    if truth is None:
+        state = model.default_state()
+    else:
+        state = kv.State({f"{name}/{s}": value for s, value in truth.items()})
+    for _ in range(4):
+        estimate = tracker.update(eyes(state))
+    coordinates = [s for s in estimate.state if str(s)[-3:-1] != "/q"]
+    for s in coordinates:
+        off = estimate.state[s] - state[s]
+        if s in tracker.turning:
+            off = np.angle(np.exp(1j * off))
+        assert abs(off) < 5 * estimate.deviation[s]
+    assert np.abs(eyes.truth(estimate.state) - eyes.truth(state)).max() < 0.05

@@ -1,10 +1,9 @@
 """The tangent of a state: in which directions coordinates can be off.
 
-Surprise first: these need not be the model's free speeds. A quaternion is off in three ways, as it moves with
-three speeds. But a base on two wheels, which moves with two speeds, is off in three ways, as it gets anywhere
-by turning to and fro. So coordinates that are connected by their rates, q̇ = R(q) u, have as many directions
-as the Lie algebra of the columns of R has at a point (Chow's theorem; Lynch and Park, Modern Robotics, 13.3).
-If that are all coordinates, these are their own tangent; if it is the rank of R, the speeds are.
+Surprise first: these need not be the model's free speeds. A base on two wheels moves with two speeds and is
+off in three ways, as nobody knows where it began. So coordinates are their own tangent, but for those that
+are too many: where nothing that is seen changes in directions that the rates q̇ = R(q) u do not go, the speeds
+are the tangent. A quaternion's length is such a direction.
 """
 
 from __future__ import annotations
@@ -14,7 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from kineverse.errors import ModelError
+from kineverse.estimation.noise import Array
 from kineverse.expressions.expression import Expression, array, as_expression
 from kineverse.model.rates import Rates, plain
 from kineverse.symbols import Symbol
@@ -65,16 +64,24 @@ class Chart:
         return found
 
 
-def chart_of(rates: Rates, symbols: Iterable[Symbol], known: Iterable[Symbol]) -> Chart:
-    """Return the chart of the coordinates among some symbols, and of what their rates look at.
+def chart_of(
+    rates: Rates, values: Sequence[Expression], known: Iterable[Symbol], default: Mapping[Symbol, float]
+) -> Chart:
+    """Return the chart of the coordinates that values depend on, and of what their rates look at.
 
-    Raises
-    ------
-    ModelError
-        If a part of them can be off in more ways than there are speeds, and in fewer than coordinates.
+    Parameters
+    ----------
+    rates
+        The model's table.
+    values
+        What is seen, in plain coordinates.
+    known
+        What is handed in.
+    default
+        A place at which values can be asked for.
     """
     known = set(known)
-    wanted = [s for s in symbols if s.has_derivative and s.order == 0 and s not in known]
+    wanted = [s for value in values for s in value.symbols if _is_coordinate(s, known)]
     found: set[Symbol] = set()
     while wanted:
         x = wanted.pop()
@@ -82,21 +89,19 @@ def chart_of(rates: Rates, symbols: Iterable[Symbol], known: Iterable[Symbol]) -
             continue
         found.add(x)
         looked_at = {s for entry in rates.get(x, {}).values() for s in entry.symbols}
-        wanted += [s for s in looked_at if s.has_derivative and s.order == 0 and s not in known]
+        wanted += [s for s in looked_at if _is_coordinate(s, known)]
     coordinates = tuple(sorted(found, key=lambda s: s.sort_key))
     by_speeds: set[Symbol] = set()
     for block in _blocks(coordinates, rates):
-        if any(x in rates for x in block) and not _reaches_all(block, rates):
+        if all(x in rates for x in block) and _are_too_many(block, rates, values, default):
             by_speeds.update(block)
-    tangent = {
-        v for x in coordinates for v in (rates[x] if x in by_speeds & rates.keys() else [x.derivative()])
-    }
-    return Chart(
-        coordinates,
-        tuple(sorted(tangent, key=lambda s: s.sort_key)),
-        rates,
-        frozenset(by_speeds & rates.keys()),
-    )
+    tangent = {v for x in coordinates for v in (rates[x] if x in by_speeds else [x.derivative()])}
+    in_order = tuple(sorted(tangent, key=lambda s: s.sort_key))
+    return Chart(coordinates, in_order, rates, frozenset(by_speeds))
+
+
+def _is_coordinate(symbol: Symbol, known: set[Symbol]) -> bool:
+    return symbol.has_derivative and symbol.order == 0 and symbol not in known
 
 
 def connected(items: Sequence[frozenset[Symbol]]) -> list[set[Symbol]]:
@@ -117,43 +122,39 @@ def _blocks(coordinates: tuple[Symbol, ...], rates: Rates) -> list[list[Symbol]]
     return [[x for x in coordinates if rows[x] & union] for union in connected(list(rows.values()))]
 
 
-def _reaches_all(block: list[Symbol], rates: Rates) -> bool:
-    """Whether speeds lead from a place of these coordinates to all places around it."""
-    zero, one = as_expression(0.0), as_expression(1.0)
-    rows = [rates[x] if x in rates else {x.derivative(): one} for x in block]
-    speeds = sorted({v for row in rows for v in row}, key=lambda s: s.sort_key)
-    fields = [[row.get(v, zero) for row in rows] for v in speeds]
-    plain_rank = rank = _rank(fields)
-    new = fields
-    while rank < len(block):
-        new = [_bracket(a, b, block) for a in new for b in fields[: len(speeds)]]
-        fields = [*fields, *new]
-        more = _rank(fields)
-        if more == rank:
-            break
-        rank = more
-    if rank == len(block):
-        return True
-    if rank > plain_rank or plain_rank < len(speeds):
-        raise ModelError(
-            f"The coordinates {', '.join(map(str, block))} move with {len(speeds)} speeds and can be off in "
-            f"{rank} ways: a tracker has no coordinates for that."
-        )
-    return False
-
-
-def _bracket(a: list[Expression], b: list[Expression], block: list[Symbol]) -> list[Expression]:
-    """Return the Lie bracket of two fields, (∂b/∂q) a - (∂a/∂q) b."""
-    along_a, along_b = array(a), array(b)
-    return list(along_b.partial(block) @ along_a - along_a.partial(block) @ along_b)
-
-
-def _rank(fields: list[list[Expression]]) -> int:
-    """Return the most directions that fields have at some places."""
-    matrix = array([array(f) for f in fields])
+def _are_too_many(
+    block: list[Symbol], rates: Rates, values: Sequence[Expression], default: Mapping[Symbol, float]
+) -> bool:
+    """Whether nothing that is seen changes in directions in which these coordinates do not move."""
+    zero = as_expression(0.0)
+    speeds = sorted({v for x in block for v in rates[x]}, key=lambda s: s.sort_key)
+    matrix = array([[rates[x].get(v, zero) for v in speeds] for x in block])
+    seen = [value for value in values if not set(block).isdisjoint(value.symbols)]
     random = np.random.default_rng(0)
-    places = random.uniform(0.2, 1.0, (3, len(matrix.symbols)))
-    return max(
-        int(np.linalg.matrix_rank(matrix(dict(zip(matrix.symbols, p.tolist(), strict=True))), tol=1e-9))
-        for p in places
-    )
+    for _ in range(_PLACES):
+        place = {x: default.get(x, 0.0) + random.uniform(-0.3, 0.3) for x in block}
+        around = _at(matrix, place, default)
+        left, singular, _ = np.linalg.svd(around)
+        rank = int((singular > 1e-9).sum())
+        if rank < len(speeds) or rank == len(block):
+            return False
+        for direction in left[:, rank:].T:
+            ahead, behind = (
+                {x: place[x] + h * d for x, d in zip(block, direction.tolist(), strict=True)}
+                for h in (_STEP, -_STEP)
+            )
+            for value in seen:
+                change = np.abs(_at(value, ahead, default) - _at(value, behind, default)).max()
+                if not change < _STILL * _STEP:
+                    return False
+    return True
+
+
+_PLACES = 2
+_STEP, _STILL = 1e-4, 1e-5
+
+
+def _at(expression: Expression, place: Mapping[Symbol, float], default: Mapping[Symbol, float]) -> Array:
+    values = {s: place.get(s, default.get(s, s.value or 0.0)) for s in expression.symbols}
+    found: Array = expression(values)
+    return found

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from kineverse.errors import KineverseError
 from kineverse.estimation.noise import Array
 from kineverse.symbols import Symbol
 
@@ -23,6 +24,7 @@ from .solving import Solver
 
 # Explanations whose predictions are so few deviations apart are one.
 _SAME = 0.3
+_OUTSIDE = 1e-9
 
 
 @dataclass(slots=True, eq=False)
@@ -99,6 +101,22 @@ class Filter:
         found = self.solver.inside(belief, self.reader.nothing(), known)
         self._wrap(found)
         return found
+
+    def is_possible(self, number: int, belief: Belief, known: Array) -> bool:
+        """Whether a group can be at a place: inside its limits, and where the model says something."""
+        try:
+            out = self.residuals.evaluate(belief.x, known)
+        except KineverseError:
+            return False
+        group = self.layout.groups[number]
+        spoken = [
+            out[where]
+            for i in group.seen
+            for where in (self.layout.value_slices[i], self.layout.slope_slices[i])
+        ]
+        if not all(np.isfinite(each).all() for each in spoken):
+            return False
+        return self.solver.room(number, belief.x[group.x], out).violation < _OUTSIDE
 
     def _seen(self, reading: Reading) -> list[int]:
         return [n for n, group in enumerate(self.layout.groups) if reading.seen[list(group.seen)].any()]

@@ -145,6 +145,10 @@ class Solver:
             moved.put(group.t, work.prior)
         return moved
 
+    def room(self, number: int, x: Array, out: Array) -> Room:
+        """Return what limits allow a group at a place where the model was evaluated."""
+        return self._boxes[number].room(x, out)
+
     def _run(
         self, belief: Belief, reading: Reading, known: Array, groups: Sequence[int], trust: Trust
     ) -> tuple[dict[int, _Work], Array, int]:
@@ -211,6 +215,9 @@ class Solver:
         if step is None:
             names = ", ".join(map(str, self._layout.groups[number].coordinates))
             raise ModelError(f"The limits of {names} leave no state between them.")
+        if self._layout.groups[number].by_speeds:
+            # No further than half a turn: beyond, what is linear leads anywhere.
+            step = step * min(1.0, np.pi / max(float(np.abs(step).max()), 1e-300))
         x, turn = self._charted.step(number, work.x, step, known)
         x = self._boxes[number].clipped(x)
         if float(step @ matrix @ step) <= _CONVERGED**2 or work.damping > _MOST_DAMPING:

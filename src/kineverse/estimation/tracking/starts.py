@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
+from collections.abc import Iterable
 
 import numpy as np
 
@@ -12,75 +13,80 @@ from kineverse.estimation.noise import Array
 from kineverse.symbols import Symbol
 
 from .belief import Belief
-from .charted import Charted
+from .filtering import Filter
 from .layout import Layout
-from .limits import Limits
-from .modes import MOST_MODES, Modes
-from .residuals import Residuals
+from .modes import Modes
 
-# Starts of an angle are no further apart than this [rad].
+# Starts are no further apart than this [rad], of an angle that may be anywhere.
 _APART = math.pi / 2
+_MOST_STARTS = 32
 _SAME = 1e-9
 
 
-def turning(
-    layout: Layout, limits: Limits, residuals: Residuals, x: Array, known: Array
-) -> frozenset[Symbol]:
+def turning(filter_: Filter, x: Array, known: Array) -> frozenset[Symbol]:
     """Return the coordinates without limits that come back after a turn: nothing looks different then."""
-    free = [i for i in range(len(x)) if np.isinf(limits.lower[i]) and np.isinf(limits.upper[i])]
+    chart, limits = filter_.layout.chart, filter_.limits
+    free = np.flatnonzero(np.isinf(limits.lower) & np.isinf(limits.upper))
     found = []
-    for i in free:
-        symbol = layout.chart.coordinates[i]
-        if symbol in layout.chart.by_speeds:
-            continue
+    for i in free.tolist():
         there = x.copy()
         there[i] += 2 * math.pi
         try:
-            change = np.abs(residuals.evaluate(there, known) - residuals.evaluate(x, known)).max()
+            before, after = (filter_.residuals.evaluate(at, known) for at in (x, there))
         except KineverseError:  # a loop that does not close there
             continue
-        if change < _SAME * (1 + np.abs(x).max()):
-            found.append(symbol)
+        with np.errstate(invalid="ignore"):  # where the model says nothing finite
+            change = np.abs(after - before).max()
+        is_same = change < _SAME * (1 + np.abs(x).max())
+        if is_same and chart.coordinates[i] not in chart.by_speeds:
+            found.append(chart.coordinates[i])
     return frozenset(found)
 
 
-def starts(
-    layout: Layout, limits: Limits, charted: Charted, first: Belief, known: Array, turns: frozenset[Symbol]
-) -> Modes:
-    """Return beliefs about several places, all of the same Gaussian."""
+def starts(filter_: Filter, first: Belief, known: Array) -> Modes:
+    """Return beliefs about several places, all of the same Gaussian, the given one first."""
+    layout = filter_.layout
     beliefs, alive = [first], [np.ones(len(layout.groups), dtype=bool)]
     for number, group in enumerate(layout.groups):
-        steps = [_steps_of(layout, limits, first, i, turns) for i in group.x]
-        if group.by_speeds:
-            steps = [
-                [0.0] if x in layout.chart.by_speeds else s
-                for x, s in zip(group.coordinates, steps, strict=True)
-            ]
-        own = [(x, None) for x in itertools.product(*steps)][:MOST_MODES]
-        offsets = [_in_tangent(layout, number, np.array(x)) for x, _ in own]
-        offsets += _half_turns(layout, number)
-        for mode, offset in enumerate(offsets[1:], 1):
+        steps = [_steps_of(filter_, first, i) for i in group.x]
+        offsets = [_in_tangent(layout, number, np.array(x)) for x in _some(itertools.product(*steps))]
+        mode = 0
+        for offset in offsets[1:] + _half_turns(layout, number):
+            x, turn = filter_.charted.step(number, first.x[group.x], offset, known)
+            there = first.copy()
+            there.x[group.x] = x
+            if not filter_.is_possible(number, there, known):
+                continue
+            mode += 1
             if mode == len(beliefs):
                 beliefs.append(first.copy())
                 alive.append(np.zeros(len(layout.groups), dtype=bool))
             alive[mode][number] = True
-            x, turn = charted.step(number, first.x[group.x], offset, known)
-            moved = first.part(group.t).carried(offset, turn)
             beliefs[mode].x[group.x] = x
-            beliefs[mode].put(group.t, moved)
+            beliefs[mode].put(group.t, first.part(group.t).carried(offset, turn))
     return Modes(layout, beliefs, np.array(alive))
 
 
-def _steps_of(layout: Layout, limits: Limits, first: Belief, i: int, turns: frozenset[Symbol]) -> list[float]:
-    """Return how far from the first place others are to be tried, itself first."""
-    low, high = limits.lower[i], limits.upper[i]
-    if layout.chart.coordinates[i] in turns:
+def _some(places: Iterable[tuple[float, ...]]) -> list[tuple[float, ...]]:
+    """Return as many places as there may be, from all over, the first one first."""
+    every = list(itertools.islice(places, 4096))
+    step = math.ceil(len(every) / _MOST_STARTS)
+    return every[::step]
+
+
+def _steps_of(filter_: Filter, first: Belief, i: int) -> list[float]:
+    """Return how far from the first place of a coordinate others are to be tried, itself first."""
+    coordinate = filter_.layout.chart.coordinates[i]
+    if coordinate in filter_.layout.chart.by_speeds:
+        return [0.0]
+    if coordinate in filter_.turns:
         return [0.0, math.pi / 2, math.pi, -math.pi / 2]
+    low, high = filter_.limits.lower[i], filter_.limits.upper[i]
     if not math.isfinite(high - low) or high - low <= 2 * _APART + _SAME:
         return [0.0]
-    count = math.ceil((high - low) / _APART)
+    count = min(math.ceil((high - low) / _APART), _MOST_STARTS - 1)
     middles = low + (np.arange(count) + 0.5) * (high - low) / count - first.x[i]
-    return [0.0, *middles.tolist()][:MOST_MODES]
+    return [0.0, *middles.tolist()]
 
 
 def _in_tangent(layout: Layout, number: int, change: Array) -> Array:
@@ -99,7 +105,7 @@ def _half_turns(layout: Layout, number: int) -> list[Array]:
     own = {x.derivative() for x in group.coordinates if x not in layout.chart.by_speeds}
     found: list[Array] = []
     for k, speed in enumerate(group.tangent):
-        if speed not in own and len(found) < MOST_MODES // 2:
+        if speed not in own:
             step = np.zeros(len(group.tangent))
             step[k] = math.pi
             found.append(step)

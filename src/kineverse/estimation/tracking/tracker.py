@@ -12,20 +12,18 @@ import numpy.typing as npt
 
 from kineverse.errors import UnknownNameError, ValueRejectedError, suggest
 from kineverse.estimation.noise import Array
-from kineverse.model.rates import plain
 from kineverse.state import State
 from kineverse.symbols import Symbol
 
+from .arrangement import arranged
 from .belief import Belief
-from .chart import chart_of
 from .estimate import Estimate
 from .filtering import Filter, Outcome
-from .layout import Layout, layout_of
-from .limits import Limits, first_deviations, first_place, limits_of
+from .limits import first_deviations, first_place
 from .locks import Locks
 from .modes import Modes
 from .native import native_library
-from .observed import Observation, ObservedLike, observations
+from .observed import ObservedLike, observations
 from .outliers import Outliers, as_outliers
 from .reading import Reading
 from .starts import starts, turning
@@ -75,7 +73,7 @@ class Tracker:
         known: Iterable[Symbol | str] = (),
     ) -> None:
         handed = frozenset(k if isinstance(k, Symbol) else model.symbol(k) for k in known)
-        layout, limits = _arranged(model, observations(model, observed), handed)
+        layout, limits = arranged(model, observations(model, observed), handed)
         self._layout = layout
         self._filter = Filter(layout, limits, as_outliers(outliers))
         charted = self._filter.charted
@@ -97,7 +95,7 @@ class Tracker:
             raise UnknownNameError(f"'{strange[0]}' is not estimated. {hint}")
         x = first_place(model, chart, filter_.limits, given)
         known = np.nan_to_num(self._known)
-        filter_.turns = turning(layout, filter_.limits, filter_.residuals, x, known)
+        filter_.turns = turning(filter_, x, known)
         deviations = first_deviations(chart, filter_.limits, filter_.turns)
         names = {str(v): i for i, v in enumerate(chart.tangent)}
         own = [v for v in chart.tangent if v.position in chart.coordinates]
@@ -109,7 +107,7 @@ class Tracker:
         belief = Belief((len(x), len(deviations), len(layout.groups)))
         belief.x[:] = x
         belief.information[:] = np.diag(deviations**-2.0)
-        return starts(layout, filter_.limits, filter_.charted, belief, known, filter_.turns)
+        return starts(filter_, belief, known)
 
     # -- what it is about ----------------------------------------------------------------------------------
 
@@ -127,6 +125,11 @@ class Tracker:
     def limits(self) -> dict[Symbol, tuple[float, float]]:
         """The bounds of single coordinates; ±inf where there are none, or only others that move."""
         return self._filter.limits.by_symbol(self._layout.chart)
+
+    @property
+    def turning(self) -> frozenset[Symbol]:
+        """The coordinates that come back after a turn; they stay within half a turn."""
+        return self._filter.turns
 
     @property
     def constraints(self) -> tuple[str, ...]:
@@ -329,20 +332,6 @@ def _positive(key: object, value: float) -> float:
     if not (math.isfinite(number) and number > 0):
         raise ValueRejectedError(f"The uncertainty of '{key}' is positive and finite, not {value!r}.")
     return number
-
-
-def _arranged(
-    model: ModelView, seen: tuple[Observation, ...], handed: frozenset[Symbol]
-) -> tuple[Layout, Limits]:
-    """Return what is estimated, and the limits of that."""
-    rates = model.rates
-    looked_at = {s for one in seen for s in rates.resolve(plain(one.value)).symbols}
-    chart = chart_of(rates, looked_at, handed)
-    limits = limits_of(model, chart, handed)
-    looked_at |= {s for c in limits.curved for s in c.symbols}
-    looked_at |= {s for x in chart.coordinates if x in rates for e in rates[x].values() for s in e.symbols}
-    inputs = sorted(looked_at - set(chart.coordinates), key=lambda s: s.sort_key)
-    return layout_of(chart, seen, limits.curved, inputs), limits
 
 
 def _only(values: Mapping[Symbol, float], free: frozenset[Symbol] | None) -> Mapping[Symbol, float]:
