@@ -238,7 +238,8 @@ def test_compiled_and_numpy_do_the_same():
     model = kv.load("kitchen")
     eyes = Eyes(model, [f for f in model.frames if model.speeds_of(f)], 0.1, np.radians(10))
     observed = [ObservedPose(f, covariance=eyes.covariance) for f in eyes.frames]
-    fast, slow = Tracker(model, observed), Tracker(model, observed)
+    noise = dict.fromkeys(model.speeds, 1e-3)
+    fast, slow = (Tracker(model, observed, process_noise=noise) for _ in range(2))
     slow._filter.native = None
     assert fast.wait()
     rng = np.random.default_rng(2)
@@ -253,3 +254,7 @@ def test_compiled_and_numpy_do_the_same():
             assert np.allclose(a.mean, b.mean, rtol=0, atol=1e-9)
             assert (a.nis, a.dof, a.rounds) == (pytest.approx(b.nis), b.dof, b.rounds)
             assert one.log_evidence == pytest.approx(other.log_evidence)
+            a, b = (tracker.predict(0.1, {"kitchen/fridge_door:velocity": 3.0}) for tracker in (one, other))
+            assert np.allclose(list(a.state.values()), list(b.state.values()), rtol=0, atol=1e-12)
+            assert np.allclose(a.information, b.information, rtol=1e-12)
+            assert np.allclose(a.mean, b.mean, rtol=0, atol=1e-9)

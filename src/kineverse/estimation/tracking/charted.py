@@ -58,6 +58,11 @@ class Charted:
             )
         return found
 
+    @property
+    def is_driven(self) -> bool:
+        """Whether some coordinates move by rates, and not by speeds of their own alone."""
+        return bool(self._flows)
+
     def step(self, number: int, x: Array, step: Array, known: Array) -> tuple[Array, Array | None]:
         """Return a group's coordinates after a step in its tangent, and how the tangent turns on the way.
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -96,9 +97,27 @@ class Filter:
             return Outcome(after, float(found.nis.sum()), int(found.dof.sum()), (), found.rounds)
         return self._weighed(modes, reading, known)
 
-    def inside(self, belief: Belief, known: Array) -> Belief:
-        """Return the same belief, about the most probable point inside the limits."""
-        found = self.solver.inside(belief, self.reader.nothing(), known)
+    def predict(
+        self,
+        belief: Belief,
+        known: Array,
+        dt: float,
+        speeds: Mapping[Symbol, float],
+        noise: Mapping[Symbol, float],
+    ) -> Belief:
+        """Return a belief ``dt`` seconds later, about the most probable point inside the limits.
+
+        Speeds are commanded; noise is variances by second that add to that.
+        """
+        found = None
+        if self.native is not None and self.native.is_ready and not self.charted.is_driven:
+            tangent = self.layout.chart.tangent
+            moved, grown = (np.array([by.get(v, 0.0) for v in tangent]) * dt for by in (speeds, noise))
+            found = self.native.predict(belief, moved, grown)
+        if found is None:
+            found = belief.copy()
+            self.charted.predict(found, known, dt, speeds, noise)
+            found = self.solver.inside(found, self.reader.nothing(), known)
         self._wrap(found)
         return found
 

@@ -91,6 +91,7 @@ class NativeLibrary:
             return
         pointer = ctypes.c_void_p
         code.update.argtypes, code.update.restype = (pointer,) * 8, ctypes.c_int64
+        code.predict.argtypes, code.predict.restype = (pointer,) * 4, ctypes.c_int64
         code.first_broken.argtypes = (pointer, pointer, pointer, ctypes.c_double)
         code.first_broken.restype = ctypes.c_int64
         self.code = code
@@ -141,6 +142,7 @@ class NativeSolver:
         for name, array in (*self._indices.items(), *self._numbers.items()):
             setattr(self._problem, name, array.ctypes.data)
         self._results = np.zeros((2, count))
+        self._motion = np.zeros((2, size))
         # Buffers that stay where they are: asking an array for its address takes longer than copying it.
         self._belief = np.zeros(Belief((size, size, count)).numbers.shape)
         self._reading = Reading(
@@ -185,6 +187,18 @@ class NativeSolver:
             return None
         nis, dof = self._results.copy()
         return Found(Belief(belief.sizes, self._belief.copy()), nis, dof, rounds)
+
+    def predict(self, belief: Belief, moved: Array, grown: Array) -> Belief | None:
+        """Return the belief inside the limits after steps and with variances added, both by coordinate.
+
+        None if that is not easy.
+        """
+        self._belief[:] = belief.numbers
+        self._motion[0], self._motion[1] = moved, grown
+        where = self._belief.ctypes.data, *(row.ctypes.data for row in self._motion)
+        if native_library.code.predict(self._where, *where) < 0:
+            return None
+        return Belief(belief.sizes, self._belief.copy())
 
     def are_rigid(self, reading: Reading) -> bool:
         """Whether all poses that were seen are rigid; False if that is not known."""

@@ -33,6 +33,16 @@ static void solve(const double *l, double *b, int n) {
   }
 }
 
+/* The inverse of L Lᵀ. */
+static void invert(const double *l, double *inverse, int n) {
+  double column[MOST];
+  for (int c = 0; c < n; c++) {
+    for (int i = 0; i < n; i++) column[i] = i == c;
+    solve(l, column, n);
+    for (int i = 0; i < n; i++) inverse[i * n + c] = column[i];
+  }
+}
+
 static double log_determinant(const double *l, int n) {
   double sum = 0.0;
   for (int i = 0; i < n; i++) sum += log(l[i * n + i]);

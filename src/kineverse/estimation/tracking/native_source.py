@@ -138,7 +138,7 @@ static int judge(const Problem *p, int64_t g, Work *w, const double *information
 static int go_on(const Problem *p, int64_t g, Work *w, const double *information) {
   const int n = w->n;
   const int64_t *place = p->place + p->first[g];
-  double damped[MOST * MOST], inverse[MOST * MOST], step[MOST], low[MOST], high[MOST], moved[MOST];
+  double damped[MOST * MOST], inverse[MOST * MOST], step[MOST], low[MOST], high[MOST];
   memcpy(damped, w->matrix, n * n * sizeof(double));
   for (int i = 0; i < n; i++) damped[i * n + i] *= 1 + w->damping;
   double triangle[MOST * MOST];
@@ -152,11 +152,7 @@ static int go_on(const Problem *p, int64_t g, Work *w, const double *information
     is_inside &= step[i] >= low[i] && step[i] <= high[i];
   }
   if (!is_inside) {
-    for (int c = 0; c < n; c++) {
-      for (int i = 0; i < n; i++) moved[i] = i == c;
-      solve(triangle, moved, n);
-      for (int i = 0; i < n; i++) inverse[i * n + c] = moved[i];
-    }
+    invert(triangle, inverse, n);
     if (!between(inverse, step, low, high, n)) return 0;
   }
   for (int i = 0; i < n; i++) {
@@ -257,6 +253,51 @@ API int64_t update(const Problem *p, double *belief, const double *seen, const u
     }
   }
   return rounds;
+}
+
+/* Move x on, and add variances to the covariance, of each coordinate; then to the most probable place inside
+   the bounds. Returns 0, or less if it gave up. */
+API int64_t predict(const Problem *p, double *belief, const double *moved, const double *grown) {
+  const int64_t total = p->coordinates;
+  double *x = belief, *eta = x + total, *information = eta + total + p->groups;
+  for (int64_t g = 0; g < p->groups; g++) {
+    const int64_t *place = p->place + p->first[g];
+    const int n = (int)(p->first[g + 1] - p->first[g]);
+    double triangle[MOST * MOST], covariance[MOST * MOST], after[MOST * MOST];
+    double step[MOST], vector[MOST], low[MOST], high[MOST];
+    int is_moved = 0, is_inside = 1;
+    for (int i = 0; i < n; i++) is_moved |= moved[place[i]] != 0.0 || grown[place[i]] != 0.0;
+    if (!is_moved) continue;
+    for (int r = 0; r < n; r++)
+      for (int c = 0; c < n; c++) triangle[r * n + c] = information[place[r] * total + place[c]];
+    if (!factor(triangle, n)) return -1;
+    invert(triangle, covariance, n);
+    for (int i = 0; i < n; i++) step[i] = eta[place[i]];
+    solve(triangle, step, n);
+    for (int i = 0; i < n; i++) covariance[i * n + i] += grown[place[i]];
+    memcpy(triangle, covariance, n * n * sizeof(double));
+    if (!factor(triangle, n)) return -2;
+    invert(triangle, after, n);
+    for (int i = 0; i < n; i++) {
+      vector[i] = step[i];
+      x[place[i]] += moved[place[i]];
+      low[i] = p->lower[place[i]] - x[place[i]], high[i] = p->upper[place[i]] - x[place[i]];
+      is_inside &= step[i] >= low[i] && step[i] <= high[i];
+    }
+    solve(triangle, vector, n);
+    if (!is_inside && !between(covariance, step, low, high, n)) return -3;
+    for (int r = 0; r < n; r++) {
+      const double to = x[place[r]] + step[r], lower = p->lower[place[r]], upper = p->upper[place[r]];
+      x[place[r]] = to < lower ? lower : to > upper ? upper : to;
+      eta[place[r]] = vector[r];
+      for (int c = 0; c < n; c++) {
+        const double entry = (after[r * n + c] + after[c * n + r]) / 2;
+        information[place[r] * total + place[c]] = entry;
+        eta[place[r]] -= entry * step[c];
+      }
+    }
+  }
+  return 0;
 }
 
 /* The number of the first pose that is seen and not rigid; -1 if all are. */

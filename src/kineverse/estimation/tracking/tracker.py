@@ -197,11 +197,9 @@ class Tracker:
             return known, self._modes
 
         def moved(belief: Belief) -> Belief:
-            belief = belief.copy()
             free = self._locks.free(belief, known) if self._locks else None
             moving, noise = (_only(values, free) for values in (speeds, self._noise))
-            self._filter.charted.predict(belief, known, dt, moving, noise)
-            return self._filter.inside(belief, known)
+            return self._filter.predict(belief, known, dt, moving, noise)
 
         return known, self._modes.each(moved)
 
