@@ -56,6 +56,8 @@ def evidence(solution: Solution[GroupMotion]) -> Evidence:
     information[:size, :size] += prior.T @ prior
     # As wide as half a sphere is, and with its density: a direction that nothing tells stays finite.
     turned = [i for i, j in enumerate(motion.freedom.left) if j >= WX]
+    # So does the middle of a turn, which moves nothing where the lever is nothing.
+    turned += [size + i for i, j in enumerate(motion.freedom.joints) if j >= WX]
     information[turned, turned] += 1.0
     log = seen.log_likelihood + width.log_density + log_prior(motion) + _volume(solution, width.mean)
     log += 0.5 * len(information) * math.log(math.tau) - 0.5 * float(np.linalg.slogdet(information)[1])

@@ -1,0 +1,38 @@
+"""What moves nothing makes no matrix singular: points on a line, all in one place, or two of them only."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from kineverse.estimation import identify, pose_covariance
+
+LINE = np.arange(20)[:, None] * [0.0, 0.0, 1.0]
+POSITIONS = {
+    "on a line": LINE,
+    "on a short line": 1e-3 * LINE,
+    "on a long line": 1e4 * LINE,
+    "in one place": np.full((10, 3), 0.1),
+    "two": LINE[:2],
+}
+
+
+def poses(positions):
+    made = np.tile(np.eye(4), (len(positions), 1, 1))
+    made[:, :3, 3] = positions
+    return made
+
+
+@pytest.mark.parametrize("where", POSITIONS)
+@pytest.mark.parametrize("whole", [True, False], ids=["poses", "positions"])
+def test_everything_stays_finite(where, whole):
+    seen = poses(POSITIONS[where]) if whole else POSITIONS[where]
+    found = identify(None, seen, noise=pose_covariance(0.01, 0.09))
+    for fit in found:
+        assert np.isfinite(fit.log_evidence)
+        assert np.isfinite(fit.covariance).all()
+        assert (np.diag(fit.covariance) >= 0).all()
+    if where.startswith("on a l"):
+        assert found.best.family == "prismatic"
+    if where == "in one place":
+        assert found.cannot_tell or found.best.family == "rigid"
