@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
 
 import kineverse as kv
 from kineverse.estimation import (
@@ -175,3 +178,38 @@ def test_who_contradicts_the_limits_is_told():
     tracker = Tracker(model, ["cart"])
     with pytest.raises(kv.KineverseError, match="The limits of a, b leave no state between them"):
         tracker.update({"cart": np.eye(4)})
+
+
+TOY = kv.Model()
+with TOY.edit() as _edit:
+    _edit.apply(kv.Floating(name="box", parent="world", child="box"))
+    _edit.apply(kv.Revolute(name="lid", parent="box", child="lid", axis=(0, 1, 0), lower=-1.0, upper=1.0))
+FIRST = {
+    wrong: Tracker(TOY, ["box", "lid"], outliers=wrong, process_noise={"lid:velocity": 0.1})
+    for wrong in (False, True)
+}
+
+sizes = st.floats(-1e12, 1e12)
+poses = st.tuples(st.tuples(sizes, sizes, sizes), st.tuples(*[st.floats(-4, 4)] * 3), st.floats(-20, 20))
+steps = st.lists(st.dictionaries(st.sampled_from(["box", "lid"]), poses, min_size=1), min_size=1, max_size=3)
+
+
+@given(steps, st.booleans())
+@settings(max_examples=12)
+def test_whatever_is_seen_no_answer_is_nan(steps, wrong):
+    tracker = FIRST[wrong].copy()
+    for k, step in enumerate(steps):
+        seen = {}
+        for name, (place, vector, log_scale) in step.items():
+            T = np.eye(4)
+            T[:3, :3], T[:3, 3] = Rotation.from_rotvec(vector).as_matrix(), place
+            seen[name] = (T, np.eye(6) * 10.0**log_scale)
+        before = tracker.estimate
+        try:
+            estimate = tracker.update(seen, at=float(k))
+        except kv.KineverseError:
+            estimate = tracker.estimate
+            assert estimate.state == before.state
+        assert np.isfinite(list(estimate.state.values())).all()
+        assert np.isfinite(estimate.covariance).all()
+        assert -1.0 <= estimate.state["lid"] <= 1.0

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from kineverse.errors import KineverseError
+from kineverse.errors import KineverseError, ValueRejectedError
 from kineverse.estimation.noise import Array
 from kineverse.symbols import Symbol
 
@@ -92,7 +92,7 @@ class Filter:
                 found = self.native.update(modes.best, reading, known)
             if found is None:
                 found = self.solver.update(modes.best, reading, known, self._seen(reading))
-            self._wrap(found.belief)
+            self._settle(found.belief)
             after = Modes(self.layout, [found.belief], modes.alive)
             return Outcome(after, float(found.nis.sum()), int(found.dof.sum()), (), found.rounds)
         return self._weighed(modes, reading, known)
@@ -118,7 +118,7 @@ class Filter:
             found = belief.copy()
             self.charted.predict(found, known, dt, speeds, noise)
             found = self.solver.inside(found, self.reader.nothing(), known)
-        self._wrap(found)
+        self._settle(found)
         return found
 
     def is_possible(self, number: int, belief: Belief, known: Array) -> bool:
@@ -140,8 +140,19 @@ class Filter:
     def _seen(self, reading: Reading) -> list[int]:
         return [n for n, group in enumerate(self.layout.groups) if reading.seen[list(group.seen)].any()]
 
-    def _wrap(self, belief: Belief) -> None:
-        """Bring back what has gone more than half a turn."""
+    def _settle(self, belief: Belief) -> None:
+        """Bring back what has gone more than half a turn.
+
+        Raises
+        ------
+        ValueRejectedError
+            If there are numbers that are not finite: nobody is ever told such.
+        """
+        if not np.isfinite(belief.numbers).all():
+            raise ValueRejectedError(
+                "The step leads to numbers that are not finite, as what was seen or the covariances are too "
+                "large or too small for floating point. The belief stays as it was."
+            )
         for x in self.turns:
             i = self.layout.chart.coordinates.index(x)
             belief.x[i] = math.remainder(belief.x[i], 2 * math.pi)
@@ -152,10 +163,17 @@ class Filter:
         rounds = 0
         for mode, belief in enumerate(modes.beliefs):
             groups = modes.groups(mode, self._seen(reading))
-            if groups:
+            if not groups:
+                continue
+            try:
                 new, took = self._explanations(belief, reading, known, groups)
-                candidates += new
-                rounds = max(rounds, took)
+            except KineverseError:
+                # The best one has to be explained; another that leads nowhere is given up.
+                if mode == 0:
+                    raise
+                continue
+            candidates += new
+            rounds = max(rounds, took)
         after, best = modes.ranked(candidates, self._is_same)
         nis = sum(float(c.nis[n]) for n, c in enumerate(best) if c)
         dof = sum(int(c.dof[n]) for n, c in enumerate(best) if c)
@@ -194,7 +212,7 @@ class Filter:
     def _candidate(
         self, belief: Belief, weights: Array | None, nis: Array, dof: Array, groups: list[int], known: Array
     ) -> Candidate:
-        self._wrap(belief)
+        self._settle(belief)
         return Candidate(belief, self.residuals.evaluate(belief.x, known), weights, nis, dof, groups)
 
     def _is_same(self, group: Group, one: Candidate, other: Candidate) -> bool:
