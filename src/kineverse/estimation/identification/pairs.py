@@ -10,10 +10,10 @@ from itertools import combinations
 import numpy as np
 import numpy.typing as npt
 
-from .fit import Found
+from .fit import Fit, Found
 from .identify import family_weights, identify
 from .observations import Observations
-from .rigid import Array
+from .rigid import Array, skew
 from .tracks import Track, between
 
 Families = Iterable[str] | Mapping[str, float] | None
@@ -23,6 +23,10 @@ LOG_ANYWHERE = -math.log(8.0 * math.pi**2) - 3.0 * math.log(2.0)
 
 # That of a pose by itself, somewhere in a room of 10 m.
 _LOG_ROOM = -math.log(8.0 * math.pi**2) - 3.0 * math.log(10.0)
+_TINY = 1e-300
+
+UNLIKELY = 4.0
+"""What is left is no noise if χ² is off by so many standard deviations."""
 
 
 @dataclass(frozen=True)
@@ -40,6 +44,8 @@ class Pair:
     gain
         By how much the logarithm of the density of what was seen is larger than if each pose of the child
         were anywhere in a room, all families taken together.
+    explained
+        Whether what is left is as large as the noise.
     """
 
     parent: str
@@ -47,14 +53,14 @@ class Pair:
     found: Found
     times: npt.NDArray[np.int_]
     gain: float
+    explained: bool
 
     @property
     def rigid(self) -> float:
-        """The logarithm of the odds that both are one rigid body."""
+        """The logarithm of the odds of being one rigid body against the likeliest other family."""
         rigid = sum(fit.probability for fit in self.found if fit.family == "rigid")
-        other = sum(fit.probability for fit in self.found if fit.family != "rigid")
-        tiny = 1e-300
-        return math.log(max(rigid, tiny)) - math.log(max(other, tiny))
+        other = max((fit.probability for fit in self.found if fit.family != "rigid"), default=0.0)
+        return math.log(max(rigid, _TINY)) - math.log(max(other, _TINY))
 
 
 def pair(tracks: Mapping[str, Track], parent: str, child: str, families: Families) -> Pair | None:
@@ -63,11 +69,38 @@ def pair(tracks: Mapping[str, Track], parent: str, child: str, families: Familie
     times = np.flatnonzero(a.seen & b.seen)
     if len(times) < 2:
         return None
-    found = identified(between(a, b, times), families)
+    seen = between(a, b, times)
+    found = identified(seen, families)
     weights = family_weights(families)
     best = found.best
     log = best.log_evidence + math.log(weights[best.family] / best.probability / sum(weights.values()))
-    return Pair(parent, child, found, times, log + LOG_ANYWHERE - len(times) * _LOG_ROOM)
+    squares = squared_error(seen, best)
+    expected = max(best.residuals.size - best.joint_values.size - len(best.covariance), 1)
+    explained = abs(squares - expected) < UNLIKELY * math.sqrt(2.0 * expected)
+    if explained:
+        # How large the noise happened to be is no reason to hang on something else.
+        log += 0.5 * (squares - expected)
+    return Pair(parent, child, found, times, log + LOG_ANYWHERE - len(times) * _LOG_ROOM, explained)
+
+
+def squared_error(seen: Observations, fit: Fit) -> float:
+    """Return χ²: the squares of what a fit leaves, in units of its covariance."""
+    weighted = np.linalg.solve(covariance_of(seen, fit), fit.residuals[:, :, None])[:, :, 0]
+    return float(np.sum(fit.residuals * weighted))
+
+
+def covariance_of(seen: Observations, fit: Fit) -> Array:
+    """Return the covariances of observed relative poses, in the parent's axes, (N, 6, 6)."""
+    p_R_w = np.swapaxes(seen.parent[:, :3, :3], 1, 2)
+    turned = np.zeros((len(p_R_w), 6, 6))
+    turned[:, :3, :3] = turned[:, 3:, 3:] = p_R_w
+    covariance: Array = turned @ seen.child_covariance @ np.swapaxes(turned, 1, 2)
+    if seen.parent_covariance is not None:
+        lever = np.tile(np.eye(6), (len(turned), 1, 1))
+        lever[:, :3, 3:] = -skew(fit.poses[:, :3, 3])
+        carried = lever @ turned
+        covariance = covariance + carried @ seen.parent_covariance @ np.swapaxes(carried, 1, 2)
+    return covariance
 
 
 def identified(seen: Observations, families: Families) -> Found:
@@ -98,42 +131,3 @@ def all_pairs(
     if progress is not None:
         progress(len(names), len(names))
     return found
-
-
-def ways_to_move(pairs: Iterable[Pair], tracks: Mapping[str, Track]) -> int | None:
-    """Return in how many ways the ends of a chain of parts can move against each other at once.
-
-    None if there was no time at which all of them were seen.
-    """
-    chain = list(pairs)
-    common = chain[0].times
-    for one in chain[1:]:
-        common = np.intersect1d(common, one.times)
-    if not len(common):
-        return None
-    chosen = common[np.unique(np.linspace(0, len(common) - 1, 15).astype(int))]
-    places = np.concatenate(
-        [tracks[name].poses[chosen, :3, 3] for p in chain for name in (p.parent, p.child)]
-    )
-    middle = places.mean(axis=0)
-    size = math.sqrt(float(np.mean(np.sum((places - middle) ** 2, axis=1)))) or 1.0
-    columns = np.concatenate([_twists(p, tracks, chosen, middle, size) for p in chain], axis=2)
-    if not columns.shape[2]:
-        return 0
-    values = np.linalg.svd(columns, compute_uv=False)
-    ranks = np.sum(values > 0.05 * values[:, :1], axis=1)
-    return int(np.median(ranks))
-
-
-def _twists(
-    one: Pair, tracks: Mapping[str, Track], chosen: npt.NDArray[np.int_], middle: Array, size: float
-) -> Array:
-    """Return twists about a point per unit of each joint value, lengths in units of a size."""
-    fit = one.found.best
-    linear = fit.motion.at(fit.joint_values[np.searchsorted(one.times, chosen)])
-    parent = tracks[one.parent].poses[chosen]
-    turned = parent[:, :3, :3]
-    v, w = turned @ linear.by_joints[:, :3], turned @ linear.by_joints[:, 3:]
-    child = (parent @ linear.pose)[:, :3, 3]
-    v = v - np.cross(w, (child - middle)[:, :, None], axis=1)
-    return np.concatenate([v / size, w], axis=1)

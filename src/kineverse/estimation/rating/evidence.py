@@ -17,9 +17,6 @@ from kineverse.estimation.identification.rigid import Array
 from .misfit import Misfit
 from .served import Served
 
-LOG_ANYWHERE = -math.log(8.0 * math.pi**2) - 3.0 * math.log(2.0)
-"""Logarithm of the density of a pose of which nothing is known [1/m³]; all turns have the volume 8π²."""
-
 _WIDTHS = np.geomspace(1e-5, 10.0, 43)
 _STILL = np.array([1e-9])
 _erf = np.vectorize(math.erf, otypes=[np.float64])

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
 
@@ -12,12 +12,12 @@ import numpy.typing as npt
 
 from kineverse.errors import KineverseError
 from kineverse.estimation.identification.fit import SURE, Found
-from kineverse.estimation.identification.identify import identify
 from kineverse.estimation.identification.observations import Observations
+from kineverse.estimation.identification.pairs import LOG_ANYWHERE, Families, identified
 from kineverse.model.model import Model
 from kineverse.model.operation import Operation
 
-from .evidence import LOG_ANYWHERE, log_evidence
+from .evidence import log_evidence
 from .links import Link
 from .misfit import Misfit
 from .proposal import proposal
@@ -29,8 +29,6 @@ BELIEFS: Mapping[str, float] = MappingProxyType({"served": 0.8, "rigid": 0.1, "o
 
 # Fewer observations do not show how something moves.
 _ENOUGH = 5
-
-Families = Iterable[str] | Mapping[str, float] | None
 
 
 @dataclass(frozen=True)
@@ -69,7 +67,7 @@ class Seen:
 def judged(model: Model, seen: Seen, stopped: int | None, families: Families) -> Rating:
     """Return the rating of an articulation, given since when it does not explain what is seen."""
     since = seen if stopped is None else seen.since(stopped)
-    instead = _identified(since.observations, families) if len(since.times) >= 2 else None
+    instead = identified(since.observations, families) if len(since.times) >= 2 else None
     probabilities = _probabilities(since, instead)
     operation, reason = None, ""
     if stopped is not None:
@@ -79,17 +77,6 @@ def judged(model: Model, seen: Seen, stopped: int | None, families: Families) ->
     squares = np.mean(since.misfit.residuals**2, axis=0)
     rms = math.sqrt(float(squares[:3].sum())), math.sqrt(float(squares[3:].sum()))
     return Rating(seen.link, probabilities, rms, len(seen.times), stopped, instead, operation, reason)
-
-
-def _identified(seen: Observations, families: Families) -> Found:
-    exact = seen.parent_covariance is None
-    return identify(
-        None if exact else seen.parent,
-        seen.relative if exact else seen.child,
-        covariance_a=seen.parent_covariance,
-        covariance_b=seen.child_covariance,
-        families=families,
-    )
 
 
 def _probabilities(seen: Seen, instead: Found | None) -> dict[str, float]:

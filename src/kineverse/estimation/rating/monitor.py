@@ -10,14 +10,15 @@ import numpy as np
 import numpy.typing as npt
 
 from kineverse.errors import KineverseError, ShapeError, UnknownNameError, suggest
+from kineverse.estimation.identification.pairs import Families
 from kineverse.estimation.identification.rigid import Array
+from kineverse.estimation.identification.tracks import Poses, Track, between, exactly, joined, tracks
 from kineverse.model.frame import WORLD
 from kineverse.model.model import Model
 
-from .judgement import Families, Seen, judged
+from .judgement import Seen, judged
 from .links import Link, Links, find_links
 from .misfit import misfit
-from .observed import Poses, Track, between, exactly, joined, tracks
 from .plausibility import FALSE_ALARMS, check_false_alarms, untold
 from .report import Plausibility, Rating
 from .served import Served

@@ -9,13 +9,14 @@ import numpy as np
 import numpy.typing as npt
 
 from kineverse.errors import KineverseError, ValueRejectedError
+from kineverse.estimation.identification.pairs import Families
+from kineverse.estimation.identification.tracks import Poses, Track, between, exactly, tracks
 from kineverse.model.frame import WORLD
 from kineverse.model.model import Model
 
-from .judgement import Families, Seen, judged
+from .judgement import Seen, judged
 from .links import Link, find_links
 from .misfit import misfit
-from .observed import Poses, Track, between, exactly, tracks
 from .report import Plausibility, Rating
 from .served import Served
 from .watch import Watch

@@ -9,16 +9,16 @@ from typing import Self
 
 import numpy as np
 
-from kineverse.compile import compile  # noqa: A004
+from kineverse.compile import CompiledFunction, compile  # noqa: A004
 from kineverse.errors import KineverseError
 from kineverse.estimation.identification.motion import Linear, Prior
 from kineverse.estimation.identification.observations import Observations
 from kineverse.estimation.identification.rigid import Array
 from kineverse.estimation.identification.solving import Solution, solve
-from kineverse.estimation.tracking.chart import chart_of
-from kineverse.estimation.tracking.limits import limits_of
-from kineverse.expressions.expression import array, as_expression
+from kineverse.expressions.expression import Expression, array, as_expression
 from kineverse.model.model import Model
+from kineverse.model.rates import Rates, plain
+from kineverse.symbols import Symbol
 
 # How many starts there are along a single coordinate, and scattered over several.
 _ALONG, _SCATTERED = 33, 256
@@ -44,38 +44,35 @@ class Served:
         Which joint values turn the child, (k,).
     home, middle
         The coordinates in the model's default state, (n,), and where the child is then, (3,).
-
-    Raises
-    ------
-    ModelError
-        For coordinates that nothing can be estimated for, see :mod:`kineverse.estimation.tracking.chart`.
     """
 
     def __init__(self, model: Model, child: str, parent: str) -> None:
-        carried = model.fk(child, parent)
-        chart = chart_of(model.rates, carried.symbols, ())
-        self.coordinates = chart.coordinates
-        self.pose = pose = chart.plain(carried)
-        slopes, still, none = chart.gradient(pose), as_expression(np.zeros((4, 4))), as_expression(0.0)
-        by_joints = [slopes.get(v, still) for v in chart.tangent]
-        rows = [[chart.row(x).get(v, none) for v in chart.tangent] for x in self.coordinates]
-        looked_at = {s for e in (pose, *by_joints, *(e for row in rows for e in row)) for s in e.symbols}
-        parameters = sorted(looked_at - set(self.coordinates), key=lambda s: s.sort_key)
+        rates = model.rates
+        self.pose = pose = rates.resolve(plain(model.fk(child, parent)))
+        self.coordinates = coordinates = _coordinates(pose, rates)
+        slopes = pose.gradient(heuristic=False)
+        still, none, one = as_expression(np.zeros((4, 4))), as_expression(0.0), as_expression(1.0)
+        by_coordinate = [slopes.get(x.derivative(), still) for x in coordinates]
+        parameters = sorted(
+            {s for e in (pose, *by_coordinate) for s in e.symbols} - set(coordinates),
+            key=lambda s: s.sort_key,
+        )
         self._parameters = np.array([s.value or 0.0 for s in parameters])
-        inputs = (*self.coordinates, *parameters)
-        self._linear = compile([pose, *by_joints], inputs)
-        self._rates = compile(array(rows), inputs) if rows else None
+        inputs = (*coordinates, *parameters)
+        self._linear = compile([pose, *by_coordinate], inputs)
         default = model.default_state()
-        self.home = np.array([default.get(x, 0.0) for x in self.coordinates])
-        limits = limits_of(model, chart, frozenset())
-        # The coordinate behind each joint value, if it is one.
-        plain = {x.derivative(): i for i, x in enumerate(chart.coordinates) if x not in chart.by_speeds}
-        self.own = tuple(plain.get(v) for v in chart.tangent)
-        self._columns = [i for i in self.own if i is not None]
-        # Of turns away from a reference no limits are known.
-        whole = None not in self.own
-        self.lower = np.array([limits.lower[i] if whole and i is not None else -np.inf for i in self.own])
-        self.upper = np.array([limits.upper[i] if whole and i is not None else np.inf for i in self.own])
+        self.home = np.array([default.get(x, 0.0) for x in coordinates])
+        # Coordinates with more numbers than ways to move, such as a quaternion, move by their speeds.
+        self._rates: CompiledFunction | None = None
+        self.own: tuple[int | None, ...] = tuple(range(len(coordinates)))
+        carried = any(x in rates for x in coordinates)
+        if carried and np.linalg.matrix_rank(self._twists(self.home[None, :])[1][0]) < len(coordinates):
+            rows = [rates.get(x) or {x.derivative(): one} for x in coordinates]
+            speeds = sorted({v for row in rows for v in row}, key=lambda s: s.sort_key)
+            self._rates = compile(array([[row.get(v, none) for v in speeds] for row in rows]), inputs)
+            self.own = (None,) * len(speeds)
+        limits = [_limits(model, coordinates[i]) if i is not None else UNLIMITED for i in self.own]
+        self.lower, self.upper = (np.array([pair[side] for pair in limits]) for side in (0, 1))
         there = self.at(self.home[None, :])
         self.middle = there.pose[0, :3, 3]
         self.turning = np.abs(there.by_joints[0, 3:]).max(axis=0, initial=0.0) > 1e-9
@@ -88,7 +85,7 @@ class Served:
     @property
     def is_plain(self) -> bool:
         """Whether joint values are the coordinates."""
-        return None not in self.own
+        return self._rates is None
 
     def same(self, other: Served) -> bool:
         """Whether another articulation moves alike within the same limits."""
@@ -101,42 +98,41 @@ class Served:
 
     def at(self, coordinates: Array) -> Linear:
         """Return poses at coordinates (N, n), and twists per unit of each joint value."""
-        points = np.concatenate(
-            [coordinates, np.broadcast_to(self._parameters, (len(coordinates), len(self._parameters)))],
-            axis=1,
-        )
-        poses, *slopes = self._linear.batch(points)
-        twists = np.zeros((len(points), 6, len(slopes)))
+        poses, twists = self._twists(coordinates)
+        if self._rates is not None:
+            twists = twists @ self._rates.batch(self._points(coordinates))
+        return Linear(poses, np.zeros((len(poses), 6, 0)), twists)
+
+    def moved(self, coordinates: Array, change: Array) -> Array:
+        """Return coordinates (N, n) after changes of the joint values (N, k), without limits."""
+        if self._rates is not None:
+            rates = self._rates.batch(self._points(coordinates))
+            change = (rates @ change[:, :, None])[:, :, 0]
+        result: Array = coordinates + change
+        return result
+
+    def _points(self, coordinates: Array) -> Array:
+        parameters = np.broadcast_to(self._parameters, (len(coordinates), len(self._parameters)))
+        return np.concatenate([coordinates, parameters], axis=1)
+
+    def _twists(self, coordinates: Array) -> tuple[Array, Array]:
+        """Return poses, and twists per unit of each coordinate (N, 6, n)."""
+        poses, *slopes = self._linear.batch(self._points(coordinates))
+        twists = np.zeros((len(poses), 6, len(slopes)))
         for j, slope in enumerate(slopes):
             turned = slope[:, :3, :3] @ np.swapaxes(poses[:, :3, :3], 1, 2)
             twists[:, :3, j] = slope[:, :3, 3]
             for row, (a, b) in enumerate(((2, 1), (0, 2), (1, 0))):
                 twists[:, 3 + row, j] = 0.5 * (turned[:, a, b] - turned[:, b, a])
-        return Linear(poses, np.zeros((len(points), 6, 0)), twists)
-
-    def moved(self, coordinates: Array, change: Array) -> Array:
-        """Return coordinates (N, n) after changes of the joint values (N, k), without limits."""
-        if self._rates is None:
-            return coordinates
-        if self.is_plain:
-            result = coordinates.copy()
-            result[:, self._columns] += change
-            return result
-        points = np.concatenate(
-            [coordinates, np.broadcast_to(self._parameters, (len(coordinates), len(self._parameters)))],
-            axis=1,
-        )
-        moved: Array = coordinates + (self._rates.batch(points) @ change[:, :, None])[:, :, 0]
-        return moved
+        return poses, twists
 
     def solve(self, seen: Observations) -> tuple[Array, Solution[ServedMotion]]:
         """Return the most likely coordinates (N, n) inside the limits, and the quadratic around them."""
         coordinates = self._starts(seen)
         for _ in range(1 if self.is_plain else _ROUNDS):
             values = np.zeros((len(seen), self.joints))
-            if self.is_plain and self.joints:
-                values = coordinates[:, self._columns]
-                coordinates = self.moved(coordinates, -values)
+            if self.is_plain:
+                coordinates, values = values, coordinates
             solution = solve(seen, ServedMotion(self, coordinates), values)
             coordinates = self.moved(coordinates, solution.values)
         return coordinates, solution
@@ -174,9 +170,7 @@ class Served:
             return self.home[None, :]
         low, high = self._inside()
         reach = np.where(self.turning, math.pi, 1.0)
-        middle = np.zeros(self.joints)
-        if self.is_plain:
-            middle = self.home[self._columns]
+        middle = self.home if self.is_plain else np.zeros(self.joints)
         from_low = np.where(np.isfinite(low), low, middle) + reach
         from_high = np.where(np.isfinite(high), high, middle) - reach
         low, high = np.where(np.isfinite(low), low, from_high), np.where(np.isfinite(high), high, from_low)
@@ -185,15 +179,43 @@ class Served:
         else:
             random = np.random.default_rng(0)
             values = random.uniform(low, high, (_SCATTERED, self.joints))
-        start = np.tile(self.home, (len(values), 1))
-        if self.is_plain:
-            start[:, self._columns] = 0.0
-        return self.moved(start, values)
+        start = np.zeros_like(self.home) if self.is_plain else self.home
+        return self.moved(np.tile(start, (len(values), 1)), values)
 
     def _inside(self) -> tuple[Array, Array]:
         width = self.upper - self.lower
         margin = np.where(np.isfinite(width), _INSIDE * width, 0.0)
         return self.lower + margin, self.upper - margin
+
+
+UNLIMITED = (-math.inf, math.inf)
+
+
+def _coordinates(pose: Expression, rates: Rates) -> tuple[Symbol, ...]:
+    """Return the coordinates that a pose depends on, and those that the rates of these look at."""
+    found: set[Symbol] = set()
+    waiting = list(pose.symbols)
+    while waiting:
+        x = waiting.pop()
+        if x in found or not x.has_derivative or x.order:
+            continue
+        found.add(x)
+        waiting += [s for entry in rates.get(x, {}).values() for s in entry.symbols]
+    return tuple(sorted(found, key=lambda s: s.sort_key))
+
+
+def _limits(model: Model, coordinate: Symbol) -> tuple[float, float]:
+    """Return the limits of a coordinate by itself; those that depend on others may be wider."""
+    lower, upper = UNLIMITED
+    for constraint in model.constraints_for([coordinate]).values():
+        if constraint.line is None or constraint.expression.symbols != (coordinate,):
+            continue
+        if constraint.lower.symbols or constraint.upper.symbols:
+            continue
+        slope, offset = constraint.line
+        low, high = sorted((float(b) - offset) / slope for b in (constraint.lower, constraint.upper))
+        lower, upper = max(lower, low), min(upper, high)
+    return lower, upper
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,303 @@
+"""Which part hangs on which: the kinematic graph of parts whose poses were seen (Sturm et al. 2011).
+
+Every pair of parts is identified. Parts that do not move against each other are one rigid body. Bodies are
+connected by the tree of largest evidence, where the density of all poses is the product over the tree's
+connections of how the child was seen in the parent; the noise of a part enters each of its connections anew,
+which is why what hangs on the world, whose place is known, is slightly preferred. A pair beside the tree that
+moves in fewer ways than the tree lets it closes a loop.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field
+from itertools import pairwise
+
+import numpy as np
+import numpy.typing as npt
+
+from kineverse.articulations import Fixed, Floating
+from kineverse.errors import NameTakenError, ValueRejectedError
+from kineverse.model.frame import WORLD
+from kineverse.model.model import Model
+from kineverse.model.operation import Operation
+
+from .fit import SURE, Fit, Found
+from .loops import closes_loop
+from .operations import rigid_pose
+from .pairs import Families, Pair, all_pairs, pair
+from .rigid import Array, inverse
+from .spanning import alternatives, path, spanning_tree
+from .tracks import Poses, Track, exactly, tracks
+
+
+@dataclass(frozen=True)
+class Edge:
+    """A joint between two parts.
+
+    Attributes
+    ----------
+    parent, child
+        The parts.
+    found
+        What was identified between them, see :class:`~kineverse.estimation.Found`.
+    probability
+        That they are connected, and not another pair in their place.
+    others
+        The pairs that may be connected in their place, with their probabilities, if these are not negligible.
+    """
+
+    parent: str
+    child: str
+    found: Found
+    probability: float = 1.0
+    others: Mapping[tuple[str, str], float] = field(default_factory=dict)
+
+    @property
+    def fit(self) -> Fit:
+        """The most probable joint, with its covariance and the range that was seen."""
+        return self.found.best
+
+    def __str__(self) -> str:
+        words = f"{self.parent} -> {self.child}: {self.found}"
+        for (a, b), probability in self.others.items():
+            words += f"; or {a} -> {b} ({probability:.0%})"
+        return words
+
+
+@dataclass(frozen=True)
+class RigidBody:
+    """Parts that do not move against each other.
+
+    Attributes
+    ----------
+    parts
+        The first stands for all of them in edges.
+    places
+        Their poses in the first, (4, 4), by name.
+    probability
+        That they are one.
+    """
+
+    parts: tuple[str, ...]
+    places: Mapping[str, Array]
+    probability: float = 1.0
+
+    def __str__(self) -> str:
+        words = " = ".join(self.parts)
+        return words if self.probability >= SURE else f"{words} ({self.probability:.0%})"
+
+
+@dataclass(frozen=True)
+class Graph:
+    """Bodies and the joints between them.
+
+    Attributes
+    ----------
+    bodies
+        Rigid bodies, each part in one of them.
+    edges
+        The joints, from the roots outwards: parents first.
+    loops
+        Pairs beside these that move in fewer ways against each other than the joints between them allow.
+    roots
+        The parts from which edges go outwards: the world if it was one, and one for every group of parts that
+        was never seen together with others.
+    """
+
+    bodies: tuple[RigidBody, ...]
+    edges: tuple[Edge, ...]
+    loops: tuple[Edge, ...]
+    roots: tuple[str, ...]
+
+    def operations(self, prefix: str | None = None) -> Iterator[Operation]:
+        """Yield what builds the model, parents first: joints are called like their child.
+
+        Parameters
+        ----------
+        prefix
+            Put in front of all names but the world's, with a slash.
+        """
+
+        def name(part: str) -> str:
+            return part if prefix is None or part == WORLD else f"{prefix}/{part}"
+
+        for root in self.roots:
+            if root != WORLD:
+                yield Floating(name=name(root), parent=WORLD, child=name(root))
+        placed = {edge.child: edge for edge in self.edges}
+        ordered = [*self.roots, *placed]
+        for first in ordered:
+            if first in placed:
+                edge = placed[first]
+                yield edge.fit.operation(name(first), name(edge.parent))
+            body = next(b for b in self.bodies if b.parts[0] == first)
+            for part in body.parts[1:]:
+                origin = rigid_pose(body.places[part])
+                yield Fixed(name=name(part), parent=name(first), child=name(part), origin=origin)
+
+    def model(self, prefix: str | None = None) -> Model:
+        """Return a model with a frame for each part. Loops are stated, but not closed in it.
+
+        Parameters
+        ----------
+        prefix
+            Put in front of all names but the world's, with a slash.
+        """
+        model = Model()
+        with model.edit() as edit:
+            for operation in self.operations(prefix):
+                edit.apply(operation)
+        return model
+
+    def __str__(self) -> str:
+        lines = [f"rigid: {body}" for body in self.bodies if len(body.parts) > 1]
+        lines += [str(edge) for edge in self.edges]
+        lines += [f"loop: {edge}" for edge in self.loops]
+        lines += [f"{root} is connected to nothing" for root in self.roots[1:]]
+        return "\n".join(lines)
+
+
+def identify_graph(
+    poses: Mapping[str, Poses],
+    *,
+    noise: npt.ArrayLike | None = None,
+    world: bool = True,
+    families: Families = None,
+    progress: Callable[[int, int], object] | None = None,
+) -> Graph:
+    """Return which part hangs on which, and how.
+
+    N parts have N (N - 1) / 2 pairs, or N (N + 1) / 2 with the world, and each is identified.
+
+    Parameters
+    ----------
+    poses
+        From names of parts to their poses over time, all in one frame: (N, 4, 4), or pairs of poses and
+        covariance, (6, 6) or (N, 6, 6). A pose that was not seen is NaN throughout.
+    noise
+        The covariance, (6, 6), of those that come with none, see :mod:`kineverse.estimation.noise`.
+    world
+        Whether the frame of the poses is the world: then it is a part as well, which is exactly known. False
+        for an observer that moves.
+    families
+        What is tried for each pair, see :func:`~kineverse.estimation.identify`.
+    progress
+        Called with the number of pairs that are done and that of all.
+
+    Raises
+    ------
+    ShapeError, ValueRejectedError
+        For poses or covariances that are none, less than two parts, and if it is not known how well a part is
+        seen.
+    NameTakenError
+        For a part that is called ``world`` beside the world.
+    UnknownNameError
+        For a family that does not exist.
+    """
+    seen = tracks(poses, noise)
+    if world:
+        if WORLD in seen:
+            raise NameTakenError("The world is a part already; call the part otherwise, or say world=False.")
+        seen = {WORLD: exactly(max((len(t.poses) for t in seen.values()), default=0)), **seen}
+    if len(seen) < 2:
+        raise ValueRejectedError("How parts are connected takes at least two of them, or one and the world.")
+    pairs = all_pairs(seen, families, progress)
+    bodies = _bodies(seen, pairs)
+    firsts = [body.parts[0] for body in bodies]
+    between = {c: p for c, p in pairs.items() if c <= set(firsts)}
+    gains = {c: p.gain for c, p in between.items()}
+    tree = spanning_tree(firsts, gains)
+    roots, directed = _outwards(firsts, tree)
+    edges = []
+    for parent, child in directed:
+        likely = alternatives(frozenset((parent, child)), tree, gains)
+        others = {
+            (between[c].parent, between[c].child): p
+            for c, p in likely.items()
+            if c != {parent, child} and p > 1.0 - SURE
+        }
+        known = _towards(between[frozenset((parent, child))], parent, seen, families)
+        edges.append(Edge(parent, child, known.found, likely[frozenset((parent, child))], others))
+    return Graph(bodies, tuple(edges), tuple(_loops(between, tree, seen)), roots)
+
+
+def _bodies(seen: Mapping[str, Track], pairs: Mapping[frozenset[str], Pair]) -> tuple[RigidBody, ...]:
+    """Return rigid bodies: parts join while more speaks for it than against it over all pairs."""
+    group: dict[str, tuple[str, ...]] = {name: (name,) for name in seen}
+    surest = dict.fromkeys(seen, 1.0)
+    for joined in sorted(pairs.values(), key=lambda p: -p.rigid):
+        a, b = group[joined.parent], group[joined.child]
+        if a == b or joined.rigid <= 0.0:
+            continue
+        across = [pairs[frozenset((x, y))] for x in a for y in b if frozenset((x, y)) in pairs]
+        odds = sum(p.rigid for p in across)
+        if odds <= 0.0:
+            continue
+        least = min(joined.found["rigid"].probability, surest[a[0]], surest[b[0]])
+        for name in (*a, *b):
+            group[name], surest[name] = (*a, *b), least
+    result = []
+    for parts in dict.fromkeys(group.values()):
+        # What was seen most often stands for all, and the world before everything.
+        often = {p: (p == WORLD, int(seen[p].seen.sum())) for p in parts}
+        ordered = sorted(parts, key=lambda p: (*(-n for n in often[p]), list(seen).index(p)))
+        places = _places(ordered, pairs)
+        result.append(RigidBody(tuple(ordered), places, surest[parts[0]]))
+    return tuple(result)
+
+
+def _places(parts: list[str], pairs: Mapping[frozenset[str], Pair]) -> dict[str, Array]:
+    """Return the poses of parts in the first, along the pairs that are surest to be rigid."""
+    places = {parts[0]: np.eye(4)}
+    rigid = {c: p.rigid for c, p in pairs.items() if c <= set(parts)}
+    tree = spanning_tree(parts, rigid)
+    for part in parts[1:]:
+        place = np.eye(4)
+        for a, b in pairwise(path(tree, parts[0], part)):
+            known = pairs[frozenset((a, b))]
+            reference = np.asarray(known.found["rigid"].parameters["reference"])
+            place = place @ (reference if known.parent == a else inverse(reference))
+        places[part] = place
+    return places
+
+
+def _outwards(nodes: list[str], tree: list[frozenset[str]]) -> tuple[tuple[str, ...], list[tuple[str, str]]]:
+    """Return roots, and connections from them outwards: the world is one, else what most parts hang on."""
+    degree = {node: sum(node in c for c in tree) for node in nodes}
+    roots: list[str] = []
+    directed: list[tuple[str, str]] = []
+    reached: set[str] = set()
+    for node in sorted(nodes, key=lambda n: (n != WORLD, -degree[n], nodes.index(n))):
+        if node in reached:
+            continue
+        roots.append(node)
+        reached.add(node)
+        waiting = [node]
+        while waiting:
+            parent = waiting.pop(0)
+            for child in nodes:
+                if child not in reached and frozenset((parent, child)) in tree:
+                    directed.append((parent, child))
+                    reached.add(child)
+                    waiting.append(child)
+    return tuple(roots), directed
+
+
+def _towards(known: Pair, parent: str, seen: Mapping[str, Track], families: Families) -> Pair:
+    """Return a pair seen from its other end, if need be."""
+    if known.parent == parent:
+        return known
+    turned = pair(seen, known.child, known.parent, families)
+    return known if turned is None else turned
+
+
+def _loops(
+    between: Mapping[frozenset[str], Pair],
+    tree: list[frozenset[str]],
+    seen: Mapping[str, Track],
+) -> Iterator[Edge]:
+    for connection, known in between.items():
+        joints = [between[frozenset(ends)] for ends in pairwise(path(tree, known.parent, known.child))]
+        if connection not in tree and joints and closes_loop(known, joints, seen):
+            yield Edge(known.parent, known.child, known.found)
