@@ -258,3 +258,21 @@ def test_compiled_and_numpy_do_the_same():
             assert np.allclose(list(a.state.values()), list(b.state.values()), rtol=0, atol=1e-12)
             assert np.allclose(a.information, b.information, rtol=1e-12)
             assert np.allclose(a.mean, b.mean, rtol=0, atol=1e-9)
+
+
+@pytest.mark.compiler
+def test_what_is_not_doubted_is_found_in_c_as_well():
+    model = kv.load("kitchen")
+    eyes = Eyes(model, [f for f in model.frames if model.speeds_of(f)][:12])
+    fast, slow = (Tracker(model, eyes.frames, outliers=True) for _ in range(2))
+    slow._filter.native = None
+    assert fast.wait()
+    truth = {str(s): np.mean(fast.limits[s]) for s in fast.symbols}
+    for step in range(4):
+        seen = eyes(truth)
+        seen[eyes.frames[2 * step]][:3, 3] += 1.0
+        a, b = fast.update(seen), slow.update(seen)
+        assert a.outliers == b.outliers == (eyes.frames[2 * step],)
+        assert np.allclose(list(a.state.values()), list(b.state.values()), rtol=0, atol=1e-9)
+        assert np.allclose(a.information, b.information, rtol=1e-6)
+        assert a.log_evidence == pytest.approx(b.log_evidence, rel=1e-6)

@@ -34,7 +34,7 @@ _COUNTS = ("observations", "groups", "coordinates")
 _INDICES = (
     "is_pose", "size", "value", "slope", "seen", "white", "first", "place", "first_watch", "watch",
 )  # fmt: skip
-_NUMBERS = ("lower", "upper", "input", "output", "work")
+_NUMBERS = ("lower", "upper", "input", "output", "work", "squares")
 
 
 class _Problem(ctypes.Structure):
@@ -137,6 +137,7 @@ class NativeSolver:
             "input": self._input,
             "output": np.zeros(function.shapes[0]),
             "work": np.zeros(sum(5 * w + w * w for w in widths)),
+            "squares": np.zeros(len(layout.observations)),
         }
         self._problem = _Problem(observations=len(layout.observations), groups=count, coordinates=size)
         for name, array in (*self._indices.items(), *self._numbers.items()):
@@ -165,6 +166,11 @@ class NativeSolver:
             and all(len(group.tangent) <= _MOST_UNKNOWNS for group in layout.groups)
             and all(one.size <= _MOST_NUMBERS for one in layout.observations)
         )
+
+    @property
+    def squares(self) -> Array:
+        """The squares of the whitened errors of what was seen, after the last update."""
+        return self._numbers["squares"]
 
     @property
     def is_ready(self) -> bool:

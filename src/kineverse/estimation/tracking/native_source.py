@@ -21,7 +21,7 @@ typedef struct {
   /* The coordinates of group g are place[first[g]] to place[first[g + 1]]; likewise what is seen of it. */
   const int64_t *first, *place, *first_watch, *watch;
   const double *lower, *upper;
-  double *input, *output, *work;
+  double *input, *output, *work, *squares;
 } Problem;
 
 /* A group on its way: posterior matrix and vector, best place and belief, trial and its belief. */
@@ -117,7 +117,11 @@ static int judge(const Problem *p, int64_t g, Work *w, const double *information
     for (int c = 0; c < n; c++) matrix[r * n + c] = information[place[r] * p->coordinates + place[c]];
   memcpy(vector, w->trial_prior, n * sizeof(double));
   for (int64_t k = p->first_watch[g]; k < p->first_watch[g + 1]; k++)
-    if (mask[p->watch[k]]) cost += add(p, p->watch[k], n, seen, whitening, matrix, vector);
+    if (mask[p->watch[k]]) {
+      const double half = add(p, p->watch[k], n, seen, whitening, matrix, vector);
+      p->squares[p->watch[k]] = 2 * half;
+      cost += half;
+    }
   const int fine = isfinite(cost) && is_finite(matrix, n * n) && is_finite(vector, n);
   if (!fine && !w->is_begun) return 0;
   if (!fine || (w->is_begun && cost > w->cost + 1e-10 * (1 + fabs(w->cost)))) {

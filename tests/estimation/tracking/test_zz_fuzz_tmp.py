@@ -1,0 +1,215 @@
+"""What cannot be is refused by name, and leaves the belief as it was."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+import kineverse as kv
+from kineverse.estimation import (
+    Hypotheses,
+    ObservedExpression,
+    ObservedPose,
+    ObservedPosition,
+    Outliers,
+    Tracker,
+)
+
+DOOR, HANDLE = "kitchen/fridge_door", "kitchen/fridge_door_handle"
+
+
+@pytest.fixture(scope="module")
+def model():
+    return kv.load("kitchen")
+
+
+@pytest.fixture
+def tracker(model):
+    return Tracker(model, [DOOR, HANDLE])
+
+
+def pose(model, angle=0.4):
+    return np.array(model.fk(DOOR)({DOOR: angle}))
+
+
+def broken(model, **entries):
+    T = pose(model)
+    for place, value in entries.items():
+        T[int(place[1]), int(place[2])] = value
+    return T
+
+
+@pytest.mark.parametrize(
+    ("seen", "message"),
+    [
+        (lambda m: {DOOR: broken(m, e03=np.nan)}, "fridge_door' is not finite"),
+        (lambda m: {DOOR: broken(m, e03=np.inf)}, "fridge_door' is not finite"),
+        (
+            lambda m: {DOOR: broken(m, e00=1.5)},
+            r"fridge_door' is not rigid: RᵀR is off from the identity by [\d.]+",
+        ),
+        (lambda m: {DOOR: np.diag([-1.0, 1, 1, 1])}, "is a reflection"),
+        (lambda m: {DOOR: broken(m, e33=2.0)}, "last row"),
+        (lambda m: {DOOR: np.eye(3)}, "4×4"),
+        (lambda m: {DOOR: "here"}, "no numbers"),
+        (lambda m: {"kitchen/fridge_dor": np.eye(4)}, "fridge_dor' is not observed. Did you mean"),
+        (lambda m: {DOOR: (pose(m), -np.eye(6))}, "covariance of 'kitchen/fridge_door' is not positive"),
+        (lambda m: {DOOR: (pose(m), np.zeros((6, 6)))}, "is not positive"),
+        (lambda m: {DOOR: (pose(m), np.full((6, 6), np.nan))}, "is not finite"),
+        (lambda m: {DOOR: (pose(m), np.triu(np.ones((6, 6))))}, "is not symmetric"),
+        (lambda m: {DOOR: (pose(m), np.eye(3))}, "6×6"),
+        (lambda m: [pose(m)], "a mapping"),
+    ],
+)
+@pytest.mark.parametrize("outliers", [None, True])
+def test_what_was_seen_wrong(model, seen, message, outliers):
+    tracker = Tracker(model, [DOOR, HANDLE], outliers=outliers)
+    tracker.update({DOOR: pose(model)}, at=1.0)
+    before = tracker.estimate
+    with pytest.raises(kv.KineverseError, match=message):
+        tracker.update(seen(model), at=2.0)
+    after = tracker.estimate
+    assert after.state == before.state
+    assert np.array_equal(after.information, before.information)
+
+
+def test_arrays_of_poses(model, tracker):
+    poses = np.stack([pose(model), np.full((4, 4), np.nan)])
+    tracker.update_poses(poses, np.array([True, False]))  # what is not seen is not looked at
+    with pytest.raises(kv.KineverseError, match="fridge_door_handle' is not finite"):
+        tracker.update_poses(poses)
+    with pytest.raises(kv.ShapeError, match=r"\(2, 4, 4\)"):
+        tracker.update_poses(poses[:1])
+    with pytest.raises(kv.ShapeError, match="mask of 2"):
+        tracker.update_poses(poses, [1, 0])
+    with pytest.raises(kv.KineverseError, match="poses alone, which z is not"):
+        Tracker(model, [DOOR, ObservedExpression("z", kv.position(DOOR), 1.0)]).update_poses(poses)
+
+
+def test_time(model, tracker):
+    tracker.update({DOOR: pose(model)}, at=5.0)
+    with pytest.raises(
+        kv.KineverseError, match="Time goes backwards: an observation at 4 s after one at 5 s"
+    ):
+        tracker.update({DOOR: pose(model)}, at=4.0)
+    for dt in (-1.0, np.nan, np.inf):
+        with pytest.raises(kv.KineverseError, match="Time goes on"):
+            tracker.predict(dt)
+    with pytest.raises(kv.KineverseError, match="finite number of seconds"):
+        tracker.update({DOOR: pose(model)}, at=np.nan)
+    with pytest.raises(kv.KineverseError, match="Commands need the time"):
+        tracker.update({DOOR: pose(model)}, commands={f"{DOOR}:velocity": 1.0})
+    assert tracker.update({DOOR: pose(model)}, at=5.5).stamp == 5.5
+
+
+@pytest.mark.parametrize(
+    ("observed", "options", "message"),
+    [
+        ([], {}, "at least one frame"),
+        (["kitchen/fridge_dor"], {}, "Did you mean"),
+        ([DOOR, DOOR], {}, "Two observations have the name"),
+        (["kitchen/room"], {}, "does not move with any coordinate"),
+        ([DOOR, 3], {}, "the name of a frame"),
+        ([ObservedPose(DOOR, covariance=np.zeros((6, 6)))], {}, "not positive"),
+        ([ObservedPosition(DOOR, (1, 2))], {}, "three numbers"),
+        ([ObservedExpression("z", np.eye(2) * kv.position(DOOR), 1.0)], {}, "a scalar or a vector"),
+        ([DOOR], {"start": {"kitchen/fridge_dor": 1.0}}, "is not estimated. Did you mean"),
+        ([DOOR], {"uncertainty": {"kitchen/fridge_dor": 1.0}}, "is not estimated. Did you mean"),
+        ([DOOR], {"uncertainty": {DOOR: 0.0}}, "positive and finite"),
+        ([DOOR], {"process_noise": {f"{DOOR}:velocity": np.nan}}, "positive and finite"),
+        ([DOOR], {"process_noise": {"wheel:velocity": 1.0}}, "Nothing that is estimated moves with"),
+        ([DOOR], {"outliers": 3}, "Outliers are"),
+        ([DOOR], {"known": ["kitchen/fridge_dor"]}, "Did you mean"),
+        ([DOOR], {"known": [DOOR]}, "does not move with any coordinate"),
+    ],
+)
+def test_trackers_that_cannot_be(model, observed, options, message):
+    frames = [name for name in model.frames if not model.speeds_of(name)]
+    observed = [frames[0] if o == "kitchen/room" else o for o in observed]
+    with pytest.raises(kv.KineverseError, match=message):
+        Tracker(model, observed, **options)
+
+
+def test_commands_and_known(model, tracker):
+    with pytest.raises(kv.KineverseError, match="Nothing that is estimated moves with 'fridge:velocity'"):
+        tracker.predict(0.1, {"fridge:velocity": 1.0})
+    with pytest.raises(kv.KineverseError, match="must be finite"):
+        tracker.predict(0.1, {f"{DOOR}:velocity": np.nan})
+    with model.edit() as edit:
+        edit.add_frame("eye", parent="world", transform=kv.rotation_z(kv.position("pan")))
+    with_camera = Tracker(model, [ObservedPose(DOOR, relative_to="eye")], known=["pan"])
+    with pytest.raises(kv.KineverseError, match="no finite value of 'pan'"):
+        with_camera.update({DOOR: pose(model)})
+    with pytest.raises(kv.KineverseError, match="'pam' is not known"):
+        with_camera.update({DOOR: pose(model)}, given={"pam": 0.0})
+    with_camera.update({DOOR: pose(model)}, given={"pan": 0.0})
+
+
+def test_outliers_that_cannot_be():
+    for options in ({"fraction": 0.0}, {"fraction": 1.0}, {"reach": 0.0}, {"reach": np.inf}):
+        with pytest.raises(kv.KineverseError):
+            Outliers(**options)
+
+
+def test_hypotheses_that_cannot_be(model, tracker):
+    with pytest.raises(kv.KineverseError, match="no hypothesis"):
+        Hypotheses({})
+    with pytest.raises(kv.KineverseError, match="observe different things"):
+        Hypotheses({"a": tracker, "b": Tracker(model, [DOOR])})
+    with pytest.raises(kv.KineverseError, match="prior does not fit"):
+        Hypotheses({"a": tracker}, {"b": 1.0})
+    with pytest.raises(kv.KineverseError, match="positive"):
+        Hypotheses({"a": tracker}, {"a": 0.0})
+    with pytest.raises(kv.KineverseError, match="Forgetting"):
+        Hypotheses({"a": tracker}, forgetting=-1.0)
+
+
+def test_who_contradicts_the_limits_is_told():
+    model = kv.Model()
+    a, b = kv.position("a"), kv.position("b")
+    with model.edit() as edit:
+        edit.add_frame("cart", parent="world", transform=kv.translation(a, b, 0))
+        edit.constrain("sum", 3, a + b, 4)
+        edit.constrain("a/position", 0, a, 1)
+        edit.constrain("b/position", 0, b, 1)
+    tracker = Tracker(model, ["cart"])
+    with pytest.raises(kv.KineverseError, match="The limits of a, b leave no state between them"):
+        tracker.update({"cart": np.eye(4)})
+
+
+TOY = kv.Model()
+with TOY.edit() as _edit:
+    _edit.apply(kv.Floating(name="box", parent="world", child="box"))
+    _edit.apply(kv.Revolute(name="lid", parent="box", child="lid", axis=(0, 1, 0), lower=-1.0, upper=1.0))
+FIRST = {
+    wrong: Tracker(TOY, ["box", "lid"], outliers=wrong, process_noise={"lid:velocity": 0.1})
+    for wrong in (False, True)
+}
+
+sizes = st.floats(-1e12, 1e12)
+poses = st.tuples(st.tuples(sizes, sizes, sizes), st.tuples(*[st.floats(-4, 4)] * 3), st.floats(-20, 20))
+steps = st.lists(st.dictionaries(st.sampled_from(["box", "lid"]), poses, min_size=1), min_size=1, max_size=3)
+
+
+@given(steps, st.booleans())
+@settings(max_examples=250)
+def test_whatever_is_seen_no_answer_is_nan(steps, wrong):
+    tracker = FIRST[wrong].copy()
+    for k, step in enumerate(steps):
+        seen = {}
+        for name, (place, vector, log_scale) in step.items():
+            T = np.eye(4)
+            T[:3, :3], T[:3, 3] = Rotation.from_rotvec(vector).as_matrix(), place
+            seen[name] = (T, np.eye(6) * 10.0**log_scale)
+        before = tracker.estimate
+        try:
+            estimate = tracker.update(seen, at=float(k))
+        except kv.KineverseError:
+            estimate = tracker.estimate
+            assert estimate.state == before.state
+        assert np.isfinite(list(estimate.state.values())).all()
+        assert np.isfinite(estimate.covariance).all()
+        assert -1.0 <= estimate.state["lid"] <= 1.0
