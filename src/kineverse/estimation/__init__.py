@@ -6,6 +6,7 @@
 """
 
 from .identification import Fit, Found, Identifier, identify
+from .identification.graph import Edge, Graph, RigidBody, identify_graph
 from .noise import pose_covariance
 from .rating import ImplausibleError, Plausibility, PlausibilityMonitor, Rating, plausibility
 from .tracking import (
@@ -19,11 +20,13 @@ from .tracking import (
 )
 
 __all__ = [
+    "Edge",
     "Estimate",
     "Fit",
     "Found",
-    "Identifier",
+    "Graph",
     "Hypotheses",
+    "Identifier",
     "ImplausibleError",
     "ObservedExpression",
     "ObservedPose",
@@ -32,8 +35,10 @@ __all__ = [
     "Plausibility",
     "PlausibilityMonitor",
     "Rating",
+    "RigidBody",
     "Tracker",
     "identify",
+    "identify_graph",
     "plausibility",
     "pose_covariance",
 ]

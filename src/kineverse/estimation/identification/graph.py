@@ -219,7 +219,7 @@ def identify_graph(
         }
         known = _towards(between[frozenset((parent, child))], parent, seen, families)
         edges.append(Edge(parent, child, known.found, likely[frozenset((parent, child))], others))
-    return Graph(bodies, tuple(edges), tuple(_loops(between, tree, seen)), roots)
+    return Graph(bodies, tuple(edges), tuple(_loops(between, tree)), roots)
 
 
 def _bodies(seen: Mapping[str, Track], pairs: Mapping[frozenset[str], Pair]) -> tuple[RigidBody, ...]:
@@ -295,9 +295,8 @@ def _towards(known: Pair, parent: str, seen: Mapping[str, Track], families: Fami
 def _loops(
     between: Mapping[frozenset[str], Pair],
     tree: list[frozenset[str]],
-    seen: Mapping[str, Track],
 ) -> Iterator[Edge]:
     for connection, known in between.items():
         joints = [between[frozenset(ends)] for ends in pairwise(path(tree, known.parent, known.child))]
-        if connection not in tree and joints and closes_loop(known, joints, seen):
+        if connection not in tree and joints and closes_loop(known, joints):
             yield Edge(known.parent, known.child, known.found)

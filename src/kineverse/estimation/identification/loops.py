@@ -1,27 +1,28 @@
 """Whether a pair of parts closes a loop: it moves in fewer ways than the joints between both let it.
 
-The joints between both say where one is in the other, and far more precisely than a look at the pair alone,
-as each joint value is known by itself. So these poses have to fit what was identified for the pair, too.
+In a loop joint values are no longer independent: as many of them as the pair has ways to move determine all
+others. A pair that only happens to move nearly like a simple joint, as a door and a drawer far away, is none.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import combinations, combinations_with_replacement
 
 import numpy as np
 import numpy.typing as npt
 
-from .identify import identify
-from .pairs import UNLIKELY, Pair, covariance_of
+from .pairs import Pair
 from .rigid import Array, inverse, skew
-from .tracks import Track, between
 
 # How small a way to move may be beside the largest, to be one.
 _RANK = 0.05
-# Of a joint's parameters, which are off by the noise of as many observations as there are for each of them.
-_PARAMETERS = 12.0
+# The degree of polynomials of one and of two joint values; 2 for more.
+_DEGREES = {1: 5, 2: 3}
+# Which part of a joint value's variance may be left open where it is determined by others.
+_OPEN = 0.1
 
 
 @dataclass(frozen=True)
@@ -34,14 +35,15 @@ class Chain:
         (N, 4, 4).
     twists
         Of the end about its origin, in the axes of the beginning, per unit of each joint value, (N, 6, m).
-    deviations
-        Of the joint values, (N, m).
+    values, deviations
+        The joint values and how well they are known, (N, m).
     times
         The numbers of the observations.
     """
 
     poses: Array
     twists: Array
+    values: Array
     deviations: Array
     times: npt.NDArray[np.int_]
 
@@ -64,6 +66,7 @@ def chain(pairs: Sequence[Pair], start: str) -> Chain:
     poses = np.tile(np.eye(4), (len(times), 1, 1))
     # Twists about the origin of the beginning, until all are known.
     twists: list[Array] = []
+    values: list[Array] = []
     deviations: list[Array] = []
     for one in pairs:
         fit = one.found.best
@@ -77,27 +80,45 @@ def chain(pairs: Sequence[Pair], start: str) -> Chain:
         v, w = turned @ linear.by_joints[:, :3], turned @ linear.by_joints[:, 3:]
         place = (parent @ linear.pose)[:, :3, 3]
         twists.append(np.concatenate([v + skew(place) @ w, w], axis=1))
+        values.append(fit.joint_values[rows])
         deviations.append(fit.deviations[rows])
         poses = poses @ step
         start = one.child if forward else one.parent
     columns = np.concatenate(twists, axis=2)
     columns[:, :3] -= skew(poses[:, :3, 3]) @ columns[:, 3:]
-    return Chain(poses, columns, np.concatenate(deviations, axis=1), times)
+    return Chain(poses, columns, np.concatenate(values, axis=1), np.concatenate(deviations, axis=1), times)
 
 
-def closes_loop(known: Pair, joints: Sequence[Pair], seen: Mapping[str, Track]) -> bool:
+def closes_loop(known: Pair, joints: Sequence[Pair]) -> bool:
     """Whether a pair is held by more than the joints between both, from its parent to its child."""
     if known.found.cannot_tell or not known.explained:
         return False
     between_both = chain(joints, known.parent)
-    if len(between_both.times) < 2 or between_both.ways <= known.found.best.motion.joints:
+    fit = known.found.best
+    count = fit.motion.joints
+    if len(between_both.times) < 2 or between_both.ways <= count:
         return False
-    observed = between(seen[known.parent], seen[known.child], known.times)
-    noise = covariance_of(observed, known.found.best).mean(axis=0) * _PARAMETERS / len(known.times)
-    scaled = between_both.twists * between_both.deviations[:, None, :]
-    spread = scaled @ np.swapaxes(scaled, 1, 2) + noise
-    family = known.found.best.family
-    fit = identify(None, between_both.poses, covariance_b=spread, families=[family]).best
-    squares = np.sum(fit.residuals * np.linalg.solve(spread, fit.residuals[:, :, None])[:, :, 0])
-    expected = fit.residuals.size
-    return bool(squares < expected + UNLIKELY * math.sqrt(2.0 * expected))
+    own = np.searchsorted(known.times, between_both.times)
+    values = np.concatenate([between_both.values, fit.joint_values[own]], axis=1)
+    deviations = np.concatenate([between_both.deviations, fit.deviations[own]], axis=1)
+    return any(
+        _determine(values, deviations, list(chosen)) for chosen in combinations(range(values.shape[1]), count)
+    )
+
+
+def _determine(values: Array, deviations: Array, chosen: list[int]) -> bool:
+    """Whether some joint values determine all others, as polynomials of them."""
+    moved = values - values.mean(axis=0)
+    scale = moved.std(axis=0)
+    x = (moved / np.where(scale > 0.0, scale, 1.0))[:, chosen]
+    terms = [np.ones(len(x))]
+    for degree in range(1, _DEGREES.get(len(chosen), 2) + 1):
+        factors = combinations_with_replacement(range(len(chosen)), degree)
+        terms += [np.prod(x[:, some], axis=1) for some in factors]
+    if len(values) < 2 * len(terms):
+        return False
+    rest = [j for j in range(values.shape[1]) if j not in chosen]
+    features = np.column_stack(terms)
+    left = moved[:, rest] - features @ np.linalg.lstsq(features, moved[:, rest], rcond=None)[0]
+    noise = np.mean(deviations[:, rest] ** 2, axis=0)
+    return bool(np.all(np.mean(left**2, axis=0) < _OPEN * scale[rest] ** 2 + 4.0 * noise))
