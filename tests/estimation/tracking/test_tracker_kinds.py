@@ -155,3 +155,25 @@ def test_what_has_more_coordinates_than_ways_to_move_or_many_turns(name, truth):
             off = np.angle(np.exp(1j * off))
         assert abs(off) < 5 * estimate.deviation[s]
     assert np.abs(eyes.truth(estimate.state) - eyes.truth(state)).max() < 0.05
+
+
+def test_a_camera_that_nobody_knows_is_found_by_what_stands_still():
+    model = kv.Model()
+    hinge = kv.Pose.of(kv.translation(1, 0, 0))
+    with model.edit() as edit:
+        edit.apply(kv.Floating(name="camera", parent="world", child="camera"))
+        edit.apply(
+            kv.Revolute(
+                name="door", parent="world", child="door", axis=(0, 0, 1), lower=0, upper=1.5, origin=hinge
+            )
+        )
+        edit.add_frame("marker", "world", kv.translation(1, 1, 0.3))
+    eyes = Eyes(model, ["marker", "door"], relative_to="camera")
+    tracker = Tracker(model, [ObservedPose(f, relative_to="camera") for f in eyes.frames])
+    turn = {"camera/qx": 0.5, "camera/qy": -0.5, "camera/qz": 0.5, "camera/qw": 0.5}
+    truth = model.default_state().updated({"camera/x": 0.3, "door": 0.8, **turn})
+    for _ in range(10):
+        estimate = tracker.update(eyes(truth))
+    assert estimate.state["door"] == pytest.approx(0.8, abs=4 * estimate.deviation["door"])
+    assert estimate.state["camera/x"] == pytest.approx(0.3, abs=4 * estimate.deviation["camera/x"])
+    assert len(estimate.tangent) == 7

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from scipy.optimize import least_squares
+from scipy.optimize import least_squares, nnls
 from scipy.spatial.transform import Rotation
 from seeing import Eyes, noisy
 
 import kineverse as kv
 from kineverse.estimation import ObservedExpression, ObservedPose, Tracker, pose_covariance
+from kineverse.estimation.tracking.quadratic import smallest_between
 
 
 def slides() -> kv.Model:
@@ -276,3 +277,79 @@ def test_what_is_not_doubted_is_found_in_c_as_well():
         assert np.allclose(list(a.state.values()), list(b.state.values()), rtol=0, atol=1e-9)
         assert np.allclose(a.information, b.information, rtol=1e-6)
         assert a.log_evidence == pytest.approx(b.log_evidence, rel=1e-6)
+
+
+@pytest.mark.compiler
+@pytest.mark.parametrize("seed", range(3))
+def test_compiled_and_numpy_agree_about_groups_with_several_active_bounds(seed):
+    model = kv.Model()
+    rng = np.random.default_rng(seed)
+    with model.edit() as edit:
+        before = "world"
+        for name in "abcde":
+            axis, step = rng.standard_normal(3), rng.standard_normal(3)
+            edit.apply(
+                kv.Revolute(name=name, parent=before, child=f"{name} link", axis=axis, lower=-0.5, upper=0.5)
+            )
+            before = f"{name} end"
+            edit.add_frame(before, parent=f"{name} link", transform=kv.translation(*step))
+    a, b = kv.position("a"), kv.position("b")
+    observed = [
+        ObservedPose("e end", covariance=0.01 * np.eye(6) + 0.005),
+        kv.estimation.ObservedPosition("c end", (0.1, 0.2, 0.3)),
+        ObservedExpression("sum", kv.array([a + b, a * b]), 0.02 * np.eye(2)),
+    ]
+    noise = dict.fromkeys(model.speeds, 0.01)
+    fast, slow = (Tracker(model, observed, process_noise=noise) for _ in range(2))
+    slow._filter.native = None
+    assert fast.wait()
+    assert len(fast.groups) == 1
+    truth = {str(s): rng.choice([-0.5, 0.5, 0.1]) for s in fast.symbols}
+    at_bounds = 0
+    for _ in range(4):
+        seen = {
+            "e end": noisy(model.fk("e end")(truth), 0.1, 0.1, rng),
+            "c end": rng.standard_normal(3) * 0.01
+            + (model.fk("c end") @ [0.1, 0.2, 0.3, 1])({s: truth[s] for s in "abc"})[:3],
+            "sum": [truth["a"] + truth["b"], truth["a"] * truth["b"]] + 0.1 * rng.standard_normal(2),
+        }
+        one, other = fast.update(seen), slow.update(seen)
+        assert (
+            fast._filter.native.update(fast._modes.best, fast._filter.reader.read(seen), np.empty(0))
+            is not None
+        )
+        for _ in range(2):
+            assert np.allclose(list(one.state.values()), list(other.state.values()), rtol=0, atol=1e-9)
+            assert np.allclose(one.information, other.information, rtol=1e-8, atol=1e-8)
+            assert np.allclose(one.mean, other.mean, rtol=0, atol=1e-8)
+            assert fast.log_evidence == pytest.approx(slow.log_evidence)
+            at_bounds += sum(abs(abs(x) - 0.5) < 1e-12 for x in one.state.values())
+            one, other = (t.predict(0.1, {"b:velocity": 1.0}) for t in (fast, slow))
+    assert at_bounds > 0
+
+
+def test_the_least_of_a_quadratic_between_bounds():
+    rng = np.random.default_rng(0)
+    for _ in range(60):
+        n, m = rng.integers(1, 7), rng.integers(0, 7)
+        half = rng.standard_normal((n, n))
+        A, g = half @ half.T + 0.1 * np.eye(n), 3 * rng.standard_normal(n)
+        rows = rng.standard_normal((m, n))
+        inside = rows @ rng.standard_normal(n)
+        low, high = inside - rng.uniform(0, 1, m), inside + rng.uniform(0, 1, m)
+        low[rng.random(m) < 0.3] = -np.inf
+        x = smallest_between(np.linalg.inv(A), g, rows, low, high)
+        assert (rows @ x >= low - 1e-8).all()
+        assert (rows @ x <= high + 1e-8).all()
+        # Karush, Kuhn and Tucker: the gradient is made of active rows, with the right signs.
+        gradient = A @ x + g
+        at_low, at_high = np.abs(rows @ x - low) < 1e-8, np.abs(rows @ x - high) < 1e-8
+        normals = np.concatenate([rows[at_low], -rows[at_high]])
+        left = nnls(normals.T, gradient)[1] if len(normals) else np.linalg.norm(gradient)
+        assert left < 1e-7
+    assert (
+        smallest_between(
+            np.eye(1), np.zeros(1), np.ones((2, 1)), np.array([1.0, -np.inf]), np.array([np.inf, 0.0])
+        )
+        is None
+    )

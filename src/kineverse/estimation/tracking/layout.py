@@ -34,8 +34,8 @@ class Group:
         The numbers of its observations.
     limits
         The numbers of its curved limits.
-    by_speeds
-        Whether some of the coordinates move by others' speeds.
+    driven
+        Where in its tangent are speeds of which no coordinate is the position, such as angular velocities.
     """
 
     coordinates: tuple[Symbol, ...]
@@ -44,7 +44,12 @@ class Group:
     t: Indices
     seen: tuple[int, ...]
     limits: tuple[int, ...]
-    by_speeds: bool
+    driven: Indices
+
+    @property
+    def by_speeds(self) -> bool:
+        """Whether some of its coordinates move by such speeds."""
+        return len(self.driven) > 0
 
 
 @dataclass(frozen=True, eq=False)
@@ -200,6 +205,7 @@ def layout_of(
     for union in connected([*watched, *limited, *rated]):
         tangent = tuple(v for v in chart.tangent if v in union)
         coordinates = tuple(x for x in chart.coordinates if speeds[x] & union)
+        own = {x.derivative() for x in coordinates if x not in chart.by_speeds}
         groups.append(
             Group(
                 coordinates,
@@ -208,7 +214,7 @@ def layout_of(
                 np.array([chart.tangent.index(v) for v in tangent]),
                 tuple(i for i, w in enumerate(watched) if w & union),
                 tuple(i for i, w in enumerate(limited) if w & union),
-                bool(chart.by_speeds & set(coordinates)),
+                np.array([k for k, v in enumerate(tangent) if v not in own], dtype=np.int64),
             )
         )
     return Layout(chart, observations, limits, tuple(known), tuple(groups))

@@ -55,6 +55,8 @@ class Motion:
         k4 = rate(q + k3)
         after = q + (k1 + 2 * k2 + 2 * k3 + k4) / 6
         inputs = (*self.coordinates, *self.speeds, *known)
+        # What moves at a constant rate needs no short steps, however far it goes.
+        self._bends = np.array([[v in row and bool(row[v].symbols) for v in speeds] for row in rows])
         self._rates = compile(matrix, (*self.coordinates, *known))
         self._step = compile([after, after.partial(self.coordinates), after.partial(self.speeds)], inputs)
 
@@ -71,7 +73,7 @@ class Motion:
         ValueRejectedError
             If it cannot be followed.
         """
-        largest = float(np.abs(speeds).max(initial=0.0)) * float(np.abs(self.rates(q, known)).sum())
+        largest = float((self._bends * np.abs(self.rates(q, known))).sum(axis=0) @ np.abs(speeds))
         if not math.isfinite(largest) or largest > _MOST_STEPS * _LONGEST:
             names = ", ".join(map(str, self.coordinates))
             raise ValueRejectedError(f"{names} cannot be followed so far in one step.")

@@ -215,9 +215,9 @@ class Solver:
         if step is None:
             names = ", ".join(map(str, self._layout.groups[number].coordinates))
             raise ModelError(f"The limits of {names} leave no state between them.")
-        if self._layout.groups[number].by_speeds:
-            # No further than half a turn: beyond, what is linear leads anywhere.
-            step = step * min(1.0, np.pi / max(float(np.abs(step).max()), 1e-300))
+        turned = float(np.abs(step[self._layout.groups[number].driven]).max(initial=0.0))
+        if turned > np.pi:
+            step = step * (np.pi / turned)  # half a turn: beyond, what is linear leads anywhere
         x, turn = self._charted.step(number, work.x, step, known)
         x = self._boxes[number].clipped(x)
         if float(step @ matrix @ step) <= _CONVERGED**2 or work.damping > _MOST_DAMPING:

@@ -102,11 +102,9 @@ def _in_tangent(layout: Layout, number: int, change: Array) -> Array:
 def _half_turns(layout: Layout, number: int) -> list[Array]:
     """Return steps to the other sides of what moves by others' speeds, such as quaternions."""
     group = layout.groups[number]
-    own = {x.derivative() for x in group.coordinates if x not in layout.chart.by_speeds}
-    found: list[Array] = []
-    for k, speed in enumerate(group.tangent):
-        if speed not in own:
-            step = np.zeros(len(group.tangent))
-            step[k] = math.pi
-            found.append(step)
+    found = []
+    for k in group.driven:
+        step = np.zeros(len(group.tangent))
+        step[k] = math.pi
+        found.append(step)
     return found
