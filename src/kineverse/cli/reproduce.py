@@ -20,6 +20,8 @@ examples:
   kineverse reproduce --list
   kineverse reproduce fig3
   kineverse reproduce fig3 --figure door.svg
+  kineverse reproduce estimation-grid --quick
+  kineverse reproduce sturm --data sturm_tracks
   kineverse reproduce fig3 --json"""
 
 
