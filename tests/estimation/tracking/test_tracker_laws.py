@@ -220,6 +220,25 @@ def test_limits_may_be_about_several_coordinates():
     assert x + estimate.mean == pytest.approx(np.array([1.2, 0.9]), abs=2e-2)
 
 
+def test_limits_may_move_with_others():
+    """A drawer may come out as far as the door beside it is open, and a bolt holds the door near zero."""
+    model = slides()
+    a, b = kv.position("a"), kv.position("b")
+    with model.edit() as edit:
+        edit.constrain("a/position", 0, a, kv.limit_table(b, {0.0: 0.2, 1.0: 1.0}))
+        edit.constrain("b/position", 0, b, 1)
+        edit.constrain("held", *kv.blocked_unless(b, a < 0.9, upper=0.8))
+    seen = ObservedExpression("z", kv.array([a, b]), 0.01 * np.eye(2))
+    tracker = Tracker(model, [seen], uncertainty={"a": 10.0, "b": 10.0})
+    for _ in range(3):
+        estimate = tracker.update({"z": [0.9, 0.3]})
+    # The nearest point of a = 0.2 + 0.8 b.
+    along = np.array([0.8, 1.0]) / np.hypot(0.8, 1.0)
+    wanted = np.array([0.2, 0.0]) + along * (along @ (np.array([0.9, 0.3]) - [0.2, 0.0]))
+    assert [estimate.state["a"], estimate.state["b"]] == pytest.approx(wanted.tolist(), abs=1e-4)
+    assert not model.violations(estimate.state, tolerance=1e-7)
+
+
 def test_information_comes_back_from_a_limit():
     a = kv.position("a")
     model = slides()

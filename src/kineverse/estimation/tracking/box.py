@@ -12,6 +12,9 @@ from .layout import Layout
 from .limits import Limits
 
 
+_FAR = 1e300
+
+
 class Room(NamedTuple):
     """What a step may change at a place: ``lower <= rows ξ <= upper``."""
 
@@ -54,8 +57,10 @@ class Box:
         if self._curved:
             curved = np.stack([out[where] for where in self._curved])
             rows = np.concatenate([rows, curved[:, 3:]])
-            lower = np.concatenate([lower, curved[:, 1] - curved[:, 0]])
-            upper = np.concatenate([upper, curved[:, 2] - curved[:, 0]])
+            # Bounds that hold only now and then are infinite else, and so may be what they are compared with.
+            value = np.nan_to_num(curved[:, 0], nan=np.nan, posinf=_FAR, neginf=-_FAR)
+            lower = np.concatenate([lower, curved[:, 1] - value])
+            upper = np.concatenate([upper, curved[:, 2] - value])
         return Room(rows, lower, upper)
 
     def clipped(self, x: Array) -> Array:

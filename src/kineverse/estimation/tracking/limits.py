@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from kineverse.estimation.noise import Array
+from kineverse.expressions.expression import as_expression
 from kineverse.model.constraint import Constraint
 from kineverse.symbols import Symbol
 
@@ -58,13 +59,26 @@ def limits_of(model: ModelView, chart: Chart, known: frozenset[Symbol]) -> Limit
             continue
         names.append(name)
         if not _is_box(constraint, chart):
-            curved.append(constraint)
+            curved += _one_sided(constraint, index)
             continue
         slope, offset = constraint.line or (1.0, 0.0)
         low, high = sorted((float(b) - offset) / slope for b in (constraint.lower, constraint.upper))
         i = index[constraint.expression.symbols[0]]
         lower[i], upper[i] = max(lower[i], low), min(upper[i], high)
     return Limits(tuple(names), lower, upper, tuple(curved))
+
+
+def _one_sided(constraint: Constraint, moving: Mapping[Symbol, int]) -> list[Constraint]:
+    """Return a constraint as such, or if its bounds move, as two whose bounds are 0."""
+    low, middle, high = constraint.lower, constraint.expression, constraint.upper
+    if not any(s in moving for s in (*low.symbols, *high.symbols)):
+        return [constraint]
+    sides = []
+    if low.symbols or np.isfinite(float(low)):
+        sides.append(Constraint(as_expression(0.0), middle - low, as_expression(np.inf)))
+    if high.symbols or np.isfinite(float(high)):
+        sides.append(Constraint(as_expression(-np.inf), middle - high, as_expression(0.0)))
+    return sides
 
 
 def _is_box(constraint: Constraint, chart: Chart) -> bool:
