@@ -122,7 +122,7 @@ GROUPS: Mapping[str, Group] = MappingProxyType(
 PITCHES = 0.1
 """The standard deviation of a pitch, beforehand [m/rad]."""
 
-REACH = 3.0
+REACH = 1.0
 """The standard deviation of each component of a lever, beforehand [m]."""
 
 

@@ -9,13 +9,11 @@ import numpy.typing as npt
 
 from kineverse.errors import ShapeError, ValueRejectedError
 
-from .canonical import canonical
 from .fit import Found
 from .groups import GroupMotion
-from .identify import family_weights, noise_of, solutions, weighed
+from .identify import family_weights, judged, noise_of, solutions, weighed
 from .native import solver
 from .observations import Observations, observations
-from .refining import refined
 from .rigid import Array
 from .solving import Solution
 
@@ -121,9 +119,10 @@ class Identifier:
             self._solutions = solutions(seen, self._weights)
         else:
             self._solutions = {name: _continued(seen, s) for name, s in self._solutions.items()}
-        found = weighed(self._solutions, self._weights, self._stated)
+        known = judged(seen, self._solutions, self._weights)
+        found = weighed(known, self._weights, self._stated)
         chances = {fit.family for fit in found if fit.probability > _NO_CHANCE}
-        self._solutions = {name: s for name, s in self._solutions.items() if name in chances}
+        self._solutions = {name: solution for name, (solution, _) in known.items() if name in chances}
         return found
 
 
@@ -146,5 +145,4 @@ def _continued(seen: Observations, before: Solution[GroupMotion]) -> Solution[Gr
         apart = np.sum((seen.relative[:known] - seen.relative[k]) ** 2, axis=(1, 2))
         values.append(before.values[int(np.argmin(apart))][None])
     parent = np.concatenate([before.parent, seen.parent[known:]])
-    solution = solver.solve(seen, before.motion, np.concatenate(values), parent, before.belief)
-    return canonical(refined(seen, solution))
+    return solver.solve(seen, before.motion, np.concatenate(values), parent, before.belief)

@@ -13,7 +13,7 @@ from kineverse.errors import UnknownNameError, ValueRejectedError, suggest
 from kineverse.estimation.noise import pose_covariance
 
 from .canonical import canonical
-from .evidence import evidence
+from .evidence import Evidence, evidence
 from .fit import Found
 from .groups import GroupMotion
 from .native import solver
@@ -29,16 +29,19 @@ WEIGHTS: Mapping[str, float] = MappingProxyType(
         "rigid": 1.0,
         "prismatic": 1.0,
         "revolute": 1.0,
-        "screw": 0.02,
-        "cylindrical": 0.02,
-        "spherical": 0.05,
-        "planar": 0.05,
-        "free": 0.05,
+        "screw": 0.01,
+        "cylindrical": 0.01,
+        "spherical": 0.01,
+        "planar": 0.01,
+        "free": 0.01,
     }
 )
 """How probable families are beforehand, beside each other."""
 
 _UNKNOWN_NOISE = (0.005, math.radians(1.0))
+_FIRST_STEPS = 4
+# What is less probable than the best by this, as a logarithm, is not refined.
+_CHANCE = 15.0
 # By what the unknown noise is multiplied, and how that is believed to be spread: a factor of 5 either way.
 _SCALES = np.geomspace(0.01, 100.0, 33)
 _SCALE_SPREAD = math.log(5.0)
@@ -81,7 +84,7 @@ def identify(
     weights = family_weights(families)
     of_a, of_b, stated = noise_of(a is not None, covariance_a, covariance_b, noise)
     seen = observations(a, b, of_a, of_b)
-    return weighed(solutions(seen, weights), weights, stated)
+    return weighed(judged(seen, solutions(seen, weights), weights), weights, stated)
 
 
 def noise_of(
@@ -138,23 +141,51 @@ def solutions(seen: Observations, names: Iterable[str]) -> dict[str, Solution[Gr
     """Return the most likely member of each family."""
     solver.prepare()
     overview = Overview(seen)
-    return {name: canonical(refined(seen, _most_likely(seen, name, overview))) for name in names}
+    return {name: _most_likely(seen, name, overview) for name in names}
 
 
 def _most_likely(seen: Observations, name: str, overview: Overview) -> Solution[GroupMotion]:
-    found = [solver.solve(seen, start.motion, start.values) for start in starts(name, overview)]
-    return min(found, key=lambda solution: solution.cost)
+    softened = seen.softened()
+    first = softened[0] if softened else seen
+    begun = [solver.solve(first, s.motion, s.values, steps=_FIRST_STEPS) for s in starts(name, overview)]
+    best = min(begun, key=lambda solution: solution.cost)
+    for softer in softened:
+        best = solver.solve(softer, best.motion, best.values, best.parent)
+    if best.converged and not softened:
+        return best
+    return solver.solve(seen, best.motion, best.values, best.parent)
 
 
-def weighed(found: Mapping[str, Solution[GroupMotion]], weights: Mapping[str, float], stated: bool) -> Found:
+def judged(
+    seen: Observations, found: Mapping[str, Solution[GroupMotion]], weights: Mapping[str, float]
+) -> dict[str, tuple[Solution[GroupMotion], Evidence]]:
+    """Return solutions and their evidence, those that have a chance with joint values integrated out."""
+    first = {name: (solution, evidence(solution)) for name, solution in found.items()}
+    logs = {name: known.log_evidence + math.log(weights[name]) for name, (_, known) in first.items()}
+    least = max(logs.values()) - _CHANCE
+    result = {}
+    for name, (solution, known) in first.items():
+        if logs[name] >= least:
+            final = canonical(refined(seen, solution))
+            result[name] = final, evidence(final)
+        else:
+            result[name] = canonical(solution), known
+    return result
+
+
+def weighed(
+    found: Mapping[str, tuple[Solution[GroupMotion], Evidence]],
+    weights: Mapping[str, float],
+    stated: bool,
+) -> Found:
     """Return the fits of all families, weighed by their evidence."""
     beforehand = {name: math.log(weights[name]) for name in found}
     if stated:
-        evidences = {name: evidence(solution) for name, solution in found.items()}
+        evidences = {name: known for name, (_, known) in found.items()}
         logs = {name: e.log_evidence for name, e in evidences.items()}
         scale = 1.0
     else:
-        grid = {name: [evidence(s.scaled(c)) for c in _SCALES] for name, s in found.items()}
+        grid = {name: [evidence(s.scaled(c)) for c in _SCALES] for name, (s, _) in found.items()}
         spread = -0.5 * (np.log(_SCALES) / _SCALE_SPREAD) ** 2
         spread -= np.logaddexp.reduce(spread)
         joint = {name: spread + [e.log_evidence for e in es] for name, es in grid.items()}
@@ -166,7 +197,7 @@ def weighed(found: Mapping[str, Solution[GroupMotion]], weights: Mapping[str, fl
     total: Array = np.array([logs[name] + beforehand[name] for name in found])
     probabilities = np.exp(total - np.logaddexp.reduce(total))
     fits = [
-        fit_of(found[name], evidences[name], logs[name], float(p))
+        fit_of(found[name][0], evidences[name], logs[name], float(p))
         for name, p in zip(found, probabilities, strict=True)
     ]
     return Found(tuple(sorted(fits, key=lambda fit: -fit.probability)), scale)

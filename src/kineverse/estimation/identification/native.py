@@ -101,10 +101,11 @@ class SolverLibrary:
         values: Array,
         parent: Array | None = None,
         belief: Belief | None = None,
+        steps: int = STEPS,
     ) -> Solution[GroupMotion]:
         """Do what :func:`.solving.solve` does."""
         if self._code is None:
-            return solve(seen, motion, values, parent, belief)
+            return solve(seen, motion, values, parent, belief, steps)
         count, rows = len(seen), seen.rows
         moved = np.empty(25)
         moved[:9], moved[9:12] = motion.left[:3, :3].ravel(), motion.left[:3, 3]
@@ -121,7 +122,7 @@ class SolverLibrary:
             moved.ctypes.data,
             values.ctypes.data,
             parents.ctypes.data,
-            STEPS,
+            steps,
             ctypes.addressof(cost),
             residuals.ctypes.data,
             covariances.ctypes.data,

@@ -205,22 +205,26 @@ static void advance(const Problem *p, const Motion *m, const double *step, Motio
 /* How the width of what is seen changes with each parameter, joint values following. */
 static int widen(const Problem *p, const Motion *m, const Observation *all, double *slope) {
   int rows = (int)p->rows, joints = (int)p->joints, n = (int)size_of(p);
+  Motion moved[MOST];
   for (int i = 0; i < n; i++) {
     double step[MOST] = {0};
-    Motion moved;
     step[i] = DIFFERENCE;
-    advance(p, m, step, &moved);
+    advance(p, m, step, moved + i);
     slope[i] = 0.0;
-    for (int64_t k = 0; k < p->count; k++) {
-      Observation o = all[k];
-      double inverse[36], weighted[36], own[6], before = spread(p, &o);
-      if (!own_part(p, &o, 0.0, inverse, weighted, own)) return 0;
-      for (int j = 0; j < joints; j++)
+  }
+  for (int64_t k = 0; k < p->count; k++) {
+    Observation o = all[k];
+    double inverse[36], weighted[36], own[6], before = spread(p, &o);
+    if (!own_part(p, &o, 0.0, inverse, weighted, own)) return 0;
+    for (int i = 0; i < n; i++) {
+      for (int j = 0; j < joints; j++) {
+        double change = 0.0;
         for (int l = 0; l < joints; l++)
           for (int r = 0; r < rows; r++)
-            o.values[j] -= DIFFERENCE * inverse[joints * j + l] * weighted[rows * l + r] *
-            all[k].by_parameters[r * n + i];
-      place(p, &moved, &o);
+            change += inverse[joints * j + l] * weighted[rows * l + r] * all[k].by_parameters[r * n + i];
+        o.values[j] = all[k].values[j] - DIFFERENCE * change;
+      }
+      place(p, moved + i, &o);
       combine(p, &o);
       slope[i] += (spread(p, &o) - before) / DIFFERENCE;
     }

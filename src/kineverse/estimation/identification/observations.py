@@ -13,6 +13,8 @@ from kineverse.errors import ShapeError, ValueRejectedError
 from .rigid import Array, inverse
 
 _RIGID = 1e-4
+# How much of a step the width of a valley makes.
+_THIN = 4.0
 
 
 @dataclass(frozen=True)
@@ -48,6 +50,26 @@ class Observations:
     def relative(self) -> Array:
         """parent_T_child as observed, (N, 4, 4)."""
         return inverse(self.parent) @ self.child
+
+    def softened(self) -> list[Observations]:
+        """Return the same observations with less precise positions, the least precise first.
+
+        Where positions are known much better than what a lever makes of the errors of orientations, the
+        likelihood is a thin and curved valley. Steps find into it if it narrows by and by.
+        """
+        lever = float(np.sqrt(np.mean(np.sum(self.relative[:, :3, 3] ** 2, axis=1))))
+        if self.parent_covariance is None:
+            return []
+        turned = lever * float(np.sqrt(np.mean(np.einsum("nii->ni", self.parent_covariance)[:, 3:])))
+        place = float(np.sqrt(np.mean(np.einsum("nii->ni", self.child_covariance)[:, :3])))
+        result, factor = [], 0.5 * turned / place
+        while factor > _THIN:
+            scale = np.array([factor] * 3 + [1.0] * 3)
+            of_child = self.child_covariance * np.outer(scale, scale)[: self.rows, : self.rows]
+            of_parent = self.parent_covariance * np.outer(scale, scale)
+            result.append(Observations(self.parent, self.child, of_parent, of_child))
+            factor /= _THIN
+        return result
 
 
 def observations(

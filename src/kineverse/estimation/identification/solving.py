@@ -25,8 +25,8 @@ from .rigid import Array, exponential, logarithm, pose, skew
 
 M = TypeVar("M", bound=Motion)
 
-STEPS = 60
-CLOSE = 1e-9
+STEPS = 40
+CLOSE = 1e-7
 _DIFFERENCE = 1e-5
 
 
@@ -120,6 +120,7 @@ def solve(
     values: Array,
     parent: Array | None = None,
     belief: Belief | None = None,
+    steps: int = STEPS,
 ) -> Solution[M]:
     """Return the most likely member of a family, from a start.
 
@@ -133,11 +134,13 @@ def solve(
         True poses of the parent to start from, (N, 4, 4); those observed if None.
     belief
         What is believed of joint values; next to nothing if None.
+    steps
+        After so many the best so far is returned.
     """
     belief = belief or Belief.vague(motion.joints)
     point = _point(seen, motion, values, seen.parent if parent is None else parent, belief)
     damping, converged = 0.0, False
-    for _ in range(STEPS):
+    for _ in range(steps):
         reduced = _step(seen, point, damping, belief)
         if reduced is None:
             damping = max(10.0 * damping, 1e-6)

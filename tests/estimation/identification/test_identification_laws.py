@@ -1,0 +1,146 @@
+"""What holds for every recording: frames do not matter, nor does the order; parent and child can be exchanged."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from part_recordings import Recording, angle_between, off_axis, recording, transform
+from scipy.optimize import least_squares
+from scipy.spatial.transform import Rotation
+
+from kineverse.estimation import Found, Identifier, identify
+from kineverse.estimation.identification.identify import solutions
+from kineverse.estimation.identification.observations import observations
+
+MOVING = ("prismatic", "revolute")
+FAMILIES = ("rigid", "prismatic", "revolute", "planar")
+
+
+def found_in(seen: Recording) -> Found:
+    return identify(seen.parent, seen.child, noise=seen.covariance, families=FAMILIES)
+
+
+def seeded(family: str, seed: int, count: int = 12) -> Recording:
+    return recording(family, count=count, position=0.02, orientation=0.03, seed=seed)
+
+
+def some_pose(seed: int) -> np.ndarray:
+    random = np.random.default_rng(seed)
+    return transform(Rotation.random(random_state=random), random.normal(0, 2.0, 3))
+
+
+@settings(max_examples=6)
+@given(st.integers(0, 10**6), st.sampled_from(MOVING))
+def test_the_observer_may_stand_anywhere(seed: int, family: str) -> None:
+    seen = seeded(family, seed)
+    before = found_in(seen)
+    elsewhere = some_pose(seed + 1)
+    turn = np.kron(np.eye(2), elsewhere[:3, :3])
+    after = identify(
+        elsewhere @ seen.parent,
+        elsewhere @ seen.child,
+        noise=turn @ seen.covariance @ turn.T,
+        families=FAMILIES,
+    )
+    same_joint(before, after, family)
+
+
+@settings(max_examples=6)
+@given(st.integers(0, 10**6), st.sampled_from(MOVING))
+def test_the_frame_of_the_child_turns_with_it(seed: int, family: str) -> None:
+    seen = seeded(family, seed)
+    change = np.eye(4)
+    change[:3, :3] = some_pose(seed)[:3, :3]
+    before = found_in(seen)
+    after = identify(seen.parent, seen.child @ change, noise=seen.covariance, families=FAMILIES)
+    same_joint(before, after, family)
+    np.testing.assert_allclose(
+        before[family].parameters["reference"] @ change, after[family].parameters["reference"], atol=1e-3
+    )
+
+
+@settings(max_examples=6)
+@given(st.integers(0, 10**6), st.sampled_from(MOVING))
+def test_the_order_of_poses_does_not_matter(seed: int, family: str) -> None:
+    seen = seeded(family, seed)
+    order = np.random.default_rng(seed).permutation(len(seen.parent))
+    before = found_in(seen)
+    after = identify(seen.parent[order], seen.child[order], noise=seen.covariance, families=FAMILIES)
+    same_joint(before, after, family)
+    np.testing.assert_allclose(before[family].joint_values[order], after[family].joint_values, atol=1e-3)
+
+
+def same_joint(before: Found, after: Found, family: str) -> None:
+    for fit in before:
+        assert after[fit.family].probability == pytest.approx(fit.probability, abs=0.02)
+    one, other = before[family], after[family]
+    assert angle_between(one.parameters["axis"], other.parameters["axis"]) < 0.05 * one.deviation("axis.x")
+    np.testing.assert_allclose(np.linalg.norm(one.range), np.linalg.norm(other.range), rtol=0.01)
+
+
+@pytest.mark.parametrize("family", MOVING)
+def test_exchanging_parent_and_child_inverts_the_model(family: str) -> None:
+    seen = seeded(family, 5, count=20)
+    fit = found_in(seen)[family]
+    other = identify(seen.child, seen.parent, noise=seen.covariance, families=FAMILIES)[family]
+    inverse = np.linalg.inv(other.parameters["reference"])
+    axis = inverse[:3, :3] @ other.parameters["axis"]
+    assert angle_between(axis, fit.parameters["axis"]) < fit.deviation("axis.x")
+    if family == "revolute":
+        point = inverse[:3, :3] @ other.parameters["point"] + inverse[:3, 3]
+        assert off_axis(fit.parameters["point"], fit.parameters["axis"], point) < fit.deviation("point.x")
+
+
+@pytest.mark.parametrize("family", MOVING)
+def test_the_likelihood_is_that_of_all_true_poses_as_unknowns(family: str) -> None:
+    seen = seeded(family, 9, count=5)
+    covariance = seen.covariance
+    ours = solutions(observations(seen.parent, seen.child, covariance, covariance), [family])[family]
+    deviation = np.sqrt(np.diag(covariance))
+
+    def errors(unknown: np.ndarray) -> np.ndarray:
+        count = len(seen.parent)
+        left = transform(Rotation.from_rotvec(unknown[:3]), unknown[3:6])
+        right = transform(Rotation.from_rotvec(unknown[6:9]), unknown[9:12])
+        values = unknown[12 : 12 + count]
+        parents = unknown[12 + count :].reshape(count, 6)
+        result = []
+        for k in range(count):
+            twist = np.zeros(6)
+            twist[5 if family == "revolute" else 2] = values[k]
+            there = transform(Rotation.from_rotvec(parents[k, 3:]), parents[k, :3])
+            motion = transform(Rotation.from_rotvec(twist[3:]), twist[:3])
+            for seen_pose, true in ((seen.parent[k], there), (seen.child[k], there @ left @ motion @ right)):
+                turned = Rotation.from_matrix(seen_pose[:3, :3] @ true[:3, :3].T).as_rotvec()
+                result.append(np.concatenate([seen_pose[:3, 3] - true[:3, 3], turned]) / deviation)
+        return np.concatenate(result)
+
+    start = [
+        *Rotation.from_matrix(seen.left[:3, :3]).as_rotvec(),
+        *seen.left[:3, 3],
+        *Rotation.from_matrix(seen.right[:3, :3]).as_rotvec(),
+        *seen.right[:3, 3],
+        *seen.values[:, 0],
+    ]
+    for pose in seen.true_parent:
+        start += [*pose[:3, 3], *Rotation.from_matrix(pose[:3, :3]).as_rotvec()]
+    theirs = least_squares(errors, start, x_scale="jac")
+    axis = Rotation.from_rotvec(theirs.x[:3]).as_matrix()[:, 2]
+    assert ours.cost == pytest.approx(2 * theirs.cost, rel=1e-2)
+    assert angle_between(axis, ours.motion.left[:3, 2]) < 2e-3
+
+
+@pytest.mark.parametrize("family", MOVING)
+def test_one_by_one_is_as_all_at_once(family: str) -> None:
+    seen = seeded(family, 2, count=14)
+    identifier = Identifier(noise=seen.covariance, families=FAMILIES)
+    for a, b in zip(seen.parent, seen.child, strict=True):
+        identifier.add(a, b)
+        if len(identifier) > 4:
+            assert identifier.found.best.probability > 0.0
+    whole = found_in(seen)
+    one, other = identifier.found[family], whole[family]
+    assert one.log_evidence == pytest.approx(other.log_evidence, abs=0.02)
+    assert angle_between(one.parameters["axis"], other.parameters["axis"]) < 0.05 * other.deviation("axis.x")
