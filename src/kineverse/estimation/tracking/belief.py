@@ -9,6 +9,7 @@ from functools import cached_property
 import numpy as np
 import numpy.typing as npt
 
+from kineverse.errors import ValueRejectedError
 from kineverse.estimation.noise import Array
 
 Indices = npt.NDArray[np.int64]
@@ -20,8 +21,21 @@ def symmetric(matrix: Array) -> Array:
 
 
 def inverse(matrix: Array) -> Array:
-    """Return the inverse of a positive definite matrix, symmetric."""
-    return symmetric(np.asarray(np.linalg.inv(matrix), dtype=np.float64))
+    """Return the inverse of a positive definite matrix, symmetric.
+
+    Raises
+    ------
+    ValueRejectedError
+        If rounding has left nothing of it in some direction.
+    """
+    try:
+        np.linalg.cholesky(matrix)
+        return symmetric(np.asarray(np.linalg.inv(matrix), dtype=np.float64))
+    except np.linalg.LinAlgError:
+        raise ValueRejectedError(
+            "Some directions are known so much better than others that floating point cannot hold both: a "
+            "covariance that was handed in is far too small, or an uncertainty far too large."
+        ) from None
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,7 +59,7 @@ class Quadratic:
     @staticmethod
     def of_density(matrix: Array, vector: Array) -> Quadratic:
         """Return the one whose least cost is 0."""
-        return Quadratic(matrix, vector, float(vector @ np.linalg.solve(matrix, vector)) / 2)
+        return Quadratic(matrix, vector, float(vector @ inverse(matrix) @ vector) / 2)
 
     def with_seen(self, seen: Iterable[tuple[Array, Array, float]]) -> Quadratic:
         """Return it with the squares of errors e - S ξ added, given as (e, S, weight)."""
@@ -69,7 +83,7 @@ class Quadratic:
     @cached_property
     def least(self) -> float:
         """The least cost."""
-        return self.cost - float(self.vector @ np.linalg.solve(self.matrix, self.vector)) / 2
+        return self.cost - float(self.vector @ inverse(self.matrix) @ self.vector) / 2
 
     @cached_property
     def log_determinant(self) -> float:

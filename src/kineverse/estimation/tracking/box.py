@@ -11,7 +11,6 @@ from kineverse.estimation.noise import Array
 from .layout import Layout
 from .limits import Limits
 
-
 _FAR = 1e300
 
 

@@ -12,6 +12,7 @@ from kineverse.estimation.noise import Array
 from kineverse.state import State
 from kineverse.symbols import Symbol
 
+from .belief import inverse
 from .filtering import Filter, Outcome
 from .modes import Modes
 
@@ -69,7 +70,7 @@ class Estimate:
         found = np.zeros_like(self._belief.information)
         for group in self._layout.groups:
             block = np.ix_(group.t, group.t)
-            found[block] = np.linalg.inv(self._belief.information[block])
+            found[block] = inverse(self._belief.information[block])
         return found
 
     @cached_property

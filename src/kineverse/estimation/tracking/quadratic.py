@@ -44,7 +44,7 @@ def smallest_between(
             held = normals[active]
             way = inverse @ normal
             if active:
-                relation = np.linalg.solve(held @ inverse @ held.T, held @ way)
+                relation = np.linalg.lstsq(held @ inverse @ held.T, held @ way, rcond=None)[0]
                 way = way - inverse @ held.T @ relation
             else:
                 relation = np.empty(0)
