@@ -1,0 +1,142 @@
+"""Learning a joint while it moves: poses are kept, families weighed, and the best one becomes a model."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+import kineverse as kv
+from kineverse.estimation import Fit, Found, ObservedPose, Tracker, identify
+from kineverse.model.frame import WORLD
+from kineverse.view.triangles import Floats
+
+from .markers import Seen, Sight
+from .strangers import BASE, PART
+
+LEARNED = "stranger/learned"
+"""The joint in the model that was learned."""
+
+LOOKS, THINKS = 0.25, 1.0
+"""How often a pose is kept, and how often all of them are weighed [s]."""
+
+FEWEST, MOST = 4, 96
+"""With how many poses the weighing begins, and from how many on every other one is forgotten."""
+
+RESTLESS = 0.3
+"""Of what was learned: the variance that a coordinate gains [m²/s], [rad²/s]."""
+
+TOLD = ("revolute", "prismatic", "screw", "cylindrical", "rigid")
+"""Families of which a model is made; what else moves is only watched."""
+
+
+@dataclass(frozen=True, slots=True)
+class Thought:
+    """What was thought at a time [s]: the probability of each family."""
+
+    time: float
+    probabilities: dict[str, float]
+
+
+class Learner:
+    """Learns how a part moves on its base from poses of both, which nobody explains to it.
+
+    Attributes
+    ----------
+    found
+        What all poses so far say; None as long as there are too few.
+    thoughts
+        What was thought before, one for each time they were weighed.
+    model
+        Base and part, connected by what was learned; None as long as nothing is certain.
+    tracker
+        Of the joint that was learned, if it can move.
+    """
+
+    def __init__(self) -> None:
+        self.found: Found | None = None
+        self.thoughts: list[Thought] = []
+        self.model: kv.Model | None = None
+        self.tracker: Tracker | None = None
+        self._base: list[Floats] = []
+        self._part: list[Floats] = []
+        self._covariances: list[Floats] = []
+        self._fk: Callable[[dict[str, float]], Floats] | None = None
+        self._looked = self._thought = -np.inf
+        self._pace = LOOKS
+
+    def step(self, seen: Seen, time: float, dt: float, sight: Sight) -> None:
+        """Take in what was seen of base and part, in this order, ``dt`` after the last time [s]."""
+        if time >= self._looked + self._pace:
+            self._looked = time
+            self._base.append(seen.poses[0])
+            self._part.append(seen.poses[1])
+            self._covariances.append(sight.covariance)
+            self._thin_out()
+        if time >= self._thought + THINKS and len(self._part) >= FEWEST:
+            self._thought = time
+            self._think(time)
+        if self.tracker is not None:
+            self.tracker.predict(dt)
+            self.tracker.update({PART: (seen.poses[1], sight.covariance)})
+
+    def _thin_out(self) -> None:
+        """Forget every other pose where there are many: old ones say as much as new ones."""
+        if len(self._part) > MOST:
+            self._base, self._part = self._base[::2], self._part[::2]
+            self._covariances = self._covariances[::2]
+            self._pace *= 2.0
+
+    def _think(self, time: float) -> None:
+        covariances = np.array(self._covariances)
+        base, part = np.array(self._base), np.array(self._part)
+        self.found = identify(base, part, covariance_a=covariances, covariance_b=covariances)
+        self.thoughts.append(Thought(time, {fit.family: fit.probability for fit in self.found}))
+        best = self.found.best
+        if self.found.cannot_tell or best.family not in TOLD:
+            self.model = self.tracker = self._fk = None
+            return
+        # The base stands somewhere, which is learned in the same way.
+        stands = identify(None, base, covariance_b=covariances, families=["rigid"]).best
+        model = kv.Model()
+        with model.edit() as edit:
+            edit.apply(stands.operation(BASE, WORLD))
+            edit.apply(best.operation(LEARNED, BASE, PART))
+        self._follow(model, best)
+
+    def _follow(self, model: kv.Model, fit: Fit) -> None:
+        """Track with what was just learned, from where the part was seen last."""
+        self.model, self.tracker, self._fk = model, None, kv.compile(model.fk(PART))
+        names = [str(s) for s in model.degrees_of_freedom]
+        if names:
+            self.tracker = Tracker(
+                model,
+                [ObservedPose(PART)],
+                start=dict(zip(names, fit.joint_values[-1].tolist(), strict=True)),
+                process_noise={s.derivative(): RESTLESS for s in model.degrees_of_freedom},
+            )
+
+    @property
+    def values(self) -> dict[str, float]:
+        """Of the coordinates of the model that was learned, by name."""
+        if self.tracker is None:
+            return {}
+        return {str(symbol): value for symbol, value in self.tracker.estimate.state.items()}
+
+    @property
+    def part(self) -> Floats | None:
+        """Where the part is held to be, 4×4; None as long as nobody knows how it moves."""
+        return None if self._fk is None else self._fk(self.values)
+
+    @property
+    def seen(self) -> Floats:
+        """The places at which the part was seen (N, 3) [m]."""
+        return np.array(self._part).reshape(-1, 4, 4)[:, :3, 3]
+
+    @property
+    def base(self) -> Floats:
+        """Where the base is held to be; where it was seen last, while nothing is certain."""
+        if self.model is not None:
+            return np.asarray(self.model.fk(BASE)({}))
+        return self._base[-1] if self._base else np.eye(4)
