@@ -231,7 +231,7 @@ def test_without_a_compiler_commands_answer_the_same(run, monkeypatch, tmp_path,
 
 def test_a_missing_compiler_is_said_only_when_asked(run, monkeypatch, tmp_path):
     monkeypatch.delenv("CC", raising=False)
-    words = ("demo", "--headless", "--picture", tmp_path / "picture.png")
+    words = ("demo", "--sliders", "--headless", "--picture", tmp_path / "picture.png")
     # What was not found on one path is logged once, so there are two.
     monkeypatch.setenv("PATH", str(tmp_path / "first"))
     status, _, err = run(*words)

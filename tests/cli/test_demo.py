@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+import argparse
+import re
 import subprocess
 import sys
 
@@ -8,8 +10,9 @@ import pytest
 
 import kineverse as kv
 from kineverse.cli import main
-from kineverse.cli.demo import MODELS, STATE
+from kineverse.cli.demo import MODELS, STATE, add_arguments
 from kineverse.cli.drive import SAMPLES, drive
+from kineverse.view.living.strangers import STRANGERS
 
 
 @pytest.fixture(scope="module")
@@ -26,9 +29,38 @@ def test_the_opening_scene_is_one_the_models_have_and_allow(both):
     assert list(both.violations(both.default_state().updated(STATE))) == []
 
 
-def test_headless_drives_everything_writes_a_picture_and_ends(tmp_path, capsys):
+def test_headless_tracks_learns_writes_a_picture_and_ends(tmp_path, capsys):
     path = tmp_path / "picture.png"
-    assert main(["demo", "--headless", "--picture", str(path)]) == 0
+    assert main(["demo", "--headless", "--seconds", "8", "--picture", str(path)]) == 0
+    out, err = capsys.readouterr()
+    assert err == ""
+    marker, track, _, nees, *_ = re.findall(r"  +([\d.]+)(?: mm| ms)?$", out, flags=re.MULTILINE)
+    assert float(track) < 0.3 * float(marker)
+    assert 0.6 < float(nees) < 1.6
+    assert re.search(r"^revolute +0\.9", out, flags=re.MULTILINE)
+    assert re.search(r"^axis +± [\d.]+°, off by [\d.]+°$", out, flags=re.MULTILINE)
+    assert path.read_bytes().startswith(b"\x89PNG")
+
+
+def test_a_short_life_cannot_tell_and_none_is_refused(tmp_path, capsys):
+    words = ["demo", "--headless", "--stranger", "stool", "--picture", str(tmp_path / "x.png"), "--seconds"]
+    assert main([*words, "1"]) == 0
+    assert "cannot tell" in capsys.readouterr().out
+    for seconds in ("0", "nan", "1e9"):
+        assert main([*words, seconds]) == 2
+        assert "--seconds is between" in capsys.readouterr().err
+
+
+def test_the_strangers_on_offer_are_those_there_are():
+    parser = argparse.ArgumentParser()
+    add_arguments(parser)
+    (option,) = (action for action in parser._actions if action.dest == "stranger")
+    assert sorted(option.choices) == sorted(STRANGERS)
+
+
+def test_headless_sliders_drive_everything_write_a_picture_and_end(tmp_path, capsys):
+    path = tmp_path / "picture.png"
+    assert main(["demo", "--sliders", "--headless", "--picture", str(path)]) == 0
     out, err = capsys.readouterr()
     assert err == ""
     assert "45 DoF driven" in out
@@ -41,7 +73,7 @@ def test_headless_needs_the_core_alone(tmp_path):
     code = (
         f"import sys\nfor name in {extras!r}: sys.modules[name] = None\n"
         f"from kineverse.cli import main\n"
-        f"sys.exit(main(['demo', '--headless', '--picture', {str(tmp_path / 'core.png')!r}]))"
+        f"sys.exit(main(['demo', '--headless', '--seconds', '1', '--picture', {str(tmp_path / 'core.png')!r}]))"
     )
     words = [sys.executable, "-c", code]
     done = subprocess.run(words, capture_output=True, text=True, timeout=300, check=False)

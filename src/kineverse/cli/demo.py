@@ -1,4 +1,4 @@
-"""``kineverse demo``: a kitchen and a robot."""
+"""``kineverse demo``: a kitchen that lives, or a kitchen and a robot to be moved by hand."""
 
 from __future__ import annotations
 
@@ -6,21 +6,28 @@ import argparse
 import sys
 from typing import TYPE_CHECKING
 
+from kineverse.cli.progress import progress
 from kineverse.cli.table import figure, table
 from kineverse.cli.view import add_page_options, announce, until_interrupted
+from kineverse.errors import ValueRejectedError
 
 if TYPE_CHECKING:
     import kineverse as kv
     from kineverse.view.camera import Camera
+    from kineverse.view.living.following import Figures
 
-HELP = """show the kitchen and a robot that ship with Kineverse
+HELP = """show a kitchen that lives, tracked through noise, and a joint that is learned
 
-Opens them in the browser until Ctrl-C. With --headless everything that moves is driven through its range, a
-picture is written, and the command ends; that needs neither a browser nor anything beyond the core.
+Opens it in the browser until Ctrl-C: doors and drawers move, noisy markers are all that is seen of them, and
+beside the truth stands what is believed. In front something moves of which nobody says how. With --headless
+some seconds of that pass without a browser, in numbers and a picture; that needs nothing beyond the core.
+With --sliders it is the kitchen and a robot instead, to be moved by hand.
 
 examples:
   kineverse demo
-  kineverse demo --headless --picture kitchen.png"""
+  kineverse demo --headless --picture kitchen.png
+  kineverse demo --stranger stool
+  kineverse demo --sliders"""
 
 MODELS = ("kitchen", "pr2")
 
@@ -50,20 +57,84 @@ STATE = {
     "pr2/r_wrist_flex_joint": -0.35,
     "pr2/torso_lift_joint": 0.15,
 }
-"""The opening scene [m], [rad]: the robot stands before the row, and somebody forgot to shut the doors."""
+"""Where sliders start [m], [rad]: the robot stands before the row, and somebody forgot to shut the doors."""
 
 EYE, TARGET, VIEW = (-3.5, 4.9, 2.75), (0.2, 0.0, 0.8), 0.66
 """Where it is seen from [m], [rad]: over the island's corner, along the open doors."""
 
 
+SECONDS, STEP, SETTLED = 18.0, 1.0 / 12.0, 3.0
+"""Without a browser: how much time passes, in what steps, and from when on figures count [s]."""
+
+LONGEST = 3600.0
+"""The most time that may be asked for [s]."""
+
+
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
-    parser.add_argument("--headless", action="store_true", help="drive everything, write a picture, end")
+    parser.add_argument("--headless", action="store_true", help="numbers and a picture instead of a page")
     parser.add_argument("--picture", metavar="PATH", default="demo.png", help="with --headless (demo.png)")
+    parser.add_argument(
+        "--stranger", choices=("chest", "crate", "stool"), default="chest", help="what is learned"
+    )
+    parser.add_argument(
+        "--seconds", type=float, default=SECONDS, metavar="S", help=f"with --headless: how long ({SECONDS:g})"
+    )
+    parser.add_argument("--sliders", action="store_true", help="a kitchen and a robot, to be moved by hand")
     add_page_options(parser)
 
 
 def run(arguments: argparse.Namespace) -> int:
+    """Show the scene that is asked for, or compute it."""
+    if arguments.sliders:
+        return _by_hand(arguments)
+    from kineverse.view.living import Life
+
+    if arguments.headless:
+        return _some_seconds(arguments)
+    from kineverse.view.living.page import LivingPage
+
+    with (
+        until_interrupted(),
+        LivingPage(Life(stranger=arguments.stranger), port=arguments.port, label="Kineverse demo") as page,
+    ):
+        announce(page, browser=not arguments.no_browser)
+        print(f"{page.life.kitchen}, tracked; a {page.life.stranger.name}, learned", flush=True)
+        page.wait()
+    return 0
+
+
+def _some_seconds(arguments: argparse.Namespace) -> int:
+    """Let the scene live for a while without a browser, say how it went, and write a picture of its end."""
+    from kineverse.view.living import Life
+    from kineverse.view.living.following import average
+    from kineverse.view.living.picture import save
+    from kineverse.view.living.report import table_of_learning, table_of_tracking
+
+    steps = _steps(arguments.seconds)
+    life = Life(stranger=arguments.stranger)
+    # First: a path that cannot be written to should not be found out at the end.
+    open(arguments.picture, "ab").close()
+    figures: list[Figures] = []
+    for _ in progress(range(steps), "living", "step"):
+        life.step(STEP)
+        if life.time > SETTLED or not figures:
+            figures.append(life.now)
+    print(table(*table_of_tracking(life, average(figures)), "<>"), end="\n\n")
+    print(table(*table_of_learning(life), "<>"))
+    save(arguments.picture, life)
+    print(f"picture: {arguments.picture}")
+    return 0
+
+
+def _steps(seconds: float) -> int:
+    """Return in how many steps so much time passes."""
+    if not STEP <= seconds <= LONGEST:
+        raise ValueRejectedError(f"--seconds is between {STEP:.2g} and {LONGEST:g}, not {seconds!r}")
+    return round(seconds / STEP)
+
+
+def _by_hand(arguments: argparse.Namespace) -> int:
     """Load both models; show or drive them."""
     import kineverse as kv
 

@@ -16,6 +16,7 @@ from kineverse.cli.progress import progress
 
 if TYPE_CHECKING:
     import kineverse as kv
+    from kineverse.view.living.page import LivingPage
     from kineverse.view.viewer import Viewer
 
 HELP = """show a model in the browser, with a slider for everything that moves
@@ -107,7 +108,7 @@ def _write_picture(
     return 0
 
 
-def announce(page: Viewer, browser: bool) -> None:
+def announce(page: Viewer | LivingPage, browser: bool) -> None:
     """Print the address of a page and open it, if there is a screen to open it on."""
     print(f"{page.address}   (Ctrl-C ends)", flush=True)
     has_screen = sys.platform in ("win32", "darwin") or any(
