@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
+
 import numpy as np
 import pytest
 from scipy.optimize import least_squares, nnls
@@ -372,3 +374,24 @@ def test_the_least_of_a_quadratic_between_bounds():
         )
         is None
     )
+
+
+@pytest.mark.compiler
+def test_copies_may_be_used_in_several_threads():
+    model = kv.load("kitchen")
+    eyes = Eyes(model, [f for f in model.frames if model.speeds_of(f)])
+    first = Tracker(model, eyes.frames, process_noise=dict.fromkeys(model.speeds, 1e-3))
+    first.wait()
+    rng = np.random.default_rng(0)
+    truths = [{str(s): rng.uniform(*first.limits[s]) for s in first.symbols} for _ in range(4)]
+    readings = [[eyes.array(truth) for _ in range(30)] for truth in truths]
+
+    def follow(some):
+        tracker = first.copy()
+        for step, poses in enumerate(some):
+            estimate = tracker.update_poses(poses, at=0.1 * step)
+        return estimate.state
+
+    alone = [follow(some) for some in readings]
+    with ThreadPoolExecutor(4) as threads:
+        assert list(threads.map(follow, readings)) == alone

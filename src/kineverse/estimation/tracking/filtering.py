@@ -192,14 +192,14 @@ class Filter:
         if self.outliers is None or self.native is None or not self.native.is_ready:
             return None, 0
         found = self.native.update(modes.best, reading, known)
-        if found is None:
+        if found is None or found.squares is None:
             return None, 0
         sure = []
         for number in self._seen(reading):
             seen = [i for i in self.layout.groups[number].seen if reading.seen[i]]
             wrong = [self.outliers.log_density(self.layout.observations[i]) for i in seen]
             judged = [
-                self.outliers.judge(float(self.native.squares[i]), float(reading.log_scale[i]), density)
+                self.outliers.judge(float(found.squares[i]), float(reading.log_scale[i]), density)
                 for i, density in zip(seen, wrong, strict=True)
             ]
             found.belief.evidence[number] += len(seen) * math.log(1 - self.outliers.fraction)

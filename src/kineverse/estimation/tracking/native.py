@@ -103,7 +103,7 @@ native_library = NativeLibrary()
 class NativeSolver:
     """What :class:`.solving.Solver` does for one tracker, in C.
 
-    It has memory of its own, so it is for one thread.
+    It has memory of its own, which threads use in turns.
 
     Parameters
     ----------
@@ -131,13 +131,14 @@ class NativeSolver:
             "watch": [i for group in layout.groups for i in group.seen],
         }
         self._indices: dict[str, Indices] = {name: np.array(v, dtype=np.int64) for name, v in kept.items()}
+        self._squares = np.zeros(len(layout.observations))
         self._numbers = {
             "lower": limits.lower,
             "upper": limits.upper,
             "input": self._input,
             "output": np.zeros(function.shapes[0]),
             "work": np.zeros(sum(5 * w + w * w for w in widths)),
-            "squares": np.zeros(len(layout.observations)),
+            "squares": self._squares,
         }
         self._problem = _Problem(observations=len(layout.observations), groups=count, coordinates=size)
         for name, array in (*self._indices.items(), *self._numbers.items()):
@@ -153,7 +154,9 @@ class NativeSolver:
             np.zeros(len(layout.observations)),
         )
         self._loaded: Reading | None = None
+        self._lock = threading.Lock()
         self._where = ctypes.addressof(self._problem)
+        self._moved = [row.ctypes.data for row in self._motion]
         self._seen = [array.ctypes.data for array in self._reading]
         self._written = [self._belief.ctypes.data, *self._seen, *(row.ctypes.data for row in self._results)]
 
@@ -161,16 +164,11 @@ class NativeSolver:
     def suits(layout: Layout) -> bool:
         """Whether C can do it: coordinates that are their own tangent, limits of single ones."""
         return (
-            not layout.chart.by_speeds
+            tuple(x.derivative() for x in layout.chart.coordinates) == layout.chart.tangent
             and not layout.limits
             and all(len(group.tangent) <= _MOST_UNKNOWNS for group in layout.groups)
             and all(one.size <= _MOST_NUMBERS for one in layout.observations)
         )
-
-    @property
-    def squares(self) -> Array:
-        """The squares of the whitened errors of what was seen, after the last update."""
-        return self._numbers["squares"]
 
     @property
     def is_ready(self) -> bool:
@@ -185,34 +183,37 @@ class NativeSolver:
 
         Then numpy finds out why.
         """
-        self._load(reading)
-        self._belief[:] = belief.numbers
-        self._input[self._size :] = known
-        rounds = native_library.code.update(self._where, *self._written)
-        if rounds < 0:
-            return None
-        nis, dof = self._results.copy()
-        return Found(Belief(belief.sizes, self._belief.copy()), nis, dof, rounds)
+        with self._lock:
+            self._load(reading)
+            self._belief[:] = belief.numbers
+            self._input[self._size :] = known
+            rounds = native_library.code.update(self._where, *self._written)
+            if rounds < 0:
+                return None
+            nis, dof = self._results.copy()
+            after = Belief(belief.sizes, self._belief.copy())
+            return Found(after, nis, dof, rounds, squares=self._squares.copy())
 
     def predict(self, belief: Belief, moved: Array, grown: Array) -> Belief | None:
         """Return the belief inside the limits after steps and with variances added, both by coordinate.
 
         None if that is not easy.
         """
-        self._belief[:] = belief.numbers
-        self._motion[0], self._motion[1] = moved, grown
-        where = self._belief.ctypes.data, *(row.ctypes.data for row in self._motion)
-        if native_library.code.predict(self._where, *where) < 0:
-            return None
-        return Belief(belief.sizes, self._belief.copy())
+        with self._lock:
+            self._belief[:] = belief.numbers
+            self._motion[0], self._motion[1] = moved, grown
+            if native_library.code.predict(self._where, self._written[0], *self._moved) < 0:
+                return None
+            return Belief(belief.sizes, self._belief.copy())
 
     def are_rigid(self, reading: Reading) -> bool:
         """Whether all poses that were seen are rigid; False if that is not known."""
         code = native_library.code
         if code is None:
             return False
-        self._load(reading)
-        return bool(code.first_broken(self._where, *self._seen[:2], RIGID) < 0)
+        with self._lock:
+            self._load(reading)
+            return bool(code.first_broken(self._where, *self._seen[:2], RIGID) < 0)
 
     def _load(self, reading: Reading) -> None:
         if self._loaded is reading:

@@ -51,6 +51,8 @@ class Found:
         How many times the model was evaluated.
     weights
         How far each observation was believed; None if all were.
+    squares
+        Of the whitened errors of what was seen; None if nobody has kept them.
     """
 
     belief: Belief
@@ -58,6 +60,7 @@ class Found:
     dof: Array
     rounds: int
     weights: Array | None = None
+    squares: Array | None = None
 
 
 @dataclass(slots=True, eq=False)

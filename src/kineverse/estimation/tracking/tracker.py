@@ -152,7 +152,7 @@ class Tracker:
         return self._modes.log_evidence
 
     def copy(self) -> Tracker:
-        """Return another one that goes on from here; compiled functions are shared, for use in one thread."""
+        """Return another one that goes on from here; all that is compiled is shared, with any threads."""
         return copy.copy(self)
 
     # -- steps ---------------------------------------------------------------------------------------------
