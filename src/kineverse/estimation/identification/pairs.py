@@ -71,7 +71,7 @@ def pair(tracks: Mapping[str, Track], parent: str, child: str, families: Familie
         return None
     seen = between(a, b, times)
     found = identified(seen, families)
-    weights = family_weights(families)
+    weights = {str(getattr(f, "name", f)): w for f, w in family_weights(families).items()}
     best = found.best
     log = best.log_evidence + math.log(weights[best.family] / best.probability / sum(weights.values()))
     squares = squared_error(seen, best)

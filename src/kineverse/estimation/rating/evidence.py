@@ -12,6 +12,7 @@ import math
 
 import numpy as np
 
+from kineverse.estimation.identification.matrices import inverted, log_determinants, times
 from kineverse.estimation.identification.rigid import Array
 
 from .misfit import Misfit
@@ -25,7 +26,7 @@ _erf = np.vectorize(math.erf, otypes=[np.float64])
 def log_evidence(served: Served, seen: Misfit, still: bool = False) -> float:
     """Return the logarithm of the density of the observed relative poses, with joint values integrated out.
 
-    Several joint values are taken as independent of each other, and what turns a quaternion as anywhere.
+    Limits cut off what is drawn only where there is one joint value.
 
     Parameters
     ----------
@@ -35,20 +36,43 @@ def log_evidence(served: Served, seen: Misfit, still: bool = False) -> float:
         Whether it is taken as not moving, somewhere within its limits.
     """
     log = -float(np.sum(0.5 * np.sum(seen.normal**2, axis=1) + seen.log_scale))
+    widths = _STILL if still else _WIDTHS
+    if served.joints == 1:
+        lower, upper = float(served.lower[0]), float(served.upper[0])
+        density = float(_log_density(served)[0])
+        values, variances = seen.values[:, 0], seen.covariances[:, 0, 0]
+        return log + _log_mean(_log_widths(values, variances, lower, upper, widths, density))
+    return log + (_several(served, seen, widths) if served.joints else 0.0)
+
+
+def _several(served: Served, seen: Misfit, widths: Array) -> float:
+    """Return log ∫ Π_k ∫ N(â_k; a, C_k) p(a; μ, s) da dμ at the best widths s, on average."""
+    best, log = np.zeros(served.joints), 0.0
     for j in range(served.joints):
-        values, variances = seen.values[:, j], seen.covariances[:, j, j]
-        lower, upper = float(served.lower[j]), float(served.upper[j])
-        if not np.isfinite(upper - lower):
-            reach = math.pi if served.turning[j] else 10.0
-            density = -math.log(2.0 * reach)
-        else:
-            density = -math.log(max(upper - lower, 1e-6))
-        if served.own[j] is None:
-            log += density * len(values)
-            continue
-        logs = _log_widths(values, variances, lower, upper, _STILL if still else _WIDTHS, density)
-        log += float(np.logaddexp.reduce(logs)) - math.log(len(logs))
-    return log
+        variances = seen.covariances[:, j, j]
+        logs = _log_widths(seen.values[:, j], variances, -math.inf, math.inf, widths, 0.0)
+        best[j] = widths[int(np.argmax(logs))]
+        log += _log_mean(logs - float(np.max(logs)))
+    total = seen.covariances + np.diag(best**2)
+    weights = inverted(total)
+    information = weights.sum(axis=0)
+    mean = np.linalg.solve(information, times(weights, seen.values).sum(axis=0))
+    off = seen.values - mean
+    log -= 0.5 * (float(np.sum(off * times(weights, off))) + log_determinants(math.tau * total))
+    volume = 0.5 * log_determinants(math.tau * inverted(information)[None])
+    return log + min(volume + float(_log_density(served).sum()), 0.0)
+
+
+def _log_density(served: Served) -> Array:
+    """Return the logarithm of the density of the mean of each joint value: anywhere within its limits."""
+    width = served.upper - served.lower
+    free = np.where(served.turning, 2.0 * math.pi, 20.0)
+    density: Array = -np.log(np.where(np.isfinite(width), np.maximum(width, 1e-6), free))
+    return density
+
+
+def _log_mean(logs: Array) -> float:
+    return float(np.logaddexp.reduce(logs)) - math.log(len(logs))
 
 
 def _log_widths(

@@ -13,8 +13,9 @@ from typing import Self
 import numpy as np
 
 from kineverse.estimation.identification.matrices import inverted
+from kineverse.estimation.identification.motion import Linear
 from kineverse.estimation.identification.observations import Observations
-from kineverse.estimation.identification.rigid import Array, skew
+from kineverse.estimation.identification.rigid import Array, logarithm, skew
 
 from .served import Served
 
@@ -31,7 +32,8 @@ class Misfit:
     coordinates
         The most likely coordinates inside the limits, (N, n).
     values
-        The most likely joint values without limits, by linearisation, (N, k).
+        The most likely joint values without limits, by linearisation, (N, k). Where they are no coordinates,
+        turns and slides from the first observation.
     covariances
         Of them, (N, k, k).
     normal
@@ -78,6 +80,8 @@ def misfit(served: Served, seen: Observations) -> Misfit:
     # At a limit the best value without limits is a step away.
     step = (covariances @ transposed @ error[:, :, None])[:, :, 0]
     values = solution.values + step
+    if not served.is_plain:
+        values = _turns(solution.linear)
     basis = np.linalg.qr(directions, mode="complete")[0]
     across = np.swapaxes(basis[:, :, joints:], 1, 2)
     deviations = np.sqrt(np.einsum("nii->ni", covariances))
@@ -93,6 +97,15 @@ def misfit(served: Served, seen: Observations) -> Misfit:
         solution.residuals,
         0.5 * (_log_determinants(solution.covariance) - _log_determinants(covariances)),
     )
+
+
+def _turns(linear: Linear) -> Array:
+    """Return the joint values that lead from the first pose to each, to first order."""
+    first = linear.pose[0]
+    turned = logarithm(linear.pose[:, :3, :3] @ first[:3, :3].T)
+    twists = np.concatenate([linear.pose[:, :3, 3] - first[:3, 3], turned], axis=1)
+    values: Array = twists @ np.linalg.pinv(linear.by_joints[0]).T
+    return values
 
 
 def _moved(pose: Array, middle: Array) -> Array:

@@ -8,16 +8,20 @@ the joint stays.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 
 from kineverse.articulations import Joint
 from kineverse.estimation.identification.fit import Fit
 from kineverse.estimation.identification.groups import WX, GroupMotion
-from kineverse.estimation.identification.operations import joint_operation
+from kineverse.estimation.identification.operations import joint_operation, rigid_pose
 from kineverse.estimation.identification.rigid import Array, exponential, inverse, pose
+from kineverse.model.articulation import Articulation
+from kineverse.model.body import Pose
+from kineverse.model.frame import Frame
 from kineverse.model.model import Model
 from kineverse.model.operation import (
     ARTICULATIONS,
@@ -32,6 +36,8 @@ from kineverse.model.reader import Reader
 from .links import Link
 from .served import Served
 
+Writes: TypeAlias = Mapping[tuple[str, str], Any]
+
 
 @dataclass(frozen=True)
 class Relearned(Operation):
@@ -45,15 +51,26 @@ class Relearned(Operation):
         The name under which the articulation is on record; that of the joint if None.
     kept
         The rest, as pairs of a cell (kind, name) and a value.
+    frame
+        The frame that the joint places.
+    before, after
+        Where the joint stands in its parent, and the frame on what the joint moves.
     """
 
     joint: Operation
     record: str | None = None
     kept: tuple[tuple[tuple[str, str], Any], ...] = ()
+    frame: str = ""
+    before: Pose = Pose()
+    after: Pose = Pose()
 
     def apply(self, model: Reader) -> Effects:
         """Write the joint and the rest."""
         writes = self.joint.apply(model).writes()
+        if (FRAMES, self.frame) in writes:
+            placed = writes[FRAMES, self.frame]
+            factors = (self.before, *placed.factors, self.after)
+            writes[FRAMES, self.frame] = Frame(placed.parent, factors)
         if self.record is not None:
             writes = {
                 (kind, self.record if kind == ARTICULATIONS else name): value
@@ -76,8 +93,16 @@ def proposal(model: Model, link: Link, served: Served, coordinates: Array, fit: 
     coordinates
         The served articulation's coordinates at the fit's observations, (N, n).
     fit
-        What was identified between the frames that were seen, of one of the families of joints.
+        What was identified between the frames that were seen.
     """
+    base_T_parent = _constant(model, link.parent, link.base)
+    frame_T_child = _constant(model, link.child, link.frame)
+    if not isinstance(fit.motion, GroupMotion):
+        joint = fit.operation(_name(model, link, served, fit.joint_values.shape[1]), link.base, link.frame)
+        writes = model.history.entry(link.tag).writes
+        kept = _kept(writes, link, served, False, _records(writes, link))
+        places = rigid_pose(base_T_parent), rigid_pose(inverse(frame_T_child))
+        return Relearned(joint, next(iter(_records(writes, link)), None), kept, link.frame, *places)
     motion, values = fit.motion, fit.joint_values
     old = coordinates[:, 0] if served.joints == 1 and len(served.coordinates) == 1 else None
     alike = False
@@ -93,30 +118,38 @@ def proposal(model: Model, link: Link, served: Served, coordinates: Array, fit: 
         # Nothing was seen that contradicts the old limits; those that were left are wider now.
         (low, high), *_ = limits
         limits = [(min(low, float(served.lower[0])), max(high, float(served.upper[0])))]
-    base_T_parent = _constant(model, link.parent, link.base)
-    frame_T_child = _constant(model, link.child, link.frame)
     motion = replace(motion, left=base_T_parent @ motion.left, right=motion.right @ inverse(frame_T_child))
     writes = model.history.entry(link.tag).writes
-    records = {
-        name: value
-        for (kind, name), value in writes.items()
-        if kind == ARTICULATIONS and value.child == link.frame
-    }
+    records = _records(writes, link)
     record = next(iter(records), None)
-    name = record or link.frame
-    if old is not None and motion.joints == 1:
-        name = served.coordinates[0].path
+    name = _name(model, link, served, motion.joints)
     joint = joint_operation(motion, limits, name, link.base, link.frame)
     if record is not None and isinstance(joint, Joint):
         joint = replace(joint, dynamics=records[record].dynamics)
-    kept = _kept(writes, link, served, alike, set(records))
+    kept = _kept(writes, link, served, alike, records)
     if record in (None, name) and not kept:
         return joint
     return Relearned(joint, None if record == name else record, kept)
 
 
+def _records(writes: Writes, link: Link) -> dict[str, Articulation]:
+    """Return what is on record about the joint."""
+    return {
+        name: value
+        for (kind, name), value in writes.items()
+        if kind == ARTICULATIONS and value.child == link.frame
+    }
+
+
+def _name(model: Model, link: Link, served: Served, joints: int) -> str:
+    """Return what the joint is called: like the old coordinate, where there was one and is one."""
+    if joints == 1 and len(served.coordinates) == 1:
+        return served.coordinates[0].path
+    return next(iter(_records(model.history.entry(link.tag).writes, link)), link.frame)
+
+
 def _kept(
-    writes: dict[tuple[str, str], Any], link: Link, served: Served, alike: bool, records: set[str]
+    writes: Writes, link: Link, served: Served, alike: bool, records: Mapping[str, Articulation]
 ) -> tuple[tuple[tuple[str, str], Any], ...]:
     """Return what has nothing to do with the pose between both frames."""
     own = set(served.coordinates)

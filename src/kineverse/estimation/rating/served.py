@@ -15,9 +15,9 @@ from kineverse.estimation.identification.motion import Linear, Prior
 from kineverse.estimation.identification.observations import Observations
 from kineverse.estimation.identification.rigid import Array
 from kineverse.estimation.identification.solving import Solution, solve
-from kineverse.expressions.expression import Expression, array, as_expression
+from kineverse.expressions.expression import array, as_expression
 from kineverse.model.model import Model
-from kineverse.model.rates import Rates, plain
+from kineverse.model.rates import plain
 from kineverse.symbols import Symbol
 
 # How many starts there are along a single coordinate, and scattered over several.
@@ -38,6 +38,8 @@ class Served:
     ----------
     coordinates
         The n coordinates.
+    joints
+        The number of joint values, k.
     lower, upper
         Limits of the joint values, (k,); ±inf where there are none.
     turning
@@ -49,38 +51,32 @@ class Served:
     def __init__(self, model: Model, child: str, parent: str) -> None:
         rates = model.rates
         self.pose = pose = rates.resolve(plain(model.fk(child, parent)))
-        self.coordinates = coordinates = _coordinates(pose, rates)
-        slopes = pose.gradient(heuristic=False)
-        still, none, one = as_expression(np.zeros((4, 4))), as_expression(0.0), as_expression(1.0)
+        self.coordinates = coordinates = tuple(s for s in pose.symbols if s.has_derivative)
+        slopes, still = pose.gradient(heuristic=False), as_expression(np.zeros((4, 4)))
         by_coordinate = [slopes.get(x.derivative(), still) for x in coordinates]
-        parameters = sorted(
-            {s for e in (pose, *by_coordinate) for s in e.symbols} - set(coordinates),
-            key=lambda s: s.sort_key,
-        )
-        self._parameters = np.array([s.value or 0.0 for s in parameters])
-        inputs = (*coordinates, *parameters)
-        self._linear = compile([pose, *by_coordinate], inputs)
+        rows = [rates.get(x) or {x.derivative(): as_expression(1.0)} for x in coordinates]
+        mentioned = (pose, *by_coordinate, *(entry for row in rows for entry in row.values()))
+        others = sorted({s for e in mentioned for s in e.symbols} - {*coordinates}, key=lambda s: s.sort_key)
         default = model.default_state()
+        self._others = np.array([default.get(s, s.value or 0.0) for s in others])
+        inputs = (*coordinates, *others)
+        self._linear = compile([pose, *by_coordinate], inputs)
         self.home = np.array([default.get(x, 0.0) for x in coordinates])
-        # Coordinates with more numbers than ways to move, such as a quaternion, move by their speeds.
+        # Coordinates with more numbers than ways to move, such as a quaternion, move by their speeds. Others
+        # are where they are, however they came there, be it on wheels.
         self._rates: CompiledFunction | None = None
-        self.own: tuple[int | None, ...] = tuple(range(len(coordinates)))
-        carried = any(x in rates for x in coordinates)
-        if carried and np.linalg.matrix_rank(self._twists(self.home[None, :])[1][0]) < len(coordinates):
-            rows = [rates.get(x) or {x.derivative(): one} for x in coordinates]
+        count = len(coordinates)
+        if any(x in rates for x in coordinates) and self._ways() < count:
             speeds = sorted({v for row in rows for v in row}, key=lambda s: s.sort_key)
+            none = as_expression(0.0)
             self._rates = compile(array([[row.get(v, none) for v in speeds] for row in rows]), inputs)
-            self.own = (None,) * len(speeds)
-        limits = [_limits(model, coordinates[i]) if i is not None else UNLIMITED for i in self.own]
+            count = len(speeds)
+        self.joints = count
+        limits = [_limits(model, x) for x in coordinates] if self.is_plain else [UNLIMITED] * count
         self.lower, self.upper = (np.array([pair[side] for pair in limits]) for side in (0, 1))
         there = self.at(self.home[None, :])
         self.middle = there.pose[0, :3, 3]
         self.turning = np.abs(there.by_joints[0, 3:]).max(axis=0, initial=0.0) > 1e-9
-
-    @property
-    def joints(self) -> int:
-        """The number of joint values, k."""
-        return len(self.own)
 
     @property
     def is_plain(self) -> bool:
@@ -93,7 +89,7 @@ class Served:
             self.pose == other.pose
             and np.array_equal(self.lower, other.lower)
             and np.array_equal(self.upper, other.upper)
-            and np.array_equal(self._parameters, other._parameters)
+            and np.array_equal(self._others, other._others)
         )
 
     def at(self, coordinates: Array) -> Linear:
@@ -111,9 +107,14 @@ class Served:
         result: Array = coordinates + change
         return result
 
+    def _ways(self) -> int:
+        """Return in how many ways the child can move at home."""
+        _, twists = self._twists(self.home[None, :])
+        return int(np.linalg.matrix_rank(twists[0]))
+
     def _points(self, coordinates: Array) -> Array:
-        parameters = np.broadcast_to(self._parameters, (len(coordinates), len(self._parameters)))
-        return np.concatenate([coordinates, parameters], axis=1)
+        others = np.broadcast_to(self._others, (len(coordinates), len(self._others)))
+        return np.concatenate([coordinates, others], axis=1)
 
     def _twists(self, coordinates: Array) -> tuple[Array, Array]:
         """Return poses, and twists per unit of each coordinate (N, 6, n)."""
@@ -189,19 +190,6 @@ class Served:
 
 
 UNLIMITED = (-math.inf, math.inf)
-
-
-def _coordinates(pose: Expression, rates: Rates) -> tuple[Symbol, ...]:
-    """Return the coordinates that a pose depends on, and those that the rates of these look at."""
-    found: set[Symbol] = set()
-    waiting = list(pose.symbols)
-    while waiting:
-        x = waiting.pop()
-        if x in found or not x.has_derivative or x.order:
-            continue
-        found.add(x)
-        waiting += [s for entry in rates.get(x, {}).values() for s in entry.symbols]
-    return tuple(sorted(found, key=lambda s: s.sort_key))
 
 
 def _limits(model: Model, coordinate: Symbol) -> tuple[float, float]:
