@@ -17,6 +17,7 @@ from kineverse.estimation.identification.pairs import LOG_ANYWHERE, Families, id
 from kineverse.model.model import Model
 from kineverse.model.operation import Operation
 
+from .earlier import explained
 from .evidence import log_evidence
 from .links import Link
 from .misfit import Misfit
@@ -71,7 +72,7 @@ def judged(model: Model, seen: Seen, stopped: int | None, families: Families) ->
     probabilities = _probabilities(since, instead)
     operation, reason = None, ""
     if stopped is not None:
-        operation, reason = _proposed(model, since, instead)
+        operation, reason = _proposed(model, seen, since, instead)
     else:
         reason = _doubt(probabilities, len(since.times))
     squares = np.mean(since.misfit.residuals**2, axis=0)
@@ -104,13 +105,14 @@ def _doubt(probabilities: Mapping[str, float], count: int) -> str:
     return "it hardly moved" if other == "rigid" else f"it may be {other} as well"
 
 
-def _proposed(model: Model, seen: Seen, instead: Found | None) -> tuple[Operation | None, str]:
-    if instead is None or len(seen.times) < _ENOUGH:
+def _proposed(model: Model, seen: Seen, since: Seen, instead: Found | None) -> tuple[Operation | None, str]:
+    if instead is None or len(since.times) < _ENOUGH:
         return None, "it was seen too seldom since to say what it is instead"
     if not instead.best.told:
         return None, f"what it is instead is not known yet, {instead}"
     try:
-        coordinates = seen.served.beyond_limits(seen.observations, seen.misfit.coordinates)
-        return proposal(model, seen.link, seen.served, coordinates, instead.best), ""
+        rows, fit = explained(instead.best, seen.observations, len(seen.times) - len(since.times))
+        coordinates = seen.served.beyond_limits(seen.observations, seen.misfit.coordinates)[rows]
+        return proposal(model, seen.link, seen.served, coordinates, fit), ""
     except KineverseError as error:
         return None, f"what it is instead is no operation. {error}"
