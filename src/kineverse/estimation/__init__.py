@@ -5,7 +5,7 @@
 :mod:`kineverse.estimation.rating` says whether a model explains what is seen.
 """
 
-from .identification import Fit, Found, Identifier, identify
+from .identification import Family, Fit, Found, Identifier, Unknown, identify
 from .identification.graph import Edge, Graph, RigidBody, identify_graph
 from .noise import pose_covariance
 from .rating import ImplausibleError, Plausibility, PlausibilityMonitor, Rating, plausibility
@@ -22,6 +22,7 @@ from .tracking import (
 __all__ = [
     "Edge",
     "Estimate",
+    "Family",
     "Fit",
     "Found",
     "Graph",
@@ -37,6 +38,7 @@ __all__ = [
     "Rating",
     "RigidBody",
     "Tracker",
+    "Unknown",
     "identify",
     "identify_graph",
     "plausibility",

@@ -128,8 +128,10 @@ def test_the_likelihood_is_that_of_all_true_poses_as_unknowns(family: str) -> No
         start += [*pose[:3, 3], *Rotation.from_matrix(pose[:3, :3]).as_rotvec()]
     theirs = least_squares(errors, start, x_scale="jac")
     axis = Rotation.from_rotvec(theirs.x[:3]).as_matrix()[:, 2]
-    assert ours.cost == pytest.approx(2 * theirs.cost, rel=1e-2)
-    assert angle_between(axis, ours.motion.left[:3, 2]) < 2e-3
+    # They do not know that levers are within reach, which hardly matters.
+    beforehand = ours.motion.prior().residuals
+    assert ours.cost - beforehand @ beforehand == pytest.approx(2 * theirs.cost, rel=1e-3)
+    assert angle_between(axis, ours.motion.left[:3, 2]) < 3e-3
 
 
 @pytest.mark.parametrize("family", MOVING)

@@ -7,17 +7,20 @@ from dataclasses import replace
 import numpy as np
 
 from .groups import VZ, WZ, GroupMotion
+from .motion import Member
 from .rigid import Array, exponential, frame_along, pose
 from .solving import Solution
 
 
-def canonical(solution: Solution[GroupMotion]) -> Solution[GroupMotion]:
+def canonical(solution: Solution[Member]) -> Solution[Member]:
     """Return the same motion with the axis towards its largest component and joint values around 0.
 
     The origin of the joint's frame is the point of the axis that is nearest to the child at 0; on a slider it
     is the child's origin.
     """
     motion = solution.motion
+    if not isinstance(motion, GroupMotion):
+        return solution
     name = motion.group.name
     if name in ("rigid", "free", "spherical"):
         return solution

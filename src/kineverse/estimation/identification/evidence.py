@@ -18,8 +18,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from .groups import PITCHES, REACH, VX, VY, WX, GroupMotion
 from .matrices import inverted
+from .motion import Member
 from .rigid import Array
 from .solving import Solution
 from .widths import Alone, Widths, alone, widths
@@ -45,7 +45,7 @@ class Evidence:
     joint_covariances: Array
 
 
-def evidence(solution: Solution[GroupMotion]) -> Evidence:
+def evidence(solution: Solution[Member]) -> Evidence:
     """Return the evidence of a family of joints around its most likely member."""
     motion, size = solution.motion, solution.motion.size
     seen = alone(solution)
@@ -54,28 +54,11 @@ def evidence(solution: Solution[GroupMotion]) -> Evidence:
     information = _information(solution, width, values)
     prior = motion.prior().by_parameters
     information[:size, :size] += prior.T @ prior
-    # As wide as half a sphere is, and with its density: a direction that nothing tells stays finite.
-    turned = [i for i, j in enumerate(motion.freedom.left) if j >= WX]
-    # So does the middle of a turn, which moves nothing where the lever is nothing.
-    turned += [size + i for i, j in enumerate(motion.freedom.joints) if j >= WX]
-    information[turned, turned] += 1.0
-    log = seen.log_likelihood + width.log_density + log_prior(motion) + _volume(solution, width.mean)
+    beforehand, precision = motion.beforehand(width.mean)
+    information[np.diag_indices_from(information)] += precision
+    log = seen.log_likelihood + width.log_density + beforehand
     log += 0.5 * len(information) * math.log(math.tau) - 0.5 * float(np.linalg.slogdet(information)[1])
     return Evidence(log, inverted(information)[:size, :size], values, covariances)
-
-
-def log_prior(motion: GroupMotion) -> float:
-    """Return the logarithm of the density of what a family has beyond a mean pose."""
-    freedom, reach = motion.freedom, motion.group.reach
-    result = 0.0
-    if WX in freedom.left:
-        result -= math.log(math.tau)
-    if VX in freedom.left and VY in freedom.left and reach:
-        lever = motion.right[:reach, 3] / REACH
-        result -= 0.5 * float(lever @ lever) + 0.5 * reach * math.log(math.tau * REACH**2)
-    if motion.group.pitch:
-        result -= 0.5 * (motion.pitch / PITCHES) ** 2 + 0.5 * math.log(math.tau * PITCHES**2)
-    return result
 
 
 def _together(seen: Alone, width: Widths) -> tuple[Array, Array]:
@@ -88,7 +71,7 @@ def _together(seen: Alone, width: Widths) -> tuple[Array, Array]:
     return values, shrink @ seen.covariances
 
 
-def _information(solution: Solution[GroupMotion], width: Widths, values: Array) -> Array:
+def _information(solution: Solution[Member], width: Widths, values: Array) -> Array:
     """Return the information about parameters and μ."""
     linear = solution.motion.at(values)
     by_joints = linear.by_joints
@@ -97,13 +80,3 @@ def _information(solution: Solution[GroupMotion], width: Widths, values: Array) 
     both = np.concatenate([linear.by_parameters, by_joints], axis=2)
     result: Array = (np.swapaxes(both, 1, 2) @ weights @ both).sum(axis=0)
     return result
-
-
-def _volume(solution: Solution[GroupMotion], mean: Array) -> float:
-    """Return the logarithm of the volume of mean poses per unit of the parameters that move it."""
-    motion = solution.motion
-    linear = motion.at(mean[None, :])
-    start = len(motion.freedom.left)
-    moved = linear.by_parameters[0, :, start : start + len(motion.freedom.right)]
-    matrix = np.concatenate([moved, linear.by_joints[0]], axis=1)
-    return float(np.linalg.slogdet(matrix)[1])

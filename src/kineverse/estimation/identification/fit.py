@@ -5,13 +5,14 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
 from kineverse.errors import UnknownNameError, ValueRejectedError, suggest
 from kineverse.model.operation import Operation
 
-from .groups import WX, GroupMotion
+from .groups import GroupMotion
 from .operations import joint_operation
 from .rigid import Array
 
@@ -53,6 +54,10 @@ class Fit:
         Whether the data carry what the family has beyond a pose.
     reason
         If not, why.
+    rows
+        6 if poses of the child were seen, 3 if positions.
+    motion
+        The member of the family, as the solver has it.
     """
 
     family: str
@@ -67,7 +72,8 @@ class Fit:
     residuals: Array
     told: bool
     reason: str
-    motion: GroupMotion
+    rows: int
+    motion: Any
 
     @property
     def range(self) -> Array:
@@ -79,7 +85,8 @@ class Fit:
     @property
     def poses(self) -> Array:
         """The poses of the child in the parent at the joint values, (N, 4, 4)."""
-        return self.motion.at(self.joint_values).pose
+        poses: Array = self.motion.at(self.joint_values).pose
+        return poses
 
     @property
     def rms(self) -> tuple[float, float]:
@@ -116,7 +123,7 @@ class Fit:
         ValueRejectedError
             If only positions of the child were seen, so that its orientation is not known.
         """
-        if self.motion.rows == 3:
+        if self.rows == 3 and isinstance(self.motion, GroupMotion):
             raise ValueRejectedError(
                 f"Only positions of the child were seen, so how it is turned on '{name}' is not known."
             )
@@ -125,8 +132,11 @@ class Fit:
 
     def __str__(self) -> str:
         words = [f"{self.family}, {self.probability:.1%}"]
-        for (low, high), joint in zip(self.range, self.motion.freedom.joints, strict=True):
-            words.append(f"{math.degrees(high - low):.1f}°" if joint >= WX else f"{high - low:.3g} m")
+        grouped = isinstance(self.motion, GroupMotion)
+        for (low, high), kind in zip(self.range, self.motion.kinds, strict=True):
+            unit = ("m", "°")[kind] if grouped else ""
+            size = math.degrees(high - low) if unit == "°" else high - low
+            words.append(f"{size:.1f}°" if unit == "°" else f"{size:.3g} {unit}".rstrip())
         return ", ".join(words)
 
 

@@ -10,6 +10,7 @@ moved from L to R, and what is in it is a shift of joint values.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from types import MappingProxyType
@@ -221,6 +222,69 @@ class GroupMotion:
         step[:, turning] = np.clip(step[:, turning], -0.5, 0.5)
         result: Array = values + step
         return result
+
+    @property
+    def name(self) -> str:
+        """That of the group."""
+        return self.group.name
+
+    @property
+    def kinds(self) -> tuple[int, ...]:
+        """Slides share a width, and so do turns."""
+        return tuple(int(j >= WX) for j in self.freedom.joints)
+
+    def beforehand(self, mean: Array) -> tuple[float, Array]:
+        """Return the density of what the family has beyond a mean pose, and what keeps it finite.
+
+        A lever is within reach, and a direction anywhere on half the sphere, as an axis has no sign. The mean
+        pose has the density 1 / (m³ rad³) everywhere, which is no density but is the same for all.
+        """
+        freedom, reach = self.freedom, self.group.reach
+        log = 0.0
+        if WX in freedom.left:
+            log -= math.log(math.tau)
+        if VX in freedom.left and VY in freedom.left and reach:
+            lever = self.right[:reach, 3] / REACH
+            log -= 0.5 * float(lever @ lever) + 0.5 * reach * math.log(math.tau * REACH**2)
+        if self.group.pitch:
+            log -= 0.5 * (self.pitch / PITCHES) ** 2 + 0.5 * math.log(math.tau * PITCHES**2)
+        # The volume of mean poses per unit of the parameters that move it.
+        linear = self.at(mean[None, :])
+        right = slice(len(freedom.left), len(freedom.left) + len(freedom.right))
+        matrix = np.concatenate([linear.by_parameters[0, :, right], linear.by_joints[0]], axis=1)
+        # A lever of nothing has no volume at all; the size of an atom is as good.
+        log += float(np.sum(np.log(np.maximum(np.linalg.svd(matrix, compute_uv=False), 1e-10))))
+        # As wide as half a sphere is, and with its density: a direction that nothing tells stays finite. So
+        # does the middle of a turn, which moves nothing where the lever is nothing.
+        precision = np.zeros(self.size + self.joints)
+        precision[: len(freedom.left)] = [j >= WX for j in freedom.left]
+        precision[self.size :] = [j >= WX for j in freedom.joints]
+        return log, precision
+
+    def named(self) -> dict[str, Array | float]:
+        """Return what a member of a family is, by name."""
+        name = self.name
+        result: dict[str, Array | float] = {}
+        axis, point = self.left[:3, 2].copy(), self.left[:3, 3].copy()
+        if name == "planar":
+            result["normal"] = axis
+        elif name == "spherical":
+            result["centre"] = point
+        elif name not in ("rigid", "free"):
+            result["axis"] = axis
+            if name != "prismatic":
+                result["point"] = point
+        if self.group.pitch:
+            result["pitch"] = math.tau * self.pitch
+        result["reference"] = self.left @ self.right
+        return result
+
+    def coordinates(self) -> tuple[str, ...]:
+        """Return the names of the parameters, in their order."""
+        letters = "xyz"
+        left = [f"point.{letters[j]}" if j < WX else f"axis.{letters[j - WX]}" for j in self.freedom.left]
+        right = [f"child.{letters[j]}" if j < WX else f"child.r{letters[j - WX]}" for j in self.freedom.right]
+        return (*left, *right, *(["pitch"] if self.group.pitch else []))
 
     def prior(self) -> Prior:
         """Return that levers are within reach, and pitches ordinary."""

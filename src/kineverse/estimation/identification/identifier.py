@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
-
 import numpy as np
 import numpy.typing as npt
 
 from kineverse.errors import ShapeError, ValueRejectedError
 
+from .family import Family
 from .fit import Found
-from .groups import GroupMotion
-from .identify import family_weights, judged, noise_of, solutions, weighed
+from .identify import Families, family_weights, judged, noise_of, solutions, weighed
+from .motion import Member
 from .native import solver
 from .observations import Observations, observations
 from .rigid import Array
@@ -46,14 +45,14 @@ class Identifier:
         *,
         covariance_a: npt.ArrayLike | None = None,
         covariance_b: npt.ArrayLike | None = None,
-        families: Iterable[str] | Mapping[str, float] | None = None,
+        families: Families = None,
         noise: npt.ArrayLike | None = None,
     ) -> None:
         self._weights = family_weights(families)
         self._noise = covariance_a, covariance_b, noise
         self._stated = True
         self._seen: list[Observations] = []
-        self._solutions: dict[str, Solution[GroupMotion]] = {}
+        self._solutions: dict[str | Family, Solution[Member]] = {}
         self._found: Found | None = None
         self._whole = 0
 
@@ -122,7 +121,8 @@ class Identifier:
         known = judged(seen, self._solutions, self._weights)
         found = weighed(known, self._weights, self._stated)
         chances = {fit.family for fit in found if fit.probability > _NO_CHANCE}
-        self._solutions = {name: solution for name, (solution, _) in known.items() if name in chances}
+        kept = {family: s for family, (s, _) in known.items() if s.motion.name in chances}
+        self._solutions = kept
         return found
 
 
@@ -136,7 +136,7 @@ def _joined(parts: list[Observations]) -> Observations:
     )
 
 
-def _continued(seen: Observations, before: Solution[GroupMotion]) -> Solution[GroupMotion]:
+def _continued(seen: Observations, before: Solution[Member]) -> Solution[Member]:
     """Return the solution of a family for more observations than it was found from."""
     known = len(before.values)
     values: list[Array] = [before.values]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping
 from types import MappingProxyType
+from typing import TypeAlias
 
 import numpy as np
 import numpy.typing as npt
@@ -14,15 +15,19 @@ from kineverse.estimation.noise import pose_covariance
 
 from .canonical import canonical
 from .evidence import Evidence, evidence
+from .family import Family, family_starts
 from .fit import Found
-from .groups import GroupMotion
+from .motion import Member
 from .native import solver
 from .observations import Observations, observations
 from .refining import refined
 from .reporting import fit_of
 from .rigid import Array
 from .solving import Solution
-from .starts import Overview, starts
+from .starts import Overview, Start, starts
+
+Families: TypeAlias = "Iterable[str | Family] | Mapping[str | Family, float] | str | Family | None"
+"""Families by name or of one's own; a mapping says how probable they are beforehand."""
 
 WEIGHTS: Mapping[str, float] = MappingProxyType(
     {
@@ -53,7 +58,7 @@ def identify(
     *,
     covariance_a: npt.ArrayLike | None = None,
     covariance_b: npt.ArrayLike | None = None,
-    families: Iterable[str] | Mapping[str, float] | None = None,
+    families: Families = None,
     noise: npt.ArrayLike | None = None,
 ) -> Found:
     """Return how part b moves against part a, judged by poses of both that were observed with noise.
@@ -112,7 +117,7 @@ def noise_of(
     return unknown, unknown, False
 
 
-def family_weights(families: Iterable[str] | Mapping[str, float] | None) -> dict[str, float]:
+def family_weights(families: Families) -> dict[str | Family, float]:
     """Return the families that are tried and how probable they are beforehand.
 
     Raises
@@ -123,31 +128,39 @@ def family_weights(families: Iterable[str] | Mapping[str, float] | None) -> dict
         For a weight that is not positive, or if there is no family.
     """
     if families is None:
-        return dict(WEIGHTS)
-    if isinstance(families, str):
+        families = WEIGHTS
+    elif isinstance(families, (str, Family)):
         families = [families]
     given = dict(families) if isinstance(families, Mapping) else dict.fromkeys(families)
     if not given:
         raise ValueRejectedError("There is no family to try.")
     for name, weight in given.items():
-        if name not in WEIGHTS:
+        if isinstance(name, str) and name not in WEIGHTS:
             raise UnknownNameError(f"There is no family {name!r}. {suggest(str(name), WEIGHTS, 'family')}")
         if weight is not None and not (math.isfinite(weight) and weight > 0.0):
             raise ValueRejectedError(f"The weight of the family {name!r} is positive, not {weight!r}.")
-    return {name: WEIGHTS[name] if weight is None else float(weight) for name, weight in given.items()}
+    result: dict[str | Family, float] = {}
+    for name, weight in given.items():
+        usual = name.weight if isinstance(name, Family) else WEIGHTS[name]
+        result[name] = usual if weight is None else float(weight)
+    return result
 
 
-def solutions(seen: Observations, names: Iterable[str]) -> dict[str, Solution[GroupMotion]]:
+def solutions(seen: Observations, families: Iterable[str | Family]) -> dict[str | Family, Solution[Member]]:
     """Return the most likely member of each family."""
     solver.prepare()
     overview = Overview(seen)
-    return {name: _most_likely(seen, name, overview) for name in names}
+    return {name: _most_likely(seen, name, overview) for name in families}
 
 
-def _most_likely(seen: Observations, name: str, overview: Overview) -> Solution[GroupMotion]:
+def _most_likely(seen: Observations, family: str | Family, overview: Overview) -> Solution[Member]:
+    if isinstance(family, Family):
+        begin = [Start(motion, values) for motion, values in family_starts(family, seen)]
+    else:
+        begin = list(starts(family, overview))
     softened = seen.softened()
     first = softened[0] if softened else seen
-    begun = [solver.solve(first, s.motion, s.values, steps=_FIRST_STEPS) for s in starts(name, overview)]
+    begun = [solver.solve(first, s.motion, s.values, steps=_FIRST_STEPS) for s in begin]
     best = min(begun, key=lambda solution: solution.cost)
     for softer in softened:
         best = solver.solve(softer, best.motion, best.values, best.parent)
@@ -157,8 +170,8 @@ def _most_likely(seen: Observations, name: str, overview: Overview) -> Solution[
 
 
 def judged(
-    seen: Observations, found: Mapping[str, Solution[GroupMotion]], weights: Mapping[str, float]
-) -> dict[str, tuple[Solution[GroupMotion], Evidence]]:
+    seen: Observations, found: Mapping[str | Family, Solution[Member]], weights: Mapping[str | Family, float]
+) -> dict[str | Family, tuple[Solution[Member], Evidence]]:
     """Return solutions and their evidence, those that have a chance with joint values integrated out."""
     first = {name: (solution, evidence(solution)) for name, solution in found.items()}
     logs = {name: known.log_evidence + math.log(weights[name]) for name, (_, known) in first.items()}
@@ -174,8 +187,8 @@ def judged(
 
 
 def weighed(
-    found: Mapping[str, tuple[Solution[GroupMotion], Evidence]],
-    weights: Mapping[str, float],
+    found: Mapping[str | Family, tuple[Solution[Member], Evidence]],
+    weights: Mapping[str | Family, float],
     stated: bool,
 ) -> Found:
     """Return the fits of all families, weighed by their evidence."""

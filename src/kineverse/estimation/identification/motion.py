@@ -61,3 +61,33 @@ class Motion(Protocol):
     def prior(self) -> Prior:
         """Return what is believed of the parameters."""
         ...
+
+
+class Member(Motion, Protocol):
+    """A member of a family that is weighed against others."""
+
+    @property
+    def name(self) -> str:
+        """That of the family."""
+        ...
+
+    @property
+    def kinds(self) -> tuple[int, ...]:
+        """What kind of joint value each is: those of one kind share a width."""
+        ...
+
+    def beforehand(self, mean: Array) -> tuple[float, Array]:
+        """Return what is believed of parameters and of the mean of the joint values, for the evidence.
+
+        That is the logarithm of its density here, and the precision (n + k,) beside that of :meth:`prior`
+        that keeps directions finite which nothing tells.
+        """
+        ...
+
+    def named(self) -> dict[str, Array | float]:
+        """Return the parameters by name, for people."""
+        ...
+
+    def coordinates(self) -> tuple[str, ...]:
+        """Return the names of the n parameters."""
+        ...

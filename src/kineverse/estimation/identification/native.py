@@ -18,6 +18,7 @@ from kineverse.compile.toolchain import CLOSED, toolchain
 from kineverse.compile.worker import Build, request
 
 from .groups import PITCHES, REACH, GroupMotion
+from .motion import Member
 from .native_source import SOLVE
 from .observations import Observations
 from .rigid import Array, pose
@@ -97,14 +98,14 @@ class SolverLibrary:
     def solve(
         self,
         seen: Observations,
-        motion: GroupMotion,
+        motion: Member,
         values: Array,
         parent: Array | None = None,
         belief: Belief | None = None,
         steps: int = STEPS,
-    ) -> Solution[GroupMotion]:
+    ) -> Solution[Member]:
         """Do what :func:`.solving.solve` does."""
-        if self._code is None:
+        if self._code is None or not isinstance(motion, GroupMotion):
             return solve(seen, motion, values, parent, belief, steps)
         count, rows = len(seen), seen.rows
         moved = np.empty(25)

@@ -26,10 +26,14 @@ from kineverse.articulations import (
     Screw,
 )
 from kineverse.model.body import Pose
+from kineverse.model.constraint import Constraint
 from kineverse.model.operation import Effects, Operation
 from kineverse.model.reader import Reader
+from kineverse.symbols import position
 
+from .family import FamilyMotion
 from .groups import GroupMotion
+from .motion import Member
 from .rigid import Array, mean_rotation
 
 _Z = (0.0, 0.0, 1.0)
@@ -80,12 +84,50 @@ class MountedBall(Mounted, Ball):
     """A ball in a socket and a part on it: parent_T_child = origin · rotation(quaternion) · mount."""
 
 
+@dataclass(frozen=True, kw_only=True)
+class FamilyJoint(Joint):
+    """A joint of a family of one's own: parent_T_child = origin · transform.
+
+    Its coordinate is ``name``; of several, each is called like the joint of the family, below the name.
+
+    Attributes
+    ----------
+    motion
+        The member of the family.
+    ranges
+        The limits of its joint values.
+    """
+
+    motion: FamilyMotion
+    ranges: tuple[tuple[float, float], ...]
+
+    def apply(self, model: Reader) -> Effects:
+        """Write the child frame and the limits."""
+        self.check_free(model)
+        symbols = list(self.motion.family.joints)
+        names = [self.name] if len(symbols) == 1 else [f"{self.name}/{s}" for s in symbols]
+        q = tuple(position(name) for name in names)
+        home = tuple(0.5 * (low + high) for low, high in self.ranges)
+        constraints: dict[str, Constraint] = {}
+        for name, coordinate, (low, high) in zip(names, q, self.ranges, strict=True):
+            constraints.update(Limits(low, high).on(name, coordinate))
+        return Effects(
+            frames={self.child: (self.parent, (self.origin, self.motion.expression(q)))},
+            constraints=constraints,
+            articulations={self.name: self.record(q, home, tuple(c.derivative() for c in q))},
+        )
+
+
 def joint_operation(
-    motion: GroupMotion, limits: Sequence[tuple[float, float]], name: str, parent: str, child: str
+    motion: Member, limits: Sequence[tuple[float, float]], name: str, parent: str, child: str
 ) -> Operation:
     """Return a member of a family as an operation, with limits for its joint values."""
     names: dict[str, Any] = {"name": name, "parent": parent, "child": child}
-    family = motion.group.name
+    if isinstance(motion, FamilyMotion):
+        return FamilyJoint(**names, motion=motion, ranges=tuple(limits))
+    if not isinstance(motion, GroupMotion):
+        raise TypeError(f"A {type(motion).__name__} is no joint.")
+    family = motion.name
     origin, mount = rigid_pose(motion.left), rigid_pose(motion.right)
     whole = rigid_pose(motion.left @ motion.right)
     # A direction of L in the child, where nothing turns.

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from .groups import GroupMotion
+from .motion import Member
 from .native import solver
 from .observations import Observations
 from .rigid import Array
@@ -23,7 +23,7 @@ _SETTLED = 0.01
 _NARROWEST = 1e-4
 
 
-def refined(seen: Observations, solution: Solution[GroupMotion]) -> Solution[GroupMotion]:
+def refined(seen: Observations, solution: Solution[Member]) -> Solution[Member]:
     """Return the solution with joint values integrated out."""
     if not solution.motion.joints or not solution.motion.size:
         return solution

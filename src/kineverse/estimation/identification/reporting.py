@@ -8,7 +8,8 @@ import numpy as np
 
 from .evidence import Evidence
 from .fit import Fit
-from .groups import WX, GroupMotion
+from .groups import GroupMotion
+from .motion import Member
 from .rigid import Array
 from .solving import Solution
 
@@ -16,28 +17,29 @@ from .solving import Solution
 _KNOWN = math.radians(20.0)
 
 
-def fit_of(solution: Solution[GroupMotion], known: Evidence, log: float, probability: float) -> Fit:
+def fit_of(solution: Solution[Member], known: Evidence, log: float, probability: float) -> Fit:
     """Return the fit of a family."""
     motion = solution.motion
-    names = coordinates(motion)
+    names = motion.coordinates()
     covariance = known.covariance.copy()
-    if motion.group.pitch:
-        covariance[-1] *= math.tau
+    if "pitch" in names and isinstance(motion, GroupMotion):
+        covariance[-1] *= math.tau  # [m/rad] to [m/revolution]
         covariance[:, -1] *= math.tau
     reason = _untold(names, covariance)
     return Fit(
-        family=motion.group.name,
+        family=motion.name,
         probability=probability,
         log_evidence=log,
-        parameters=parameters(motion),
+        parameters=motion.named(),
         covariance=covariance,
         coordinates=names,
-        frame=motion.left,
+        frame=motion.left if isinstance(motion, GroupMotion) else np.eye(4),
         joint_values=known.joint_values,
         deviations=np.sqrt(np.einsum("nii->ni", known.joint_covariances)),
         residuals=solution.residuals,
         told=not reason,
         reason=reason,
+        rows=solution.residuals.shape[1],
         motion=motion,
     )
 
@@ -49,30 +51,3 @@ def _untold(names: tuple[str, ...], covariance: Array) -> str:
         return ""
     worst = math.sqrt(float(np.linalg.eigvalsh(covariance[np.ix_(turns, turns)])[-1]))
     return "" if worst <= _KNOWN else f"its axis is known to {math.degrees(worst):.0f}° only"
-
-
-def parameters(motion: GroupMotion) -> dict[str, Array | float]:
-    """Return what a member of a family is, by name."""
-    name = motion.group.name
-    result: dict[str, Array | float] = {}
-    axis, point = motion.left[:3, 2].copy(), motion.left[:3, 3].copy()
-    if name == "planar":
-        result["normal"] = axis
-    elif name == "spherical":
-        result["centre"] = point
-    elif name not in ("rigid", "free"):
-        result["axis"] = axis
-        if name != "prismatic":
-            result["point"] = point
-    if motion.group.pitch:
-        result["pitch"] = math.tau * motion.pitch
-    result["reference"] = motion.left @ motion.right
-    return result
-
-
-def coordinates(motion: GroupMotion) -> tuple[str, ...]:
-    """Return the names of the parameters, in their order."""
-    letters = "xyz"
-    left = [f"point.{letters[j]}" if j < WX else f"axis.{letters[j - WX]}" for j in motion.freedom.left]
-    right = [f"child.{letters[j]}" if j < WX else f"child.r{letters[j - WX]}" for j in motion.freedom.right]
-    return (*left, *right, *(["pitch"] if motion.group.pitch else []))

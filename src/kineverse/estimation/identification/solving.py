@@ -24,6 +24,7 @@ from .observations import Observations
 from .rigid import Array, exponential, logarithm, pose, skew
 
 M = TypeVar("M", bound=Motion)
+M_co = TypeVar("M_co", bound=Motion, covariant=True)
 
 STEPS = 40
 CLOSE = 1e-7
@@ -55,7 +56,7 @@ class Belief:
 
 
 @dataclass(frozen=True)
-class Solution(Generic[M]):
+class Solution(Generic[M_co]):
     """What maximises the likelihood, and the quadratic around it.
 
     Attributes
@@ -81,7 +82,7 @@ class Solution(Generic[M]):
         Whether steps became small; else the best that was found.
     """
 
-    motion: M
+    motion: M_co
     values: Array
     cost: float
     residuals: Array
@@ -97,10 +98,10 @@ class Solution(Generic[M]):
 
 
 @dataclass(frozen=True)
-class _Point(Generic[M]):
+class _Point(Generic[M_co]):
     """A place in the space of all unknowns, linearised."""
 
-    motion: M
+    motion: M_co
     values: Array
     parent: Array
     linear: Linear

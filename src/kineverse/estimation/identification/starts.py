@@ -8,6 +8,7 @@ from functools import cached_property
 import numpy as np
 
 from .groups import GROUPS, GroupMotion
+from .motion import Member
 from .observations import Observations
 from .rigid import Array, frame_along, inverse, logarithm, mean_rotation, pose
 
@@ -15,7 +16,7 @@ from .rigid import Array, frame_along, inverse, logarithm, mean_rotation, pose
 class Start:
     """A member of a family and joint values (N, k)."""
 
-    def __init__(self, motion: GroupMotion, values: Array) -> None:
+    def __init__(self, motion: Member, values: Array) -> None:
         self.motion = motion
         self.values = values
 

@@ -12,13 +12,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from .groups import WX, GroupMotion
 from .matrices import inverted, log_determinants, times
+from .motion import Member
 from .rigid import Array
 from .solving import Solution
 
 # From hardly anything to more than there is [m], [rad].
 _GRID = np.geomspace(1e-5, 10.0, 61)
+_LITTLE = 1e-6
 _STEP = math.log(float(_GRID[1] / _GRID[0]))
 
 
@@ -39,11 +40,12 @@ class Alone:
     log_likelihood: float
 
 
-def alone(solution: Solution[GroupMotion]) -> Alone:
+def alone(solution: Solution[Member]) -> Alone:
     """Return joint values by the observations alone, by the quadratic at the solution."""
     weights, by_joints = inverted(solution.covariance), solution.linear.by_joints
     weighted = np.swapaxes(by_joints, 1, 2) @ weights
-    covariances = inverted(weighted @ by_joints)
+    # A turn that moves nothing is known as little as can be, and so little that it does not matter.
+    covariances = inverted(weighted @ by_joints + _LITTLE * np.eye(by_joints.shape[2]))
     change = times(covariances, times(weighted, solution.residuals))
     left = solution.residuals - times(by_joints, change)
     log = -0.5 * float(np.sum(left * times(weights, left))) + 0.5 * log_determinants(math.tau * covariances)
@@ -70,15 +72,15 @@ class Widths:
     log_density: float
 
 
-def widths(motion: GroupMotion, seen: Alone) -> Widths:
+def widths(motion: Member, seen: Alone) -> Widths:
     """Return the most likely widths of the motion."""
-    turning = np.array([j >= WX for j in motion.freedom.joints])
-    deviations, occam = np.zeros(len(turning)), 0.0
+    kinds = np.array(motion.kinds)
+    deviations, occam = np.zeros(len(kinds)), 0.0
     variances = np.einsum("nii->ni", seen.covariances)
-    for block in (turning, ~turning):
-        if block.any():
-            deviations[block], part = _width(seen.values[:, block], variances[:, block])
-            occam += part
+    for kind in sorted(set(motion.kinds)):
+        block = kinds == kind
+        deviations[block], part = _width(seen.values[:, block], variances[:, block])
+        occam += part
     total = seen.covariances + np.diag(deviations**2)
     weights = inverted(total)
     mean: Array = np.linalg.solve(weights.sum(axis=0), times(weights, seen.values).sum(axis=0))

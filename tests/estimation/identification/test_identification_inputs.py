@@ -1,0 +1,99 @@
+"""What is no recording is refused with what is wrong, and what says nothing is called so."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from part_recordings import recording
+
+import kineverse as kv
+from kineverse.estimation import Identifier, identify, pose_covariance
+
+NOISE = pose_covariance(0.01, 0.02)
+SEEN = recording("revolute", count=6, position=0.01, orientation=0.02, seed=0)
+
+
+def with_entry(poses: np.ndarray, value: float) -> np.ndarray:
+    changed = poses.copy()
+    changed[3, 0, 0] = value
+    return changed
+
+
+@pytest.mark.parametrize(
+    ("parent", "child", "noise", "message"),
+    [
+        (SEEN.parent, with_entry(SEEN.child, np.nan), NOISE, "Pose 3 of the child is not finite"),
+        (with_entry(SEEN.parent, 2.0), SEEN.child, NOISE, "Pose 3 of the parent is no rigid transform"),
+        (SEEN.parent, 1.01 * SEEN.child, NOISE, "unit length"),
+        (SEEN.parent, SEEN.child * [[1, 1, -1, 1]], NOISE, "mirrors"),
+        (SEEN.parent[:1], SEEN.child[:1], NOISE, "one pose"),
+        (SEEN.parent[:0], SEEN.child[:0], NOISE, "no poses"),
+        (SEEN.parent[:4], SEEN.child, NOISE, "4 poses of the parent and 6"),
+        (SEEN.parent, SEEN.child[:, :3, :3], NOISE, "shape"),
+        (SEEN.parent, SEEN.child, -NOISE, "not positive definite"),
+        (SEEN.parent, SEEN.child, 0 * NOISE, "not positive definite"),
+        (SEEN.parent, SEEN.child, NOISE + np.eye(6, k=1), "not symmetric"),
+        (SEEN.parent, SEEN.child, NOISE[:4, :4], "shape"),
+        (SEEN.parent, "poses", NOISE, "no array of numbers"),
+    ],
+)
+def test_bad_input_is_refused(parent: object, child: object, noise: np.ndarray, message: str) -> None:
+    with pytest.raises(kv.KineverseError, match=message):
+        identify(parent, child, noise=noise)
+
+
+def test_covariances_and_families_have_to_make_sense() -> None:
+    with pytest.raises(kv.ValueRejectedError, match="One part has a covariance"):
+        identify(SEEN.parent, SEEN.child, covariance_a=NOISE)
+    with pytest.raises(kv.UnknownNameError, match="revolute"):
+        identify(SEEN.parent, SEEN.child, noise=NOISE, families=["revolut"])
+    with pytest.raises(kv.ValueRejectedError, match="no family"):
+        identify(SEEN.parent, SEEN.child, noise=NOISE, families=[])
+    with pytest.raises(kv.UnknownNameError, match="not tried"):
+        identify(SEEN.parent, SEEN.child, noise=NOISE, families=["rigid"])["screw"]
+
+
+@pytest.mark.parametrize("count", [2, 3, 10])
+def test_identical_poses_do_not_say_how_something_moves(count: int) -> None:
+    found = identify(
+        np.tile(SEEN.parent[0], (count, 1, 1)), np.tile(SEEN.child[0], (count, 1, 1)), noise=NOISE
+    )
+    assert found.best.family == "rigid"
+    assert not found["revolute"].told
+    assert all(np.isfinite(fit.log_evidence) for fit in found)
+
+
+def test_two_poses_of_something_that_moved() -> None:
+    found = identify(SEEN.parent[:2], SEEN.child[:2], noise=NOISE)
+    assert found.cannot_tell or found.best.probability < 1.0
+    assert str(found)
+
+
+def test_positions_alone_tell_a_circle_from_a_line() -> None:
+    for family in ("revolute", "prismatic"):
+        seen = recording(family, count=25, position=0.003, orientation=0.003, seed=2)
+        found = identify(seen.parent, seen.child[:, :3, 3], noise=seen.covariance)
+        assert found.best.family == family
+        with pytest.raises(kv.ValueRejectedError, match="Only positions"):
+            found.best.operation("door", "body")
+
+
+def test_a_parent_that_is_the_world() -> None:
+    seen = recording("revolute", count=15, position=0.005, orientation=0.01, seed=5)
+    known = np.linalg.inv(seen.true_parent) @ seen.child
+    found = identify(None, known, noise=seen.covariance)
+    assert found.best.family == "revolute"
+
+
+def test_an_identifier_keeps_what_it_has_when_a_pose_is_refused() -> None:
+    identifier = Identifier(noise=NOISE)
+    with pytest.raises(kv.ValueRejectedError, match="0 poses so far"):
+        _ = identifier.found
+    identifier.add(SEEN.parent[0], SEEN.child[0])
+    with pytest.raises(kv.ValueRejectedError, match="not finite"):
+        identifier.add(SEEN.parent[1], np.nan * SEEN.child[1])
+    with pytest.raises(kv.ShapeError, match="mix"):
+        identifier.add(SEEN.parent[1], SEEN.child[1, :3, 3])
+    identifier.add(SEEN.parent[1], SEEN.child[1])
+    assert len(identifier) == 2
+    assert identifier.found.fits
