@@ -24,7 +24,7 @@ LOOKS, THINKS = 0.25, 1.0
 FEWEST, MOST = 4, 96
 """With how many poses the weighing begins, and from how many on every other one is forgotten."""
 
-RESTLESS = 0.3
+RESTLESS = 0.06
 """Of what was learned: the variance that a coordinate gains [m²/s], [rad²/s]."""
 
 TOLD = ("revolute", "prismatic", "screw", "cylindrical", "rigid")
