@@ -11,7 +11,7 @@ INSTALL := $(BIN)/python -m pip install --quiet --no-input --disable-pip-version
 .NOTPARALLEL:
 
 help:
-	@echo "make demo    open a kitchen and a robot in the browser (ARGS=--headless: write a picture and end)"
+	@echo "make demo    open a kitchen that lives in the browser (ARGS=--headless: numbers, a picture, and end)"
 	@echo "make test    formatter, linter, types, tests"
 	@echo "make fuzz    look for inputs that break a reader (ARGS='--target sdf --minutes 60')"
 	@echo "make format  format the code and mend what the linter can mend"

@@ -1,4 +1,4 @@
-"""Draw the pictures of the docs: the gallery, and what is near. With names, some of them."""
+"""Draw the pictures of the docs: the gallery, what is near, and the demo. With names, some of them."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ import io
 import sys
 from pathlib import Path
 
+import living
 import near
 import numpy as np
 from configurations import TAKES, Take, values
@@ -23,7 +24,7 @@ from kineverse.view.surfaces import Surfaces
 FOLDER = Path(__file__).resolve().parents[2] / "docs" / "pictures"
 WIDTH, GAP = 480, 4
 LARGEST = 24_000
-NEAR = "near"
+OTHERS = {"near": near.drawn, "living": living.drawn}
 
 
 def main() -> int:
@@ -31,9 +32,9 @@ def main() -> int:
     parser = argparse.ArgumentParser(prog="python tools/pictures", description=__doc__)
     parser.add_argument("names", nargs="*", metavar="NAME", help="scenes (all)")
     missing = 0
-    for name in parser.parse_args().names or (*gallery.names(), NEAR):
-        if name == NEAR:
-            write(name, near.drawn())
+    for name in parser.parse_args().names or (*gallery.names(), *OTHERS):
+        if name in OTHERS:
+            write(name, OTHERS[name]())
             continue
         if name not in TAKES:
             missing += 1

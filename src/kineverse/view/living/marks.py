@@ -9,7 +9,7 @@ from kineverse.view.triangles import Floats, Triangles, unit
 
 from .axis import TURNING, spread
 
-MARKER, THICK = 0.15, 0.012
+MARKER, THICK = 0.18, 0.02
 """The length and thickness of a marker's axes [m]."""
 
 BAR, CAP = 0.018, 0.04
