@@ -135,6 +135,24 @@ def test_a_linkage_is_a_loop() -> None:
     assert "loop: " in str(graph)
 
 
+@pytest.mark.parametrize("seed", range(3))
+def test_a_telescope_hangs_by_its_smaller_motions_and_few_poses_leave_doubt(seed: int) -> None:
+    model = kv.Model()
+    with model.edit() as edit:
+        edit.apply(kv.Prismatic(name="inner", parent="world", child="inner", axis=(1, 0, 0)))
+        edit.apply(kv.Prismatic(name="outer", parent="inner", child="outer", axis=(1, 0, 0)))
+    sure, unsure = (
+        identify_graph(seen(model, ["inner", "outer"], count, seed, reach=0.3), noise=NOISE, families=SOME)
+        for count in (40, 4)
+    )
+    assert [(e.parent, e.child) for e in sure.edges] == [("world", "inner"), ("inner", "outer")]
+    assert all(e.probability > 0.99 for e in sure.edges)
+    assert any(e.probability < 0.99 for e in unsure.edges)
+    for edge in unsure.edges:
+        assert edge.probability + sum(edge.others.values()) > 0.9
+        assert all(f"or {a} -> {b}" in str(edge) for a, b in edge.others)
+
+
 def test_drawers_and_doors_beside_each_other_are_no_loop() -> None:
     kitchen = kv.load("kitchen")
     frames = ["kitchen/fridge_door_handle", "kitchen/oven_left_drawer", "kitchen/oven_right_drawer"]

@@ -2,9 +2,8 @@
 
 Every pair of parts is identified. Parts that do not move against each other are one rigid body. Bodies are
 connected by the tree of largest evidence, where the density of all poses is the product over the tree's
-connections of how the child was seen in the parent; the noise of a part enters each of its connections anew,
-which is why what hangs on the world, whose place is known, is slightly preferred. A pair beside the tree that
-moves in fewer ways than the tree lets it closes a loop.
+connections of how the child was seen in the parent, as if the latter's place were known. A pair beside the
+tree that moves in fewer ways than the tree lets it closes a loop.
 """
 
 from __future__ import annotations

@@ -80,6 +80,9 @@ def pair(tracks: Mapping[str, Track], parent: str, child: str, families: Familie
     if explained:
         # How large the noise happened to be is no reason to hang on something else.
         log += 0.5 * (squares - expected)
+    if a.covariances is not None:
+        # A part on a joint is better known than it is seen: its noise is no reason to hang on the world.
+        log += _log_volume(covariance_of(seen, best), best) - _log_volume(child_covariance(seen), best)
     return Pair(parent, child, found, times, log + LOG_ANYWHERE - len(times) * _LOG_ROOM, explained)
 
 
@@ -91,16 +94,34 @@ def squared_error(seen: Observations, fit: Fit) -> float:
 
 def covariance_of(seen: Observations, fit: Fit) -> Array:
     """Return the covariances of observed relative poses, in the parent's axes, (N, 6, 6)."""
-    p_R_w = np.swapaxes(seen.parent[:, :3, :3], 1, 2)
-    turned = np.zeros((len(p_R_w), 6, 6))
-    turned[:, :3, :3] = turned[:, 3:, 3:] = p_R_w
-    covariance: Array = turned @ seen.child_covariance @ np.swapaxes(turned, 1, 2)
+    turned, covariance = _turned(seen), child_covariance(seen)
     if seen.parent_covariance is not None:
         lever = np.tile(np.eye(6), (len(turned), 1, 1))
         lever[:, :3, 3:] = -skew(fit.poses[:, :3, 3])
         carried = lever @ turned
         covariance = covariance + carried @ seen.parent_covariance @ np.swapaxes(carried, 1, 2)
     return covariance
+
+
+def child_covariance(seen: Observations) -> Array:
+    """Return the covariances of the child's pose in the parent's axes, (N, 6, 6)."""
+    turned = _turned(seen)
+    covariance: Array = turned @ seen.child_covariance @ np.swapaxes(turned, 1, 2)
+    return covariance
+
+
+def _turned(seen: Observations) -> Array:
+    p_R_w = np.swapaxes(seen.parent[:, :3, :3], 1, 2)
+    turned = np.zeros((len(p_R_w), 6, 6))
+    turned[:, :3, :3] = turned[:, 3:, 3:] = p_R_w
+    return turned
+
+
+def _log_volume(covariance: Array, fit: Fit) -> float:
+    """Return the logarithm of the volume of noise across a motion, up to a constant: ½ log |S| |Jᵀ S⁻¹ J|."""
+    by_joints = fit.motion.at(fit.joint_values).by_joints
+    along = np.swapaxes(by_joints, 1, 2) @ np.linalg.solve(covariance, by_joints)
+    return 0.5 * float(np.sum(np.linalg.slogdet(covariance)[1] + np.linalg.slogdet(along)[1]))
 
 
 def identified(seen: Observations, families: Families) -> Found:
