@@ -10,7 +10,7 @@ import pytest
 from seen_frames import NOISE, moved, seen
 
 import kineverse as kv
-from kineverse.estimation import Plausibility, plausibility
+from kineverse.estimation import Family, Plausibility, plausibility
 
 DOOR, TAG = "kitchen/fridge_door", "joint kitchen/fridge_door"
 HANDLE, FRIDGE = "kitchen/fridge_door_handle", "kitchen/fridge"
@@ -193,6 +193,48 @@ def test_a_garage_door_that_is_served_as_a_hinge() -> None:
     assert set(model.frames) == set(served.frames)
     again = plausibility(model, observations, noise=NOISE, families=("revolute", "planar", "free"))
     assert again["door"].stopped is None
+
+
+def test_a_family_of_ones_own_is_proposed() -> None:
+    served = kv.Model()
+    with served.edit() as edit:
+        hinge = kv.Revolute(name="garage/door", parent="world", child="garage/door", axis=(0, 1, 0))
+        edit.apply(hinge, tag="door")
+        edit.add_frame("garage/upper_edge", parent="garage/door", transform=kv.translation(0, 0, 1.9))
+    angle, length = kv.position("angle"), kv.parameter("length", 1.5)
+    rising = kv.translation(0, 0, length * (1 - np.cos(angle))) @ kv.rotation_y(angle)
+    family = Family(
+        "garage", rising @ kv.translation(0, 0, length), {angle: (-0.1, 1.7)}, {length: (1.5, 0.5)}
+    )
+    observations = seen(
+        garage_door("regular"), ["garage/upper_edge"], {"garage/door": np.linspace(0.0, 1.5, 40)}, 19
+    )
+    report = plausibility(served, observations, noise=NOISE, families=[family, "revolute", "free"])
+    assert report["door"].stopped is not None
+    assert report["door"].found is not None
+    assert report["door"].found.best.parameters["length"] == pytest.approx(2.0, abs=0.02)
+    model = mended(served, report)
+    assert model.degrees_of_freedom == served.degrees_of_freedom
+    assert plausibility(model, observations, noise=NOISE, families=["revolute", "free"])["door"].explains
+    # What was seen before it was noticed says how far it goes, too.
+    low, high = model.limits("garage/door")
+    assert (low, high) == pytest.approx((0.0, 1.5), abs=0.05)
+
+
+@pytest.mark.parametrize(
+    "scene",
+    ["cylindrical", "universal", "planar", "ackermann", "door_with_handle", "folding_door", "four_bar"],
+)
+def test_all_kinds_of_articulations_explain_themselves(scene: str) -> None:
+    model = kv.load(f"articulations/{scene}")
+    random = np.random.default_rng(0)
+    values = {}
+    for symbol in model.degrees_of_freedom:
+        low, high = np.clip(model.limits(symbol), -1.0, 1.0)
+        values[str(symbol)] = random.uniform(low, high, 20)
+    report = plausibility(model, seen(model, model.frames, values, 20), noise=NOISE, families=["rigid"])
+    assert len(report) + len(report.left_out) == len(model.frames)
+    assert report.implausible == ()
 
 
 def test_an_articulation_of_ones_own() -> None:
