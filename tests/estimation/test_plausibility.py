@@ -58,6 +58,10 @@ def test_what_is_right_is_left_alone(kitchen: kv.Model) -> None:
     assert report.proposals == {}
     report.raise_if_implausible()
     assert report[TAG].link.parent == FRIDGE
+    again = plausibility(
+        kitchen.snapshot(), seen(kitchen, [HANDLE], values, 1), noise=NOISE, families=SOME, strict=True
+    )
+    assert again[TAG].explains
 
 
 def test_an_axis_that_is_off_by_3_cm(kitchen: kv.Model) -> None:
@@ -345,6 +349,8 @@ def test_bad_input_is_refused(kitchen: kv.Model) -> None:
     some[2, :3, :3] *= 1.1
     with pytest.raises(kv.ValueRejectedError, match="Pose 2"):
         plausibility(kitchen, {HANDLE: some}, noise=NOISE)
+    nothing = plausibility(kitchen, {HANDLE: np.zeros((0, 4, 4))}, noise=NOISE)
+    assert nothing[TAG].verdict == "cannot tell"
     never = plausibility(kitchen, {HANDLE: np.full((3, 4, 4), np.nan)}, noise=NOISE)
     assert never[TAG].verdict == "cannot tell"
     assert "never seen together" in never[TAG].reason

@@ -81,6 +81,8 @@ def _track(name: str, given: Any, noise: npt.ArrayLike | None) -> Track:
             f"How well '{name}' is seen is not known, and without that nothing can be judged: give a pair of "
             "poses and their covariance, or noise=kv.estimation.pose_covariance(position, orientation)."
         )
+    if not len(poses):
+        return Track(poses, np.zeros((0, 6, 6)), np.zeros(0, dtype=bool))
     seen: npt.NDArray[np.bool_] = np.logical_not(np.isnan(poses).all(axis=(1, 2)))
     poses[~seen] = np.eye(4)
     check_rigid(poses, f"frame '{name}'")

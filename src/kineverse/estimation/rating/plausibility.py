@@ -12,7 +12,7 @@ from kineverse.errors import KineverseError, ValueRejectedError
 from kineverse.estimation.identification.pairs import Families
 from kineverse.estimation.identification.tracks import Poses, Track, between, exactly, tracks
 from kineverse.model.frame import WORLD
-from kineverse.model.model import Model
+from kineverse.model.model import Model, Snapshot
 
 from .judgement import Seen, judged
 from .links import Link, find_links
@@ -26,7 +26,7 @@ FALSE_ALARMS = 1e-3
 
 
 def plausibility(
-    model: Model,
+    model: Model | Snapshot,
     observations: Mapping[str, Poses],
     *,
     noise: npt.ArrayLike | None = None,
@@ -70,6 +70,8 @@ def plausibility(
         If ``strict``, and an articulation stopped explaining what is seen.
     """
     check_false_alarms(false_alarms)
+    if isinstance(model, Snapshot):
+        model = model.model()
     seen = tracks(observations, noise)
     found = find_links(model, observations, relative_to)
     if relative_to is not None:
