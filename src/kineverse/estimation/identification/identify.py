@@ -44,7 +44,7 @@ WEIGHTS: Mapping[str, float] = MappingProxyType(
 """How probable families are beforehand, beside each other."""
 
 _UNKNOWN_NOISE = (0.005, math.radians(1.0))
-_FIRST_STEPS = 4
+_FIRST_STEPS = 2
 # What is less probable than the best by this, as a logarithm, is not refined.
 _CHANCE = 15.0
 # By what the unknown noise is multiplied, and how that is believed to be spread: a factor of 5 either way.

@@ -18,7 +18,7 @@ from kineverse.compile.toolchain import CLOSED, toolchain
 from kineverse.compile.worker import Build, request
 
 from .groups import PITCHES, REACH, GroupMotion
-from .motion import Member
+from .motion import Linear, Member
 from .native_source import SOLVE
 from .observations import Observations
 from .rigid import Array, pose
@@ -91,7 +91,7 @@ class SolverLibrary:
             self._hopeless = True
             return
         pointer = ctypes.c_void_p
-        code.solve.argtypes = (*(pointer,) * 4, ctypes.c_int64, *(pointer,) * 3)
+        code.solve.argtypes = (*(pointer,) * 4, ctypes.c_int64, *(pointer,) * 6)
         code.solve.restype = ctypes.c_int64
         self._code = code
 
@@ -118,6 +118,10 @@ class SolverLibrary:
         residuals, covariances = np.empty((count, rows)), np.empty((count, rows, rows))
         belief = belief or Belief.vague(motion.joints)
         problem = _problem(seen, motion, belief)
+        poses = np.zeros((count, 4, 4))
+        poses[:, 3, 3] = 1.0
+        linear = Linear(poses, np.empty((count, rows, motion.size)), np.empty((count, rows, motion.joints)))
+        results = (residuals, covariances, *linear)
         converged = self._code.solve(
             ctypes.addressof(problem),
             moved.ctypes.data,
@@ -125,8 +129,7 @@ class SolverLibrary:
             parents.ctypes.data,
             steps,
             ctypes.addressof(cost),
-            residuals.ctypes.data,
-            covariances.ctypes.data,
+            *(array.ctypes.data for array in results),
         )
         if converged < 0:
             raise MemoryError("There is no memory for so many observations.")
@@ -136,7 +139,7 @@ class SolverLibrary:
             right=pose(moved[12:21].reshape(3, 3), moved[21:24]),
             pitch=float(moved[24]),
         )
-        linear, settled = motion.at(values), converged == 1
+        settled = converged == 1
         return Solution(motion, values, cost.value, residuals, covariances, linear, parents, belief, settled)
 
 

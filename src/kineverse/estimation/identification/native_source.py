@@ -210,8 +210,9 @@ static int move(const Problem *p, const Motion *m, const Observation *all, doubl
 
 /* As solve in solving.py. Returns whether it converged, or -1 without memory. */
 EXPORT int64_t solve(const Problem *p, Motion *motion, double *values, double *parents, int64_t steps,
-                     double *cost, double *residuals, double *covariances) {
-  int64_t joints = p->joints, rows = p->rows;
+                     double *cost, double *residuals, double *covariances, double *poses,
+                     double *by_parameters, double *by_joints) {
+  int64_t joints = p->joints, rows = p->rows, size = size_of(p);
   Observation *memory = malloc(2 * p->count * sizeof(Observation));
   Observation *here = memory, *there = memory + p->count;
   if (!memory) return -1;
@@ -256,8 +257,16 @@ EXPORT int64_t solve(const Problem *p, Motion *motion, double *values, double *p
     memcpy(values + joints * k, here[k].values, joints * sizeof(double));
     memcpy(residuals + rows * k, here[k].residual, rows * sizeof(double));
     memcpy(covariances + rows * rows * k, here[k].covariance, rows * rows * sizeof(double));
-    for (int i = 0; i < 9; i++) parents[16 * k + 4 * (i / 3) + i % 3] = here[k].parent_R[i];
-    for (int i = 0; i < 3; i++) parents[16 * k + 4 * i + 3] = here[k].parent_p[i];
+    memcpy(by_parameters + rows * size * k, here[k].by_parameters, rows * size * sizeof(double));
+    memcpy(by_joints + rows * joints * k, here[k].by_joints, rows * joints * sizeof(double));
+    for (int i = 0; i < 9; i++) {
+      parents[16 * k + 4 * (i / 3) + i % 3] = here[k].parent_R[i];
+      poses[16 * k + 4 * (i / 3) + i % 3] = here[k].H_R[i];
+    }
+    for (int i = 0; i < 3; i++) {
+      parents[16 * k + 4 * i + 3] = here[k].parent_p[i];
+      poses[16 * k + 4 * i + 3] = here[k].lever[i];
+    }
   }
   free(memory);
   return converged;
