@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from kineverse.estimation import identify, pose_covariance
+import kineverse as kv
+from kineverse.estimation import Family, Unknown, identify, pose_covariance
 from kineverse.estimation.identification.identify import WEIGHTS
 from kineverse.view.identified import SIZE, Looked, draw_identified
 
@@ -86,3 +87,16 @@ def test_every_family_is_drawn(family, whole):
     figure.canvas.draw()
     assert figure.get_suptitle() == "a title"
     assert {"joint values, ±2 σ", "left over"} <= {axes.get_title() for axes in figure.axes}
+
+
+def test_a_family_of_ones_own_is_drawn():
+    figure = pytest.importorskip("matplotlib.figure").Figure(figsize=SIZE, layout="constrained")
+    q, radius = kv.position("q"), kv.parameter("radius", 0.5)
+    circle = kv.rotation_z(q) @ kv.translation(radius, 0, 0)
+    family = Family("circle", circle, {q.symbols[0]: (-1.0, 2.0)}, {radius.symbols[0]: Unknown(0.5, 0.2)})
+    angles = np.linspace(0, 1.2, 20)
+    points = np.column_stack([0.4 * np.cos(angles), 0.4 * np.sin(angles), 0 * angles])
+    fit = identify(None, points, noise=NOISE, families=[family]).best
+    draw_identified(figure, fit, points, "a circle")
+    figure.canvas.draw()
+    assert fit.parameters["radius"] == pytest.approx(0.4, abs=0.02)

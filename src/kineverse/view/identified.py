@@ -150,16 +150,16 @@ def draw_side(axes: Axes, looked: Looked) -> None:
 def draw_values(axes: Axes, fit: Fit) -> None:
     """Draw joint values over the observations, with their standard deviations."""
     number = np.arange(len(fit.joint_values))
-    turning = [component >= 3 for component in fit.motion.freedom.joints]
+    # A family of one's own does not say which of its joint values are angles.
+    freedom = getattr(fit.motion, "freedom", None)
+    turning = [j >= 3 for j in freedom.joints] if freedom else [False] * fit.joint_values.shape[1]
+    units = {"[deg]" if turns else "[m]" for turns in turning} if freedom else {"its own units"}
     for k, turns in enumerate(turning):
         scale = np.degrees(1.0) if turns else 1.0
         value, spread = scale * fit.joint_values[:, k], scale * SIGMAS * fit.deviations[:, k]
         axes.fill_between(number, value - spread, value + spread, alpha=0.25, linewidth=0)
         axes.plot(number, value, ".-", markersize=3, linewidth=0.8)
-    axes.set(
-        title=f"joint values, ±{SIGMAS:g} σ",
-        ylabel=", ".join(sorted({"[deg]" if t else "[m]" for t in turning})),
-    )
+    axes.set(title=f"joint values, ±{SIGMAS:g} σ", ylabel=", ".join(sorted(units)))
     axes.tick_params(labelbottom=False)
 
 
