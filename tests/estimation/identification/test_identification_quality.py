@@ -16,7 +16,7 @@ from kineverse.estimation.identification.identify import solutions
 from kineverse.estimation.identification.observations import observations
 from kineverse.estimation.identification.widths import Alone, widths
 
-REPEATS = 50
+REPEATS = 40
 
 # Family, how far it goes, position noise [m], orientation noise [rad], and how often it is seen.
 CLEAR = [
@@ -64,7 +64,7 @@ def stated(fits: list[Fit], coordinate: str) -> float:
 @pytest.mark.parametrize("case", CLEAR)
 def test_the_bound_is_reached_and_the_covariance_is_true(case: tuple) -> None:
     turned, shifted, plain, _, fits = errors(*case)
-    # The root mean square of so many two-dimensional errors is known to 7 % or so.
+    # The root mean square of so many two-dimensional errors is known to 8 % or so.
     assert 0.8 * plain < rms(turned) < 1.2 * plain
     assert rms(turned) == pytest.approx(math.sqrt(2) * stated(fits, "axis"), rel=0.25)
     if len(shifted):
@@ -81,7 +81,7 @@ def test_short_motions_are_estimated_as_well_as_joint_values_allow(case: tuple) 
 
 def test_a_motion_within_the_noise_is_no_motion() -> None:
     """A criterion that counts joint values as parameters would say something else, with ever more poses."""
-    for seed in range(5):
+    for seed in range(3):
         seen = recording("rigid", count=80, position=0.03, orientation=0.05, seed=seed)
         found = identify(seen.parent, seen.child, noise=seen.covariance)
         assert found["rigid"].probability > 0.5

@@ -22,7 +22,7 @@ from .motion import Linear, Member
 from .native_source import SOLVE
 from .observations import Observations
 from .rigid import Array, pose
-from .solving import CLOSE, STEPS, Belief, Solution, solve
+from .solving import CLOSE, CLOSE_ENOUGH, STEPS, Belief, Solution, solve
 
 _FLAGS = ("-O3", "-lm", *CLOSED)
 _COUNTS = ("count", "rows", "joints", "lefts", "rights", "pitched", "reach", "known", "marginal")
@@ -155,7 +155,8 @@ def _problem(seen: Observations, motion: GroupMotion, belief: Belief) -> _Proble
     for name in _ARRAYS:
         array = getattr(seen, name)
         setattr(problem, name, None if array is None else array.ctypes.data)
-    problem.reach_scale, problem.pitch_scale, problem.close = REACH, PITCHES, CLOSE
+    close = CLOSE_ENOUGH if belief.marginal else CLOSE
+    problem.reach_scale, problem.pitch_scale, problem.close = REACH, PITCHES, close
     problem.marginal = belief.marginal
     problem.mean[: motion.joints] = belief.mean.tolist()
     problem.precision[: motion.joints] = belief.precision.tolist()
