@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import multiprocessing
 import os
+import threading
 from collections.abc import Iterator, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor
 from contextlib import contextmanager
@@ -153,6 +154,18 @@ def _seed(cell: Cell) -> list[int]:
     return [SEED, cell.joint == "revolute", cell.count, *micro]
 
 
+def _end_with_parent() -> None:
+    """End this process when the one that made it is gone: its own end would not reach us."""
+    parent = multiprocessing.parent_process()
+    assert parent is not None  # it is what runs this
+
+    def wait() -> None:
+        parent.join()
+        os._exit(1)
+
+    threading.Thread(target=wait, daemon=True).start()
+
+
 @contextmanager
 def _workers(count: int) -> Iterator[ProcessPoolExecutor]:
     """Yield processes that use a core each."""
@@ -160,8 +173,14 @@ def _workers(count: int) -> Iterator[ProcessPoolExecutor]:
     before = {name: os.environ.get(name) for name in names}
     os.environ.update(dict.fromkeys(names, "1"))
     try:
-        with ProcessPoolExecutor(count, multiprocessing.get_context("spawn")) as pool:
-            yield pool
+        with ProcessPoolExecutor(
+            count, multiprocessing.get_context("spawn"), initializer=_end_with_parent
+        ) as pool:
+            try:
+                yield pool
+            except BaseException:
+                pool.shutdown(wait=False, cancel_futures=True)
+                raise
     finally:
         for name, value in before.items():
             if value is None:
