@@ -40,7 +40,7 @@ def test_the_commands_work(
     monkeypatch.chdir(tmp_path)
     words = shlex.split(command)[1:]
     # What runs until it is interrupted, measures, or is about files of one's own is asked for its help instead.
-    if words[0] in ("view", "bench", "diff", "decompose"):
+    if words[0] in ("view", "bench", "diff", "decompose", "fit"):
         words = [words[0], "--help"]
     assert main(words) == 0
     assert capsys.readouterr().out
