@@ -9,7 +9,14 @@ from scipy.stats import chi2
 from seeing import Eyes
 
 import kineverse as kv
-from kineverse.estimation import Hypotheses, ObservedPose, ObservedPosition, Outliers, Tracker
+from kineverse.estimation import (
+    Hypotheses,
+    ObservedExpression,
+    ObservedPose,
+    ObservedPosition,
+    Outliers,
+    Tracker,
+)
 
 STEPS = 25
 CONFIGURATIONS = 40
@@ -236,3 +243,62 @@ def test_points_of_a_body_from_any_side():
             estimate = tracker.update(seen)
         said = Rotation.from_quat([estimate.state[f"b/q{c}"] for c in "xyzw"])
         assert (said * turn.inv()).magnitude() < 0.05
+
+
+def on_wheels(points):
+    model = kv.Model()
+    with model.edit() as edit:
+        edit.apply(kv.OmniBase(name="b", parent="world", child="b"))
+    seen = [ObservedPosition("b", p, name=n) for n, p in points.items()]
+    return model, Tracker(model, seen, uncertainty={"b/x": 1, "b/y": 1})
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_who_sees_one_point_of_a_body_learns_nothing_of_its_angle(seed):
+    """States are possible on a ring; its tangents at two places must not pass for two observations."""
+    model, tracker = on_wheels({"p": (0.1, 0.2, 0.3)})
+    rng = np.random.default_rng(seed)
+    truth = {"b/x": rng.normal(), "b/y": rng.normal(), "b/angle": rng.uniform(-3, 3)}
+    there = (model.fk("b")(truth) @ [0.1, 0.2, 0.3, 1])[:3]
+    for _ in range(50):
+        estimate = tracker.update({"p": there + 0.01 * rng.standard_normal(3)})
+    assert estimate.deviation["b/angle"] > 2
+    for name in ("b/x", "b/y"):
+        assert abs(estimate.state[name] - truth[name]) < 3 * estimate.deviation[name]
+
+
+def test_two_points_of_a_body_seen_in_turn():
+    points = {"p": (0.1, 0.2, 0.3), "q": (-0.4, 0.1, 0.0)}
+    model, first = on_wheels(points)
+    found = []
+    for seed in range(40):
+        tracker, rng = first.copy(), np.random.default_rng(seed)
+        truth = {"b/x": rng.normal(), "b/y": rng.normal(), "b/angle": rng.uniform(-3, 3)}
+        body = model.fk("b")(truth)
+        for step in range(20):
+            name = "pq"[step % 2]
+            estimate = tracker.update({name: (body @ [*points[name], 1])[:3] + 0.01 * rng.standard_normal(3)})
+        error = np.array([estimate.state[s.position] - truth[str(s.position)] for s in estimate.tangent])
+        error[0] = np.remainder(error[0] + np.pi, 2 * np.pi) - np.pi
+        found.append(error @ estimate.information @ error / 3)
+    assert 0.6 < np.mean(found) < 1.6
+
+
+@pytest.mark.parametrize("start", [(-5, 0.5), (1, 1), (5, 5), (0, -3)])
+def test_a_place_from_distances_one_at_a_time(start):
+    model = kv.Model()
+    with model.edit() as edit:
+        edit.apply(kv.Planar(name="p", parent="world", child="p"))
+    x, y = model.symbol("p/x"), model.symbol("p/y")
+    masts = {"a": (0, 0), "b": (3, 0), "c": (0, 3)}
+    tracker = Tracker(
+        model,
+        [ObservedExpression(n, np.sqrt((x - a) ** 2 + (y - b) ** 2), 0.01**2) for n, (a, b) in masts.items()],
+        start=dict(zip(("p/x", "p/y"), start, strict=True)),
+    )
+    for _ in range(8):
+        for name, (a, b) in masts.items():
+            estimate = tracker.update({name: np.hypot(1 - a, 2 - b)})
+    assert estimate.state["p/x"] == pytest.approx(1, abs=1e-6)
+    assert estimate.state["p/y"] == pytest.approx(2, abs=1e-6)
+    assert max(estimate.deviation.values()) < 0.006

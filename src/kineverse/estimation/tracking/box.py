@@ -66,3 +66,10 @@ class Box:
         """Return a place that rounding has not led out of the bounds of single coordinates."""
         x[self._own] = np.clip(x[self._own], self._lower, self._upper)
         return x
+
+    def taken(self, x: Array, after: Array, step: Array) -> Array:
+        """Return what is left of a step in the tangent if it was clipped on the way from x."""
+        left = step.copy()
+        for row, k in zip(self._rows, self._own, strict=True):
+            left[row == 1.0] = after[k] - x[k]
+        return left

@@ -22,6 +22,7 @@ from .outliers import Outliers
 from .reading import Reader, Reading
 from .residuals import Residuals
 from .solving import Solver
+from .widening import Widening
 
 # Explanations whose predictions are so few deviations apart are one.
 _SAME = 0.3
@@ -76,6 +77,7 @@ class Filter:
         self.residuals = Residuals(layout, self.function)
         self.reader = Reader(layout)
         self.solver = Solver(layout, self.residuals, self.charted, limits)
+        self.widening = Widening(layout, self.residuals, self.charted, self.reader, self.solver.boxes)
         self.native = NativeSolver(layout, limits, self.function) if NativeSolver.suits(layout) else None
         self.turns: frozenset[Symbol] = frozenset()
         if self.native:
@@ -88,6 +90,13 @@ class Filter:
 
     def update(self, modes: Modes, reading: Reading, known: Array) -> Outcome:
         """Return what is believed after a reading; see :meth:`.solving.Solver.update`."""
+        outcome = self._updated(modes, reading, known)
+        looked = modes.looked | reading.seen
+        outcome.modes = outcome.modes.each(lambda belief: self.widening.widened(belief, looked, known))
+        outcome.modes.looked = looked
+        return outcome
+
+    def _updated(self, modes: Modes, reading: Reading, known: Array) -> Outcome:
         if modes.is_single and self.outliers is None:
             found = None
             if self.native is not None and self.native.is_ready:

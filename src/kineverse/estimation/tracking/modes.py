@@ -61,16 +61,25 @@ class Modes:
         At first.
     alive
         For each belief, which groups have it (modes, groups); all have the first.
+    looked
+        A mask of the observations of which something was seen so far; none if None.
 
     Attributes
     ----------
-    beliefs, alive
+    beliefs, alive, looked
         As they are now.
     """
 
-    def __init__(self, layout: Layout, beliefs: Sequence[Belief], alive: npt.NDArray[np.bool_]) -> None:
+    def __init__(
+        self,
+        layout: Layout,
+        beliefs: Sequence[Belief],
+        alive: npt.NDArray[np.bool_],
+        looked: npt.NDArray[np.bool_] | None = None,
+    ) -> None:
         self._layout = layout
         self.beliefs, self.alive = tuple(beliefs), alive
+        self.looked = np.zeros(len(layout.observations), dtype=bool) if looked is None else looked
 
     @property
     def best(self) -> Belief:
@@ -88,7 +97,7 @@ class Modes:
 
     def each(self, change: Callable[[Belief], Belief]) -> Modes:
         """Return what becomes of them when each belief changes."""
-        return Modes(self._layout, [change(b) for b in self.beliefs], self.alive)
+        return Modes(self._layout, [change(b) for b in self.beliefs], self.alive, self.looked)
 
     def evidence(self, number: int) -> Array:
         """Return the log evidence of the modes of a group, its best one first."""
@@ -139,7 +148,8 @@ class Modes:
                 copy_group(source, belief, number, group)
             beliefs.append(belief)
             alive.append([mode < len(own_modes) for own_modes in kept])
-        return Modes(self._layout, beliefs, np.array(alive)), [own_modes[0][1] for own_modes in kept]
+        after = Modes(self._layout, beliefs, np.array(alive), self.looked)
+        return after, [own_modes[0][1] for own_modes in kept]
 
 
 def copy_group(source: Belief, target: Belief, number: int, group: Group) -> None:

@@ -98,11 +98,16 @@ class Solver:
     ----------
     layout, residuals, charted, limits
         The parts of a tracker.
+
+    Attributes
+    ----------
+    boxes
+        The limits of each group.
     """
 
     def __init__(self, layout: Layout, residuals: Residuals, charted: Charted, limits: Limits) -> None:
         self._layout, self._residuals, self._charted = layout, residuals, charted
-        self._boxes = [Box(number, layout, limits) for number in range(len(layout.groups))]
+        self.boxes = [Box(number, layout, limits) for number in range(len(layout.groups))]
 
     def update(
         self, belief: Belief, reading: Reading, known: Array, groups: Sequence[int], trust: Trust = "all"
@@ -150,7 +155,7 @@ class Solver:
 
     def room(self, number: int, x: Array, out: Array) -> Room:
         """Return what limits allow a group at a place where the model was evaluated."""
-        return self._boxes[number].room(x, out)
+        return self.boxes[number].room(x, out)
 
     def _run(
         self, belief: Belief, reading: Reading, known: Array, groups: Sequence[int], trust: Trust
@@ -188,7 +193,7 @@ class Solver:
         is_finite = np.isfinite(cost) and all(np.isfinite(s).all() for _, s in seen.values())
         if not is_finite and work.room is None:
             self._residuals.check(out, group.seen)
-        room = self._boxes[number].room(work.trial, out)
+        room = self.boxes[number].room(work.trial, out)
         if not is_finite or not _is_better(work, cost, room):
             work.damping = max(10 * work.damping, 1e-3)
             return
@@ -222,7 +227,7 @@ class Solver:
         if turned > np.pi:
             step = step * (np.pi / turned)  # half a turn: beyond, what is linear leads anywhere
         x, turn = self._charted.step(number, work.x, step, known)
-        x = self._boxes[number].clipped(x)
+        x = self.boxes[number].clipped(x)
         if float(step @ matrix @ step) <= _CONVERGED**2 or work.damping > _MOST_DAMPING:
             work.x, work.settled = x, work.posterior.carried(step, turn)
             work.prior = work.prior.carried(step, turn)
