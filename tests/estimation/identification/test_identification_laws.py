@@ -146,3 +146,17 @@ def test_one_by_one_is_as_all_at_once(family: str) -> None:
     one, other = identifier.found[family], whole[family]
     assert one.log_evidence == pytest.approx(other.log_evidence, abs=0.02)
     assert angle_between(one.parameters["axis"], other.parameters["axis"]) < 0.05 * other.deviation("axis.x")
+
+
+def test_going_on_for_long_does_not_drift() -> None:
+    seen = recording("revolute", count=127, position=0.02, orientation=0.03, seed=3)
+    identifier = Identifier(noise=seen.covariance, families=["revolute"])
+    for a, b in zip(seen.parent, seen.child, strict=True):
+        identifier.add(a, b)
+        if len(identifier) >= 64:
+            assert identifier.found
+    one, other = (
+        identifier.found["revolute"],
+        identify(seen.parent, seen.child, noise=seen.covariance)["revolute"],
+    )
+    assert angle_between(one.parameters["axis"], other.parameters["axis"]) < 0.05 * other.deviation("axis.x")

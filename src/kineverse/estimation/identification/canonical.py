@@ -8,7 +8,7 @@ import numpy as np
 
 from .groups import VZ, WZ, GroupMotion
 from .motion import Member
-from .rigid import Array, exponential, frame_along, pose
+from .rigid import Array, exponential, frame_along, orthonormal, pose
 from .solving import Solution
 
 
@@ -31,7 +31,9 @@ def canonical(solution: Solution[Member]) -> Solution[Member]:
     middle = np.zeros(6)
     middle[list(motion.freedom.joints)] = shift
     middle[VZ] += motion.pitch * middle[WZ]
-    motion = replace(motion, left=motion.left @ pose(exponential(middle[3:]), middle[:3]))
+    # What goes on from an earlier solution multiplies rotations without end, and they drift.
+    left, right = orthonormal(motion.left), orthonormal(motion.right)
+    motion = replace(motion, left=left @ pose(exponential(middle[3:]), middle[:3]), right=right)
     values = values - shift
     motion = _origin(motion)
     axis = motion.left[:3, 2]

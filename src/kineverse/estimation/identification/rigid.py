@@ -23,6 +23,16 @@ def inverse(a_T_b: Array) -> Array:
     return pose(b_R_a, -(b_R_a @ a_T_b[..., :3, 3:])[..., 0])
 
 
+def orthonormal(a_T_b: Array) -> Array:
+    """Return transforms whose rotations are the nearest ones, for rotations that are nearly so.
+
+    One step of Newton's method for the polar decomposition: R (3 - RᵀR) / 2 squares the error.
+    """
+    rotation = a_T_b[..., :3, :3]
+    nearer = 0.5 * rotation @ (3.0 * np.eye(3) - np.swapaxes(rotation, -1, -2) @ rotation)
+    return pose(nearer, a_T_b[..., :3, 3])
+
+
 def skew(v: Array) -> Array:
     """Return [v]×, so that ``skew(v) @ w`` is v × w."""
     result = np.zeros((*v.shape, 3))
