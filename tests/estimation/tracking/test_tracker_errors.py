@@ -55,6 +55,7 @@ def broken(model, **entries):
         (lambda m: {DOOR: broken(m, e33=2.0)}, "last row"),
         (lambda m: {DOOR: np.eye(3)}, "4×4"),
         (lambda m: {DOOR: "here"}, "no numbers"),
+        (lambda m: {DOOR: pose(m) * (1 + 0j)}, "no numbers"),
         (lambda m: {"kitchen/fridge_dor": np.eye(4)}, "fridge_dor' is not observed. Did you mean"),
         (lambda m: {DOOR: (pose(m), -np.eye(6))}, "covariance of 'kitchen/fridge_door' is not positive"),
         (lambda m: {DOOR: (pose(m), np.zeros((6, 6)))}, "is not positive"),
@@ -98,6 +99,10 @@ def test_time(model, tracker):
     for dt in (-1.0, np.nan, np.inf):
         with pytest.raises(kv.KineverseError, match="Time goes on"):
             tracker.predict(dt)
+    with pytest.raises(kv.KineverseError, match="length of a step is a number"):
+        tracker.predict("long")
+    with pytest.raises(kv.KineverseError, match="time of an observation is a number"):
+        tracker.update({DOOR: pose(model)}, at="now")
     with pytest.raises(kv.KineverseError, match="finite number of seconds"):
         tracker.update({DOOR: pose(model)}, at=np.nan)
     with pytest.raises(kv.KineverseError, match="Commands need the time"):
@@ -118,7 +123,9 @@ def test_time(model, tracker):
         ([ObservedExpression("z", np.eye(2) * kv.position(DOOR), 1.0)], {}, "a scalar or a vector"),
         ([DOOR], {"start": {"kitchen/fridge_dor": 1.0}}, "is not estimated. Did you mean"),
         ([DOOR], {"uncertainty": {"kitchen/fridge_dor": 1.0}}, "is not estimated. Did you mean"),
+        ([DOOR], {"start": {DOOR: np.inf}}, "must be finite"),
         ([DOOR], {"uncertainty": {DOOR: 0.0}}, "positive and finite"),
+        ([DOOR], {"uncertainty": {DOOR: "wide"}}, "is a number, not 'wide'"),
         ([DOOR], {"process_noise": {f"{DOOR}:velocity": np.nan}}, "positive and finite"),
         ([DOOR], {"process_noise": {"wheel:velocity": 1.0}}, "Nothing that is estimated moves with"),
         ([DOOR], {"outliers": 3}, "Outliers are"),
@@ -138,6 +145,8 @@ def test_commands_and_known(model, tracker):
         tracker.predict(0.1, {"fridge:velocity": 1.0})
     with pytest.raises(kv.KineverseError, match="must be finite"):
         tracker.predict(0.1, {f"{DOOR}:velocity": np.nan})
+    with pytest.raises(kv.KineverseError, match="is a number"):
+        tracker.predict(0.1, {f"{DOOR}:velocity": "fast"})
     with model.edit() as edit:
         edit.add_frame("eye", parent="world", transform=kv.rotation_z(kv.position("pan")))
     with_camera = Tracker(model, [ObservedPose(DOOR, relative_to="eye")], known=["pan"])
@@ -146,6 +155,19 @@ def test_commands_and_known(model, tracker):
     with pytest.raises(kv.KineverseError, match="'pam' is not known"):
         with_camera.update({DOOR: pose(model)}, given={"pam": 0.0})
     with_camera.update({DOOR: pose(model)}, given={"pan": 0.0})
+    at_rest = kv.State({DOOR: 0.5}, stamp=0.0)
+    begun = Tracker(model, [ObservedPose(DOOR, relative_to="eye")], known=["pan"], start=at_rest)
+    assert begun.update({DOOR: pose(model)}, at=1.0, given={"pan": 0.0}).stamp == 1.0
+
+
+def test_two_numbers_are_a_vector_and_no_pair():
+    model = kv.Model()
+    with model.edit() as edit:
+        edit.apply(kv.Planar(name="p", parent="world", child="p"))
+    where = kv.array([kv.position("p/x"), kv.position("p/y")])
+    tracker = Tracker(model, [ObservedExpression("p", where, np.eye(2) * 1e-4)])
+    assert tracker.update({"p": (1.0, 2.0)}).state["p/y"] == pytest.approx(2.0, abs=1e-3)
+    assert tracker.update({"p": ((1.0, 2.0), np.eye(2))}).state["p/x"] == pytest.approx(1.0, abs=1e-3)
 
 
 def test_outliers_that_cannot_be():

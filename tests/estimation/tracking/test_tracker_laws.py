@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pickle
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
@@ -395,3 +396,17 @@ def test_copies_may_be_used_in_several_threads():
     alone = [follow(some) for some in readings]
     with ThreadPoolExecutor(4) as threads:
         assert list(threads.map(follow, readings)) == alone
+
+
+@pytest.mark.compiler
+def test_a_tracker_goes_to_another_process_as_it_is():
+    model = kv.load("kitchen")
+    frames = [f for f in model.frames if model.speeds_of(f)]
+    eyes, tracker = Eyes(model, frames), Tracker(model, frames, outliers=True)
+    truth = {str(s): 0.2 for s in tracker.symbols}
+    tracker.wait()
+    tracker.update(eyes(truth))
+    there, seen = pickle.loads(pickle.dumps(tracker)), eyes(truth)
+    here, again = tracker.update(seen), there.update(seen)
+    assert again.state == pytest.approx(dict(here.state), abs=1e-9)
+    np.testing.assert_allclose(again.covariance, here.covariance, rtol=1e-9)

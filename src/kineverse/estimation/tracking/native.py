@@ -112,8 +112,7 @@ class NativeSolver:
     """
 
     def __init__(self, layout: Layout, limits: Limits, function: CompiledFunction) -> None:
-        self._function = function
-        self._layout = layout
+        self._layout, self._limits, self._function = layout, limits, function
         count, size = len(layout.groups), len(layout.chart.coordinates)
         self._input = np.zeros(len(layout.inputs))
         self._size = size
@@ -159,6 +158,10 @@ class NativeSolver:
         self._moved = [row.ctypes.data for row in self._motion]
         self._seen = [array.ctypes.data for array in self._reading]
         self._written = [self._belief.ctypes.data, *self._seen, *(row.ctypes.data for row in self._results)]
+
+    def __reduce__(self) -> Any:
+        # Addresses mean something in this process only.
+        return NativeSolver, (self._layout, self._limits, self._function)
 
     @staticmethod
     def suits(layout: Layout) -> bool:

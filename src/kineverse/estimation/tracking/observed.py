@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, TypeAlias
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
@@ -216,3 +216,31 @@ def checked_covariance(given: npt.ArrayLike, size: int, label: str) -> Array:
             "known exactly is handed in as known=, and what is not measured is left out."
         )
     return matrix
+
+
+def checked_number(given: Any, what: str) -> float:
+    """Return a number.
+
+    Raises
+    ------
+    ValueRejectedError
+        If it is none.
+    """
+    try:
+        return float(given)
+    except (TypeError, ValueError):
+        raise ValueRejectedError(f"{what} is a number, not {given!r:.80}.") from None
+
+
+def checked_positive(key: object, given: Any) -> float:
+    """Return a deviation or variance of something.
+
+    Raises
+    ------
+    ValueRejectedError
+        If it is not positive and finite.
+    """
+    number = checked_number(given, f"The uncertainty of '{key}'")
+    if not (math.isfinite(number) and number > 0):
+        raise ValueRejectedError(f"The uncertainty of '{key}' is positive and finite, not {given!r}.")
+    return number

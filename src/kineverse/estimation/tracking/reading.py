@@ -93,7 +93,7 @@ class Reader:
                 hint = suggest(str(name), self._index, "observation")
                 raise UnknownNameError(f"'{name}' is not observed. {hint}")
             one = self._layout.observations[i]
-            if isinstance(value, tuple) and len(value) == 2:
+            if _is_pair(value, one):
                 value, covariance = value
                 checked = checked_covariance(covariance, one.size, one.label)
                 if whitenings is self._whitening:
@@ -168,6 +168,13 @@ def check_pose(pose: Array, label: str) -> None:
         )
 
 
+def _is_pair(value: Any, one: Observation) -> bool:
+    """Whether something is a value and its covariance, and not the two numbers of a vector."""
+    if not (isinstance(value, tuple) and len(value) == 2):
+        return False
+    return one.size != 2 or np.ndim(value[0]) > 0
+
+
 def _pose_like(given: npt.ArrayLike, label: str) -> Array:
     pose = _numbers(given, f"The pose of '{label}'")
     if pose.shape != (4, 4):
@@ -200,6 +207,8 @@ def _checked_vector(given: Any, one: Observation) -> Array:
 
 def _numbers(given: npt.ArrayLike, what: str) -> Array:
     try:
+        if np.iscomplexobj(given):
+            raise TypeError
         return np.asarray(given, dtype=np.float64)
     except (TypeError, ValueError):
         raise ValueRejectedError(f"{what}: these are no numbers: {given!r:.80}.") from None

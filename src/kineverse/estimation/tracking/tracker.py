@@ -23,7 +23,7 @@ from .limits import first_deviations, first_place
 from .locks import Locks
 from .modes import Modes
 from .native import native_library
-from .observed import ObservedLike, observations
+from .observed import ObservedLike, checked_number, checked_positive, observations
 from .outliers import Outliers, as_outliers
 from .reading import Reading
 from .starts import starts, turning
@@ -77,7 +77,7 @@ class Tracker:
         self._layout = layout
         self._filter = Filter(layout, limits, as_outliers(outliers))
         charted = self._filter.charted
-        self._noise = {charted.speed(k): _positive(k, v) for k, v in (process_noise or {}).items()}
+        self._noise = {charted.speed(k): checked_positive(k, v) for k, v in (process_noise or {}).items()}
         self._known = np.array([np.nan if s.value is None else s.value for s in layout.known])
         self._locks = Locks(model, layout, charted) if locks else None
         self._stamp: float | None = getattr(start, "stamp", None)
@@ -93,6 +93,9 @@ class Tracker:
         if strange:
             hint = suggest(strange[0], map(str, chart.coordinates), "coordinate")
             raise UnknownNameError(f"'{strange[0]}' is not estimated. {hint}")
+        for key, value in given.items():
+            if not math.isfinite(value):
+                raise ValueRejectedError(f"start= of '{key}' is {value!r}; it must be finite.")
         x = first_place(model, chart, filter_.limits, given)
         known = np.nan_to_num(self._known)
         filter_.turns = turning(filter_, x, known)
@@ -103,7 +106,7 @@ class Tracker:
         for key, value in uncertainty.items():
             if str(key) not in names:
                 raise UnknownNameError(f"'{key}' is not estimated. {suggest(str(key), names, 'coordinate')}")
-            deviations[names[str(key)]] = _positive(key, value)
+            deviations[names[str(key)]] = checked_positive(key, value)
         filter_.widening.deviations = deviations
         belief = Belief((len(x), len(deviations), len(layout.groups)))
         belief.x[:] = x
@@ -179,15 +182,17 @@ class Tracker:
         UnknownNameError
             For a speed that moves nothing here.
         """
+        dt = checked_number(dt, "The length of a step")
         if not (math.isfinite(dt) and dt >= 0):
             raise ValueRejectedError(
                 f"Time goes on: a step of {dt!r} s is none. Steps are finite and not negative."
             )
         speeds = {}
         for key, value in (commands or {}).items():
-            speeds[self._filter.charted.speed(key)] = float(value)
-            if not math.isfinite(value):
+            speed = checked_number(value, f"The commanded speed '{key}'")
+            if not math.isfinite(speed):
                 raise ValueRejectedError(f"The commanded speed '{key}' is {value!r}; it must be finite.")
+            speeds[self._filter.charted.speed(key)] = speed
         self._known, self._modes = self._predicted(dt, speeds, self._values_of_known(given))
         if self._stamp is not None:
             self._stamp += dt
@@ -281,8 +286,12 @@ class Tracker:
             self._filter.reader.check_poses(reading)
         before = self._modes, self._known, self._stamp
         try:
+            known = self._values_of_known(given)
+            # On the way there, what is known was what it was before, if anybody has said so.
+            if not np.isfinite(self._known).all():
+                self._known = known
             self._advance(at, commands)
-            self._known = self._values_of_known(given)
+            self._known = known
             outcome = self._filter.update(self._modes, reading, self._known)
         except BaseException:
             self._modes, self._known, self._stamp = before
@@ -295,6 +304,7 @@ class Tracker:
             if commands:
                 raise ValueRejectedError("Commands need the time they lasted: give at=, or call predict.")
             return
+        at = checked_number(at, "The time of an observation")
         if not math.isfinite(at):
             raise ValueRejectedError(f"The time of an observation is a finite number of seconds, not {at!r}.")
         if self._stamp is not None:
@@ -324,13 +334,6 @@ class Tracker:
     def __repr__(self) -> str:
         sizes = f"{len(self.symbols)} coordinates in {len(self.groups)} groups"
         return f"<Tracker: {sizes}, {len(self.observed)} observed>"
-
-
-def _positive(key: object, value: float) -> float:
-    number = float(value)
-    if not (math.isfinite(number) and number > 0):
-        raise ValueRejectedError(f"The uncertainty of '{key}' is positive and finite, not {value!r}.")
-    return number
 
 
 def _only(values: Mapping[Symbol, float], free: frozenset[Symbol] | None) -> Mapping[Symbol, float]:
