@@ -177,3 +177,30 @@ def test_a_camera_that_nobody_knows_is_found_by_what_stands_still():
     assert estimate.state["door"] == pytest.approx(0.8, abs=4 * estimate.deviation["door"])
     assert estimate.state["camera/x"] == pytest.approx(0.3, abs=4 * estimate.deviation["camera/x"])
     assert len(estimate.tangent) == 7
+
+
+@pytest.mark.parametrize("name", ["bare", "drawn"])
+def test_a_dial_that_begins_again(name):
+    """A turntable goes round twice, and its dial says so within a turn; C and numpy alike."""
+    model = kv.Model()
+    with model.edit() as edit:
+        edit.apply(kv.Continuous(name="q", parent="world", child="plate"))
+    q = model.symbol("q")
+    says = {"bare": q, "drawn": np.arctan2(np.sin(q), np.cos(q))}[name]
+    tracker = Tracker(
+        model,
+        [ObservedExpression("dial", says, 0.01**2, period=2 * np.pi)],
+        start={"q": 3.0},
+        uncertainty={"q": 0.1},
+        process_noise={"q:velocity": 0.1},
+    )
+    assert tracker.turning == {q}
+    for step in range(100):
+        tracker.wait() if step == 50 else None
+        truth = 3.0 + 0.13 * step
+        estimate = tracker.update({"dial": np.remainder(truth, 2 * np.pi)}, at=0.1 * step)
+        off = np.remainder(estimate.state["q"] - truth + np.pi, 2 * np.pi) - np.pi
+        assert abs(off) < 0.02
+        assert estimate.nis < 5
+    with pytest.raises(kv.KineverseError, match="period of 'dial' is positive"):
+        Tracker(model, [ObservedExpression("dial", q, 1.0, period=0.0)])

@@ -34,7 +34,7 @@ _COUNTS = ("observations", "groups", "coordinates")
 _INDICES = (
     "is_pose", "size", "value", "slope", "seen", "white", "first", "place", "first_watch", "watch",
 )  # fmt: skip
-_NUMBERS = ("lower", "upper", "input", "output", "work", "squares")
+_NUMBERS = ("period", "lower", "upper", "input", "output", "work", "squares")
 
 
 class _Problem(ctypes.Structure):
@@ -132,6 +132,7 @@ class NativeSolver:
         self._indices: dict[str, Indices] = {name: np.array(v, dtype=np.int64) for name, v in kept.items()}
         self._squares = np.zeros(len(layout.observations))
         self._numbers = {
+            "period": np.array([one.period for one in layout.observations]),
             "lower": limits.lower,
             "upper": limits.upper,
             "input": self._input,

@@ -20,7 +20,7 @@ typedef struct {
   const int64_t *is_pose, *size, *value, *slope, *seen, *white;
   /* The coordinates of group g are place[first[g]] to place[first[g + 1]]; likewise what is seen of it. */
   const int64_t *first, *place, *first_watch, *watch;
-  const double *lower, *upper;
+  const double *period, *lower, *upper;
   double *input, *output, *work, *squares;
 } Problem;
 
@@ -79,7 +79,10 @@ static double add(const Problem *p, int64_t i, int n, const double *seen, const 
       for (int k = 0; k < 3; k++) turned[k * n + c] = a[k] + once[k] / 2 + factor * twice[k];
     }
   } else {
-    for (int a = 0; a < d; a++) error[a] = z[a] - value[a];
+    for (int a = 0; a < d; a++) {
+      error[a] = z[a] - value[a];
+      if (isfinite(p->period[i])) error[a] -= p->period[i] * rint(error[a] / p->period[i]);
+    }
   }
   double cost = 0.0;
   for (int a = 0; a < d; a++) {

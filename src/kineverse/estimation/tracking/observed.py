@@ -83,11 +83,15 @@ class ObservedExpression:
         Of shape () or (d,).
     covariance
         d×d, or the variance of a scalar.
+    period
+        After which its numbers begin again, as those of an angle that is read off a dial do after 2π; None if
+        they never do.
     """
 
     name: str
     expression: Expression
     covariance: npt.ArrayLike
+    period: float | None = None
 
 
 ObservedLike: TypeAlias = str | ObservedPose | ObservedPosition | ObservedExpression
@@ -109,6 +113,8 @@ class Observation:
         4×4, or (d,).
     covariance
         Of one observation.
+    period
+        After which numbers begin again; inf if they never do.
     """
 
     name: str
@@ -116,6 +122,7 @@ class Observation:
     is_pose: bool
     value: Expression
     covariance: Array
+    period: float = math.inf
 
     @property
     def size(self) -> int:
@@ -175,7 +182,18 @@ def _observation(model: ModelView, item: ObservedLike) -> Observation:
     is_pose = isinstance(item, ObservedPose)
     size = 6 if is_pose else value.shape[0]
     covariance = usual if item.covariance is None else checked_covariance(item.covariance, size, label)
-    return Observation(name, label, is_pose, value, covariance)
+    period = item.period if isinstance(item, ObservedExpression) and item.period is not None else math.inf
+    if not period > 0:
+        raise ValueRejectedError(f"The period of '{label}' is positive, not {period!r}.")
+    return Observation(name, label, is_pose, value, covariance, float(period))
+
+
+def nearest(difference: Array, period: float) -> Array:
+    """Return differences of numbers that begin again after a period, none longer than half of it."""
+    if math.isinf(period):
+        return difference
+    found: Array = difference - period * np.round(difference / period)
+    return found
 
 
 def _vector(item: ObservedExpression) -> Expression:

@@ -11,6 +11,7 @@ from kineverse.errors import ValueRejectedError
 from kineverse.estimation.noise import Array
 
 from .layout import Layout
+from .observed import nearest
 from .reading import Reading
 from .rotations import logarithms, slopes_of_logarithms
 
@@ -67,7 +68,7 @@ class Residuals:
                 slopes[i] = np.concatenate([slope[:3], turn @ slope[3:]])
         for i in seen:
             if i not in errors:
-                errors[i] = values[i] - out[layout.value_slices[i]]
+                errors[i] = nearest(values[i] - out[layout.value_slices[i]], layout.observations[i].period)
         pairs = {}
         for i in seen:
             size = layout.observations[i].size

@@ -16,6 +16,7 @@ from .belief import Belief
 from .filtering import Filter
 from .layout import Layout
 from .modes import Modes
+from .observed import nearest
 
 # Starts are no further apart than this [rad], of an angle that may be anywhere.
 _APART = math.pi / 2
@@ -36,11 +37,19 @@ def turning(filter_: Filter, x: Array, known: Array) -> frozenset[Symbol]:
         except KineverseError:  # a loop that does not close there
             continue
         with np.errstate(invalid="ignore"):  # where the model says nothing finite
-            change = np.abs(after - before).max()
+            change = np.abs(_difference(filter_.layout, before, after)).max()
         is_same = change < _SAME * (1 + np.abs(x).max())
         if is_same and chart.coordinates[i] not in chart.by_speeds:
             found.append(chart.coordinates[i])
     return frozenset(found)
+
+
+def _difference(layout: Layout, before: Array, after: Array) -> Array:
+    """Return by how much a model says something else than before."""
+    found = after - before
+    for one, where in zip(layout.observations, layout.value_slices, strict=True):
+        found[where] = nearest(found[where], one.period)
+    return found
 
 
 def starts(filter_: Filter, first: Belief, known: Array) -> Modes:
