@@ -16,18 +16,17 @@ from .belief import Belief
 from .charted import Charted
 from .layout import Group, Layout
 from .limits import Limits
-from .modes import UNLIKELY, Candidate, Modes
+from .modes import Candidate, Modes
 from .native import NativeSolver, native_library
 from .outliers import Outliers
 from .reading import Reader, Reading
 from .residuals import Residuals
 from .solving import Solver
+from .undoubted import Undoubted
 from .widening import Widening
 
 # Explanations whose predictions are so few deviations apart are one.
 _SAME = 0.3
-# Who is right with this probability is not doubted: what is left changes nothing that counts.
-_SURE = 1 - 1e-6
 _OUTSIDE = 1e-9
 
 
@@ -79,6 +78,7 @@ class Filter:
         self.solver = Solver(layout, self.residuals, self.charted, limits)
         self.widening = Widening(layout, self.residuals, self.charted, self.reader, self.solver.boxes)
         self.native = NativeSolver(layout, limits, self.function) if NativeSolver.suits(layout) else None
+        self.undoubted = Undoubted(layout, self.native, outliers) if self.native and outliers else None
         self.turns: frozenset[Symbol] = frozenset()
         if self.native:
             native_library.prepare()
@@ -170,9 +170,10 @@ class Filter:
 
     def _weighed(self, modes: Modes, reading: Reading, known: Array) -> Outcome:
         """Explain a reading in all ways, and keep the best."""
-        sure, rounds = self._undoubted(modes, reading, known)
-        candidates = [sure] if sure else []
-        left = [number for number in self._seen(reading) if not sure or number not in sure.groups]
+        seen = self._seen(reading)
+        candidates, rounds = self._undoubted(modes, reading, known, seen)
+        sure = {number for candidate in candidates for number in candidate.groups}
+        left = [number for number in seen if number not in sure]
         for mode, belief in enumerate(modes.beliefs):
             groups = modes.groups(mode, left)
             if not groups:
@@ -196,28 +197,16 @@ class Filter:
         ]
         return Outcome(after, nis, dof, tuple(doubted), rounds)
 
-    def _undoubted(self, modes: Modes, reading: Reading, known: Array) -> tuple[Candidate | None, int]:
-        """Return what C finds of groups that are explained in one way, with nothing that may be wrong."""
-        if self.outliers is None or self.native is None or not self.native.is_ready:
-            return None, 0
-        found = self.native.update(modes.best, reading, known)
-        if found is None or found.squares is None:
-            return None, 0
-        sure = []
-        for number in self._seen(reading):
-            seen = [i for i in self.layout.groups[number].seen if reading.seen[i]]
-            wrong = [self.outliers.log_density(self.layout.observations[i]) for i in seen]
-            judged = [
-                self.outliers.judge(float(found.squares[i]), float(reading.log_scale[i]), density)
-                for i, density in zip(seen, wrong, strict=True)
-            ]
-            found.belief.evidence[number] += len(seen) * math.log(1 - self.outliers.fraction)
-            gained = found.belief.evidence[number] - modes.best.evidence[number]
-            is_likely = gained - sum(wrong) > UNLIKELY
-            if modes.alive[:, number].sum() == 1 and is_likely and all(w > _SURE for w, _ in judged):
-                sure.append(number)
-        weights = np.ones(len(self.layout.observations))
-        return Candidate(found.belief, np.empty(0), weights, found.nis, found.dof, sure), found.rounds
+    def _undoubted(
+        self, modes: Modes, reading: Reading, known: Array, groups: list[int]
+    ) -> tuple[list[Candidate], int]:
+        """Return what C finds of groups that can be explained in one way only."""
+        if self.undoubted is None or not self.is_native:
+            return [], 0
+        found, rounds = self.undoubted.explained(modes, reading, known, groups)
+        for candidate in found:
+            self._settle(candidate.belief)
+        return found, rounds
 
     def _explanations(
         self, belief: Belief, reading: Reading, known: Array, groups: list[int]
