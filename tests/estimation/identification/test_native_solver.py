@@ -8,7 +8,7 @@ from part_recordings import JOINTS, recording
 
 from kineverse.estimation.identification.native import solver
 from kineverse.estimation.identification.observations import Observations, observations
-from kineverse.estimation.identification.solving import solve
+from kineverse.estimation.identification.solving import Belief, solve, solve_first
 from kineverse.estimation.identification.starts import Overview, starts
 
 
@@ -36,3 +36,32 @@ def test_c_and_numpy_agree(family: str, how: str) -> None:
         for a, b in zip(slow.motion.at(slow.values), fast.motion.at(fast.values), strict=True):
             np.testing.assert_allclose(a, b, atol=1e-4)
         np.testing.assert_allclose(slow.residuals, fast.residuals, atol=1e-4)
+
+
+@pytest.mark.compiler
+@pytest.mark.parametrize("family", [f for f in JOINTS if f not in ("rigid", "free")])
+@pytest.mark.parametrize("how", ["both noisy", "parent known", "positions"])
+def test_steps_with_joint_values_integrated_out_agree(family: str, how: str) -> None:
+    assert solver.prepare(wait=True)
+    seen = seen_as(how, family)
+    start = next(starts(family, Overview(seen)))
+    near = solve(seen, start.motion, start.values)
+    # C has derivatives in closed form, and numpy takes differences.
+    belief = Belief(near.values.mean(axis=0), np.full(near.motion.joints, 0.3**-2), marginal=True)
+    slow = solve(seen, near.motion, near.values, near.parent, belief, steps=1)
+    fast = solver.solve(seen, near.motion, near.values, near.parent, belief, steps=1)
+    assert fast.cost == pytest.approx(slow.cost, rel=1e-6, abs=1e-6)
+    np.testing.assert_allclose(fast.linear.pose, slow.linear.pose, atol=1e-6)
+
+
+@pytest.mark.compiler
+@pytest.mark.parametrize("family", ["revolute", "planar"])
+def test_the_best_of_several_starts_goes_on(family: str) -> None:
+    assert solver.prepare(wait=True)
+    seen = seen_as("both noisy", family)
+    begin = [*starts(family, Overview(seen))]
+    assert len(begin) > 1
+    slow, fast = solve_first(seen, begin), solver.solve_first(seen, begin)
+    assert slow.converged
+    assert fast.converged
+    np.testing.assert_allclose(slow.residuals, fast.residuals, atol=1e-4)

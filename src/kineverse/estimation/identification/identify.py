@@ -23,8 +23,8 @@ from .observations import Observations, observations
 from .refining import refined
 from .reporting import fit_of
 from .rigid import Array
-from .solving import Solution
-from .starts import Overview, Start, starts
+from .solving import Solution, Start
+from .starts import Overview, starts
 
 Families: TypeAlias = "Iterable[str | Family] | Mapping[str | Family, float] | str | Family | None"
 """Families by name or of one's own; a mapping says how probable they are beforehand."""
@@ -44,7 +44,6 @@ WEIGHTS: Mapping[str, float] = MappingProxyType(
 """How probable families are beforehand, beside each other."""
 
 _UNKNOWN_NOISE = (0.005, math.radians(1.0))
-_FIRST_STEPS = 2
 # What is less probable than the best by this, as a logarithm, is not refined.
 _CHANCE = 15.0
 # By what the unknown noise is multiplied, and how that is believed to be spread: a factor of 5 either way.
@@ -158,15 +157,11 @@ def _most_likely(seen: Observations, family: str | Family, overview: Overview) -
         begin = [Start(motion, values) for motion, values in family_starts(family, seen)]
     else:
         begin = list(starts(family, overview))
-    softened = seen.softened()
-    first = softened[0] if softened else seen
-    begun = [solver.solve(first, s.motion, s.values, steps=_FIRST_STEPS) for s in begin]
-    best = min(begun, key=lambda solution: solution.cost)
-    for softer in softened:
-        best = solver.solve(softer, best.motion, best.values, best.parent)
-    if best.converged and not softened:
-        return best
-    return solver.solve(seen, best.motion, best.values, best.parent)
+    first, *softer = [*seen.softened(), seen]
+    best = solver.solve_first(first, begin)
+    for narrower in softer:
+        best = solver.solve(narrower, best.motion, best.values, best.parent)
+    return best
 
 
 def judged(

@@ -8,6 +8,7 @@ from __future__ import annotations
 import ctypes
 import hashlib
 import threading
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -22,9 +23,10 @@ from .motion import Linear, Member
 from .native_source import SOLVE
 from .observations import Observations
 from .rigid import Array, pose
-from .solving import CLOSE, CLOSE_ENOUGH, STEPS, Belief, Solution, solve
+from .solving import CLOSE, CLOSE_ENOUGH, FIRST_STEPS, STEPS, Belief, Solution, Start, solve, solve_first
 
-_FLAGS = ("-O3", "-lm", *CLOSED)
+# Numbers of its own, that need not agree with those of an interpreter to the last bit.
+_FLAGS = ("-O3", "-ffp-contract=fast", "-fno-rounding-math", "-lm", *CLOSED)
 _COUNTS = ("count", "rows", "joints", "lefts", "rights", "pitched", "reach", "known", "marginal")
 _ARRAYS = ("parent", "child", "parent_covariance", "child_covariance")
 
@@ -71,7 +73,7 @@ class SolverLibrary:
         if compiler is None:
             self._hopeless = True
             return None
-        key = hashlib.sha256(repr((SOLVE, compiler.identity)).encode()).hexdigest()[:40]
+        key = hashlib.sha256(repr((SOLVE, _FLAGS, compiler.identity)).encode()).hexdigest()[:40]
         path = library_cache().find(key)
         if path is not None:
             self._load(path)
@@ -91,7 +93,8 @@ class SolverLibrary:
             self._hopeless = True
             return
         pointer = ctypes.c_void_p
-        code.solve.argtypes = (*(pointer,) * 4, ctypes.c_int64, *(pointer,) * 6)
+        counter = ctypes.c_int64
+        code.solve.argtypes = (pointer, counter, *(pointer,) * 3, counter, counter, *(pointer,) * 6)
         code.solve.restype = ctypes.c_int64
         self._code = code
 
@@ -107,40 +110,68 @@ class SolverLibrary:
         """Do what :func:`.solving.solve` does."""
         if self._code is None or not isinstance(motion, GroupMotion):
             return solve(seen, motion, values, parent, belief, steps)
-        count, rows = len(seen), seen.rows
-        moved = np.empty(25)
-        moved[:9], moved[9:12] = motion.left[:3, :3].ravel(), motion.left[:3, 3]
-        moved[12:21], moved[21:24] = motion.right[:3, :3].ravel(), motion.right[:3, 3]
-        moved[24] = motion.pitch
-        values = np.array(values, dtype=np.float64, order="C")
+        return self._settled(seen, [(motion, values)], parent, belief, steps)
+
+    def solve_first(self, seen: Observations, starts: Sequence[Start]) -> Solution[Member]:
+        """Do what :func:`.solving.solve_first` does."""
+        groups = [(s.motion, s.values) for s in starts if isinstance(s.motion, GroupMotion)]
+        if self._code is None or len(groups) < len(starts):
+            return solve_first(seen, starts)
+        return self._settled(seen, groups, None, None, STEPS)
+
+    def _settled(
+        self,
+        seen: Observations,
+        starts: Sequence[tuple[GroupMotion, Array]],
+        parent: Array | None,
+        belief: Belief | None,
+        steps: int,
+    ) -> Solution[Member]:
+        motion = starts[0][0]
+        count, rows, joints, size = len(seen), seen.rows, motion.joints, motion.size
+        belief = belief or Belief.vague(joints)
+        moved = np.array([_packed(start) for start, _ in starts])
+        values = np.array([v for _, v in starts], dtype=np.float64, order="C")
         parents = np.array(seen.parent if parent is None else parent, order="C")
         cost = ctypes.c_double()
         residuals, covariances = np.empty((count, rows)), np.empty((count, rows, rows))
-        belief = belief or Belief.vague(motion.joints)
-        problem = _problem(seen, motion, belief)
         poses = np.zeros((count, 4, 4))
         poses[:, 3, 3] = 1.0
-        linear = Linear(poses, np.empty((count, rows, motion.size)), np.empty((count, rows, motion.joints)))
-        results = (residuals, covariances, *linear)
+        linear = Linear(poses, np.empty((count, rows, size)), np.empty((count, rows, joints)))
+        problem = _problem(seen, motion, belief)
         converged = self._code.solve(
             ctypes.addressof(problem),
+            len(starts),
             moved.ctypes.data,
             values.ctypes.data,
             parents.ctypes.data,
+            FIRST_STEPS,
             steps,
             ctypes.addressof(cost),
-            *(array.ctypes.data for array in results),
+            *(array.ctypes.data for array in (residuals, covariances, *linear)),
         )
         if converged < 0:
             raise MemoryError("There is no memory for so many observations.")
-        motion = replace(
-            motion,
-            left=pose(moved[:9].reshape(3, 3), moved[9:12]),
-            right=pose(moved[12:21].reshape(3, 3), moved[21:24]),
-            pitch=float(moved[24]),
-        )
         settled = converged == 1
-        return Solution(motion, values, cost.value, residuals, covariances, linear, parents, belief, settled)
+        motion = _unpacked(motion, moved[0])
+        return Solution(
+            motion, values[0], cost.value, residuals, covariances, linear, parents, belief, settled
+        )
+
+
+def _packed(motion: GroupMotion) -> Array:
+    """Return what C knows of a member: rotation and place of both sides, and the pitch."""
+    result = np.empty(25)
+    for at, side in ((0, motion.left), (12, motion.right)):
+        result[at : at + 9] = side[:3, :3].ravel()
+        result[at + 9 : at + 12] = side[:3, 3]
+    result[24] = motion.pitch
+    return result
+
+
+def _unpacked(motion: GroupMotion, packed: Array) -> GroupMotion:
+    left, right = (pose(packed[at : at + 9].reshape(3, 3), packed[at + 9 : at + 12]) for at in (0, 12))
+    return replace(motion, left=left, right=right, pitch=float(packed[24]))
 
 
 def _problem(seen: Observations, motion: GroupMotion, belief: Belief) -> _Problem:

@@ -6,39 +6,41 @@ ALGEBRA = r"""
 #include <stdlib.h>
 #include <string.h>
 
-static void times33(const double *a, const double *b, double *c) {
+#define FAST static inline __attribute__((always_inline))
+
+FAST void times33(const double *a, const double *b, double *c) {
   for (int i = 0; i < 3; i++)
     for (int j = 0; j < 3; j++)
       c[3 * i + j] = a[3 * i] * b[j] + a[3 * i + 1] * b[3 + j] + a[3 * i + 2] * b[6 + j];
 }
 
-static void transposed_times33(const double *a, const double *b, double *c) {
+FAST void transposed_times33(const double *a, const double *b, double *c) {
   for (int i = 0; i < 3; i++)
     for (int j = 0; j < 3; j++) c[3 * i + j] = a[i] * b[j] + a[3 + i] * b[3 + j] + a[6 + i] * b[6 + j];
 }
 
-static void times_transposed33(const double *a, const double *b, double *c) {
+FAST void times_transposed33(const double *a, const double *b, double *c) {
   for (int i = 0; i < 3; i++)
     for (int j = 0; j < 3; j++)
       c[3 * i + j] = a[3 * i] * b[3 * j] + a[3 * i + 1] * b[3 * j + 1] + a[3 * i + 2] * b[3 * j + 2];
 }
 
-static void apply(const double *a, const double *v, double *w) {
+FAST void apply(const double *a, const double *v, double *w) {
   for (int i = 0; i < 3; i++) w[i] = a[3 * i] * v[0] + a[3 * i + 1] * v[1] + a[3 * i + 2] * v[2];
 }
 
-static void apply_transposed(const double *a, const double *v, double *w) {
+FAST void apply_transposed(const double *a, const double *v, double *w) {
   for (int i = 0; i < 3; i++) w[i] = a[i] * v[0] + a[3 + i] * v[1] + a[6 + i] * v[2];
 }
 
-static void cross(const double *a, const double *b, double *c) {
+FAST void cross(const double *a, const double *b, double *c) {
   c[0] = a[1] * b[2] - a[2] * b[1];
   c[1] = a[2] * b[0] - a[0] * b[2];
   c[2] = a[0] * b[1] - a[1] * b[0];
 }
 
 /* I + s [v]x + c [v]x^2 */
-static void series(const double *v, double s, double c, double *r) {
+FAST void series(const double *v, double s, double c, double *r) {
   double square = v[0] * v[0] + v[1] * v[1] + v[2] * v[2];
   for (int i = 0; i < 3; i++)
     for (int j = 0; j < 3; j++) r[3 * i + j] = c * v[i] * v[j] + (i == j ? 1.0 - c * square : 0.0);
@@ -46,7 +48,7 @@ static void series(const double *v, double s, double c, double *r) {
   r[3] += s * v[2]; r[6] -= s * v[1]; r[7] += s * v[0];
 }
 
-static void exponential(const double *v, double *r) {
+FAST void exponential(const double *v, double *r) {
   double square = v[0] * v[0] + v[1] * v[1] + v[2] * v[2], angle = sqrt(square);
   if (square < 1e-10) series(v, 1.0 - square / 6.0, 0.5 - square / 24.0, r);
   else series(v, sin(angle) / angle, (1.0 - cos(angle)) / square, r);
@@ -82,64 +84,80 @@ static void logarithm(const double *r, double *v) {
   for (int i = 0; i < 3; i++) v[i] = factor * axis[i];
 }
 
-/* The lower factor of a positive definite matrix in its place; 0 if it is none. */
-static int factorise(double *a, int n) {
+/* The lower factor of a positive definite matrix in its place, with the reciprocals of its diagonal; returns
+   the product of the diagonal, or 0 if it is none. */
+FAST double factorise(double *a, const int n) {
+  double product = 1.0;
   for (int j = 0; j < n; j++) {
     for (int k = 0; k < j; k++)
       for (int i = j; i < n; i++) a[n * i + j] -= a[n * i + k] * a[n * j + k];
-    if (!(a[n * j + j] > 0.0)) return 0;
-    double d = a[n * j + j] = sqrt(a[n * j + j]);
-    for (int i = j + 1; i < n; i++) a[n * i + j] /= d;
+    if (!(a[n * j + j] > 0.0)) return 0.0;
+    double d = sqrt(a[n * j + j]), reciprocal = 1.0 / d;
+    product *= d;
+    a[n * j + j] = reciprocal;
+    for (int i = j + 1; i < n; i++) a[n * i + j] *= reciprocal;
   }
-  return 1;
+  return product;
 }
 
-static void forward(const double *l, int n, double *x) {
+/* Solve L L' x = b in the place of b. */
+static void resolve(const double *l, int n, double *x) {
   for (int i = 0; i < n; i++) {
     for (int k = 0; k < i; k++) x[i] -= l[n * i + k] * x[k];
-    x[i] /= l[n * i + i];
+    x[i] *= l[n * i + i];
   }
-}
-
-static void backward(const double *l, int n, double *x) {
   for (int i = n - 1; i >= 0; i--) {
     for (int k = i + 1; k < n; k++) x[i] -= l[n * k + i] * x[k];
-    x[i] /= l[n * i + i];
+    x[i] *= l[n * i + i];
   }
 }
 
-static int invert(const double *a, int n, double *inverse) {
-  double l[36], x[6];
-  memcpy(l, a, n * n * sizeof(double));
-  if (!factorise(l, n)) return 0;
-  for (int j = 0; j < n; j++) {
-    for (int i = 0; i < n; i++) x[i] = i == j;
-    forward(l, n, x);
-    backward(l, n, x);
-    for (int i = 0; i < n; i++) inverse[n * i + j] = x[i];
-  }
-  return 1;
+/* The inverse of a positive definite matrix; returns the root of its determinant, or 0 if it is none. */
+FAST double invert(const double *a, const int n, double *inverse) {
+  double l[36], root;
+  for (int i = 0; i < n * n; i++) l[i] = a[i];
+  root = factorise(l, n);
+  if (root == 0.0) return 0.0;
+  for (int j = 0; j < n; j++)
+    for (int i = j + 1; i < n; i++) {
+      double sum = 0.0;
+      for (int k = j; k < i; k++) sum -= l[n * i + k] * l[n * k + j];
+      l[n * i + j] = sum * l[n * i + i];
+    }
+  for (int i = 0; i < n; i++)
+    for (int j = 0; j <= i; j++) {
+      double sum = 0.0;
+      for (int k = i; k < n; k++) sum += l[n * k + i] * l[n * k + j];
+      inverse[n * i + j] = inverse[n * j + i] = sum;
+    }
+  return root;
 }
 
-static double squared(const double *error, const double *covariance, int n) {
-  double l[36], x[6], sum = 0.0;
-  memcpy(l, covariance, n * n * sizeof(double));
-  memcpy(x, error, n * sizeof(double));
-  if (!factorise(l, n)) return NAN;
-  forward(l, n, x);
-  for (int i = 0; i < n; i++) sum += x[i] * x[i];
+/* e' W e */
+FAST double squared(const double *e, const double *W, const int n) {
+  double sum = 0.0;
+  for (int i = 0; i < n; i++)
+    for (int j = 0; j < n; j++) sum += e[i] * W[n * i + j] * e[j];
   return sum;
 }
 
 /* A covariance in the axes whose columns are R's. */
-static void turn(const double *covariance, const double *R, int n, double *turned) {
+FAST void turn(const double *covariance, const double *R, const int n, double *turned) {
   for (int i = 0; i < n; i += 3)
-    for (int j = 0; j < n; j += 3) {
+    for (int j = 0; j <= i; j += 3) {
       double block[9], half[9], whole[9];
-      for (int r = 0; r < 9; r++) block[r] = covariance[n * (i + r / 3) + j + r % 3];
+      for (int r = 0; r < 3; r++)
+        for (int c = 0; c < 3; c++) block[3 * r + c] = covariance[n * (i + r) + j + c];
       transposed_times33(R, block, half);
       times33(half, R, whole);
-      for (int r = 0; r < 9; r++) turned[n * (i + r / 3) + j + r % 3] = whole[r];
+      for (int r = 0; r < 3; r++)
+        for (int c = 0; c < 3; c++)
+          turned[n * (i + r) + j + c] = turned[n * (j + c) + i + r] = whole[3 * r + c];
     }
+}
+
+/* An error in other axes. */
+FAST void turn_back(const double *R, const double *error, const int n, double *turned) {
+  for (int i = 0; i < n; i += 3) apply(R, error + i, turned + i);
 }
 """

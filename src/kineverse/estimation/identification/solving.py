@@ -13,13 +13,14 @@ poses as unknowns.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Generic, Self, TypeVar
+from typing import Generic, NamedTuple, Self, TypeVar
 
 import numpy as np
 
 from .matrices import inverted, log_determinants, times
-from .motion import Linear, Motion, Prior
+from .motion import Linear, Member, Motion, Prior
 from .observations import Observations
 from .rigid import Array, exponential, logarithm, pose, skew
 
@@ -27,6 +28,8 @@ M = TypeVar("M", bound=Motion)
 M_co = TypeVar("M_co", bound=Motion, covariant=True)
 
 STEPS = 40
+# Of each of several starts, before the best of them goes on.
+FIRST_STEPS = 2
 # What the last step promises to reduce the cost by. A hundredth of a standard deviation is as near as
 # widths are known.
 CLOSE, CLOSE_ENOUGH = 1e-7, 1e-4
@@ -55,6 +58,13 @@ class Belief:
     def vague(joints: int) -> Belief:
         """Return the belief that keeps joint values finite where nothing tells them, and nothing else."""
         return Belief(np.zeros(joints), np.full(joints, 1e-4))
+
+
+class Start(NamedTuple):
+    """A member of a family and joint values (N, k)."""
+
+    motion: Member
+    values: Array
 
 
 @dataclass(frozen=True)
@@ -174,6 +184,15 @@ def solve(
         belief,
         converged,
     )
+
+
+def solve_first(seen: Observations, starts: Sequence[Start]) -> Solution[Member]:
+    """Return the most likely member of a family, from the best of several starts after few steps."""
+    if len(starts) == 1:
+        return solve(seen, *starts[0])
+    begun = [solve(seen, *start, steps=FIRST_STEPS) for start in starts]
+    best = min(begun, key=lambda solution: solution.cost)
+    return best if best.converged else solve(seen, best.motion, best.values, best.parent)
 
 
 def _point(seen: Observations, motion: M, values: Array, parent: Array, belief: Belief) -> _Point[M]:

@@ -3,22 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 from functools import cached_property
 
 import numpy as np
 
 from .groups import GROUPS, GroupMotion
-from .motion import Member
 from .observations import Observations
 from .rigid import Array, frame_along, inverse, logarithm, mean_rotation, pose
-
-
-class Start:
-    """A member of a family and joint values (N, k)."""
-
-    def __init__(self, motion: Member, values: Array) -> None:
-        self.motion = motion
-        self.values = values
+from .solving import Start
 
 
 class Overview:
@@ -117,9 +110,7 @@ def _about_an_axis(name, overview, axis, start) -> Iterator[Start]:  # type: ign
         if overview.rows == 3:
             right = np.eye(4)
             right[0, 3] = np.mean(np.linalg.norm(lever, axis=1))
-            result.motion = GroupMotion(
-                result.motion.group, 3, result.motion.left, right, result.motion.pitch
-            )
+            result = Start(replace(result.motion, right=right), result.values)
         yield result
 
 
@@ -147,8 +138,7 @@ def _about_a_point(overview, joints, start) -> Iterator[Start]:  # type: ignore[
     result = start(frame, centre, values)
     right = np.eye(4)
     right[0, 3] = radius
-    result.motion = GroupMotion(result.motion.group, 3, result.motion.left, right)
-    yield result
+    yield Start(replace(result.motion, right=right), result.values)
 
 
 def _directions(centred: Array) -> Array:
