@@ -8,7 +8,8 @@ contribute
 so a motion that is short beside the noise costs next to nothing, and one that is long pays for every joint
 value by how much better than s it is known. The mean μ and the parameters follow by Laplace's method. All
 families have a mean pose, of which nothing is known beforehand, and it is measured alike in all of them; what
-a family has beyond that has a proper prior: directions are anywhere on the sphere, levers within reach.
+a family has beyond that has a proper prior: directions are anywhere on the sphere, levers within reach. So
+does the point of the child whose slides are meant, see :mod:`.sliding`.
 """
 
 from __future__ import annotations
@@ -21,6 +22,7 @@ import numpy as np
 from .matrices import inverted
 from .motion import Member
 from .rigid import Array
+from .sliding import by_point
 from .solving import Solution
 from .widths import Alone, Widths, alone, widths
 
@@ -72,11 +74,11 @@ def _together(seen: Alone, width: Widths) -> tuple[Array, Array]:
 
 
 def _information(solution: Solution[Member], width: Widths, values: Array) -> Array:
-    """Return the information about parameters and μ."""
+    """Return the information about parameters, μ and the point that slides."""
     linear = solution.motion.at(values)
     by_joints = linear.by_joints
     moved = (by_joints * width.deviations**2) @ np.swapaxes(by_joints, 1, 2)
     weights = inverted(solution.covariance + moved)
-    both = np.concatenate([linear.by_parameters, by_joints], axis=2)
+    both = np.concatenate([linear.by_parameters, by_joints, by_point(solution.motion, values)], axis=2)
     result: Array = (np.swapaxes(both, 1, 2) @ weights @ both).sum(axis=0)
     return result

@@ -60,6 +60,9 @@ class Group:
     reach
         How many components of the child's place in the joint's frame are a lever: beforehand they are
         believed to be within reach.
+    slides
+        How many directions it slides in and turns besides, so that it matters whose slides they are, see
+        :mod:`.sliding`.
     """
 
     name: str
@@ -67,6 +70,7 @@ class Group:
     positions: Freedom
     pitch: bool = False
     reach: int = 0
+    slides: int = 0
 
     def freedom(self, rows: int) -> Freedom:
         """Return the freedom for poses (6) or positions (3)."""
@@ -113,8 +117,14 @@ GROUPS: Mapping[str, Group] = MappingProxyType(
                 "planar",
                 Freedom((VX, VY, WZ), (WX, WY), (VZ, WX, WY)),
                 Freedom((VX, VY), (WX, WY), (VZ,)),
+                slides=2,
             ),
-            Group("free", Freedom((VX, VY, VZ, WX, WY, WZ), (), ()), Freedom((VX, VY, VZ), (), ())),
+            Group(
+                "free",
+                Freedom((VX, VY, VZ, WX, WY, WZ), (), ()),
+                Freedom((VX, VY, VZ), (), ()),
+                slides=3,
+            ),
         )
     }
 )
@@ -164,6 +174,11 @@ class GroupMotion:
     def joints(self) -> int:
         """Number of joint values."""
         return len(self.freedom.joints)
+
+    @property
+    def slides(self) -> int:
+        """Number of components of the sliding point that are unknown, see :mod:`.sliding`."""
+        return self.group.slides if self.rows == 6 else 0
 
     def at(self, values: Array) -> Linear:
         """Return the poses at joint values (N, k)."""
@@ -246,6 +261,9 @@ class GroupMotion:
         if VX in freedom.left and VY in freedom.left and reach:
             lever = self.right[:reach, 3] / REACH
             log -= 0.5 * float(lever @ lever) + 0.5 * reach * math.log(math.tau * REACH**2)
+        if self.slides:
+            place = self.right[: self.slides, 3] / REACH
+            log -= 0.5 * float(place @ place) + 0.5 * self.slides * math.log(math.tau * REACH**2)
         if self.group.pitch:
             log -= 0.5 * (self.pitch / PITCHES) ** 2 + 0.5 * math.log(math.tau * PITCHES**2)
         # The volume of mean poses per unit of the parameters that move it.
@@ -256,9 +274,10 @@ class GroupMotion:
         log += float(np.sum(np.log(np.maximum(np.linalg.svd(matrix, compute_uv=False), 1e-10))))
         # As wide as half a sphere is, and with its density: a direction that nothing tells stays finite. So
         # does the middle of a turn, which moves nothing where the lever is nothing.
-        precision = np.zeros(self.size + self.joints)
+        precision = np.zeros(self.size + self.joints + self.slides)
         precision[: len(freedom.left)] = [j >= WX for j in freedom.left]
-        precision[self.size :] = [j >= WX for j in freedom.joints]
+        precision[self.size : self.size + self.joints] = [j >= WX for j in freedom.joints]
+        precision[self.size + self.joints :] = REACH**-2
         return log, precision
 
     def named(self) -> dict[str, Array | float]:

@@ -23,6 +23,7 @@ from .observations import Observations, observations
 from .refining import refined
 from .reporting import fit_of
 from .rigid import Array
+from .sliding import slid
 from .solving import Solution, Start
 from .starts import Overview, starts
 
@@ -38,14 +39,16 @@ WEIGHTS: Mapping[str, float] = MappingProxyType(
         "cylindrical": 0.01,
         "spherical": 0.01,
         "planar": 0.01,
-        "free": 0.01,
+        "free": 0.0001,
     }
 )
-"""How probable families are beforehand, beside each other."""
+"""How probable families are beforehand, beside each other. What slides by nothing and turns is a ball in its
+socket too, and a free one is rarer."""
 
 _UNKNOWN_NOISE = (0.005, math.radians(1.0))
-# What is less probable than the best by this, as a logarithm, is not refined.
-_CHANCE = 15.0
+# What is less probable than the best by this, as a logarithm, is not refined. Where noise is large beside the
+# motion and a lever bends it, what each observation says is not known better than this before.
+_CHANCE, _CHANCE_EACH = 15.0, 0.5
 # By what the unknown noise is multiplied, and how that is believed to be spread: a factor of 5 either way.
 _SCALES = np.geomspace(0.01, 100.0, 33)
 _SCALE_SPREAD = math.log(5.0)
@@ -168,9 +171,10 @@ def judged(
     seen: Observations, found: Mapping[str | Family, Solution[Member]], weights: Mapping[str | Family, float]
 ) -> dict[str | Family, tuple[Solution[Member], Evidence]]:
     """Return solutions and their evidence, those that have a chance with joint values integrated out."""
+    found = {name: slid(solution) for name, solution in found.items()}
     first = {name: (solution, evidence(solution)) for name, solution in found.items()}
     logs = {name: known.log_evidence + math.log(weights[name]) for name, (_, known) in first.items()}
-    least = max(logs.values()) - _CHANCE
+    least = max(logs.values()) - _CHANCE - _CHANCE_EACH * len(seen)
     result = {}
     for name, (solution, known) in first.items():
         if logs[name] >= least:

@@ -72,6 +72,11 @@ class Member(Motion, Protocol):
         ...
 
     @property
+    def rows(self) -> int:
+        """6, or 3 for positions only."""
+        ...
+
+    @property
     def kinds(self) -> tuple[int, ...]:
         """What kind of joint value each is: those of one kind share a width."""
         ...
@@ -80,7 +85,7 @@ class Member(Motion, Protocol):
         """Return what is believed of parameters and of the mean of the joint values, for the evidence.
 
         That is the logarithm of its density here, and the precision (n + k,) beside that of :meth:`prior`
-        that keeps directions finite which nothing tells.
+        that keeps directions finite which nothing tells; also (n + k + c,) where a point of the child slides.
         """
         ...
 

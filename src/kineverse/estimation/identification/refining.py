@@ -14,6 +14,7 @@ from .motion import Member
 from .native import solver
 from .observations import Observations
 from .rigid import Array
+from .sliding import slid
 from .solving import Belief, Solution
 from .widths import alone, widths
 
@@ -30,6 +31,7 @@ def refined(seen: Observations, solution: Solution[Member]) -> Solution[Member]:
     known = solution.belief
     before: Array | None = known.precision**-0.5 if known.marginal else None
     for _ in range(_TURNS):
+        solution = slid(solution)
         found = widths(solution.motion, alone(solution))
         wide = np.maximum(found.deviations, _NARROWEST)
         if before is not None and np.all(np.abs(np.log(wide / before)) < _SETTLED):

@@ -11,6 +11,7 @@ from .fit import Fit
 from .groups import GroupMotion
 from .motion import Member
 from .rigid import Array
+from .sliding import of_child
 from .solving import Solution
 
 # A direction that is known no better than this is not known [rad].
@@ -19,9 +20,10 @@ _KNOWN = math.radians(20.0)
 
 def fit_of(solution: Solution[Member], known: Evidence, log: float, probability: float) -> Fit:
     """Return the fit of a family."""
-    motion = solution.motion
+    motion, covariance, values, covariances = of_child(
+        solution.motion, known.covariance.copy(), known.joint_values, known.joint_covariances
+    )
     names = motion.coordinates()
-    covariance = known.covariance.copy()
     if "pitch" in names and isinstance(motion, GroupMotion):
         covariance[-1] *= math.tau  # [m/rad] to [m/revolution]
         covariance[:, -1] *= math.tau
@@ -34,8 +36,8 @@ def fit_of(solution: Solution[Member], known: Evidence, log: float, probability:
         covariance=covariance,
         coordinates=names,
         frame=motion.left if isinstance(motion, GroupMotion) else np.eye(4),
-        joint_values=known.joint_values,
-        deviations=np.sqrt(np.einsum("nii->ni", known.joint_covariances)),
+        joint_values=values,
+        deviations=np.sqrt(np.einsum("nii->ni", covariances)),
         residuals=solution.residuals,
         told=not reason,
         reason=reason,
