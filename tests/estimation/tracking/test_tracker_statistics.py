@@ -192,6 +192,31 @@ def test_hinge_or_drawer():
         assert probabilities[right] > 0.999
 
 
+@pytest.mark.compiler
+@pytest.mark.parametrize("is_compiled", [True, False])
+def test_who_has_to_leave_its_limits_to_explain_is_not_believed(is_compiled):
+    """The evidence is that inside the limits: compared with an integral over them, it is off by one at most."""
+    seen = [0.09, 0.11, 0.1]
+    found, exact = {}, {}
+    for lower in (0.0, 0.08, 0.25):
+        model = part(
+            kv.Prismatic(name="q", parent="world", child="part", axis=(0, 0, 1), lower=lower, upper=0.5)
+        )
+        tracker = Tracker(model, [ObservedPosition("part", covariance=np.eye(3) * 0.01**2)])
+        tracker.wait()
+        if not is_compiled:
+            tracker._filter.native = None
+        q = np.linspace(lower, 0.5, 100_001)
+        prior = np.exp(-(((q - tracker.estimate.state["q"]) / (0.5 - lower) * 2) ** 2) / 2)
+        right = np.prod([np.exp(-(((q - z) / 0.01) ** 2) / 2) for z in seen], axis=0)
+        exact[lower] = np.log((prior * right).sum() / prior.sum())
+        for z in seen:
+            tracker.update({"part": (0, 0, z)})
+        found[lower] = tracker.log_evidence
+    for lower in (0.08, 0.25):
+        assert found[lower] - found[0.0] == pytest.approx(exact[lower] - exact[0.0], rel=0.02, abs=1)
+
+
 def test_locked_or_free_and_a_lock_that_opens():
     model = part(kv.Revolute(name="q", parent="world", child="part", axis=(0, 0, 1), lower=0, upper=1.5))
     start = {"start": {"q": 0.0}, "uncertainty": {"q": 0.01}}

@@ -187,6 +187,26 @@ static int go_on(const Problem *p, int64_t g, Work *w, const double *information
   return 1;
 }
 
+/* What the bounds cost before anything is seen, for a mean at a step from x; below 0 if that is not known. */
+static double beyond(const Problem *p, int64_t g, const Work *w, const double *information,
+                     const double *triangle, const double *mean) {
+  const int n = w->n;
+  const int64_t *place = p->place + p->first[g];
+  double inverse[MOST * MOST], step[MOST], low[MOST], high[MOST], cost = 0.0;
+  int is_inside = 1;
+  for (int i = 0; i < n; i++) {
+    low[i] = p->lower[place[i]] - w->x[i], high[i] = p->upper[place[i]] - w->x[i], step[i] = mean[i];
+    is_inside &= mean[i] >= low[i] && mean[i] <= high[i];
+  }
+  if (is_inside) return 0.0;
+  invert(triangle, inverse, n);
+  if (!between(inverse, step, low, high, n)) return -1.0;
+  for (int r = 0; r < n; r++)
+    for (int c = 0; c < n; c++)
+      cost += (step[r] - mean[r]) * information[place[r] * p->coordinates + place[c]] * (step[c] - mean[c]);
+  return cost > 0.0 ? cost / 2 : 0.0;
+}
+
 /* Update x, η, log evidence of groups and Λ, which lie one after the other; nis and dof of groups are
    results. Groups of which nothing is seen stay. Returns the number of rounds; below 0, it gave up. */
 API int64_t update(const Problem *p, double *belief, const double *seen, const uint8_t *mask,
@@ -194,7 +214,7 @@ API int64_t update(const Problem *p, double *belief, const double *seen, const u
   const int64_t n = p->coordinates, groups = p->groups;
   double *x = belief, *eta = x + n, *evidence = eta + n, *information = evidence + groups;
   Work works[groups];
-  double *room = p->work, before[groups], triangle[MOST * MOST];
+  double *room = p->work, before[groups], outside[groups], triangle[MOST * MOST];
   int64_t open = 0, rounds = 0;
   for (int64_t g = 0; g < groups; g++) {
     Work *w = works + g;
@@ -221,6 +241,8 @@ API int64_t update(const Problem *p, double *belief, const double *seen, const u
     solve(triangle, mean, size);
     for (int r = 0; r < size; r++) along += mean[r] * w->prior[r];
     w->trial_cost = along / 2;
+    outside[g] = beyond(p, g, w, information, triangle, mean);
+    if (outside[g] < 0.0) return -7;
   }
   memcpy(p->input, x, n * sizeof(double));
   while (open) {
@@ -251,7 +273,7 @@ API int64_t update(const Problem *p, double *belief, const double *seen, const u
     for (int r = 0; r < w->n; r++) along += mean[r] * w->vector[r];
     const double least = w->posterior_cost - along / 2;
     nis[g] = least > 0.0 ? 2 * least : 0.0;
-    evidence[g] += (before[g] - log_determinant(triangle, w->n)) / 2 - least;
+    evidence[g] += (before[g] - log_determinant(triangle, w->n)) / 2 - (w->posterior_cost - outside[g]);
     for (int64_t k = p->first_watch[g]; k < p->first_watch[g + 1]; k++)
       if (mask[p->watch[k]]) evidence[g] -= log_scale[p->watch[k]];
     for (int r = 0; r < w->n; r++) {

@@ -77,6 +77,8 @@ class _Work:
         Where it is evaluated next.
     room
         What the limits allow at the best place; None before there is one.
+    outside
+        What the limits cost before anything is seen, where they keep the belief from its mean.
     """
 
     x: Array
@@ -84,6 +86,7 @@ class _Work:
     posterior: Quadratic
     trial: Array
     trial_prior: Quadratic
+    outside: float = 0.0
     cost: float = np.inf
     beyond: float = 0.0
     room: Room | None = None
@@ -197,6 +200,8 @@ class Solver:
         if not is_finite or not _is_better(work, cost, room):
             work.damping = max(10 * work.damping, 1e-3)
             return
+        if work.room is None:
+            work.outside = _least_inside(work.prior, room)
         work.x, work.prior, work.cost, work.room = work.trial, work.trial_prior, cost, room
         weights[list(judged)] = [weight for weight, _ in judged.values()]
         work.posterior = work.prior.with_seen((e, s, judged[i][0]) for i, (e, s) in seen.items())
@@ -253,16 +258,21 @@ class Solver:
             posterior = work.settled or work.posterior
             after.put(group.t, posterior)
             # What the cost would be without limits; for what is linear, this is the innovation in S⁻¹.
-            least = posterior.least
-            nis[number] = max(2 * least, 0.0)
+            nis[number] = max(2 * posterior.least, 0.0)
             dof[number] = sum(self._layout.observations[i].size for i in seen if weights[i] >= 0.5)
             after.evidence[number] += (
                 (work.prior.log_determinant - posterior.log_determinant) / 2
-                - least
+                - (posterior.cost - work.outside)
                 - work.beyond
                 - float(reading.log_scale[seen].sum())
             )
         return Found(after, nis, dof, rounds, None if trust == "all" else weights)
+
+
+def _least_inside(belief: Quadratic, room: Room) -> float:
+    """Return the least cost of a belief inside the limits; 0 if nothing is, which others find out."""
+    step = smallest_between(inverse(belief.matrix), -belief.vector, *room)
+    return 0.0 if step is None else belief.carried(step, None).cost
 
 
 def _is_better(work: _Work, cost: float, room: Room) -> bool:
