@@ -10,6 +10,7 @@ from kineverse.estimation.identification.native import solver
 from kineverse.estimation.identification.observations import Observations, observations
 from kineverse.estimation.identification.solving import Belief, solve, solve_first
 from kineverse.estimation.identification.starts import Overview, starts
+from kineverse.estimation.identification.widths import alone, widths
 
 
 def seen_as(how: str, family: str) -> Observations:
@@ -65,3 +66,20 @@ def test_the_best_of_several_starts_goes_on(family: str) -> None:
     assert slow.converged
     assert fast.converged
     np.testing.assert_allclose(slow.residuals, fast.residuals, atol=1e-4)
+
+
+@pytest.mark.compiler
+@pytest.mark.parametrize("family", [f for f in JOINTS if f != "rigid"])
+@pytest.mark.parametrize("how", ["both noisy", "positions"])
+def test_widths_agree(family: str, how: str) -> None:
+    assert solver.prepare(wait=True)
+    seen = seen_as(how, family)
+    solution = solve_first(seen, [*starts(family, Overview(seen))])
+    slow, fast = alone(solution, native=False), alone(solution)
+    np.testing.assert_allclose(slow.values, fast.values, rtol=1e-8, atol=1e-10)
+    np.testing.assert_allclose(slow.covariances, fast.covariances, rtol=1e-8, atol=1e-12)
+    assert fast.log_likelihood == pytest.approx(slow.log_likelihood, rel=1e-10)
+    wide, width = widths(solution.motion, slow, native=False), widths(solution.motion, slow)
+    np.testing.assert_allclose(wide.deviations, width.deviations, rtol=1e-8)
+    np.testing.assert_allclose(wide.mean, width.mean, rtol=1e-8, atol=1e-10)
+    assert width.log_density == pytest.approx(wide.log_density, rel=1e-10)

@@ -55,6 +55,11 @@ class SolverLibrary:
         """Whether C does the work."""
         return self._code is not None
 
+    @property
+    def code(self) -> Any:
+        """The compiled functions, or None."""
+        return self._code
+
     def prepare(self, wait: bool = False) -> bool:
         """Take it from the cache or have it compiled in the background; return whether it is there."""
         if self._code is not None:
@@ -96,6 +101,9 @@ class SolverLibrary:
         counter = ctypes.c_int64
         code.solve.argtypes = (pointer, counter, *(pointer,) * 3, counter, counter, *(pointer,) * 6)
         code.solve.restype = ctypes.c_int64
+        code.alone.argtypes = (*(counter,) * 3, ctypes.c_double, *(pointer,) * 5)
+        code.widths.argtypes = (counter, counter, *(pointer,) * 3, counter, *(pointer,) * 3)
+        code.alone.restype = code.widths.restype = ctypes.c_double
         self._code = code
 
     def solve(

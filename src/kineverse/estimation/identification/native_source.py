@@ -4,12 +4,14 @@ from .native_algebra import ALGEBRA
 from .native_look import LOOK
 from .native_step import STEP
 from .native_widening import WIDEN
+from .native_widths import WIDTHS
 
 SOLVE = (
     ALGEBRA
     + LOOK
     + WIDEN
     + STEP
+    + WIDTHS
     + r"""
 /* Take steps until they are small; returns whether they became so. What was found is in *here then. */
 static int64_t settle(const Problem *p, const Weights *w, Motion *now, Observation **here,

@@ -14,12 +14,15 @@ import numpy as np
 
 from .matrices import inverted, log_determinants, times
 from .motion import Member
+from .native import solver
 from .rigid import Array
 from .solving import Solution
 
 # From hardly anything to more than there is [m], [rad].
 _GRID = np.geomspace(1e-5, 10.0, 61)
 _LITTLE = 1e-6
+# Joint values that C has room for.
+_MOST = 6
 _STEP = math.log(float(_GRID[1] / _GRID[0]))
 
 
@@ -40,9 +43,15 @@ class Alone:
     log_likelihood: float
 
 
-def alone(solution: Solution[Member]) -> Alone:
-    """Return joint values by the observations alone, by the quadratic at the solution."""
-    weights, by_joints = inverted(solution.covariance), solution.linear.by_joints
+def alone(solution: Solution[Member], native: bool = True) -> Alone:
+    """Return joint values by the observations alone, by the quadratic at the solution.
+
+    It is done in C where it can be and ``native`` is true.
+    """
+    by_joints = solution.linear.by_joints
+    if native and solver.is_native and by_joints.shape[2] <= _MOST:
+        return _alone(solution)
+    weights = inverted(solution.covariance)
     weighted = np.swapaxes(by_joints, 1, 2) @ weights
     # A turn that moves nothing is known as little as can be, and so little that it does not matter.
     covariances = inverted(weighted @ by_joints + _LITTLE * np.eye(by_joints.shape[2]))
@@ -52,6 +61,17 @@ def alone(solution: Solution[Member]) -> Alone:
     return Alone(
         solution.values + change, covariances, log - 0.5 * log_determinants(math.tau * solution.covariance)
     )
+
+
+def _alone(solution: Solution[Member]) -> Alone:
+    count, rows, joints = solution.linear.by_joints.shape
+    given = [
+        np.ascontiguousarray(x) for x in (solution.covariance, solution.linear.by_joints, solution.residuals)
+    ]
+    values, covariances = np.array(solution.values, order="C"), np.empty((count, joints, joints))
+    pointers = (x.ctypes.data for x in (*given, values, covariances))
+    log: float = solver.code.alone(count, rows, joints, _LITTLE, *pointers)
+    return Alone(values, covariances, log)
 
 
 @dataclass(frozen=True)
@@ -72,8 +92,10 @@ class Widths:
     log_density: float
 
 
-def widths(motion: Member, seen: Alone) -> Widths:
-    """Return the most likely widths of the motion."""
+def widths(motion: Member, seen: Alone, native: bool = True) -> Widths:
+    """Return the most likely widths of the motion; in C like :func:`alone`."""
+    if native and solver.is_native and motion.joints <= _MOST:
+        return _widths(motion, seen)
     kinds = np.array(motion.kinds)
     deviations, occam = np.zeros(len(kinds)), 0.0
     variances = np.einsum("nii->ni", seen.covariances)
@@ -87,6 +109,29 @@ def widths(motion: Member, seen: Alone) -> Widths:
     off = seen.values - mean
     log = -0.5 * float(np.sum(off * times(weights, off))) - 0.5 * log_determinants(math.tau * total)
     return Widths(deviations, mean, log + occam)
+
+
+def _widths(motion: Member, seen: Alone) -> Widths:
+    kinds, deviations, mean = (
+        np.array(motion.kinds, dtype=np.int64),
+        np.empty(motion.joints),
+        np.empty(motion.joints),
+    )
+    values, covariances = np.ascontiguousarray(seen.values), np.ascontiguousarray(seen.covariances)
+    log: float = solver.code.widths(
+        len(values),
+        motion.joints,
+        kinds.ctypes.data,
+        values.ctypes.data,
+        covariances.ctypes.data,
+        len(_GRID),
+        _GRID.ctypes.data,
+        deviations.ctypes.data,
+        mean.ctypes.data,
+    )
+    if math.isnan(log) and np.isfinite(values).all():
+        raise MemoryError("There is no memory for so many observations.")
+    return Widths(deviations, mean, log)
 
 
 def _width(values: Array, variances: Array) -> tuple[float, float]:
