@@ -31,7 +31,7 @@ class Estimate:
         The normalised innovation squared of the last update and the number of its parts: χ² distributed, if
         noise is what the covariances say.
     rounds
-        How many times the model was evaluated.
+        How many times the model was evaluated; at 50 it was left where it was, although it had not settled.
     stamp
         [s]; None if the tracker has not heard of time.
     """
@@ -81,7 +81,10 @@ class Estimate:
 
     @cached_property
     def deviation(self) -> Mapping[Symbol | str, float]:
-        """The standard deviation of each coordinate, by symbol and by name [m], [rad]."""
+        """The standard deviation of each coordinate, by symbol and by name [m], [rad].
+
+        That of the Gaussian without limits; at a limit the state varies by less, as it stays inside.
+        """
         found: dict[Symbol | str, float] = {}
         for number, group in enumerate(self._layout.groups):
             basis = self._filter.charted.basis(number, self._belief.x[group.x], self._known)
