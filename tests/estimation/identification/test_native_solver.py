@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from part_recordings import JOINTS, recording
 
+from kineverse.estimation.identification.groups import GroupMotion
 from kineverse.estimation.identification.native import solver
 from kineverse.estimation.identification.observations import Observations, observations
 from kineverse.estimation.identification.solving import Belief, solve, solve_first
@@ -83,3 +84,16 @@ def test_widths_agree(family: str, how: str) -> None:
     np.testing.assert_allclose(wide.deviations, width.deviations, rtol=1e-8)
     np.testing.assert_allclose(wide.mean, width.mean, rtol=1e-8, atol=1e-10)
     assert width.log_density == pytest.approx(wide.log_density, rel=1e-10)
+
+
+@pytest.mark.compiler
+@pytest.mark.parametrize("family", [*JOINTS])
+@pytest.mark.parametrize("how", ["both noisy", "positions"])
+def test_poses_agree(family: str, how: str) -> None:
+    assert solver.prepare(wait=True)
+    start = next(starts(family, Overview(seen_as(how, family))))
+    assert isinstance(start.motion, GroupMotion)
+    for slow, fast in zip(
+        start.motion.at(start.values, native=False), start.motion.at(start.values), strict=True
+    ):
+        np.testing.assert_allclose(slow, fast, atol=1e-13)

@@ -18,6 +18,7 @@ from typing import Self
 
 import numpy as np
 
+from .library import at, library
 from .motion import Linear, Prior
 from .rigid import Array, exponential, pose, right_jacobian, skew
 
@@ -180,8 +181,10 @@ class GroupMotion:
         """Number of components of the sliding point that are unknown, see :mod:`.sliding`."""
         return self.group.slides if self.rows == 6 else 0
 
-    def at(self, values: Array) -> Linear:
-        """Return the poses at joint values (N, k)."""
+    def at(self, values: Array, native: bool = True) -> Linear:
+        """Return the poses at joint values (N, k); it is done in C where it can be and ``native`` is true."""
+        if native and library.is_native:
+            return at(self, values)
         freedom = self.freedom
         twist = np.zeros((len(values), 6))
         twist[:, freedom.joints] = values

@@ -63,6 +63,31 @@ static void begin(const Problem *p, const double *values, const double *parents,
   }
 }
 
+static void keep(const Problem *p, const Observation *o, double *pose, double *by_parameters,
+                 double *by_joints) {
+  int64_t size = size_of(p), joints = p->joints;
+  for (int r = 0; r < p->rows; r++) {
+    memcpy(by_parameters + size * r, o->by_parameters + MOST * r, size * sizeof(double));
+    for (int j = 0; j < joints; j++) by_joints[joints * r + j] = o->by_joints[6 * j + r];
+  }
+  for (int i = 0; i < 3; i++) {
+    for (int j = 0; j < 3; j++) pose[4 * i + j] = o->H_R[3 * i + j];
+    pose[4 * i + 3] = o->lever[i];
+  }
+}
+
+/* As at in groups.py. */
+EXPORT void at(const Problem *p, int64_t count, const Motion *m, const double *values, double *poses,
+               double *by_parameters, double *by_joints) {
+  Observation o;
+  for (int64_t k = 0; k < count; k++) {
+    memcpy(o.values, values + p->joints * k, p->joints * sizeof(double));
+    if (p->rows == 6) place(p, m, &o, 6);
+    else place(p, m, &o, 3);
+    int64_t each = p->rows * k;
+    keep(p, &o, poses + 16 * k, by_parameters + size_of(p) * each, by_joints + p->joints * each);
+  }
+}
 
 /* As solve_first in solving.py. Returns whether it converged, or -1 without memory. */
 EXPORT int64_t solve(const Problem *p, int64_t starts, Motion *motion, double *values, double *parents,
@@ -103,17 +128,10 @@ EXPORT int64_t solve(const Problem *p, int64_t starts, Motion *motion, double *v
     memcpy(values + joints * k, o->values, joints * sizeof(double));
     memcpy(residuals + rows * k, o->residual, rows * sizeof(double));
     memcpy(covariances + rows * rows * k, o->covariance, rows * rows * sizeof(double));
-    for (int r = 0; r < rows; r++) {
-      memcpy(by_parameters + size * (rows * k + r), o->by_parameters + MOST * r, size * sizeof(double));
-      for (int j = 0; j < joints; j++) by_joints[joints * (rows * k + r) + j] = o->by_joints[6 * j + r];
-    }
-    for (int i = 0; i < 9; i++) {
-      parents[16 * k + 4 * (i / 3) + i % 3] = o->parent_R[i];
-      poses[16 * k + 4 * (i / 3) + i % 3] = o->H_R[i];
-    }
+    keep(p, o, poses + 16 * k, by_parameters + rows * size * k, by_joints + rows * joints * k);
     for (int i = 0; i < 3; i++) {
+      for (int j = 0; j < 3; j++) parents[16 * k + 4 * i + j] = o->parent_R[3 * i + j];
       parents[16 * k + 4 * i + 3] = o->parent_p[i];
-      poses[16 * k + 4 * i + 3] = o->lever[i];
     }
   }
   free(memory);

@@ -12,9 +12,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from .library import library
 from .matrices import inverted, log_determinants, times
 from .motion import Member
-from .native import solver
 from .rigid import Array
 from .solving import Solution
 
@@ -49,7 +49,7 @@ def alone(solution: Solution[Member], native: bool = True) -> Alone:
     It is done in C where it can be and ``native`` is true.
     """
     by_joints = solution.linear.by_joints
-    if native and solver.is_native and by_joints.shape[2] <= _MOST:
+    if native and library.is_native and by_joints.shape[2] <= _MOST:
         return _alone(solution)
     weights = inverted(solution.covariance)
     weighted = np.swapaxes(by_joints, 1, 2) @ weights
@@ -70,7 +70,7 @@ def _alone(solution: Solution[Member]) -> Alone:
     ]
     values, covariances = np.array(solution.values, order="C"), np.empty((count, joints, joints))
     pointers = (x.ctypes.data for x in (*given, values, covariances))
-    log: float = solver.code.alone(count, rows, joints, _LITTLE, *pointers)
+    log: float = library.code.alone(count, rows, joints, _LITTLE, *pointers)
     return Alone(values, covariances, log)
 
 
@@ -94,7 +94,7 @@ class Widths:
 
 def widths(motion: Member, seen: Alone, native: bool = True) -> Widths:
     """Return the most likely widths of the motion; in C like :func:`alone`."""
-    if native and solver.is_native and motion.joints <= _MOST:
+    if native and library.is_native and motion.joints <= _MOST:
         return _widths(motion, seen)
     kinds = np.array(motion.kinds)
     deviations, occam = np.zeros(len(kinds)), 0.0
@@ -118,7 +118,7 @@ def _widths(motion: Member, seen: Alone) -> Widths:
         np.empty(motion.joints),
     )
     values, covariances = np.ascontiguousarray(seen.values), np.ascontiguousarray(seen.covariances)
-    log: float = solver.code.widths(
+    log: float = library.code.widths(
         len(values),
         motion.joints,
         kinds.ctypes.data,

@@ -1,0 +1,156 @@
+"""What of identification is done in C, compiled in the background and kept like compiled functions.
+
+Until then, and without a compiler, numpy does the same.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import functools
+import hashlib
+import threading
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from kineverse.compile.cache import library_cache
+from kineverse.compile.toolchain import CLOSED, toolchain
+from kineverse.compile.worker import Build, request
+
+from .motion import Linear
+from .native_source import SOLVE
+from .rigid import Array
+
+if TYPE_CHECKING:
+    from .groups import Group, GroupMotion
+
+# Numbers of its own, that need not agree with those of an interpreter to the last bit.
+_FLAGS = ("-O3", "-ffp-contract=fast", "-fno-rounding-math", "-lm", *CLOSED)
+_COUNTS = ("count", "rows", "joints", "lefts", "rights", "pitched", "reach", "known", "marginal")
+ARRAYS = ("parent", "child", "parent_covariance", "child_covariance")
+
+
+class Problem(ctypes.Structure):
+    """What is to be solved, as C has it."""
+
+    _fields_ = (
+        *((name, ctypes.c_int64) for name in _COUNTS),
+        *((name, ctypes.c_int64 * 6) for name in ("joint", "left", "right")),
+        *((name, ctypes.c_void_p) for name in ARRAYS),
+        *((name, ctypes.c_double) for name in ("reach_scale", "pitch_scale", "close")),
+        *((name, ctypes.c_double * 6) for name in ("mean", "precision")),
+    )
+
+
+class Library:
+    """The compiled functions, once there are any; for the whole process."""
+
+    def __init__(self) -> None:
+        self._code: Any = None
+        self._build: Build | None = None
+        self._hopeless = False
+        self._lock = threading.Lock()
+
+    @property
+    def is_native(self) -> bool:
+        """Whether C does the work."""
+        return self._code is not None
+
+    @property
+    def code(self) -> Any:
+        """The compiled functions, or None."""
+        return self._code
+
+    def prepare(self, wait: bool = False) -> bool:
+        """Take it from the cache or have it compiled in the background; return whether it is there."""
+        if self._code is not None:
+            return True
+        with self._lock:
+            if self._build is None and self._code is None:
+                self._build = self._seek()
+            build = self._build
+        if wait and build is not None:
+            build.wait(None)
+            self._built(build)
+        return self.is_native
+
+    def _seek(self) -> Build | None:
+        compiler = None if self._hopeless else toolchain()
+        if compiler is None:
+            self._hopeless = True
+            return None
+        key = hashlib.sha256(repr((SOLVE, _FLAGS, compiler.identity)).encode()).hexdigest()[:40]
+        path = library_cache().find(key)
+        if path is not None:
+            self._load(path)
+            return None
+        return request(key, compiler, lambda: SOLVE, _FLAGS, self._built)
+
+    def _built(self, build: Build) -> None:
+        if build.path is not None and self._code is None:
+            self._load(build.path)
+        self._hopeless = self._code is None and not build.forgotten
+        self._build = None
+
+    def _load(self, path: str) -> None:
+        try:
+            code = ctypes.CDLL(path)
+        except OSError:
+            self._hopeless = True
+            return
+        pointer = ctypes.c_void_p
+        counter = ctypes.c_int64
+        code.solve.argtypes = (pointer, counter, *(pointer,) * 3, counter, counter, *(pointer,) * 6)
+        code.solve.restype = ctypes.c_int64
+        code.at.argtypes = (pointer, counter, *(pointer,) * 5)
+        code.at.restype = None
+        code.alone.argtypes = (*(counter,) * 3, ctypes.c_double, *(pointer,) * 5)
+        code.widths.argtypes = (counter, counter, *(pointer,) * 3, counter, *(pointer,) * 3)
+        code.alone.restype = code.widths.restype = ctypes.c_double
+        self._code = code
+
+
+library = Library()
+
+
+@functools.cache
+def problem_of(group: Group, rows: int) -> Problem:
+    """Return the problem with what a family says, and nothing else. It is shared: copy it."""
+    freedom, problem = group.freedom(rows), Problem()
+    problem.rows, problem.joints = rows, len(freedom.joints)
+    problem.lefts, problem.rights = len(freedom.left), len(freedom.right)
+    problem.pitched, problem.reach = group.pitch, group.reach
+    for name, components in (("joint", freedom.joints), ("left", freedom.left), ("right", freedom.right)):
+        getattr(problem, name)[: len(components)] = components
+    return problem
+
+
+def packed(motion: GroupMotion) -> Array:
+    """Return what C knows of a member: rotation and place of both sides, and the pitch."""
+    result = np.empty(25)
+    for at, side in ((0, motion.left), (12, motion.right)):
+        result[at : at + 9] = side[:3, :3].ravel()
+        result[at + 9 : at + 12] = side[:3, 3]
+    result[24] = motion.pitch
+    return result
+
+
+def linear_of(count: int, rows: int, size: int, joints: int) -> Linear:
+    """Return room for poses, of which the last rows are there, and their derivatives."""
+    poses = np.zeros((count, 4, 4))
+    poses[:, 3, 3] = 1.0
+    return Linear(poses, np.empty((count, rows, size)), np.empty((count, rows, joints)))
+
+
+def at(motion: GroupMotion, values: Array) -> Linear:
+    """Return the poses at joint values (N, k), as :meth:`.groups.GroupMotion.at` does."""
+    result = linear_of(len(values), motion.rows, motion.size, motion.joints)
+    moved, values = packed(motion), np.ascontiguousarray(values, dtype=np.float64)
+    library.code.at(
+        ctypes.addressof(problem_of(motion.group, motion.rows)),
+        len(values),
+        moved.ctypes.data,
+        values.ctypes.data,
+        *(array.ctypes.data for array in result),
+    )
+    return result
