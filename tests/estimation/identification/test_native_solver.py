@@ -9,6 +9,7 @@ from part_recordings import JOINTS, recording
 from kineverse.estimation.identification.groups import GroupMotion
 from kineverse.estimation.identification.native import solver
 from kineverse.estimation.identification.observations import Observations, observations
+from kineverse.estimation.identification.sliding import slid
 from kineverse.estimation.identification.solving import Belief, solve, solve_first
 from kineverse.estimation.identification.starts import Overview, starts
 from kineverse.estimation.identification.widths import alone, widths
@@ -97,3 +98,16 @@ def test_poses_agree(family: str, how: str) -> None:
         start.motion.at(start.values, native=False), start.motion.at(start.values), strict=True
     ):
         np.testing.assert_allclose(slow, fast, atol=1e-13)
+
+
+@pytest.mark.compiler
+@pytest.mark.parametrize("family", ["planar", "free"])
+def test_points_that_slide_agree(family: str) -> None:
+    assert solver.prepare(wait=True)
+    seen = seen_as("both noisy", family)
+    solution = solver.solve_first(seen, [*starts(family, Overview(seen))])
+    slow, fast = slid(solution, native=False), slid(solution)
+    assert np.abs(slow.values - solution.values).max() > 1e-3
+    np.testing.assert_allclose(slow.values, fast.values, atol=1e-9)
+    for a, b in zip(slow.linear, fast.linear, strict=True):
+        np.testing.assert_allclose(a, b, atol=1e-9)

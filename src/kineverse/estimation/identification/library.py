@@ -9,6 +9,7 @@ import ctypes
 import functools
 import hashlib
 import threading
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -19,7 +20,7 @@ from kineverse.compile.worker import Build, request
 
 from .motion import Linear
 from .native_source import SOLVE
-from .rigid import Array
+from .rigid import Array, pose
 
 if TYPE_CHECKING:
     from .groups import Group, GroupMotion
@@ -106,6 +107,12 @@ class Library:
         code.at.restype = None
         code.alone.argtypes = (*(counter,) * 3, ctypes.c_double, *(pointer,) * 5)
         code.widths.argtypes = (counter, counter, *(pointer,) * 3, counter, *(pointer,) * 3)
+        code.slid.argtypes = (
+            *(pointer, counter, counter, counter),
+            *(ctypes.c_double, ctypes.c_double, counter),
+            *(pointer,) * 9,
+        )
+        code.slid.restype = counter
         code.alone.restype = code.widths.restype = ctypes.c_double
         self._code = code
 
@@ -133,6 +140,12 @@ def packed(motion: GroupMotion) -> Array:
         result[at + 9 : at + 12] = side[:3, 3]
     result[24] = motion.pitch
     return result
+
+
+def unpacked(motion: GroupMotion, packed: Array) -> GroupMotion:
+    """Return the member that C calls so."""
+    left, right = (pose(packed[at : at + 9].reshape(3, 3), packed[at + 9 : at + 12]) for at in (0, 12))
+    return replace(motion, left=left, right=right, pitch=float(packed[24]))
 
 
 def linear_of(count: int, rows: int, size: int, joints: int) -> Linear:

@@ -4,15 +4,14 @@ from __future__ import annotations
 
 import ctypes
 from collections.abc import Sequence
-from dataclasses import replace
 
 import numpy as np
 
 from .groups import PITCHES, REACH, GroupMotion
-from .library import ARRAYS, Problem, library, linear_of, packed, problem_of
+from .library import ARRAYS, Problem, library, linear_of, packed, problem_of, unpacked
 from .motion import Member
 from .observations import Observations
-from .rigid import Array, pose
+from .rigid import Array
 from .solving import CLOSE, CLOSE_ENOUGH, FIRST_STEPS, STEPS, Belief, Solution, Start, solve, solve_first
 
 
@@ -81,15 +80,10 @@ class Solver:
         if converged < 0:
             raise MemoryError("There is no memory for so many observations.")
         settled = converged == 1
-        motion = _unpacked(motion, moved[0])
+        motion = unpacked(motion, moved[0])
         return Solution(
             motion, values[0], cost.value, residuals, covariances, linear, parents, belief, settled
         )
-
-
-def _unpacked(motion: GroupMotion, packed: Array) -> GroupMotion:
-    left, right = (pose(packed[at : at + 9].reshape(3, 3), packed[at + 9 : at + 12]) for at in (0, 12))
-    return replace(motion, left=left, right=right, pitch=float(packed[24]))
 
 
 def _problem(seen: Observations, motion: GroupMotion, belief: Belief) -> Problem:

@@ -187,4 +187,30 @@ static double look_at_all(const Problem *p, const Motion *m, const Weights *w, O
   if (p->pitched) cost += m->pitch * m->pitch / (p->pitch_scale * p->pitch_scale);
   return cost;
 }
+
+static void keep(const Problem *p, const Observation *o, double *pose, double *by_parameters,
+                 double *by_joints) {
+  int64_t size = size_of(p), joints = p->joints;
+  for (int r = 0; r < p->rows; r++) {
+    memcpy(by_parameters + size * r, o->by_parameters + MOST * r, size * sizeof(double));
+    for (int j = 0; j < joints; j++) by_joints[joints * r + j] = o->by_joints[6 * j + r];
+  }
+  for (int i = 0; i < 3; i++) {
+    for (int j = 0; j < 3; j++) pose[4 * i + j] = o->H_R[3 * i + j];
+    pose[4 * i + 3] = o->lever[i];
+  }
+}
+
+/* As at in groups.py. */
+EXPORT void at(const Problem *p, int64_t count, const Motion *m, const double *values, double *poses,
+               double *by_parameters, double *by_joints) {
+  Observation o;
+  for (int64_t k = 0; k < count; k++) {
+    memcpy(o.values, values + p->joints * k, p->joints * sizeof(double));
+    if (p->rows == 6) place(p, m, &o, 6);
+    else place(p, m, &o, 3);
+    int64_t each = p->rows * k;
+    keep(p, &o, poses + 16 * k, by_parameters + size_of(p) * each, by_joints + p->joints * each);
+  }
+}
 """

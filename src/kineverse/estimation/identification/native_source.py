@@ -2,6 +2,7 @@
 
 from .native_algebra import ALGEBRA
 from .native_look import LOOK
+from .native_sliding import SLIDING
 from .native_step import STEP
 from .native_widening import WIDEN
 from .native_widths import WIDTHS
@@ -12,6 +13,7 @@ SOLVE = (
     + WIDEN
     + STEP
     + WIDTHS
+    + SLIDING
     + r"""
 /* Take steps until they are small; returns whether they became so. What was found is in *here then. */
 static int64_t settle(const Problem *p, const Weights *w, Motion *now, Observation **here,
@@ -60,32 +62,6 @@ static void begin(const Problem *p, const double *values, const double *parents,
     for (int i = 0; i < 9; i++) all[k].parent_R[i] = parents[16 * k + 4 * (i / 3) + i % 3];
     for (int i = 0; i < 3; i++) all[k].parent_p[i] = parents[16 * k + 4 * i + 3];
     memcpy(all[k].values, values + p->joints * k, p->joints * sizeof(double));
-  }
-}
-
-static void keep(const Problem *p, const Observation *o, double *pose, double *by_parameters,
-                 double *by_joints) {
-  int64_t size = size_of(p), joints = p->joints;
-  for (int r = 0; r < p->rows; r++) {
-    memcpy(by_parameters + size * r, o->by_parameters + MOST * r, size * sizeof(double));
-    for (int j = 0; j < joints; j++) by_joints[joints * r + j] = o->by_joints[6 * j + r];
-  }
-  for (int i = 0; i < 3; i++) {
-    for (int j = 0; j < 3; j++) pose[4 * i + j] = o->H_R[3 * i + j];
-    pose[4 * i + 3] = o->lever[i];
-  }
-}
-
-/* As at in groups.py. */
-EXPORT void at(const Problem *p, int64_t count, const Motion *m, const double *values, double *poses,
-               double *by_parameters, double *by_joints) {
-  Observation o;
-  for (int64_t k = 0; k < count; k++) {
-    memcpy(o.values, values + p->joints * k, p->joints * sizeof(double));
-    if (p->rows == 6) place(p, m, &o, 6);
-    else place(p, m, &o, 3);
-    int64_t each = p->rows * k;
-    keep(p, &o, poses + 16 * k, by_parameters + size_of(p) * each, by_joints + p->joints * each);
   }
 }
 

@@ -12,30 +12,38 @@ out of the evidence: what becomes of a family does not depend on where the origi
 
 from __future__ import annotations
 
+import ctypes
 from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
 
 from .groups import REACH, WX, GroupMotion
+from .library import library, packed, problem_of, unpacked
 from .matrices import inverted, times
-from .motion import Member
+from .motion import Linear, Member
 from .rigid import Array, exponential, skew
 from .solving import Solution
-from .widths import alone, widths
+from .widths import GRID, LITTLE, alone, widths
 
 _TURNS = 3
 
 
-def slid(solution: Solution[Member]) -> Solution[Member]:
-    """Return the same motion with slides of the point that makes them most probable."""
+def slid(solution: Solution[Member], native: bool = True) -> Solution[Member]:
+    """Return the same motion with slides of the point that makes them most probable.
+
+    It is done in C where it can be and ``native`` is true.
+    """
     motion = solution.motion
     if not isinstance(motion, GroupMotion) or not motion.slides:
         return solution
+    if native and library.is_native:
+        return _slid(solution, motion)
     slides, joints = motion.slides, motion.joints
     for _ in range(_TURNS):
-        seen = alone(solution)
-        weights = inverted(seen.covariances + np.diag(widths(solution.motion, seen).deviations ** 2))
+        seen = alone(solution, native)
+        width = widths(solution.motion, seen, native)
+        weights = inverted(seen.covariances + np.diag(width.deviations**2))
         # What the mean and c would make of joint values.
         by = np.zeros((len(seen.values), joints, joints + slides))
         by[:, range(joints), range(joints)] = 1.0
@@ -50,6 +58,21 @@ def slid(solution: Solution[Member]) -> Solution[Member]:
         assert isinstance(solution.motion, GroupMotion)  # a changed one is none else
         motion = solution.motion
     return solution
+
+
+def _slid(solution: Solution[Member], motion: GroupMotion) -> Solution[Member]:
+    moved, values, kinds = packed(motion), solution.values.copy(), np.array(motion.kinds, dtype=np.int64)
+    linear = Linear(*(array.copy() for array in solution.linear))
+    given = (GRID, kinds, solution.covariance, solution.residuals, moved, values, *linear)
+    done = library.code.slid(
+        ctypes.addressof(problem_of(motion.group, motion.rows)),
+        *(len(values), motion.slides, _TURNS),
+        *(REACH, LITTLE, len(GRID)),
+        *(array.ctypes.data for array in given),
+    )
+    if not done:
+        raise MemoryError("There is no memory for so many observations.")
+    return replace(solution, motion=unpacked(motion, moved), values=values, linear=linear)
 
 
 def by_point(motion: Member, values: Array) -> Array:

@@ -19,11 +19,11 @@ from .rigid import Array
 from .solving import Solution
 
 # From hardly anything to more than there is [m], [rad].
-_GRID = np.geomspace(1e-5, 10.0, 61)
-_LITTLE = 1e-6
+GRID = np.geomspace(1e-5, 10.0, 61)
+LITTLE = 1e-6
 # Joint values that C has room for.
-_MOST = 6
-_STEP = math.log(float(_GRID[1] / _GRID[0]))
+MOST = 6
+_STEP = math.log(float(GRID[1] / GRID[0]))
 
 
 @dataclass(frozen=True)
@@ -49,12 +49,12 @@ def alone(solution: Solution[Member], native: bool = True) -> Alone:
     It is done in C where it can be and ``native`` is true.
     """
     by_joints = solution.linear.by_joints
-    if native and library.is_native and by_joints.shape[2] <= _MOST:
+    if native and library.is_native and by_joints.shape[2] <= MOST:
         return _alone(solution)
     weights = inverted(solution.covariance)
     weighted = np.swapaxes(by_joints, 1, 2) @ weights
     # A turn that moves nothing is known as little as can be, and so little that it does not matter.
-    covariances = inverted(weighted @ by_joints + _LITTLE * np.eye(by_joints.shape[2]))
+    covariances = inverted(weighted @ by_joints + LITTLE * np.eye(by_joints.shape[2]))
     change = times(covariances, times(weighted, solution.residuals))
     left = solution.residuals - times(by_joints, change)
     log = -0.5 * float(np.sum(left * times(weights, left))) + 0.5 * log_determinants(math.tau * covariances)
@@ -70,7 +70,7 @@ def _alone(solution: Solution[Member]) -> Alone:
     ]
     values, covariances = np.array(solution.values, order="C"), np.empty((count, joints, joints))
     pointers = (x.ctypes.data for x in (*given, values, covariances))
-    log: float = library.code.alone(count, rows, joints, _LITTLE, *pointers)
+    log: float = library.code.alone(count, rows, joints, LITTLE, *pointers)
     return Alone(values, covariances, log)
 
 
@@ -94,7 +94,7 @@ class Widths:
 
 def widths(motion: Member, seen: Alone, native: bool = True) -> Widths:
     """Return the most likely widths of the motion; in C like :func:`alone`."""
-    if native and library.is_native and motion.joints <= _MOST:
+    if native and library.is_native and motion.joints <= MOST:
         return _widths(motion, seen)
     kinds = np.array(motion.kinds)
     deviations, occam = np.zeros(len(kinds)), 0.0
@@ -124,8 +124,8 @@ def _widths(motion: Member, seen: Alone) -> Widths:
         kinds.ctypes.data,
         values.ctypes.data,
         covariances.ctypes.data,
-        len(_GRID),
-        _GRID.ctypes.data,
+        len(GRID),
+        GRID.ctypes.data,
         deviations.ctypes.data,
         mean.ctypes.data,
     )
@@ -136,14 +136,14 @@ def _widths(motion: Member, seen: Alone) -> Widths:
 
 def _width(values: Array, variances: Array) -> tuple[float, float]:
     """Return the best s, and the logarithm of the mean over all s relative to the best."""
-    total = variances + _GRID[:, None, None] ** 2
+    total = variances + GRID[:, None, None] ** 2
     weights = 1.0 / total
     mean = (weights * values).sum(axis=1) / weights.sum(axis=1)
     squares = (values - mean[:, None, :]) ** 2 * weights
     # With the mean integrated out, or a few values would seem narrower than they are.
     logs = -0.5 * (np.log(total) + squares).sum(axis=(1, 2)) - 0.5 * np.log(weights.sum(axis=1)).sum(axis=1)
     top = int(np.argmax(logs))
-    best = math.log(float(_GRID[top]))
+    best = math.log(float(GRID[top]))
     if 0 < top < len(logs) - 1:
         before, here, after = logs[top - 1 : top + 2]
         best += 0.5 * _STEP * float((after - before) / (2.0 * here - before - after))
