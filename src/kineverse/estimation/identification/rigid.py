@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import numpy.typing as npt
 
@@ -107,10 +109,14 @@ def right_jacobian(v: Array) -> Array:
 def frame_along(z: Array) -> Array:
     """Return a rotation (3, 3) whose last column is a direction z (3,)."""
     z = z / np.linalg.norm(z)
-    helper = np.eye(3)[int(np.argmin(np.abs(z)))]
-    x = np.cross(helper, z)
-    x /= np.linalg.norm(x)
-    return np.column_stack([x, np.cross(z, x), z])
+    # By numbers, as numpy takes long over three of them.
+    z0, z1, z2 = z.tolist()
+    least = int(np.argmin(np.abs(z)))
+    x0, x1, x2 = ((0.0, -z2, z1), (z2, 0.0, -z0), (-z1, z0, 0.0))[least]
+    length = math.hypot(x0, x1, x2)
+    x0, x1, x2 = x0 / length, x1 / length, x2 / length
+    y0, y1, y2 = z1 * x2 - z2 * x1, z2 * x0 - z0 * x2, z0 * x1 - z1 * x0
+    return np.array([[x0, y0, z0], [x1, y1, z1], [x2, y2, z2]])
 
 
 def mean_rotation(rotations: Array) -> Array:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import replace
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 
@@ -44,6 +45,11 @@ class Overview:
         normal = self.spread[2]
         return [_directions(self.turns)[0], normal] if self.rows == 6 else [normal]
 
+    @cached_property
+    def turnings(self) -> list[_Turning]:
+        """Turns about any of them."""
+        return [turning for axis in self.axes for turning in _turnings(self, axis)]
+
 
 def starts(name: str, overview: Overview) -> Iterator[Start]:
     """Yield starts for a family of joints."""
@@ -76,11 +82,33 @@ def starts(name: str, overview: Overview) -> Iterator[Start]:
     elif name == "spherical":
         yield from _about_a_point(overview, group.freedom(rows).joints, start)
     else:
-        for axis in overview.axes:
-            yield from _about_an_axis(name, overview, axis, start)
+        yield from _about_an_axis(name, overview, start)
 
 
-def _about_an_axis(name, overview, axis, start) -> Iterator[Start]:  # type: ignore[no-untyped-def]
+class _Turning(NamedTuple):
+    """Turns about an axis that fit what was seen: what hinges, screws and cylinders have in common.
+
+    Attributes
+    ----------
+    frame, centre
+        Whose last column is the axis, (3, 3), and where that is (3,).
+    angles, along
+        How far it turned and slid in each observation, (N,).
+    slope
+        Slides by turns.
+    radius
+        The mean distance from the axis.
+    """
+
+    frame: Array
+    centre: Array
+    angles: Array
+    along: Array
+    slope: float
+    radius: float
+
+
+def _turnings(overview: Overview, axis: Array) -> Iterator[_Turning]:
     frame = frame_along(axis)
     centred = overview.positions - overview.mean[:3, 3]
     flat, along = centred @ frame[:, :2], centred @ frame[:, 2]
@@ -99,17 +127,22 @@ def _about_an_axis(name, overview, axis, start) -> Iterator[Start]:  # type: ign
             angles = np.arctan2(lever[:, 1], lever[:, 0])
             place = flat[0] - lever[0]
         centre = overview.mean[:3, 3] + frame[:, :2] @ place
-        slope = 0.0
-        variance = float(np.var(angles))
-        if variance > 0.0:
-            slope = float(np.mean((angles - angles.mean()) * along)) / variance
-        values = angles[:, None]
+        off = angles - angles.mean()
+        variance = float(off @ off)
+        slope = float(off @ along) / variance if variance > 0.0 else 0.0
+        radius = float(np.mean(np.sqrt(np.sum(lever**2, axis=1))))
+        yield _Turning(frame, centre, angles, along, slope, radius)
+
+
+def _about_an_axis(name, overview, start) -> Iterator[Start]:  # type: ignore[no-untyped-def]
+    for turning in overview.turnings:
+        values = turning.angles[:, None]
         if name == "cylindrical":
-            values = np.column_stack([along, angles])
-        result = start(frame, centre, values, slope if name == "screw" else 0.0)
+            values = np.column_stack([turning.along, turning.angles])
+        result = start(turning.frame, turning.centre, values, turning.slope if name == "screw" else 0.0)
         if overview.rows == 3:
             right = np.eye(4)
-            right[0, 3] = np.mean(np.linalg.norm(lever, axis=1))
+            right[0, 3] = turning.radius
             result = Start(replace(result.motion, right=right), result.values)
         yield result
 
