@@ -12,7 +12,7 @@ from .library import ARRAYS, Problem, library, linear_of, packed, problem_of, un
 from .motion import Member
 from .observations import Observations
 from .rigid import Array
-from .solving import CLOSE, CLOSE_ENOUGH, FIRST_STEPS, STEPS, Belief, Solution, Start, solve, solve_first
+from .solving import CLOSE, FIRST_STEPS, STEPS, Belief, Solution, Start, solve, solve_first
 
 
 class Solver:
@@ -92,8 +92,7 @@ def _problem(seen: Observations, motion: GroupMotion, belief: Belief) -> Problem
     for name in ARRAYS:
         array = getattr(seen, name)
         setattr(problem, name, None if array is None else array.ctypes.data)
-    close = CLOSE_ENOUGH if belief.marginal else CLOSE
-    problem.reach_scale, problem.pitch_scale, problem.close = REACH, PITCHES, close
+    problem.reach_scale, problem.pitch_scale, problem.close = REACH, PITCHES, CLOSE
     problem.marginal = belief.marginal
     problem.mean[: motion.joints] = belief.mean.tolist()
     problem.precision[: motion.joints] = belief.precision.tolist()

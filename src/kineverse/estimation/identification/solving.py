@@ -30,9 +30,9 @@ M_co = TypeVar("M_co", bound=Motion, covariant=True)
 STEPS = 40
 # Of each of several starts, before the best of them goes on.
 FIRST_STEPS = 2
-# What the last step promises to reduce the cost by. A hundredth of a standard deviation is as near as
-# widths are known.
-CLOSE, CLOSE_ENOUGH = 1e-7, 1e-4
+# What the last step promises to reduce the cost by: a hundredth of a standard deviation is as near as widths
+# are known.
+CLOSE = 1e-4
 _DIFFERENCE = 1e-5
 
 
@@ -152,7 +152,7 @@ def solve(
     """
     belief = belief or Belief.vague(motion.joints)
     point = _point(seen, motion, values, seen.parent if parent is None else parent, belief)
-    damping, converged, close = 0.0, False, CLOSE_ENOUGH if belief.marginal else CLOSE
+    damping, converged = 0.0, False
     for _ in range(steps):
         reduced = _step(seen, point, damping, belief)
         if reduced is None:
@@ -162,12 +162,12 @@ def solve(
             continue
         trial, gain = reduced
         if trial.cost <= point.cost + 1e-12 * abs(point.cost):
-            converged = gain < close
+            converged = gain < CLOSE
             point, damping = trial, 0.1 * damping if damping > 1e-6 else 0.0
             if converged:
                 break
         else:
-            if gain < close:
+            if gain < CLOSE:
                 converged = True
                 break
             damping = max(10.0 * damping, 1e-4)
