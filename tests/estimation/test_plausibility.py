@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 from seen_frames import NOISE, moved, seen
 
 import kineverse as kv
@@ -134,6 +135,46 @@ def test_a_door_beyond_its_limits(kitchen: kv.Model) -> None:
     assert report[TAG].stopped >= 40
     model = mended(kitchen, report)
     assert model.limits(DOOR)[1] == pytest.approx(2.2, abs=0.1)
+
+
+def astray(observations: dict[str, np.ndarray], rows: list[int], seed: int) -> None:
+    """Make some poses of the handle plain wrong."""
+    random = np.random.default_rng(seed)
+    observations[HANDLE][rows, :3, 3] += random.normal(0.0, 0.5, (len(rows), 3))
+    observations[HANDLE][rows, :3, :3] = Rotation.random(len(rows), random_state=seed).as_matrix()
+
+
+@pytest.mark.parametrize("row", [0, 14, 29])
+def test_one_wrong_pose_in_thirty_is_an_outlier_and_no_alarm(kitchen: kv.Model, row: int) -> None:
+    observations = seen(kitchen, [HANDLE], {DOOR: np.linspace(0.0, 1.5, 30)}, 20)
+    astray(observations, [row], row)
+    rating = plausibility(kitchen, observations, noise=NOISE, families=SOME)[TAG]
+    assert rating.explains
+    assert rating.outliers == (row,)
+    assert rating.proposal is None
+    assert "1 of 30 observations left out" in str(rating)
+    # Who says that there are none has one explained.
+    rating = plausibility(kitchen, observations, noise=NOISE, families=SOME, outliers=False)[TAG]
+    assert rating.stopped == row
+
+
+def test_what_is_there_instead_is_found_between_outliers(kitchen: kv.Model) -> None:
+    values = np.random.default_rng(1).uniform(0.0, 0.4, 40)
+    observations = seen(another(kitchen, slid), [HANDLE], {DOOR: values}, 21)
+    astray(observations, [6, 11, 30], 22)
+    rating = plausibility(kitchen, observations, noise=NOISE, families=SOME)[TAG]
+    assert rating.stopped in range(3)
+    assert rating.outliers == (6, 11, 30)
+    assert rating.probabilities["prismatic"] > 0.9
+    assert isinstance(rating.proposal, kv.Prismatic)
+
+
+def test_many_that_are_off_are_no_outliers(kitchen: kv.Model) -> None:
+    observations = seen(kitchen, [HANDLE], {DOOR: np.linspace(0.0, 1.5, 20)}, 23)
+    astray(observations, [2, 3, 9, 10, 11, 16], 24)
+    assert not plausibility(kitchen, observations, noise=NOISE, families=SOME)[TAG].explains
+    with pytest.raises(kv.ValueRejectedError, match="Outliers are True, False"):
+        plausibility(kitchen, observations, noise=NOISE, outliers=0.1)  # type: ignore[arg-type]
 
 
 def test_what_hardly_moved_says_nothing(kitchen: kv.Model) -> None:

@@ -51,6 +51,11 @@ class Observations:
         """parent_T_child as observed, (N, 4, 4)."""
         return inverse(self.parent) @ self.child
 
+    def at(self, rows: slice | npt.NDArray[np.int_]) -> Observations:
+        """Return some of them."""
+        of_parent = None if self.parent_covariance is None else self.parent_covariance[rows]
+        return Observations(self.parent[rows], self.child[rows], of_parent, self.child_covariance[rows])
+
     def softened(self) -> list[Observations]:
         """Return the same observations with less precise positions, the least precise first.
 

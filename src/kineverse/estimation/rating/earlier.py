@@ -1,9 +1,9 @@
-"""Which earlier observations fit what was identified later: they say how far it goes, too."""
+"""Which other observations fit what was identified from some: they say how far it goes, too."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Self
+from typing import Self, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
@@ -12,7 +12,9 @@ from kineverse.estimation.identification.fit import Fit
 from kineverse.estimation.identification.motion import Linear, Motion, Prior
 from kineverse.estimation.identification.observations import Observations
 from kineverse.estimation.identification.rigid import Array
-from kineverse.estimation.identification.solving import solve
+from kineverse.estimation.identification.solving import Solution, solve
+
+Rows: TypeAlias = "npt.NDArray[np.int_]"
 
 # χ² of six numbers that is exceeded once in a thousand.
 _LIKELY = 22.5
@@ -49,36 +51,40 @@ class Known:
         return Prior(np.zeros(0), np.zeros((0, 0)))
 
 
-def explained(fit: Fit, seen: Observations, first: int) -> tuple[npt.NDArray[np.int_], Fit]:
-    """Return which observations a fit to those from one on explains, and the fit with their joint values.
+def explained(fit: Fit, seen: Observations, used: Rows) -> tuple[Rows, Fit]:
+    """Return which observations a fit to some of them explains, and the fit with their joint values.
 
     Parameters
     ----------
     fit
-        Of the observations from ``first`` on.
+        Of the observations ``used``.
     seen
         All observations.
-    first
-        Where those of the fit begin.
+    used
+        The numbers of those of the fit.
 
     Returns
     -------
     rows, fit
-        The numbers of earlier observations that are explained, followed by those of the fit.
+        The numbers of other observations that are explained, followed by those of the fit.
     """
-    late = np.arange(first, len(seen))
-    if not first or not fit.motion.joints:
-        return late, fit
-    relative, poses = seen.relative[:first], fit.poses
-    apart = np.sum((relative[:, None] - poses[None])[:, :, :3] ** 2, axis=(2, 3))
-    before = Observations(
-        seen.parent[:first],
-        seen.child[:first],
-        None if seen.parent_covariance is None else seen.parent_covariance[:first],
-        seen.child_covariance[:first],
-    )
-    solution = solve(before, Known(fit.motion), fit.joint_values[np.argmin(apart, axis=1)])
+    others = np.setdiff1d(np.arange(len(seen)), used)
+    if not len(others) or not fit.motion.joints:
+        return used, fit
+    solution = beside(fit, seen.at(others))
+    fits = squared_errors(solution) < _LIKELY
+    values = np.concatenate([solution.values[fits], fit.joint_values])
+    return np.concatenate([others[fits], used]), replace(fit, joint_values=values)
+
+
+def beside(fit: Fit, seen: Observations) -> Solution[Known]:
+    """Return the most likely joint values of a fit at observations that it need not be made of."""
+    apart = np.sum((seen.relative[:, None] - fit.poses[None])[:, :, :3] ** 2, axis=(2, 3))
+    return solve(seen, Known(fit.motion), fit.joint_values[np.argmin(apart, axis=1)])
+
+
+def squared_errors(solution: Solution[Known]) -> Array:
+    """Return χ² of each observation, (N,)."""
     weighted = np.linalg.solve(solution.covariance, solution.residuals[:, :, None])[:, :, 0]
-    rows = np.flatnonzero(np.sum(solution.residuals * weighted, axis=1) < _LIKELY)
-    values = np.concatenate([solution.values[rows], fit.joint_values])
-    return np.concatenate([rows, late]), replace(fit, joint_values=values)
+    squares: Array = np.sum(solution.residuals * weighted, axis=1)
+    return squares

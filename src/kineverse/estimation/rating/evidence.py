@@ -15,7 +15,7 @@ import numpy as np
 from kineverse.estimation.identification.matrices import inverted, log_determinants, times
 from kineverse.estimation.identification.rigid import Array
 
-from .misfit import Misfit
+from .misfit import SIZES, Misfit
 from .served import Served
 
 _WIDTHS = np.geomspace(1e-5, 10.0, 43)
@@ -43,6 +43,23 @@ def log_evidence(served: Served, seen: Misfit, still: bool = False) -> float:
         values, variances = seen.values[:, 0], seen.covariances[:, 0, 0]
         return log + _log_mean(_log_widths(values, variances, lower, upper, widths, density))
     return log + (_several(served, seen, widths) if served.joints else 0.0)
+
+
+def log_elsewhere(seen: Misfit) -> float:
+    """Return by how much the density is larger if the articulation, or the child on it, sits elsewhere.
+
+    With ρ = G δ + noise and δ ~ N(0, s² I), where it sits integrated out, on average over some sizes s. As a
+    logarithm.
+    """
+    transposed = np.swapaxes(seen.by_place, 1, 2)
+    information = np.sum(transposed @ seen.by_place, axis=0)
+    pull = np.sum(transposed @ seen.normal[:, :, None], axis=0)[:, 0]
+    logs = []
+    for size in SIZES:
+        total = information + np.eye(len(pull)) / size**2
+        log_volume = np.linalg.slogdet(size**2 * total)[1]
+        logs.append(0.5 * (pull @ np.linalg.solve(total, pull) - log_volume))
+    return _log_mean(np.array(logs))
 
 
 def _several(served: Served, seen: Misfit, widths: Array) -> float:

@@ -14,19 +14,24 @@ from kineverse.errors import KineverseError
 from kineverse.estimation.identification.fit import SURE, Found
 from kineverse.estimation.identification.observations import Observations
 from kineverse.estimation.identification.pairs import LOG_ANYWHERE, Families, identified
+from kineverse.estimation.tracking.outliers import Outliers
 from kineverse.model.model import Model
 from kineverse.model.operation import Operation
 
+from .astray import agreeing, credible
 from .earlier import explained
-from .evidence import log_evidence
+from .evidence import log_elsewhere, log_evidence
 from .links import Link
 from .misfit import Misfit
 from .proposal import proposal
 from .report import Rating
 from .served import Served
 
-BELIEFS: Mapping[str, float] = MappingProxyType({"served": 0.8, "rigid": 0.1, "other": 0.1})
-"""How probable it is beforehand that an articulation is as served, does not move, or is something else."""
+BELIEFS: Mapping[str, float] = MappingProxyType(
+    {"served": 0.8, "elsewhere": 0.05, "rigid": 0.1, "other": 0.05}
+)
+"""How probable it is beforehand that an articulation is as served, that it or what is on it sits a bit
+elsewhere, that it does not move, or that it is something else."""
 
 # Fewer observations do not show how something moves.
 _ENOUGH = 5
@@ -52,43 +57,51 @@ class Seen:
     misfit: Misfit
     times: npt.NDArray[np.int_]
 
-    def since(self, number: int) -> Seen:
-        """Return how it was seen from an observation on."""
-        first = int(np.searchsorted(self.times, number))
-        o = self.observations
-        later = Observations(
-            o.parent[first:],
-            o.child[first:],
-            None if o.parent_covariance is None else o.parent_covariance[first:],
-            o.child_covariance[first:],
+    def at(self, rows: slice | npt.NDArray[np.int_]) -> Seen:
+        """Return some of the times at which it was seen."""
+        return Seen(
+            self.link, self.served, self.observations.at(rows), self.misfit.at(rows), self.times[rows]
         )
-        return Seen(self.link, self.served, later, self.misfit.since(first), self.times[first:])
 
 
-def judged(model: Model, seen: Seen, stopped: int | None, families: Families) -> Rating:
+def judged(
+    model: Model, seen: Seen, stopped: int | None, families: Families, outliers: Outliers | None
+) -> Rating:
     """Return the rating of an articulation, given since when it does not explain what is seen."""
-    since = seen if stopped is None else seen.since(stopped)
-    instead = identified(since.observations, families) if len(since.times) >= 2 else None
-    probabilities = _probabilities(since, instead)
+    if stopped is None:
+        since = seen
+        right = credible(seen.misfit, outliers)
+    else:
+        since = seen.at(slice(int(np.searchsorted(seen.times, stopped)), None))
+        right = agreeing(since.observations, families, outliers)
+    good = since.at(right)
+    instead = identified(good.observations, families) if len(right) >= 2 else None
+    probabilities = _probabilities(good, instead)
     operation, reason = None, ""
     if stopped is not None:
-        operation, reason = _proposed(model, seen, since, instead)
+        operation, reason = _proposed(model, seen, good, instead)
     else:
-        reason = _doubt(probabilities, len(since.times))
-    squares = np.mean(since.misfit.residuals**2, axis=0)
+        reason = _doubt(probabilities, len(right))
+    squares = np.mean(good.misfit.residuals**2, axis=0)
     rms = math.sqrt(float(squares[:3].sum())), math.sqrt(float(squares[3:].sum()))
-    return Rating(seen.link, probabilities, rms, len(seen.times), stopped, instead, operation, reason)
+    wrong = tuple(np.setdiff1d(since.times, good.times).tolist())
+    return Rating(seen.link, probabilities, rms, len(seen.times), stopped, instead, operation, reason, wrong)
 
 
 def _probabilities(seen: Seen, instead: Found | None) -> dict[str, float]:
     served, left = seen.served, seen.misfit
-    logs = {"served": math.log(BELIEFS["served"]) + log_evidence(served, left), "rigid": -math.inf}
+    as_served = log_evidence(served, left)
+    logs = {
+        "served": math.log(BELIEFS["served"]) + as_served,
+        "elsewhere": math.log(BELIEFS["elsewhere"]) + as_served + log_elsewhere(left),
+        "rigid": -math.inf,
+    }
     if served.joints:
         logs["rigid"] = math.log(BELIEFS["rigid"]) + log_evidence(served, left, still=True)
     # A family's probability is its evidence times its belief beforehand, up to what is common to all.
     for fit in instead or ():
         if fit.probability > 0.0 and instead is not None:
-            odds = math.log(BELIEFS["other"] * fit.probability / instead.best.probability)
+            odds = math.log(BELIEFS["other"]) + math.log(fit.probability / instead.best.probability)
             log = odds + instead.best.log_evidence + LOG_ANYWHERE
             logs[fit.family] = float(np.logaddexp(logs.get(fit.family, -math.inf), log))
     total = float(np.logaddexp.reduce(list(logs.values())))
@@ -102,6 +115,8 @@ def _doubt(probabilities: Mapping[str, float], count: int) -> str:
     if count < _ENOUGH:
         return f"both were seen {count} time{'s' if count > 1 else ''} only"
     other = max((name for name in probabilities if name != "served"), key=lambda name: probabilities[name])
+    if other == "elsewhere":
+        return "it may sit a bit elsewhere as well"
     return "it hardly moved" if other == "rigid" else f"it may be {other} as well"
 
 
@@ -111,7 +126,8 @@ def _proposed(model: Model, seen: Seen, since: Seen, instead: Found | None) -> t
     if not instead.best.told:
         return None, f"what it is instead is not known yet, {instead}"
     try:
-        rows, fit = explained(instead.best, seen.observations, len(seen.times) - len(since.times))
+        used = np.searchsorted(seen.times, since.times)
+        rows, fit = explained(instead.best, seen.observations, used)
         coordinates = seen.served.beyond_limits(seen.observations, seen.misfit.coordinates)[rows]
         return proposal(model, seen.link, seen.served, coordinates, fit), ""
     except KineverseError as error:

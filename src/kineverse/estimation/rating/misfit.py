@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from typing import Self
 
 import numpy as np
+import numpy.typing as npt
 
 from kineverse.estimation.identification.matrices import inverted
 from kineverse.estimation.identification.motion import Linear
@@ -18,6 +19,9 @@ from kineverse.estimation.identification.observations import Observations
 from kineverse.estimation.identification.rigid import Array, logarithm, skew
 
 from .served import Served
+
+SIZES = (0.01, 0.05, 0.3)
+"""How far elsewhere something may sit, as standard deviations of each part of a twist [m], [rad]."""
 
 # Joint values that nothing tells are believed within 100 [m] or [rad].
 _PRECISION = 1e-4
@@ -63,9 +67,9 @@ class Misfit:
     def __len__(self) -> int:
         return len(self.normal)
 
-    def since(self, first: int) -> Self:
-        """Return the misfit of the observations from one on."""
-        return type(self)(*(getattr(self, name)[first:] for name in self.__dataclass_fields__))
+    def at(self, rows: slice | npt.NDArray[np.int_]) -> Self:
+        """Return the misfit of some of the observations."""
+        return type(self)(*(getattr(self, name)[rows] for name in self.__dataclass_fields__))
 
 
 def misfit(served: Served, seen: Observations) -> Misfit:

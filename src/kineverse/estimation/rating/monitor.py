@@ -13,6 +13,7 @@ from kineverse.errors import KineverseError, ShapeError, UnknownNameError, sugge
 from kineverse.estimation.identification.pairs import Families
 from kineverse.estimation.identification.rigid import Array
 from kineverse.estimation.identification.tracks import Poses, Track, between, exactly, joined, tracks
+from kineverse.estimation.tracking.outliers import Outliers, as_outliers
 from kineverse.model.frame import WORLD
 from kineverse.model.model import Model
 
@@ -53,7 +54,7 @@ class PlausibilityMonitor:
         The model.
     frames
         Names of the frames that may be seen.
-    noise, relative_to, families, false_alarms
+    noise, relative_to, families, false_alarms, outliers
         As in :func:`~kineverse.estimation.plausibility`.
     keep
         How many of the last observations are kept, to say what an articulation is instead.
@@ -73,6 +74,7 @@ class PlausibilityMonitor:
         relative_to: str | None = WORLD,
         families: Families = None,
         false_alarms: float = FALSE_ALARMS,
+        outliers: Outliers | bool | None = True,
         keep: int = 500,
     ) -> None:
         check_false_alarms(false_alarms)
@@ -80,6 +82,7 @@ class PlausibilityMonitor:
         self.frames = tuple(dict.fromkeys(frames))
         self.false_alarms = false_alarms
         self.count = 0
+        self._outliers = as_outliers(outliers)
         self._noise, self._relative_to, self._families = noise, relative_to, families
         self._kept: deque[dict[str, Track]] = deque(maxlen=keep)
         self._watched: list[_Watched] = []
@@ -150,7 +153,10 @@ class PlausibilityMonitor:
             if old is not None and old.served is not None and served is not None and served.same(old.served):
                 self._watched.append(old)
             else:
-                self._watched.append(_Watched(link, served, reason, Watch(self.false_alarms)))
+                self._watched.append(_Watched(link, served, reason, self._watch()))
+
+    def _watch(self) -> Watch:
+        return Watch(self.false_alarms, self._outliers.fraction if self._outliers else 0.0)
 
     def _add(self, watched: _Watched, seen: Mapping[str, Track]) -> None:
         link = watched.link
@@ -173,7 +179,7 @@ class PlausibilityMonitor:
         parent, child = (joined([one[name] for one in kept]) for name in (link.parent, link.child))
         poses = between(parent, child, np.arange(len(times)))
         seen = Seen(link, watched.served, poses, misfit(watched.served, poses), np.array(times))
-        return judged(self.model, seen, watched.stopped, self._families)
+        return judged(self.model, seen, watched.stopped, self._families, self._outliers)
 
 
 def _one(given: Poses, name: str) -> Poses:

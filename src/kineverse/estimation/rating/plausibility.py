@@ -11,6 +11,7 @@ import numpy.typing as npt
 from kineverse.errors import KineverseError, ValueRejectedError
 from kineverse.estimation.identification.pairs import Families
 from kineverse.estimation.identification.tracks import Poses, Track, between, exactly, tracks
+from kineverse.estimation.tracking.outliers import Outliers, as_outliers
 from kineverse.model.frame import WORLD
 from kineverse.model.model import Model, Snapshot
 
@@ -33,6 +34,7 @@ def plausibility(
     relative_to: str | None = WORLD,
     families: Families = None,
     false_alarms: float = FALSE_ALARMS,
+    outliers: Outliers | bool | None = True,
     strict: bool = False,
 ) -> Plausibility:
     """Return whether the articulations of a model still explain what is seen, and what would if they do not.
@@ -57,6 +59,9 @@ def plausibility(
         What is tried instead, see :func:`~kineverse.estimation.identify`.
     false_alarms
         The probability with which an articulation may be called implausible though it is as served.
+    outliers
+        How often observations are wrong altogether, see :class:`~kineverse.estimation.Outliers`; False or
+        None if they never are. Then less is noticed sooner.
     strict
         Whether to raise if one is.
 
@@ -70,13 +75,14 @@ def plausibility(
         If ``strict``, and an articulation stopped explaining what is seen.
     """
     check_false_alarms(false_alarms)
+    wrong = as_outliers(outliers)
     if isinstance(model, Snapshot):
         model = model.model()
     seen = tracks(observations, noise)
     found = find_links(model, observations, relative_to)
     if relative_to is not None:
         seen[relative_to] = exactly(max((len(track.poses) for track in seen.values()), default=0))
-    ratings = [_rated(model, link, seen, families, false_alarms) for link in found.links]
+    ratings = [_rated(model, link, seen, families, false_alarms, wrong) for link in found.links]
     result = Plausibility(tuple(ratings), found.left_out, false_alarms)
     if strict:
         result.raise_if_implausible()
@@ -103,7 +109,12 @@ def untold(link: Link, count: int, reason: str) -> Rating:
 
 
 def _rated(
-    model: Model, link: Link, seen: Mapping[str, Track], families: Families, false_alarms: float
+    model: Model,
+    link: Link,
+    seen: Mapping[str, Track],
+    families: Families,
+    false_alarms: float,
+    outliers: Outliers | None,
 ) -> Rating:
     parent, child = seen[link.parent], seen[link.child]
     times = np.flatnonzero(parent.seen & child.seen)
@@ -115,8 +126,8 @@ def _rated(
         left = misfit(served, poses)
     except KineverseError as error:
         return untold(link, len(times), f"its pose cannot be computed. {error}")
-    watch = Watch(false_alarms)
+    watch = Watch(false_alarms, outliers.fraction if outliers else 0.0)
     for row in zip(left.normal, left.by_place, left.beyond, strict=True):
         watch.add(*row)
     stopped = None if watch.stopped is None else int(times[watch.stopped])
-    return judged(model, Seen(link, served, poses, left, times), stopped, families)
+    return judged(model, Seen(link, served, poses, left, times), stopped, families, outliers)

@@ -26,8 +26,8 @@ class Rating:
     link
         The operation that was judged, and between which frames.
     probabilities
-        Of the articulation as ``served``, of a ``rigid`` connection, of the child being ``free``, and of
-        other families: on the observations from ``stopped`` on, or on all.
+        Of the articulation as ``served``, of the same ``elsewhere``, of a ``rigid`` connection, of the child
+        being ``free``, and of other families: on the observations from ``stopped`` on, or on all.
     rms
         What is left of positions [m] and orientations [rad] with the best joint values, root mean square over
         the same observations.
@@ -41,6 +41,8 @@ class Rating:
         The operation to replace the served one by, if it stopped explaining and something else does.
     reason
         Why nothing can be told, or proposed; empty if it can.
+    outliers
+        The observations that are taken for wrong altogether, and left out of all of this.
     """
 
     link: Link
@@ -51,6 +53,7 @@ class Rating:
     found: Found | None = None
     proposal: Operation | None = None
     reason: str = ""
+    outliers: tuple[int, ...] = ()
 
     @property
     def tag(self) -> str:
@@ -78,6 +81,8 @@ class Rating:
         if shown:
             place, turn = self.rms
             words += f" ({shown}; off by {place * 1e3:.3g} mm, {math.degrees(turn):.2g}°)"
+        if self.outliers:
+            words += f"; {len(self.outliers)} of {self.count} observations left out as outliers"
         return words
 
 

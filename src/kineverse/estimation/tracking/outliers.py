@@ -49,10 +49,15 @@ class Outliers:
         if not (math.isfinite(self.reach) and self.reach > 0):
             raise ValueRejectedError(f"The reach of outliers is positive and finite, not {self.reach!r}.")
 
+    @property
+    def log_anywhere(self) -> float:
+        """The logarithm of u, of a pose."""
+        return -3 * math.log(self.reach) - math.log(_ROTATIONS)
+
     def log_density(self, one: Observation) -> float:
         """Return log(ε u) of an observation."""
         if one.is_pose:
-            return math.log(self.fraction) - 3 * math.log(self.reach) - math.log(_ROTATIONS)
+            return math.log(self.fraction) + self.log_anywhere
         return math.log(self.fraction) - one.size * math.log(self.reach)
 
     def judge(self, square: float, log_scale: float, log_density: float) -> tuple[float, float]:
