@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from part_recordings import JOINTS, recording
 
+from kineverse.estimation.identification.evidence import evidence
 from kineverse.estimation.identification.groups import GroupMotion
 from kineverse.estimation.identification.native import solver
 from kineverse.estimation.identification.observations import Observations, observations
@@ -111,3 +112,17 @@ def test_points_that_slide_agree(family: str) -> None:
     np.testing.assert_allclose(slow.values, fast.values, atol=1e-9)
     for a, b in zip(slow.linear, fast.linear, strict=True):
         np.testing.assert_allclose(a, b, atol=1e-9)
+
+
+@pytest.mark.compiler
+@pytest.mark.parametrize("family", [*JOINTS])
+@pytest.mark.parametrize("how", ["both noisy", "positions"])
+def test_evidence_agrees(family: str, how: str) -> None:
+    assert solver.prepare(wait=True)
+    seen = seen_as(how, family)
+    solution = solver.solve_first(seen, [*starts(family, Overview(seen))])
+    slow, fast = evidence(solution, native=False), evidence(solution)
+    assert fast.log_evidence == pytest.approx(slow.log_evidence, rel=1e-9)
+    np.testing.assert_allclose(slow.covariance, fast.covariance, rtol=1e-6, atol=1e-12)
+    np.testing.assert_allclose(slow.joint_values, fast.joint_values, atol=1e-9)
+    np.testing.assert_allclose(slow.joint_covariances, fast.joint_covariances, atol=1e-12)

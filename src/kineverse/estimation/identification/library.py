@@ -107,6 +107,8 @@ class Library:
         code.at.restype = None
         code.alone.argtypes = (*(counter,) * 3, ctypes.c_double, *(pointer,) * 5)
         code.widths.argtypes = (counter, counter, *(pointer,) * 3, counter, *(pointer,) * 3)
+        code.informed.argtypes = (pointer, counter, counter, *(pointer,) * 9)
+        code.informed.restype = None
         code.slid.argtypes = (
             *(pointer, counter, counter, counter),
             *(ctypes.c_double, ctypes.c_double, counter),

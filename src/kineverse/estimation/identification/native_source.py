@@ -1,6 +1,7 @@
 """C text: what :func:`.solving.solve` does for the families of joints, in the same steps."""
 
 from .native_algebra import ALGEBRA
+from .native_evidence import EVIDENCE
 from .native_look import LOOK
 from .native_sliding import SLIDING
 from .native_step import STEP
@@ -14,6 +15,7 @@ SOLVE = (
     + STEP
     + WIDTHS
     + SLIDING
+    + EVIDENCE
     + r"""
 /* Take steps until they are small; returns whether they became so. What was found is in *here then. */
 static int64_t settle(const Problem *p, const Weights *w, Motion *now, Observation **here,
