@@ -17,6 +17,7 @@ from .canonical import canonical
 from .evidence import Evidence, evidence
 from .family import Family, family_starts
 from .fit import Found
+from .mirrored import straightened
 from .motion import Member
 from .native import solver
 from .observations import Observations, observations
@@ -164,7 +165,7 @@ def _most_likely(seen: Observations, family: str | Family, overview: Overview) -
     best = solver.solve_first(first, begin)
     for narrower in softer:
         best = solver.solve(narrower, best.motion, best.values, best.parent)
-    return best
+    return straightened(seen, best)
 
 
 def judged(

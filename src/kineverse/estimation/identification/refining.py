@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from .mirrored import straightened
 from .motion import Member
 from .native import solver
 from .observations import Observations
@@ -39,4 +40,5 @@ def refined(seen: Observations, solution: Solution[Member]) -> Solution[Member]:
         before = wide
         belief = Belief(found.mean, wide**-2.0, marginal=True)
         solution = solver.solve(seen, solution.motion, solution.values, solution.parent, belief)
+        solution = straightened(seen, solution)
     return solution

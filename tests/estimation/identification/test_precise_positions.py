@@ -1,0 +1,60 @@
+"""Positions that are known much better than orientations: what an observation means is not where steps lead."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from joint_bounds import direction_bound
+from part_recordings import angle_between, recording, transform
+from scipy.optimize import least_squares
+from scipy.spatial.transform import Rotation
+
+from kineverse.estimation import identify
+from kineverse.estimation.identification.groups import GROUPS, GroupMotion
+from kineverse.estimation.identification.mirrored import singly
+from kineverse.estimation.identification.observations import observations
+from kineverse.estimation.identification.solving import Belief
+
+ORIENTATION = math.radians(10.0)
+
+
+def test_sliders_are_found_although_distances_say_two_things() -> None:
+    squares, bounds = [], []
+    for seed in range(6):
+        seen = recording(
+            "prismatic", count=80, position=1e-3, orientation=ORIENTATION, seed=seed, extent=0.4, radius=0.5
+        )
+        fit = identify(seen.parent, seen.child, noise=seen.covariance, families=["prismatic"]).best
+        squares.append(angle_between(fit.parameters["axis"], seen.axis) ** 2)
+        bounds.append(direction_bound(seen, "prismatic", width=float(np.std(seen.values))) ** 2)
+    assert math.sqrt(np.mean(squares)) < 1.4 * math.sqrt(np.mean(bounds))
+
+
+@pytest.mark.parametrize("family", ["prismatic", "revolute"])
+def test_an_observation_by_itself_is_as_least_squares_have_it(family: str) -> None:
+    seen = recording(family, count=5, position=0.01, orientation=0.05, seed=2)
+    problem = observations(seen.parent, seen.child, seen.covariance, seen.covariance)
+    motion = GroupMotion(GROUPS[family], 6, seen.left, seen.right)
+    belief = Belief(np.zeros(1), np.full(1, 0.2**-2.0))
+    found = singly(problem, motion, seen.values, seen.parent, belief)
+    deviation = np.sqrt(np.diag(seen.covariance))
+
+    def errors(unknown: np.ndarray, k: int) -> np.ndarray:
+        there = transform(Rotation.from_rotvec(unknown[4:]), unknown[1:4])
+        result = [unknown[:1] / 0.2]
+        for pose, true in (
+            (seen.parent[k], there),
+            (seen.child[k], there @ motion.at(unknown[None, :1]).pose[0]),
+        ):
+            turned = Rotation.from_matrix(pose[:3, :3] @ true[:3, :3].T).as_rotvec()
+            result.append(np.concatenate([pose[:3, 3] - true[:3, 3], turned]) / deviation)
+        return np.concatenate(result)
+
+    for k, parent in enumerate(seen.true_parent):
+        start = [seen.values[k, 0], *parent[:3, 3], *Rotation.from_matrix(parent[:3, :3]).as_rotvec()]
+        theirs = least_squares(errors, start, args=(k,))
+        assert found.values[k, 0] == pytest.approx(theirs.x[0], abs=1e-3)
+        turned = Rotation.from_matrix(found.orientation[k]) * Rotation.from_rotvec(theirs.x[4:]).inv()
+        assert turned.magnitude() < 1e-3
