@@ -103,6 +103,36 @@ def test_its_symbols_are_the_same_every_time():
     assert not any(key.path.startswith("distance/") for key in one.expression.gradient())
 
 
+def test_no_two_pairs_of_bodies_share_symbols():
+    """The word that stands between two names may be a part of them too."""
+    model = kv.Model()
+    slide = kv.position("slide")
+    names = (
+        "a",
+        "b",
+        "c",
+        "a/to/b",
+        "b/to/c",
+        "to",
+        "to_",
+        "to/to",
+        "to_/to",
+        "a/to",
+        "to/b",
+        "a/to_",
+        "auto",
+    )
+    with model.edit() as edit:
+        for k, name in enumerate(names):
+            edit.add_frame(name, "world", kv.translation(k * slide, 0, 0), body(Sphere(0.1)))
+    scene = Scene(model)
+    scene.update({"slide": 1.0})
+    pairs = [(a, b) for a in names for b in names if a != b]
+    paths = {symbol.path for pair in pairs for row in scene.expression(*pair).parameters for symbol in row}
+    assert len(paths) == 9 * len(pairs)
+    assert "distance/a/to/b/point_a/x" in paths  # as in documents that there are
+
+
 def test_another_scene_takes_over_the_parameters_that_the_model_has(tmp_path):
     """A program that reads its own document again speaks of the same distance, at whatever state it begins."""
     model = kv.load("kitchen")

@@ -11,6 +11,7 @@ penetration d is negative and n is the same, so nothing happens to the gradient 
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 
 import numpy as np
@@ -76,7 +77,7 @@ def parameters_of(model: ModelView, closest: Closest, world_T_a: Floats, world_T
     def of(path: str, value: float) -> Symbol:
         return known[path] if path in known else parameter(path, value)
 
-    path = f"distance/{closest.a}/to/{closest.b}"
+    path = f"distance/{_without_to(closest.a)}/to/{_without_to(closest.b)}"
     return tuple(
         tuple(of(f"{path}/{name}/{axis}", float(value)) for axis, value in zip("xyz", row, strict=True))
         for name, row in zip(_ROWS, _rows(closest, world_T_a, world_T_b), strict=True)
@@ -90,6 +91,11 @@ def pair_distance(model: ModelView, a: str, b: str, parameters: Parameters) -> P
     world_a = world_T_a[:3, :3] @ point_a + world_T_a[:3, 3]
     world_b = world_T_b[:3, :3] @ point_b + world_T_b[:3, 3]
     return PairDistance(a, b, normal @ (world_b - world_a), parameters)
+
+
+def _without_to(body: str) -> str:
+    """Return a name without a part ``to``, which stands between two names; no two become the same."""
+    return re.sub(r"(^|/)(to_*)(?=/|$)", r"\1\2_", body)
 
 
 def _rows(closest: Closest, world_T_a: Floats, world_T_b: Floats) -> tuple[Floats, Floats, Floats]:
