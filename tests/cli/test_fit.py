@@ -124,6 +124,18 @@ def test_the_document_is_the_joint(door, tmp_path, capsys):
     assert (tmp_path / "door.png").stat().st_size > 10_000
 
 
+def test_a_pose_that_does_not_fit_is_named(tmp_path, capsys):
+    rng = np.random.default_rng(7)
+    seen = noisy(hinge(np.linspace(0.0, 1.2, 40)), rng)
+    seen[17, :3, :3] = turned([0.0, 0.4, 0.0]) @ seen[17, :3, :3]
+    table = write(tmp_path / "poses.csv", {"door": seen})
+    words = [table, "--noise", "2mm,0.5deg", "--families", "revolute"]
+    assert answer(words, capsys)["outliers"] == [17]
+    assert main(["fit", *words]) == 0
+    assert "1 of 40 poses does not fit: 17 (counted from 0)" in capsys.readouterr().out
+    assert answer([*words, "--thin", "9"], capsys)["outliers"] == []
+
+
 @pytest.mark.parametrize("suffix", ["png", "svg"])
 def test_the_picture_is_drawn(door, tmp_path, capsys, suffix):
     pytest.importorskip("matplotlib")
@@ -214,6 +226,7 @@ def test_thinned_recordings_are_shorter(door, capsys):
         ("part,x,y,z\na,0,0,0\nb,0,0,1\n", [], "which part moves?"),
         ("part,x,y,z\na,0,0,0\nb,0,0,1\n", ["--child", "c"], "has no part 'c'"),
         ("0 0 0\n0 0 1\n", ["--columns", "x,y"], "2 names were given"),
+        ("0 0 0\n0 0 1\n", ["--document", "a.urdf"], "whose name ends in .kv.json"),
     ],
 )
 def test_what_cannot_be_is_answered_in_a_line(rows, words, says, tmp_path, capsys):

@@ -89,6 +89,17 @@ def test_every_family_is_drawn(family, whole):
     assert {"joint values, ±2 σ", "left over"} <= {axes.get_title() for axes in figure.axes}
 
 
+@pytest.mark.parametrize("family", ["revolute", "prismatic"])
+def test_what_does_not_fit_is_ringed(found, family):
+    figure = pytest.importorskip("matplotlib.figure").Figure(figsize=SIZE, layout="constrained")
+    draw_identified(figure, found[family], hinge(), "a title", [3, 8])
+    looked = Looked.at(found[family], hinge())
+    side = next(axes for axes in figure.axes if axes.get_title() == "from the side")
+    ringed = np.asarray(side.collections[-1].get_offsets())
+    expected = looked.seen[[3, 8]][:, [2, 0] if family == "prismatic" else [0, 2]]
+    np.testing.assert_allclose(ringed, expected)
+
+
 def test_a_family_of_ones_own_is_drawn():
     figure = pytest.importorskip("matplotlib.figure").Figure(figsize=SIZE, layout="constrained")
     q, radius = kv.position("q"), kv.parameter("radius", 0.5)

@@ -6,6 +6,7 @@ import argparse
 import json
 import math
 import sys
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -99,6 +100,11 @@ def run(arguments: argparse.Namespace) -> int:
     from kineverse.cli.fit_report import as_json, as_text
     from kineverse.estimation.recording import read_recording
 
+    if arguments.document and not arguments.document.endswith(".kv.json"):
+        raise ValueRejectedError(
+            f"--document {arguments.document!r}: the joint is written as a document, whose name ends in "
+            ".kv.json. Then: kineverse convert joint.kv.json joint.urdf"
+        )
     stated = None if arguments.noise is None else parse_noise(arguments.noise)
     recording = read_recording(arguments.poses, arguments.columns)
     if recording.ignored:
@@ -111,12 +117,13 @@ def run(arguments: argparse.Namespace) -> int:
         pair = pair.thinned(arguments.thin)
     with doing(f"learning from {len(pair.child_poses)} poses"):
         found, noise = learn(pair, stated, arguments.families)
-    written = write(arguments, pair, found)
+    outliers = outliers_of(pair, found, noise)
+    written = write(arguments, pair, found, outliers)
     if arguments.json:
-        answer = {"poses": arguments.poses, **as_json(pair, found, noise), **written}
+        answer = {"poses": arguments.poses, **as_json(pair, found, noise, outliers), **written}
         print(json.dumps(answer, indent=2, allow_nan=False))
     else:
-        print(as_text(arguments.poses, pair, found, noise))
+        print(as_text(arguments.poses, pair, found, noise, outliers))
         for what, path in written.items():
             if path:
                 print(f"{what}: {path}")
@@ -170,14 +177,25 @@ def learn(pair: Pair, stated: tuple[float, float | None] | None, families: str |
     return found, Noise(position, orientation if whole else None, stated is not None)
 
 
-def write(arguments: argparse.Namespace, pair: Pair, found: Found) -> dict[str, Any]:
+def outliers_of(pair: Pair, found: Found, noise: Noise) -> list[int]:
+    """Return the numbers of the poses, from 0, that are wrong altogether if the best joint is right."""
+    from kineverse.estimation import pose_covariance
+    from kineverse.estimation.identification.observations import observations
+    from kineverse.estimation.identification.outlying import outlying
+
+    covariance = pose_covariance(noise.position, noise.orientation or 1.0)
+    seen = observations(pair.parent_poses, pair.child_poses, covariance, covariance)
+    return [int(number) for number in outlying(found.best, seen)]
+
+
+def write(arguments: argparse.Namespace, pair: Pair, found: Found, outliers: Sequence[int]) -> dict[str, Any]:
     """Write what was asked for, and return where it is."""
     if arguments.picture:
         from kineverse.experiments.report import Figure
         from kineverse.view.identified import SIZE, draw_identified
 
         title = f"{pair.child} in {pair.parent}: {found}"
-        picture = Figure(lambda c: draw_identified(c, found.best, pair.relative, title), SIZE)
+        picture = Figure(lambda c: draw_identified(c, found.best, pair.relative, title, outliers), SIZE)
         picture.save(arguments.picture)
     if arguments.document:
         from kineverse.cli.fit_document import document_of

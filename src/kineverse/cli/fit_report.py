@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -17,8 +18,11 @@ if TYPE_CHECKING:
 _SHOWN = 1e-4
 """Less probable families are counted, not listed."""
 
+_LISTED = 10
+"""Of more poses that do not fit only the first are listed."""
 
-def as_text(source: str, pair: Pair, found: Found, noise: Noise) -> str:
+
+def as_text(source: str, pair: Pair, found: Found, noise: Noise, outliers: Sequence[int]) -> str:
     """Return what was found: the joint, how sure that is, and what else it could be."""
     best = found.best
     said = f"{best.family}, {_percent(best.probability)}"
@@ -31,13 +35,14 @@ def as_text(source: str, pair: Pair, found: Found, noise: Noise) -> str:
         "",
         said,
         *(f"  {name:10}{value}" for name, value in _parts(best)),
+        *_misfits(outliers, len(pair.child_poses), what),
         "",
         *_ranking(found),
     ]
     return "\n".join(lines)
 
 
-def as_json(pair: Pair, found: Found, noise: Noise) -> dict[str, Any]:
+def as_json(pair: Pair, found: Found, noise: Noise, outliers: Sequence[int]) -> dict[str, Any]:
     """Return everything that was found, as plain values."""
     return {
         "parent": pair.parent,
@@ -48,6 +53,7 @@ def as_json(pair: Pair, found: Found, noise: Noise) -> dict[str, Any]:
         "told": not found.cannot_tell,
         "family": found.best.family,
         "says": str(found),
+        "outliers": list(outliers),
         "fits": [_fit(fit) for fit in found.fits],
     }
 
@@ -80,6 +86,16 @@ def _parts(fit: Fit) -> list[tuple[str, str]]:
     if fit.residuals.shape[1] > 3:
         left += f", {figure(math.degrees(fit.rms[1]), 3)} deg"
     return [*parts, ("left over", f"{left} rms")]
+
+
+def _misfits(outliers: Sequence[int], count: int, what: str) -> list[str]:
+    """Return which poses do not fit at all, from 0, in words."""
+    if not outliers:
+        return []
+    numbers = ", ".join(map(str, outliers[:_LISTED]))
+    more = ", …" if len(outliers) > _LISTED else ""
+    do = "does" if len(outliers) == 1 else "do"
+    return [f"  {len(outliers)} of {count} {what} {do} not fit: {numbers}{more} (counted from 0)"]
 
 
 def ranges(fit: Fit) -> list[tuple[float, float, float, bool]]:

@@ -6,6 +6,7 @@ canvases and axes that the caller makes.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -83,7 +84,9 @@ class Looked:
         return into @ fit.covariance[np.ix_(chosen, chosen)] @ np.swapaxes(into, 1, 2)
 
 
-def draw_identified(canvas: Canvas, fit: Fit, relative: Array, title: str) -> None:
+def draw_identified(
+    canvas: Canvas, fit: Fit, relative: Array, title: str, outliers: Sequence[int] = ()
+) -> None:
     """Draw what was seen and a fit: along the axis, from its side, and over the observations.
 
     Parameters
@@ -96,6 +99,8 @@ def draw_identified(canvas: Canvas, fit: Fit, relative: Array, title: str) -> No
         What it was made of: poses (N, 4, 4) or positions (N, 3) of the child in the parent [m].
     title
         Above the picture.
+    outliers
+        The numbers of observations that do not fit: they are ringed.
     """
     looked = Looked.at(fit, relative)
     parts = canvas.subplot_mosaic(
@@ -103,8 +108,10 @@ def draw_identified(canvas: Canvas, fit: Fit, relative: Array, title: str) -> No
     )
     draw_along(parts["along"], looked)
     draw_side(parts["side"], looked)
+    for part, points in _shown(looked):
+        _ring(parts[part], points[list(outliers)])
     draw_values(parts["values"], fit)
-    draw_left(parts["left"], fit)
+    draw_left(parts["left"], fit, outliers)
     canvas.suptitle(title)
 
 
@@ -163,9 +170,11 @@ def draw_values(axes: Axes, fit: Fit) -> None:
     axes.tick_params(labelbottom=False)
 
 
-def draw_left(axes: Axes, fit: Fit) -> None:
-    """Draw what the fit leaves of each observation."""
+def draw_left(axes: Axes, fit: Fit, outliers: Sequence[int] = ()) -> None:
+    """Draw what the fit leaves of each observation, those that do not fit with a line."""
     number = np.arange(len(fit.residuals))
+    for outlier in outliers:
+        axes.axvline(outlier, color=AXIS, linewidth=0.8, linestyle=":")
     axes.plot(number, 1e3 * np.linalg.norm(fit.residuals[:, :3], axis=1), color=MODEL, linewidth=0.8)
     axes.set(xlabel="observation", title="left over")
     axes.set_ylabel("position [mm]", color=MODEL)
@@ -176,6 +185,18 @@ def draw_left(axes: Axes, fit: Fit) -> None:
         other.plot(number, angles, color="tab:orange", linewidth=0.8)
         other.set_ylabel("orientation [deg]", color="tab:orange")
         other.set_ylim(bottom=0.0)
+
+
+def _shown(looked: Looked) -> list[tuple[str, Array]]:
+    """Return where observations are in both views, (N, 2) each."""
+    if looked.fit.family == "prismatic":
+        return [("along", 1e3 * (looked.seen - looked.fitted)[:, :2]), ("side", looked.seen[:, [2, 0]])]
+    return [("along", looked.seen[:, [0, 1]]), ("side", looked.seen[:, [0, 2]])]
+
+
+def _ring(axes: Axes, points: Array) -> None:
+    """Mark what does not fit."""
+    axes.scatter(points[:, 0], points[:, 1], s=60, facecolors="none", edgecolors=AXIS, zorder=4)
 
 
 def _points(axes: Axes, looked: Looked, right: int, up: int) -> None:

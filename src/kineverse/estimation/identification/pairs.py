@@ -93,28 +93,28 @@ def squared_error(seen: Observations, fit: Fit) -> float:
 
 
 def covariance_of(seen: Observations, fit: Fit) -> Array:
-    """Return the covariances of observed relative poses, in the parent's axes, (N, 6, 6)."""
-    turned, covariance = _turned(seen), child_covariance(seen)
+    """Return the covariances of observed relative poses, or positions, in the parent's axes, (N, m, m)."""
+    covariance = child_covariance(seen)
     if seen.parent_covariance is not None:
-        lever = np.tile(np.eye(6), (len(turned), 1, 1))
+        lever = np.tile(np.eye(6), (len(seen), 1, 1))
         lever[:, :3, 3:] = -skew(fit.poses[:, :3, 3])
-        carried = lever @ turned
+        carried = lever[:, : seen.rows] @ _turned(seen, 6)
         covariance = covariance + carried @ seen.parent_covariance @ np.swapaxes(carried, 1, 2)
     return covariance
 
 
 def child_covariance(seen: Observations) -> Array:
-    """Return the covariances of the child's pose in the parent's axes, (N, 6, 6)."""
-    turned = _turned(seen)
+    """Return the covariances of the child's pose or position in the parent's axes, (N, m, m)."""
+    turned = _turned(seen, seen.rows)
     covariance: Array = turned @ seen.child_covariance @ np.swapaxes(turned, 1, 2)
     return covariance
 
 
-def _turned(seen: Observations) -> Array:
+def _turned(seen: Observations, rows: int) -> Array:
     p_R_w = np.swapaxes(seen.parent[:, :3, :3], 1, 2)
     turned = np.zeros((len(p_R_w), 6, 6))
     turned[:, :3, :3] = turned[:, 3:, 3:] = p_R_w
-    return turned
+    return turned[:, :rows, :rows]
 
 
 def _log_volume(covariance: Array, fit: Fit) -> float:

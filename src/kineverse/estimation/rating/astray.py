@@ -6,12 +6,11 @@ import math
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from kineverse.estimation.identification.identify import family_weights
 from kineverse.estimation.identification.observations import Observations
+from kineverse.estimation.identification.outlying import is_right
 from kineverse.estimation.identification.pairs import Families, identified
-from kineverse.estimation.identification.rigid import Array
 from kineverse.estimation.tracking.outliers import Outliers
 
 from .earlier import Rows, beside, squared_errors
@@ -32,7 +31,7 @@ def credible(left: Misfit, outliers: Outliers | None) -> Rows:
     if left.beyond.size:
         squares = squares + np.maximum(left.beyond, 0.0).max(axis=1) ** 2
     log_scale = left.log_scale + 0.5 * np.linalg.slogdet(2.0 * np.pi * left.covariances)[1]
-    right = everything[_right(squares, log_scale, outliers)]
+    right = everything[is_right(squares, log_scale, outliers)]
     # More than chance makes of their fraction are no outliers, but something that is not understood.
     expected = outliers.fraction * len(left)
     usual = len(left) - len(right) <= expected + 2.0 * math.sqrt(expected)
@@ -76,7 +75,7 @@ def _kept(seen: Observations, family: Any, outliers: Outliers) -> Rows:
         for _ in range(_ROUNDS):
             solution = beside(identified(seen.at(rows), [family]).best, seen)
             log_scale = 0.5 * np.linalg.slogdet(2.0 * np.pi * solution.covariance)[1]
-            before, rows = rows, everything[_right(squared_errors(solution), log_scale, outliers)]
+            before, rows = rows, everything[is_right(squared_errors(solution), log_scale, outliers)]
             if not _enough(rows, len(seen)) or np.array_equal(rows, before):
                 break
         if len(rows) == len(seen):
@@ -88,14 +87,6 @@ def _kept(seen: Observations, family: Any, outliers: Outliers) -> Rows:
 
 def _enough(kept: Rows, count: int) -> bool:
     return len(kept) >= max((1.0 - _SHARE) * count, _ENOUGH - 1)
-
-
-def _right(squares: Array, log_scale: Array, outliers: Outliers) -> npt.NDArray[np.bool_]:
-    """Return which observations are more probable to be right than wrong."""
-    right: npt.NDArray[np.bool_] = math.log(1.0 - outliers.fraction) - 0.5 * squares - log_scale > _wrong(
-        outliers
-    )
-    return right
 
 
 def _wrong(outliers: Outliers) -> float:
