@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
-from typing import Any
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -140,25 +140,44 @@ class Fit:
         return ", ".join(words)
 
 
-@dataclass(frozen=True)
+class Offer(NamedTuple):
+    """A family with its probability, and what makes its fit once somebody looks at it."""
+
+    family: str
+    probability: float
+    make: Callable[[], Fit]
+
+
+@dataclass(frozen=True, eq=False)
 class Found:
-    """Every family that was tried, the most probable first.
+    """Every family that was tried, the most probable first. Fits are made when they are looked at.
 
     Attributes
     ----------
-    fits
+    offers
         One for each family.
     noise_scale
         By how much the standard deviations of the noise were scaled; 1 where it was given.
     """
 
-    fits: tuple[Fit, ...]
+    offers: tuple[Offer, ...]
     noise_scale: float = 1.0
+    _made: dict[int, Fit] = field(default_factory=dict, repr=False)
+
+    @property
+    def fits(self) -> tuple[Fit, ...]:
+        """One for each family."""
+        return tuple(self._fit(k) for k in range(len(self)))
+
+    @property
+    def probabilities(self) -> dict[str, float]:
+        """By family, the largest first."""
+        return {offer.family: offer.probability for offer in self.offers}
 
     @property
     def best(self) -> Fit:
         """The most probable one."""
-        return self.fits[0]
+        return self._fit(0)
 
     @property
     def cannot_tell(self) -> bool:
@@ -166,23 +185,26 @@ class Found:
         return self.best.probability < SURE or not self.best.told
 
     def __getitem__(self, family: str) -> Fit:
-        for fit in self.fits:
-            if fit.family == family:
-                return fit
-        raise UnknownNameError(
-            f"The family {family!r} was not tried. {suggest(family, (f.family for f in self.fits), 'family')}"
-        )
+        tried = [offer.family for offer in self.offers]
+        if family not in tried:
+            raise UnknownNameError(f"The family {family!r} was not tried. {suggest(family, tried, 'family')}")
+        return self._fit(tried.index(family))
 
     def __iter__(self) -> Iterator[Fit]:
         return iter(self.fits)
 
     def __len__(self) -> int:
-        return len(self.fits)
+        return len(self.offers)
 
     def __str__(self) -> str:
         if not self.cannot_tell:
             return str(self.best)
         if self.best.probability >= SURE:
             return f"cannot tell: {self.best.family}, but {self.best.reason}"
-        likely = [f for f in self.fits if f.probability > 1.0 - SURE]
-        return "cannot tell: " + " or ".join(f"{f.family} ({f.probability:.0%})" for f in likely)
+        likely = {name: p for name, p in self.probabilities.items() if p > 1.0 - SURE}
+        return "cannot tell: " + " or ".join(f"{name} ({p:.0%})" for name, p in likely.items())
+
+    def _fit(self, k: int) -> Fit:
+        if k not in self._made:
+            self._made[k] = self.offers[k].make()
+        return self._made[k]

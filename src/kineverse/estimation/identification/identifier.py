@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import numpy.typing as npt
 
@@ -9,11 +11,12 @@ from kineverse.errors import ShapeError, ValueRejectedError
 
 from .family import Family
 from .fit import Found
+from .groups import GroupMotion
 from .identify import Families, family_weights, judged, noise_of, solutions, weighed
 from .motion import Member
 from .native import solver
 from .observations import Observations, observations
-from .rigid import Array
+from .rigid import Array, orthonormal
 from .solving import Solution
 
 # A family that is less probable than this rests until there are twice as many observations.
@@ -120,9 +123,8 @@ class Identifier:
             self._solutions = {name: _continued(seen, s) for name, s in self._solutions.items()}
         known = judged(seen, self._solutions, self._weights)
         found = weighed(known, self._weights, self._stated)
-        chances = {fit.family for fit in found if fit.probability > _NO_CHANCE}
-        kept = {family: s for family, (s, _) in known.items() if s.motion.name in chances}
-        self._solutions = kept
+        chances = {name for name, probability in found.probabilities.items() if probability > _NO_CHANCE}
+        self._solutions = {family: s for family, (s, _) in known.items() if s.motion.name in chances}
         return found
 
 
@@ -145,4 +147,8 @@ def _continued(seen: Observations, before: Solution[Member]) -> Solution[Member]
         apart = np.sum((seen.relative[:known] - seen.relative[k]) ** 2, axis=(1, 2))
         values.append(before.values[int(np.argmin(apart))][None])
     parent = np.concatenate([before.parent, seen.parent[known:]])
-    return solver.solve(seen, before.motion, np.concatenate(values), parent, before.belief)
+    motion = before.motion
+    if isinstance(motion, GroupMotion):
+        # Steps multiply rotations without end, and they drift.
+        motion = replace(motion, left=orthonormal(motion.left), right=orthonormal(motion.right))
+    return solver.solve(seen, motion, np.concatenate(values), parent, before.belief)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping
+from functools import partial
 from types import MappingProxyType
 from typing import TypeAlias
 
@@ -16,7 +17,7 @@ from kineverse.estimation.noise import pose_covariance
 from .canonical import canonical
 from .evidence import Evidence, evidence
 from .family import Family, family_starts
-from .fit import Found
+from .fit import Fit, Found, Offer
 from .mirrored import straightened
 from .motion import Member
 from .native import solver
@@ -172,17 +173,17 @@ def judged(
     seen: Observations, found: Mapping[str | Family, Solution[Member]], weights: Mapping[str | Family, float]
 ) -> dict[str | Family, tuple[Solution[Member], Evidence]]:
     """Return solutions and their evidence, those that have a chance with joint values integrated out."""
-    found = {name: slid(solution) for name, solution in found.items()}
-    first = {name: (solution, evidence(solution)) for name, solution in found.items()}
-    logs = {name: known.log_evidence + math.log(weights[name]) for name, (_, known) in first.items()}
-    least = max(logs.values()) - _CHANCE - _CHANCE_EACH * len(seen)
     result = {}
-    for name, (solution, known) in first.items():
-        if logs[name] >= least:
-            final = canonical(refined(seen, solution))
-            result[name] = final, evidence(final)
-        else:
-            result[name] = canonical(solution), known
+    for name, solution in found.items():
+        first = refined(seen, solution) if solution.belief.marginal else slid(solution)
+        result[name] = first, evidence(first)
+    logs = {name: known.log_evidence + math.log(weights[name]) for name, (_, known) in result.items()}
+    least = max(logs.values()) - _CHANCE - _CHANCE_EACH * len(seen)
+    for name, (solution, _) in result.items():
+        if logs[name] >= least and not solution.belief.marginal:
+            final = refined(seen, solution)
+            if final is not solution:
+                result[name] = final, evidence(final)
     return result
 
 
@@ -194,23 +195,27 @@ def weighed(
     """Return the fits of all families, weighed by their evidence."""
     beforehand = {name: math.log(weights[name]) for name in found}
     if stated:
-        evidences = {name: known for name, (_, known) in found.items()}
-        logs = {name: e.log_evidence for name, e in evidences.items()}
+        logs = {name: known.log_evidence for name, (_, known) in found.items()}
         scale = 1.0
     else:
-        grid = {name: [evidence(s.scaled(c)) for c in _SCALES] for name, (s, _) in found.items()}
         spread = -0.5 * (np.log(_SCALES) / _SCALE_SPREAD) ** 2
         spread -= np.logaddexp.reduce(spread)
-        joint = {name: spread + [e.log_evidence for e in es] for name, es in grid.items()}
+        joint = {
+            name: spread + [evidence(solution.scaled(c)).log_evidence for c in _SCALES]
+            for name, (solution, _) in found.items()
+        }
         logs = {name: float(np.logaddexp.reduce(j)) for name, j in joint.items()}
         best = max(logs, key=lambda name: logs[name] + beforehand[name])
-        top = int(np.argmax(joint[best]))
-        scale = float(_SCALES[top])
-        evidences = {name: es[top] for name, es in grid.items()}
+        scale = float(_SCALES[int(np.argmax(joint[best]))])
     total: Array = np.array([logs[name] + beforehand[name] for name in found])
-    probabilities = np.exp(total - np.logaddexp.reduce(total))
-    fits = [
-        fit_of(found[name][0], evidences[name], logs[name], float(p))
-        for name, p in zip(found, probabilities, strict=True)
+    probabilities = np.exp(total - np.logaddexp.reduce(total)).tolist()
+    offers = [
+        Offer(solution.motion.name, p, partial(_fit, solution, scale, logs[name], p))
+        for (name, (solution, _)), p in zip(found.items(), probabilities, strict=True)
     ]
-    return Found(tuple(sorted(fits, key=lambda fit: -fit.probability)), scale)
+    return Found(tuple(sorted(offers, key=lambda offer: -offer.probability)), scale)
+
+
+def _fit(solution: Solution[Member], scale: float, log_evidence: float, probability: float) -> Fit:
+    solution = canonical(solution)
+    return fit_of(solution, evidence(solution.scaled(scale)), log_evidence, probability)

@@ -56,15 +56,19 @@ class Observations:
         of_parent = None if self.parent_covariance is None else self.parent_covariance[rows]
         return Observations(self.parent[rows], self.child[rows], of_parent, self.child_covariance[rows])
 
-    def softened(self) -> list[Observations]:
+    def softened(self) -> tuple[Observations, ...]:
         """Return the same observations with less precise positions, the least precise first.
 
         Where positions are known much better than what a lever makes of the errors of orientations, the
         likelihood is a thin and curved valley. Steps find into it if it narrows by and by.
         """
+        return self._softened
+
+    @cached_property
+    def _softened(self) -> tuple[Observations, ...]:
         lever = float(np.sqrt(np.mean(np.sum(self.relative[:, :3, 3] ** 2, axis=1))))
         if self.parent_covariance is None:
-            return []
+            return ()
         turned = lever * float(np.sqrt(np.mean(np.einsum("nii->ni", self.parent_covariance)[:, 3:])))
         place = float(np.sqrt(np.mean(np.einsum("nii->ni", self.child_covariance)[:, :3])))
         result, factor = [], 0.5 * turned / place
@@ -74,7 +78,7 @@ class Observations:
             of_parent = self.parent_covariance * np.outer(scale, scale)
             result.append(Observations(self.parent, self.child, of_parent, of_child))
             factor /= _THIN
-        return result
+        return tuple(result)
 
 
 def observations(
