@@ -20,7 +20,7 @@ import numpy as np
 
 from .library import at, library
 from .motion import Linear, Prior
-from .rigid import Array, exponential, pose, right_jacobian, skew
+from .rigid import Array, exponential, orthonormal, pose, right_jacobian, skew
 
 VX, VY, VZ, WX, WY, WZ = range(6)
 
@@ -231,7 +231,9 @@ class GroupMotion:
         l_T_l = pose(exponential(left[3:]), left[:3])
         r_T_r = pose(exponential(right[3:]), right[:3])
         pitch = self.pitch + (float(step[-1]) if self.group.pitch else 0.0)
-        return replace(self, left=self.left @ l_T_l, right=r_T_r @ self.right, pitch=pitch)
+        # Rotations that are multiplied without end would drift.
+        left_moved, right_moved = orthonormal(self.left @ l_T_l), orthonormal(r_T_r @ self.right)
+        return replace(self, left=left_moved, right=right_moved, pitch=pitch)
 
     def bounded(self, values: Array, step: Array) -> Array:
         """Return joint values after a step: at most half a radian at once."""

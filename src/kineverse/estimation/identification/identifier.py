@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import numpy.typing as npt
 
@@ -11,12 +9,11 @@ from kineverse.errors import ShapeError, ValueRejectedError
 
 from .family import Family
 from .fit import Found
-from .groups import GroupMotion
 from .identify import Families, family_weights, judged, noise_of, solutions, weighed
 from .motion import Member
 from .native import solver
 from .observations import Observations, observations
-from .rigid import Array, orthonormal
+from .rigid import Array
 from .solving import Solution
 
 # A family that is less probable than this rests until there are twice as many observations.
@@ -147,8 +144,4 @@ def _continued(seen: Observations, before: Solution[Member]) -> Solution[Member]
         apart = np.sum((seen.relative[:known] - seen.relative[k]) ** 2, axis=(1, 2))
         values.append(before.values[int(np.argmin(apart))][None])
     parent = np.concatenate([before.parent, seen.parent[known:]])
-    motion = before.motion
-    if isinstance(motion, GroupMotion):
-        # Steps multiply rotations without end, and they drift.
-        motion = replace(motion, left=orthonormal(motion.left), right=orthonormal(motion.right))
-    return solver.solve(seen, motion, np.concatenate(values), parent, before.belief)
+    return solver.solve(seen, before.motion, np.concatenate(values), parent, before.belief)

@@ -111,7 +111,7 @@ class Library:
         code.informed.restype = None
         code.slid.argtypes = (
             *(pointer, counter, counter, counter),
-            *(ctypes.c_double, ctypes.c_double, counter),
+            *(*(ctypes.c_double,) * 3, counter),
             *(pointer,) * 9,
         )
         code.slid.restype = counter

@@ -84,6 +84,15 @@ static void logarithm(const double *r, double *v) {
   for (int i = 0; i < 3; i++) v[i] = factor * axis[i];
 }
 
+/* The rotation that is nearest to what is nearly one: R (3 - R'R) / 2 squares the error. */
+static void straighten(double *R) {
+  double square[9], nearer[9];
+  transposed_times33(R, R, square);
+  for (int i = 0; i < 9; i++) square[i] = (i % 4 ? 0.0 : 1.5) - 0.5 * square[i];
+  times33(R, square, nearer);
+  memcpy(R, nearer, sizeof nearer);
+}
+
 /* The lower factor of a positive definite matrix in its place, with the reciprocals of its diagonal; returns
    the product of the diagonal, or 0 if it is none. */
 FAST double factorise(double *a, const int n) {

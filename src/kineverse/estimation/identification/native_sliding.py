@@ -3,15 +3,16 @@
 SLIDING = r"""
 /* As slid in sliding.py: motion, values and derivatives are changed in their place. Returns 0 without
    memory. */
-EXPORT int64_t slid(const Problem *p, int64_t count, int64_t slides, int64_t turns, double reach,
-                    double little, int64_t size, const double *grid, const int64_t *kinds,
+EXPORT int64_t slid(const Problem *p, int64_t count, int64_t slides, int64_t turns, double close,
+                    double reach, double little, int64_t size, const double *grid, const int64_t *kinds,
                     const double *covariance, const double *residuals, Motion *m, double *values,
                     double *poses, double *by_parameters, double *by_joints) {
   int joints = (int)p->joints, n = joints + (int)slides;
   double *memory = malloc(count * (joints + joints * joints + 9) * sizeof(double));
   if (!memory) return 0;
   double *places = memory, *known = places + count * joints, *turned = known + count * joints * joints;
-  for (int64_t turn = 0; turn < turns; turn++) {
+  double most = INFINITY;
+  for (int64_t turn = 0; turn < turns && most > close; turn++) {
     double deviations[6], mean[6], normal[81] = {0}, change[9] = {0};
     memcpy(places, values, count * joints * sizeof(double));
     alone(count, p->rows, joints, little, covariance, by_joints, residuals, places, known);
@@ -42,7 +43,11 @@ EXPORT int64_t slid(const Problem *p, int64_t count, int64_t slides, int64_t tur
     }
     factorise(normal, n);
     resolve(normal, n, change);
-    for (int i = 0; i < slides; i++) m->right_p[i] += change[joints + i];
+    most = 0.0;
+    for (int i = 0; i < slides; i++) {
+      m->right_p[i] += change[joints + i];
+      most = fmax(most, fabs(change[joints + i]));
+    }
     for (int64_t k = 0; k < count; k++)
       for (int i = 0; i < slides; i++)
         for (int j = 0; j < slides; j++)

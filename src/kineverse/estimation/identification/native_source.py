@@ -87,6 +87,8 @@ EXPORT int64_t solve(const Problem *p, int64_t starts, Motion *motion, double *v
   double best = INFINITY;
   for (int64_t i = 0; i < starts; i++) {
     Motion trial = motion[i];
+    straighten(trial.left_R);
+    straighten(trial.right_R);
     begin(p, values + i * count * joints, parents, here);
     double reached = look_at_all(p, &trial, weights, here);
     int64_t done = starts > 1 ? settle(p, weights, &trial, &here, &there, first, &reached) : 0;

@@ -27,6 +27,8 @@ from .solving import Solution
 from .widths import GRID, LITTLE, alone, widths
 
 _TURNS = 3
+# What the point moves by when it has settled [m].
+_CLOSE = 1e-6
 
 
 def slid(solution: Solution[Member], native: bool = True) -> Solution[Member]:
@@ -57,6 +59,8 @@ def slid(solution: Solution[Member], native: bool = True) -> Solution[Member]:
         solution = _changed(solution, motion, change)
         assert isinstance(solution.motion, GroupMotion)  # a changed one is none else
         motion = solution.motion
+        if np.abs(change).max() <= _CLOSE:
+            break
     return solution
 
 
@@ -67,7 +71,7 @@ def _slid(solution: Solution[Member], motion: GroupMotion) -> Solution[Member]:
     done = library.code.slid(
         ctypes.addressof(problem_of(motion.group, motion.rows)),
         *(len(values), motion.slides, _TURNS),
-        *(REACH, LITTLE, len(GRID)),
+        *(_CLOSE, REACH, LITTLE, len(GRID)),
         *(array.ctypes.data for array in given),
     )
     if not done:
