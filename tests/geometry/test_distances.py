@@ -8,10 +8,12 @@ import numpy as np
 import pytest
 import trimesh
 from convex_shapes import EXACT, KINDS, MujocoPairs, gap, random_pose, random_shape
+from scipy.spatial.transform import Rotation
 
 from kineverse.geometry.narrow import Narrow
+from kineverse.geometry.reach import gaps
 from kineverse.geometry.solids import _triangles, enlarged, solid_of
-from kineverse.model.body import Box, Sphere
+from kineverse.model.body import Box, Cone, Ellipsoid, Sphere
 
 EACH = 4
 PAIRS = list(itertools.combinations_with_replacement(KINDS, 2))
@@ -99,6 +101,32 @@ def test_where_coal_fails_altogether_there_is_still_a_way_out(shapes, monkeypatc
         assert distance <= gap(a, b, poses, normal) + 1e-9
         assert distance < 0
         assert normal @ (point_b - point_a) == pytest.approx(distance, abs=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("one", "other", "turn", "position"),
+    [
+        (
+            Cone(0.017881, 0.064586),
+            Box((0.0002, 0.04808, 0.0002)),
+            2.989989,
+            (-0.007736, 0.037628, -0.032351),
+        ),
+        (Ellipsoid((4.4, 0.0024, 0.0044)), Ellipsoid((0.78, 0.58, 0.0008)), 0.0, (0.0, 0.0, 0.0052)),
+    ],
+)
+def test_where_thin_things_touch_the_normal_shows_their_depth(one, other, turn, position):
+    """Here coal has a depth and a normal of length one that have nothing to do with each other."""
+    rotation = Rotation.from_rotvec([0, 0, turn]).as_matrix()
+    poses = np.stack([np.eye(4)[:3], np.column_stack([rotation, position])])
+    solids = solid_of(one), solid_of(other)
+    narrow = Narrow(solids, poses)
+    distance = narrow.distance(0, 1)
+    point_a, point_b, normal = narrow.witness()
+    a, b = ((solid, pose[:, :3], pose[:, 3]) for solid, pose in zip(solids, poses, strict=True))
+    assert gaps(a, b, normal[None])[0] == pytest.approx(distance, abs=2e-5)
+    assert normal @ (point_b - point_a) == pytest.approx(distance, abs=1e-9)
+    assert abs(distance) < 1e-4
 
 
 @pytest.mark.parametrize(("one", "other"), PAIRS)

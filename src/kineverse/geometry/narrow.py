@@ -19,6 +19,7 @@ import numpy as np
 from kineverse.model.body import Sphere
 
 from .mesh_files import Floats
+from .reach import Placed, furthest, gaps, widest_gap
 from .solids import Solid, coal_engine, enlarged, solid_of
 
 APART_TOLERANCE, DEPTH_TOLERANCE = 1e-8, 1e-6
@@ -32,6 +33,9 @@ ACCURACY = 1e-4
 
 # Nearer than this the direction between the closest points is made of rounding errors.
 _TOUCH = 1e-6
+# Along its normal a depth may be off by so much, some of what coal stops at; it grows with what is larger
+# than 1 m [m].
+_SHOWN = 3 * DEPTH_TOLERANCE
 # So far things are moved apart to see in which direction they touch, and no further than this part of them.
 _APART, _APART_OF_RADIUS = 1e-4, 1e-3
 # What coal is asked about is made at least so large: the tolerances in it are made for decimetres [m].
@@ -99,7 +103,7 @@ class Narrow:
         if not (a.is_convex and b.is_convex):
             return self._with_triangles(a, b, at_a, at_b)
         for request in (*self._rougher, None):
-            if -1e300 < distance < -_TOUCH and self._normal_is_right():
+            if -1e300 < distance < -_TOUCH and self._normal_is_right() and self._shows(i, j, distance):
                 return distance
             if request is None or abs(distance) <= _TOUCH:
                 break
@@ -157,11 +161,17 @@ class Narrow:
         x, y, z = self._result.normal.tolist()
         return bool(abs(x * x + y * y + z * z - 1.0) < 1e-6)
 
+    def _shows(self, i: int, j: int, distance: float) -> bool:
+        """Whether moving so far along the normal separates two convex solids that are in each other."""
+        normal = self.witness()[2]
+        shown = float(gaps(*self._placed_solids(i, j), normal[None])[0])
+        return distance - shown <= _SHOWN * max(1.0, *(solid.radius for solid in self._pair(i, j)))
+
     def _mend(self, i: int, j: int, functor: Any) -> float:
         """Measure two convex solids in touch, or that coal failed on, when they are a little apart.
 
         By how much and in which direction they were moved is taken off again. For flat faces that is exact,
-        for round ones the rest is of second order in 0.1 mm.
+        for round ones the rest is of second order in 0.1 mm. If that fails too, a way out is searched for.
         """
         at_a, result = self._transforms[i], self._result
         rotation, position = self._parts[j]
@@ -169,20 +179,27 @@ class Narrow:
             shifted = self._coal.Transform3s(rotation, position + shift)
             for request in (self._request, *self._rougher):
                 result.clear()
+                self._mended = None
                 distance: float = functor(at_a, shifted, request, result)
                 if abs(distance) < 1e300 and self._normal_is_right():
                     point_a, point_b, normal = self.witness()
+                    distance -= float(normal @ shift)
                     self._mended = point_a, point_b - shift, normal
-                    return distance - float(normal @ shift)
-        # Nothing is left but a way out that is long enough for certain: that of the boxes around them.
+                    if self._shows(i, j, distance):
+                        return distance
+        return self._searched(i, j)
+
+    def _searched(self, i: int, j: int) -> float:
+        """Measure two convex solids by a search: a way out for certain, and nearly the shortest."""
+        a, b = self._placed_solids(i, j)
         start, end = self._centres(i, j)
-        normal = _unit(end - start)
-        a, b = (
-            float(np.abs(normal @ self._parts[k][0]) @ solid.half)
-            for k, solid in zip((i, j), self._pair(i, j), strict=True)
-        )
-        self._mended = start + a * normal, end - b * normal, normal
-        return float(normal @ (end - start)) - a - b
+        distance, normal = widest_gap(a, b, _unit(end - start)[None])
+        self._mended = furthest(a, normal), furthest(b, -normal), normal
+        return distance
+
+    def _placed_solids(self, i: int, j: int) -> tuple[Placed, Placed]:
+        a, b = self._pair(i, j)
+        return (a, *self._parts[i]), (b, *self._parts[j])
 
     def _ways_apart(self, i: int, j: int) -> list[Floats]:
         far = min(_APART, _APART_OF_RADIUS * min(solid.radius for solid in self._pair(i, j)))

@@ -1,0 +1,105 @@
+"""How far solids reach in a direction, and so how far apart two are along it, without coal.
+
+No distance of convex solids is less than any gap, and the largest gap is the distance, see :mod:`.narrow`.
+"""
+
+from __future__ import annotations
+
+from typing import TypeAlias
+
+import numpy as np
+
+from kineverse.model.body import Cone
+
+from .mesh_files import Floats
+from .solids import Solid
+
+Placed: TypeAlias = tuple[Solid, Floats, Floats]
+"""A convex solid with its (3, 3) rotation and (3,) position in the world."""
+
+_ROUNDS, _SETS, _STARTS = 80, 8, 2
+
+
+def gaps(a: Placed, b: Placed, ways: Floats) -> Floats:
+    """Return how far two solids are apart along unit directions (n, 3) from one to the other, (n,) [m].
+
+    Where that is negative, moving the second by so much along the direction separates them.
+    """
+    (solid_a, rotation_a, at_a), (solid_b, rotation_b, at_b) = a, b
+    apart: Floats = (
+        ways @ (at_b - at_a) - _reach(solid_a, ways @ rotation_a) - _reach(solid_b, -ways @ rotation_b)
+    )
+    return apart
+
+
+def widest_gap(a: Placed, b: Placed, ways: Floats) -> tuple[float, Floats]:
+    """Search for the direction with the largest gap; return the gap [m] and the unit direction (3,).
+
+    The best of the axes of both, of some fixed directions and of those given, (n, 3), are turned a little, by
+    less and less.
+    """
+    tried = np.concatenate(
+        [ways, _SPREAD, *(sign * rotation.T for _, rotation, _ in (a, b) for sign in (1.0, -1.0))]
+    )
+    values = gaps(a, b, tried)
+    found = [_uphill(a, b, tried[k], float(values[k])) for k in np.argsort(-values, kind="stable")[:_STARTS]]
+    return max(found, key=lambda one: one[0])
+
+
+def furthest(placed: Placed, way: Floats) -> Floats:
+    """Return the point (3,) of a solid, in the world, that is furthest in a unit direction.
+
+    Of an edge or a face it is about the middle.
+    """
+    solid, rotation, position = placed
+    step = 1e-6
+    # The gradient of the reach is a point; at an edge or a face, the mean of some of them.
+    ends = way + step * np.concatenate([np.eye(3), -np.eye(3)])
+    reach = _reach(solid, ends @ rotation)
+    point = (reach[:3] - reach[3:]) / (2 * step)
+    short = float(_reach(solid, (way @ rotation)[None])[0] - way @ point)
+    return np.asarray(position + point + short * way)
+
+
+def _uphill(a: Placed, b: Placed, way: Floats, gap: float) -> tuple[float, Floats]:
+    width = 0.3
+    for turn in range(_ROUNDS):
+        # Others each time: along a ridge only few lead upwards.
+        turned = way + width * _SPREAD[turn % _SETS :: _SETS]
+        turned /= np.linalg.norm(turned, axis=1, keepdims=True)
+        values = gaps(a, b, turned)
+        best = int(np.argmax(values))
+        if values[best] > gap:
+            gap, way = float(values[best]), turned[best]
+            width *= 1.5
+        else:
+            width *= 0.75
+    return gap, way
+
+
+def _reach(solid: Solid, ways: Floats) -> Floats:
+    """Return the largest ``way @ x`` over the points x of a solid in its own frame, for (n, 3) directions."""
+    core, surface = solid.core, solid.surface
+    if core is None:
+        assert isinstance(surface, Cone)
+        half, side = surface.length / 2, np.hypot(ways[:, 0], ways[:, 1])
+        return np.maximum(half * ways[:, 2], surface.radius * side - half * ways[:, 2])
+    reach: Floats = np.abs(ways) @ core.half
+    if core.radius:
+        reach += core.radius * np.sqrt((ways * ways).sum(axis=1))
+    if core.radii[0]:
+        reach += np.sqrt(((ways * core.radii) ** 2).sum(axis=1))
+    if core.corners.size:
+        reach += (ways @ core.corners).max(axis=1)
+    return reach
+
+
+def _spread(count: int) -> Floats:
+    """Return unit directions (count, 3) all around, of which any number of the first ones are so too."""
+    k = np.arange(1, count + 1)
+    height, angle = 2.0 * (k * 0.7548776662466927 % 1.0) - 1.0, 2.0 * np.pi * (k * 0.5698402909980532 % 1.0)
+    side = np.sqrt(1.0 - height**2)
+    return np.stack([side * np.cos(angle), side * np.sin(angle), height], axis=1)
+
+
+_SPREAD = _spread(240)
