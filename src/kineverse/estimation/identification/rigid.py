@@ -12,7 +12,10 @@ Array = npt.NDArray[np.float64]
 
 def pose(rotation: Array, position: Array) -> Array:
     """Return transforms of rotations (..., 3, 3) and positions (..., 3)."""
-    result = np.zeros((*np.broadcast_shapes(rotation.shape[:-2], position.shape[:-1]), 4, 4))
+    shape = rotation.shape[:-2]
+    if shape != position.shape[:-1]:
+        shape = np.broadcast_shapes(shape, position.shape[:-1])
+    result = np.zeros((*shape, 4, 4))
     result[..., :3, :3] = rotation
     result[..., :3, 3] = position
     result[..., 3, 3] = 1.0
