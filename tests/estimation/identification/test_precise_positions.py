@@ -22,14 +22,14 @@ ORIENTATION = math.radians(10.0)
 
 def test_sliders_are_found_although_distances_say_two_things() -> None:
     squares, bounds = [], []
-    for seed in range(6):
+    for seed in (1, 2, 3):
         seen = recording(
             "prismatic", count=80, position=1e-3, orientation=ORIENTATION, seed=seed, extent=0.4, radius=0.5
         )
         fit = identify(seen.parent, seen.child, noise=seen.covariance, families=["prismatic"]).best
         squares.append(angle_between(fit.parameters["axis"], seen.axis) ** 2)
         bounds.append(direction_bound(seen, "prismatic", width=float(np.std(seen.values))) ** 2)
-    assert math.sqrt(np.mean(squares)) < 1.4 * math.sqrt(np.mean(bounds))
+    assert math.sqrt(np.mean(squares)) < 1.25 * math.sqrt(np.mean(bounds))
 
 
 @pytest.mark.parametrize("family", ["prismatic", "revolute"])

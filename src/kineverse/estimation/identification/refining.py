@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from .evidence import evidence
 from .mirrored import straightened
 from .motion import Member
 from .native import solver
@@ -29,6 +30,19 @@ def refined(seen: Observations, solution: Solution[Member]) -> Solution[Member]:
     """Return the solution with joint values integrated out."""
     if not solution.motion.joints or not solution.motion.size:
         return solution
+    result = _settled(seen, solution)
+    softened = seen.softened()
+    if solution.belief.marginal or not softened:
+        return result
+    # The maximum of the likelihood is no good start where positions are that precise: it has bent the motion
+    # so that each joint value has a place on it. With widths believed while the valley narrows, it has not.
+    for softer in (*softened, seen):
+        solution = solver.solve(softer, solution.motion, solution.values, solution.parent, solution.belief)
+        solution = _settled(softer, straightened(softer, solution))
+    return max(result, solution, key=lambda each: evidence(each).log_evidence)
+
+
+def _settled(seen: Observations, solution: Solution[Member]) -> Solution[Member]:
     known = solution.belief
     before: Array | None = known.precision**-0.5 if known.marginal else None
     for _ in range(_TURNS):
