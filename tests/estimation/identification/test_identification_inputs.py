@@ -35,6 +35,14 @@ def with_entry(poses: np.ndarray, value: float) -> np.ndarray:
         (SEEN.parent, SEEN.child, NOISE + np.eye(6, k=1), "not symmetric"),
         (SEEN.parent, SEEN.child, NOISE[:4, :4], "shape"),
         (SEEN.parent, "poses", NOISE, "no array of numbers"),
+        (SEEN.parent, SEEN.child + 0j, NOISE, "no array of numbers"),
+        (
+            SEEN.parent,
+            SEEN.child + 1e200 * np.eye(4, k=3),
+            NOISE,
+            "Pose 0 of the child has a number of 1e.200",
+        ),
+        (SEEN.parent, SEEN.child, 1e-18 * NOISE, "known to 1e-11"),
     ],
 )
 def test_bad_input_is_refused(parent: object, child: object, noise: np.ndarray, message: str) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -13,6 +14,8 @@ from kineverse.errors import ShapeError, ValueRejectedError
 from .rigid import Array, inverse
 
 _RIGID = 1e-4
+# Beyond these a double has not enough digits for what is computed.
+_LARGEST, _SMALLEST = 1e9, 1e-7
 # How much of a step the width of a valley makes.
 _THIN = 4.0
 
@@ -194,11 +197,19 @@ def covariances(given: npt.ArrayLike, count: int, rows: int, part: str) -> Array
             f"The covariance of the {part} is not {how} (at pose {k}). "
             "kv.estimation.pose_covariance(position, orientation) makes one of standard deviations."
         )
+    least = float(np.sqrt(np.linalg.eigvalsh(matrices)[:, 0].min(initial=math.inf)))
+    if least < _SMALLEST:
+        raise ValueRejectedError(
+            f"The covariance of the {part} says that something is known to {least:.2g} (metres or radians). "
+            f"Less than {_SMALLEST:.0g} is not told apart from what numbers lose."
+        )
     return np.ascontiguousarray(matrices)
 
 
 def _numbers(given: npt.ArrayLike, what: str) -> Array:
     try:
+        if np.iscomplexobj(given):
+            raise TypeError
         return np.asarray(given, dtype=np.float64)
     except (TypeError, ValueError):
         raise ShapeError(f"{what} are no array of numbers.") from None
@@ -209,4 +220,11 @@ def _check_finite(rows: Array, part: str, what: str = "Pose") -> None:
     if len(wrong):
         raise ValueRejectedError(
             f"{what} {int(wrong[0])} of the {part} is not finite. Leave out what was not seen."
+        )
+    wrong = np.flatnonzero(np.abs(rows).max(axis=1, initial=0.0) > _LARGEST)
+    if len(wrong):
+        most = float(np.abs(rows[wrong[0]]).max())
+        raise ValueRejectedError(
+            f"{what} {int(wrong[0])} of the {part} has a number of {most:.2g}. None is expected above "
+            f"{_LARGEST:.0g}: lengths are in metres, angles in radians."
         )
