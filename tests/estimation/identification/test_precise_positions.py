@@ -6,30 +6,32 @@ import math
 
 import numpy as np
 import pytest
-from joint_bounds import direction_bound
-from part_recordings import angle_between, recording, transform
+from part_recordings import recording, transform
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
-from kineverse.estimation import identify
 from kineverse.estimation.identification.groups import GROUPS, GroupMotion
-from kineverse.estimation.identification.mirrored import singly
+from kineverse.estimation.identification.mirrored import others, singly, straightened
 from kineverse.estimation.identification.observations import observations
-from kineverse.estimation.identification.solving import Belief
-
-ORIENTATION = math.radians(10.0)
+from kineverse.estimation.identification.solving import Belief, solve
 
 
-def test_sliders_are_found_although_distances_say_two_things() -> None:
-    squares, bounds = [], []
-    for seed in (1, 2, 3):
-        seen = recording(
-            "prismatic", count=80, position=1e-3, orientation=ORIENTATION, seed=seed, extent=0.4, radius=0.5
-        )
-        fit = identify(seen.parent, seen.child, noise=seen.covariance, families=["prismatic"]).best
-        squares.append(angle_between(fit.parameters["axis"], seen.axis) ** 2)
-        bounds.append(direction_bound(seen, "prismatic", width=float(np.std(seen.values))) ** 2)
-    assert math.sqrt(np.mean(squares)) < 1.25 * math.sqrt(np.mean(bounds))
+@pytest.mark.parametrize("family", ["prismatic", "revolute"])
+def test_observations_on_the_wrong_side_are_put_right(family: str) -> None:
+    seen = recording(
+        family, count=40, position=1e-3, orientation=math.radians(5.0), seed=3, extent=0.4, radius=0.5
+    )
+    problem = observations(seen.parent, seen.child, seen.covariance, seen.covariance)
+    assert problem.softened()
+    motion = GroupMotion(GROUPS[family], 6, seen.left, seen.right)
+    belief = Belief(np.zeros(1), np.full(1, 0.12**-2.0), marginal=True)
+    good = solve(problem, motion, seen.values, seen.true_parent, belief)
+    parent = good.parent.copy()
+    there = singly(problem, good.motion, others(good.motion, good.values, belief), parent, belief)
+    parent[:10, :3, :3] = there.orientation[:10]
+    bad = solve(problem, good.motion, np.concatenate([there.values[:10], good.values[10:]]), parent, belief)
+    assert bad.cost > good.cost + 1.0
+    assert straightened(problem, bad).cost < good.cost + 0.1 * (bad.cost - good.cost)
 
 
 @pytest.mark.parametrize("family", ["prismatic", "revolute"])

@@ -68,7 +68,7 @@ def _exchanged(
     """Return joint values and the parent's poses with the other ones where they are more probable."""
     belief, parent = solution.belief, solution.parent
     here = singly(seen, motion, solution.values, parent, belief)
-    there = singly(seen, motion, _others(motion, solution.values, belief), parent, belief)
+    there = singly(seen, motion, others(motion, solution.values, belief), parent, belief)
     better = there.log_density > here.log_density + _BETTER
     if not better.any():
         return None
@@ -124,7 +124,7 @@ def singly(seen: Observations, motion: GroupMotion, values: Array, parent: Array
     return best
 
 
-def _others(motion: GroupMotion, values: Array, belief: Belief) -> Array:
+def others(motion: GroupMotion, values: Array, belief: Belief) -> Array:
     """Return the other joint values (N, 1) at which the child is as far from the parent."""
     l_p_parent = -motion.left[:3, :3].T @ motion.left[:3, 3]
     if motion.freedom.joints[0] < WZ:
