@@ -20,6 +20,7 @@ from kineverse.view.living.panel import kitchen_report, stranger_report
 from kineverse.view.living.picture import picture
 from kineverse.view.living.routine import Routine
 from kineverse.view.living.scenery import Scenery
+from kineverse.view.living.sorting import Sorter
 from kineverse.view.living.strangers import STRANGERS
 
 STEP = 1.0 / 12.0
@@ -126,6 +127,11 @@ def test_outliers_are_told_apart():
     assert len(wrong.symmetric_difference(life.following.estimate.outliers)) <= 2
 
 
+def test_who_does_not_see_a_door_knows_how_far_it_may_have_gone():
+    _, figures, _ = lived(20.0, seed=1, sight=Sight(0.03, hidden=0.5))
+    assert 0.6 < average(figures[36:]).nees < 1.5
+
+
 def test_what_is_hidden_becomes_doubtful_and_another_noise_is_taken_in():
     life, *_ = lived(1.5)
     sure = life.following.doubt()
@@ -163,6 +169,28 @@ def test_a_stranger_is_learned_and_then_tracked(name, chest):
     assert sigmas < 2.2
     # The mean of what a marker is off is 1.6 standard deviations of one coordinate.
     assert np.mean(off[-20:]) < 1.2 * life.sight.noise
+
+
+def test_a_stranger_is_learned_between_outliers():
+    life, *_ = lived(8.0, seed=2, sight=Sight(0.03, outliers=0.2))
+    best = life.learner.found.best
+    assert (best.family, life.learner.found.cannot_tell) == ("revolute", False)
+    assert error(best, *life.stranger.axis)[0] < math.radians(9.0)
+
+
+def test_wrong_poses_of_a_stranger_are_sorted_out():
+    sorter, markers, sight = Sorter(), Markers(2, 3), Sight(0.03, outliers=0.2, hidden=0.3)
+    missed = dropped = right = 0
+    for k in range(120):
+        poses = np.stack(STRANGERS["stool"]().poses(0.5 - 0.5 * math.cos(0.1 * k)))
+        seen = markers.look(poses, k * STEP, sight)
+        good = sorter.good(seen, STEP, sight)
+        assert not (good & ~seen.there).any()
+        missed += (seen.wrong & good).sum()
+        right += (seen.there & ~seen.wrong).sum()
+        dropped += (seen.there & ~seen.wrong & ~good).sum()
+    assert missed <= 1
+    assert dropped < 0.05 * right
 
 
 def test_another_stranger_is_met_from_the_beginning():

@@ -16,7 +16,7 @@ from kineverse.view.triangles import Floats
 
 from .markers import Seen, Sight
 
-RESTLESS = 0.03
+RESTLESS = 0.1
 """What may move at any time: the variance that a coordinate gains [m²/s], [rad²/s]."""
 
 SIGMAS = 2.0

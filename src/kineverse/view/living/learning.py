@@ -8,11 +8,12 @@ from dataclasses import dataclass
 import numpy as np
 
 import kineverse as kv
-from kineverse.estimation import Fit, Found, ObservedPose, Tracker, identify
+from kineverse.estimation import Fit, Found, ObservedPose, Outliers, Tracker, identify
 from kineverse.model.frame import WORLD
 from kineverse.view.triangles import Floats
 
 from .markers import Seen, Sight
+from .sorting import Sorter
 from .strangers import BASE, PART
 
 LEARNED = "stranger/learned"
@@ -64,31 +65,34 @@ class Learner:
         self._covariances: list[Floats] = []
         self._fk: Callable[[dict[str, float]], Floats] | None = None
         self._looked = self._thought = -np.inf
+        self._sorter = Sorter()
         self._pace = LOOKS
 
     def step(self, seen: Seen, time: float, dt: float, sight: Sight) -> None:
         """Take in what was seen of base and part, in this order, ``dt`` after the last time [s]."""
-        if time >= self._looked + self._pace:
+        good = self._sorter.good(seen, dt, sight)
+        if good.all() and time >= self._looked + self._pace:
             self._looked = time
-            self._base.append(seen.poses[0])
-            self._part.append(seen.poses[1])
-            self._covariances.append(sight.covariance)
-            self._thin_out()
+            self._keep(seen, sight)
         if time >= self._thought + THINKS and len(self._part) >= FEWEST:
             self._thought = time
-            self._think(time)
+            self._think(time, sight)
         if self.tracker is not None:
             self.tracker.predict(dt)
-            self.tracker.update({PART: (seen.poses[1], sight.covariance)})
+            if seen.there[1]:
+                self.tracker.update({PART: (seen.poses[1], sight.covariance)})
 
-    def _thin_out(self) -> None:
-        """Forget every other pose where there are many: old ones say as much as new ones."""
+    def _keep(self, seen: Seen, sight: Sight) -> None:
+        """Remember poses, and forget every other one where there are many: old ones say as much as new."""
+        self._base.append(seen.poses[0])
+        self._part.append(seen.poses[1])
+        self._covariances.append(sight.covariance)
         if len(self._part) > MOST:
             self._base, self._part = self._base[::2], self._part[::2]
             self._covariances = self._covariances[::2]
             self._pace *= 2.0
 
-    def _think(self, time: float) -> None:
+    def _think(self, time: float, sight: Sight) -> None:
         covariances = np.array(self._covariances)
         base, part = np.array(self._base), np.array(self._part)
         self.found = identify(base, part, covariance_a=covariances, covariance_b=covariances)
@@ -103,9 +107,9 @@ class Learner:
         with model.edit() as edit:
             edit.apply(stands.operation(BASE, WORLD))
             edit.apply(best.operation(LEARNED, BASE, PART))
-        self._follow(model, best)
+        self._follow(model, best, sight)
 
-    def _follow(self, model: kv.Model, fit: Fit) -> None:
+    def _follow(self, model: kv.Model, fit: Fit, sight: Sight) -> None:
         """Track with what was just learned, from where the part was seen last."""
         self.model, self.tracker, self._fk = model, None, kv.compile(model.fk(PART))
         names = [str(s) for s in model.degrees_of_freedom]
@@ -115,6 +119,7 @@ class Learner:
                 [ObservedPose(PART)],
                 start=dict(zip(names, fit.joint_values[-1].tolist(), strict=True)),
                 process_noise={s.derivative(): RESTLESS for s in model.degrees_of_freedom},
+                outliers=Outliers(sight.outliers) if sight.outliers else None,
             )
 
     @property

@@ -113,10 +113,8 @@ class Life:
         swing = smooth(since / GROWS) * (0.5 - 0.5 * math.cos(math.tau * since / SWING))
         self.position = low + swing * (high - low)
         self.poses = np.stack(self.stranger.poses(self.position))
-        # Who does not know how something moves cannot tell what is wrong with a pose, or why one is missing.
-        plain = Sight(self.sight.noise)
-        self.stranger_seen = self._strange_markers.look(self.poses, self.time, plain)
-        self.learner.step(self.stranger_seen, self.time, dt, plain)
+        self.stranger_seen = self._strange_markers.look(self.poses, self.time, self.sight)
+        self.learner.step(self.stranger_seen, self.time, dt, self.sight)
 
     @property
     def figures(self) -> Figures:
