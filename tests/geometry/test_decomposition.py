@@ -300,6 +300,22 @@ WRONG = {
     "os.abort": ("import os; os.abort()", "ended by SIGABRT"),
     "raises": ("raise RuntimeError('too concave')", "ended with status 1: RuntimeError: too concave"),
     "nothing": ("return []", "ended with status 1"),
+    "no memory for C++": (
+        "import os; os.write(2, b'instance of std::bad_alloc\\n\\nAborted.'); os.abort()",
+        "by SIGABRT: Aborted. It needs more memory than it may have",
+    ),
+    "no memory to load": (
+        "raise OSError('x.so: failed to map segment from shared object')",
+        "object. It needs more memory than it may have",
+    ),
+    "no memory in the system": (
+        "import os, signal; os.kill(os.getpid(), signal.SIGKILL)",
+        "Systems without free memory",
+    ),
+    "a crash": (
+        "import os; os.kill(os.getpid(), 11)",
+        "SIGSEGV. Simplify or mend the mesh, or allow more memory",
+    ),
     "not finite": ("mesh.vertices[0] = float('nan')\n" + ONE_HULL, "not where the mesh is"),
     "elsewhere": ("mesh.vertices += 1\n" + ONE_HULL, "not where the mesh is"),
     "a line": ("mesh.vertices[:] = mesh.vertices[0]\n" + ONE_HULL, "found no hull"),

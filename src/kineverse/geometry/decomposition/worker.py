@@ -23,6 +23,14 @@ from .surface import Surface
 PROGRAM = Path(__file__).with_name("program.py")
 _POLL = 0.05
 _LAST_WORDS = 300
+# What Python, C++ and the loader of libraries say when there is no memory.
+_OF_MEMORY = (
+    b"MemoryError",
+    b"bad_alloc",
+    b"annot allocate memory",
+    b"failed to map segment",
+    b"Resource temporarily unavailable",
+)
 
 
 class DecompositionError(KineverseError, RuntimeError):
@@ -133,6 +141,12 @@ def _why(status: int, said: bytes) -> str:
             how = f"was ended by signal {-status}"
     else:
         how = f"ended with status {status}"
-    short = "bad_alloc" in last or "MemoryError" in last
-    advice = "It needs more memory than it may have." if short else "Simplify or mend the mesh."
-    return f"CoACD {how}{': ' if last else ''}{last} {advice}".rstrip()
+    if any(sign in said for sign in _OF_MEMORY):
+        advice = (
+            "It needs more memory than it may have: allow more, simplify the mesh, or allow a larger error."
+        )
+    elif "SIGKILL" in how:
+        advice = "Systems without free memory do that: decompose fewer at a time, or simplify the mesh."
+    else:
+        advice = "Simplify or mend the mesh, or allow more memory."
+    return f"CoACD {how}{': ' if last else ''}{last.rstrip('.')}. {advice}"
