@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from part_recordings import JOINTS, recording
+from part_recordings import JOINTS, noisy, recording
 
 import kineverse as kv
 from kineverse.estimation import identify, pose_covariance
@@ -38,3 +38,26 @@ def test_the_operation_moves_as_the_fit_does(family: str) -> None:
             values = dict(zip(joint.coordinates, fit.joint_values[k], strict=True))
             np.testing.assert_allclose(pose(values), fit.poses[k], atol=1e-9)
             assert not model.violations(values)
+
+
+def test_fits_are_made_once_and_in_the_order_of_their_probabilities() -> None:
+    seen = recording("revolute", count=12, position=0.02, orientation=0.05, seed=5)
+    found = identify(seen.parent, seen.child, noise=seen.covariance)
+    assert [fit.family for fit in found] == [*found.probabilities]
+    assert [fit.probability for fit in found] == sorted(found.probabilities.values(), reverse=True)
+    assert found.best is found.fits[0] is found[found.best.family]
+    assert len(found) == len(JOINTS)
+
+
+@pytest.mark.parametrize("pitch", [0.01, -0.03])
+def test_a_screw_is_one_after_several_turns(pitch: float) -> None:
+    turn = kv.position("turn")
+    nut = kv.translation(0.3, 0.1, 0.0) @ kv.translation(0, 0, pitch * turn) @ kv.rotation_z(turn)
+    pose = kv.compile([nut @ kv.translation(0.1, 0.0, 0.0)])
+    angles = np.linspace(0.0, 20.0, 60)
+    true = pose.batch(angles[:, None])[0]
+    seen = noisy(true, 0.002, 0.01, np.random.default_rng(0))
+    found = identify(None, seen[np.random.default_rng(1).permutation(60)], noise=COVARIANCE)
+    assert found.best.family == "screw"
+    assert found.best.parameters["pitch"] == pytest.approx(2 * np.pi * pitch, rel=0.05)
+    assert np.ptp(found.best.joint_values) == pytest.approx(20.0, abs=0.1)

@@ -6,8 +6,10 @@ import numpy as np
 import pytest
 from part_recordings import JOINTS, recording
 
+from kineverse.estimation import identify
 from kineverse.estimation.identification.evidence import evidence
 from kineverse.estimation.identification.groups import GroupMotion
+from kineverse.estimation.identification.library import library
 from kineverse.estimation.identification.native import solver
 from kineverse.estimation.identification.observations import Observations, observations
 from kineverse.estimation.identification.sliding import slid
@@ -126,3 +128,21 @@ def test_evidence_agrees(family: str, how: str) -> None:
     np.testing.assert_allclose(slow.covariance, fast.covariance, rtol=1e-6, atol=1e-12)
     np.testing.assert_allclose(slow.joint_values, fast.joint_values, atol=1e-9)
     np.testing.assert_allclose(slow.joint_covariances, fast.joint_covariances, atol=1e-12)
+
+
+@pytest.mark.compiler
+@pytest.mark.parametrize("family", ["prismatic", "revolute", "planar"])
+def test_without_a_compiler_the_same_is_found(family: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert solver.prepare(wait=True)
+    seen = recording(family, count=12, position=0.02, orientation=0.05, seed=1)
+    fast = identify(seen.parent, seen.child, noise=seen.covariance)
+    with monkeypatch.context() as patched:
+        patched.setattr(library, "_code", None)
+        patched.setattr(library, "_hopeless", True)
+        slow = identify(seen.parent, seen.child, noise=seen.covariance)
+        assert not solver.is_native
+        best = slow.best
+    assert fast.probabilities == pytest.approx(slow.probabilities, rel=0.02, abs=1e-4)
+    assert fast.best.family == best.family
+    np.testing.assert_allclose(fast.best.covariance, best.covariance, rtol=0.05, atol=1e-6)
+    np.testing.assert_allclose(fast.best.joint_values, best.joint_values, atol=0.02 * best.deviations.max())
