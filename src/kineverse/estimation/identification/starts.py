@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from dataclasses import replace
 from functools import cached_property
@@ -136,6 +137,8 @@ def _turnings(overview: Overview, axis: Array) -> Iterator[_Turning]:
 
 def _about_an_axis(name, overview, start) -> Iterator[Start]:  # type: ignore[no-untyped-def]
     for turning in overview.turnings:
+        if name == "screw":
+            yield from _in_several_turns(overview, turning, start)
         values = turning.angles[:, None]
         if name == "cylindrical":
             values = np.column_stack([turning.along, turning.angles])
@@ -145,6 +148,22 @@ def _about_an_axis(name, overview, start) -> Iterator[Start]:  # type: ignore[no
             right[0, 3] = turning.radius
             result = Start(replace(result.motion, right=right), result.values)
         yield result
+
+
+def _in_several_turns(overview, turning, start) -> Iterator[Start]:  # type: ignore[no-untyped-def]
+    """Yield the screw whose turns are counted by how far it has moved, if it made more than one."""
+    if overview.rows == 3:
+        return
+    order = np.argsort(turning.along, kind="stable")
+    angles = np.empty_like(turning.angles)
+    angles[order] = np.unwrap(turning.angles[order])
+    if np.ptp(angles) <= math.tau:
+        return
+    slope, offset = np.polyfit(angles, turning.along, 1)
+    result = start(turning.frame, turning.centre, angles[:, None], float(slope))
+    right = result.motion.right.copy()
+    right[2, 3] += offset
+    yield Start(replace(result.motion, right=right), result.values)
 
 
 def _about_a_point(overview, joints, start) -> Iterator[Start]:  # type: ignore[no-untyped-def]
