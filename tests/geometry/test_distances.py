@@ -11,7 +11,7 @@ from convex_shapes import EXACT, KINDS, MujocoPairs, gap, random_pose, random_sh
 from scipy.spatial.transform import Rotation
 
 from kineverse.geometry.narrow import Narrow
-from kineverse.geometry.reach import gaps
+from kineverse.geometry.reach import furthest, gaps
 from kineverse.geometry.solids import _triangles, enlarged, solid_of
 from kineverse.model.body import Box, Cone, Ellipsoid, Sphere
 
@@ -89,6 +89,24 @@ def test_in_touch_the_normal_is_still_right(one, other, shapes):
         assert distance == pytest.approx(wanted, abs=1e-5)
         assert gap(a, b, poses, normal) == pytest.approx(wanted, abs=2e-5)
         assert normal @ (point_b - point_a) == pytest.approx(distance, abs=1e-9)
+
+
+@pytest.mark.parametrize(("one", "other"), PAIRS)
+def test_almost_in_touch_the_normal_shows_the_gap(one, other, shapes):
+    rng = np.random.default_rng([6, KINDS.index(one), KINDS.index(other)])
+    a, b = shapes[one][0], shapes[other][1]
+    for space in (1e-5, 1e-4, 1e-3):
+        poses = np.stack([random_pose(rng, 0.1), random_pose(rng, 0.1)])
+        way = rng.normal(size=3)
+        way /= np.linalg.norm(way)
+        point_a, point_b = (
+            furthest((shape.solid, pose[:, :3], pose[:, 3]), sign * way)
+            for shape, pose, sign in zip((a, b), poses, (1, -1), strict=True)
+        )
+        poses[1, :, 3] += point_a + space * way - point_b
+        distance, _, _, normal = measured(a, b, poses)
+        assert distance == pytest.approx(space, abs=2e-7)
+        assert gap(a, b, poses, normal) == pytest.approx(distance, abs=2e-7)
 
 
 def test_where_coal_fails_altogether_there_is_still_a_way_out(shapes, monkeypatch):
