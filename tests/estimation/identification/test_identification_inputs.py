@@ -105,3 +105,12 @@ def test_an_identifier_keeps_what_it_has_when_a_pose_is_refused() -> None:
     identifier.add(SEEN.parent[1], SEEN.child[1])
     assert len(identifier) == 2
     assert identifier.found.fits
+
+
+@pytest.mark.parametrize("count", [2, 3])
+def test_what_always_fits_is_not_told(count: int) -> None:
+    """Two positions are on a line and three on a circle, however the part moves."""
+    seen = recording("free", count=count, position=0.003, orientation=0.003, seed=2)
+    found = identify(None, seen.true_relative[:, :3, 3], noise=seen.covariance)
+    assert found.cannot_tell
+    assert not found["prismatic" if count == 2 else "revolute"].told

@@ -27,7 +27,7 @@ def fit_of(solution: Solution[Member], known: Evidence, log: float, probability:
     if "pitch" in names and isinstance(motion, GroupMotion):
         covariance[-1] *= math.tau  # [m/rad] to [m/revolution]
         covariance[:, -1] *= math.tau
-    reason = _untold(names, covariance)
+    reason = _untested(solution) or _untold(names, covariance)
     return Fit(
         family=motion.name,
         probability=probability,
@@ -43,6 +43,17 @@ def fit_of(solution: Solution[Member], known: Evidence, log: float, probability:
         reason=reason,
         rows=solution.residuals.shape[1],
         motion=motion,
+    )
+
+
+def _untested(solution: Solution[Member]) -> str:
+    """Return that a family of joints could not but fit, as two positions always lie on a line."""
+    motion, seen = solution.motion, solution.residuals.size
+    if not isinstance(motion, GroupMotion) or not motion.size or not motion.joints:
+        return ""
+    unknown = motion.size + solution.values.size
+    return (
+        "" if unknown < seen else f"{seen} numbers were seen and it has {unknown} unknowns, so it always fits"
     )
 
 
