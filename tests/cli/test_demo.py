@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
 import re
 import subprocess
 import sys
@@ -79,6 +80,17 @@ def test_headless_needs_the_core_alone(tmp_path):
     done = subprocess.run(words, capture_output=True, text=True, timeout=300, check=False)
     assert (done.returncode, done.stderr) == (0, "")
     assert (tmp_path / "core.png").exists()
+
+
+def test_who_interrupts_finds_no_empty_picture(tmp_path, monkeypatch):
+    def interrupted(self, dt):
+        if dt > 0.0:
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr("kineverse.view.living.Life.step", interrupted)
+    with contextlib.suppress(KeyboardInterrupt):
+        assert main(["demo", "--headless", "--picture", str(tmp_path / "x.png")]) != 0
+    assert not list(tmp_path.iterdir())
 
 
 def test_a_picture_that_cannot_be_written_is_one_line(tmp_path, capsys):

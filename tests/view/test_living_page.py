@@ -107,7 +107,7 @@ def test_the_scene_lives_in_the_browser_and_what_is_learned_is_said(browser, mon
     # However slowly the page is drawn, the stranger waits to be learned.
     monkeypatch.setattr("kineverse.view.living.life.STAYS", 3600.0)
     life, errors = Life(), []
-    while life.time < 4.0:
+    while life.time < 5.5:
         life.step(1.0 / 12.0)
     assert life.learner.found.cannot_tell
     with LivingPage(life, port=0) as page:
@@ -117,7 +117,7 @@ def test_the_scene_lives_in_the_browser_and_what_is_learned_is_said(browser, mon
         tab.get_by_text("cannot tell").wait_for()
         before = shot(tab)
         assert np.ptp(before) > 150
-        assert life.time < 4.5
+        assert life.time < 6.0
         tab.get_by_label("pause").uncheck()
         tab.get_by_text("revolute, 9").wait_for()
         tab.get_by_text("the tracked part is off by").wait_for()

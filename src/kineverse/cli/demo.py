@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import os
 import sys
 from typing import TYPE_CHECKING
 
@@ -114,7 +115,7 @@ def _some_seconds(arguments: argparse.Namespace) -> int:
     steps = _steps(arguments.seconds)
     life = Life(stranger=arguments.stranger)
     # First: a path that cannot be written to should not be found out at the end.
-    open(arguments.picture, "ab").close()
+    _try_to_write(arguments.picture)
     figures: list[Figures] = []
     for _ in progress(range(steps), "living", "step"):
         life.step(STEP)
@@ -125,6 +126,14 @@ def _some_seconds(arguments: argparse.Namespace) -> int:
     save(arguments.picture, life)
     print(f"picture: {arguments.picture}")
     return 0
+
+
+def _try_to_write(path: str) -> None:
+    """Open a file for writing, and leave none that was not there: who interrupts finds nothing empty."""
+    new = not os.path.lexists(path)
+    open(path, "ab").close()
+    if new:
+        os.remove(path)
 
 
 def _steps(seconds: float) -> int:

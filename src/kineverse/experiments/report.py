@@ -97,6 +97,5 @@ def _matplotlib(module: str) -> ModuleType:
         return importlib.import_module(module)
     except ImportError:
         raise MissingExtraError(
-            "Figures need matplotlib: pip install 'kineverse-articulation[figures]'. "
-            "Without a figure: --no-figure."
+            "Figures need matplotlib: pip install 'kineverse-articulation[figures]', or do without a figure."
         ) from None
