@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from kineverse.geometry.narrow import Narrow
 from kineverse.geometry.reach import furthest, gaps
 from kineverse.geometry.solids import _triangles, enlarged, solid_of
-from kineverse.model.body import Box, Cone, Ellipsoid, Sphere
+from kineverse.model.body import Box, Capsule, Cone, Ellipsoid, Sphere
 
 EACH = 4
 PAIRS = list(itertools.combinations_with_replacement(KINDS, 2))
@@ -107,6 +107,25 @@ def test_almost_in_touch_the_normal_shows_the_gap(one, other, shapes):
         distance, _, _, normal = measured(a, b, poses)
         assert distance == pytest.approx(space, abs=2e-7)
         assert gap(a, b, poses, normal) == pytest.approx(distance, abs=2e-7)
+
+
+@pytest.mark.parametrize("other", [Box((2.0, 0.004, 0.002)), Capsule(0.001, 2.0), Box((0.002, 2.0, 2.0))])
+def test_needles_and_plates_in_touch_touch(other):
+    rng = np.random.default_rng(7)
+    solids = solid_of(Box((0.0002, 0.11, 0.21))), solid_of(other)
+    for _ in range(60):
+        poses = np.stack([random_pose(rng, 0.1), random_pose(rng, 0.1)])
+        way = rng.normal(size=3)
+        way /= np.linalg.norm(way)
+        point_a, point_b = (
+            furthest((solid, pose[:, :3], pose[:, 3]), sign * way)
+            for solid, pose, sign in zip(solids, poses, (1, -1), strict=True)
+        )
+        poses[1, :, 3] += point_a - point_b
+        narrow = Narrow(solids, poses)
+        assert narrow.distance(0, 1) == pytest.approx(0.0, abs=1e-6)
+        point_a, point_b, _ = narrow.witness()
+        np.testing.assert_allclose(point_a, point_b, atol=2e-5)
 
 
 def test_where_coal_fails_altogether_there_is_still_a_way_out(shapes, monkeypatch):

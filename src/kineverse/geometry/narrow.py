@@ -38,7 +38,7 @@ _TOUCH = 1e-6
 # than 1 m [m].
 _SHOWN = 3 * DEPTH_TOLERANCE
 # So far things are moved apart to see in which direction they touch, and no further than this part of them.
-_APART, _APART_OF_RADIUS = 1e-4, 1e-3
+_APART, _APART_OF_RADIUS = 1e-5, 1e-3
 # What coal is asked about is made at least so large: the tolerances in it are made for decimetres [m].
 _SMALL, _LARGE_ENOUGH, _TOO_LARGE = 5e-3, 0.1, 1e3
 _CONTACTS = 256
@@ -172,7 +172,7 @@ class Narrow:
         """Measure two convex solids in touch, or that coal failed on, when they are a little apart.
 
         By how much and in which direction they were moved is taken off again. For flat faces that is exact,
-        for round ones the rest is of second order in 0.1 mm. If that fails too, a way out is searched for.
+        for round ones the rest is of second order in 0.01 mm. If that fails too, a way out is searched for.
         """
         at_a, result = self._transforms[i], self._result
         rotation, position = self._parts[j]
