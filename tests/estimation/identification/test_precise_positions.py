@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,6 +11,7 @@ from part_recordings import recording, transform
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
+from kineverse.estimation.identification.evidence import overrated
 from kineverse.estimation.identification.groups import GROUPS, GroupMotion
 from kineverse.estimation.identification.mirrored import others, singly, straightened
 from kineverse.estimation.identification.observations import observations
@@ -32,6 +34,20 @@ def test_observations_on_the_wrong_side_are_put_right(family: str) -> None:
     bad = solve(problem, good.motion, np.concatenate([there.values[:10], good.values[10:]]), parent, belief)
     assert bad.cost > good.cost + 1.0
     assert straightened(problem, bad).cost < good.cost + 0.1 * (bad.cost - good.cost)
+
+
+def test_what_steps_have_not_reached_does_not_count() -> None:
+    seen = recording("planar", count=20, position=1e-3, orientation=0.05, seed=3)
+    problem = observations(seen.parent, seen.child, seen.covariance, seen.covariance)
+    motion = GroupMotion(GROUPS["planar"], 6, seen.left, seen.right)
+    belief = Belief(np.zeros(3), np.full(3, 0.3**-2.0), marginal=True)
+    early = solve(problem, motion, seen.values, None, belief, steps=1)
+    assert not early.converged
+    assert overrated(early) > 1.0
+    late = solve(problem, motion, seen.values, None, belief)
+    assert overrated(late) == 0.0
+    # At the end of all steps the quadratic keeps what it promises.
+    assert overrated(replace(late, converged=False)) < 0.1
 
 
 @pytest.mark.parametrize("family", ["prismatic", "revolute"])

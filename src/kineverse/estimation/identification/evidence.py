@@ -22,7 +22,7 @@ import numpy as np
 
 from .groups import GroupMotion
 from .library import library, packed, problem_of
-from .matrices import inverted
+from .matrices import inverted, log_determinants, times
 from .motion import Member
 from .rigid import Array
 from .sliding import by_point
@@ -87,6 +87,28 @@ def _informed(
         *(array.ctypes.data for array in arrays),
     )
     return results
+
+
+def overrated(solution: Solution[Member]) -> float:
+    """Return by how much the quadratic promises more, as a logarithm, than is there where steps ended early.
+
+    Evidence takes the quadratic at its word. Where it has not been followed to its end, what was reached is
+    what counts.
+    """
+    belief = solution.belief
+    if solution.converged or not belief.marginal:
+        return 0.0
+    seen = alone(solution)
+    total = seen.covariances + np.diag(1.0 / belief.precision)
+    off = seen.values - belief.mean
+    promised = -0.5 * float(np.sum(off * times(inverted(total), off))) - 0.5 * log_determinants(
+        math.tau * total
+    )
+    prior = solution.motion.prior().residuals
+    reached = -0.5 * (solution.cost - float(prior @ prior)) - 0.5 * solution.residuals.size * math.log(
+        math.tau
+    )
+    return max(0.0, promised + seen.log_likelihood - reached)
 
 
 def _together(seen: Alone, width: Widths) -> tuple[Array, Array]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping
+from dataclasses import replace
 from functools import partial
 from types import MappingProxyType
 from typing import TypeAlias
@@ -15,7 +16,7 @@ from kineverse.errors import UnknownNameError, ValueRejectedError, suggest
 from kineverse.estimation.noise import pose_covariance
 
 from .canonical import canonical
-from .evidence import Evidence, evidence
+from .evidence import Evidence, evidence, overrated
 from .family import Family, family_starts
 from .fit import Fit, Found, Offer
 from .mirrored import straightened
@@ -176,15 +177,20 @@ def judged(
     result = {}
     for name, solution in found.items():
         first = refined(seen, solution) if solution.belief.marginal else slid(solution)
-        result[name] = first, evidence(first)
+        result[name] = first, _reached(first)
     logs = {name: known.log_evidence + math.log(weights[name]) for name, (_, known) in result.items()}
     least = max(logs.values()) - _CHANCE - _CHANCE_EACH * len(seen)
     for name, (solution, _) in result.items():
         if logs[name] >= least and not solution.belief.marginal:
             final = refined(seen, solution)
             if final is not solution:
-                result[name] = final, evidence(final)
+                result[name] = final, _reached(final)
     return result
+
+
+def _reached(solution: Solution[Member]) -> Evidence:
+    known = evidence(solution)
+    return replace(known, log_evidence=known.log_evidence - overrated(solution))
 
 
 def weighed(
