@@ -314,6 +314,20 @@ def test_a_model_that_was_read_from_a_document(kitchen: kv.Model) -> None:
     assert report[TAG].stopped is None
 
 
+def test_one_of_several_joint_values_beyond_its_limits() -> None:
+    model = kv.Model()
+    with model.edit() as edit:
+        edit.apply(kv.Planar(name="puck", parent="world", child="puck", lower=-0.5, upper=0.5), tag="puck")
+    values = np.random.default_rng(0).uniform(-0.4, 0.4, (3, 30))
+    for shift, explained in ((0.0, True), (0.5, False)):
+        shifted = dict(zip(("puck/x", "puck/y", "puck/angle"), values, strict=True))
+        shifted["puck/x"] = shifted["puck/x"] + shift
+        rating = plausibility(model, seen(model, ["puck"], shifted, 25), noise=NOISE)["puck"]
+        assert rating.explains is explained
+        assert (rating.probabilities["served"] > 0.9) is explained
+        assert (rating.stopped is None) is explained
+
+
 def test_turns_of_a_ball_are_joint_values_too() -> None:
     model = kv.Model()
     with model.edit() as edit:

@@ -26,7 +26,8 @@ _erf = np.vectorize(math.erf, otypes=[np.float64])
 def log_evidence(served: Served, seen: Misfit, still: bool = False) -> float:
     """Return the logarithm of the density of the observed relative poses, with joint values integrated out.
 
-    Limits cut off what is drawn only where there is one joint value.
+    Limits cut off what is drawn only where there is one joint value. What is beyond those of several is less
+    probable by its distance.
 
     Parameters
     ----------
@@ -42,6 +43,8 @@ def log_evidence(served: Served, seen: Misfit, still: bool = False) -> float:
         density = float(_log_density(served)[0])
         values, variances = seen.values[:, 0], seen.covariances[:, 0, 0]
         return log + _log_mean(_log_widths(values, variances, lower, upper, widths, density))
+    # Of several joint values the prior is not cut off, but the nearest that is inside the limits counts.
+    log -= 0.5 * float(np.sum(np.maximum(seen.beyond, 0.0) ** 2))
     return log + (_several(served, seen, widths) if served.joints else 0.0)
 
 
