@@ -136,6 +136,24 @@ def test_a_pose_that_does_not_fit_is_named(tmp_path, capsys):
     assert answer([*words, "--thin", "9"], capsys)["outliers"] == []
 
 
+def test_neighbours_whose_errors_are_alike_count_once(tmp_path, capsys):
+    rng = np.random.default_rng(5)
+    seen = noisy(hinge(np.linspace(0.0, 1.2, 200)), rng)
+    seen[:, 0, 3] += 0.006 * np.sin(np.linspace(0, 12, 200))
+    table = write(tmp_path / "poses.csv", {"door": seen})
+    words = [table, "--families", "rigid,prismatic,revolute"]
+    found = answer(words, capsys)
+    assert (found["count"], found["family"]) == (200, "revolute")
+    assert found["judged"] < 60
+    everything = answer([*words, "--thin", "200"], capsys)
+    assert everything["judged"] == 200
+    # Who counts the same error ten times is too sure.
+    sure, surer = (one["fits"][0]["deviations"]["axis.x"] for one in (found, everything))
+    assert surer < 0.7 * sure
+    assert main(["fit", *words]) == 0
+    assert f"judged by {found['judged']} of them" in capsys.readouterr().out
+
+
 @pytest.mark.parametrize("suffix", ["png", "svg"])
 def test_the_picture_is_drawn(door, tmp_path, capsys, suffix):
     pytest.importorskip("matplotlib")

@@ -30,8 +30,9 @@ pitch, yaw, or rx, ry, rz, a rotation vector), in m, rad and s unless a unit fol
 a part in each row, or all parts are in one row, and then columns are called door.x. Without a head, 3 columns
 are positions and 7 are poses.
 
-Errors of observations are taken for independent of each other. Those of a camera at 30 Hz are not; then
---thin 20 takes so many, evenly over the recording.
+Errors of observations are taken for independent of each other. Those of a camera at 30 Hz are not; where
+what is left of neighbours is alike, so many are judged as tell something of their own, evenly over the
+recording. --thin N takes another number of them.
 
 Joints of all kinds are tried: rigid, prismatic, revolute, screw, cylindrical, spherical, planar, free. Each
 gets the probability with which it explains what was seen.
@@ -86,7 +87,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="M[,RAD]",
         help="standard deviations of poses, of each coordinate and about each axis: 3mm,1deg (estimated)",
     )
-    parser.add_argument("--thin", metavar="N", type=int, help="take so many of the poses, evenly (all)")
+    parser.add_argument(
+        "--thin",
+        metavar="N",
+        type=int,
+        help="take so many of the poses, evenly (as many as tell something of their own)",
+    )
     parser.add_argument("--families", metavar="NAMES", help="only these joints: prismatic,revolute")
     parser.add_argument(
         "--picture", metavar="FILE", help="draw what was seen and what was found (.png, .svg)"
@@ -115,15 +121,20 @@ def run(arguments: argparse.Namespace) -> int:
         print(f"kineverse: note: {pair.alone} poses of one part without the other", file=sys.stderr)
     if arguments.thin is not None:
         pair = pair.thinned(arguments.thin)
-    with doing(f"learning from {len(pair.child_poses)} poses"):
+    with doing(f"learning from {len(pair.lines)} poses"):
         found, noise = learn(pair, stated, arguments.families)
-    outliers = outliers_of(pair, found, noise)
-    written = write(arguments, pair, found, outliers)
+        outliers = outliers_of(pair, found, noise)
+        judged = pair if arguments.thin is not None else pair.thinned(telling(found, len(pair.lines)))
+        if len(judged.lines) < len(pair.lines):
+            found, noise = learn(judged, stated, arguments.families)
+    count = len(judged.lines)
+    wrong = np.flatnonzero(np.isin(judged.lines, pair.lines[outliers]))
+    written = write(arguments, judged, found, [int(number) for number in wrong])
     if arguments.json:
-        answer = {"poses": arguments.poses, **as_json(pair, found, noise, outliers), **written}
+        answer = {"poses": arguments.poses, **as_json(pair, count, found, noise, outliers), **written}
         print(json.dumps(answer, indent=2, allow_nan=False))
     else:
-        print(as_text(arguments.poses, pair, found, noise, outliers))
+        print(as_text(arguments.poses, pair, count, found, noise, outliers))
         for what, path in written.items():
             if path:
                 print(f"{what}: {path}")
@@ -175,6 +186,14 @@ def learn(pair: Pair, stated: tuple[float, float | None] | None, families: str |
     found = identify(pair.parent_poses, pair.child_poses, noise=covariance, families=chosen)
     position, orientation = stated or (found.noise_scale * one for one in UNKNOWN_NOISE)
     return found, Noise(position, orientation if whole else None, stated is not None)
+
+
+def telling(found: Found, count: int) -> int:
+    """Return how many of the poses tell something of their own, by what the best joint leaves of them."""
+    from kineverse.estimation.recording import independent_count
+
+    # What is free leaves nothing.
+    return next((independent_count(fit.residuals) for fit in found if fit.family != "free"), count)
 
 
 def outliers_of(pair: Pair, found: Found, noise: Noise) -> list[int]:

@@ -22,7 +22,7 @@ _LISTED = 10
 """Of more poses that do not fit only the first are listed."""
 
 
-def as_text(source: str, pair: Pair, found: Found, noise: Noise, outliers: Sequence[int]) -> str:
+def as_text(source: str, pair: Pair, judged: int, found: Found, noise: Noise, outliers: Sequence[int]) -> str:
     """Return what was found: the joint, how sure that is, and what else it could be."""
     best = found.best
     said = f"{best.family}, {_percent(best.probability)}"
@@ -31,6 +31,7 @@ def as_text(source: str, pair: Pair, found: Found, noise: Noise, outliers: Seque
     what = "poses" if pair.child_poses.ndim == 3 else "positions"
     lines = [
         f"{pair.child} in {pair.parent}: {len(pair.child_poses)} {what} ({source})",
+        *_chosen(judged, len(pair.child_poses)),
         f"noise: {_noise(noise)}",
         "",
         said,
@@ -42,12 +43,13 @@ def as_text(source: str, pair: Pair, found: Found, noise: Noise, outliers: Seque
     return "\n".join(lines)
 
 
-def as_json(pair: Pair, found: Found, noise: Noise, outliers: Sequence[int]) -> dict[str, Any]:
+def as_json(pair: Pair, judged: int, found: Found, noise: Noise, outliers: Sequence[int]) -> dict[str, Any]:
     """Return everything that was found, as plain values."""
     return {
         "parent": pair.parent,
         "child": pair.child,
         "count": len(pair.child_poses),
+        "judged": judged,
         "orientations": pair.child_poses.ndim == 3,
         "noise": {"position": noise.position, "orientation": noise.orientation, "given": noise.given},
         "told": not found.cannot_tell,
@@ -56,6 +58,12 @@ def as_json(pair: Pair, found: Found, noise: Noise, outliers: Sequence[int]) -> 
         "outliers": list(outliers),
         "fits": [_fit(fit) for fit in found.fits],
     }
+
+
+def _chosen(judged: int, count: int) -> list[str]:
+    if judged == count:
+        return []
+    return [f"judged by {judged} of them, as errors of neighbours are alike (--thin {count} takes all)"]
 
 
 def _noise(noise: Noise) -> str:
