@@ -129,7 +129,7 @@ def test_the_published_filter_is_within_5_percent_of_the_authors_code():
     for noise, reported in zip(LEVELS, REPORTED_MEAN, strict=True):
         means = []
         for seed in range(4):
-            truth, seen, training = observed(scene, noise, seed, 300)
+            truth, seen, training = observed(scene, noise, seed, 150)
             means.append(np.abs(run_published(scene, seen, training).q - truth).mean())
         assert np.mean(means) == pytest.approx(reported, rel=0.05)
 
