@@ -76,7 +76,7 @@ def browser(chromium):
 
 def opened(browser, page, errors):
     """Return a tab that shows a page; what goes wrong on it is noted."""
-    tab = browser.new_page(viewport={"width": 820, "height": 460})
+    tab = browser.new_page(viewport={"width": 640, "height": 300})
     tab.set_default_timeout(PATIENCE)
     tab.on("pageerror", lambda error: errors.append(str(error)))
     tab.on("console", lambda message: errors.append(message.text) if message.type == "error" else None)
@@ -98,7 +98,7 @@ def shot(tab):
     imaging = pytest.importorskip("PIL.Image")
     import io
 
-    data = tab.screenshot(clip={"x": 0, "y": 0, "width": 430, "height": 460})
+    data = tab.screenshot(clip={"x": 0, "y": 0, "width": 250, "height": 300})
     return np.asarray(imaging.open(io.BytesIO(data)).convert("RGB")).astype(int)
 
 
@@ -146,7 +146,7 @@ def test_two_look_at_one_life_and_one_of_them_leaves(browser):
         page._server.on_client_connect(lambda _: came.set())
         page._server.on_client_disconnect(lambda _: left.set())
         # Two that are drawn at once by software may take minutes: the second has only to be there.
-        other = browser.new_page(viewport={"width": 820, "height": 460})
+        other = browser.new_page(viewport={"width": 640, "height": 300})
         other.goto(page.address, wait_until="commit", timeout=PATIENCE)
         assert came.wait(60.0)
         tab.close()
