@@ -6,16 +6,12 @@ Until then, and without a compiler, numpy and coal do it.
 from __future__ import annotations
 
 import ctypes
-import hashlib
-import threading
 from typing import Any, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
 
-from kineverse.compile.cache import library_cache
-from kineverse.compile.toolchain import CLOSED, toolchain
-from kineverse.compile.worker import Build, request
+from kineverse.compile.source_library import SourceLibrary
 
 from . import sweep
 from .mesh_files import Floats
@@ -31,8 +27,6 @@ _ARRAYS = (
 )  # fmt: skip
 
 
-_SOURCE = SWEEP + NARROW
-
 Search: TypeAlias = tuple[Indices, Floats, Floats, Floats, npt.NDArray[np.int64] | None]
 """Pairs, lower bounds, distances, witnesses, and the order of the nearest ones; until the next question."""
 
@@ -45,66 +39,11 @@ class _Struct(ctypes.Structure):
     )
 
 
-class SweepLibrary:
+class SweepLibrary(SourceLibrary):
     """The compiled sweep, once there is one; for all scenes of the process."""
 
     def __init__(self) -> None:
-        self._code: Any = None
-        self._build: Build | None = None
-        self._hopeless = False
-        self._lock = threading.Lock()
-
-    @property
-    def is_native(self) -> bool:
-        """Whether C does the work."""
-        return self._code is not None
-
-    def prepare(self, wait: bool = False) -> bool:
-        """Take it from the cache or have it compiled in the background; return whether it is there."""
-        with self._lock:
-            if self._build is None and self._code is None:
-                self._build = self._seek()
-            build = self._build
-        if wait and build is not None:
-            build.wait(None)
-            self._built(build)
-        return self.is_native
-
-    def _seek(self) -> Build | None:
-        compiler = None if self._hopeless else toolchain()
-        if compiler is None:
-            self._hopeless = True
-            return None
-        key = hashlib.sha256(repr((_SOURCE, compiler.identity)).encode()).hexdigest()[:40]
-        path = library_cache().find(key)
-        if path is not None:
-            self._load(path)
-            return None
-        return request(key, compiler, lambda: _SOURCE, ("-O3", *CLOSED), self._built)
-
-    def _built(self, build: Build) -> None:
-        if build.path is not None and self._code is None:
-            self._load(build.path)
-        self._hopeless = self._code is None and not build.forgotten
-        self._build = None
-
-    def _load(self, path: str) -> None:
-        try:
-            code = ctypes.CDLL(path)
-        except OSError:
-            self._hopeless = True
-            return
-        pointer = ctypes.c_void_p
-        code.place.argtypes, code.place.restype = (pointer, pointer), ctypes.c_int64
-        code.near.argtypes = (pointer, ctypes.c_double, pointer, pointer, ctypes.c_int64)
-        code.near.restype = ctypes.c_int64
-        code.measure.argtypes = (pointer, pointer, ctypes.c_int64, ctypes.c_double, pointer, pointer)
-        code.measure.restype = None
-        code.rank.argtypes = (pointer, pointer, ctypes.c_int64, pointer, ctypes.c_double, pointer)
-        code.rank.restype = ctypes.c_int64
-        code.search.argtypes = (pointer, *(ctypes.c_double,) * 2, ctypes.c_int64, *(pointer,) * 6)
-        code.search.restype = ctypes.c_int64
-        self._code = code
+        super().__init__(SWEEP + NARROW, _declare)
 
     def place(self, table: Table, fresh: Floats) -> int:
         """Do what :func:`.sweep.place` does; ``fresh`` is contiguous."""
@@ -206,6 +145,19 @@ def _native(table: Table) -> _Native:
     if table.standing_changed:
         native.stand(table)
     return native
+
+
+def _declare(code: Any) -> None:
+    pointer = ctypes.c_void_p
+    code.place.argtypes, code.place.restype = (pointer, pointer), ctypes.c_int64
+    code.near.argtypes = (pointer, ctypes.c_double, pointer, pointer, ctypes.c_int64)
+    code.near.restype = ctypes.c_int64
+    code.measure.argtypes = (pointer, pointer, ctypes.c_int64, ctypes.c_double, pointer, pointer)
+    code.measure.restype = None
+    code.rank.argtypes = (pointer, pointer, ctypes.c_int64, pointer, ctypes.c_double, pointer)
+    code.rank.restype = ctypes.c_int64
+    code.search.argtypes = (pointer, *(ctypes.c_double,) * 2, ctypes.c_int64, *(pointer,) * 6)
+    code.search.restype = ctypes.c_int64
 
 
 sweep_library = SweepLibrary()

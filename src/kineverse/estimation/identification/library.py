@@ -7,16 +7,13 @@ from __future__ import annotations
 
 import ctypes
 import functools
-import hashlib
-import threading
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from kineverse.compile.cache import library_cache
-from kineverse.compile.toolchain import CLOSED, toolchain
-from kineverse.compile.worker import Build, request
+from kineverse.compile.source_library import SourceLibrary
+from kineverse.compile.toolchain import CLOSED
 
 from .motion import Linear
 from .native_source import SOLVE
@@ -43,83 +40,28 @@ class Problem(ctypes.Structure):
     )
 
 
-class Library:
-    """The compiled functions, once there are any; for the whole process."""
-
-    def __init__(self) -> None:
-        self._code: Any = None
-        self._build: Build | None = None
-        self._hopeless = False
-        self._lock = threading.Lock()
-
-    @property
-    def is_native(self) -> bool:
-        """Whether C does the work."""
-        return self._code is not None
-
-    @property
-    def code(self) -> Any:
-        """The compiled functions, or None."""
-        return self._code
-
-    def prepare(self, wait: bool = False) -> bool:
-        """Take it from the cache or have it compiled in the background; return whether it is there."""
-        if self._code is not None:
-            return True
-        with self._lock:
-            if self._build is None and self._code is None:
-                self._build = self._seek()
-            build = self._build
-        if wait and build is not None:
-            build.wait(None)
-            self._built(build)
-        return self.is_native
-
-    def _seek(self) -> Build | None:
-        compiler = None if self._hopeless else toolchain()
-        if compiler is None:
-            self._hopeless = True
-            return None
-        key = hashlib.sha256(repr((SOLVE, _FLAGS, compiler.identity)).encode()).hexdigest()[:40]
-        path = library_cache().find(key)
-        if path is not None:
-            self._load(path)
-            return None
-        return request(key, compiler, lambda: SOLVE, _FLAGS, self._built)
-
-    def _built(self, build: Build) -> None:
-        if build.path is not None and self._code is None:
-            self._load(build.path)
-        self._hopeless = self._code is None and not build.forgotten
-        self._build = None
-
-    def _load(self, path: str) -> None:
-        try:
-            code = ctypes.CDLL(path)
-        except OSError:
-            self._hopeless = True
-            return
-        pointer = ctypes.c_void_p
-        counter = ctypes.c_int64
-        code.solve.argtypes = (pointer, counter, *(pointer,) * 3, counter, counter, *(pointer,) * 6)
-        code.solve.restype = ctypes.c_int64
-        code.at.argtypes = (pointer, counter, *(pointer,) * 5)
-        code.at.restype = None
-        code.alone.argtypes = (*(counter,) * 3, ctypes.c_double, *(pointer,) * 5)
-        code.widths.argtypes = (counter, counter, *(pointer,) * 3, counter, *(pointer,) * 3)
-        code.informed.argtypes = (pointer, counter, counter, *(pointer,) * 9)
-        code.informed.restype = None
-        code.slid.argtypes = (
-            *(pointer, counter, counter, counter),
-            *(*(ctypes.c_double,) * 3, counter),
-            *(pointer,) * 9,
-        )
-        code.slid.restype = counter
-        code.alone.restype = code.widths.restype = ctypes.c_double
-        self._code = code
+def _declare(code: Any) -> None:
+    pointer = ctypes.c_void_p
+    counter = ctypes.c_int64
+    code.solve.argtypes = (pointer, counter, *(pointer,) * 3, counter, counter, *(pointer,) * 6)
+    code.solve.restype = ctypes.c_int64
+    code.at.argtypes = (pointer, counter, *(pointer,) * 5)
+    code.at.restype = None
+    code.alone.argtypes = (*(counter,) * 3, ctypes.c_double, *(pointer,) * 5)
+    code.widths.argtypes = (counter, counter, *(pointer,) * 3, counter, *(pointer,) * 3)
+    code.informed.argtypes = (pointer, counter, counter, *(pointer,) * 9)
+    code.informed.restype = None
+    code.slid.argtypes = (
+        *(pointer, counter, counter, counter),
+        *(*(ctypes.c_double,) * 3, counter),
+        *(pointer,) * 9,
+    )
+    code.slid.restype = counter
+    code.alone.restype = code.widths.restype = ctypes.c_double
 
 
-library = Library()
+library = SourceLibrary(SOLVE, _declare, _FLAGS)
+"""The compiled functions, once there are any; for the whole process."""
 
 
 @functools.cache

@@ -6,16 +6,13 @@ Until then, without a compiler, and where coordinates are driven or limits curve
 from __future__ import annotations
 
 import ctypes
-import hashlib
 import threading
 from typing import Any
 
 import numpy as np
 
 from kineverse.compile import CompiledFunction
-from kineverse.compile.cache import library_cache
-from kineverse.compile.toolchain import CLOSED, toolchain
-from kineverse.compile.worker import Build, request
+from kineverse.compile.source_library import SourceLibrary
 from kineverse.estimation.noise import Array
 
 from .belief import Belief, Indices
@@ -27,7 +24,6 @@ from .reading import RIGID, Reading
 from .solving import Found
 
 # What the C has room for.
-_SOURCE = QUADRATIC + UPDATE
 _MOST_UNKNOWNS, _MOST_NUMBERS = 64, 64
 
 _COUNTS = ("observations", "groups", "coordinates")
@@ -45,59 +41,16 @@ class _Problem(ctypes.Structure):
     )
 
 
-class NativeLibrary:
-    """The compiled update, once there is one; for all trackers of the process."""
-
-    def __init__(self) -> None:
-        self.code: Any = None
-        self._build: Build | None = None
-        self._hopeless = False
-        self._lock = threading.Lock()
-
-    def prepare(self, wait: bool = False) -> bool:
-        """Take it from the cache or have it compiled in the background; return whether it is there."""
-        with self._lock:
-            if self._build is None and self.code is None and not self._hopeless:
-                self._build = self._seek()
-            build = self._build
-        if wait and build is not None:
-            build.wait(None)
-            self._built(build)
-        return self.code is not None
-
-    def _seek(self) -> Build | None:
-        compiler = toolchain()
-        if compiler is None:
-            self._hopeless = True
-            return None
-        key = hashlib.sha256(repr((_SOURCE, compiler.identity)).encode()).hexdigest()[:40]
-        path = library_cache().find(key)
-        if path is not None:
-            self._load(path)
-            return None
-        return request(key, compiler, lambda: _SOURCE, ("-O3", *CLOSED), self._built)
-
-    def _built(self, build: Build) -> None:
-        if build.path is not None and self.code is None:
-            self._load(build.path)
-        self._hopeless = self.code is None and not build.forgotten
-        self._build = None
-
-    def _load(self, path: str) -> None:
-        try:
-            code = ctypes.CDLL(path)
-        except OSError:
-            self._hopeless = True
-            return
-        pointer = ctypes.c_void_p
-        code.update.argtypes, code.update.restype = (pointer,) * 8, ctypes.c_int64
-        code.predict.argtypes, code.predict.restype = (pointer,) * 4, ctypes.c_int64
-        code.first_broken.argtypes = (pointer, pointer, pointer, ctypes.c_double)
-        code.first_broken.restype = ctypes.c_int64
-        self.code = code
+def _declare(code: Any) -> None:
+    pointer = ctypes.c_void_p
+    code.update.argtypes, code.update.restype = (pointer,) * 8, ctypes.c_int64
+    code.predict.argtypes, code.predict.restype = (pointer,) * 4, ctypes.c_int64
+    code.first_broken.argtypes = (pointer, pointer, pointer, ctypes.c_double)
+    code.first_broken.restype = ctypes.c_int64
 
 
-native_library = NativeLibrary()
+native_library = SourceLibrary(QUADRATIC + UPDATE, _declare)
+"""The compiled update, once there is one; for all trackers of the process."""
 
 
 class NativeSolver:
