@@ -14,7 +14,7 @@ from kineverse.view.living import Life, Sight
 from kineverse.view.living.axis import error, spread
 from kineverse.view.living.figure import doubtful
 from kineverse.view.living.following import average
-from kineverse.view.living.markers import Markers, rotations
+from kineverse.view.living.markers import Markers
 from kineverse.view.living.marks import REACH, SIGMAS, axis_line, axis_tube, rod
 from kineverse.view.living.panel import kitchen_report, stranger_report
 from kineverse.view.living.picture import picture
@@ -73,12 +73,6 @@ def test_a_few_things_move_at_a_time_and_all_of_it_repeats():
 # -- what is seen ------------------------------------------------------------------------------------------
 
 
-def test_rotations_are_those_of_scipy():
-    vectors = np.random.default_rng(0).normal(size=(50, 3)) * np.geomspace(1e-9, 3.0, 50)[:, None]
-    np.testing.assert_allclose(rotations(vectors), Rotation.from_rotvec(vectors).as_matrix(), atol=1e-12)
-    np.testing.assert_array_equal(rotations(np.zeros((1, 3)))[0], np.eye(3))
-
-
 def test_noise_is_what_its_covariance_says_and_the_shares_are_what_was_asked_for():
     poses = np.tile(np.eye(4), (4000, 1, 1))
     poses[:, :3, :3] = Rotation.random(4000, random_state=1).as_matrix()
@@ -101,6 +95,8 @@ def test_a_sight_that_is_none_is_refused(wrong):
 
 
 def test_equal_seeds_live_equal_lives_and_others_do_not():
+    # C that becomes ready in the midst of a life rounds otherwise than numpy.
+    Life().following.tracker.wait()
     one, two, other = (lived(0.5, seed=seed)[0] for seed in (3, 3, 4))
     np.testing.assert_array_equal(one.seen.poses, two.seen.poses)
     assert one.following.values == two.following.values
