@@ -21,7 +21,6 @@ from kineverse.experiments.fig4.protocol import (
     Noise,
     gaussian_noise,
     published_noise,
-    rotations,
     scene_of,
 )
 from kineverse.experiments.fig4.runs import Run, run_published
@@ -77,12 +76,6 @@ def test_gaussian_noise_is_in_the_observers_axes(pose):
         errors_in("world", noisy, pose), (NOISE.position, NOISE.orientation), strict=True
     ):
         np.testing.assert_allclose(np.cov(errors, rowvar=False) / sigma**2, np.eye(3), atol=0.03)
-
-
-def test_rotations_are_those_of_scipy():
-    vectors = np.random.default_rng(4).normal(0, 1.5, (50, 3))
-    vectors[:3] = [[0, 0, 0], [1e-9, 0, 0], [0, math.pi, 0]]
-    np.testing.assert_allclose(rotations(vectors), Rotation.from_rotvec(vectors).as_matrix(), atol=1e-14)
 
 
 def test_all_that_moves_is_observed_and_drawers_come_first(kitchen):

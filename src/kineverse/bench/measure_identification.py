@@ -11,7 +11,8 @@ import numpy as np
 
 from kineverse.estimation import Identifier, identify, pose_covariance
 from kineverse.estimation.identification.native import solver
-from kineverse.estimation.identification.rigid import exponential, logarithm, pose
+from kineverse.estimation.identification.rigid import pose
+from kineverse.estimation.rotations import exponential, logarithm
 
 from .agreement import Array
 from .peers import Field, installed

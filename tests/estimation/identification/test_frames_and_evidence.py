@@ -8,7 +8,7 @@ from part_recordings import Array, Recording, angle_between, recording, transfor
 from scipy.spatial.transform import Rotation
 
 from kineverse.estimation import Found, identify
-from kineverse.estimation.identification.rigid import skew
+from kineverse.estimation.rotations import skew
 
 # By how much differences of log evidence may change when frames are moved by half a metre: levers are within a
 # metre of the child's origin, beforehand, and errors of orientations are small to first order only.

@@ -9,7 +9,6 @@ from seeing import Eyes
 
 import kineverse as kv
 from kineverse.estimation import ObservedPose, Tracker
-from kineverse.estimation.tracking.rotations import logarithms, slopes_of_logarithms
 
 
 def floating() -> kv.Model:
@@ -50,23 +49,6 @@ def test_flow_and_its_derivatives(make):
         assert np.allclose(by_start, np.transpose(columns), atol=1e-5)
         columns = [(integrated(q, u + d) - integrated(q, u - d)) / (2 * h) for d in h * np.eye(len(u))]
         assert np.allclose(by_speeds, np.transpose(columns), atol=1e-5)
-
-
-def test_logarithms_are_scipys_and_their_slopes_differences():
-    rng = np.random.default_rng(0)
-    directions = rng.standard_normal((200, 3))
-    directions /= np.linalg.norm(directions, axis=1)[:, None]
-    angles = np.concatenate([[0.0, 1e-12, 1e-6, 0.019, 0.021, np.pi - 1e-6, np.pi], rng.uniform(0, 3.1, 193)])
-    vectors = directions * angles[:, None]
-    rotations = Rotation.from_rotvec(vectors).as_matrix()
-    found = logarithms(rotations)
-    assert np.allclose(np.linalg.norm(found, axis=1), angles, atol=1e-9)
-    assert np.allclose(Rotation.from_rotvec(found).as_matrix(), rotations, atol=1e-12)
-    for k, d in enumerate(1e-6 * np.eye(3)):
-        ahead, behind = (logarithms(rotations @ Rotation.from_rotvec(s * d).as_matrix()) for s in (1, -1))
-        column = slopes_of_logarithms(found)[:, :, k]
-        some = angles < 3.1
-        assert np.allclose(((ahead - behind) / 2e-6)[some], column[some], atol=1e-4)
 
 
 @pytest.mark.parametrize("place", [(0.5, 1.0, -2.0), (300.0, -4000.0, 20.0)])

@@ -6,9 +6,11 @@ from dataclasses import replace
 
 import numpy as np
 
+from kineverse.estimation.rotations import exponential
+
 from .groups import VZ, WZ, GroupMotion
 from .motion import Member
-from .rigid import Array, exponential, frame_along, orthonormal, pose
+from .rigid import Array, frame_along, orthonormal, pose
 from .solving import Solution
 
 

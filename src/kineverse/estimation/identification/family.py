@@ -14,13 +14,14 @@ import numpy as np
 from kineverse.compile import CompiledFunction
 from kineverse.compile import compile as compiled
 from kineverse.errors import ShapeError, UnknownNameError, ValueRejectedError
+from kineverse.estimation.rotations import logarithm
 from kineverse.expressions.expression import Expression
 from kineverse.symbols import Symbol
 
 from .groups import REACH
 from .motion import Linear, Prior
 from .observations import Observations
-from .rigid import Array, logarithm
+from .rigid import Array
 
 # Joint values that are tried for each observation, for each joint alone, and members that are tried besides.
 _TRIED = 41

@@ -18,9 +18,11 @@ from typing import Self
 
 import numpy as np
 
+from kineverse.estimation.rotations import exponential, right_jacobian, skew
+
 from .library import at, library
 from .motion import Linear, Prior
-from .rigid import Array, exponential, orthonormal, pose, right_jacobian, skew
+from .rigid import Array, orthonormal, pose
 
 VX, VY, VZ, WX, WY, WZ = range(6)
 

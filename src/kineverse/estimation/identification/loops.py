@@ -14,8 +14,10 @@ from itertools import combinations, combinations_with_replacement
 import numpy as np
 import numpy.typing as npt
 
+from kineverse.estimation.rotations import skew
+
 from .pairs import Pair
-from .rigid import Array, inverse, skew
+from .rigid import Array, inverse
 
 # How small a way to move may be beside the largest, to be one.
 _RANK = 0.05

@@ -14,12 +14,14 @@ from typing import NamedTuple
 
 import numpy as np
 
+from kineverse.estimation.rotations import exponential, logarithm, skew
+
 from .groups import WZ, GroupMotion
 from .matrices import inverted, times
 from .motion import Member
 from .native import solver
 from .observations import Observations
-from .rigid import Array, exponential, logarithm, skew
+from .rigid import Array
 from .solving import Belief, Solution
 
 _STEPS, _TURNS = 6, 4

@@ -10,10 +10,12 @@ from itertools import combinations
 import numpy as np
 import numpy.typing as npt
 
+from kineverse.estimation.rotations import skew
+
 from .fit import Fit, Found
 from .identify import family_weights, identify
 from .observations import Observations
-from .rigid import Array, skew
+from .rigid import Array
 from .tracks import Track, between
 
 Families = Iterable[str] | Mapping[str, float] | None

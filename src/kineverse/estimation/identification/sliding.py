@@ -18,11 +18,13 @@ from typing import NamedTuple
 
 import numpy as np
 
+from kineverse.estimation.rotations import exponential, skew
+
 from .groups import REACH, WX, GroupMotion
 from .library import library, packed, problem_of, unpacked
 from .matrices import inverted, times
 from .motion import Linear, Member
-from .rigid import Array, exponential, skew
+from .rigid import Array
 from .solving import Solution
 from .widths import GRID, LITTLE, alone, widths
 

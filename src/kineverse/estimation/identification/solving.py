@@ -19,10 +19,12 @@ from typing import Generic, NamedTuple, Self, TypeVar
 
 import numpy as np
 
+from kineverse.estimation.rotations import exponential, logarithm, skew
+
 from .matrices import inverted, log_determinants, times
 from .motion import Linear, Member, Motion, Prior
 from .observations import Observations
-from .rigid import Array, exponential, logarithm, pose, skew
+from .rigid import Array, pose
 
 M = TypeVar("M", bound=Motion)
 M_co = TypeVar("M_co", bound=Motion, covariant=True)

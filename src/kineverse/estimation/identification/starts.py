@@ -10,9 +10,11 @@ from typing import NamedTuple
 
 import numpy as np
 
+from kineverse.estimation.rotations import logarithm
+
 from .groups import GROUPS, GroupMotion
 from .observations import Observations
-from .rigid import Array, frame_along, inverse, logarithm, mean_rotation, pose
+from .rigid import Array, frame_along, inverse, mean_rotation, pose
 from .solving import Start
 
 

@@ -16,7 +16,8 @@ import numpy.typing as npt
 from kineverse.estimation.identification.matrices import inverted
 from kineverse.estimation.identification.motion import Linear
 from kineverse.estimation.identification.observations import Observations
-from kineverse.estimation.identification.rigid import Array, logarithm, skew
+from kineverse.estimation.identification.rigid import Array
+from kineverse.estimation.rotations import logarithm, skew
 
 from .served import Served
 

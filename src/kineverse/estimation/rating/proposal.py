@@ -18,7 +18,8 @@ from kineverse.articulations import Joint
 from kineverse.estimation.identification.fit import Fit
 from kineverse.estimation.identification.groups import WX, GroupMotion
 from kineverse.estimation.identification.operations import joint_operation, rigid_pose
-from kineverse.estimation.identification.rigid import Array, exponential, inverse, pose
+from kineverse.estimation.identification.rigid import Array, inverse, pose
+from kineverse.estimation.rotations import exponential
 from kineverse.model.articulation import Articulation
 from kineverse.model.body import Pose
 from kineverse.model.frame import Frame

@@ -9,11 +9,11 @@ import numpy as np
 from kineverse.compile import CompiledFunction
 from kineverse.errors import ValueRejectedError
 from kineverse.estimation.noise import Array
+from kineverse.estimation.rotations import inverse_right_jacobian, logarithm
 
 from .layout import Layout
 from .observed import nearest
 from .reading import Reading
-from .rotations import logarithms, slopes_of_logarithms
 
 
 class Residuals:
@@ -58,8 +58,8 @@ class Residuals:
             said = np.stack([out[layout.value_slices[i]] for i in poses])
             found = np.stack([values[i] for i in poses]).reshape(-1, 4, 4)
             turned = found[:, :3, :3] @ np.swapaxes(said[:, :9].reshape(-1, 3, 3), 1, 2)
-            vectors = logarithms(turned)
-            back = slopes_of_logarithms(vectors)
+            vectors = logarithm(turned)
+            back = inverse_right_jacobian(vectors)
             errors.update(
                 zip(poses, np.concatenate([found[:, :3, 3] - said[:, 9:], vectors], axis=1), strict=True)
             )

@@ -21,7 +21,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
-from kineverse.experiments.estimation_grid.samples import Cell, Samples, motions, rotations
+from kineverse.estimation.rotations import exponential
+from kineverse.experiments.estimation_grid.samples import Cell, Samples, motions
 
 Array = npt.NDArray[np.float64]
 
@@ -130,7 +131,7 @@ def _seen(samples: Samples, shared: int, k: int, step: float) -> Array:
 def _off(poses: Array, change: Array) -> Array:
     moved = poses.copy()
     moved[..., :3, 3] += change[:3]
-    moved[..., :3, :3] = rotations(change[3:]) @ moved[..., :3, :3]
+    moved[..., :3, :3] = exponential(change[3:]) @ moved[..., :3, :3]
     return moved
 
 

@@ -15,6 +15,8 @@ from typing import Literal
 import numpy as np
 import numpy.typing as npt
 
+from kineverse.estimation.rotations import exponential
+
 Array = npt.NDArray[np.float64]
 Joint = Literal["prismatic", "revolute"]
 
@@ -83,7 +85,7 @@ def draw(cell: Cell, count: int, rng: np.random.Generator) -> Samples:
     axis, zero = _units(rng, count), np.tile(np.eye(4), (count, 1, 1))
     to_axis, lever = _across(rng, axis), _across(rng, axis)
     point = TO_AXIS * to_axis
-    zero[:, :3, :3] = rotations(rng.uniform(-math.pi, math.pi, (count, 1)) * _units(rng, count))
+    zero[:, :3, :3] = exponential(rng.uniform(-math.pi, math.pi, (count, 1)) * _units(rng, count))
     zero[:, :3, 3] = point + LEVER * lever
     values = np.tile(np.linspace(0.0, cell.range, cell.count), (count, 1))
     parents = _poses_anywhere(rng, (count, cell.count))
@@ -101,29 +103,16 @@ def motions(joint: Joint, axis: Array, point: Array, values: Array) -> Array:
     if joint == "prismatic":
         moved[..., :3, 3] = along
         return moved
-    turned = rotations(along)
+    turned = exponential(along)
     moved[..., :3, :3] = turned
     moved[..., :3, 3] = point[:, None] - (turned @ point[:, None, :, None])[..., 0]
     return moved
 
 
-def rotations(vectors: Array) -> Array:
-    """Return Exp of rotation vectors [rad], (..., 3, 3), by Rodrigues' formula."""
-    angle = np.linalg.norm(vectors, axis=-1)[..., None, None]
-    cross = np.zeros((*vectors.shape, 3))
-    x, y, z = np.moveaxis(vectors, -1, 0)
-    cross[..., 0, 1], cross[..., 0, 2], cross[..., 1, 2] = -z, y, -x
-    cross -= np.swapaxes(cross, -1, -2)
-    # sin(φ)/φ, and (1 - cos φ)/φ² as a square, which loses nothing near 0.
-    first, second = np.sinc(angle / math.pi), 0.5 * np.sinc(0.5 * angle / math.pi) ** 2
-    turned: Array = np.eye(3) + first * cross + second * cross @ cross
-    return turned
-
-
 def _seen(poses: Array, cell: Cell, rng: np.random.Generator) -> Array:
     seen, shape = poses.copy(), (*poses.shape[:2], 3)
     seen[..., :3, 3] += cell.position * rng.standard_normal(shape)
-    seen[..., :3, :3] = rotations(cell.orientation * rng.standard_normal(shape)) @ seen[..., :3, :3]
+    seen[..., :3, :3] = exponential(cell.orientation * rng.standard_normal(shape)) @ seen[..., :3, :3]
     return seen
 
 
@@ -145,6 +134,6 @@ def _poses_anywhere(rng: np.random.Generator, shape: tuple[int, int]) -> Array:
     q = rng.standard_normal((*shape, 4))
     w, v = q[..., :1], q[..., 1:]
     length = np.linalg.norm(v, axis=-1, keepdims=True)
-    poses[..., :3, :3] = rotations(2.0 * np.arctan2(length, w) * v / length)
+    poses[..., :3, :3] = exponential(2.0 * np.arctan2(length, w) * v / length)
     poses[..., :3, 3] = rng.uniform(-1.0, 1.0, (*shape, 3))
     return poses

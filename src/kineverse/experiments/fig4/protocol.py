@@ -12,6 +12,7 @@ import numpy.typing as npt
 
 from kineverse.compile import CompiledFunction, compile  # noqa: A004
 from kineverse.errors import ModelError
+from kineverse.estimation.rotations import exponential
 from kineverse.estimation.tracking.published import PublishedFilter
 from kineverse.model.view import ModelView
 from kineverse.symbols import Symbol
@@ -164,7 +165,7 @@ def published_noise(
     shift = _directions(rng, lead, directions) * rng.normal(0, noise.position, (*lead, 1))
     turn = _directions(rng, lead, directions) * rng.normal(0, noise.orientation, (*lead, 1))
     moved[..., :3, 3] += (poses[..., :3, :3] @ shift[..., None])[..., 0]
-    moved[..., :3, :3] = poses[..., :3, :3] @ rotations(turn)
+    moved[..., :3, :3] = poses[..., :3, :3] @ exponential(turn)
     return moved
 
 
@@ -173,22 +174,8 @@ def gaussian_noise(poses: Array, noise: Noise, rng: Generator) -> Array:
     lead = poses.shape[:-2]
     moved = poses.copy()
     moved[..., :3, 3] += rng.normal(0, noise.position, (*lead, 3))
-    moved[..., :3, :3] = rotations(rng.normal(0, noise.orientation, (*lead, 3))) @ poses[..., :3, :3]
+    moved[..., :3, :3] = exponential(rng.normal(0, noise.orientation, (*lead, 3))) @ poses[..., :3, :3]
     return moved
-
-
-def rotations(vectors: Array) -> Array:
-    """Return the rotations of rotation vectors (..., 3), by Rodrigues' formula."""
-    angle = np.linalg.norm(vectors, axis=-1)[..., None, None]
-    cross = np.zeros((*vectors.shape, 3))
-    x, y, z = np.moveaxis(vectors, -1, 0)
-    cross[..., 0, 1], cross[..., 0, 2], cross[..., 1, 2] = -z, y, -x
-    cross -= np.swapaxes(cross, -1, -2)
-    # sin(t)/t and (1 - cos t)/t² in a form that is right at 0.
-    found: Array = (
-        np.eye(3) + np.sinc(angle / np.pi) * cross + np.sinc(angle / (2 * np.pi)) ** 2 / 2 * cross @ cross
-    )
-    return found
 
 
 def _directions(rng: Generator, lead: tuple[int, ...], how: Directions) -> Array:

@@ -9,6 +9,7 @@ import numpy.typing as npt
 
 from kineverse.errors import ValueRejectedError
 from kineverse.estimation import pose_covariance
+from kineverse.estimation.rotations import exponential
 from kineverse.view.triangles import Floats
 
 TURN = np.radians(1.0) / 0.01
@@ -85,19 +86,6 @@ class Markers:
         size = np.where(wrong, ASTRAY, sight.noise)[:, None]
         seen = poses.copy()
         seen[:, :3, 3] += size * self._random.standard_normal((count, 3))
-        turns = rotations(TURN * size * self._random.standard_normal((count, 3)))
+        turns = exponential(TURN * size * self._random.standard_normal((count, 3)))
         seen[:, :3, :3] = turns @ poses[:, :3, :3]
         return Seen(seen, self._lot >= sight.hidden, wrong)
-
-
-def rotations(vectors: Floats) -> Floats:
-    """Return the rotations (N, 3, 3) of rotation vectors (N, 3) [rad], by Rodrigues' formula."""
-    angle = np.linalg.norm(vectors, axis=1)[:, None, None]
-    k = np.zeros((len(vectors), 3, 3))
-    for row, column, entry, sign in ((0, 1, 2, -1), (0, 2, 1, 1), (1, 2, 0, -1)):
-        k[:, row, column] = sign * vectors[:, entry]
-        k[:, column, row] = -sign * vectors[:, entry]
-    safe = np.where(angle > 1e-12, angle, 1.0)
-    unit = k / safe
-    found: Floats = np.eye(3) + np.sin(angle) * unit + (1.0 - np.cos(angle)) * unit @ unit
-    return found
