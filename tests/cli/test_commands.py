@@ -10,21 +10,8 @@ import numpy as np
 import pytest
 
 import kineverse as kv
-from kineverse.cli import main
 
 COMMAND = [sys.executable, "-m", "kineverse.cli"]
-
-
-@pytest.fixture
-def run(capsys):
-    """Run the command in this process: status, standard output, standard error."""
-
-    def call(*words):
-        status = main([str(word) for word in words])
-        captured = capsys.readouterr()
-        return status, captured.out, captured.err
-
-    return call
 
 
 def python(*words):

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import kineverse as kv
-from kineverse.cli import contacts, main
+from kineverse.cli import contacts
 
 pytest.importorskip("coal", reason="distances need the extra 'geometry'")
 imaging = pytest.importorskip("PIL.Image")
@@ -20,16 +20,6 @@ SLIDE = (
     '<limit lower="0" upper="1" effort="1" velocity="1"/></joint>'
 )
 BALL, MESH = '<sphere radius="0.5"/>', '<mesh filename="lost.stl"/>'
-
-
-@pytest.fixture
-def run(capsys):
-    def call(*words):
-        status = main([str(word) for word in words])
-        captured = capsys.readouterr()
-        return status, captured.out, captured.err
-
-    return call
 
 
 @pytest.fixture

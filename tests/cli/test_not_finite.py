@@ -8,20 +8,9 @@ import numpy as np
 import pytest
 
 import kineverse as kv
-from kineverse.cli import main
 from kineverse.model.body import Body, Box, Shape
 
 CUBE = Body(visuals=(Shape(Box((1.0, 1.0, 1.0))),))
-
-
-@pytest.fixture
-def run(capsys):
-    def call(*words):
-        status = main([str(word) for word in words])
-        captured = capsys.readouterr()
-        return status, captured.out, captured.err
-
-    return call
 
 
 @pytest.fixture
