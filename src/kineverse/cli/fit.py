@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import math
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -46,9 +45,6 @@ examples:
   kineverse fit poses.csv --child door --document door.kv.json     then: kineverse view door.kv.json"""
 
 UNDECIDED = 1
-
-UNKNOWN_NOISE = (0.005, math.radians(1.0))
-"""What :func:`kineverse.estimation.identify` scales where no noise is stated [m], [rad]."""
 
 
 @dataclass(frozen=True)
@@ -174,6 +170,7 @@ def learn(pair: Pair, stated: tuple[float, float | None] | None, families: str |
         For a family that does not exist.
     """
     from kineverse.estimation import identify, pose_covariance
+    from kineverse.estimation.identification.identify import UNKNOWN_NOISE
 
     whole = pair.child_poses.ndim == 3 or pair.parent_poses is not None
     if stated is not None and stated[1] is None and whole:

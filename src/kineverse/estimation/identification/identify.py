@@ -48,7 +48,9 @@ WEIGHTS: Mapping[str, float] = MappingProxyType(
 """How probable families are beforehand, beside each other. What slides by nothing and turns is a ball in its
 socket too, and a free one is rarer."""
 
-_UNKNOWN_NOISE = (0.005, math.radians(1.0))
+UNKNOWN_NOISE = (0.005, math.radians(1.0))
+"""What is scaled where no noise is stated: standard deviations of positions [m] and orientations [rad]."""
+
 # What is less probable than the best by this, as a logarithm, is not refined. Where noise is large beside the
 # motion and a lever bends it, what each observation says is not known better than this before.
 _CHANCE, _CHANCE_EACH = 15.0, 0.5
@@ -118,7 +120,7 @@ def noise_of(
         raise ValueRejectedError(
             "One part has a covariance and the other has none. Give both, or the same for both as noise."
         )
-    unknown = pose_covariance(*_UNKNOWN_NOISE)
+    unknown = pose_covariance(*UNKNOWN_NOISE)
     return unknown, unknown, False
 
 
