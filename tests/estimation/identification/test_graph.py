@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-from itertools import combinations, pairwise
+from itertools import pairwise
 
 import numpy as np
 import numpy.typing as npt
 import pytest
 from part_recordings import noisy
-from scipy.sparse.csgraph import minimum_spanning_tree
 
 import kineverse as kv
 from kineverse.estimation import identify_graph, pose_covariance
-from kineverse.estimation.identification.spanning import alternatives, path, sides, spanning_tree
 
 Array = npt.NDArray[np.float64]
 POSITION, ORIENTATION = 0.003, 0.008
@@ -148,7 +146,12 @@ def test_a_telescope_hangs_by_its_smaller_motions_and_few_poses_leave_doubt(seed
     assert [(e.parent, e.child) for e in sure.edges] == [("world", "inner"), ("inner", "outer")]
     assert all(e.probability > 0.99 for e in sure.edges)
     assert any(e.probability < 0.99 for e in unsure.edges)
+    for graph in (sure, unsure):
+        # A tree of three parts has two connections.
+        assert sum(graph.connections.values()) == pytest.approx(2.0)
+        assert list(graph.connections.values()) == sorted(graph.connections.values(), reverse=True)
     for edge in unsure.edges:
+        assert graph.connections[edge.parent, edge.child] == edge.probability
         assert edge.probability + sum(edge.others.values()) > 0.9
         assert all(f"or {a} -> {b}" in str(edge) for a, b in edge.others)
 
@@ -185,36 +188,6 @@ def test_the_order_of_parts_and_of_times_does_not_matter(poses: dict[str, Array]
     assert {(e.parent, e.child) for e in first.edges} == {(e.parent, e.child) for e in second.edges}
     axes = [np.asarray({e.child: e for e in g.edges}["door"].fit.parameters["axis"]) for g in (first, second)]
     assert np.allclose(*axes, atol=1e-5)
-
-
-@pytest.mark.parametrize("seed", range(4))
-def test_the_spanning_tree_is_that_of_scipy(seed: int) -> None:
-    random = np.random.default_rng(seed)
-    nodes = list(range(7))
-    gains = {frozenset(pair): float(random.uniform(1.0, 9.0)) for pair in combinations(nodes, 2)}
-    matrix = np.zeros((7, 7))
-    for connection, gain in gains.items():
-        a, b = sorted(connection)
-        matrix[a, b] = 10.0 - gain
-    wanted = minimum_spanning_tree(matrix).tocoo()
-    tree = spanning_tree(nodes, gains)
-    assert set(tree) == {frozenset(map(int, ends)) for ends in zip(wanted.row, wanted.col, strict=True)}
-
-    # What may stand in for a connection is what makes a tree of the rest.
-    connection = tree[2]
-    rest = [c for c in tree if c != connection]
-    likely = alternatives(connection, tree, gains)
-    trees = {
-        c for c in gains if len(spanning_tree(nodes, dict.fromkeys([*rest, c], 0.0))) == 6 and c not in rest
-    }
-    assert set(likely) == trees
-    assert sum(likely.values()) == pytest.approx(1.0)
-    assert next(iter(likely)) == connection
-    one, other = sides(connection, tree)
-    assert one | other == set(nodes)
-    way = path(tree, 0, 6)
-    assert (way[0], way[-1]) == (0, 6)
-    assert all(frozenset(ends) in tree for ends in pairwise(way))
 
 
 def test_bad_input_is_refused(poses: dict[str, Array]) -> None:

@@ -2,8 +2,9 @@
 
 Every pair of parts is identified. Parts that do not move against each other are one rigid body. Bodies are
 connected by the tree of largest evidence, where the density of all poses is the product over the tree's
-connections of how the child was seen in the parent, as if the latter's place were known. A pair beside the
-tree that moves in fewer ways than the tree lets it closes a loop.
+connections of how the child was seen in the parent, as if the latter's place were known. So given the tree,
+connections are independent, and the probability of each is its share in the sum over all trees. A pair beside
+the tree that moves in fewer ways than the tree lets it closes a loop.
 """
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ from .loops import closes_loop
 from .operations import rigid_pose
 from .pairs import Families, Pair, all_pairs, pair
 from .rigid import Array, inverse
-from .spanning import alternatives, path, spanning_tree
+from .spanning import edge_probabilities, instead, path, spanning_tree
 from .tracks import Poses, Track, exactly, tracks
 
 
@@ -41,9 +42,10 @@ class Edge:
     found
         What was identified between them, see :class:`~kineverse.estimation.Found`.
     probability
-        That they are connected, and not another pair in their place.
+        That this joint is there, over all trees of joints; 1 for one that closes a loop.
     others
-        The pairs that may be connected in their place, with their probabilities, if these are not negligible.
+        The pairs that may be connected while these are not, with their probabilities, if these are not
+        negligible.
     """
 
     parent: str
@@ -99,6 +101,9 @@ class Graph:
         The joints, from the roots outwards: parents first.
     loops
         Pairs beside these that move in fewer ways against each other than the joints between them allow.
+    connections
+        The probability that there is a joint between two bodies, over all trees, for all pairs that were seen
+        together and close no loop, the likeliest first.
     roots
         The parts from which edges go outwards: the world if it was one, and one for every group of parts that
         was never seen together with others.
@@ -108,6 +113,7 @@ class Graph:
     edges: tuple[Edge, ...]
     loops: tuple[Edge, ...]
     roots: tuple[str, ...]
+    connections: Mapping[tuple[str, str], float] = field(default_factory=dict)
 
     def operations(self, prefix: str | None = None) -> Iterator[Operation]:
         """Yield what builds the model, parents first: joints are called like their child.
@@ -205,20 +211,24 @@ def identify_graph(
     bodies = _bodies(seen, pairs)
     firsts = [body.parts[0] for body in bodies]
     between = {c: p for c, p in pairs.items() if c <= set(firsts)}
-    gains = {c: p.gain for c, p in between.items()}
-    tree = spanning_tree(firsts, gains)
+    tree = spanning_tree(firsts, {c: p.gain for c, p in between.items()})
+    loops = dict(_loops(between, tree))
+    # What closes a loop is there beside the tree, not in place of a part of it.
+    gains = {c: p.gain for c, p in between.items() if c not in loops}
+    likely = edge_probabilities(firsts, gains)
     roots, directed = _outwards(firsts, tree)
     edges = []
     for parent, child in directed:
-        likely = alternatives(frozenset((parent, child)), tree, gains)
-        others = {
-            (between[c].parent, between[c].child): p
-            for c, p in likely.items()
-            if c != {parent, child} and p > 1.0 - SURE
-        }
-        known = _towards(between[frozenset((parent, child))], parent, seen, families)
-        edges.append(Edge(parent, child, known.found, likely[frozenset((parent, child))], others))
-    return Graph(bodies, tuple(edges), tuple(_loops(between, tree)), roots)
+        connection = frozenset((parent, child))
+        others = {}
+        if likely[connection] < SURE:
+            found = instead(connection, tree, gains)
+            others = {(between[c].parent, between[c].child): p for c, p in found.items() if p > 1.0 - SURE}
+        known = _towards(between[connection], parent, seen, families)
+        edges.append(Edge(parent, child, known.found, likely[connection], others))
+    ordered = sorted(likely.items(), key=lambda pair: -pair[1])
+    connections = {(between[c].parent, between[c].child): p for c, p in ordered}
+    return Graph(bodies, tuple(edges), tuple(loops.values()), roots, connections)
 
 
 def _bodies(seen: Mapping[str, Track], pairs: Mapping[frozenset[str], Pair]) -> tuple[RigidBody, ...]:
@@ -294,8 +304,8 @@ def _towards(known: Pair, parent: str, seen: Mapping[str, Track], families: Fami
 def _loops(
     between: Mapping[frozenset[str], Pair],
     tree: list[frozenset[str]],
-) -> Iterator[Edge]:
+) -> Iterator[tuple[frozenset[str], Edge]]:
     for connection, known in between.items():
         joints = [between[frozenset(ends)] for ends in pairwise(path(tree, known.parent, known.child))]
         if connection not in tree and joints and closes_loop(known, joints):
-            yield Edge(known.parent, known.child, known.found)
+            yield connection, Edge(known.parent, known.child, known.found)

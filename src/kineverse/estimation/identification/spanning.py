@@ -8,6 +8,8 @@ from typing import TypeVar
 
 import numpy as np
 
+from .rigid import Array
+
 Node = TypeVar("Node", bound=Hashable)
 
 
@@ -43,18 +45,60 @@ def sides(
     return parts[0], parts[1]
 
 
-def alternatives(
-    connection: frozenset[Node], tree: Iterable[frozenset[Node]], gains: Mapping[frozenset[Node], float]
+def edge_probabilities(
+    nodes: Iterable[Node], gains: Mapping[frozenset[Node], float]
 ) -> dict[frozenset[Node], float]:
-    """Return the probability of each connection that could hold both sides together, the rest being as it is.
+    """Return the probability of each connection, over all trees that connect what can be connected.
 
-    The likeliest first; they sum up to 1.
+    A tree's probability is proportional to exp(Σ gains of its connections): all trees are equally probable
+    beforehand, and what speaks for one connection is independent of the others, given the tree. By the
+    matrix-tree theorem (Kirchhoff 1847) a connection ij of weight w is in a tree with probability w / c,
+    where c is the conductance between i and j of a network with these weights. It is found by taking away all
+    other nodes, one after the other (star-mesh transform), which adds and multiplies positive numbers only:
+    in logarithms every digit stays, however far gains are apart.
+
+    The probabilities sum up to the number of connections of a tree.
+    """
+    order = {node: k for k, node in enumerate(nodes)}
+    logs = np.full((len(order), len(order)), -np.inf)
+    for connection, gain in gains.items():
+        i, j = (order[node] for node in connection)
+        logs[i, j] = logs[j, i] = gain
+    found = {}
+    for connection, gain in gains.items():
+        i, j = (order[node] for node in connection)
+        found[connection] = math.exp(min(0.0, gain - _log_conductance(logs, i, j)))
+    return found
+
+
+def instead(
+    connection: frozenset[Node],
+    tree: Iterable[frozenset[Node]],
+    gains: Mapping[frozenset[Node], float],
+) -> dict[frozenset[Node], float]:
+    """Return the probabilities of connections between both sides of one, in trees without that one.
+
+    The likeliest first. They sum up to at least the probability that the one is not there.
     """
     one, other = sides(connection, tree)
-    logs = {c: gain for c, gain in gains.items() if c & one and c & other}
-    total = float(np.logaddexp.reduce(list(logs.values())))
-    found = {c: math.exp(log - total) for c, log in logs.items()}
-    return dict(sorted(found.items(), key=lambda pair: -pair[1]))
+    around = {c: gain for c, gain in gains.items() if c <= one | other}
+    missing = 1.0 - edge_probabilities(one | other, around)[connection]
+    del around[connection]
+    found = edge_probabilities(one | other, around)
+    across = {c: missing * p for c, p in found.items() if c & one and c & other}
+    return dict(sorted(across.items(), key=lambda pair: -pair[1]))
+
+
+def _log_conductance(logs: Array, start: int, end: int) -> float:
+    """Return the logarithm of the conductance between two nodes, from those of all connections."""
+    order = [*(k for k in range(len(logs)) if k not in (start, end)), start, end]
+    left = logs[np.ix_(order, order)]
+    for _ in order[2:]:
+        spokes, left = left[0, 1:], left[1:, 1:]
+        total = np.logaddexp.reduce(spokes)
+        if total > -np.inf:
+            left = np.logaddexp(left, spokes[:, None] + spokes - total)
+    return float(left[0, 1])
 
 
 def path(tree: Iterable[frozenset[Node]], start: Node, end: Node) -> list[Node]:
