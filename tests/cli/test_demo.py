@@ -100,6 +100,16 @@ def test_a_picture_that_cannot_be_written_is_one_line(tmp_path, capsys):
     assert len(err.splitlines()) == 1
 
 
+@pytest.mark.parametrize("words", [[], ["--sliders"]])
+def test_a_picture_is_no_jpeg(tmp_path, capsys, words):
+    path = tmp_path / "x.jpg"
+    assert main(["demo", "--headless", "--picture", str(path), *words]) == 2
+    err = capsys.readouterr().err
+    assert "written as .png, not .jpg" in err
+    assert len(err.splitlines()) == 1
+    assert not path.exists()
+
+
 def test_driving_finds_what_is_wrong_with_a_model():
     a, b = kv.position("a"), kv.position("b")
     model = kv.Model()

@@ -8,9 +8,9 @@ import pytest
 from small_models import BLUE, RED, cabinet
 
 import kineverse as kv
-from kineverse.errors import ShapeError, UnknownNameError, ValueRejectedError
+from kineverse.errors import FormatError, ShapeError, UnknownNameError, ValueRejectedError
 from kineverse.view import Camera, picture, save
-from kineverse.view.png import encode_png
+from kineverse.view.png import encode_png, write_png
 
 FRONT = Camera((-3.0, 0.3, 1.0), (0.0, 0.0, 0.5))
 SMALL = (160, 120)
@@ -143,3 +143,13 @@ def test_what_is_no_image_is_refused(wrong):
 def test_colours_of_the_models_are_what_this_file_takes_them_for():
     assert RED[0] > 1.8 * max(RED[1:3])
     assert BLUE[2] > 1.4 * max(BLUE[:2])
+
+
+def test_a_file_is_called_what_it_is(tmp_path):
+    pixels = np.zeros((2, 2, 3), dtype=np.uint8)
+    for name in ("x.png", "x.PNG", "x"):
+        write_png(tmp_path / name, pixels)
+        assert (tmp_path / name).read_bytes() == encode_png(pixels)
+    with pytest.raises(FormatError, match=r"written as \.png, not \.jpg"):
+        write_png(tmp_path / "x.jpg", pixels)
+    assert not (tmp_path / "x.jpg").exists()

@@ -74,7 +74,9 @@ LONGEST = 3600.0
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     parser.add_argument("--headless", action="store_true", help="numbers and a picture instead of a page")
-    parser.add_argument("--picture", metavar="PATH", default="demo.png", help="with --headless (demo.png)")
+    parser.add_argument(
+        "--picture", metavar="PATH", default="demo.png", help="with --headless, a .png (demo.png)"
+    )
     parser.add_argument(
         "--stranger", choices=("chest", "crate", "stool"), default="chest", help="what is learned"
     )
@@ -87,6 +89,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Show the scene that is asked for, or compute it."""
+    from kineverse.view.png import check_png_name
+
+    check_png_name(arguments.picture)
     if arguments.sliders:
         return _by_hand(arguments)
     from kineverse.view.living import Life

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from kineverse.errors import ShapeError
+from kineverse.errors import FormatError, ShapeError
 
 
 def write_png(path: str | Path, pixels: npt.NDArray[np.uint8]) -> None:
@@ -19,8 +19,24 @@ def write_png(path: str | Path, pixels: npt.NDArray[np.uint8]) -> None:
     ------
     ShapeError
         If the array is not an image of 8 bits a channel.
+    FormatError
+        If the name says that it is a file of another kind, see :func:`check_png_name`.
     """
+    check_png_name(path)
     Path(path).write_bytes(encode_png(pixels))
+
+
+def check_png_name(path: str | Path) -> None:
+    """Look whether a file may be called so: it ends in .png, or says nothing about its kind.
+
+    Raises
+    ------
+    FormatError
+        If it ends in something else.
+    """
+    suffix = Path(path).suffix
+    if suffix.lower() not in ("", ".png"):
+        raise FormatError(f"Pictures are written as .png, not {suffix}: '{Path(path).with_suffix('.png')}'.")
 
 
 def encode_png(pixels: npt.NDArray[np.uint8]) -> bytes:
