@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,6 +13,7 @@ from scipy.spatial.transform import Rotation
 import kineverse as kv
 from kineverse.cli import main
 
+TRACKS = Path(__file__).parents[3] / "shared" / "data" / "sturm_tracks"
 AXIS, POINT = np.array([0.0, 0.6, 0.8]), np.array([0.5, 0.1, -0.2])
 
 
@@ -254,3 +256,14 @@ def test_what_cannot_be_is_answered_in_a_line(rows, words, says, tmp_path, capsy
     error = capsys.readouterr().err
     assert says in error
     assert error.count("\n") == 1
+
+
+def test_a_slow_error_is_no_screw(capsys):
+    """What a hand does while it opens a microwave is off a circle for seconds, which says little however often seen."""
+    handle = TRACKS / "microwave" / "microwave1.log"
+    if not handle.exists():
+        pytest.skip(f"no {handle}")
+    main(["fit", str(handle), "--json"])
+    found = json.loads(capsys.readouterr().out)
+    assert found["judged"] < 20
+    assert found["family"] == "revolute"

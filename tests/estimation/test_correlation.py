@@ -32,7 +32,8 @@ def test_a_known_correlation_is_measured(alike: float) -> None:
 def test_one_component_is_enough_and_one_wrong_pose_is_not() -> None:
     slow = errors(400, 0.0, 1)
     slow[:, 2] = np.sin(np.linspace(0, 6, 400))
-    assert independent_count(slow) == 20
+    # Two bumps say little, however many rows they have.
+    assert independent_count(slow) == 8
     jump = errors(400, 0.0, 2)
     jump[17] = 1e6
     assert independent_count(jump) == 400

@@ -9,8 +9,8 @@ import numpy.typing as npt
 
 Array = npt.NDArray[np.float64]
 
-# Fewer than these are never asked for: with a few, correlations are not known.
-_FEWEST = 20
+# Of fewer rows correlations are not known, and fewer than these are never asked for.
+_LOOKED_AT, _FEWEST = 20, 8
 
 
 def independent_count(residuals: Array) -> int:
@@ -21,7 +21,7 @@ def independent_count(residuals: Array) -> int:
     are left. The sum ends where ρ_k is no larger than by chance, and the slowest component counts.
     """
     count = len(residuals)
-    if count <= _FEWEST:
+    if count <= _LOOKED_AT:
         return count
     slowest = max(_correlation_time(column) for column in residuals.T)
     return min(count, max(_FEWEST, round(count / slowest)))
