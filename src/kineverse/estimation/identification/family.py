@@ -118,11 +118,12 @@ class Family:
 
 @dataclass(frozen=True, eq=False)
 class FamilyMotion:
-    """A member of a family of one's own."""
+    """A member of a family of one's own; lengths of poses are in a unit [m], see :mod:`.lengths`."""
 
     family: Family
     rows: int
     parameters: Array
+    unit: float = 1.0
 
     @property
     def name(self) -> str:
@@ -148,7 +149,9 @@ class FamilyMotion:
         """Return the poses at joint values (N, k)."""
         count, rows = len(values), self.rows
         inputs = np.concatenate([values, np.tile(self.parameters, (count, 1))], axis=1)
-        poses, *derivatives = self.family.function.batch(inputs)
+        poses, *derivatives = (np.array(a) for a in self.family.function.batch(inputs))
+        for lengths in (poses, *derivatives):
+            lengths[:, :3, 3] /= self.unit
         blocks = iter(derivatives)
         by_parameters = _twists(poses, next(blocks))[:, :rows] if self.size else np.zeros((count, rows, 0))
         by_joints = _twists(poses, next(blocks))[:, :rows] if self.joints else np.zeros((count, rows, 0))
@@ -203,9 +206,9 @@ class FamilyMotion:
         return np.array([u.start for u in unknowns]), np.array([u.deviation for u in unknowns])
 
 
-def family_starts(family: Family, seen: Observations) -> Iterator[tuple[FamilyMotion, Array]]:
+def family_starts(family: Family, seen: Observations, unit: float) -> Iterator[tuple[FamilyMotion, Array]]:
     """Yield members of a family, at its start and around, with the joint values that come nearest."""
-    motion = FamilyMotion(family, seen.rows, np.array([u.start for u in family.unknowns.values()]))
+    motion = FamilyMotion(family, seen.rows, np.array([u.start for u in family.unknowns.values()]), unit)
     # Always the same ones, so that the same poses give the same answer.
     random = np.random.default_rng(0)
     _, deviation = motion._beliefs()

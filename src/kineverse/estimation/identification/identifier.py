@@ -10,6 +10,7 @@ from kineverse.errors import ShapeError, ValueRejectedError
 from .family import Family
 from .fit import Found
 from .identify import Families, family_weights, judged, noise_of, solutions, weighed
+from .lengths import in_units, unit_of
 from .motion import Member
 from .native import solver
 from .observations import Observations, observations
@@ -54,7 +55,7 @@ class Identifier:
         self._seen: list[Observations] = []
         self._solutions: dict[str | Family, Solution[Member]] = {}
         self._found: Found | None = None
-        self._whole = 0
+        self._whole, self._unit = 0, 1.0
 
     def __len__(self) -> int:
         return len(self._seen)
@@ -113,13 +114,16 @@ class Identifier:
 
     def _find(self) -> Found:
         seen = _joined(self._seen)
-        if len(seen) >= 2 * self._whole:
-            self._whole = len(seen)
-            self._solutions = solutions(seen, self._weights)
+        whole = len(seen) >= 2 * self._whole
+        if whole:
+            self._whole, self._unit = len(seen), unit_of(seen)
+        seen = in_units(seen, self._unit)
+        if whole:
+            self._solutions = solutions(seen, self._weights, self._unit)
         else:
             self._solutions = {name: _continued(seen, s) for name, s in self._solutions.items()}
         known = judged(seen, self._solutions, self._weights)
-        found = weighed(known, self._weights, self._stated)
+        found = weighed(known, self._weights, self._stated, self._unit)
         chances = {name for name, probability in found.probabilities.items() if probability > _NO_CHANCE}
         self._solutions = {family: s for family, (s, _) in known.items() if s.motion.name in chances}
         return found

@@ -19,6 +19,7 @@ from .canonical import canonical
 from .evidence import Evidence, evidence, overrated
 from .family import Family, family_starts
 from .fit import Fit, Found, Offer
+from .lengths import in_metres, in_units, log_density, unit_of
 from .mirrored import straightened
 from .motion import Member
 from .native import solver
@@ -96,7 +97,9 @@ def identify(
     weights = family_weights(families)
     of_a, of_b, stated = noise_of(a is not None, covariance_a, covariance_b, noise)
     seen = observations(a, b, of_a, of_b)
-    return weighed(judged(seen, solutions(seen, weights), weights), weights, stated)
+    unit = unit_of(seen)
+    seen = in_units(seen, unit)
+    return weighed(judged(seen, solutions(seen, weights, unit), weights), weights, stated, unit)
 
 
 def noise_of(
@@ -153,16 +156,20 @@ def family_weights(families: Families) -> dict[str | Family, float]:
     return result
 
 
-def solutions(seen: Observations, families: Iterable[str | Family]) -> dict[str | Family, Solution[Member]]:
-    """Return the most likely member of each family."""
+def solutions(
+    seen: Observations, families: Iterable[str | Family], unit: float = 1.0
+) -> dict[str | Family, Solution[Member]]:
+    """Return the most likely member of each family, for observations in a unit of length [m]."""
     solver.prepare()
     overview = Overview(seen)
-    return {name: _most_likely(seen, name, overview) for name in families}
+    return {name: _most_likely(seen, name, overview, unit) for name in families}
 
 
-def _most_likely(seen: Observations, family: str | Family, overview: Overview) -> Solution[Member]:
+def _most_likely(
+    seen: Observations, family: str | Family, overview: Overview, unit: float
+) -> Solution[Member]:
     if isinstance(family, Family):
-        begin = [Start(motion, values) for motion, values in family_starts(family, seen)]
+        begin = [Start(motion, values) for motion, values in family_starts(family, seen, unit)]
     else:
         begin = list(starts(family, overview))
     first, *softer = [*seen.softened(), seen]
@@ -199,8 +206,9 @@ def weighed(
     found: Mapping[str | Family, tuple[Solution[Member], Evidence]],
     weights: Mapping[str | Family, float],
     stated: bool,
+    unit: float = 1.0,
 ) -> Found:
-    """Return the fits of all families, weighed by their evidence."""
+    """Return the fits of all families, weighed by their evidence, of observations in a unit of length [m]."""
     beforehand = {name: math.log(weights[name]) for name in found}
     if stated:
         logs = {name: known.log_evidence for name, (_, known) in found.items()}
@@ -217,13 +225,13 @@ def weighed(
         scale = float(_SCALES[int(np.argmax(joint[best]))])
     total: Array = np.array([logs[name] + beforehand[name] for name in found])
     probabilities = np.exp(total - np.logaddexp.reduce(total)).tolist()
-    offers = [
-        Offer(solution.motion.name, p, partial(_fit, solution, scale, logs[name], p))
-        for (name, (solution, _)), p in zip(found.items(), probabilities, strict=True)
-    ]
+    offers = []
+    for (name, (solution, _)), p in zip(found.items(), probabilities, strict=True):
+        log = logs[name] + log_density(len(solution.residuals), unit)
+        offers.append(Offer(solution.motion.name, p, partial(_fit, solution, scale, log, p, unit)))
     return Found(tuple(sorted(offers, key=lambda offer: -offer.probability)), scale)
 
 
-def _fit(solution: Solution[Member], scale: float, log_evidence: float, probability: float) -> Fit:
+def _fit(solution: Solution[Member], scale: float, log: float, probability: float, unit: float) -> Fit:
     solution = canonical(solution)
-    return fit_of(solution, evidence(solution.scaled(scale)), log_evidence, probability)
+    return in_metres(fit_of(solution, evidence(solution.scaled(scale)), log, probability), unit)
