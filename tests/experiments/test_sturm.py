@@ -13,7 +13,8 @@ from kineverse.errors import FormatError
 from kineverse.experiments import Options, reproduce
 from kineverse.experiments.sturm.figure import draw_recordings, size_of
 from kineverse.experiments.sturm.recordings import POSITION, THINNED, Labelled, labelled_recordings
-from kineverse.experiments.sturm.report import judge, report
+from kineverse.experiments.sturm.judging import judge
+from kineverse.experiments.sturm.report import report
 
 TRACKS = Path(__file__).parents[3] / "shared" / "data" / "sturm_tracks"
 RNG = np.random.default_rng(0)

@@ -6,13 +6,12 @@ import math
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
+from kineverse.experiments.sturm.judging import Judged
 from kineverse.view.identified import Looked, draw_along, draw_side
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure as Canvas
-
-    from kineverse.experiments.sturm.report import Judged
 
 COLUMNS = 10
 SMALL, LARGE = 1.5, 4.0

@@ -4,23 +4,21 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from kineverse.estimation import identify
 from kineverse.estimation.identification.fit import Fit, Found
 from kineverse.experiments.options import Options
 from kineverse.experiments.registry import Progress
 from kineverse.experiments.report import Figure, Report, Table
 from kineverse.experiments.sturm.figure import draw_recordings, size_of
+from kineverse.experiments.sturm.judging import Judged, judge
 from kineverse.experiments.sturm.recordings import (
     ORIENTATION,
     POSITION,
     SOURCE,
     THINNED,
-    Labelled,
     labelled_recordings,
 )
 
@@ -30,41 +28,10 @@ LEAST_RIGHT = 0.95
 NAMES = {"revolute": "hinge", "prismatic": "drawer"}
 
 
-@dataclass(frozen=True, eq=False)
-class Judged:
-    """A recording and what it was taken for.
-
-    Attributes
-    ----------
-    recording
-        What was seen.
-    found
-        All families with their probabilities.
-    """
-
-    recording: Labelled
-    found: Found
-
-    @property
-    def called(self) -> str:
-        """The most probable family."""
-        return self.found.best.family
-
-    @property
-    def right(self) -> bool:
-        """Whether that is the label."""
-        return self.called == self.recording.label
-
-
 def run(progress: Progress, options: Options) -> Report:
     """Identify what each recording shows, with what is fixed beforehand for its kind of sensor."""
     recordings = list(labelled_recordings(options.data))
     return report([judge(recording) for recording in progress(recordings, "sturm", "recording")])
-
-
-def judge(recording: Labelled) -> Judged:
-    """Identify what one recording shows."""
-    return Judged(recording, identify(None, recording.poses, covariance_b=recording.covariance))
 
 
 def report(judged: Sequence[Judged]) -> Report:
