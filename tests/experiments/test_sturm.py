@@ -12,8 +12,8 @@ from kineverse.cli import main
 from kineverse.errors import FormatError
 from kineverse.experiments import Options, reproduce
 from kineverse.experiments.sturm.figure import draw_recordings, size_of
-from kineverse.experiments.sturm.recordings import POSITION, THINNED, Labelled, labelled_recordings
 from kineverse.experiments.sturm.judging import judge
+from kineverse.experiments.sturm.recordings import POSITION, THINNED, Labelled, labelled_recordings
 from kineverse.experiments.sturm.report import report
 
 TRACKS = Path(__file__).parents[3] / "shared" / "data" / "sturm_tracks"
