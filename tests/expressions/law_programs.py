@@ -6,6 +6,7 @@ program, so no example is thrown away for it.
 
 from __future__ import annotations
 
+import functools
 import operator
 
 import law_oracle as oracle
@@ -175,6 +176,20 @@ def interpret(program, vocabulary, values):
 
 # -- strategies --------------------------------------------------------------------------------------------
 
+# Strategies are made once: to make and check them anew for every draw takes longer than all that is drawn.
+
+
+@functools.cache
+def choice(*values):
+    """Return a strategy that draws one of some values."""
+    return st.sampled_from(values)
+
+
+@functools.cache
+def several(least, most, last):
+    """Return a strategy that draws some different numbers from 0 to a last one."""
+    return st.lists(st.integers(0, last), min_size=least, max_size=most, unique=True)
+
 
 def apply(kind, *operands, options=None):
     return (kind, options, *operands)
@@ -205,6 +220,7 @@ def _numbers(shape):
     return values.map(lambda x: np.reshape(x, shape).tolist())
 
 
+@functools.cache
 def leaf(shape):
     symbols = st.integers(0, 5).map(lambda i: ("symbol", i))
     if shape == S:
@@ -224,6 +240,7 @@ SMOOTH = ("pairwise", "pairwise", "structural", "structural", "elementwise")
 EVERYTHING = (*SMOOTH, "augmented", "augmented", "truth", "selection")
 
 
+@functools.cache
 @st.composite
 def programs(draw, shape=S, depth=3, kinds=EVERYTHING):
     """Draw a program of a shape out of some kinds of operations."""
@@ -235,15 +252,15 @@ def programs(draw, shape=S, depth=3, kinds=EVERYTHING):
 
     def fitting():
         shapes = {S: [S], V3: [V3, V3, S], M23: [M23, M23, V3, S], M33: [M33, M33, V3, S]}[shape]
-        return inner(draw(st.sampled_from(shapes)))
+        return inner(draw(choice(*shapes)))
 
     def elementwise():
-        kind = draw(st.sampled_from(sorted(set(ELEMENTWISE) - {"logic_not"})))
+        kind = draw(choice(*sorted(set(ELEMENTWISE) - {"logic_not"})))
         return apply(kind, _DOMAIN.get(kind, lambda x: x)(inner()))
 
     def pairwise():
         names = ["add", "sub", "mul", "mul", "div", "power", "integer", "mod", "arctan2", "copysign", "hypot"]
-        kind = draw(st.sampled_from([*names, "minimum", "maximum", "iadd", "isub", "imul", "itruediv"]))
+        kind = draw(choice(*names, "minimum", "maximum", "iadd", "isub", "imul", "itruediv"))
         a, b = inner(), fitting()
         if draw(st.booleans()) and not kind.startswith("i"):
             a, b = b, a
@@ -254,21 +271,19 @@ def programs(draw, shape=S, depth=3, kinds=EVERYTHING):
         elif kind == "power":
             a, b = _positive(_bounded(a)), _bounded(b)
         elif kind == "integer":
-            kind, b = "power", const(draw(st.sampled_from([0.0, 1.0, 2.0, 3.0, -1.0, -2.0])))
+            kind, b = "power", const(draw(choice(0.0, 1.0, 2.0, 3.0, -1.0, -2.0)))
             a = _positive(a) if b[1] < 0 else a
         return apply(kind, a, b)
 
     def selection():
-        kind = draw(st.sampled_from(["where", "clip"]))
+        kind = draw(choice("where", "clip"))
         if kind == "where":
             return apply("where", truth(), inner(), fitting())
         return apply("clip", inner(), const(-0.513), const(0.467))
 
     def truth(level=2):
         kind = draw(
-            st.sampled_from(
-                ["less", "less", "sharp", "logic_and", "logic_or", "logic_not", "logic_all", "logic_any"]
-            )
+            choice("less", "less", "sharp", "logic_and", "logic_or", "logic_not", "logic_all", "logic_any")
         )
         if kind in ("less", "sharp") or level == 0:
             contrast = 1e10 if kind == "sharp" else 2.0
@@ -279,16 +294,14 @@ def programs(draw, shape=S, depth=3, kinds=EVERYTHING):
         return apply(kind, *(truth(level - 1) for _ in range(count)))
 
     def augmented():
-        kind = draw(st.sampled_from(["augment", "augment", "heuristic", "with_gradient"]))
-        keys = draw(st.lists(st.integers(0, 4), max_size=3, unique=True))
+        kind = draw(choice("augment", "augment", "heuristic", "with_gradient"))
+        keys = draw(several(0, 3, 4))
         return apply(kind, inner(), *(fitting() for _ in keys), options=tuple(keys))
 
     def structural():
         if shape == S:
             kind = draw(
-                st.sampled_from(
-                    ["norm", "sum", "mean", "trace", "det", "element", "index", "matmul", "raveled"]
-                )
+                choice("norm", "sum", "mean", "trace", "det", "element", "index", "matmul", "raveled")
             )
             if kind == "norm":
                 return apply("norm", apply("concatenate", inner(V3), const([0.3])))
@@ -297,13 +310,11 @@ def programs(draw, shape=S, depth=3, kinds=EVERYTHING):
             if kind == "det":
                 return apply("det", invertible())
             sources = {"trace": [M33], "element": [M33, M23], "index": [V3], "raveled": [M33]}
-            source = inner(draw(st.sampled_from(sources.get(kind, [V3, M23]))))
+            source = inner(draw(choice(*sources.get(kind, [V3, M23]))))
             return apply("index", apply("ravel", source)) if kind == "raveled" else apply(kind, source)
         if shape == V3:
             kind = draw(
-                st.sampled_from(
-                    ["first", "column", "ravel", "diagonal", "masked", "sum0", "Mv", "vM", "cross", "array"]
-                )
+                choice("first", "column", "ravel", "diagonal", "masked", "sum0", "Mv", "vM", "cross", "array")
             )
             if kind == "array":
                 return apply("array", inner(S), inner(S), inner(S))
@@ -315,17 +326,13 @@ def programs(draw, shape=S, depth=3, kinds=EVERYTHING):
             source = {"column": M33, "diagonal": M33, "masked": V3}.get(kind, M23)
             return apply(kind, inner(source))
         if shape == M23:
-            kind = draw(st.sampled_from(["rows", "stack", "vstack", "matmul", "imatmul"]))
+            kind = draw(choice("rows", "stack", "vstack", "matmul", "imatmul"))
             if kind == "rows":
                 return apply(kind, inner(M33))
             if kind in ("stack", "vstack"):
                 return apply(kind, inner(V3), inner(V3))
             return apply(kind, inner(M23), inner(M33))
-        kind = draw(
-            st.sampled_from(
-                ["inverse", "T", "matmul", "outer", "vstack", "stack1", "flip", "roll", "reversed"]
-            )
-        )
+        kind = draw(choice("inverse", "T", "matmul", "outer", "vstack", "stack1", "flip", "roll", "reversed"))
         if kind == "inverse":
             return apply(kind, invertible())
         if kind == "outer":
@@ -349,17 +356,16 @@ def programs(draw, shape=S, depth=3, kinds=EVERYTHING):
         "augmented": augmented,
         "structural": structural,
     }
-    return chosen[draw(st.sampled_from(kinds))]()
+    return chosen[draw(choice(*kinds))]()
 
 
+@functools.cache
 @st.composite
 def nested(draw, shape=S, levels=3):
     """Draw augment inside augment inside augment, with something in between: general programs hardly ever do."""
     program = draw(programs(shape, 1))
     for _ in range(levels):
-        between = draw(
-            st.sampled_from(["nothing", "sin", "mul", "add", "select", "logic", "maximum", "double"])
-        )
+        between = draw(choice("nothing", "sin", "mul", "add", "select", "logic", "maximum", "double"))
         other = draw(programs(shape, 1))
         program = {
             "nothing": program,
@@ -371,8 +377,8 @@ def nested(draw, shape=S, levels=3):
             "maximum": apply("maximum", program, other),
             "double": apply("div", program, _positive(program)),
         }[between]
-        kind = draw(st.sampled_from(["augment", "augment", "augment", "heuristic", "with_gradient"]))
-        keys = draw(st.lists(st.integers(0, 4), min_size=1, max_size=2, unique=True))
+        kind = draw(choice("augment", "augment", "augment", "heuristic", "with_gradient"))
+        keys = draw(several(1, 2, 4))
         entries = [
             draw(st.one_of(programs(shape, 1), st.just(apply("mul", const(2.0), program)))) for _ in keys
         ]
@@ -380,17 +386,18 @@ def nested(draw, shape=S, levels=3):
     return program
 
 
+@functools.cache
 @st.composite
 def compositions(draw, shape=S):
     """Draw a substitution into a program that is likely to be augmented by keys of replaced symbols."""
     inside = draw(st.one_of(nested(shape, 2), programs(shape, 2)))
-    chosen = draw(st.lists(st.integers(0, 5), min_size=1, max_size=4, unique=True))
+    chosen = draw(several(1, 4, 5))
     replacements = [draw(st.one_of(programs(S, 1), nested(S, 1), leaf(S))) for _ in chosen]
     program = apply("substitute", inside, *replacements, options=tuple(chosen))
-    around = draw(st.sampled_from(["nothing", "mul", "again"]))
+    around = draw(choice("nothing", "mul", "again"))
     if around == "mul":
         return apply("mul", program, draw(programs(shape, 1)))
     if around == "again":
-        again = draw(st.lists(st.integers(0, 2), min_size=1, max_size=2, unique=True))
+        again = draw(several(1, 2, 2))
         return apply("substitute", program, *(draw(programs(S, 1)) for _ in again), options=tuple(again))
     return program

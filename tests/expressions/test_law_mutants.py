@@ -7,6 +7,8 @@ because equal nodes are shared and remember their gradients.
 
 from __future__ import annotations
 
+import functools
+
 import casadi as ca
 import law_checks as lc
 import law_oracle as oracle
@@ -22,19 +24,18 @@ from kineverse.expressions.functions import Extremum, Norm, Select, inverse, max
 from kineverse.expressions.node import Augment, Node
 from kineverse.logic import And, Less, Not, Or, weighted_sum
 
-PROGRAMS = [
-    program
-    for pair in zip(
-        lc.corpus(lc.general(), 60), lc.corpus(lc.nested(), 60), lc.corpus(lc.compositions(), 60), strict=True
-    )
-    for program in pair
-]
+
+@functools.cache
+def programs():
+    """Return the programs that every mutant is put to; a worker that runs none of this does not draw them."""
+    corpora = (lc.corpus(strategy, 40) for strategy in (lc.general(), lc.nested(), lc.compositions()))
+    return [program for programs in zip(*corpora, strict=True) for program in programs]
 
 
 def suite(vocabulary):
     """Run all of it; raises if something is wrong."""
     cases(vocabulary)
-    for program in PROGRAMS:
+    for program in programs():
         values = vocabulary.values
         try:
             with np.errstate(all="ignore"):
