@@ -9,7 +9,7 @@ the tree that moves in fewer ways than the tree lets it closes a loop.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
 
@@ -17,12 +17,13 @@ import numpy as np
 import numpy.typing as npt
 
 from kineverse.articulations import Fixed, Floating
-from kineverse.errors import NameTakenError, ValueRejectedError
+from kineverse.errors import ModelError, NameTakenError, ValueRejectedError
 from kineverse.model.frame import WORLD
 from kineverse.model.model import Model
 from kineverse.model.operation import Operation
 
 from .fit import SURE, Fit, Found
+from .linkages import Closing, Loop, closed
 from .loops import closes_loop
 from .operations import rigid_pose
 from .pairs import Families, Pair, all_pairs, pair
@@ -41,18 +42,25 @@ class Edge:
         The parts.
     found
         What was identified between them, see :class:`~kineverse.estimation.Found`.
+    times
+        The numbers of the observations in which both were seen, those of the joint values.
     probability
         That this joint is there, over all trees of joints; 1 for one that closes a loop.
     others
         The pairs that may be connected while these are not, with their probabilities, if these are not
         negligible.
+    closing
+        How a loop is closed in a model; None for the joints of the tree, and for a loop that cannot be
+        closed, as where coordinates of a ball would have to follow others.
     """
 
     parent: str
     child: str
     found: Found
+    times: npt.NDArray[np.int_]
     probability: float = 1.0
     others: Mapping[tuple[str, str], float] = field(default_factory=dict)
+    closing: Closing | None = None
 
     @property
     def fit(self) -> Fit:
@@ -115,13 +123,23 @@ class Graph:
     roots: tuple[str, ...]
     connections: Mapping[tuple[str, str], float] = field(default_factory=dict)
 
-    def operations(self, prefix: str | None = None) -> Iterator[Operation]:
+    def operations(self, prefix: str | None = None, close: bool = True) -> Iterator[Operation]:
         """Yield what builds the model, parents first: joints are called like their child.
+
+        A loop between ``a`` and ``b`` has the frames ``b/a/seat``, on a, and ``b/a/pin``, on b, and is called
+        ``b/a/loop``.
 
         Parameters
         ----------
         prefix
             Put in front of all names but the world's, with a slash.
+        close
+            Whether loops are closed; else their tree is all there is.
+
+        Raises
+        ------
+        ModelError
+            For a loop whose coordinates cannot follow others, as those of a ball in its tree.
         """
 
         def name(part: str) -> str:
@@ -140,18 +158,34 @@ class Graph:
             for part in body.parts[1:]:
                 origin = rigid_pose(body.places[part])
                 yield Fixed(name=name(part), parent=name(first), child=name(part), origin=origin)
+        for loop in self.loops if close else ():
+            if loop.closing is None:
+                raise ModelError(
+                    f"The loop of '{loop.parent}' and '{loop.child}' cannot be closed: it has coordinates "
+                    "that cannot follow others, as those of a ball, or it is a screw that would close it. "
+                    "Say close=False for a model in which it is open."
+                )
+            yield from loop.closing.operations(name)
 
-    def model(self, prefix: str | None = None) -> Model:
-        """Return a model with a frame for each part. Loops are stated, but not closed in it.
+    def model(self, prefix: str | None = None, close: bool = True) -> Model:
+        """Return a model with a frame for each part.
 
         Parameters
         ----------
         prefix
             Put in front of all names but the world's, with a slash.
+        close
+            Whether loops are closed; else their tree is all there is.
+
+        Raises
+        ------
+        ModelError, UnsolvedError
+            For a loop whose coordinates cannot follow others, and for one that does not close or is singular
+            where it was seen.
         """
         model = Model()
         with model.edit() as edit:
-            for operation in self.operations(prefix):
+            for operation in self.operations(prefix, close):
                 edit.apply(operation)
         return model
 
@@ -212,20 +246,20 @@ def identify_graph(
     firsts = [body.parts[0] for body in bodies]
     between = {c: p for c, p in pairs.items() if c <= set(firsts)}
     tree = spanning_tree(firsts, {c: p.gain for c, p in between.items()})
-    loops = dict(_loops(between, tree))
+    roots, directed = _outwards(firsts, tree)
+    joints = [_towards(between[frozenset(ends)], ends[0], seen, families) for ends in directed]
+    loops = _loops(between, joints)
     # What closes a loop is there beside the tree, not in place of a part of it.
     gains = {c: p.gain for c, p in between.items() if c not in loops}
     likely = edge_probabilities(firsts, gains)
-    roots, directed = _outwards(firsts, tree)
     edges = []
-    for parent, child in directed:
-        connection = frozenset((parent, child))
+    for joint in joints:
+        connection = frozenset((joint.parent, joint.child))
         others = {}
         if likely[connection] < SURE:
             found = instead(connection, tree, gains)
             others = {(between[c].parent, between[c].child): p for c, p in found.items() if p > 1.0 - SURE}
-        known = _towards(between[connection], parent, seen, families)
-        edges.append(Edge(parent, child, known.found, likely[connection], others))
+        edges.append(Edge(joint.parent, joint.child, joint.found, joint.times, likely[connection], others))
     ordered = sorted(likely.items(), key=lambda pair: -pair[1])
     connections = {(between[c].parent, between[c].child): p for c, p in ordered}
     return Graph(bodies, tuple(edges), tuple(loops.values()), roots, connections)
@@ -301,11 +335,16 @@ def _towards(known: Pair, parent: str, seen: Mapping[str, Track], families: Fami
     return known if turned is None else turned
 
 
-def _loops(
-    between: Mapping[frozenset[str], Pair],
-    tree: list[frozenset[str]],
-) -> Iterator[tuple[frozenset[str], Edge]]:
+def _loops(between: Mapping[frozenset[str], Pair], joints: Sequence[Pair]) -> dict[frozenset[str], Edge]:
+    """Return what closes loops of a tree, by its ends."""
+    tree = {frozenset((joint.parent, joint.child)): joint for joint in joints}
+    candidates = []
     for connection, known in between.items():
-        joints = [between[frozenset(ends)] for ends in pairwise(path(tree, known.parent, known.child))]
-        if connection not in tree and joints and closes_loop(known, joints):
-            yield connection, Edge(known.parent, known.child, known.found)
+        way = [tree[frozenset(ends)] for ends in pairwise(path(tree, known.parent, known.child))]
+        if connection not in tree and way and closes_loop(known, way):
+            candidates.append(Loop(known, way))
+    found = {}
+    for (joint, _), closing in closed(candidates, joints):
+        edge = Edge(joint.parent, joint.child, joint.found, joint.times, closing=closing)
+        found[frozenset((joint.parent, joint.child))] = edge
+    return found

@@ -9,22 +9,54 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import combinations, combinations_with_replacement
+from itertools import combinations, product
+from typing import NamedTuple, Protocol
 
 import numpy as np
 import numpy.typing as npt
 
 from kineverse.estimation.rotations import skew
 
+from .fit import Fit, Found
+from .groups import GroupMotion
 from .pairs import Pair
 from .rigid import Array, inverse
 
-# How small a way to move may be beside the largest, to be one.
-_RANK = 0.05
-# The degree of polynomials of one and of two joint values; 2 for more.
+RANK = 0.05
+"""How small a way to move may be beside the largest, to be one."""
+
+# The degree of polynomials, or of Fourier series, of one and of two joint values; 2 for more.
 _DEGREES = {1: 5, 2: 3}
 # Which part of a joint value's variance may be left open where it is determined by others.
 _OPEN = 0.1
+# From which range on an angle may go round, so that its values jump somewhere [rad].
+_WIDE = math.pi
+# How far joint values elsewhere are from those that were seen [m] or [rad].
+_ELSEWHERE = 0.3
+
+
+class Joint(Protocol):
+    """A joint between two parts, with the numbers of the observations in which both were seen."""
+
+    @property
+    def parent(self) -> str:
+        """Where it begins."""
+        ...
+
+    @property
+    def child(self) -> str:
+        """Where it ends."""
+        ...
+
+    @property
+    def found(self) -> Found:
+        """What was identified between them."""
+        ...
+
+    @property
+    def times(self) -> npt.NDArray[np.int_]:
+        """The numbers of the observations."""
+        ...
 
 
 @dataclass(frozen=True)
@@ -39,6 +71,8 @@ class Chain:
         Of the end about its origin, in the axes of the beginning, per unit of each joint value, (N, 6, m).
     values, deviations
         The joint values and how well they are known, (N, m).
+    turning
+        Which of them are angles, (m,).
     times
         The numbers of the observations.
     """
@@ -47,6 +81,7 @@ class Chain:
     twists: Array
     values: Array
     deviations: Array
+    turning: tuple[bool, ...]
     times: npt.NDArray[np.int_]
 
     @property
@@ -57,23 +92,32 @@ class Chain:
         scaled = self.twists.copy()
         scaled[:, :3] /= math.sqrt(float(np.mean(np.sum(self.poses[:, :3, 3] ** 2, axis=1)))) or 1.0
         values = np.linalg.svd(scaled, compute_uv=False)
-        return int(np.median(np.sum(values > _RANK * values[:, :1], axis=1)))
+        return int(np.median(np.sum(values > RANK * values[:, :1], axis=1)))
 
 
-def chain(pairs: Sequence[Pair], start: str) -> Chain:
-    """Return the chain of some joints, each beginning where the one before ended."""
-    times = pairs[0].times
-    for one in pairs[1:]:
+def chain(joints: Sequence[Joint], start: str, random: np.random.Generator | None = None) -> Chain:
+    """Return the chain of some joints, each beginning where the one before ended.
+
+    With ``random`` it is not where it was seen, but somewhere else, with joint values that know nothing of
+    each other.
+    """
+    times = joints[0].times
+    for one in joints[1:]:
         times = np.intersect1d(times, one.times)
     poses = np.tile(np.eye(4), (len(times), 1, 1))
     # Twists about the origin of the beginning, until all are known.
     twists: list[Array] = []
     values: list[Array] = []
     deviations: list[Array] = []
-    for one in pairs:
+    for one in joints:
         fit = one.found.best
         rows = np.searchsorted(one.times, times)
-        linear = fit.motion.at(fit.joint_values[rows])
+        taken = fit.joint_values[rows]
+        if random is not None:
+            taken = random.permuted(taken, axis=0)
+            if isinstance(fit.motion, GroupMotion):
+                taken = taken + random.uniform(-_ELSEWHERE, _ELSEWHERE, taken.shape)
+        linear = fit.motion.at(taken)
         forward = one.parent == start
         step = linear.pose if forward else inverse(linear.pose)
         # A joint that is passed backwards moves by the opposite twist, said in its other part.
@@ -82,16 +126,18 @@ def chain(pairs: Sequence[Pair], start: str) -> Chain:
         v, w = turned @ linear.by_joints[:, :3], turned @ linear.by_joints[:, 3:]
         place = (parent @ linear.pose)[:, :3, 3]
         twists.append(np.concatenate([v + skew(place) @ w, w], axis=1))
-        values.append(fit.joint_values[rows])
+        values.append(taken)
         deviations.append(fit.deviations[rows])
         poses = poses @ step
         start = one.child if forward else one.parent
     columns = np.concatenate(twists, axis=2)
     columns[:, :3] -= skew(poses[:, :3, 3]) @ columns[:, 3:]
-    return Chain(poses, columns, np.concatenate(values, axis=1), np.concatenate(deviations, axis=1), times)
+    angles = tuple(angle for one in joints for angle in turning(one.found.best))
+    joined, known = np.concatenate(values, axis=1), np.concatenate(deviations, axis=1)
+    return Chain(poses, columns, joined, known, angles, times)
 
 
-def closes_loop(known: Pair, joints: Sequence[Pair]) -> bool:
+def closes_loop(known: Pair, joints: Sequence[Joint]) -> bool:
     """Whether a pair is held by more than the joints between both, from its parent to its child."""
     if known.found.cannot_tell or not known.explained:
         return False
@@ -103,24 +149,50 @@ def closes_loop(known: Pair, joints: Sequence[Pair]) -> bool:
     own = np.searchsorted(known.times, between_both.times)
     values = np.concatenate([between_both.values, fit.joint_values[own]], axis=1)
     deviations = np.concatenate([between_both.deviations, fit.deviations[own]], axis=1)
-    return any(
-        _determine(values, deviations, list(chosen)) for chosen in combinations(range(values.shape[1]), count)
-    )
+    angles = [*between_both.turning, *turning(fit)]
+    seen = [
+        _Seen(values[:, k], deviations[:, k], angle and bool(np.ptp(values[:, k]) > _WIDE))
+        for k, angle in enumerate(angles)
+    ]
+    return any(_determine(seen, chosen) for chosen in combinations(range(len(seen)), count))
 
 
-def _determine(values: Array, deviations: Array, chosen: list[int]) -> bool:
-    """Whether some joint values determine all others, as polynomials of them."""
-    moved = values - values.mean(axis=0)
-    scale = moved.std(axis=0)
-    x = (moved / np.where(scale > 0.0, scale, 1.0))[:, chosen]
-    terms = [np.ones(len(x))]
-    for degree in range(1, _DEGREES.get(len(chosen), 2) + 1):
-        factors = combinations_with_replacement(range(len(chosen)), degree)
-        terms += [np.prod(x[:, some], axis=1) for some in factors]
-    if len(values) < 2 * len(terms):
+class _Seen(NamedTuple):
+    """The values of a joint, how well they are known, and whether they go round."""
+
+    values: Array
+    deviations: Array
+    round: bool
+
+    def terms(self, degree: int) -> list[Array]:
+        """Return what is of a degree in a polynomial of the values, or in a Fourier series."""
+        if not degree:
+            return [np.ones(len(self.values))]
+        if self.round:
+            return [np.cos(degree * self.values), np.sin(degree * self.values)]
+        moved = self.values - self.values.mean()
+        return [(moved / (moved.std() or 1.0)) ** degree]
+
+
+def turning(fit: Fit) -> list[bool]:
+    """Return which joint values are angles."""
+    own = isinstance(fit.motion, GroupMotion)
+    return [own and bool(kind) for kind in fit.motion.kinds]
+
+
+def _determine(seen: Sequence[_Seen], chosen: Sequence[int]) -> bool:
+    """Whether some joint values determine all others, as polynomials or Fourier series of them."""
+    most = _DEGREES.get(len(chosen), 2)
+    degrees = [d for d in product(range(most + 1), repeat=len(chosen)) if sum(d) <= most]
+    each = [[seen[k].terms(d) for k, d in zip(chosen, some, strict=True)] for some in degrees]
+    features = np.column_stack([np.prod(factors, axis=0) for some in each for factors in product(*some)])
+    if len(features) < 2 * features.shape[1]:
         return False
-    rest = [j for j in range(values.shape[1]) if j not in chosen]
-    features = np.column_stack(terms)
-    left = moved[:, rest] - features @ np.linalg.lstsq(features, moved[:, rest], rcond=None)[0]
-    noise = np.mean(deviations[:, rest] ** 2, axis=0)
-    return bool(np.all(np.mean(left**2, axis=0) < _OPEN * scale[rest] ** 2 + 4.0 * noise))
+    for k in set(range(len(seen))) - {*chosen}:
+        for term in seen[k].terms(1):
+            moved = term - term.mean()
+            left = moved - features @ np.linalg.lstsq(features, moved, rcond=None)[0]
+            noise = np.mean(seen[k].deviations ** 2) / (1.0 if seen[k].round else seen[k].values.var() or 1.0)
+            if np.mean(left**2) >= _OPEN * np.mean(moved**2) + 4.0 * noise:
+                return False
+    return True

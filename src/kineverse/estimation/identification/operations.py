@@ -104,8 +104,7 @@ class FamilyJoint(Joint):
     def apply(self, model: Reader) -> Effects:
         """Write the child frame and the limits."""
         self.check_free(model)
-        symbols = list(self.motion.family.joints)
-        names = [self.name] if len(symbols) == 1 else [f"{self.name}/{s}" for s in symbols]
+        names = family_coordinates(self.motion, self.name)
         q = tuple(position(name) for name in names)
         home = tuple(0.5 * (low + high) for low, high in self.ranges)
         constraints: dict[str, Constraint] = {}
@@ -116,6 +115,12 @@ class FamilyJoint(Joint):
             constraints=constraints,
             articulations={self.name: self.record(q, home, tuple(c.derivative() for c in q))},
         )
+
+
+def family_coordinates(motion: FamilyMotion, name: str) -> tuple[str, ...]:
+    """Return the coordinates of a joint of a family of one's own, in the order of its joint values."""
+    symbols = list(motion.family.joints)
+    return (name,) if len(symbols) == 1 else tuple(f"{name}/{s}" for s in symbols)
 
 
 def joint_operation(
