@@ -6,7 +6,8 @@
 """
 
 from .identification import Family, Fit, Found, Identifier, Unknown, identify
-from .identification.graph import Edge, Graph, RigidBody, identify_graph
+from .identification.bodies import RigidBody
+from .identification.graph import Edge, Graph, identify_graph
 from .noise import pose_covariance
 from .rating import ImplausibleError, Plausibility, PlausibilityMonitor, Rating, plausibility
 from .tracking import (

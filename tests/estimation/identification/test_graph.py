@@ -180,6 +180,64 @@ def test_what_was_never_seen_together_is_not_connected(poses: dict[str, Array]) 
     assert set(graph.model().frames) == set(some)
 
 
+def test_parts_that_were_seen_as_points_hang_on_others(cart: kv.Model, poses: dict[str, Array]) -> None:
+    some = {part: poses[part] for part in ("cart", "door")}
+    some |= {part: poses[part][:, :3, 3].copy() for part in ("drawer", "sticker", "handle")}
+    some["drawer"][[3, 8]] = np.nan
+    graph = identify_graph(some, noise=NOISE, families=SOME, world=False)
+    assert graph.points == ("drawer", "sticker", "handle")
+    assert graph.roots == ("cart",)
+    assert {(e.parent, e.child, e.fit.family) for e in graph.edges} == {
+        ("cart", "door", "revolute"),
+        ("cart", "drawer", "prismatic"),
+        ("door", "handle", "revolute"),
+    }
+    assert [body.parts for body in graph.bodies if len(body.parts) > 1] == [("door", "sticker")]
+    model = graph.model()
+    truth = kv.compile(
+        [cart.fk(part, "cart")[:3, 3] for part in ("drawer", "handle", "sticker")], cart.degrees_of_freedom
+    )
+    points = np.random.default_rng(0).uniform(0.0, 1.0, (40, len(cart.degrees_of_freedom)))
+    for k in (0, 17):
+        values = {e.child: float(e.fit.joint_values[np.searchsorted(e.times, k), 0]) for e in graph.edges}
+        for part, position in zip(("drawer", "handle", "sticker"), truth(points[k]), strict=True):
+            assert np.allclose(model.fk(part, "cart")[:3, 3](values), position, atol=0.02)
+
+
+def test_points_that_nothing_holds_slide() -> None:
+    random = np.random.default_rng(0)
+    places = {"fly": random.uniform(-1.0, 1.0, (30, 3)), "ant": random.uniform(-1.0, 1.0, (30, 3))}
+    places["ant"][:, 2] = 0.3
+    seen = {part: place + random.normal(0.0, POSITION, place.shape) for part, place in places.items()}
+    graph = identify_graph(seen, noise=NOISE, families=SOME)
+    assert {(e.parent, e.child, e.fit.family) for e in graph.edges} == {
+        ("world", "fly", "free"),
+        ("world", "ant", "planar"),
+    }
+    model = graph.model()
+    assert {str(s) for s in model.degrees_of_freedom} == {"fly/x", "fly/y", "fly/z", "ant/x", "ant/y"}
+    for edge in graph.edges:
+        values = dict(zip((f"{edge.child}/{c}" for c in "xyz"), edge.fit.joint_values[7], strict=False))
+        found = model.fk(edge.child)[:3, 3](values)
+        assert np.allclose(found, places[edge.child][7], atol=5.0 * POSITION)
+        everywhere = {str(x): value for x, value in model.default_state().items()} | values
+        assert not model.violations(everywhere)
+
+
+def test_points_alone_are_refused(poses: dict[str, Array]) -> None:
+    points = {part: poses[part][:, :3, 3] for part in ("cart", "door")}
+    with pytest.raises(kv.ValueRejectedError, match="Only positions were seen"):
+        identify_graph(points, noise=NOISE, world=False)
+    with pytest.raises(kv.ValueRejectedError, match="say as_point=True"):
+        identify_graph(points, noise=NOISE).edges[0].fit.operation("cart", "world")
+    # What never was seen together with a pose floats by itself.
+    apart = {"cart": poses["cart"].copy(), "door": points["door"].copy()}
+    apart["cart"][:20], apart["door"][20:] = np.nan, np.nan
+    graph = identify_graph(apart, noise=NOISE, families=SOME, world=False)
+    assert graph.roots == ("cart", "door")
+    assert graph.edges == ()
+
+
 def test_the_order_of_parts_and_of_times_does_not_matter(poses: dict[str, Array]) -> None:
     parts = ["cart", "drawer", "door"]
     first = identify_graph({p: poses[p] for p in parts}, noise=NOISE, families=SOME)

@@ -12,6 +12,7 @@ from scipy.special import logsumexp
 from kineverse.estimation.identification.spanning import (
     edge_probabilities,
     instead,
+    outwards,
     path,
     sides,
     spanning_tree,
@@ -102,3 +103,33 @@ def test_what_is_there_instead_is_counted_in_trees_without(seed: int) -> None:
             logs = [log for tree, log in trees.items() if c in tree and connection not in tree]
             assert probability == pytest.approx(np.exp(logsumexp(logs) - total))
         assert sum(found.values()) >= 1.0 - edge_probabilities(range(5), gains)[connection] - 1e-12
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_leaves_have_one_connection(seed: int) -> None:
+    gains = all_gains(5, 2.0, seed)
+    leaves = (1, 4)
+    gains = {c: gain for c, gain in gains.items() if c != {1, 4}}
+    trees = {
+        tree: log
+        for tree, log in all_trees(gains).items()
+        if all(sum(leaf in c for c in tree) == 1 for leaf in leaves)
+    }
+    total = logsumexp(list(trees.values()))
+    best = spanning_tree(range(5), gains, leaves)
+    assert set(best) == set(max(trees, key=trees.__getitem__))
+    found = edge_probabilities(range(5), gains, leaves)
+    for connection, probability in found.items():
+        logs = [log for tree, log in trees.items() if connection in tree]
+        assert probability == pytest.approx(np.exp(logsumexp(logs) - total))
+    for connection in best:
+        for c, probability in instead(connection, best, gains, leaves).items():
+            logs = [log for tree, log in trees.items() if c in tree and connection not in tree]
+            assert probability == pytest.approx(np.exp(logsumexp(logs) - total))
+
+
+def test_roots_come_first_and_parents_before_children() -> None:
+    tree = [frozenset("ab"), frozenset("bc"), frozenset("de")]
+    roots, directed = outwards("bdac", "abcde", tree)
+    assert roots == ("b", "d")
+    assert directed == [("b", "a"), ("b", "c"), ("d", "e")]

@@ -110,22 +110,27 @@ class Fit:
         k = self.coordinates.index(coordinate)
         return math.sqrt(float(self.covariance[k, k]))
 
-    def operation(self, name: str, parent: str, child: str | None = None) -> Operation:
+    def operation(
+        self, name: str, parent: str, child: str | None = None, *, as_point: bool = False
+    ) -> Operation:
         """Return the joint as an operation, with the range that was seen as its limits.
 
         Parameters
         ----------
         name, parent, child
             Of the articulation and its frames; the child is called like the articulation if None.
+        as_point
+            Whether the child is a point, and it does not matter how its frame is turned.
 
         Raises
         ------
         ValueRejectedError
             If only positions of the child were seen, so that its orientation is not known.
         """
-        if self.rows == 3 and isinstance(self.motion, GroupMotion):
+        if self.rows == 3 and isinstance(self.motion, GroupMotion) and not as_point:
             raise ValueRejectedError(
-                f"Only positions of the child were seen, so how it is turned on '{name}' is not known."
+                f"Only positions of the child were seen, so how it is turned on '{name}' is not known. If "
+                "that does not matter, say as_point=True."
             )
         limits = [(float(low), float(high)) for low, high in self.range]
         return joint_operation(self.motion, limits, name, parent, name if child is None else child)

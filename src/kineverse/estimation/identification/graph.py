@@ -22,13 +22,13 @@ from kineverse.model.frame import WORLD
 from kineverse.model.model import Model
 from kineverse.model.operation import Operation
 
+from .bodies import RigidBody, rigid_bodies
 from .fit import SURE, Fit, Found
 from .linkages import Closing, Loop, closed
 from .loops import closes_loop
 from .operations import rigid_pose
 from .pairs import Families, Pair, all_pairs, pair
-from .rigid import Array, inverse
-from .spanning import edge_probabilities, instead, path, spanning_tree
+from .spanning import edge_probabilities, instead, outwards, path, spanning_tree
 from .tracks import Poses, Track, exactly, tracks
 
 
@@ -75,29 +75,6 @@ class Edge:
 
 
 @dataclass(frozen=True)
-class RigidBody:
-    """Parts that do not move against each other.
-
-    Attributes
-    ----------
-    parts
-        The first stands for all of them in edges.
-    places
-        Their poses in the first, (4, 4), by name.
-    probability
-        That they are one.
-    """
-
-    parts: tuple[str, ...]
-    places: Mapping[str, Array]
-    probability: float = 1.0
-
-    def __str__(self) -> str:
-        words = " = ".join(self.parts)
-        return words if self.probability >= SURE else f"{words} ({self.probability:.0%})"
-
-
-@dataclass(frozen=True)
 class Graph:
     """Bodies and the joints between them.
 
@@ -122,6 +99,7 @@ class Graph:
     loops: tuple[Edge, ...]
     roots: tuple[str, ...]
     connections: Mapping[tuple[str, str], float] = field(default_factory=dict)
+    points: tuple[str, ...] = ()
 
     def operations(self, prefix: str | None = None, close: bool = True) -> Iterator[Operation]:
         """Yield what builds the model, parents first: joints are called like their child.
@@ -153,7 +131,7 @@ class Graph:
         for first in ordered:
             if first in placed:
                 edge = placed[first]
-                yield edge.fit.operation(name(first), name(edge.parent))
+                yield edge.fit.operation(name(first), name(edge.parent), as_point=first in self.points)
             body = next(b for b in self.bodies if b.parts[0] == first)
             for part in body.parts[1:]:
                 origin = rigid_pose(body.places[part])
@@ -213,7 +191,8 @@ def identify_graph(
     ----------
     poses
         From names of parts to their poses over time, all in one frame: (N, 4, 4), or pairs of poses and
-        covariance, (6, 6) or (N, 6, 6). A pose that was not seen is NaN throughout.
+        covariance, (6, 6) or (N, 6, 6). A pose that was not seen is NaN throughout. Of a part that was only
+        seen as a point, positions, (N, 3), with (3, 3) or (N, 3, 3).
     noise
         The covariance, (6, 6), of those that come with none, see :mod:`kineverse.estimation.noise`.
     world
@@ -227,104 +206,51 @@ def identify_graph(
     Raises
     ------
     ShapeError, ValueRejectedError
-        For poses or covariances that are none, less than two parts, and if it is not known how well a part is
-        seen.
+        For poses or covariances that are none, less than two parts, if all of them are points, and if it is
+        not known how well a part is seen.
     NameTakenError
         For a part that is called ``world`` beside the world.
     UnknownNameError
         For a family that does not exist.
     """
-    seen = tracks(poses, noise)
+    seen = tracks(poses, noise, points=True)
     if world:
         if WORLD in seen:
             raise NameTakenError("The world is a part already; call the part otherwise, or say world=False.")
         seen = {WORLD: exactly(max((len(t.poses) for t in seen.values()), default=0)), **seen}
     if len(seen) < 2:
         raise ValueRejectedError("How parts are connected takes at least two of them, or one and the world.")
+    if all(track.is_point for track in seen.values()):
+        raise ValueRejectedError(
+            "Only positions were seen, of all parts. What a part hangs on has to be seen as a pose, "
+            "(N, 4, 4); the world is one, unless world=False."
+        )
     pairs = all_pairs(seen, families, progress)
-    bodies = _bodies(seen, pairs)
+    bodies = rigid_bodies(seen, pairs)
     firsts = [body.parts[0] for body in bodies]
     between = {c: p for c, p in pairs.items() if c <= set(firsts)}
-    tree = spanning_tree(firsts, {c: p.gain for c, p in between.items()})
-    roots, directed = _outwards(firsts, tree)
+    points = {name for name, track in seen.items() if track.is_point}
+    tree = spanning_tree(firsts, {c: p.gain for c, p in between.items()}, points)
+    # From the world, or from what most parts hang on, but never from a point.
+    first = sorted(firsts, key=lambda n: (n != WORLD, n in points, -sum(n in c for c in tree)))
+    roots, directed = outwards(first, firsts, tree)
     joints = [_towards(between[frozenset(ends)], ends[0], seen, families) for ends in directed]
-    loops = _loops(between, joints)
+    loops = _loops({c: p for c, p in between.items() if not c & points}, joints)
     # What closes a loop is there beside the tree, not in place of a part of it.
     gains = {c: p.gain for c, p in between.items() if c not in loops}
-    likely = edge_probabilities(firsts, gains)
+    likely = edge_probabilities(firsts, gains, points)
     edges = []
     for joint in joints:
         connection = frozenset((joint.parent, joint.child))
         others = {}
         if likely[connection] < SURE:
-            found = instead(connection, tree, gains)
+            found = instead(connection, tree, gains, points)
             others = {(between[c].parent, between[c].child): p for c, p in found.items() if p > 1.0 - SURE}
         edges.append(Edge(joint.parent, joint.child, joint.found, joint.times, likely[connection], others))
     ordered = sorted(likely.items(), key=lambda pair: -pair[1])
     connections = {(between[c].parent, between[c].child): p for c, p in ordered}
-    return Graph(bodies, tuple(edges), tuple(loops.values()), roots, connections)
-
-
-def _bodies(seen: Mapping[str, Track], pairs: Mapping[frozenset[str], Pair]) -> tuple[RigidBody, ...]:
-    """Return rigid bodies: parts join while more speaks for it than against it over all pairs."""
-    group: dict[str, tuple[str, ...]] = {name: (name,) for name in seen}
-    surest = dict.fromkeys(seen, 1.0)
-    for joined in sorted(pairs.values(), key=lambda p: -p.rigid):
-        a, b = group[joined.parent], group[joined.child]
-        if a == b or joined.rigid <= 0.0:
-            continue
-        across = [pairs[frozenset((x, y))] for x in a for y in b if frozenset((x, y)) in pairs]
-        odds = sum(p.rigid for p in across)
-        if odds <= 0.0:
-            continue
-        least = min(joined.found["rigid"].probability, surest[a[0]], surest[b[0]])
-        for name in (*a, *b):
-            group[name], surest[name] = (*a, *b), least
-    result = []
-    for parts in dict.fromkeys(group.values()):
-        # What was seen most often stands for all, and the world before everything.
-        often = {p: (p == WORLD, int(seen[p].seen.sum())) for p in parts}
-        ordered = sorted(parts, key=lambda p: (*(-n for n in often[p]), list(seen).index(p)))
-        places = _places(ordered, pairs)
-        result.append(RigidBody(tuple(ordered), places, surest[parts[0]]))
-    return tuple(result)
-
-
-def _places(parts: list[str], pairs: Mapping[frozenset[str], Pair]) -> dict[str, Array]:
-    """Return the poses of parts in the first, along the pairs that are surest to be rigid."""
-    places = {parts[0]: np.eye(4)}
-    rigid = {c: p.rigid for c, p in pairs.items() if c <= set(parts)}
-    tree = spanning_tree(parts, rigid)
-    for part in parts[1:]:
-        place = np.eye(4)
-        for a, b in pairwise(path(tree, parts[0], part)):
-            known = pairs[frozenset((a, b))]
-            reference = np.asarray(known.found["rigid"].parameters["reference"])
-            place = place @ (reference if known.parent == a else inverse(reference))
-        places[part] = place
-    return places
-
-
-def _outwards(nodes: list[str], tree: list[frozenset[str]]) -> tuple[tuple[str, ...], list[tuple[str, str]]]:
-    """Return roots, and connections from them outwards: the world is one, else what most parts hang on."""
-    degree = {node: sum(node in c for c in tree) for node in nodes}
-    roots: list[str] = []
-    directed: list[tuple[str, str]] = []
-    reached: set[str] = set()
-    for node in sorted(nodes, key=lambda n: (n != WORLD, -degree[n], nodes.index(n))):
-        if node in reached:
-            continue
-        roots.append(node)
-        reached.add(node)
-        waiting = [node]
-        while waiting:
-            parent = waiting.pop(0)
-            for child in nodes:
-                if child not in reached and frozenset((parent, child)) in tree:
-                    directed.append((parent, child))
-                    reached.add(child)
-                    waiting.append(child)
-    return tuple(roots), directed
+    of_points = tuple(name for name in seen if name in points)
+    return Graph(bodies, tuple(edges), tuple(loops.values()), roots, connections, of_points)
 
 
 def _towards(known: Pair, parent: str, seen: Mapping[str, Track], families: Families) -> Pair:

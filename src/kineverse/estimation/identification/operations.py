@@ -29,6 +29,7 @@ from kineverse.model.body import Pose
 from kineverse.model.constraint import Constraint
 from kineverse.model.operation import Effects, Operation
 from kineverse.model.reader import Reader
+from kineverse.spatial import translation
 from kineverse.symbols import position
 
 from .family import FamilyMotion
@@ -85,6 +86,37 @@ class MountedBall(Mounted, Ball):
 
 
 @dataclass(frozen=True, kw_only=True)
+class SlidingPoint(Joint):
+    """A point in a plane, or anywhere: parent_T_child = origin · translation(x, y, z).
+
+    Coordinates are ``name/x``, ``name/y`` and, anywhere, ``name/z`` [m].
+
+    Attributes
+    ----------
+    ranges
+        The limits of each.
+    """
+
+    ranges: tuple[tuple[float, float], ...]
+
+    def apply(self, model: Reader) -> Effects:
+        """Write the child frame and the limits."""
+        self.check_free(model)
+        names = [f"{self.name}/{axis}" for axis, _ in zip("xyz", self.ranges, strict=False)]
+        q = tuple(position(name) for name in names)
+        constraints: dict[str, Constraint] = {}
+        for name, coordinate, (low, high) in zip(names, q, self.ranges, strict=True):
+            constraints.update(Limits(low, high).on(name, coordinate))
+        home = tuple(0.5 * (low + high) for low, high in self.ranges)
+        place = translation(*q, *([0.0] * (3 - len(q))))
+        return Effects(
+            frames={self.child: (self.parent, (self.origin, place))},
+            constraints=constraints,
+            articulations={self.name: self.record(q, home, tuple(c.derivative() for c in q))},
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
 class FamilyJoint(Joint):
     """A joint of a family of one's own: parent_T_child = origin · transform.
 
@@ -133,6 +165,10 @@ def joint_operation(
     if not isinstance(motion, GroupMotion):
         raise TypeError(f"A {type(motion).__name__} is no joint.")
     family = motion.name
+    if motion.rows == 3 and family in ("planar", "free"):
+        place = motion.left.copy()
+        place[:3, 3] += place[:3, :3] @ motion.right[:3, 3]
+        return SlidingPoint(**names, origin=rigid_pose(place), ranges=tuple(limits))
     origin, mount = rigid_pose(motion.left), rigid_pose(motion.right)
     whole = rigid_pose(motion.left @ motion.right)
     # A direction of L in the child, where nothing turns.

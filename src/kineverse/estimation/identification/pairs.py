@@ -20,11 +20,13 @@ from .tracks import Track, between
 
 Families = Iterable[str] | Mapping[str, float] | None
 
-LOG_ANYWHERE = -math.log(8.0 * math.pi**2) - 3.0 * math.log(2.0)
+_LOG_TURNED = -math.log(8.0 * math.pi**2)
+
+LOG_ANYWHERE = _LOG_TURNED - 3.0 * math.log(2.0)
 """Logarithm of the density of a pose of which nothing is known, within 2 m [1/m³]; all turns have 8π²."""
 
-# That of a pose by itself, somewhere in a room of 10 m.
-_LOG_ROOM = -math.log(8.0 * math.pi**2) - 3.0 * math.log(10.0)
+# That of a position by itself, somewhere in a room of 10 m.
+_LOG_ROOM = -3.0 * math.log(10.0)
 _TINY = 1e-300
 
 UNLIKELY = 4.0
@@ -66,8 +68,15 @@ class Pair:
 
 
 def pair(tracks: Mapping[str, Track], parent: str, child: str, families: Families) -> Pair | None:
-    """Return what is between two parts; None if they were not seen together at least twice."""
+    """Return what is between two parts; None if they were not seen together at least twice.
+
+    What was seen as a point is the child, and between two points there is nothing to see.
+    """
+    if tracks[parent].is_point:
+        parent, child = child, parent
     a, b = tracks[parent], tracks[child]
+    if a.is_point:
+        return None
     times = np.flatnonzero(a.seen & b.seen)
     if len(times) < 2:
         return None
@@ -85,7 +94,9 @@ def pair(tracks: Mapping[str, Track], parent: str, child: str, families: Familie
     if a.covariances is not None:
         # A part on a joint is better known than it is seen: its noise is no reason to hang on the world.
         log += _log_volume(covariance_of(seen, best), best) - _log_volume(child_covariance(seen), best)
-    return Pair(parent, child, found, times, log + LOG_ANYWHERE - len(times) * _LOG_ROOM, explained)
+    turned = 0.0 if b.is_point else _LOG_TURNED
+    log += LOG_ANYWHERE - _LOG_TURNED + turned - len(times) * (_LOG_ROOM + turned)
+    return Pair(parent, child, found, times, log, explained)
 
 
 def squared_error(seen: Observations, fit: Fit) -> float:
@@ -129,9 +140,10 @@ def _log_volume(covariance: Array, fit: Fit) -> float:
 def identified(seen: Observations, families: Families) -> Found:
     """Return what is between two parts that were seen."""
     exact = seen.parent_covariance is None
+    child = seen.relative if exact else seen.child
     return identify(
         None if exact else seen.parent,
-        seen.relative if exact else seen.child,
+        child if seen.rows == 6 else child[:, :3, 3],
         covariance_a=seen.parent_covariance,
         covariance_b=seen.child_covariance,
         families=families,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Hashable, Iterable, Mapping
+from collections.abc import Collection, Hashable, Iterable, Mapping, Sequence
 from typing import TypeVar
 
 import numpy as np
@@ -13,16 +13,19 @@ from .rigid import Array
 Node = TypeVar("Node", bound=Hashable)
 
 
-def spanning_tree(nodes: Iterable[Node], gains: Mapping[frozenset[Node], float]) -> list[frozenset[Node]]:
+def spanning_tree(
+    nodes: Iterable[Node], gains: Mapping[frozenset[Node], float], leaves: Collection[Node] = ()
+) -> list[frozenset[Node]]:
     """Return the connections of the tree with the largest sum of gains; of several trees, if need be.
 
     The structure of largest likelihood, if densities are products over connections (Chow and Liu 1968).
+    Leaves have one connection at most.
     """
     group = {node: {node} for node in nodes}
     chosen = []
     for connection in sorted(gains, key=lambda c: -gains[c]):
         a, b = connection
-        if group[a] is group[b]:
+        if group[a] is group[b] or any(len(group[leaf]) > 1 for leaf in connection if leaf in leaves):
             continue
         chosen.append(connection)
         group[a] |= group[b]
@@ -46,7 +49,7 @@ def sides(
 
 
 def edge_probabilities(
-    nodes: Iterable[Node], gains: Mapping[frozenset[Node], float]
+    nodes: Iterable[Node], gains: Mapping[frozenset[Node], float], leaves: Collection[Node] = ()
 ) -> dict[frozenset[Node], float]:
     """Return the probability of each connection, over all trees that connect what can be connected.
 
@@ -57,17 +60,27 @@ def edge_probabilities(
     other nodes, one after the other (star-mesh transform), which adds and multiplies positive numbers only:
     in logarithms every digit stays, however far gains are apart.
 
-    The probabilities sum up to the number of connections of a tree.
+    Leaves have one connection at most, so each of them chooses by itself. The probabilities sum up to the
+    number of connections of a tree.
     """
-    order = {node: k for k, node in enumerate(nodes)}
+    order = {node: k for k, node in enumerate(node for node in nodes if node not in leaves)}
     logs = np.full((len(order), len(order)), -np.inf)
+    of_leaf: dict[Node, float] = {}
     for connection, gain in gains.items():
-        i, j = (order[node] for node in connection)
-        logs[i, j] = logs[j, i] = gain
+        for leaf in connection & {*leaves}:
+            of_leaf[leaf] = float(np.logaddexp(of_leaf.get(leaf, -np.inf), gain))
+        if connection <= order.keys():
+            i, j = (order[node] for node in connection)
+            logs[i, j] = logs[j, i] = gain
     found = {}
     for connection, gain in gains.items():
-        i, j = (order[node] for node in connection)
-        found[connection] = math.exp(min(0.0, gain - _log_conductance(logs, i, j)))
+        if connection <= order.keys():
+            i, j = (order[node] for node in connection)
+            total = _log_conductance(logs, i, j)
+        else:
+            (leaf,) = connection & {*leaves}
+            total = of_leaf[leaf]
+        found[connection] = math.exp(min(0.0, gain - total))
     return found
 
 
@@ -75,6 +88,7 @@ def instead(
     connection: frozenset[Node],
     tree: Iterable[frozenset[Node]],
     gains: Mapping[frozenset[Node], float],
+    leaves: Collection[Node] = (),
 ) -> dict[frozenset[Node], float]:
     """Return the probabilities of connections between both sides of one, in trees without that one.
 
@@ -82,10 +96,11 @@ def instead(
     """
     one, other = sides(connection, tree)
     around = {c: gain for c, gain in gains.items() if c <= one | other}
-    missing = 1.0 - edge_probabilities(one | other, around)[connection]
+    missing = 1.0 - edge_probabilities(one | other, around, leaves)[connection]
     del around[connection]
-    found = edge_probabilities(one | other, around)
-    across = {c: missing * p for c, p in found.items() if c & one and c & other}
+    found = edge_probabilities(one | other, around, leaves)
+    apart = {*leaves} - connection
+    across = {c: missing * p for c, p in found.items() if c & one and c & other and not c & apart}
     return dict(sorted(across.items(), key=lambda pair: -pair[1]))
 
 
@@ -119,3 +134,27 @@ def path(tree: Iterable[frozenset[Node]], start: Node, end: Node) -> list[Node]:
     while way[-1] != start:
         way.append(before[way[-1]])
     return way[::-1]
+
+
+def outwards(
+    first: Iterable[Node], nodes: Sequence[Node], tree: Iterable[frozenset[Node]]
+) -> tuple[tuple[Node, ...], list[tuple[Node, Node]]]:
+    """Return roots, and connections from them outwards; what comes first is a root, if another is not."""
+    connections = list(tree)
+    roots: list[Node] = []
+    directed: list[tuple[Node, Node]] = []
+    reached: set[Node] = set()
+    for node in first:
+        if node in reached:
+            continue
+        roots.append(node)
+        reached.add(node)
+        waiting = [node]
+        while waiting:
+            parent = waiting.pop(0)
+            for child in nodes:
+                if child not in reached and frozenset((parent, child)) in connections:
+                    directed.append((parent, child))
+                    reached.add(child)
+                    waiting.append(child)
+    return tuple(roots), directed

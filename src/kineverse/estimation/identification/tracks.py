@@ -15,7 +15,8 @@ from .observations import Observations, check_rigid, covariances
 from .rigid import Array
 
 Poses: TypeAlias = "npt.ArrayLike | tuple[npt.ArrayLike, npt.ArrayLike]"
-"""Poses (N, 4, 4), or a pair of them and their covariance: (6, 6), or (N, 6, 6) with one for each pose."""
+"""Poses (N, 4, 4), or a pair of them and their covariance: (6, 6), or (N, 6, 6) with one for each pose. Where
+points are welcome, positions (N, 3) with (3, 3) or (N, 3, 3)."""
 
 
 @dataclass(frozen=True)
@@ -25,9 +26,9 @@ class Track:
     Attributes
     ----------
     poses
-        (N, 4, 4).
+        (N, 4, 4); of a point, with rotations that mean nothing.
     covariances
-        (N, 6, 6); None if they are exact.
+        (N, 6, 6), or (N, 3, 3) of a point; None if they are exact.
     seen
         When it was seen, (N,).
     """
@@ -36,8 +37,15 @@ class Track:
     covariances: Array | None
     seen: npt.NDArray[np.bool_]
 
+    @property
+    def is_point(self) -> bool:
+        """Whether only positions were seen."""
+        return self.covariances is not None and self.covariances.shape[-1] == 3
 
-def tracks(observations: Mapping[str, Poses], noise: npt.ArrayLike | None) -> dict[str, Track]:
+
+def tracks(
+    observations: Mapping[str, Poses], noise: npt.ArrayLike | None, points: bool = False
+) -> dict[str, Track]:
     """Return what was seen, checked.
 
     Parameters
@@ -47,6 +55,8 @@ def tracks(observations: Mapping[str, Poses], noise: npt.ArrayLike | None) -> di
         not seen.
     noise
         The covariance of those that come with none.
+    points
+        Whether positions, (N, 3), do as well.
 
     Raises
     ------
@@ -55,7 +65,7 @@ def tracks(observations: Mapping[str, Poses], noise: npt.ArrayLike | None) -> di
     """
     if not isinstance(observations, Mapping):
         raise ShapeError("Observations are a mapping from names of frames to poses of shape (N, 4, 4).")
-    found = {name: _track(name, given, noise) for name, given in observations.items()}
+    found = {name: _track(name, given, noise, points) for name, given in observations.items()}
     counts = {name: len(track.poses) for name, track in found.items()}
     if len(set(counts.values())) > 1:
         listed = ", ".join(f"{count} of '{name}'" for name, count in counts.items())
@@ -66,7 +76,7 @@ def tracks(observations: Mapping[str, Poses], noise: npt.ArrayLike | None) -> di
     return found
 
 
-def _track(name: str, given: Any, noise: npt.ArrayLike | None) -> Track:
+def _track(name: str, given: Any, noise: npt.ArrayLike | None, points: bool) -> Track:
     covariance = noise
     if isinstance(given, tuple) and len(given) == 2:
         given, covariance = given
@@ -74,22 +84,31 @@ def _track(name: str, given: Any, noise: npt.ArrayLike | None) -> Track:
         poses = np.array(given, dtype=np.float64)
     except (TypeError, ValueError):
         raise ShapeError(f"The poses of '{name}' are no array of numbers.") from None
+    is_point = points and poses.ndim == 2 and poses.shape[1] == 3
+    if is_point:
+        positions, poses = poses, np.tile(np.eye(4), (len(poses), 1, 1))
+        poses[:, :3, 3] = positions
+        poses[np.isnan(positions).all(axis=1)] = np.nan
     if poses.ndim != 3 or poses.shape[1:] != (4, 4):
-        raise ShapeError(f"The poses of '{name}' are an array of shape (N, 4, 4), not {poses.shape}.")
+        also = ", or (N, 3) of a point" if points else ""
+        raise ShapeError(f"The poses of '{name}' are an array of shape (N, 4, 4){also}, not {poses.shape}.")
     if covariance is None:
         raise ValueRejectedError(
             f"How well '{name}' is seen is not known, and without that nothing can be judged: give a pair of "
             "poses and their covariance, or noise=kv.estimation.pose_covariance(position, orientation)."
         )
+    rows = 3 if is_point else 6
     if not len(poses):
-        return Track(poses, np.zeros((0, 6, 6)), np.zeros(0, dtype=bool))
+        return Track(poses, np.zeros((0, rows, rows)), np.zeros(0, dtype=bool))
     seen: npt.NDArray[np.bool_] = np.logical_not(np.isnan(poses).all(axis=(1, 2)))
     poses[~seen] = np.eye(4)
     check_rigid(poses, f"frame '{name}'")
     spread = np.array(covariance, dtype=np.float64)
+    if is_point and spread.shape[-2:] == (6, 6):
+        spread = spread[..., :3, :3]
     if spread.ndim == 3 and len(spread) == len(seen):
-        spread[~seen] = np.eye(6)
-    return Track(poses, covariances(spread, len(poses), 6, f"frame '{name}'"), seen)
+        spread[~seen] = np.eye(spread.shape[-1])
+    return Track(poses, covariances(spread, len(poses), rows, f"frame '{name}'"), seen)
 
 
 def exactly(count: int) -> Track:
