@@ -97,7 +97,7 @@ def test_exchanging_parent_and_child_inverts_the_model(family: str) -> None:
 def test_the_likelihood_is_that_of_all_true_poses_as_unknowns(family: str) -> None:
     seen = seeded(family, 9, count=5)
     covariance = seen.covariance
-    ours = solutions(observations(seen.parent, seen.child, covariance, covariance), [family])[family]
+    ours = solutions(observations(seen.parent, seen.child, covariance, covariance), [family])[family].solution
     deviation = np.sqrt(np.diag(covariance))
 
     def errors(unknown: np.ndarray) -> np.ndarray:

@@ -10,7 +10,6 @@ from joint_bounds import direction_bound
 from part_recordings import angle_between, noisy, off_axis, recording
 
 from kineverse.estimation import Fit, identify, pose_covariance
-from kineverse.estimation.identification.evidence import evidence
 from kineverse.estimation.identification.groups import GROUPS, GroupMotion
 from kineverse.estimation.identification.identify import solutions
 from kineverse.estimation.identification.observations import observations
@@ -107,7 +106,7 @@ def test_the_evidence_of_rigid_parts_is_an_integral() -> None:
     seen = random.normal(0.3, sigma, (count, 3))
     covariance = sigma**2 * np.eye(3)
     problem = observations(None, seen, covariance, covariance)
-    found = evidence(solutions(problem, ["rigid"])["rigid"]).log_evidence
+    found = solutions(problem, ["rigid"])["rigid"].log_evidence
     grid = np.linspace(0.1, 0.5, 4001)
     expected = 0.0
     for axis in range(3):

@@ -14,14 +14,11 @@ does the point of the child whose slides are meant, see :mod:`.sliding`.
 
 from __future__ import annotations
 
-import ctypes
 import math
 from dataclasses import dataclass
 
 import numpy as np
 
-from .groups import GroupMotion
-from .library import library, packed, problem_of
 from .matrices import inverted, log_determinants, times
 from .motion import Member
 from .rigid import Array
@@ -49,44 +46,26 @@ class Evidence:
     joint_values: Array
     joint_covariances: Array
 
+    @staticmethod
+    def of(log: float, information: Array, size: int, values: Array, covariances: Array) -> Evidence:
+        """Return it with the covariance of the first unknowns, which are the parameters."""
+        return Evidence(log, inverted(information)[:size, :size], values, covariances)
 
-def evidence(solution: Solution[Member], native: bool = True) -> Evidence:
-    """Return the evidence of a family of joints around its most likely member.
 
-    It is done in C where it can be and ``native`` is true.
-    """
+def evidence(solution: Solution[Member]) -> Evidence:
+    """Return the evidence of a family of joints around its most likely member."""
     motion, size = solution.motion, solution.motion.size
-    seen = alone(solution, native)
-    width = widths(motion, seen, native) if motion.joints else Widths(np.zeros(0), np.zeros(0), 0.0)
-    if native and library.is_native and isinstance(motion, GroupMotion):
-        values, covariances, information = _informed(solution, motion, seen, width)
-    else:
-        values, covariances = _together(seen, width)
-        information = _information(solution, width, values)
+    seen = alone(solution)
+    width = widths(motion, seen) if motion.joints else Widths(np.zeros(0), np.zeros(0), 0.0)
+    values, covariances = _together(seen, width)
+    information = _information(solution, width, values)
     prior = motion.prior().by_parameters
     information[:size, :size] += prior.T @ prior
     beforehand, precision = motion.beforehand(width.mean)
     information[np.diag_indices_from(information)] += precision
     log = seen.log_likelihood + width.log_density + beforehand
     log += 0.5 * len(information) * math.log(math.tau) - 0.5 * float(np.linalg.slogdet(information)[1])
-    return Evidence(log, inverted(information)[:size, :size], values, covariances)
-
-
-def _informed(
-    solution: Solution[Member], motion: GroupMotion, seen: Alone, width: Widths
-) -> tuple[Array, Array, Array]:
-    """Return joint values and their covariances together, and the information."""
-    unknowns = motion.size + motion.joints + motion.slides
-    results = np.empty_like(seen.values), np.empty_like(seen.covariances), np.empty((unknowns, unknowns))
-    given = solution.covariance, seen.values, seen.covariances, width.deviations, width.mean
-    arrays = (packed(motion), *(np.ascontiguousarray(array) for array in given), *results)
-    library.code.informed(
-        ctypes.addressof(problem_of(motion.group, motion.rows)),
-        len(seen.values),
-        motion.slides,
-        *(array.ctypes.data for array in arrays),
-    )
-    return results
+    return Evidence.of(log, information, size, values, covariances)
 
 
 def overrated(solution: Solution[Member]) -> float:

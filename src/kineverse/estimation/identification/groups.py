@@ -20,7 +20,7 @@ import numpy as np
 
 from kineverse.estimation.rotations import exponential, right_jacobian, skew
 
-from .library import at, library
+from .library import at, fits, library
 from .motion import Linear, Prior
 from .rigid import Array, orthonormal, pose
 
@@ -183,9 +183,14 @@ class GroupMotion:
         """Number of components of the sliding point that are unknown, see :mod:`.sliding`."""
         return self.group.slides if self.rows == 6 else 0
 
+    @property
+    def is_plain(self) -> bool:
+        """Whether it is what its group says and nothing else, so that C knows all of it."""
+        return type(self) is GroupMotion and fits(self.group, self.rows)
+
     def at(self, values: Array, native: bool = True) -> Linear:
         """Return the poses at joint values (N, k); it is done in C where it can be and ``native`` is true."""
-        if native and library.is_native:
+        if native and library.is_native and self.is_plain:
             return at(self, values)
         freedom = self.freedom
         twist = np.zeros((len(values), 6))

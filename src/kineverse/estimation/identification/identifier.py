@@ -14,8 +14,9 @@ from .lengths import in_units, unit_of
 from .motion import Member
 from .native import solver
 from .observations import Observations, observations
+from .refining import Rated
 from .rigid import Array
-from .solving import Solution
+from .solving import Solution, Start
 
 # A family that is less probable than this rests until there are twice as many observations.
 _NO_CHANCE = 1e-6
@@ -119,14 +120,14 @@ class Identifier:
             self._whole, self._unit = len(seen), unit_of(seen)
         seen = in_units(seen, self._unit)
         if whole:
-            self._solutions = solutions(seen, self._weights, self._unit)
+            found = solutions(seen, self._weights, self._unit)
         else:
-            self._solutions = {name: _continued(seen, s) for name, s in self._solutions.items()}
-        known = judged(seen, self._solutions, self._weights)
-        found = weighed(known, self._weights, self._stated, self._unit)
-        chances = {name for name, probability in found.probabilities.items() if probability > _NO_CHANCE}
+            found = {name: _continued(seen, s) for name, s in self._solutions.items()}
+        known = judged(seen, found, self._weights)
+        result = weighed(known, self._weights, self._stated, self._unit)
+        chances = {name for name, probability in result.probabilities.items() if probability > _NO_CHANCE}
         self._solutions = {family: s for family, (s, _) in known.items() if s.motion.name in chances}
-        return found
+        return result
 
 
 def _joined(parts: list[Observations]) -> Observations:
@@ -139,7 +140,7 @@ def _joined(parts: list[Observations]) -> Observations:
     )
 
 
-def _continued(seen: Observations, before: Solution[Member]) -> Solution[Member]:
+def _continued(seen: Observations, before: Solution[Member]) -> Rated:
     """Return the solution of a family for more observations than it was found from."""
     known = len(before.values)
     values: list[Array] = [before.values]
@@ -148,4 +149,4 @@ def _continued(seen: Observations, before: Solution[Member]) -> Solution[Member]
         apart = np.sum((seen.relative[:known] - seen.relative[k]) ** 2, axis=(1, 2))
         values.append(before.values[int(np.argmin(apart))][None])
     parent = np.concatenate([before.parent, seen.parent[known:]])
-    return solver.solve(seen, before.motion, np.concatenate(values), parent, before.belief)
+    return solver.continued(seen, Start(before.motion, np.concatenate(values)), parent, before.belief)

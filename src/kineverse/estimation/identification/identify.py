@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping
-from dataclasses import replace
 from functools import partial
 from types import MappingProxyType
 from typing import TypeAlias
@@ -16,18 +15,15 @@ from kineverse.errors import UnknownNameError, ValueRejectedError, suggest
 from kineverse.estimation.noise import pose_covariance
 
 from .canonical import canonical
-from .evidence import Evidence, evidence, overrated
 from .family import Family, family_starts
 from .fit import Fit, Found, Offer
 from .lengths import in_metres, in_units, log_density, unit_of
-from .mirrored import straightened
 from .motion import Member
 from .native import solver
 from .observations import Observations, observations
-from .refining import refined
+from .refining import Rated
 from .reporting import fit_of
 from .rigid import Array
-from .sliding import slid
 from .solving import Solution, Start
 from .starts import Overview, starts
 
@@ -158,52 +154,39 @@ def family_weights(families: Families) -> dict[str | Family, float]:
 
 def solutions(
     seen: Observations, families: Iterable[str | Family], unit: float = 1.0
-) -> dict[str | Family, Solution[Member]]:
+) -> dict[str | Family, Rated]:
     """Return the most likely member of each family, for observations in a unit of length [m]."""
     solver.prepare()
     overview = Overview(seen)
-    return {name: _most_likely(seen, name, overview, unit) for name in families}
+    return {name: solver.likeliest(seen, _starts(seen, name, overview, unit)) for name in families}
 
 
-def _most_likely(
-    seen: Observations, family: str | Family, overview: Overview, unit: float
-) -> Solution[Member]:
+def _starts(seen: Observations, family: str | Family, overview: Overview, unit: float) -> list[Start]:
     if isinstance(family, Family):
-        begin = [Start(motion, values) for motion, values in family_starts(family, seen, unit)]
-    else:
-        begin = list(starts(family, overview))
-    first, *softer = [*seen.softened(), seen]
-    best = solver.solve_first(first, begin)
-    for narrower in softer:
-        best = solver.solve(narrower, best.motion, best.values, best.parent)
-    return straightened(seen, best)
+        return [Start(motion, values) for motion, values in family_starts(family, seen, unit)]
+    return list(starts(family, overview))
 
 
 def judged(
-    seen: Observations, found: Mapping[str | Family, Solution[Member]], weights: Mapping[str | Family, float]
-) -> dict[str | Family, tuple[Solution[Member], Evidence]]:
-    """Return solutions and their evidence, those that have a chance with joint values integrated out."""
-    result = {}
-    for name, solution in found.items():
-        first = refined(seen, solution) if solution.belief.marginal else slid(solution)
-        result[name] = first, _reached(first)
-    logs = {name: known.log_evidence + math.log(weights[name]) for name, (_, known) in result.items()}
+    seen: Observations, found: Mapping[str | Family, Rated], weights: Mapping[str | Family, float]
+) -> dict[str | Family, Rated]:
+    """Return what was found, and with joint values integrated out what has a chance."""
+    logs = {name: known.log_evidence + math.log(weights[name]) for name, known in found.items()}
     least = max(logs.values()) - _CHANCE - _CHANCE_EACH * len(seen)
-    for name, (solution, _) in result.items():
-        if logs[name] >= least and not solution.belief.marginal:
-            final = refined(seen, solution)
-            if final is not solution:
-                result[name] = final, _reached(final)
-    return result
+    return {
+        name: solver.refined(seen, known.solution) if logs[name] >= least and _is_rough(known) else known
+        for name, known in found.items()
+    }
 
 
-def _reached(solution: Solution[Member]) -> Evidence:
-    known = evidence(solution)
-    return replace(known, log_evidence=known.log_evidence - overrated(solution))
+def _is_rough(known: Rated) -> bool:
+    """Return whether there are joint values to be integrated out, and they are not."""
+    solution = known.solution
+    return bool(solution.motion.joints and solution.motion.size) and not solution.belief.marginal
 
 
 def weighed(
-    found: Mapping[str | Family, tuple[Solution[Member], Evidence]],
+    found: Mapping[str | Family, Rated],
     weights: Mapping[str | Family, float],
     stated: bool,
     unit: float = 1.0,
@@ -211,14 +194,13 @@ def weighed(
     """Return the fits of all families, weighed by their evidence, of observations in a unit of length [m]."""
     beforehand = {name: math.log(weights[name]) for name in found}
     if stated:
-        logs = {name: known.log_evidence for name, (_, known) in found.items()}
+        logs = {name: known.log_evidence for name, known in found.items()}
         scale = 1.0
     else:
         spread = -0.5 * (np.log(_SCALES) / _SCALE_SPREAD) ** 2
         spread -= np.logaddexp.reduce(spread)
         joint = {
-            name: spread + [evidence(solution.scaled(c)).log_evidence for c in _SCALES]
-            for name, (solution, _) in found.items()
+            name: spread + solver.log_evidences(known.solution, _SCALES) for name, known in found.items()
         }
         logs = {name: float(np.logaddexp.reduce(j)) for name, j in joint.items()}
         best = max(logs, key=lambda name: logs[name] + beforehand[name])
@@ -234,4 +216,4 @@ def weighed(
 
 def _fit(solution: Solution[Member], scale: float, log: float, probability: float, unit: float) -> Fit:
     solution = canonical(solution)
-    return in_metres(fit_of(solution, evidence(solution.scaled(scale)), log, probability), unit)
+    return in_metres(fit_of(solution, solver.evidence(solution, scale), log, probability), unit)

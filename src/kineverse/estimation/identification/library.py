@@ -14,9 +14,10 @@ import numpy as np
 
 from kineverse.compile.source_library import SourceLibrary
 from kineverse.compile.toolchain import CLOSED
+from kineverse.errors import ShapeError
 
 from .motion import Linear
-from .native_source import SOLVE
+from .native_source import SOURCE
 from .rigid import Array, pose
 
 if TYPE_CHECKING:
@@ -24,44 +25,77 @@ if TYPE_CHECKING:
 
 # Numbers of its own, that need not agree with those of an interpreter to the last bit.
 _FLAGS = ("-O3", "-ffp-contract=fast", "-fno-rounding-math", "-lm", *CLOSED)
-_COUNTS = ("count", "rows", "joints", "lefts", "rights", "pitched", "reach", "known", "marginal")
-ARRAYS = ("parent", "child", "parent_covariance", "child_covariance")
+_FAMILY = ("rows", "joints", "lefts", "rights", "pitched", "reach", "slides")
+_SCALES = ("reach_scale", "pitch_scale", "close", "little", "narrowest", "settled", "better", "slid")
+_COUNTS = ("steps", "first_steps", "turns", "sliding_turns", "mirrored_turns", "mirrored_steps", "widths")
+# So many parameters C has room for.
+_PARAMETERS = 12
+MOTION = 25
+"""How many numbers C has for a member of a family."""
+
+
+class _Belief(ctypes.Structure):
+    _fields_ = (("mean", ctypes.c_double * 6), ("precision", ctypes.c_double * 6))
+
+
+class _Noise(ctypes.Structure):
+    _fields_ = (("covariance", ctypes.c_void_p), ("inverse", ctypes.c_void_p), ("stride", ctypes.c_int64))
+
+
+class Given(ctypes.Structure):
+    """What was observed, as C has it."""
+
+    _fields_ = (
+        *((name, ctypes.c_int64) for name in ("count", "known", "softer")),
+        *((name, ctypes.c_void_p) for name in ("parent", "child", "parent_covariance", "child_covariance")),
+        ("softness", ctypes.c_void_p),
+    )
 
 
 class Problem(ctypes.Structure):
-    """What is to be solved, as C has it."""
+    """What is to be solved, as C has it: a family, what was observed, and room for what C works with."""
 
     _fields_ = (
+        *((name, ctypes.c_int64) for name in _FAMILY),
+        *((name, ctypes.c_int64 * 6) for name in ("joint", "left", "right", "kind")),
+        ("given", Given),
+        *((name, ctypes.c_double) for name in _SCALES),
         *((name, ctypes.c_int64) for name in _COUNTS),
-        *((name, ctypes.c_int64 * 6) for name in ("joint", "left", "right")),
-        *((name, ctypes.c_void_p) for name in ARRAYS),
-        *((name, ctypes.c_double) for name in ("reach_scale", "pitch_scale", "close")),
-        *((name, ctypes.c_double * 6) for name in ("mean", "precision")),
+        ("grid", ctypes.c_void_p),
+        *((name, ctypes.c_int64) for name in ("marginal", "mirrored")),
+        ("belief", _Belief),
+        ("of_parent", _Noise),
+        ("of_child", _Noise),
     )
 
 
 def _declare(code: Any) -> None:
-    pointer = ctypes.c_void_p
-    counter = ctypes.c_int64
-    code.solve.argtypes = (pointer, counter, *(pointer,) * 3, counter, counter, *(pointer,) * 6)
-    code.solve.restype = ctypes.c_int64
+    pointer, counter = ctypes.c_void_p, ctypes.c_int64
     code.at.argtypes = (pointer, counter, *(pointer,) * 5)
-    code.at.restype = None
-    code.alone.argtypes = (*(counter,) * 3, ctypes.c_double, *(pointer,) * 5)
-    code.widths.argtypes = (counter, counter, *(pointer,) * 3, counter, *(pointer,) * 3)
-    code.informed.argtypes = (pointer, counter, counter, *(pointer,) * 9)
-    code.informed.restype = None
-    code.slid.argtypes = (
-        *(pointer, counter, counter, counter),
-        *(*(ctypes.c_double,) * 3, counter),
-        *(pointer,) * 9,
-    )
-    code.slid.restype = counter
-    code.alone.restype = code.widths.restype = ctypes.c_double
+    code.memory_of.argtypes, code.memory_of.restype = (pointer,), counter
+    code.likeliest.argtypes = (pointer, counter, *(pointer,) * 4)
+    code.rate.argtypes = (pointer, counter, *(pointer,) * 7)
+    for stage in (code.solve, code.refine, code.carry_on):
+        stage.argtypes = (pointer,) * 3
+    for function in (code.at, code.likeliest, code.rate, code.solve, code.refine, code.carry_on):
+        function.restype = None
 
 
-library = SourceLibrary(SOLVE, _declare, _FLAGS)
+library = SourceLibrary(SOURCE, _declare, _FLAGS)
 """The compiled functions, once there are any; for the whole process."""
+
+
+@functools.cache
+def fits(group: Group, rows: int) -> bool:
+    """Return whether C has room for a family."""
+    freedom = group.freedom(rows)
+    left, right, joints = (len(part) for part in (freedom.left, freedom.right, freedom.joints))
+    return (
+        {*freedom.left, *freedom.right, *freedom.joints} <= {*range(6)}
+        and max(left, right + joints) <= 6
+        and left + right + group.pitch <= _PARAMETERS
+        and max(group.reach, group.slides) <= 3
+    )
 
 
 @functools.cache
@@ -71,16 +105,18 @@ def problem_of(group: Group, rows: int) -> Problem:
     problem.rows, problem.joints = rows, len(freedom.joints)
     problem.lefts, problem.rights = len(freedom.left), len(freedom.right)
     problem.pitched, problem.reach = group.pitch, group.reach
+    problem.slides = group.slides if rows == 6 else 0
     for name, components in (("joint", freedom.joints), ("left", freedom.left), ("right", freedom.right)):
         getattr(problem, name)[: len(components)] = components
+    problem.kind[: problem.joints] = [j >= 3 for j in freedom.joints]
     return problem
 
 
 def packed(motion: GroupMotion) -> Array:
     """Return what C knows of a member: rotation and place of both sides, and the pitch."""
-    result = np.empty(25)
+    result = np.empty(MOTION)
     for at, side in ((0, motion.left), (12, motion.right)):
-        result[at : at + 9] = side[:3, :3].ravel()
+        result[at : at + 9].reshape(3, 3)[:] = side[:3, :3]
         result[at + 9 : at + 12] = side[:3, 3]
     result[24] = motion.pitch
     return result
@@ -92,20 +128,27 @@ def unpacked(motion: GroupMotion, packed: Array) -> GroupMotion:
     return replace(motion, left=left, right=right, pitch=float(packed[24]))
 
 
-def linear_of(count: int, rows: int, size: int, joints: int) -> Linear:
-    """Return room for poses, of which the last rows are there, and their derivatives."""
-    poses = np.zeros((count, 4, 4))
-    poses[:, 3, 3] = 1.0
-    return Linear(poses, np.empty((count, rows, size)), np.empty((count, rows, joints)))
-
-
 def at(motion: GroupMotion, values: Array) -> Linear:
-    """Return the poses at joint values (N, k), as :meth:`.groups.GroupMotion.at` does."""
-    result = linear_of(len(values), motion.rows, motion.size, motion.joints)
-    moved, values = packed(motion), np.ascontiguousarray(values, dtype=np.float64)
+    """Return the poses at joint values (N, k), as :meth:`.groups.GroupMotion.at` does.
+
+    Raises
+    ------
+    ShapeError
+        For values of another shape.
+    """
+    values = np.ascontiguousarray(values, dtype=np.float64)
+    if values.ndim != 2 or values.shape[1] != motion.joints:
+        raise ShapeError(
+            f"The joint values of a {motion.name} motion have shape (N, {motion.joints}), not {values.shape}."
+        )
+    count, rows = len(values), motion.rows
+    result = Linear(
+        np.empty((count, 4, 4)), np.empty((count, rows, motion.size)), np.empty((count, rows, motion.joints))
+    )
+    moved = packed(motion)
     library.code.at(
-        ctypes.addressof(problem_of(motion.group, motion.rows)),
-        len(values),
+        ctypes.addressof(problem_of(motion.group, rows)),
+        count,
         moved.ctypes.data,
         values.ctypes.data,
         *(array.ctypes.data for array in result),

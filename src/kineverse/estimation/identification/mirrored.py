@@ -19,14 +19,13 @@ from kineverse.estimation.rotations import exponential, logarithm, skew
 from .groups import WZ, GroupMotion
 from .matrices import inverted, times
 from .motion import Member
-from .native import solver
 from .observations import Observations
 from .rigid import Array
-from .solving import Belief, Solution
+from .solving import Belief, Solution, solve
 
-_STEPS, _TURNS = 6, 4
+STEPS, TURNS = 6, 4
 # By how much, as a logarithm, the other one has to be more probable.
-_BETTER = 1e-3
+BETTER = 1e-3
 
 
 class Single(NamedTuple):
@@ -50,14 +49,14 @@ class Single(NamedTuple):
 def straightened(seen: Observations, solution: Solution[Member]) -> Solution[Member]:
     """Return the solution with observations on their more probable side, if positions are that precise."""
     motion = solution.motion
-    if not isinstance(motion, GroupMotion) or motion.joints != 1 or not motion.size or not seen.softened():
+    if not isinstance(motion, GroupMotion) or motion.joints != 1 or not motion.size or not seen.softness:
         return solution
-    for _ in range(_TURNS):
+    for _ in range(TURNS):
         start = _exchanged(seen, solution, motion)
         if start is None:
             break
         values, parent = start
-        better = solver.solve(seen, motion, values, parent, solution.belief)
+        better = solve(seen, motion, values, parent, solution.belief)
         if not (better.cost < solution.cost and isinstance(better.motion, GroupMotion)):
             break
         solution, motion = better, better.motion
@@ -71,7 +70,7 @@ def _exchanged(
     belief, parent = solution.belief, solution.parent
     here = singly(seen, motion, solution.values, parent, belief)
     there = singly(seen, motion, others(motion, solution.values, belief), parent, belief)
-    better = there.log_density > here.log_density + _BETTER
+    better = there.log_density > here.log_density + BETTER
     if not better.any():
         return None
     values, parent = solution.values.copy(), parent.copy()
@@ -90,7 +89,7 @@ def singly(seen: Observations, motion: GroupMotion, values: Array, parent: Array
     way, rows = seen.child[:, :3, 3] - seen.parent[:, :3, 3], seen.rows
     turned = _aligned(parent[:, :3, :3], motion.at(values).pose[:, :3, 3], way)
     best = Single(values, turned, np.full(len(seen), -math.inf))
-    for _ in range(_STEPS):
+    for _ in range(STEPS):
         linear = motion.at(values)
         lever = times(turned, linear.pose[:, :3, 3])
         back = np.swapaxes(turned, 1, 2)

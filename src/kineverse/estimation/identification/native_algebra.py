@@ -7,6 +7,7 @@ ALGEBRA = r"""
 #include <string.h>
 
 #define FAST static inline __attribute__((always_inline))
+#define TAU 6.283185307179586
 
 FAST void times33(const double *a, const double *b, double *c) {
   for (int i = 0; i < 3; i++)
@@ -121,8 +122,61 @@ static void resolve(const double *l, int n, double *x) {
   }
 }
 
-/* The inverse of a positive definite matrix; returns the root of its determinant, or 0 if it is none. */
-FAST double invert(const double *a, const int n, double *inverse) {
+/* The logarithm of the determinant of a matrix, by rows that are exchanged; a is lost. */
+static double log_volume(double *a, int n) {
+  double sum = 0.0;
+  for (int j = 0; j < n; j++) {
+    int most = j;
+    for (int i = j + 1; i < n; i++)
+      if (fabs(a[n * i + j]) > fabs(a[n * most + j])) most = i;
+    for (int c = j; c < n; c++) {
+      double other = a[n * j + c];
+      a[n * j + c] = a[n * most + c];
+      a[n * most + c] = other;
+    }
+    sum += log(fabs(a[n * j + j]));
+    for (int i = j + 1; i < n; i++) {
+      double factor = a[n * i + j] / a[n * j + j];
+      for (int c = j + 1; c < n; c++) a[n * i + c] -= factor * a[n * j + c];
+    }
+  }
+  return sum;
+}
+
+/* The singular values of the first rows of a matrix of six rows, by turning pairs of its columns until all
+   are at right angles (Hestenes 1958); a is lost. */
+static void singular_values(double *a, int rows, int n, double *values) {
+  for (int sweep = 0; sweep < 30; sweep++) {
+    int turned = 0;
+    for (int i = 0; i < n; i++)
+      for (int j = i + 1; j < n; j++) {
+        double ii = 0.0, jj = 0.0, ij = 0.0;
+        for (int r = 0; r < rows; r++) {
+          ii += a[n * r + i] * a[n * r + i];
+          jj += a[n * r + j] * a[n * r + j];
+          ij += a[n * r + i] * a[n * r + j];
+        }
+        if (ij * ij <= 1e-30 * ii * jj) continue;
+        turned = 1;
+        double zeta = (jj - ii) / (2.0 * ij);
+        double t = (zeta < 0.0 ? -1.0 : 1.0) / (fabs(zeta) + sqrt(1.0 + zeta * zeta));
+        double c = 1.0 / sqrt(1.0 + t * t), s = c * t;
+        for (int r = 0; r < rows; r++) {
+          double x = a[n * r + i], y = a[n * r + j];
+          a[n * r + i] = c * x - s * y;
+          a[n * r + j] = s * x + c * y;
+        }
+      }
+    if (!turned) break;
+  }
+  for (int i = 0; i < n; i++) {
+    values[i] = 0.0;
+    for (int r = 0; r < rows; r++) values[i] += a[n * r + i] * a[n * r + i];
+    values[i] = sqrt(values[i]);
+  }
+}
+
+FAST double invert_size(const double *a, const int n, double *inverse) {
   double l[36], root;
   for (int i = 0; i < n * n; i++) l[i] = a[i];
   root = factorise(l, n);
@@ -140,6 +194,18 @@ FAST double invert(const double *a, const int n, double *inverse) {
       inverse[n * i + j] = inverse[n * j + i] = sum;
     }
   return root;
+}
+
+/* The inverse of a positive definite matrix of at most six rows; returns the root of its determinant, or 0 if
+   it is none. */
+static double invert(const double *a, int n, double *inverse) {
+  switch (n) {
+    case 1: return invert_size(a, 1, inverse);
+    case 2: return invert_size(a, 2, inverse);
+    case 3: return invert_size(a, 3, inverse);
+    case 6: return invert_size(a, 6, inverse);
+    default: return invert_size(a, n, inverse);
+  }
 }
 
 /* e' W e */

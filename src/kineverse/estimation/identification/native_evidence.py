@@ -1,18 +1,20 @@
-"""C text: what observations say about parameters with joint values integrated out, as in :mod:`.evidence`."""
+"""C text: how probable observations are with all that is unknown integrated out, as in :mod:`.evidence`."""
 
 EVIDENCE = r"""
 #define UNKNOWNS 21 /* parameters, means of joint values, and a point that slides, at most */
+#define ATOM 1e-10
 
-/* As _together and _information in evidence.py. */
-EXPORT void informed(const Problem *p, int64_t count, int64_t slides, const Motion *m,
-                     const double *covariance, const double *places, const double *known,
-                     const double *deviations, const double *mean, double *values, double *covariances,
-                     double *information) {
-  int rows = (int)p->rows, joints = (int)p->joints, size = (int)size_of(p), n = size + joints + (int)slides;
+/* Joint values, their covariances and the information, as observations and widths tell together. */
+static void informed(const Problem *p, const Answer *a, double factor, const double *places,
+                     const double *known, const double *deviations, const double *mean, double *values,
+                     double *covariances, double *information) {
+  int rows = (int)p->rows, joints = (int)p->joints, slides = (int)p->slides, size = (int)size_of(p);
+  int n = size + joints + slides;
+  const Motion *m = &a->head->motion;
   memset(information, 0, n * n * sizeof(double));
   Observation o;
-  for (int64_t k = 0; k < count; k++) {
-    const double *C = known + joints * joints * k, *S = covariance + rows * rows * k;
+  for (int64_t k = 0; k < p->count; k++) {
+    const double *C = known + joints * joints * k, *S = a->covariances + rows * rows * k;
     double W[36], moved[36], change[6], both[6 * UNKNOWNS] = {0}, weighted[6 * UNKNOWNS];
     if (joints) widened(C, joints, deviations, W);
     for (int i = 0; i < joints; i++) {
@@ -26,11 +28,10 @@ EXPORT void informed(const Problem *p, int64_t count, int64_t slides, const Moti
       }
       values[joints * k + i] = o.values[i] = mean[i] + change[i];
     }
-    if (rows == 6) place(p, m, &o, 6);
-    else place(p, m, &o, 3);
+    place_one(p, m, &o);
     for (int r = 0; r < rows; r++) {
       for (int s = 0; s < rows; s++) {
-        moved[rows * r + s] = S[rows * r + s];
+        moved[rows * r + s] = factor * S[rows * r + s];
         for (int j = 0; j < joints; j++) {
           const double *J = o.by_joints + 6 * j;
           moved[rows * r + s] += deviations[j] * deviations[j] * J[r] * J[s];
@@ -47,8 +48,7 @@ EXPORT void informed(const Problem *p, int64_t count, int64_t slides, const Moti
       for (int r = 0; r < 3; r++)
         for (int i = 0; i < slides; i++) both[n * r + size + joints + i] = turned[3 * r + i];
     }
-    if (rows == 6) invert(moved, 6, W);
-    else invert(moved, 3, W);
+    invert(moved, rows, W);
     for (int r = 0; r < rows; r++)
       for (int i = 0; i < n; i++) {
         weighted[n * r + i] = 0.0;
@@ -58,5 +58,84 @@ EXPORT void informed(const Problem *p, int64_t count, int64_t slides, const Moti
       for (int r = 0; r < rows; r++)
         for (int j = 0; j < n; j++) information[n * i + j] += both[n * r + i] * weighted[n * r + j];
   }
+}
+
+static int has(const int64_t *components, int64_t count, int64_t component) {
+  for (int64_t i = 0; i < count; i++)
+    if (components[i] == component) return 1;
+  return 0;
+}
+
+static double of_lever(const double *lever, int64_t count, double scale) {
+  double log_density = -0.5 * count * log(TAU * scale * scale);
+  for (int64_t i = 0; i < count; i++) log_density -= 0.5 * lever[i] * lever[i] / (scale * scale);
+  return log_density;
+}
+
+/* As GroupMotion.beforehand and .prior: the density, and the precision is added to the information. */
+static double beforehand(const Problem *p, const Motion *m, const double *mean, double *information) {
+  int joints = (int)p->joints, size = (int)size_of(p), rights = (int)p->rights;
+  int n = size + joints + (int)p->slides, columns = rights + joints;
+  double log_density = 0.0, normal[MOST * MOST] = {0}, right[MOST] = {0}, matrix[36], volume[6];
+  if (has(p->left, p->lefts, 3)) log_density -= log(TAU);
+  if (has(p->left, p->lefts, 0) && has(p->left, p->lefts, 1))
+    log_density += of_lever(m->right_p, p->reach, p->reach_scale);
+  log_density += of_lever(m->right_p, p->slides, p->reach_scale);
+  if (p->pitched) log_density += of_lever(&m->pitch, 1, p->pitch_scale);
+  Observation o;
+  memcpy(o.values, mean, joints * sizeof(double));
+  place_one(p, m, &o);
+  for (int r = 0; r < p->rows; r++)
+    for (int i = 0; i < columns; i++)
+      matrix[columns * r + i] =
+          i < rights ? o.by_parameters[MOST * r + p->lefts + i] : o.by_joints[6 * (i - rights) + r];
+  singular_values(matrix, (int)p->rows, columns, volume);
+  for (int i = 0; i < columns; i++) log_density += log(fmax(volume[i], ATOM));
+  believe(p, m, normal, right);
+  for (int i = 0; i < size; i++)
+    for (int j = 0; j < size; j++) information[n * i + j] += normal[MOST * i + j];
+  for (int i = 0; i < n; i++) {
+    double turns = i < p->lefts ? p->left[i] >= 3 : i >= size && i < size + joints && p->joint[i - size] >= 3;
+    information[(n + 1) * i] += i < size + joints ? turns : 1.0 / (p->reach_scale * p->reach_scale);
+  }
+  return log_density;
+}
+
+/* As evidence in evidence.py, for errors whose variances are larger by a factor. */
+static double evidence(const Problem *p, const Answer *a, double factor, double *values,
+                       double *covariances, double *information, double *memory) {
+  int joints = (int)p->joints, n = (int)(size_of(p) + p->joints + p->slides);
+  double deviations[6], mean[6], copied[UNKNOWNS * UNKNOWNS], log_density;
+  double *places = memory, *known = places + p->count * joints;
+  memory = known + p->count * joints * joints;
+  log_density = alone(p, a, factor, places, known);
+  if (joints) log_density += widths(p, places, known, deviations, mean, memory);
+  informed(p, a, factor, places, known, deviations, mean, values, covariances, information);
+  log_density += beforehand(p, &a->head->motion, mean, information) + 0.5 * n * log(TAU);
+  memcpy(copied, information, n * n * sizeof(double));
+  return log_density - 0.5 * log_volume(copied, n);
+}
+
+/* As overrated in evidence.py. */
+static double overrated(const Problem *p, const Answer *a, double *memory) {
+  if (a->head->converged > 0.0 || !(a->head->marginal > 0.0)) return 0.0;
+  int n = (int)p->joints;
+  double *places = memory, *known = places + p->count * n, deviations[6], W[36], off[6];
+  double promised = alone(p, a, 1.0, places, known);
+  for (int i = 0; i < n; i++) deviations[i] = 1.0 / sqrt(a->head->belief.precision[i]);
+  for (int64_t k = 0; k < p->count; k++) {
+    double root = widened(known + n * n * k, n, deviations, W);
+    for (int i = 0; i < n; i++) off[i] = places[n * k + i] - a->head->belief.mean[i];
+    promised -= 0.5 * squared(off, W, n) + log(root) + 0.5 * n * log(TAU);
+  }
+  double reached = a->head->cost - unlikely(p, &a->head->motion) + p->count * p->rows * log(TAU);
+  return fmax(0.0, promised + 0.5 * reached);
+}
+
+/* The logarithm of the evidence, with nothing that is not there. */
+static double honest(const Problem *p, const Answer *a, double *memory) {
+  double information[UNKNOWNS * UNKNOWNS], *values = memory, *covariances = values + p->count * p->joints;
+  memory = covariances + p->count * p->joints * p->joints;
+  return evidence(p, a, 1.0, values, covariances, information, memory) - overrated(p, a, memory);
 }
 """

@@ -5,18 +5,29 @@ LOOK = r"""
 /* At most so many parameters; what a family has not is 0, so that rows of a fixed length are vectors. */
 #define MOST 12
 
-typedef struct {
-  int64_t count, rows, joints, lefts, rights, pitched, reach, known, marginal;
-  int64_t joint[6], left[6], right[6];
-  const double *parent, *child, *parent_covariance, *child_covariance;
-  double reach_scale, pitch_scale, close, mean[6], precision[6]; /* what is believed of joint values */
-} Problem;
-
 typedef struct { double left_R[9], left_p[3], right_R[9], right_p[3], pitch; } Motion;
 
+typedef struct { double mean[6], precision[6]; } Belief;
+
+/* Covariances and their inverses; the stride from one to the next is 0 if all are alike. */
+typedef struct { const double *covariance, *inverse; int64_t stride; } Noise;
+
 typedef struct {
-  double of_parent[36], of_child[36]; /* inverses of the covariances */
-} Weights;
+  /* The family: which components of twists are joint values and parameters, and the kinds of joint values. */
+  int64_t rows, joints, lefts, rights, pitched, reach, slides;
+  int64_t joint[6], left[6], right[6], kind[6];
+  /* What was observed, and by how much errors of positions are larger while the valley narrows. */
+  int64_t count, known, softer;
+  const double *parent, *child, *parent_covariance, *child_covariance, *softness;
+  /* Constants of the modules that say the same in numpy. */
+  double reach_scale, pitch_scale, close, little, narrowest, settled, better, slid;
+  int64_t steps, first_steps, turns, sliding_turns, mirrored_turns, mirrored_steps, widths;
+  const double *grid;
+  /* What a stage works with at the moment. */
+  int64_t marginal, mirrored;
+  Belief belief;
+  Noise of_parent, of_child;
+} Problem;
 
 typedef struct {
   double parent_R[9], parent_p[3], values[6];
@@ -83,6 +94,9 @@ FAST void place(const Problem *p, const Motion *m, Observation *o, const int row
   }
 }
 
+/* The same for a single observation, where it does not matter how long it takes. */
+static void place_one(const Problem *p, const Motion *m, Observation *o) { place(p, m, o, (int)p->rows); }
+
 /* S = Σ_B + M Σ_A Mᵀ with M = (I, -[h]x; 0, I). */
 FAST void combine(const Problem *p, Observation *o, const int rows) {
   if (p->known) return;
@@ -124,17 +138,17 @@ FAST double weigh(const Problem *p, Observation *o, const int rows) {
   double whole[36], sum = 0.0, root;
   for (int i = 0; i < joints * joints; i++) whole[i] = o->curvature[i];
   for (int i = 0; i < joints; i++) {
-    whole[(joints + 1) * i] += p->precision[i];
-    sum -= log(p->precision[i]);
+    whole[(joints + 1) * i] += p->belief.precision[i];
+    sum -= log(p->belief.precision[i]);
   }
   root = factorise(whole, joints);
   return root == 0.0 ? NAN : sum + 2.0 * log(root);
 }
 
 /* Linearise one observation; return its cost. */
-FAST double look(const Problem *p, const Motion *m, const Weights *w, int64_t k, Observation *o,
-                 const int rows) {
+FAST double look(const Problem *p, const Motion *m, int64_t k, Observation *o, const int rows) {
   place(p, m, o, rows);
+  int64_t a = p->of_parent.stride * k, b = p->of_child.stride * k;
   const double *A = p->parent + 16 * k, *B = p->child + 16 * k, *h = o->lever;
   double R[9], S[9], T[9], offset[3], error[6], turned[6], cost;
   for (int i = 0; i < 9; i++) R[i] = B[4 * (i / 3) + i % 3];
@@ -147,8 +161,8 @@ FAST double look(const Problem *p, const Motion *m, const Weights *w, int64_t k,
     logarithm(T, error + 3);
   }
   turn_back(o->parent_R, error, rows, turned);
-  cost = squared(turned, w->of_child, rows);
-  turn(p->child_covariance + rows * rows * k, o->parent_R, rows, o->covariance);
+  cost = squared(turned, p->of_child.inverse + b, rows);
+  turn(p->of_child.covariance + b, o->parent_R, rows, o->covariance);
   for (int r = 0; r < rows; r++) o->residual[r] = error[r];
   if (!p->known) {
     for (int i = 0; i < 9; i++) R[i] = A[4 * (i / 3) + i % 3];
@@ -157,35 +171,39 @@ FAST double look(const Problem *p, const Motion *m, const Weights *w, int64_t k,
     transposed_times33(o->parent_R, R, S);
     logarithm(S, o->own + 3);
     turn_back(o->parent_R, o->own, 6, turned);
-    cost += squared(turned, w->of_parent, 6);
-    turn(p->parent_covariance + 36 * k, o->parent_R, 6, o->of_parent);
+    cost += squared(turned, p->of_parent.inverse + a, 6);
+    turn(p->of_parent.covariance + a, o->parent_R, 6, o->of_parent);
     cross(o->own + 3, h, offset);
     for (int i = 0; i < rows; i++) o->residual[i] -= o->own[i] + (i < 3 ? offset[i] : 0.0);
   }
   combine(p, o, rows);
-  double root = invert(o->covariance, rows, o->weights);
+  double root = invert_size(o->covariance, rows, o->weights);
   if (root == 0.0) return NAN;
   for (int64_t j = 0; j < p->joints; j++) {
-    double off = o->values[j] - p->mean[j];
-    cost += p->precision[j] * off * off;
+    double off = o->values[j] - p->belief.mean[j];
+    cost += p->belief.precision[j] * off * off;
   }
   double spread = weigh(p, o, rows);
   return p->marginal ? cost + spread + 2.0 * log(root) : cost;
 }
 
-FAST double look_at_rows(const Problem *p, const Motion *m, const Weights *w, Observation *all,
-                         const int rows) {
+FAST double look_at_rows(const Problem *p, const Motion *m, Observation *all, const int rows) {
   double cost = 0.0;
-  for (int64_t k = 0; k < p->count; k++) cost += look(p, m, w + k, k, all + k, rows);
+  for (int64_t k = 0; k < p->count; k++) cost += look(p, m, k, all + k, rows);
   return cost;
 }
 
-static double look_at_all(const Problem *p, const Motion *m, const Weights *w, Observation *all) {
-  double cost = p->rows == 6 ? look_at_rows(p, m, w, all, 6) : look_at_rows(p, m, w, all, 3);
+/* What parameters cost: levers are within reach, and pitches ordinary. */
+static double unlikely(const Problem *p, const Motion *m) {
+  double cost = 0.0;
   for (int64_t i = 0; i < p->reach; i++)
     cost += m->right_p[i] * m->right_p[i] / (p->reach_scale * p->reach_scale);
   if (p->pitched) cost += m->pitch * m->pitch / (p->pitch_scale * p->pitch_scale);
   return cost;
+}
+
+static double look_at_all(const Problem *p, const Motion *m, Observation *all) {
+  return unlikely(p, m) + (p->rows == 6 ? look_at_rows(p, m, all, 6) : look_at_rows(p, m, all, 3));
 }
 
 static void keep(const Problem *p, const Observation *o, double *pose, double *by_parameters,
@@ -199,6 +217,7 @@ static void keep(const Problem *p, const Observation *o, double *pose, double *b
     for (int j = 0; j < 3; j++) pose[4 * i + j] = o->H_R[3 * i + j];
     pose[4 * i + 3] = o->lever[i];
   }
+  for (int j = 0; j < 4; j++) pose[12 + j] = j == 3;
 }
 
 /* As at in groups.py. */
@@ -207,8 +226,7 @@ EXPORT void at(const Problem *p, int64_t count, const Motion *m, const double *v
   Observation o;
   for (int64_t k = 0; k < count; k++) {
     memcpy(o.values, values + p->joints * k, p->joints * sizeof(double));
-    if (p->rows == 6) place(p, m, &o, 6);
-    else place(p, m, &o, 3);
+    place_one(p, m, &o);
     int64_t each = p->rows * k;
     keep(p, &o, poses + 16 * k, by_parameters + size_of(p) * each, by_joints + p->joints * each);
   }

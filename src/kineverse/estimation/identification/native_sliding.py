@@ -1,26 +1,26 @@
 """C text: the point of the child whose slides are a joint value, as in :mod:`.sliding`."""
 
 SLIDING = r"""
-/* As slid in sliding.py: motion, values and derivatives are changed in their place. Returns 0 without
-   memory. */
-EXPORT int64_t slid(const Problem *p, int64_t count, int64_t slides, int64_t turns, double close,
-                    double reach, double little, int64_t size, const double *grid, const int64_t *kinds,
-                    const double *covariance, const double *residuals, Motion *m, double *values,
-                    double *poses, double *by_parameters, double *by_joints) {
-  int joints = (int)p->joints, n = joints + (int)slides;
-  double *memory = malloc(count * (joints + joints * joints + 9) * sizeof(double));
-  if (!memory) return 0;
-  double *places = memory, *known = places + count * joints, *turned = known + count * joints * joints;
-  double most = INFINITY;
-  for (int64_t turn = 0; turn < turns && most > close; turn++) {
+/* The poses of a solution and their derivatives, at its joint values. */
+static void place_all(const Problem *p, Answer *a) {
+  at(p, p->count, &a->head->motion, a->values, a->poses, a->by_parameters, a->by_joints);
+}
+
+/* As slid in sliding.py: motion, values and derivatives are changed in their place. */
+static void slide(const Problem *p, Answer *a, double *memory) {
+  int joints = (int)p->joints, slides = (int)p->slides, n = joints + slides;
+  Motion *m = &a->head->motion;
+  double *places = memory, *known = places + p->count * joints, *turned = known + p->count * joints * joints;
+  double most = slides ? INFINITY : 0.0;
+  memory = turned + 9 * p->count;
+  for (int64_t turn = 0; turn < p->sliding_turns && most > p->slid; turn++) {
     double deviations[6], mean[6], normal[81] = {0}, change[9] = {0};
-    memcpy(places, values, count * joints * sizeof(double));
-    alone(count, p->rows, joints, little, covariance, by_joints, residuals, places, known);
-    if (isnan(widths(count, joints, kinds, places, known, size, grid, deviations, mean))) break;
-    for (int64_t k = 0; k < count; k++) {
+    alone(p, a, 1.0, places, known);
+    widths(p, places, known, deviations, mean, memory);
+    for (int64_t k = 0; k < p->count; k++) {
       /* What the mean and the point make of joint values. */
       double twist[6] = {0}, W[36], by[54] = {0}, weighted[54], *G = turned + 9 * k;
-      for (int j = 0; j < joints; j++) twist[p->joint[j]] = values[joints * k + j];
+      for (int j = 0; j < joints; j++) twist[p->joint[j]] = a->values[joints * k + j];
       exponential(twist + 3, G);
       for (int i = 0; i < joints; i++) by[n * i + i] = 1.0;
       for (int i = 0; i < slides; i++)
@@ -37,9 +37,10 @@ EXPORT int64_t slid(const Problem *p, int64_t count, int64_t slides, int64_t tur
           for (int e = 0; e < n; e++) normal[n * c + e] += weighted[n * i + c] * by[n * i + e];
         }
     }
+    double scale = 1.0 / (p->reach_scale * p->reach_scale);
     for (int i = 0; i < slides; i++) {
-      normal[(n + 1) * (joints + i)] += 1.0 / (reach * reach);
-      change[joints + i] -= m->right_p[i] / (reach * reach);
+      normal[(n + 1) * (joints + i)] += scale;
+      change[joints + i] -= m->right_p[i] * scale;
     }
     factorise(normal, n);
     resolve(normal, n, change);
@@ -48,13 +49,11 @@ EXPORT int64_t slid(const Problem *p, int64_t count, int64_t slides, int64_t tur
       m->right_p[i] += change[joints + i];
       most = fmax(most, fabs(change[joints + i]));
     }
-    for (int64_t k = 0; k < count; k++)
+    for (int64_t k = 0; k < p->count; k++)
       for (int i = 0; i < slides; i++)
         for (int j = 0; j < slides; j++)
-          values[joints * k + i] -= turned[9 * k + 3 * i + j] * change[joints + j];
-    at(p, count, m, values, poses, by_parameters, by_joints);
+          a->values[joints * k + i] -= turned[9 * k + 3 * i + j] * change[joints + j];
+    place_all(p, a);
   }
-  free(memory);
-  return 1;
 }
 """

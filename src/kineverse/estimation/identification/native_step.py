@@ -24,7 +24,7 @@ FAST int eliminate(const Problem *p, Observation *o, double damping, double *lef
   double curvature[36];
   for (int i = 0; i < joints * joints; i++) curvature[i] = o->curvature[i];
   for (int i = 0; i < joints; i++)
-    curvature[(joints + 1) * i] += p->precision[i] + damping * curvature[(joints + 1) * i];
+    curvature[(joints + 1) * i] += p->belief.precision[i] + damping * curvature[(joints + 1) * i];
   if (joints == 1) {
     if (!(curvature[0] > 0.0)) return 0;
     o->inverse[0] = 1.0 / curvature[0];
@@ -50,7 +50,7 @@ FAST void gather(const Problem *p, Observation *o, const double *left, double *n
     for (int s = 0; s < rows; s++) pushed[r] += o->weights[rows * r + s] * o->residual[s];
   }
   for (int i = 0; i < joints; i++) {
-    o->slope[i] = -p->precision[i] * (o->values[i] - p->mean[i]);
+    o->slope[i] = -p->belief.precision[i] * (o->values[i] - p->belief.mean[i]);
     for (int r = 0; r < rows; r++) o->slope[i] += o->weighted[6 * i + r] * o->residual[r];
   }
   for (int i = 0; i < joints; i++)
@@ -107,7 +107,7 @@ FAST double follow(const Problem *p, const Observation *o, const double *step, O
   }
   double change[6] = {0}, back[6];
   for (int i = 0; i < joints; i++) {
-    back[i] = -p->precision[i] * (o->values[i] - p->mean[i]);
+    back[i] = -p->belief.precision[i] * (o->values[i] - p->belief.mean[i]);
     for (int r = 0; r < rows; r++) back[i] += o->weighted[6 * i + r] * left[r];
   }
   for (int i = 0; i < joints; i++)

@@ -1,17 +1,18 @@
 """C text: joint values of each observation alone, and how wide the motion is, as in :mod:`.widths`."""
 
 WIDTHS = r"""
-#define TAU 6.283185307179586
-
-/* As alone in widths.py; values are moved in their place. Returns the logarithm of the likelihood. */
-EXPORT double alone(int64_t count, int64_t rows, int64_t joints, double little, const double *covariance,
-                    const double *by_joints, const double *residuals, double *values, double *covariances) {
-  int m = (int)rows, n = (int)joints;
+/* As alone in widths.py, for errors whose covariances are larger by a factor. Returns the logarithm of the
+   likelihood. */
+static double alone(const Problem *p, const Answer *a, double factor, double *values, double *covariances) {
+  int m = (int)p->rows, n = (int)p->joints;
   double log_likelihood = 0.0;
-  for (int64_t k = 0; k < count; k++) {
-    const double *J = by_joints + m * n * k, *e = residuals + m * k;
+  memcpy(values, a->values, p->count * n * sizeof(double));
+  for (int64_t k = 0; k < p->count; k++) {
+    const double *J = a->by_joints + m * n * k, *e = a->residuals + m * k;
     double W[36], weighted[36], curvature[36], slope[6], left[6], *C = covariances + n * n * k;
-    double root = m == 6 ? invert(covariance + 36 * k, 6, W) : invert(covariance + 9 * k, 3, W);
+    double S[36], root;
+    for (int i = 0; i < m * m; i++) S[i] = factor * a->covariances[m * m * k + i];
+    root = invert(S, m, W);
     for (int i = 0; i < n; i++) {
       slope[i] = 0.0;
       for (int r = 0; r < m; r++) {
@@ -23,7 +24,7 @@ EXPORT double alone(int64_t count, int64_t rows, int64_t joints, double little, 
     }
     for (int i = 0; i < n; i++)
       for (int j = 0; j < n; j++) {
-        double sum = i == j ? little : 0.0;
+        double sum = i == j ? p->little : 0.0;
         for (int r = 0; r < m; r++) sum += weighted[m * i + r] * J[n * r + j];
         curvature[n * i + j] = sum;
       }
@@ -98,32 +99,28 @@ FAST double widened(const double *covariance, int n, const double *deviations, d
   return invert(total, n, inverse);
 }
 
-/* As widths in widths.py, for at most six joint values. Returns the logarithm of the density, or NAN without
-   memory. */
-EXPORT double widths(int64_t count, int64_t joints, const int64_t *kinds, const double *values,
-                     const double *covariances, int64_t size, const double *grid, double *deviations,
-                     double *mean) {
-  int n = (int)joints;
+/* As widths in widths.py. Returns the logarithm of the density. */
+static double widths(const Problem *p, const double *values, const double *covariances,
+                     double *deviations, double *mean, double *memory) {
+  int n = (int)p->joints;
+  int64_t count = p->count;
   double result = 0.0, normal[36] = {0}, right[6] = {0}, inverse[36], W[36];
-  double *memory = malloc((3 * count * joints + size) * sizeof(double));
-  if (!memory) return NAN;
-  double *variances = memory + count * joints, *weights = variances + count * joints;
-  for (int64_t kind = 0; kind < 6; kind++) {
+  double *variances = memory + count * n, *weights = variances + count * n, *logs = weights + count * n;
+  for (int64_t kind = 0; kind < 2; kind++) {
     int64_t block = 0, at = 0;
     double width;
-    for (int j = 0; j < n; j++) block += kinds[j] == kind;
+    for (int j = 0; j < n; j++) block += p->kind[j] == kind;
     if (!block) continue;
     for (int64_t k = 0; k < count; k++)
       for (int j = 0; j < n; j++)
-        if (kinds[j] == kind) {
+        if (p->kind[j] == kind) {
           memory[at] = values[n * k + j];
           variances[at++] = covariances[n * n * k + (n + 1) * j];
         }
-    result += widest(count, block, memory, variances, size, grid, weights, weights + count * joints, &width);
+    result += widest(count, block, memory, variances, p->widths, p->grid, weights, logs, &width);
     for (int j = 0; j < n; j++)
-      if (kinds[j] == kind) deviations[j] = width;
+      if (p->kind[j] == kind) deviations[j] = width;
   }
-  free(memory);
   for (int64_t k = 0; k < count; k++) {
     widened(covariances + n * n * k, n, deviations, W);
     for (int i = 0; i < n; i++)

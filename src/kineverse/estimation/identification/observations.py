@@ -20,7 +20,7 @@ _LARGEST, _SMALLEST = 1e9, 1e-7
 _THIN = 4.0
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Observations:
     """Poses of a parent and a child in one frame, with the covariances of their errors.
 
@@ -68,19 +68,29 @@ class Observations:
         return self._softened
 
     @cached_property
-    def _softened(self) -> tuple[Observations, ...]:
-        lever = float(np.sqrt(np.mean(np.sum(self.relative[:, :3, 3] ** 2, axis=1))))
+    def softness(self) -> tuple[float, ...]:
+        """By how much errors of positions are larger in each of :meth:`softened`."""
         if self.parent_covariance is None:
             return ()
+        lever = float(np.sqrt(np.mean(np.sum(self.relative[:, :3, 3] ** 2, axis=1))))
         turned = lever * float(np.sqrt(np.mean(np.einsum("nii->ni", self.parent_covariance)[:, 3:])))
         place = float(np.sqrt(np.mean(np.einsum("nii->ni", self.child_covariance)[:, :3])))
-        result, factor = [], 0.5 * turned / place
-        while factor > _THIN:
-            scale = np.array([factor] * 3 + [1.0] * 3)
-            of_child = self.child_covariance * np.outer(scale, scale)[: self.rows, : self.rows]
-            of_parent = self.parent_covariance * np.outer(scale, scale)
-            result.append(Observations(self.parent, self.child, of_parent, of_child))
+        factors, factor = [], 0.5 * turned / place
+        # What was softened by one step less is not softened again because of how numbers are rounded.
+        while factor > _THIN * (1.0 + 1e-9):
+            factors.append(factor)
             factor /= _THIN
+        return tuple(factors)
+
+    @cached_property
+    def _softened(self) -> tuple[Observations, ...]:
+        of_parent, result = self.parent_covariance, []
+        for factor in self.softness:
+            each = np.array([factor] * 3 + [1.0] * 3)
+            scale = np.outer(each, each)
+            of_child = self.child_covariance * scale[: self.rows, : self.rows]
+            softer = None if of_parent is None else of_parent * scale
+            result.append(Observations(self.parent, self.child, softer, of_child))
         return tuple(result)
 
 

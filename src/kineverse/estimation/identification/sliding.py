@@ -12,7 +12,6 @@ out of the evidence: what becomes of a family does not depend on where the origi
 
 from __future__ import annotations
 
-import ctypes
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -21,32 +20,26 @@ import numpy as np
 from kineverse.estimation.rotations import exponential, skew
 
 from .groups import REACH, WX, GroupMotion
-from .library import library, packed, problem_of, unpacked
 from .matrices import inverted, times
-from .motion import Linear, Member
+from .motion import Member
 from .rigid import Array
 from .solving import Solution
-from .widths import GRID, LITTLE, alone, widths
+from .widths import alone, widths
 
-_TURNS = 3
+TURNS = 3
 # What the point moves by when it has settled [m].
-_CLOSE = 1e-6
+CLOSE = 1e-6
 
 
-def slid(solution: Solution[Member], native: bool = True) -> Solution[Member]:
-    """Return the same motion with slides of the point that makes them most probable.
-
-    It is done in C where it can be and ``native`` is true.
-    """
+def slid(solution: Solution[Member]) -> Solution[Member]:
+    """Return the same motion with slides of the point that makes them most probable."""
     motion = solution.motion
     if not isinstance(motion, GroupMotion) or not motion.slides:
         return solution
-    if native and library.is_native:
-        return _slid(solution, motion)
     slides, joints = motion.slides, motion.joints
-    for _ in range(_TURNS):
-        seen = alone(solution, native)
-        width = widths(solution.motion, seen, native)
+    for _ in range(TURNS):
+        seen = alone(solution)
+        width = widths(solution.motion, seen)
         weights = inverted(seen.covariances + np.diag(width.deviations**2))
         # What the mean and c would make of joint values.
         by = np.zeros((len(seen.values), joints, joints + slides))
@@ -61,24 +54,9 @@ def slid(solution: Solution[Member], native: bool = True) -> Solution[Member]:
         solution = _changed(solution, motion, change)
         assert isinstance(solution.motion, GroupMotion)  # a changed one is none else
         motion = solution.motion
-        if np.abs(change).max() <= _CLOSE:
+        if np.abs(change).max() <= CLOSE:
             break
     return solution
-
-
-def _slid(solution: Solution[Member], motion: GroupMotion) -> Solution[Member]:
-    moved, values, kinds = packed(motion), solution.values.copy(), np.array(motion.kinds, dtype=np.int64)
-    linear = Linear(*(array.copy() for array in solution.linear))
-    given = (GRID, kinds, solution.covariance, solution.residuals, moved, values, *linear)
-    done = library.code.slid(
-        ctypes.addressof(problem_of(motion.group, motion.rows)),
-        *(len(values), motion.slides, _TURNS),
-        *(_CLOSE, REACH, LITTLE, len(GRID)),
-        *(array.ctypes.data for array in given),
-    )
-    if not done:
-        raise MemoryError("There is no memory for so many observations.")
-    return replace(solution, motion=unpacked(motion, moved), values=values, linear=linear)
 
 
 def by_point(motion: Member, values: Array) -> Array:

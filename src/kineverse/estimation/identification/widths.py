@@ -12,7 +12,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from .library import library
 from .matrices import inverted, log_determinants, times
 from .motion import Member
 from .rigid import Array
@@ -21,8 +20,6 @@ from .solving import Solution
 # From hardly anything to more than there is [m], [rad].
 GRID = np.geomspace(1e-5, 10.0, 61)
 LITTLE = 1e-6
-# Joint values that C has room for.
-MOST = 6
 _STEP = math.log(float(GRID[1] / GRID[0]))
 
 
@@ -43,14 +40,9 @@ class Alone:
     log_likelihood: float
 
 
-def alone(solution: Solution[Member], native: bool = True) -> Alone:
-    """Return joint values by the observations alone, by the quadratic at the solution.
-
-    It is done in C where it can be and ``native`` is true.
-    """
+def alone(solution: Solution[Member]) -> Alone:
+    """Return joint values by the observations alone, by the quadratic at the solution."""
     by_joints = solution.linear.by_joints
-    if native and library.is_native and by_joints.shape[2] <= MOST:
-        return _alone(solution)
     weights = inverted(solution.covariance)
     weighted = np.swapaxes(by_joints, 1, 2) @ weights
     # A turn that moves nothing is known as little as can be, and so little that it does not matter.
@@ -61,17 +53,6 @@ def alone(solution: Solution[Member], native: bool = True) -> Alone:
     return Alone(
         solution.values + change, covariances, log - 0.5 * log_determinants(math.tau * solution.covariance)
     )
-
-
-def _alone(solution: Solution[Member]) -> Alone:
-    count, rows, joints = solution.linear.by_joints.shape
-    given = [
-        np.ascontiguousarray(x) for x in (solution.covariance, solution.linear.by_joints, solution.residuals)
-    ]
-    values, covariances = np.array(solution.values, order="C"), np.empty((count, joints, joints))
-    pointers = (x.ctypes.data for x in (*given, values, covariances))
-    log: float = library.code.alone(count, rows, joints, LITTLE, *pointers)
-    return Alone(values, covariances, log)
 
 
 @dataclass(frozen=True)
@@ -92,10 +73,8 @@ class Widths:
     log_density: float
 
 
-def widths(motion: Member, seen: Alone, native: bool = True) -> Widths:
-    """Return the most likely widths of the motion; in C like :func:`alone`."""
-    if native and library.is_native and motion.joints <= MOST:
-        return _widths(motion, seen)
+def widths(motion: Member, seen: Alone) -> Widths:
+    """Return the most likely widths of the motion."""
     kinds = np.array(motion.kinds)
     deviations, occam = np.zeros(len(kinds)), 0.0
     variances = np.einsum("nii->ni", seen.covariances)
@@ -109,29 +88,6 @@ def widths(motion: Member, seen: Alone, native: bool = True) -> Widths:
     off = seen.values - mean
     log = -0.5 * float(np.sum(off * times(weights, off))) - 0.5 * log_determinants(math.tau * total)
     return Widths(deviations, mean, log + occam)
-
-
-def _widths(motion: Member, seen: Alone) -> Widths:
-    kinds, deviations, mean = (
-        np.array(motion.kinds, dtype=np.int64),
-        np.empty(motion.joints),
-        np.empty(motion.joints),
-    )
-    values, covariances = np.ascontiguousarray(seen.values), np.ascontiguousarray(seen.covariances)
-    log: float = library.code.widths(
-        len(values),
-        motion.joints,
-        kinds.ctypes.data,
-        values.ctypes.data,
-        covariances.ctypes.data,
-        len(GRID),
-        GRID.ctypes.data,
-        deviations.ctypes.data,
-        mean.ctypes.data,
-    )
-    if math.isnan(log) and np.isfinite(values).all():
-        raise MemoryError("There is no memory for so many observations.")
-    return Widths(deviations, mean, log)
 
 
 def _width(values: Array, variances: Array) -> tuple[float, float]:
