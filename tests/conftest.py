@@ -9,9 +9,11 @@ without a C compiler it is skipped and named as well.
 from __future__ import annotations
 
 import atexit
+import gc
 import os
 import shutil
 import tempfile
+from collections.abc import Generator
 from pathlib import Path
 
 import pytest
@@ -34,8 +36,20 @@ def pytest_configure(config: pytest.Config) -> None:
         os.environ["KINEVERSE_MODEL_PATH"] = os.pathsep.join([*filter(None, places), str(SHARED)])
     folder = tempfile.mkdtemp(prefix="kineverse-tests-")
     os.environ["KINEVERSE_CACHE_DIR"] = folder
+    # A worker has one core. BLAS would take all of them for small matrices, and have them wait for each other.
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     # At the very end, when the compilers in the background are gone; they were started after this.
     atexit.register(shutil.rmtree, folder, ignore_errors=True)
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_collection() -> Generator[None, object, object]:
+    """Read the tests without a collector of garbage, which would go over all of them again and again."""
+    gc.disable()
+    try:
+        return (yield)
+    finally:
+        gc.enable()
 
 
 def pytest_runtest_setup(item: pytest.Item) -> None:
