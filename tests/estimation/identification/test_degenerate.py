@@ -4,8 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from part_recordings import recording
 
 from kineverse.estimation import identify, pose_covariance
+from kineverse.estimation.identification import refining
+from kineverse.estimation.identification.observations import observations
+from kineverse.estimation.identification.starts import Overview, starts
 
 LINE = np.arange(20)[:, None] * [0.0, 0.0, 1.0]
 POSITIONS = {
@@ -36,3 +40,11 @@ def test_everything_stays_finite(where, whole):
         assert found.best.family == "prismatic"
     if where == "in one place":
         assert found.cannot_tell or found.best.family == "rigid"
+
+
+@pytest.mark.parametrize("family", ["revolute", "screw"])
+def test_steps_of_three_positions_may_lead_anywhere(family):
+    seen = recording("spherical", count=3, position=0.1, orientation=0.02, seed=3)
+    problem = observations(seen.parent, seen.child[:, :3, 3], seen.covariance, seen.covariance)
+    likeliest = refining.likeliest(problem, [*starts(family, Overview(problem))]).solution
+    assert np.isfinite(refining.refined(problem, likeliest).log_evidence)

@@ -279,7 +279,10 @@ def _step(
         gain += float(np.sum(error**2 / np.einsum("nii->ni", point.parent_covariance)))
     if not (np.isfinite(step).all() and np.isfinite(values).all() and np.isfinite(parent).all()):
         return None
-    trial = _point(seen, point.motion.moved(step), values, parent, belief)
+    try:
+        trial = _point(seen, point.motion.moved(step), values, parent, belief)
+    except np.linalg.LinAlgError:  # so far away that the lever is all there is
+        return None
     return (trial, gain) if np.isfinite(trial.cost) else None
 
 
