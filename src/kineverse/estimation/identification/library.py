@@ -39,7 +39,10 @@ class _Belief(ctypes.Structure):
 
 
 class _Noise(ctypes.Structure):
-    _fields_ = (("covariance", ctypes.c_void_p), ("inverse", ctypes.c_void_p), ("stride", ctypes.c_int64))
+    _fields_ = (
+        *((name, ctypes.c_void_p) for name in ("covariance", "inverse")),
+        *((name, ctypes.c_int64) for name in ("stride", "round")),
+    )
 
 
 class Given(ctypes.Structure):

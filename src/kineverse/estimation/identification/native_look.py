@@ -9,8 +9,9 @@ typedef struct { double left_R[9], left_p[3], right_R[9], right_p[3], pitch; } M
 
 typedef struct { double mean[6], precision[6]; } Belief;
 
-/* Covariances and their inverses; the stride from one to the next is 0 if all are alike. */
-typedef struct { const double *covariance, *inverse; int64_t stride; } Noise;
+/* Covariances and their inverses; the stride from one to the next is 0 if all are alike. Round ones are the
+   same in all axes. */
+typedef struct { const double *covariance, *inverse; int64_t stride, round; } Noise;
 
 typedef struct {
   /* The family: which components of twists are joint values and parameters, and the kinds of joint values. */
@@ -145,12 +146,27 @@ FAST double weigh(const Problem *p, Observation *o, const int rows) {
   return root == 0.0 ? NAN : sum + 2.0 * log(root);
 }
 
+/* The covariance of the k-th observation in other axes. */
+FAST void noise_in(const Noise *noise, int64_t k, const double *R, const int rows, double *turned) {
+  const double *covariance = noise->covariance + noise->stride * k;
+  if (noise->round)
+    for (int i = 0; i < rows * rows; i++) turned[i] = covariance[i];
+  else turn(covariance, R, rows, turned);
+}
+
+/* The square of an error in other axes, by the k-th covariance. */
+FAST double square_in(const Noise *noise, int64_t k, const double *R, const double *error, const int rows) {
+  double turned[6];
+  if (noise->round) return squared(error, noise->inverse + noise->stride * k, rows);
+  turn_back(R, error, rows, turned);
+  return squared(turned, noise->inverse + noise->stride * k, rows);
+}
+
 /* Linearise one observation; return its cost. */
 FAST double look(const Problem *p, const Motion *m, int64_t k, Observation *o, const int rows) {
   place(p, m, o, rows);
-  int64_t a = p->of_parent.stride * k, b = p->of_child.stride * k;
   const double *A = p->parent + 16 * k, *B = p->child + 16 * k, *h = o->lever;
-  double R[9], S[9], T[9], offset[3], error[6], turned[6], cost;
+  double R[9], S[9], T[9], offset[3], error[6], cost;
   for (int i = 0; i < 9; i++) R[i] = B[4 * (i / 3) + i % 3];
   for (int i = 0; i < 3; i++) offset[i] = B[4 * i + 3] - o->parent_p[i];
   apply_transposed(o->parent_R, offset, error);
@@ -160,9 +176,8 @@ FAST double look(const Problem *p, const Motion *m, int64_t k, Observation *o, c
     times_transposed33(S, o->H_R, T);
     logarithm(T, error + 3);
   }
-  turn_back(o->parent_R, error, rows, turned);
-  cost = squared(turned, p->of_child.inverse + b, rows);
-  turn(p->of_child.covariance + b, o->parent_R, rows, o->covariance);
+  cost = square_in(&p->of_child, k, o->parent_R, error, rows);
+  noise_in(&p->of_child, k, o->parent_R, rows, o->covariance);
   for (int r = 0; r < rows; r++) o->residual[r] = error[r];
   if (!p->known) {
     for (int i = 0; i < 9; i++) R[i] = A[4 * (i / 3) + i % 3];
@@ -170,9 +185,8 @@ FAST double look(const Problem *p, const Motion *m, int64_t k, Observation *o, c
     apply_transposed(o->parent_R, offset, o->own);
     transposed_times33(o->parent_R, R, S);
     logarithm(S, o->own + 3);
-    turn_back(o->parent_R, o->own, 6, turned);
-    cost += squared(turned, p->of_parent.inverse + a, 6);
-    turn(p->of_parent.covariance + a, o->parent_R, 6, o->of_parent);
+    cost += square_in(&p->of_parent, k, o->parent_R, o->own, 6);
+    noise_in(&p->of_parent, k, o->parent_R, 6, o->of_parent);
     cross(o->own + 3, h, offset);
     for (int i = 0; i < rows; i++) o->residual[i] -= o->own[i] + (i < 3 ? offset[i] : 0.0);
   }

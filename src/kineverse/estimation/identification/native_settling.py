@@ -55,6 +55,11 @@ static double *noise_of(const double *given, int64_t count, const int rows, doub
   noise->covariance = covariance;
   noise->inverse = inverse;
   noise->stride = several ? size : 0;
+  noise->round = 1;
+  for (int64_t k = 0; k < each * size; k++) {
+    int64_t i = k % size / rows, j = k % size % rows, first = k - k % size + (i < 3 ? 0 : 3) * (rows + 1);
+    noise->round &= covariance[k] == (i == j ? covariance[first] : 0.0);
+  }
   return inverse + each * size;
 }
 

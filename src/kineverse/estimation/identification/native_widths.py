@@ -42,53 +42,65 @@ static double alone(const Problem *p, const Answer *a, double factor, double *va
   return log_likelihood;
 }
 
-/* The log of the density of values at a width, with their mean integrated out. */
-static double density(int64_t count, int64_t block, const double *values, const double *variances,
-                      double width, double *weights) {
-  double sum[6] = {0}, mean[6] = {0}, squares = 0.0, logs = 0.0, product = 1.0;
-  for (int64_t i = 0; i < count * block; i++) weights[i] = 1.0 / (variances[i] + width * width);
-  for (int64_t i = 0; i < count * block; i++) {
-    /* A logarithm of eight at once. */
-    product *= weights[i];
-    if (i % 8 == 7 || i + 1 == count * block) {
-      logs += log(product);
-      product = 1.0;
-    }
-  }
-  for (int64_t k = 0; k < count; k++)
-    for (int64_t b = 0; b < block; b++) {
-      sum[b] += weights[block * k + b];
-      mean[b] += weights[block * k + b] * values[block * k + b];
-    }
-  for (int64_t b = 0; b < block; b++) {
-    mean[b] /= sum[b];
-    logs -= log(sum[b]);
-  }
-  for (int64_t k = 0; k < count; k++)
-    for (int64_t b = 0; b < block; b++) {
-      double off = values[block * k + b] - mean[b];
-      squares += off * off * weights[block * k + b];
-    }
-  return 0.5 * (logs - squares);
+/* Fold products of at most eight weights into a logarithm: so many are far from what a double can hold. */
+static double logs_of(double *product) {
+  double sum = log(product[0] * product[1] * product[2]) + log(product[3] * product[4] * product[5]) +
+               log(product[6] * product[7]);
+  for (int l = 0; l < 8; l++) product[l] = 1.0;
+  return sum;
 }
 
-/* The best width, and the logarithm of the mean over all of them relative to the best. */
-static double widest(int64_t count, int64_t block, const double *values, const double *variances,
-                     int64_t size, const double *grid, double *weights, double *logs, double *deviation) {
-  int64_t top = 0;
+/* The log of the density of values around 0 at a width, with their mean integrated out; eight at once. */
+static double density(int64_t count, const double *values, const double *variances, double width) {
+  double s0[8] = {0}, s1[8] = {0}, s2[8] = {0}, product[8] = {1, 1, 1, 1, 1, 1, 1, 1};
+  double square = width * width, logs = 0.0;
+  int64_t whole = count - count % 8;
+  for (int64_t i = 0; i < whole; i += 8) {
+    for (int l = 0; l < 8; l++) {
+      double weight = 1.0 / (variances[i + l] + square), pulled = weight * values[i + l];
+      s0[l] += weight;
+      s1[l] += pulled;
+      s2[l] += pulled * values[i + l];
+      product[l] *= weight;
+    }
+    if (i % 64 == 56) logs += logs_of(product);
+  }
+  for (int64_t i = whole; i < count; i++) {
+    double weight = 1.0 / (variances[i] + square), pulled = weight * values[i];
+    s0[i - whole] += weight;
+    s1[i - whole] += pulled;
+    s2[i - whole] += pulled * values[i];
+    product[i - whole] *= weight;
+  }
+  logs += logs_of(product);
+  for (int l = 1; l < 8; l++) {
+    s0[0] += s0[l];
+    s1[0] += s1[l];
+    s2[0] += s2[l];
+  }
+  return 0.5 * (logs - log(s0[0]) - (s2[0] - s1[0] * s1[0] / s0[0]));
+}
+
+/* The best width of several columns of values, and the logarithm of the mean over all of them relative to the
+   best. */
+static double widest(const Problem *p, int64_t columns, const double *values, const double *variances,
+                     double *logs, double *deviation) {
+  int64_t top = 0, count = p->count;
   double sum = 0.0, best;
-  for (int64_t g = 0; g < size; g++) {
-    logs[g] = density(count, block, values, variances, grid[g], weights);
+  for (int64_t g = 0; g < p->widths; g++) {
+    logs[g] = 0.0;
+    for (int64_t c = 0; c < columns; c++)
+      logs[g] += density(count, values + count * c, variances + count * c, p->grid[g]);
     if (logs[g] > logs[top]) top = g;
   }
-  best = log(grid[top]);
-  if (top > 0 && top < size - 1) {
+  best = log(p->grid[top]);
+  if (top > 0 && top < p->widths - 1) {
     double before = logs[top - 1], here = logs[top], after = logs[top + 1];
-    best += 0.5 * log(grid[1] / grid[0]) * (after - before) / (2.0 * here - before - after);
+    best += 0.5 * log(p->grid[1] / p->grid[0]) * (after - before) / (2.0 * here - before - after);
   }
   *deviation = exp(best);
-  for (int64_t g = 0; g < size; g++) sum += exp(logs[g] - logs[top]);
-  return log(sum / size);
+  for (int64_t g = 0; g < p->widths; g++) sum += exp(logs[g] - logs[top]);
+  return log(sum / p->widths);
 }
 
 /* The inverse of C + diag(s^2); returns the root of the determinant. */
@@ -105,19 +117,21 @@ static double widths(const Problem *p, const double *values, const double *covar
   int n = (int)p->joints;
   int64_t count = p->count;
   double result = 0.0, normal[36] = {0}, right[6] = {0}, inverse[36], W[36];
-  double *variances = memory + count * n, *weights = variances + count * n, *logs = weights + count * n;
+  double *variances = memory + count * n, *logs = variances + count * n;
   for (int64_t kind = 0; kind < 2; kind++) {
-    int64_t block = 0, at = 0;
+    int64_t columns = 0;
     double width;
-    for (int j = 0; j < n; j++) block += p->kind[j] == kind;
-    if (!block) continue;
-    for (int64_t k = 0; k < count; k++)
-      for (int j = 0; j < n; j++)
-        if (p->kind[j] == kind) {
-          memory[at] = values[n * k + j];
-          variances[at++] = covariances[n * n * k + (n + 1) * j];
-        }
-    result += widest(count, block, memory, variances, p->widths, p->grid, weights, logs, &width);
+    for (int j = 0; j < n; j++) {
+      if (p->kind[j] != kind) continue;
+      double *column = memory + count * columns, *variance = variances + count * columns++, middle = 0.0;
+      for (int64_t k = 0; k < count; k++) middle += values[n * k + j] / count;
+      for (int64_t k = 0; k < count; k++) {
+        column[k] = values[n * k + j] - middle;
+        variance[k] = covariances[n * n * k + (n + 1) * j];
+      }
+    }
+    if (!columns) continue;
+    result += widest(p, columns, memory, variances, logs, &width);
     for (int j = 0; j < n; j++)
       if (p->kind[j] == kind) deviations[j] = width;
   }

@@ -186,17 +186,16 @@ def covariances(given: npt.ArrayLike, count: int, rows: int, part: str) -> Array
         If they are something else, or not symmetric and positive definite.
     """
     matrices = _numbers(given, f"The covariance of the {part}")
-    if matrices.shape == (rows, rows):
-        matrices = np.broadcast_to(matrices, (count, rows, rows))
-    if matrices.shape != (count, rows, rows):
+    if matrices.shape not in ((rows, rows), (count, rows, rows)):
         raise ShapeError(
             f"The covariance of the {part} has shape ({rows}, {rows}), or ({count}, {rows}, {rows}) with one "
             f"for each pose, not {matrices.shape}."
         )
-    _check_finite(matrices.reshape(count, -1), part, "Covariance")
-    scale = np.sqrt(np.abs(np.einsum("nii->ni", matrices)))
+    each = matrices.reshape(-1, rows, rows)
+    _check_finite(each.reshape(len(each), -1), part, "Covariance")
+    scale = np.sqrt(np.abs(np.einsum("nii->ni", each)))
     scale[scale == 0.0] = 1.0
-    relative = matrices / (scale[:, :, None] * scale[:, None, :])
+    relative = each / (scale[:, :, None] * scale[:, None, :])
     symmetric = np.abs(relative - np.swapaxes(relative, 1, 2)).max(axis=(1, 2)) < 1e-8
     smallest = np.linalg.eigvalsh(relative)[:, 0]
     wrong = np.flatnonzero(~symmetric | (smallest < 1e-12))
@@ -207,13 +206,13 @@ def covariances(given: npt.ArrayLike, count: int, rows: int, part: str) -> Array
             f"The covariance of the {part} is not {how} (at pose {k}). "
             "kv.estimation.pose_covariance(position, orientation) makes one of standard deviations."
         )
-    least = float(np.sqrt(np.linalg.eigvalsh(matrices)[:, 0].min(initial=math.inf)))
+    least = float(np.sqrt(np.linalg.eigvalsh(each)[:, 0].min(initial=math.inf)))
     if least < _SMALLEST:
         raise ValueRejectedError(
             f"The covariance of the {part} says that something is known to {least:.2g} (metres or radians). "
             f"Less than {_SMALLEST:.0g} is not told apart from what numbers lose."
         )
-    return np.ascontiguousarray(matrices)
+    return np.ascontiguousarray(np.broadcast_to(matrices, (count, rows, rows)))
 
 
 def _numbers(given: npt.ArrayLike, what: str) -> Array:

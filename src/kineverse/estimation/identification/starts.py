@@ -12,7 +12,7 @@ import numpy as np
 
 from kineverse.estimation.rotations import logarithm
 
-from .groups import GROUPS, GroupMotion
+from .groups import GROUPS, Group, GroupMotion
 from .observations import Observations
 from .rigid import Array, frame_along, inverse, mean_rotation, pose
 from .solving import Start
@@ -50,8 +50,14 @@ class Overview:
 
     @cached_property
     def turnings(self) -> list[_Turning]:
-        """Turns about any of them."""
-        return [turning for axis in self.axes for turning in _turnings(self, axis)]
+        """Turns about any of them; what hinges, screws and cylinders begin with."""
+        return [turning for plane in self.planes for turning in _turnings(self, *plane)]
+
+    @cached_property
+    def planes(self) -> list[tuple[Array, Array]]:
+        """Frames whose last column any of them is, and positions in them from the middle."""
+        frames = [frame_along(axis) for axis in self.axes]
+        return [(frame, (self.positions - self.mean[:3, 3]) @ frame) for frame in frames]
 
 
 def starts(name: str, overview: Overview) -> Iterator[Start]:
@@ -60,9 +66,9 @@ def starts(name: str, overview: Overview) -> Iterator[Start]:
     group = GROUPS[name]
     count = len(overview.poses)
 
-    def start(rotation: Array, centre: Array, values: Array, pitch: float = 0.0) -> Start:
+    def start(rotation: Array, centre: Array, values: Array) -> Start:
         left = pose(rotation, centre)
-        return Start(GroupMotion(group, rows, left, inverse(left) @ mean, pitch), values)
+        return Start(GroupMotion(group, rows, left, inverse(left) @ mean), values)
 
     if name == "rigid":
         yield start(np.eye(3), np.zeros(3), np.zeros((count, 0)))
@@ -76,16 +82,15 @@ def starts(name: str, overview: Overview) -> Iterator[Start]:
         along = frame_along(overview.spread[0])
         yield start(along, mean[:3, 3], ((overview.positions - mean[:3, 3]) @ along[:, 2])[:, None])
     elif name == "planar":
-        for axis in overview.axes:
-            frame = frame_along(axis)
-            values = (overview.positions - mean[:3, 3]) @ frame
+        for frame, places in overview.planes:
+            values = places.copy()
             if rows == 6:
-                values[:, 2] = overview.turns @ axis
+                values[:, 2] = overview.turns @ frame[:, 2]
             yield start(frame, mean[:3, 3], values[:, : len(group.freedom(rows).joints)])
     elif name == "spherical":
         yield from _about_a_point(overview, group.freedom(rows).joints, start)
     else:
-        yield from _about_an_axis(name, overview, start)
+        yield from _about_an_axis(group, overview)
 
 
 class _Turning(NamedTuple):
@@ -93,79 +98,71 @@ class _Turning(NamedTuple):
 
     Attributes
     ----------
-    frame, centre
-        Whose last column is the axis, (3, 3), and where that is (3,).
+    left, right
+        Frames on both sides, (4, 4); the axis is the z axis of the first.
     angles, along
         How far it turned and slid in each observation, (N,).
     slope
         Slides by turns.
-    radius
-        The mean distance from the axis.
     """
 
-    frame: Array
-    centre: Array
+    left: Array
+    right: Array
     angles: Array
     along: Array
     slope: float
-    radius: float
 
 
-def _turnings(overview: Overview, axis: Array) -> Iterator[_Turning]:
-    frame = frame_along(axis)
-    centred = overview.positions - overview.mean[:3, 3]
-    flat, along = centred @ frame[:, :2], centred @ frame[:, 2]
-    places = [_circle(flat)]
+def _turnings(overview: Overview, frame: Array, places: Array) -> Iterator[_Turning]:
+    flat, along, centre = places[:, :2], places[:, 2], overview.mean[:3, 3]
     if overview.rows == 6:
-        angles = overview.turns @ axis
-        places.append(_pivot(flat, angles))
-    for place in places:
-        lever = flat - place
-        if overview.rows == 3:
-            # The child's place at 0 is along x: L is turned until it is.
-            middle = _mean_direction(lever)
-            turned = np.column_stack([middle, [-middle[1], middle[0]]])
-            frame = np.column_stack([frame[:, :2] @ turned, frame[:, 2]])
-            flat, lever = flat @ turned, lever @ turned
-            angles = np.arctan2(lever[:, 1], lever[:, 0])
-            place = flat[0] - lever[0]
-        centre = overview.mean[:3, 3] + frame[:, :2] @ place
-        off = angles - angles.mean()
-        variance = float(off @ off)
-        slope = float(off @ along) / variance if variance > 0.0 else 0.0
-        radius = float(np.mean(np.sqrt(np.sum(lever**2, axis=1))))
-        yield _Turning(frame, centre, angles, along, slope, radius)
+        angles = overview.turns @ frame[:, 2]
+        for place in (_sphere(flat), _pivot(flat, angles)):
+            left = pose(frame, centre + frame[:, :2] @ place)
+            yield _Turning(left, inverse(left) @ overview.mean, angles, along, _slope(angles, along))
+        return
+    place = _sphere(flat)
+    lever = flat - place
+    # The child's place at 0 is along x: L is turned until it is.
+    middle = _mean_direction(lever)
+    turned = np.column_stack([middle, [-middle[1], middle[0]]])
+    x, y = (lever @ turned).T
+    left = pose(np.column_stack([frame[:, :2] @ turned, frame[:, 2]]), centre + frame[:, :2] @ place)
+    right = pose(np.eye(3), np.array([float(np.mean(np.hypot(x, y))), 0.0, 0.0]))
+    angles = np.arctan2(y, x)
+    yield _Turning(left, right, angles, along, _slope(angles, along))
 
 
-def _about_an_axis(name, overview, start) -> Iterator[Start]:  # type: ignore[no-untyped-def]
+def _slope(angles: Array, along: Array) -> float:
+    off = angles - angles.mean()
+    variance = float(off @ off)
+    return float(off @ along) / variance if variance > 0.0 else 0.0
+
+
+def _about_an_axis(group: Group, overview: Overview) -> Iterator[Start]:
+    rows = overview.rows
     for turning in overview.turnings:
-        if name == "screw":
-            yield from _in_several_turns(overview, turning, start)
-        values = turning.angles[:, None]
-        if name == "cylindrical":
-            values = np.column_stack([turning.along, turning.angles])
-        result = start(turning.frame, turning.centre, values, turning.slope if name == "screw" else 0.0)
-        if overview.rows == 3:
-            right = np.eye(4)
-            right[0, 3] = turning.radius
-            result = Start(replace(result.motion, right=right), result.values)
-        yield result
+        left, right, angles, along, slope = turning
+        if group.name == "screw" and rows == 6 and (many := _in_several_turns(group, turning)):
+            yield many
+        values = angles[:, None] if group.name != "cylindrical" else np.column_stack([along, angles])
+        yield Start(GroupMotion(group, rows, left, right, slope if group.pitch else 0.0), values)
 
 
-def _in_several_turns(overview, turning, start) -> Iterator[Start]:  # type: ignore[no-untyped-def]
-    """Yield the screw whose turns are counted by how far it has moved, if it made more than one."""
-    if overview.rows == 3:
-        return
+def _in_several_turns(group: Group, turning: _Turning) -> Start | None:
+    """Return the screw whose turns are counted by how far it has moved, if it made more than one."""
     order = np.argsort(turning.along, kind="stable")
-    angles = np.empty_like(turning.angles)
-    angles[order] = np.unwrap(turning.angles[order])
-    if np.ptp(angles) <= math.tau:
-        return
-    slope, offset = np.polyfit(angles, turning.along, 1)
-    result = start(turning.frame, turning.centre, angles[:, None], float(slope))
-    right = result.motion.right.copy()
+    angles = turning.angles[order]
+    if np.abs(np.diff(angles)).max() <= math.pi:
+        return None
+    unwrapped = np.empty_like(angles)
+    unwrapped[order] = np.unwrap(angles)
+    if np.ptp(unwrapped) <= math.tau:
+        return None
+    slope, offset = np.polyfit(unwrapped, turning.along, 1)
+    right = turning.right.copy()
     right[2, 3] += offset
-    yield Start(replace(result.motion, right=right), result.values)
+    return Start(GroupMotion(group, 6, turning.left, right, float(slope)), unwrapped[:, None])
 
 
 def _about_a_point(overview, joints, start) -> Iterator[Start]:  # type: ignore[no-untyped-def]
@@ -175,9 +172,7 @@ def _about_a_point(overview, joints, start) -> Iterator[Start]:  # type: ignore[
         # p = c + R q, linear in the centre c and the lever q.
         rotations = overview.poses[:, :3, :3]
         matrix = np.concatenate([np.tile(np.eye(3), (count, 1, 1)), rotations], axis=2).reshape(-1, 6)
-        matrix = np.concatenate([matrix, 1e-3 * np.eye(6)])
-        target = np.concatenate([(p - mean[:3, 3]).ravel(), np.zeros(6)])
-        centre = np.linalg.lstsq(matrix, target, rcond=None)[0][:3] + mean[:3, 3]
+        centre = _nearest(matrix, (p - mean[:3, 3]).ravel())[:3] + mean[:3, 3]
         yield start(np.eye(3), centre, overview.turns)
         return
     centre = _sphere(p - mean[:3, 3]) + mean[:3, 3]
@@ -207,31 +202,27 @@ def _mean_direction(lever: Array) -> Array:
     return middle / length if length > 0 else np.array([1.0, 0.0])
 
 
-def _circle(flat: Array) -> Array:
-    """Return the centre of the circle through points (N, 2), by algebraic least squares."""
-    return _sphere(flat)
-
-
 def _sphere(points: Array) -> Array:
     """Return the centre of the circle or sphere through points: |p|² = 2 c·p + const, kept within reach."""
-    size = float(np.sqrt(np.mean(np.sum(points**2, axis=1)))) or 1.0
+    size = math.sqrt(float(np.mean(np.sum(points**2, axis=1)))) or 1.0
     scaled = points / size
+    # Points on a line have no centre: this keeps it within some hundred times their extent.
     matrix = np.column_stack([2.0 * scaled, np.ones(len(points))])
-    width = matrix.shape[1]
-    # Points on a line have no centre: a touch of regularity keeps it within some hundred times their extent.
-    matrix = np.concatenate([matrix, 1e-3 * np.eye(width)])
-    target = np.concatenate([np.sum(scaled**2, axis=1), np.zeros(width)])
-    centre: Array = np.linalg.lstsq(matrix, target, rcond=None)[0][:-1] * size
-    return centre
+    return _nearest(matrix, np.sum(scaled**2, axis=1))[:-1] * size
 
 
 def _pivot(flat: Array, angles: Array) -> Array:
     """Return the fixed point of turns by known angles: p = c + rotation(angle) q, linear in c and q."""
-    count = len(flat)
-    c, s = np.cos(angles), np.sin(angles)
-    rotation = np.stack([np.stack([c, -s], axis=1), np.stack([s, c], axis=1)], axis=1)
-    matrix = np.concatenate([np.tile(np.eye(2), (count, 1, 1)), rotation], axis=2).reshape(-1, 4)
-    matrix = np.concatenate([matrix, 1e-3 * np.eye(4)])
-    target = np.concatenate([flat.ravel(), np.zeros(4)])
-    place: Array = np.linalg.lstsq(matrix, target, rcond=None)[0][:2]
-    return place
+    matrix = np.zeros((len(flat), 2, 4))
+    matrix[:, 0, 0] = matrix[:, 1, 1] = 1.0
+    matrix[:, 0, 2] = matrix[:, 1, 3] = np.cos(angles)
+    matrix[:, 1, 2] = np.sin(angles)
+    matrix[:, 0, 3] = -matrix[:, 1, 2]
+    return _nearest(matrix.reshape(-1, 4), flat.ravel())[:2]
+
+
+def _nearest(matrix: Array, target: Array) -> Array:
+    """Return x with A x nearest to b, and a touch nearer to nothing: what A does not tell stays small."""
+    normal = matrix.T @ matrix
+    normal.flat[:: len(normal) + 1] += 1e-6
+    return np.asarray(np.linalg.solve(normal, matrix.T @ target), dtype=np.float64)
