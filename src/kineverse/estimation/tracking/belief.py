@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
 
 from kineverse.errors import ValueRejectedError
 from kineverse.estimation.noise import Array
+
+if TYPE_CHECKING:
+    from .standing import Standing
 
 Indices = npt.NDArray[np.int64]
 
@@ -103,6 +107,8 @@ class Belief:
         How many coordinates, directions and groups there are.
     numbers
         All of it, one after the other; zeros if None.
+    standing
+        Of each group; None for all if not given.
 
     Attributes
     ----------
@@ -112,13 +118,21 @@ class Belief:
         η (t,), and Λ (t, t), zero between groups.
     evidence
         For each group, the logarithm of the density of all it has seen.
+    standing
+        For each group what was seen since it last moved, where that is kept, see :mod:`.standing`.
     """
 
-    __slots__ = ("evidence", "information", "numbers", "sizes", "vector", "x")
+    __slots__ = ("evidence", "information", "numbers", "sizes", "standing", "vector", "x")
 
-    def __init__(self, sizes: tuple[int, int, int], numbers: Array | None = None) -> None:
+    def __init__(
+        self,
+        sizes: tuple[int, int, int],
+        numbers: Array | None = None,
+        standing: Sequence[Standing | None] | None = None,
+    ) -> None:
         n, t, groups = sizes
         self.sizes = sizes
+        self.standing: list[Standing | None] = [None] * groups if standing is None else list(standing)
         self.numbers = np.zeros(n + t + groups + t * t) if numbers is None else numbers
         self.x = self.numbers[:n]
         self.vector = self.numbers[n : n + t]
@@ -127,7 +141,7 @@ class Belief:
 
     def copy(self) -> Belief:
         """Return one of its own."""
-        return Belief(self.sizes, self.numbers.copy())
+        return Belief(self.sizes, self.numbers.copy(), self.standing)
 
     def part(self, t: Indices) -> Quadratic:
         """Return what is believed of a group, with its places in the tangent."""

@@ -63,6 +63,16 @@ class Charted:
         """Whether some coordinates move by rates, and not by speeds of their own alone."""
         return bool(self._flows)
 
+    def moving(self, speeds: Mapping[Symbol, float], noise: Mapping[Symbol, float]) -> list[int]:
+        """Return the numbers of the groups that move at speeds or with noise."""
+        active = {v for by in (speeds, noise) for v, value in by.items() if value}
+        found = []
+        for number, group in enumerate(self._layout.groups):
+            flow = self._flows.get(number)
+            if not active.isdisjoint(group.tangent if flow is None else flow.speeds):
+                found.append(number)
+        return found
+
     def step(self, number: int, x: Array, step: Array, known: Array) -> tuple[Array, Array | None]:
         """Return a group's coordinates after a step in its tangent, and how the tangent turns on the way.
 

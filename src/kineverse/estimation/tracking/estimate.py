@@ -62,21 +62,28 @@ class Estimate:
     @cached_property
     def information(self) -> Array:
         """The inverse of the covariance."""
-        return self._belief.information.copy()
+        found = self._belief.information.copy()
+        for number, group in enumerate(self._layout.groups):
+            if self._belief.standing[number] is not None:
+                block = np.ix_(group.t, group.t)
+                found[block] = inverse(self.covariance[block])
+        return found
 
     @cached_property
     def covariance(self) -> Array:
         """The covariance of the Gaussian without limits, in the tangent (t, t) [m²], [rad²]."""
         found = np.zeros_like(self._belief.information)
-        for group in self._layout.groups:
-            block = np.ix_(group.t, group.t)
-            found[block] = inverse(self._belief.information[block])
+        for number, group in enumerate(self._layout.groups):
+            found[np.ix_(group.t, group.t)] = self._filter.ridge.covariance(number, self._belief)
         return found
 
     @cached_property
     def mean(self) -> Array:
         """The mean of the Gaussian without limits, as a step from the state in the tangent (t,)."""
-        found: Array = self.covariance @ self._belief.vector
+        found = np.zeros_like(self._belief.vector)
+        for group in self._layout.groups:
+            information = self._belief.information[np.ix_(group.t, group.t)]
+            found[group.t] = inverse(information) @ self._belief.vector[group.t]
         return found
 
     @cached_property

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
@@ -14,19 +15,21 @@ from kineverse.symbols import Symbol
 
 from .belief import Belief
 from .charted import Charted
-from .layout import Group, Layout
+from .layout import Layout
+from .likeness import Likeness
 from .limits import Limits
 from .modes import Candidate, Modes
 from .native import NativeSolver, native_library
+from .openness import Openness
 from .outliers import Outliers
 from .reading import Reader, Reading
 from .residuals import Residuals
-from .solving import Solver
+from .ridge import Ridge
+from .saddles import Saddles
+from .solving import Found, Solver
+from .standing import Memory
 from .undoubted import Undoubted
-from .widening import Widening
 
-# Explanations whose predictions are so few deviations apart are one.
-_SAME = 0.3
 _OUTSIDE = 1e-9
 
 
@@ -76,7 +79,12 @@ class Filter:
         self.residuals = Residuals(layout, self.function)
         self.reader = Reader(layout)
         self.solver = Solver(layout, self.residuals, self.charted, limits)
-        self.widening = Widening(layout, self.residuals, self.charted, self.reader, self.solver.boxes)
+        self.openness = Openness(layout)
+        self.memory = Memory(layout, self.reader, self.openness, self._found)
+        boxes = self.solver.boxes
+        self.ridge = Ridge(layout, self.residuals, self.charted, self.reader, boxes, self.openness)
+        self.likeness = Likeness(layout, self.residuals, self.reader, self.charted, self.ridge)
+        self.saddles = Saddles(layout, self.charted, self.openness, boxes)
         self.native = NativeSolver(layout, limits, self.function) if NativeSolver.suits(layout) else None
         self.undoubted = Undoubted(layout, self.native, outliers) if self.native and outliers else None
         self.turns: frozenset[Symbol] = frozenset()
@@ -90,23 +98,92 @@ class Filter:
 
     def update(self, modes: Modes, reading: Reading, known: Array) -> Outcome:
         """Return what is believed after a reading; see :meth:`.solving.Solver.update`."""
-        outcome = self._updated(modes, reading, known)
-        looked = modes.looked | reading.seen
-        outcome.modes = outcome.modes.each(lambda belief: self.widening.widened(belief, looked, known))
-        outcome.modes.looked = looked
-        return outcome
-
-    def _updated(self, modes: Modes, reading: Reading, known: Array) -> Outcome:
-        if modes.is_single and self.outliers is None:
-            found = None
-            if self.native is not None and self.native.is_ready:
-                found = self.native.update(modes.best, reading, known)
-            if found is None:
-                found = self.solver.update(modes.best, reading, known, self._seen(reading))
-            self._settle(found.belief)
-            after = Modes(self.layout, [found.belief], modes.alive)
+        modes = self._at_other_values(modes, known)
+        if not modes.is_single or self.outliers is not None:
+            return self._weighed(modes, reading, known)
+        before = modes.best
+        found = self._found(before, reading, known)
+        self.memory.remember(before, found, reading, known)
+        self._settle(found.belief)
+        after = Modes(self.layout, [found.belief], modes.alive)
+        stuck = self.saddles.unexplained(before, found)
+        explained = self._freed(before, found, reading, known, stuck) if stuck else []
+        if not explained:
             return Outcome(after, float(found.nis.sum()), int(found.dof.sum()), (), found.rounds)
-        return self._weighed(modes, reading, known)
+        first = self._candidate(found.belief, None, found.nis, found.dof, stuck, known)
+        after, best = after.ranked([first, *explained], partial(self.likeness.is_same, known, self.turns))
+        for number, candidate in enumerate(best):
+            if candidate:
+                found.nis[number] = candidate.nis[number]
+        return Outcome(after, float(found.nis.sum()), int(found.dof.sum()), (), found.rounds)
+
+    def _found(
+        self, belief: Belief, reading: Reading, known: Array, groups: list[int] | None = None
+    ) -> Found:
+        """Return what follows if everything is right; for all groups that are seen, if none are given."""
+        found = None
+        if self.native is not None and self.native.is_ready:
+            found = self.native.update(belief, reading, known)
+        if found is None:
+            groups = self._seen(reading) if groups is None else groups
+            found = self.solver.update(belief, reading, known, groups)
+        return found
+
+    def _freed(
+        self, before: Belief, found: Found, reading: Reading, known: Array, groups: list[int]
+    ) -> list[Candidate]:
+        """Return other explanations of groups that are where nothing that was seen has a slope."""
+        candidates = []
+        for start in self.saddles.aside(before, found.belief, groups, known):
+            try:
+                candidates.append(self._from_aside(start, reading, known, groups))
+            except KineverseError:  # it leads nowhere
+                continue
+        return candidates
+
+    def _from_aside(self, start: Belief, reading: Reading, known: Array, groups: list[int]) -> Candidate:
+        if self.outliers is not None:
+            start = self.solver.where_most_agree(start, reading, known, groups)
+        found = self.solver.update(start, reading, known, groups, self.outliers or "all")
+        candidate = self._explained(start, found, reading, known, groups)
+        if self.outliers is None:
+            # Where all that is remembered was another's, what remains unexplained is what counts.
+            errors = self.residuals.errors(candidate.said, reading, np.flatnonzero(reading.seen).tolist())
+            for number in groups:
+                if start.standing[number] is not None:
+                    squares = (
+                        float(e @ e) for i, (e, _) in errors.items() if self.layout.group_of[i] == number
+                    )
+                    candidate.nis[number] = sum(squares)
+        return candidate
+
+    def _explained(
+        self, before: Belief, found: Found, reading: Reading, known: Array, groups: list[int]
+    ) -> Candidate:
+        self.memory.remember(before, found, reading, known, groups)
+        self._settle(found.belief)
+        return self._candidate(found.belief, found.weights, found.nis, found.dof, groups, known)
+
+    def _at_other_values(self, modes: Modes, known: Array) -> Modes:
+        """Return the same beliefs, which remember nothing that was seen at other values of what is known."""
+
+        def changed(belief: Belief) -> Belief:
+            groups = [
+                number
+                for number, standing in enumerate(belief.standing)
+                if standing is not None and not np.array_equal(standing.known, known)
+            ]
+            return self._widened(belief, groups)
+
+        return modes.each(changed) if len(known) else modes
+
+    def _widened(self, belief: Belief, groups: Iterable[int]) -> Belief:
+        wide = belief
+        for number in groups:
+            if belief.standing[number] is not None:
+                wide = belief.copy() if wide is belief else wide
+                self.ridge.widen(number, wide)
+        return wide
 
     def predict(
         self,
@@ -120,6 +197,7 @@ class Filter:
 
         Speeds are commanded; noise is variances by second that add to that.
         """
+        belief = self._widened(belief, self.charted.moving(speeds, noise))
         found = None
         if self.native is not None and self.native.is_ready and not self.charted.is_driven:
             tangent = self.layout.chart.tangent
@@ -179,7 +257,7 @@ class Filter:
             if not groups:
                 continue
             try:
-                new, took = self._explanations(belief, reading, known, groups)
+                new, took = self._explanations(belief, reading, known, groups, mode == 0)
             except KineverseError:
                 # The best one has to be explained; another that leads nowhere is given up.
                 if mode == 0:
@@ -187,7 +265,7 @@ class Filter:
                 continue
             candidates += new
             rounds = max(rounds, took)
-        after, best = modes.ranked(candidates, self._is_same)
+        after, best = modes.ranked(candidates, partial(self.likeness.is_same, known, self.turns))
         nis = sum(float(c.nis[n]) for n, c in enumerate(best) if c)
         dof = sum(int(c.dof[n]) for n, c in enumerate(best) if c)
         doubted = [
@@ -205,24 +283,29 @@ class Filter:
             return [], 0
         found, rounds = self.undoubted.explained(modes, reading, known, groups)
         for candidate in found:
+            as_found = Found(candidate.belief, candidate.nis, candidate.dof, rounds, candidate.weights)
+            self.memory.remember(modes.best, as_found, reading, known, candidate.groups)
             self._settle(candidate.belief)
         return found, rounds
 
     def _explanations(
-        self, belief: Belief, reading: Reading, known: Array, groups: list[int]
+        self, belief: Belief, reading: Reading, known: Array, groups: list[int], is_best: bool
     ) -> tuple[list[Candidate], int]:
         """Return a belief after a reading: if all is right, and in ways in which some of it is wrong."""
         if self.outliers is None:
-            found = self.solver.update(belief, reading, known, groups)
-            return [self._candidate(found.belief, None, found.nis, found.dof, groups, known)], found.rounds
+            found = self._found(belief, reading, known, groups)
+            explained = [self._explained(belief, found, reading, known, groups)]
+            if is_best and (stuck := self._stuck(belief, found, reading, groups)):
+                explained += self._freed(belief, found, reading, known, stuck)
+            return explained, found.rounds
         nearby = self.solver.where_most_agree(belief, reading, known, groups)
         explained, rounds = [], 0
         for start in (belief, nearby):
             found = self.solver.update(start, reading, known, groups, self.outliers)
-            explained.append(
-                self._candidate(found.belief, found.weights, found.nis, found.dof, groups, known)
-            )
+            explained.append(self._explained(start, found, reading, known, groups))
             rounds = max(rounds, found.rounds)
+        if is_best and (stuck := self._stuck(belief, found, reading, groups)):
+            explained += self._freed(belief, found, reading, known, stuck)
         nothing = belief.copy()
         none = np.zeros(len(self.layout.groups))
         for number in groups:
@@ -233,16 +316,15 @@ class Filter:
         explained.append(self._candidate(nothing, weights, none, none, groups, known))
         return explained, rounds
 
+    def _stuck(self, belief: Belief, found: Found, reading: Reading, groups: list[int]) -> list[int]:
+        """Return the groups of which something is not explained, or taken for wrong."""
+        stuck = set(self.saddles.unexplained(belief, found))
+        if found.weights is not None:
+            doubted = reading.seen & (found.weights < 0.5)
+            stuck |= {n for n in groups if doubted[list(self.layout.groups[n].seen)].any()}
+        return [n for n in groups if n in stuck]
+
     def _candidate(
         self, belief: Belief, weights: Array | None, nis: Array, dof: Array, groups: list[int], known: Array
     ) -> Candidate:
-        self._settle(belief)
         return Candidate(belief, self.residuals.evaluate(belief.x, known), weights, nis, dof, groups)
-
-    def _is_same(self, group: Group, one: Candidate, other: Candidate) -> bool:
-        """Whether two explanations predict the same of a group, compared with the noise."""
-        values = self.reader.values_of(other.said)
-        nothing = self.reader.nothing()
-        as_seen = nothing._replace(values=values, seen=~nothing.seen)
-        errors = self.residuals.errors(one.said, as_seen, group.seen)
-        return all(float(e @ e) < _SAME**2 for e, _ in errors.values())

@@ -7,7 +7,7 @@ Alspach and Sorenson, Nonlinear Bayesian estimation using Gaussian sum approxima
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 import numpy.typing as npt
@@ -40,6 +40,8 @@ class Candidate:
         Of each group.
     groups
         Which groups it is about.
+    covariances
+        Of groups, as far as they were asked for.
     """
 
     belief: Belief
@@ -48,6 +50,7 @@ class Candidate:
     nis: Array
     dof: Array
     groups: Sequence[int]
+    covariances: dict[int, Array] = field(default_factory=dict)
 
 
 class Modes:
@@ -61,12 +64,10 @@ class Modes:
         At first.
     alive
         For each belief, which groups have it (modes, groups); all have the first.
-    looked
-        A mask of the observations of which something was seen so far; none if None.
 
     Attributes
     ----------
-    beliefs, alive, looked
+    beliefs, alive
         As they are now.
     """
 
@@ -75,11 +76,9 @@ class Modes:
         layout: Layout,
         beliefs: Sequence[Belief],
         alive: npt.NDArray[np.bool_],
-        looked: npt.NDArray[np.bool_] | None = None,
     ) -> None:
         self._layout = layout
         self.beliefs, self.alive = tuple(beliefs), alive
-        self.looked = np.zeros(len(layout.observations), dtype=bool) if looked is None else looked
 
     @property
     def best(self) -> Belief:
@@ -97,7 +96,7 @@ class Modes:
 
     def each(self, change: Callable[[Belief], Belief]) -> Modes:
         """Return what becomes of them when each belief changes."""
-        return Modes(self._layout, [change(b) for b in self.beliefs], self.alive, self.looked)
+        return Modes(self._layout, [change(b) for b in self.beliefs], self.alive)
 
     def evidence(self, number: int) -> Array:
         """Return the log evidence of the modes of a group, its best one first."""
@@ -148,7 +147,7 @@ class Modes:
                 copy_group(source, belief, number, group)
             beliefs.append(belief)
             alive.append([mode < len(own_modes) for own_modes in kept])
-        after = Modes(self._layout, beliefs, np.array(alive), self.looked)
+        after = Modes(self._layout, beliefs, np.array(alive))
         return after, [own_modes[0][1] for own_modes in kept]
 
 
@@ -157,3 +156,4 @@ def copy_group(source: Belief, target: Belief, number: int, group: Group) -> Non
     block = np.ix_(group.t, group.t)
     target.x[group.x], target.vector[group.t] = source.x[group.x], source.vector[group.t]
     target.information[block], target.evidence[number] = source.information[block], source.evidence[number]
+    target.standing[number] = source.standing[number]

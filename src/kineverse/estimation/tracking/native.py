@@ -148,7 +148,7 @@ class NativeSolver:
             if rounds < 0:
                 return None
             nis, dof = self._results.copy()
-            after = Belief(belief.sizes, self._belief.copy())
+            after = Belief(belief.sizes, self._belief.copy(), belief.standing)
             return Found(after, nis, dof, rounds, squares=self._squares.copy())
 
     def predict(self, belief: Belief, moved: Array, grown: Array) -> Belief | None:
@@ -161,7 +161,7 @@ class NativeSolver:
             self._motion[0], self._motion[1] = moved, grown
             if native_library.code.predict(self._where, self._written[0], *self._moved) < 0:
                 return None
-            return Belief(belief.sizes, self._belief.copy())
+            return Belief(belief.sizes, self._belief.copy(), belief.standing)
 
     def are_rigid(self, reading: Reading) -> bool:
         """Whether all poses that were seen are rigid; False if that is not known."""

@@ -8,7 +8,7 @@ is their density with outliers.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal, TypeAlias
 
@@ -53,6 +53,8 @@ class Found:
         How far each observation was believed; None if all were.
     squares
         Of the whitened errors of what was seen; None if nobody has kept them.
+    priors
+        For each group what was believed before, in the tangent at the place after it; None as well.
     """
 
     belief: Belief
@@ -61,6 +63,7 @@ class Found:
     rounds: int
     weights: Array | None = None
     squares: Array | None = None
+    priors: Mapping[int, Quadratic] | None = None
 
 
 @dataclass(slots=True, eq=False)
@@ -266,7 +269,8 @@ class Solver:
                 - work.beyond
                 - float(reading.log_scale[seen].sum())
             )
-        return Found(after, nis, dof, rounds, None if trust == "all" else weights)
+        priors = {number: work.prior for number, work in works.items()}
+        return Found(after, nis, dof, rounds, None if trust == "all" else weights, priors=priors)
 
 
 def _least_inside(belief: Quadratic, room: Room) -> float:

@@ -21,6 +21,8 @@ from .observed import nearest
 # Starts are no further apart than this [rad], of an angle that may be anywhere.
 _APART = math.pi / 2
 _MOST_STARTS = 32
+# Nobody is so many deviations from where one was told to begin.
+_FARTHEST = 5.5
 _SAME = 1e-9
 
 
@@ -61,6 +63,8 @@ def starts(filter_: Filter, first: Belief, known: Array) -> Modes:
         offsets = [_in_tangent(layout, number, np.array(x)) for x in _some(itertools.product(*steps))]
         mode = 0
         for offset in offsets[1:] + _half_turns(layout, number):
+            if np.abs(offset / filter_.openness.deviations[group.t]).max() > _FARTHEST:
+                continue
             x, turn = filter_.charted.step(number, first.x[group.x], offset, known)
             there = first.copy()
             there.x[group.x] = x

@@ -107,7 +107,7 @@ class Tracker:
             if str(key) not in names:
                 raise UnknownNameError(f"'{key}' is not estimated. {suggest(str(key), names, 'coordinate')}")
             deviations[names[str(key)]] = checked_positive(key, value)
-        filter_.widening.deviations = deviations
+        filter_.openness.deviations = deviations
         belief = Belief((len(x), len(deviations), len(layout.groups)))
         belief.x[:] = x
         belief.information[:] = np.diag(deviations**-2.0)

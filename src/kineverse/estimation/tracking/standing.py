@@ -1,0 +1,213 @@
+"""What was seen of a state that stands still is kept as it was seen.
+
+A filter adds up what observations say where they are linear, each at another estimate. An arm with seven
+joints moves in itself while its tip stays; the direction of this differs a bit from estimate to estimate, so
+the sum knows of a motion of which nobody has seen anything. As long as nothing moves, all can be linearised
+anew at one place: what was seen is summed up on SE(3) instead, and the belief follows from what was believed
+before and from that. This needs to be done only as long as there are open directions.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from types import MappingProxyType
+from typing import TypeAlias
+
+import numpy as np
+
+from kineverse.estimation.noise import Array
+from kineverse.estimation.rotations import exponential, logarithm
+
+from .belief import Belief, Quadratic, inverse
+from .layout import Layout
+from .observed import Observation, nearest
+from .openness import Openness
+from .reading import Reader, Reading, whitening
+from .solving import Found
+
+Update: TypeAlias = Callable[[Belief, Reading, Array, list[int]], Found]
+
+# Who counts less than this has said nothing.
+_NOTHING = 1e-3
+
+
+@dataclass(frozen=True, eq=False)
+class Seen:
+    """The mean of observations, weighted with their information.
+
+    Attributes
+    ----------
+    value
+        Pose 4×4 row by row, or vector.
+    information
+        Of it (d, d), in the axes of the observer.
+    peak
+        The log density of all of them if the mean is the truth.
+    """
+
+    value: Array
+    information: Array
+    peak: float
+
+    def joined(self, other: Seen, one: Observation) -> Seen:
+        """Return the mean of both."""
+        information = self.information + other.information
+        apart = self._apart(other, one)
+        share = np.linalg.solve(information, other.information)
+        step = share @ apart
+        peak = self.peak + other.peak - float(apart @ self.information @ step) / 2
+        if not one.is_pose:
+            return Seen(self.value + step, information, peak)
+        pose = self.value.reshape(4, 4).copy()
+        pose[:3, :3] = exponential(step[3:]) @ pose[:3, :3]
+        pose[:3, 3] += step[:3]
+        return Seen(pose.reshape(-1), information, peak)
+
+    def _apart(self, other: Seen, one: Observation) -> Array:
+        if not one.is_pose:
+            return nearest(other.value - self.value, one.period)
+        mine, theirs = self.value.reshape(4, 4), other.value.reshape(4, 4)
+        turn = logarithm(theirs[:3, :3] @ mine[:3, :3].T)
+        return np.concatenate([theirs[:3, 3] - mine[:3, 3], turn])
+
+
+@dataclass(frozen=True, eq=False)
+class Standing:
+    """What is known of a group since it moved last.
+
+    Attributes
+    ----------
+    prior
+        What was believed before anything was seen, in the tangent at the present place.
+    seen
+        What was seen since, by the number of the observation.
+    known
+        The values of what is known, at which it was seen.
+    evidence
+        The log evidence of the group before.
+    looks
+        How often something was seen.
+    branch
+        The same for all that follows from the same first look.
+    """
+
+    prior: Quadratic
+    seen: Mapping[int, Seen]
+    known: Array
+    evidence: float
+    looks: int = 0
+    branch: object = field(default_factory=object)
+
+    def with_seen(self, new: Mapping[int, Seen], observations: Sequence[Observation]) -> Standing:
+        """Return it with more that was seen."""
+        seen = dict(self.seen)
+        for i, one in new.items():
+            seen[i] = seen[i].joined(one, observations[i]) if i in seen else one
+        return replace(self, seen=MappingProxyType(seen), looks=self.looks + 1)
+
+    def reading(self, layout: Layout, reader: Reader) -> Reading:
+        """Return all of it as one reading."""
+        nothing = reader.nothing()
+        white, scale = nothing.whitening.copy(), nothing.log_scale.copy()
+        for i, seen in self.seen.items():
+            nothing.values[layout.seen_slices[i]] = seen.value
+            nothing.seen[i], scale[i] = True, -seen.peak
+            white[layout.white_slices[i]] = whitening(inverse(seen.information)).reshape(-1)
+        return nothing._replace(whitening=white, log_scale=scale)
+
+
+class Memory:
+    """Keeps what was seen of what stands still.
+
+    Parameters
+    ----------
+    layout, reader, openness
+        The parts of a tracker.
+    update
+        What makes of a belief, a reading, values of what is known and numbers of groups another belief.
+    """
+
+    def __init__(self, layout: Layout, reader: Reader, openness: Openness, update: Update) -> None:
+        self._layout, self._reader, self._openness, self._update = layout, reader, openness, update
+        # A single coordinate has no other that it could move with.
+        self._groups = {number for number, group in enumerate(layout.groups) if len(group.t) > 1}
+
+    def remember(
+        self,
+        before: Belief,
+        found: Found,
+        reading: Reading,
+        known: Array,
+        groups: Sequence[int] | None = None,
+    ) -> None:
+        """Have what was found follow from all that was seen, where it has open directions.
+
+        Parameters
+        ----------
+        before
+            What was believed before a reading.
+        found
+            What is believed after it, which is changed.
+        reading
+            What was seen.
+        known
+            Values of what is known.
+        groups
+            The numbers of those that are changed; all if None.
+        """
+        after, weights = found.belief, found.weights
+        for number in self._groups if groups is None else self._groups.intersection(groups):
+            group, old = self._layout.groups[number], before.standing[number]
+            new = {
+                i: self._seen(i, reading, 1.0 if weights is None else float(weights[i]))
+                for i in group.seen
+                if reading.seen[i] and (weights is None or weights[i] > _NOTHING)
+            }
+            if not new or (old is None and not self._is_open(number, after)):
+                continue
+            if old is None:
+                evidence = float(before.evidence[number])
+                first = Standing(before.part(group.t), MappingProxyType({}), known, evidence)
+                standing = first.with_seen(new, self._layout.observations)
+                after.standing[number] = replace(standing, prior=self._prior(number, before, found))
+                continue
+            standing = old.with_seen(new, self._layout.observations)
+            self._solve(number, before, after, standing, are_all_right=weights is None)
+            # What was never seen yet may still say that all was taken for its mirror image.
+            if len(standing.seen) == len(group.seen) and not self._is_open(number, after):
+                after.standing[number] = None
+
+    def _is_open(self, number: int, belief: Belief) -> bool:
+        t = self._layout.groups[number].t
+        return self._openness.is_open(number, belief.information[np.ix_(t, t)])
+
+    def _seen(self, i: int, reading: Reading, weight: float) -> Seen:
+        size = self._layout.observations[i].size
+        white = reading.whitening[self._layout.white_slices[i]].reshape(size, size)
+        value = reading.values[self._layout.seen_slices[i]].copy()
+        return Seen(value, weight * (white.T @ white), -float(reading.log_scale[i]))
+
+    def _solve(
+        self, number: int, before: Belief, after: Belief, standing: Standing, are_all_right: bool
+    ) -> None:
+        """Find the most probable state from where it was, and what is believed there."""
+        group = self._layout.groups[number]
+        first = before.copy()
+        first.put(group.t, standing.prior)
+        first.evidence[number] = standing.evidence
+        reading = standing.reading(self._layout, self._reader)
+        found = self._update(first, reading, standing.known, [number])
+        after.x[group.x] = found.belief.x[group.x]
+        after.put(group.t, found.belief.part(group.t))
+        if are_all_right:
+            after.evidence[number] = found.belief.evidence[number]
+        after.standing[number] = replace(standing, prior=self._prior(number, first, found))
+
+    def _prior(self, number: int, before: Belief, found: Found) -> Quadratic:
+        """Return what was believed before, in the tangent at the place that was found."""
+        if found.priors is not None:
+            return found.priors[number]
+        group = self._layout.groups[number]
+        step = found.belief.x[group.x] - before.x[group.x]
+        return before.part(group.t).carried(step, None)
