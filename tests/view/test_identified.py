@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -92,7 +94,7 @@ def test_every_family_is_drawn(family, whole):
 @pytest.mark.parametrize("family", ["revolute", "prismatic"])
 def test_what_does_not_fit_is_ringed(found, family):
     figure = pytest.importorskip("matplotlib.figure").Figure(figsize=SIZE, layout="constrained")
-    draw_identified(figure, found[family], hinge(), "a title", [3, 8])
+    draw_identified(figure, replace(found[family], outlying=(3, 8)), hinge(), "a title")
     looked = Looked.at(found[family], hinge())
     side = next(axes for axes in figure.axes if axes.get_title() == "from the side")
     ringed = np.asarray(side.collections[-1].get_offsets())

@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import json
 import sys
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -17,7 +16,7 @@ from kineverse.cli.progress import doing
 from kineverse.errors import ValueRejectedError
 
 if TYPE_CHECKING:
-    from kineverse.estimation import Found
+    from kineverse.estimation import Fit, Found
     from kineverse.estimation.recording import Pair
 
 Array = npt.NDArray[np.float64]
@@ -118,23 +117,17 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.thin is not None:
         pair = pair.thinned(arguments.thin)
     with doing(f"learning from {len(pair.lines)} poses"):
-        found, noise = learn(pair, stated, arguments.families)
-        outliers = outliers_of(pair, found, noise)
-        judged = pair if arguments.thin is not None else pair.thinned(telling(found, len(pair.lines)))
-        if len(judged.lines) < len(pair.lines):
-            found, noise = learn(judged, stated, arguments.families)
-    count = len(judged.lines)
-    wrong = np.flatnonzero(np.isin(judged.lines, pair.lines[outliers]))
-    written = write(arguments, judged, found, [int(number) for number in wrong])
+        learned = fitted(pair, stated, arguments.families, arguments.thin is None)
+    written = write(arguments, pair, learned)
     if arguments.json:
-        answer = {"poses": arguments.poses, **as_json(pair, count, found, noise, outliers), **written}
+        answer = {"poses": arguments.poses, **as_json(pair, learned), **written}
         print(json.dumps(answer, indent=2, allow_nan=False))
     else:
-        print(as_text(arguments.poses, pair, count, found, noise, outliers))
+        print(as_text(arguments.poses, pair, learned))
         for what, path in written.items():
             if path:
                 print(f"{what}: {path}")
-    return UNDECIDED if found.cannot_tell else 0
+    return UNDECIDED if learned.found.cannot_tell else 0
 
 
 def parse_noise(text: str) -> tuple[float, float | None]:
@@ -159,6 +152,55 @@ def parse_noise(text: str) -> tuple[float, float | None]:
     return position, orientation
 
 
+@dataclass(frozen=True)
+class Learned:
+    """What was learned from poses.
+
+    Attributes
+    ----------
+    found
+        All families with their probabilities.
+    noise
+        How far observations are off.
+    judged
+        How many of the poses families were weighed by.
+    fit
+        The best one, with all poses: those that are wrong altogether are outlying.
+    """
+
+    found: Found
+    noise: Noise
+    judged: int
+    fit: Fit
+
+
+def fitted(
+    pair: Pair, stated: tuple[float, float | None] | None, families: str | None, thins: bool
+) -> Learned:
+    """Return what is learned from poses; if it thins, from so many as tell something of their own.
+
+    Raises
+    ------
+    ValueRejectedError, UnknownNameError
+        See :func:`learn`.
+    """
+    from kineverse.estimation import Outliers
+    from kineverse.estimation.identification.beside import completed
+    from kineverse.estimation.identification.observations import observations
+    from kineverse.estimation.recording import evenly
+
+    found, noise = learn(pair, stated, families)
+    count = telling(found, len(pair.lines)) if thins else len(pair.lines)
+    if count == len(pair.lines):
+        return Learned(found, noise, count, found.best)
+    judged = evenly(len(pair.lines), count)
+    found, noise = learn(pair.at(judged), stated, families)
+    covariance = covariance_of(noise.position, noise.orientation)
+    seen = observations(pair.parent_poses, pair.child_poses, covariance, covariance)
+    fit = completed(found.best, seen, judged, outliers=Outliers(), stated=noise.given)
+    return Learned(found, noise, count, fit)
+
+
 def learn(pair: Pair, stated: tuple[float, float | None] | None, families: str | None) -> tuple[Found, Noise]:
     """Return what was found, and how far observations are off.
 
@@ -169,20 +211,23 @@ def learn(pair: Pair, stated: tuple[float, float | None] | None, families: str |
     UnknownNameError
         For a family that does not exist.
     """
-    from kineverse.estimation import identify, pose_covariance
+    from kineverse.estimation import identify
     from kineverse.estimation.identification.identify import UNKNOWN_NOISE
 
-    whole = pair.child_poses.ndim == 3 or pair.parent_poses is not None
-    if stated is not None and stated[1] is None and whole:
+    if stated is not None and stated[1] is None and pair.is_whole:
         raise ValueRejectedError("--noise: poses have two, of positions and orientations: 3mm,1deg")
-    covariance = None
-    if stated is not None:
-        # Where only positions are seen, the other half is not looked at.
-        covariance = pose_covariance(stated[0], stated[1] or 1.0)
     chosen = None if families is None else [name.strip() for name in families.split(",")]
-    found = identify(pair.parent_poses, pair.child_poses, noise=covariance, families=chosen)
+    covariance = None if stated is None else covariance_of(*stated)
+    found = identify(pair.parent_poses, pair.child_poses, noise=covariance, families=chosen, outliers=True)
     position, orientation = stated or (found.noise_scale * one for one in UNKNOWN_NOISE)
-    return found, Noise(position, orientation if whole else None, stated is not None)
+    return found, Noise(position, orientation if pair.is_whole else None, stated is not None)
+
+
+def covariance_of(position: float, orientation: float | None) -> Array:
+    """Return the covariance of poses; where only positions are seen, the other half is not looked at."""
+    from kineverse.estimation import pose_covariance
+
+    return pose_covariance(position, orientation or 1.0)
 
 
 def telling(found: Found, count: int) -> int:
@@ -190,31 +235,26 @@ def telling(found: Found, count: int) -> int:
     from kineverse.estimation.recording import independent_count
 
     # What is free leaves nothing.
-    return next((independent_count(fit.residuals) for fit in found if fit.family != "free"), count)
+    fit = next((fit for fit in found if fit.family != "free"), None)
+    if fit is None:
+        return count
+    # As many more as are wrong and tell nothing.
+    right = len(fit.right)
+    return min(count, round(independent_count(fit.residuals[fit.right]) * count / right))
 
 
-def outliers_of(pair: Pair, found: Found, noise: Noise) -> list[int]:
-    """Return the numbers of the poses, from 0, that are wrong altogether if the best joint is right."""
-    from kineverse.estimation import pose_covariance
-    from kineverse.estimation.identification.observations import observations
-    from kineverse.estimation.identification.outlying import outlying
-
-    covariance = pose_covariance(noise.position, noise.orientation or 1.0)
-    seen = observations(pair.parent_poses, pair.child_poses, covariance, covariance)
-    return [int(number) for number in outlying(found.best, seen)]
-
-
-def write(arguments: argparse.Namespace, pair: Pair, found: Found, outliers: Sequence[int]) -> dict[str, Any]:
+def write(arguments: argparse.Namespace, pair: Pair, learned: Learned) -> dict[str, Any]:
     """Write what was asked for, and return where it is."""
+    fit = learned.fit
     if arguments.picture:
         from kineverse.experiments.report import Figure
         from kineverse.view.identified import SIZE, draw_identified
 
-        title = f"{pair.child} in {pair.parent}: {found}"
-        picture = Figure(lambda c: draw_identified(c, found.best, pair.relative, title, outliers), SIZE)
+        title = f"{pair.child} in {pair.parent}: {learned.found}"
+        picture = Figure(lambda c: draw_identified(c, fit, pair.relative, title), SIZE)
         picture.save(arguments.picture)
     if arguments.document:
         from kineverse.cli.fit_document import document_of
 
-        document_of(pair, found.best).save(arguments.document)
+        document_of(pair.at(fit.right), fit).save(arguments.document)
     return {"picture": arguments.picture, "document": arguments.document}

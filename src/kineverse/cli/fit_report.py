@@ -11,7 +11,7 @@ import numpy as np
 from kineverse.cli.table import figure, table
 
 if TYPE_CHECKING:
-    from kineverse.cli.fit import Noise
+    from kineverse.cli.fit import Learned, Noise
     from kineverse.estimation import Fit, Found
     from kineverse.estimation.recording import Pair
 
@@ -22,41 +22,42 @@ _LISTED = 10
 """Of more poses that do not fit only the first are listed."""
 
 
-def as_text(source: str, pair: Pair, judged: int, found: Found, noise: Noise, outliers: Sequence[int]) -> str:
+def as_text(source: str, pair: Pair, learned: Learned) -> str:
     """Return what was found: the joint, how sure that is, and what else it could be."""
-    best = found.best
+    found, best, count = learned.found, learned.fit, len(pair.child_poses)
     said = f"{best.family}, {_percent(best.probability)}"
     if found.cannot_tell:
         said = f"{found}\nThe most probable one: {said}"
     what = "poses" if pair.child_poses.ndim == 3 else "positions"
     lines = [
-        f"{pair.child} in {pair.parent}: {len(pair.child_poses)} {what} ({source})",
-        *_chosen(judged, len(pair.child_poses)),
-        f"noise: {_noise(noise)}",
+        f"{pair.child} in {pair.parent}: {count} {what} ({source})",
+        *_chosen(learned.judged, count),
+        f"noise: {_noise(learned.noise)}",
         "",
         said,
         *(f"  {name:10}{value}" for name, value in _parts(best)),
-        *_misfits(outliers, len(pair.child_poses), what),
+        *_misfits(best.outlying, count, what),
         "",
         *_ranking(found),
     ]
     return "\n".join(lines)
 
 
-def as_json(pair: Pair, judged: int, found: Found, noise: Noise, outliers: Sequence[int]) -> dict[str, Any]:
+def as_json(pair: Pair, learned: Learned) -> dict[str, Any]:
     """Return everything that was found, as plain values."""
+    found, noise = learned.found, learned.noise
     return {
         "parent": pair.parent,
         "child": pair.child,
         "count": len(pair.child_poses),
-        "judged": judged,
+        "judged": learned.judged,
         "orientations": pair.child_poses.ndim == 3,
         "noise": {"position": noise.position, "orientation": noise.orientation, "given": noise.given},
         "told": not found.cannot_tell,
         "family": found.best.family,
         "says": str(found),
-        "outliers": list(outliers),
-        "fits": [_fit(fit) for fit in found.fits],
+        "outliers": list(learned.fit.outlying),
+        "fits": [_fit(fit) for fit in (learned.fit, *found.fits[1:])],
     }
 
 
@@ -110,9 +111,9 @@ def ranges(fit: Fit) -> list[tuple[float, float, float, bool]]:
     """Return of each joint value the least and the largest seen, their deviation, and if it is an angle."""
     found = []
     for k, component in enumerate(fit.motion.freedom.joints):
-        values = fit.joint_values[:, k]
+        values, deviations = fit.joint_values[fit.right, k], fit.deviations[fit.right, k]
         ends = [int(np.argmin(values)), int(np.argmax(values))]
-        spread = float(fit.deviations[ends, k].max())
+        spread = float(deviations[ends].max())
         found.append((float(values[ends[0]]), float(values[ends[1]]), spread, component >= 3))
     return found
 

@@ -6,7 +6,6 @@ canvases and axes that the caller makes.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -84,9 +83,7 @@ class Looked:
         return into @ fit.covariance[np.ix_(chosen, chosen)] @ np.swapaxes(into, 1, 2)
 
 
-def draw_identified(
-    canvas: Canvas, fit: Fit, relative: Array, title: str, outliers: Sequence[int] = ()
-) -> None:
+def draw_identified(canvas: Canvas, fit: Fit, relative: Array, title: str) -> None:
     """Draw what was seen and a fit: along the axis, from its side, and over the observations.
 
     Parameters
@@ -98,9 +95,7 @@ def draw_identified(
     relative
         What it was made of: poses (N, 4, 4) or positions (N, 3) of the child in the parent [m].
     title
-        Above the picture.
-    outliers
-        The numbers of observations that do not fit: they are ringed.
+        Above the picture. What is outlying is ringed.
     """
     looked = Looked.at(fit, relative)
     parts = canvas.subplot_mosaic(
@@ -109,9 +104,9 @@ def draw_identified(
     draw_along(parts["along"], looked)
     draw_side(parts["side"], looked)
     for part, points in _shown(looked):
-        _ring(parts[part], points[list(outliers)])
+        _ring(parts[part], points[list(fit.outlying)])
     draw_values(parts["values"], fit)
-    draw_left(parts["left"], fit, outliers)
+    draw_left(parts["left"], fit)
     canvas.suptitle(title)
 
 
@@ -170,10 +165,10 @@ def draw_values(axes: Axes, fit: Fit) -> None:
     axes.tick_params(labelbottom=False)
 
 
-def draw_left(axes: Axes, fit: Fit, outliers: Sequence[int] = ()) -> None:
+def draw_left(axes: Axes, fit: Fit) -> None:
     """Draw what the fit leaves of each observation, those that do not fit with a line."""
     number = np.arange(len(fit.residuals))
-    for outlier in outliers:
+    for outlier in fit.outlying:
         axes.axvline(outlier, color=AXIS, linewidth=0.8, linestyle=":")
     axes.plot(number, 1e3 * np.linalg.norm(fit.residuals[:, :3], axis=1), color=MODEL, linewidth=0.8)
     axes.set(xlabel="observation", title="left over")

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 import numpy as np
+import numpy.typing as npt
 
 from kineverse.errors import UnknownNameError, ValueRejectedError, suggest
 from kineverse.model.operation import Operation
@@ -58,6 +59,9 @@ class Fit:
         6 if poses of the child were seen, 3 if positions.
     motion
         The member of the family, as the solver has it.
+    outlying
+        The numbers of the observations that are wrong altogether if the family is right, from 0. The fit does
+        without them; their joint values are the nearest, and what is left of them is large.
     """
 
     family: str
@@ -74,13 +78,20 @@ class Fit:
     reason: str
     rows: int
     motion: Any
+    outlying: tuple[int, ...] = ()
+
+    @property
+    def right(self) -> npt.NDArray[np.int_]:
+        """The numbers of the observations that the fit is made of."""
+        return np.setdiff1d(np.arange(len(self.residuals)), self.outlying)
 
     @property
     def range(self) -> Array:
         """The least and the largest of each joint value that was seen, (k, 2)."""
         if not self.joint_values.shape[1]:
             return np.zeros((0, 2))
-        return np.column_stack([self.joint_values.min(axis=0), self.joint_values.max(axis=0)])
+        values = self.joint_values[self.right]
+        return np.column_stack([values.min(axis=0), values.max(axis=0)])
 
     @property
     def poses(self) -> Array:
@@ -90,8 +101,8 @@ class Fit:
 
     @property
     def rms(self) -> tuple[float, float]:
-        """What is left of positions [m] and orientations [rad], root mean square over observations."""
-        squares = np.mean(self.residuals**2, axis=0)
+        """What is left of positions [m] and orientations [rad], root mean square over what is right."""
+        squares = np.mean(self.residuals[self.right] ** 2, axis=0)
         return math.sqrt(float(squares[:3].sum())), math.sqrt(float(squares[3:].sum()))
 
     def deviation(self, coordinate: str) -> float:

@@ -6,14 +6,26 @@ import numpy as np
 import numpy.typing as npt
 
 from kineverse.errors import ShapeError, ValueRejectedError
+from kineverse.estimation.tracking.outliers import Outliers, as_outliers
 
+from .beside import are_right, beside
 from .family import Family
 from .fit import Found
-from .identify import Families, family_weights, judged, noise_of, solutions, weighed
-from .lengths import in_units, unit_of
+from .identify import (
+    Explained,
+    Families,
+    Sight,
+    explained,
+    explained_by,
+    family_weights,
+    noise_of,
+    sight_of,
+    weighed,
+)
 from .motion import Member
 from .native import solver
 from .observations import Observations, observations
+from .outlying import Rows
 from .refining import Rated
 from .rigid import Array
 from .solving import Solution, Start
@@ -33,8 +45,9 @@ class Identifier:
     ----------
     covariance_a, covariance_b
         Covariances of the errors of all poses that come without their own, (6, 6).
-    families, noise
-        As for :func:`.identify.identify`.
+    families, noise, outliers
+        As for :func:`.identify.identify`. A pose is taken for wrong as it comes, and perhaps for right when
+        there are twice as many.
 
     Raises
     ------
@@ -49,14 +62,16 @@ class Identifier:
         covariance_b: npt.ArrayLike | None = None,
         families: Families = None,
         noise: npt.ArrayLike | None = None,
+        outliers: Outliers | bool | None = None,
     ) -> None:
+        self._outliers = as_outliers(outliers)
         self._weights = family_weights(families)
         self._noise = covariance_a, covariance_b, noise
         self._stated = True
         self._seen: list[Observations] = []
-        self._solutions: dict[str | Family, Solution[Member]] = {}
+        self._known: dict[str | Family, Explained] = {}
         self._found: Found | None = None
-        self._whole, self._unit = 0, 1.0
+        self._whole, self._unit, self._scale = 0, 1.0, 1.0
 
     def __len__(self) -> int:
         return len(self._seen)
@@ -115,18 +130,23 @@ class Identifier:
 
     def _find(self) -> Found:
         seen = _joined(self._seen)
-        whole = len(seen) >= 2 * self._whole
-        if whole:
-            self._whole, self._unit = len(seen), unit_of(seen)
-        seen = in_units(seen, self._unit)
-        if whole:
-            found = solutions(seen, self._weights, self._unit)
+        if len(seen) >= 2 * self._whole:
+            self._whole = len(seen)
+            sight = sight_of(seen, self._stated, self._outliers)
+            self._unit = sight.unit
+            known = explained(sight, self._weights)
         else:
-            found = {name: _continued(seen, s) for name, s in self._solutions.items()}
-        known = judged(seen, found, self._weights)
-        result = weighed(known, self._weights, self._stated, self._unit)
+            sight = sight_of(seen, self._stated, self._outliers, self._unit)
+            right = {name: _right(sight, one, self._scale) for name, one in self._known.items()}
+            found = {
+                name: _continued(sight.seen.at(right[name]), one.known.solution)
+                for name, one in self._known.items()
+            }
+            known = explained_by(sight, found, right, self._weights)
+        result = weighed(sight, known, self._weights)
+        self._scale = result.noise_scale
         chances = {name for name, probability in result.probabilities.items() if probability > _NO_CHANCE}
-        self._solutions = {family: s for family, (s, _) in known.items() if s.motion.name in chances}
+        self._known = {name: one for name, one in known.items() if one.known.solution.motion.name in chances}
         return result
 
 
@@ -150,3 +170,17 @@ def _continued(seen: Observations, before: Solution[Member]) -> Rated:
         values.append(before.values[int(np.argmin(apart))][None])
     parent = np.concatenate([before.parent, seen.parent[known:]])
     return solver.continued(seen, Start(before.motion, np.concatenate(values)), parent, before.belief)
+
+
+def _right(sight: Sight, one: Explained, scale: float) -> Rows:
+    """Return the numbers of what is right: of what was, and of what came and is where it may be expected."""
+    new, solution = np.arange(one.count, len(sight.seen)), one.known.solution
+    if sight.outliers is None or solution.motion.joints == sight.seen.rows:
+        return np.concatenate([one.right, new])
+    came = beside(solution.motion, solution.values, sight.seen.at(new))
+    by_parameters = solution.motion.at(came.values).by_parameters
+    # What is not known of the joint yet is no error of what was seen.
+    unknown = solver.evidence(solution).covariance
+    covariance = came.covariance + by_parameters @ unknown @ np.swapaxes(by_parameters, 1, 2)
+    came_right = are_right(came.residuals, scale**2 * covariance, sight.outliers, sight.stated)
+    return np.concatenate([one.right, new[came_right]])

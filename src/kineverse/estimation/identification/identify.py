@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, replace
 from functools import partial
 from types import MappingProxyType
 from typing import TypeAlias
@@ -13,18 +14,20 @@ import numpy.typing as npt
 
 from kineverse.errors import UnknownNameError, ValueRejectedError, suggest
 from kineverse.estimation.noise import pose_covariance
+from kineverse.estimation.tracking.outliers import Outliers, as_outliers
 
+from .beside import completed
 from .canonical import canonical
 from .family import Family, family_starts
 from .fit import Fit, Found, Offer
 from .lengths import in_metres, in_units, log_density, unit_of
-from .motion import Member
 from .native import solver
 from .observations import Observations, observations
+from .outlying import Rows, log_belief, right_rows
 from .refining import Rated
 from .reporting import fit_of
 from .rigid import Array
-from .solving import Solution, Start
+from .solving import Start
 from .starts import Overview, starts
 
 Families: TypeAlias = "Iterable[str | Family] | Mapping[str | Family, float] | str | Family | None"
@@ -64,6 +67,7 @@ def identify(
     covariance_b: npt.ArrayLike | None = None,
     families: Families = None,
     noise: npt.ArrayLike | None = None,
+    outliers: Outliers | bool | None = None,
 ) -> Found:
     """Return how part b moves against part a, judged by poses of both that were observed with noise.
 
@@ -82,6 +86,9 @@ def identify(
     noise
         The covariance for whichever of both has none of its own. If there is none at all, the size of the
         noise is estimated, up to the ratio of 5 mm to 1°.
+    outliers
+        Whether some observations may be wrong altogether: True for the usual :class:`.Outliers`, of which as
+        many may be wrong as are not quite half.
 
     Raises
     ------
@@ -93,9 +100,8 @@ def identify(
     weights = family_weights(families)
     of_a, of_b, stated = noise_of(a is not None, covariance_a, covariance_b, noise)
     seen = observations(a, b, of_a, of_b)
-    unit = unit_of(seen)
-    seen = in_units(seen, unit)
-    return weighed(judged(seen, solutions(seen, weights, unit), weights), weights, stated, unit)
+    sight = sight_of(seen, stated, as_outliers(outliers))
+    return weighed(sight, explained(sight, weights), weights)
 
 
 def noise_of(
@@ -152,6 +158,88 @@ def family_weights(families: Families) -> dict[str | Family, float]:
     return result
 
 
+@dataclass(frozen=True)
+class Sight:
+    """What was seen, as families are compared by it.
+
+    Attributes
+    ----------
+    seen
+        The observations, with lengths in the unit.
+    unit
+        See :mod:`.lengths` [m].
+    stated
+        Whether the size of the noise is known.
+    outliers
+        How often observations are wrong, and where they are then, with lengths in the unit; None if never.
+    """
+
+    seen: Observations
+    unit: float
+    stated: bool
+    outliers: Outliers | None
+
+
+@dataclass(frozen=True)
+class Explained:
+    """What a family makes of what was seen.
+
+    Attributes
+    ----------
+    known
+        Its solution by the observations that are right, and how probable these are then.
+    right, count
+        Their numbers, and the number of all.
+    log_belief
+        The logarithm of the probability that these are right, and the density of the others.
+    """
+
+    known: Rated
+    right: Rows
+    count: int
+    log_belief: float
+
+
+def sight_of(seen: Observations, stated: bool, outliers: Outliers | None, unit: float | None = None) -> Sight:
+    """Return observations in a unit of length [m]; the ordinary one of these if None."""
+    unit = unit_of(seen) if unit is None else unit
+    if outliers is not None and outliers != Outliers():
+        outliers = replace(outliers, reach=outliers.reach / unit)
+    return Sight(in_units(seen, unit), unit, stated, outliers)
+
+
+def explained(sight: Sight, weights: Mapping[str | Family, float]) -> dict[str | Family, Explained]:
+    """Return what all families make of what was seen."""
+    seen, unit, count = sight.seen, sight.unit, len(sight.seen)
+    found = solutions(seen, weights, unit)
+    right = dict.fromkeys(found, np.arange(count))
+    if sight.outliers is not None:
+
+        def by(some: Observations, name: str | Family) -> Rated:
+            return solutions(some, [name], unit)[name]
+
+        right = right_rows(seen, found, sight.outliers, sight.stated, by)
+        some = {name: rows for name, rows in right.items() if len(rows) < count}
+        found |= {name: by(seen.at(rows), name) for name, rows in some.items()}
+    return explained_by(sight, found, right, weights)
+
+
+def explained_by(
+    sight: Sight,
+    found: Mapping[str | Family, Rated],
+    right: Mapping[str | Family, Rows],
+    weights: Mapping[str | Family, float],
+) -> dict[str | Family, Explained]:
+    """Return what families make of what was seen, from what was found by what is right."""
+    seen, outliers, count = sight.seen, sight.outliers, len(sight.seen)
+    by = {name: seen if len(rows) == count else seen.at(rows) for name, rows in right.items()}
+    beliefs = dict.fromkeys(found, 0.0)
+    if outliers is not None:
+        beliefs = {name: log_belief(outliers, count, len(some), seen.rows) for name, some in by.items()}
+    known = judged(by, found, {name: math.log(weights[name]) + beliefs[name] for name in found})
+    return {name: Explained(one, right[name], count, beliefs[name]) for name, one in known.items()}
+
+
 def solutions(
     seen: Observations, families: Iterable[str | Family], unit: float = 1.0
 ) -> dict[str | Family, Rated]:
@@ -168,15 +256,18 @@ def _starts(seen: Observations, family: str | Family, overview: Overview, unit: 
 
 
 def judged(
-    seen: Observations, found: Mapping[str | Family, Rated], weights: Mapping[str | Family, float]
+    seen: Mapping[str | Family, Observations],
+    found: Mapping[str | Family, Rated],
+    beliefs: Mapping[str | Family, float],
 ) -> dict[str | Family, Rated]:
-    """Return what was found, and with joint values integrated out what has a chance."""
-    logs = {name: known.log_evidence + math.log(weights[name]) for name, known in found.items()}
-    least = max(logs.values()) - _CHANCE - _CHANCE_EACH * len(seen)
-    return {
-        name: solver.refined(seen, known.solution) if logs[name] >= least and _is_rough(known) else known
-        for name, known in found.items()
-    }
+    """Return what was found, and with joint values integrated out what has a chance.
+
+    Each family is by observations of its own, and has a belief beforehand, as a logarithm.
+    """
+    logs = {name: known.log_evidence + beliefs[name] for name, known in found.items()}
+    least = max(logs.values()) - _CHANCE - _CHANCE_EACH * max(len(some) for some in seen.values())
+    rough = [name for name, known in found.items() if logs[name] >= least and _is_rough(known)]
+    return {**found, **{name: solver.refined(seen[name], found[name].solution) for name in rough}}
 
 
 def _is_rough(known: Rated) -> bool:
@@ -186,21 +277,18 @@ def _is_rough(known: Rated) -> bool:
 
 
 def weighed(
-    found: Mapping[str | Family, Rated],
-    weights: Mapping[str | Family, float],
-    stated: bool,
-    unit: float = 1.0,
+    sight: Sight, found: Mapping[str | Family, Explained], weights: Mapping[str | Family, float]
 ) -> Found:
-    """Return the fits of all families, weighed by their evidence, of observations in a unit of length [m]."""
-    beforehand = {name: math.log(weights[name]) for name in found}
-    if stated:
-        logs = {name: known.log_evidence for name, known in found.items()}
+    """Return the fits of all families, weighed by their evidence."""
+    beforehand = {name: math.log(weights[name]) + one.log_belief for name, one in found.items()}
+    if sight.stated:
+        logs = {name: one.known.log_evidence for name, one in found.items()}
         scale = 1.0
     else:
         spread = -0.5 * (np.log(_SCALES) / _SCALE_SPREAD) ** 2
         spread -= np.logaddexp.reduce(spread)
         joint = {
-            name: spread + solver.log_evidences(known.solution, _SCALES) for name, known in found.items()
+            name: spread + solver.log_evidences(one.known.solution, _SCALES) for name, one in found.items()
         }
         logs = {name: float(np.logaddexp.reduce(j)) for name, j in joint.items()}
         best = max(logs, key=lambda name: logs[name] + beforehand[name])
@@ -208,12 +296,13 @@ def weighed(
     total: Array = np.array([logs[name] + beforehand[name] for name in found])
     probabilities = np.exp(total - np.logaddexp.reduce(total)).tolist()
     offers = []
-    for (name, (solution, _)), p in zip(found.items(), probabilities, strict=True):
-        log = logs[name] + log_density(len(solution.residuals), unit)
-        offers.append(Offer(solution.motion.name, p, partial(_fit, solution, scale, log, p, unit)))
+    for (name, one), p in zip(found.items(), probabilities, strict=True):
+        log = logs[name] + one.log_belief + log_density(len(sight.seen), sight.unit)
+        offers.append(Offer(one.known.solution.motion.name, p, partial(_fit, sight, one, scale, log, p)))
     return Found(tuple(sorted(offers, key=lambda offer: -offer.probability)), scale)
 
 
-def _fit(solution: Solution[Member], scale: float, log: float, probability: float, unit: float) -> Fit:
-    solution = canonical(solution)
-    return in_metres(fit_of(solution, solver.evidence(solution, scale), log, probability), unit)
+def _fit(sight: Sight, one: Explained, scale: float, log_evidence: float, probability: float) -> Fit:
+    solution = canonical(one.known.solution)
+    fit = fit_of(solution, solver.evidence(solution, scale), log_evidence, probability)
+    return in_metres(completed(fit, sight.seen, one.right, scale), sight.unit)

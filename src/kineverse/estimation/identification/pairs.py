@@ -11,6 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from kineverse.estimation.rotations import skew
+from kineverse.estimation.tracking.outliers import Outliers
 
 from .fit import Fit, Found
 from .identify import family_weights, identify
@@ -137,7 +138,7 @@ def _log_volume(covariance: Array, fit: Fit) -> float:
     return 0.5 * float(np.sum(np.linalg.slogdet(covariance)[1] + np.linalg.slogdet(along)[1]))
 
 
-def identified(seen: Observations, families: Families) -> Found:
+def identified(seen: Observations, families: Families, outliers: Outliers | None = None) -> Found:
     """Return what is between two parts that were seen."""
     exact = seen.parent_covariance is None
     child = seen.relative if exact else seen.child
@@ -147,6 +148,7 @@ def identified(seen: Observations, families: Families) -> Found:
         covariance_a=seen.parent_covariance,
         covariance_b=seen.child_covariance,
         families=families,
+        outliers=outliers,
     )
 
 

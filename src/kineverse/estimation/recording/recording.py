@@ -45,6 +45,11 @@ class Track:
         return len(self.poses)
 
 
+def evenly(count: int, most: int) -> Indices:
+    """Return at most so many of the numbers below a count, the first and the last among them."""
+    return np.unique(np.linspace(0, count - 1, most).round().astype(np.intp))
+
+
 @dataclass(frozen=True, eq=False)
 class Pair:
     """Two parts at the times when both were seen.
@@ -71,6 +76,11 @@ class Pair:
     alone: int = 0
 
     @property
+    def is_whole(self) -> bool:
+        """Whether orientations were seen, of the child or of a parent."""
+        return self.child_poses.ndim == 3 or self.parent_poses is not None
+
+    @property
     def relative(self) -> Array:
         """Poses of the child in the parent (N, 4, 4), or its positions (N, 3), with the errors of both."""
         if self.parent_poses is None:
@@ -90,11 +100,12 @@ class Pair:
         """
         if count < 2:
             raise ValueRejectedError(f"{count} of the poses: how something moves takes at least two to see.")
-        chosen = np.unique(np.linspace(0, len(self.lines) - 1, count).round().astype(np.intp))
-        parents = None if self.parent_poses is None else self.parent_poses[chosen]
-        return replace(
-            self, parent_poses=parents, child_poses=self.child_poses[chosen], lines=self.lines[chosen]
-        )
+        return self.at(evenly(len(self.lines), count))
+
+    def at(self, rows: Indices) -> Pair:
+        """Return some of the observations."""
+        parents = None if self.parent_poses is None else self.parent_poses[rows]
+        return replace(self, parent_poses=parents, child_poses=self.child_poses[rows], lines=self.lines[rows])
 
 
 @dataclass(frozen=True, eq=False)
