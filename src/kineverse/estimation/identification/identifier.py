@@ -169,7 +169,7 @@ def _continued(seen: Observations, before: Solution[Member]) -> Rated:
         apart = np.sum((seen.relative[:known] - seen.relative[k]) ** 2, axis=(1, 2))
         values.append(before.values[int(np.argmin(apart))][None])
     parent = np.concatenate([before.parent, seen.parent[known:]])
-    return solver.continued(seen, Start(before.motion, np.concatenate(values)), parent, before.belief)
+    return solver.continued(seen, Start(before.motion, np.concatenate(values)), parent, before.belief, known)
 
 
 def _right(sight: Sight, one: Explained, scale: float) -> Rows:

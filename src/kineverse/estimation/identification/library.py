@@ -25,11 +25,11 @@ if TYPE_CHECKING:
 
 # Numbers of its own, that need not agree with those of an interpreter to the last bit.
 _FLAGS = ("-O3", "-ffp-contract=fast", "-fno-rounding-math", "-lm", *CLOSED)
-_FAMILY = ("rows", "joints", "lefts", "rights", "pitched", "reach", "slides")
+_FAMILY = ("rows", "joints", "lefts", "rights", "pitches", "pitched", "reach", "slides")
 _SCALES = ("reach_scale", "pitch_scale", "close", "little", "narrowest", "settled", "better", "slid")
 _COUNTS = ("steps", "first_steps", "turns", "sliding_turns", "mirrored_turns", "mirrored_steps", "widths")
-# So many parameters C has room for.
-_PARAMETERS = 12
+# So many parameters C has room for, and so many unknowns of a family altogether.
+_PARAMETERS, _UNKNOWNS = 12, 16
 MOTION = 25
 """How many numbers C has for a member of a family."""
 
@@ -49,7 +49,7 @@ class Given(ctypes.Structure):
     """What was observed, as C has it."""
 
     _fields_ = (
-        *((name, ctypes.c_int64) for name in ("count", "known", "softer")),
+        *((name, ctypes.c_int64) for name in ("count", "known", "fresh", "softer")),
         *((name, ctypes.c_void_p) for name in ("parent", "child", "parent_covariance", "child_covariance")),
         ("softness", ctypes.c_void_p),
     )
@@ -97,6 +97,7 @@ def fits(group: Group, rows: int) -> bool:
         {*freedom.left, *freedom.right, *freedom.joints} <= {*range(6)}
         and max(left, right + joints) <= 6
         and left + right + group.pitch <= _PARAMETERS
+        and left + right + group.pitch + joints + group.slides <= _UNKNOWNS
         and max(group.reach, group.slides) <= 3
     )
 
@@ -107,7 +108,8 @@ def problem_of(group: Group, rows: int) -> Problem:
     freedom, problem = group.freedom(rows), Problem()
     problem.rows, problem.joints = rows, len(freedom.joints)
     problem.lefts, problem.rights = len(freedom.left), len(freedom.right)
-    problem.pitched, problem.reach = group.pitch, group.reach
+    problem.pitches = problem.pitched = group.pitch
+    problem.reach = group.reach
     problem.slides = group.slides if rows == 6 else 0
     for name, components in (("joint", freedom.joints), ("left", freedom.left), ("right", freedom.right)):
         getattr(problem, name)[: len(components)] = components

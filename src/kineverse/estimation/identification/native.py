@@ -89,13 +89,14 @@ class Solver:
         _run(library.code.refine, _problem(seen, solution.motion), answer)
         return Rated(answer.solution, answer.log_evidence)
 
-    def continued(self, seen: Observations, start: Start, parent: Array, belief: Belief) -> Rated:
+    def continued(self, seen: Observations, start: Start, parent: Array, belief: Belief, known: int) -> Rated:
         """Do what :func:`.refining.continued` does."""
         motion = start.motion
         if not _is_for_c(motion):
-            return refining.continued(seen, start, parent, belief)
-        answer = Answer(motion, belief, start.values, parent)
-        _run(library.code.carry_on, _problem(seen, motion), answer)
+            return refining.continued(seen, start, parent, belief, known)
+        problem, answer = _problem(seen, motion), Answer(motion, belief, start.values, parent)
+        problem.given.fresh = len(seen) - known
+        _run(library.code.carry_on, problem, answer)
         return Rated(answer.solution, answer.log_evidence)
 
     def evidence(self, solution: Solution[Member], scale: float = 1.0) -> Evidence:

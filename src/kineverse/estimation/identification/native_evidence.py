@@ -1,32 +1,31 @@
 """C text: how probable observations are with all that is unknown integrated out, as in :mod:`.evidence`."""
 
 EVIDENCE = r"""
-#define UNKNOWNS 21 /* parameters, means of joint values, and a point that slides, at most */
+/* Parameters, means of joint values, and a point that slides, at most; rows of a fixed length are vectors. */
+#define UNKNOWNS 16
 #define ATOM 1e-10
 
 /* Joint values, their covariances and the information, as observations and widths tell together. */
-static void informed(const Problem *p, const Answer *a, double factor, const double *places,
-                     const double *known, const double *deviations, const double *mean, double *values,
+static void informed(const Problem *p, const Answer *a, double factor, const Apart *apart, double *values,
                      double *covariances, double *information) {
   int rows = (int)p->rows, joints = (int)p->joints, slides = (int)p->slides, size = (int)size_of(p);
   int n = size + joints + slides;
   const Motion *m = &a->head->motion;
-  memset(information, 0, n * n * sizeof(double));
+  double total[UNKNOWNS * UNKNOWNS] = {0};
   Observation o;
   for (int64_t k = 0; k < p->count; k++) {
-    const double *C = known + joints * joints * k, *S = a->covariances + rows * rows * k;
-    double W[36], moved[36], change[6], both[6 * UNKNOWNS] = {0}, weighted[6 * UNKNOWNS];
-    if (joints) widened(C, joints, deviations, W);
+    const double *C = apart->covariances + joints * joints * k, *S = a->covariances + rows * rows * k;
+    double W[36], moved[36], both[6 * UNKNOWNS] = {0}, weighted[6 * UNKNOWNS] = {0};
+    if (joints) widened(C, joints, apart->deviations, W);
     for (int i = 0; i < joints; i++) {
-      double square = deviations[i] * deviations[i];
-      change[i] = 0.0;
+      double square = apart->deviations[i] * apart->deviations[i], change = 0.0;
       for (int j = 0; j < joints; j++) {
         double sum = 0.0;
         for (int l = 0; l < joints; l++) sum += W[joints * i + l] * C[joints * l + j];
         covariances[joints * joints * k + joints * i + j] = square * sum;
-        change[i] += square * W[joints * i + j] * (places[joints * k + j] - mean[j]);
+        change += square * W[joints * i + j] * (apart->values[joints * k + j] - apart->mean[j]);
       }
-      values[joints * k + i] = o.values[i] = mean[i] + change[i];
+      values[joints * k + i] = o.values[i] = apart->mean[i] + change;
     }
     place_one(p, m, &o);
     for (int r = 0; r < rows; r++) {
@@ -34,11 +33,11 @@ static void informed(const Problem *p, const Answer *a, double factor, const dou
         moved[rows * r + s] = factor * S[rows * r + s];
         for (int j = 0; j < joints; j++) {
           const double *J = o.by_joints + 6 * j;
-          moved[rows * r + s] += deviations[j] * deviations[j] * J[r] * J[s];
+          moved[rows * r + s] += apart->deviations[j] * apart->deviations[j] * J[r] * J[s];
         }
       }
-      for (int i = 0; i < size; i++) both[n * r + i] = o.by_parameters[MOST * r + i];
-      for (int j = 0; j < joints; j++) both[n * r + size + j] = o.by_joints[6 * j + r];
+      for (int i = 0; i < size; i++) both[UNKNOWNS * r + i] = o.by_parameters[MOST * r + i];
+      for (int j = 0; j < joints; j++) both[UNKNOWNS * r + size + j] = o.by_joints[6 * j + r];
     }
     if (slides) {
       double twist[6] = {0}, G[9], turned[9];
@@ -46,18 +45,19 @@ static void informed(const Problem *p, const Answer *a, double factor, const dou
       exponential(twist + 3, G);
       times33(m->left_R, G, turned);
       for (int r = 0; r < 3; r++)
-        for (int i = 0; i < slides; i++) both[n * r + size + joints + i] = turned[3 * r + i];
+        for (int i = 0; i < slides; i++) both[UNKNOWNS * r + size + joints + i] = turned[3 * r + i];
     }
     invert(moved, rows, W);
     for (int r = 0; r < rows; r++)
-      for (int i = 0; i < n; i++) {
-        weighted[n * r + i] = 0.0;
-        for (int s = 0; s < rows; s++) weighted[n * r + i] += W[rows * r + s] * both[n * s + i];
-      }
+      for (int s = 0; s < rows; s++)
+        for (int i = 0; i < UNKNOWNS; i++)
+          weighted[UNKNOWNS * r + i] += W[rows * r + s] * both[UNKNOWNS * s + i];
     for (int i = 0; i < n; i++)
       for (int r = 0; r < rows; r++)
-        for (int j = 0; j < n; j++) information[n * i + j] += both[n * r + i] * weighted[n * r + j];
+        for (int j = 0; j < UNKNOWNS; j++)
+          total[UNKNOWNS * i + j] += both[UNKNOWNS * r + i] * weighted[UNKNOWNS * r + j];
   }
+  for (int i = 0; i < n; i++) memcpy(information + n * i, total + UNKNOWNS * i, n * sizeof(double));
 }
 
 static int has(const int64_t *components, int64_t count, int64_t component) {
@@ -81,7 +81,7 @@ static double beforehand(const Problem *p, const Motion *m, const double *mean, 
   if (has(p->left, p->lefts, 0) && has(p->left, p->lefts, 1))
     log_density += of_lever(m->right_p, p->reach, p->reach_scale);
   log_density += of_lever(m->right_p, p->slides, p->reach_scale);
-  if (p->pitched) log_density += of_lever(&m->pitch, 1, p->pitch_scale);
+  if (p->pitches) log_density += of_lever(&m->pitch, 1, p->pitch_scale);
   Observation o;
   memcpy(o.values, mean, joints * sizeof(double));
   place_one(p, m, &o);
@@ -102,40 +102,39 @@ static double beforehand(const Problem *p, const Motion *m, const double *mean, 
 }
 
 /* As evidence in evidence.py, for errors whose variances are larger by a factor. */
-static double evidence(const Problem *p, const Answer *a, double factor, double *values,
-                       double *covariances, double *information, double *memory) {
-  int joints = (int)p->joints, n = (int)(size_of(p) + p->joints + p->slides);
-  double deviations[6], mean[6], copied[UNKNOWNS * UNKNOWNS], log_density;
-  double *places = memory, *known = places + p->count * joints;
-  memory = known + p->count * joints * joints;
-  log_density = alone(p, a, factor, places, known);
-  if (joints) log_density += widths(p, places, known, deviations, mean, memory);
-  informed(p, a, factor, places, known, deviations, mean, values, covariances, information);
-  log_density += beforehand(p, &a->head->motion, mean, information) + 0.5 * n * log(TAU);
+static double evidence(const Problem *p, const Answer *a, double factor, const Apart *apart, double *values,
+                       double *covariances, double *information) {
+  int n = (int)(size_of(p) + p->joints + p->slides);
+  double copied[UNKNOWNS * UNKNOWNS], log_density = apart->log_likelihood + apart->log_density;
+  informed(p, a, factor, apart, values, covariances, information);
+  log_density += beforehand(p, &a->head->motion, apart->mean, information) + 0.5 * n * log(TAU);
   memcpy(copied, information, n * n * sizeof(double));
   return log_density - 0.5 * log_volume(copied, n);
 }
 
+/* Its logarithm alone. */
+static double log_evidence(const Problem *p, const Answer *a, const Apart *apart, double *memory) {
+  double information[UNKNOWNS * UNKNOWNS];
+  return evidence(p, a, 1.0, apart, memory, memory + p->count * p->joints, information);
+}
+
 /* As overrated in evidence.py. */
-static double overrated(const Problem *p, const Answer *a, double *memory) {
+static double overrated(const Problem *p, const Answer *a, const Apart *apart) {
   if (a->head->converged > 0.0 || !(a->head->marginal > 0.0)) return 0.0;
   int n = (int)p->joints;
-  double *places = memory, *known = places + p->count * n, deviations[6], W[36], off[6];
-  double promised = alone(p, a, 1.0, places, known);
+  double deviations[6], W[36], off[6], promised = apart->log_likelihood;
   for (int i = 0; i < n; i++) deviations[i] = 1.0 / sqrt(a->head->belief.precision[i]);
   for (int64_t k = 0; k < p->count; k++) {
-    double root = widened(known + n * n * k, n, deviations, W);
-    for (int i = 0; i < n; i++) off[i] = places[n * k + i] - a->head->belief.mean[i];
+    double root = widened(apart->covariances + n * n * k, n, deviations, W);
+    for (int i = 0; i < n; i++) off[i] = apart->values[n * k + i] - a->head->belief.mean[i];
     promised -= 0.5 * squared(off, W, n) + log(root) + 0.5 * n * log(TAU);
   }
   double reached = a->head->cost - unlikely(p, &a->head->motion) + p->count * p->rows * log(TAU);
   return fmax(0.0, promised + 0.5 * reached);
 }
 
-/* The logarithm of the evidence, with nothing that is not there. */
-static double honest(const Problem *p, const Answer *a, double *memory) {
-  double information[UNKNOWNS * UNKNOWNS], *values = memory, *covariances = values + p->count * p->joints;
-  memory = covariances + p->count * p->joints * p->joints;
-  return evidence(p, a, 1.0, values, covariances, information, memory) - overrated(p, a, memory);
+/* Leave the logarithm of the evidence in an answer, with nothing that is not there. */
+static void judge(const Problem *p, Answer *a, const Apart *apart, double *memory) {
+  a->head->log_evidence = log_evidence(p, a, apart, memory) - overrated(p, a, apart);
 }
 """

@@ -15,10 +15,10 @@ typedef struct { const double *covariance, *inverse; int64_t stride, round; } No
 
 typedef struct {
   /* The family: which components of twists are joint values and parameters, and the kinds of joint values. */
-  int64_t rows, joints, lefts, rights, pitched, reach, slides;
+  int64_t rows, joints, lefts, rights, pitches, pitched, reach, slides;
   int64_t joint[6], left[6], right[6], kind[6];
   /* What was observed, and by how much errors of positions are larger while the valley narrows. */
-  int64_t count, known, softer;
+  int64_t count, known, fresh, softer;
   const double *parent, *child, *parent_covariance, *child_covariance, *softness;
   /* Constants of the modules that say the same in numpy. */
   double reach_scale, pitch_scale, close, little, narrowest, settled, better, slid;
@@ -49,7 +49,7 @@ FAST void column(const double *axis, int about, const double *lever, double *J, 
     for (int i = 0; i < 3; i++) J[(3 + i) * stride] = about ? axis[i] : 0.0;
 }
 
-static int64_t size_of(const Problem *p) { return p->lefts + p->rights + p->pitched; }
+static int64_t size_of(const Problem *p) { return p->lefts + p->rights + p->pitches; }
 
 /* The child's pose in the parent at joint values, and its derivatives. */
 FAST void place(const Problem *p, const Motion *m, Observation *o, const int rows) {
@@ -74,7 +74,7 @@ FAST void place(const Problem *p, const Motion *m, Observation *o, const int row
     for (int i = 0; i < 3; i++) axis[i] = PJ[3 * i + p->right[j] % 3];
     column(axis, p->right[j] >= 3, o->arm, o->by_parameters + at++, MOST, rows);
   }
-  if (p->pitched)
+  if (p->pitches)
     for (int i = 0; i < rows; i++)
       o->by_parameters[at + i * MOST] = i < 3 ? m->left_R[3 * i + 2] * twist[5] : 0.0;
   double J[9], turning[9];
@@ -212,7 +212,7 @@ static double unlikely(const Problem *p, const Motion *m) {
   double cost = 0.0;
   for (int64_t i = 0; i < p->reach; i++)
     cost += m->right_p[i] * m->right_p[i] / (p->reach_scale * p->reach_scale);
-  if (p->pitched) cost += m->pitch * m->pitch / (p->pitch_scale * p->pitch_scale);
+  if (p->pitches) cost += m->pitch * m->pitch / (p->pitch_scale * p->pitch_scale);
   return cost;
 }
 

@@ -80,7 +80,7 @@ static void believe_as(Problem *p, const Head *head) {
 /* Take steps until they are small; returns whether they became so. What was found is in *here then. */
 static int64_t settle(const Problem *p, Motion *now, Observation **here, Observation **there, int64_t steps,
                       double *best) {
-  double damping = 0.0;
+  double damping = 0.0, before = 0.0;
   for (int64_t i = 0; i < steps; i++) {
     double gain = 0.0, trial = NAN;
     Motion next;
@@ -95,7 +95,8 @@ static int64_t settle(const Problem *p, Motion *now, Observation **here, Observa
       *now = next;
       *best = trial;
       damping = damping > 1e-6 ? 0.1 * damping : 0.0;
-      if (gain < p->close) return 1;
+      if (gain < p->close || gain * gain < p->close * before) return 1;
+      before = gain;
     } else if (gain < p->close) {
       return 1;
     } else {
@@ -114,6 +115,19 @@ static void begin(const Problem *p, const double *values, const double *parents,
   }
 }
 
+static void note_unknowns(const Problem *p, const Observation *found, double *values, double *parents) {
+  for (int64_t k = 0; k < p->count; k++) {
+    const Observation *o = found + k;
+    double *parent = parents + 16 * k;
+    memcpy(values + p->joints * k, o->values, p->joints * sizeof(double));
+    for (int i = 0; i < 3; i++) {
+      for (int j = 0; j < 3; j++) parent[4 * i + j] = o->parent_R[3 * i + j];
+      parent[4 * i + 3] = o->parent_p[i];
+    }
+    for (int j = 0; j < 4; j++) parent[12 + j] = j == 3;
+  }
+}
+
 /* Leave in an answer what was found. */
 static void note(const Problem *p, const Motion *m, double cost, int64_t converged, const Observation *found,
                  Answer *a) {
@@ -125,17 +139,11 @@ static void note(const Problem *p, const Motion *m, double cost, int64_t converg
   a->head->belief = p->belief;
   for (int64_t k = 0; k < p->count; k++) {
     const Observation *o = found + k;
-    double *parent = a->parents + 16 * k;
-    memcpy(a->values + joints * k, o->values, joints * sizeof(double));
     memcpy(a->residuals + rows * k, o->residual, rows * sizeof(double));
     memcpy(a->covariances + rows * rows * k, o->covariance, rows * rows * sizeof(double));
     keep(p, o, a->poses + 16 * k, a->by_parameters + rows * size * k, a->by_joints + rows * joints * k);
-    for (int i = 0; i < 3; i++) {
-      for (int j = 0; j < 3; j++) parent[4 * i + j] = o->parent_R[3 * i + j];
-      parent[4 * i + 3] = o->parent_p[i];
-    }
-    for (int j = 0; j < 4; j++) parent[12 + j] = j == 3;
   }
+  note_unknowns(p, found, a->values, a->parents);
 }
 
 /* From the best of several starts, after few steps of each, to where steps are small. Parents begin where
@@ -170,5 +178,26 @@ static void go_on(Problem *p, Answer *a, double *memory) {
   Motion from = a->head->motion;
   believe_as(p, a->head);
   solve_from(p, 1, &from, a->values, p->steps, a, memory);
+}
+
+/* Move joint values and parents of the last observations, which are new, with the motion as it is. */
+static void settle_new(const Problem *p, Answer *a, double *memory) {
+  int64_t first = p->count - p->fresh;
+  Problem q = *p;
+  q.count = p->fresh;
+  q.lefts = q.rights = q.pitches = q.reach = 0;
+  q.parent += 16 * first;
+  q.child += 16 * first;
+  q.of_parent.covariance += q.of_parent.stride * first;
+  q.of_parent.inverse += q.of_parent.stride * first;
+  q.of_child.covariance += q.of_child.stride * first;
+  q.of_child.inverse += q.of_child.stride * first;
+  Observation *here = (Observation *)memory, *there = here + q.count;
+  double *values = a->values + q.joints * first, *parents = a->parents + 16 * first;
+  Motion m = a->head->motion;
+  begin(&q, values, parents, here);
+  double cost = look_at_all(&q, &m, here);
+  settle(&q, &m, &here, &there, q.steps, &cost);
+  note_unknowns(&q, here, values, parents);
 }
 """

@@ -10,13 +10,12 @@ static void place_all(const Problem *p, Answer *a) {
 static void slide(const Problem *p, Answer *a, double *memory) {
   int joints = (int)p->joints, slides = (int)p->slides, n = joints + slides;
   Motion *m = &a->head->motion;
-  double *places = memory, *known = places + p->count * joints, *turned = known + p->count * joints * joints;
-  double most = slides ? INFINITY : 0.0;
+  double most = slides ? INFINITY : 0.0, *turned = memory;
   memory = turned + 9 * p->count;
   for (int64_t turn = 0; turn < p->sliding_turns && most > p->slid; turn++) {
-    double deviations[6], mean[6], normal[81] = {0}, change[9] = {0};
-    alone(p, a, 1.0, places, known);
-    widths(p, places, known, deviations, mean, memory);
+    double normal[81] = {0}, change[9] = {0};
+    Apart apart;
+    take_apart(p, a, 1.0, &apart, memory);
     for (int64_t k = 0; k < p->count; k++) {
       /* What the mean and the point make of joint values. */
       double twist[6] = {0}, W[36], by[54] = {0}, weighted[54], *G = turned + 9 * k;
@@ -25,7 +24,7 @@ static void slide(const Problem *p, Answer *a, double *memory) {
       for (int i = 0; i < joints; i++) by[n * i + i] = 1.0;
       for (int i = 0; i < slides; i++)
         for (int j = 0; j < slides; j++) by[n * i + joints + j] = G[3 * i + j];
-      widened(known + joints * joints * k, joints, deviations, W);
+      widened(apart.covariances + joints * joints * k, joints, apart.deviations, W);
       for (int i = 0; i < joints; i++)
         for (int c = 0; c < n; c++) {
           weighted[n * i + c] = 0.0;
@@ -33,7 +32,7 @@ static void slide(const Problem *p, Answer *a, double *memory) {
         }
       for (int c = 0; c < n; c++)
         for (int i = 0; i < joints; i++) {
-          change[c] += weighted[n * i + c] * places[joints * k + i];
+          change[c] += weighted[n * i + c] * apart.values[joints * k + i];
           for (int e = 0; e < n; e++) normal[n * c + e] += weighted[n * i + c] * by[n * i + e];
         }
     }

@@ -1,10 +1,11 @@
 """C text: whole stages of identification, as :mod:`.refining` has them in numpy, each one call."""
 
 STAGES = r"""
-/* How many numbers of memory a stage needs: covariances with their inverses, two answers, and observations
-   three times, which is more than any sum needs. */
+/* How many numbers of memory a stage needs: covariances with their inverses, two answers with what observations
+   say apart, and observations three times, which is more than any sum needs. */
 EXPORT int64_t memory_of(const Problem *p) {
-  return p->widths + 2 * answer_size(p) + p->count * (NOISE + 3 * OBSERVATION);
+  int64_t apart = p->joints * (1 + p->joints);
+  return p->widths + 2 * answer_size(p) + p->count * (NOISE + 2 * apart + 3 * OBSERVATION);
 }
 
 /* Every stage begins with the errors as they are, and with what is in its answer; returns free memory. */
@@ -15,55 +16,53 @@ static double *begin_stage(Problem *p, double *memory, double *answer, Answer *a
   return memory + NOISE * p->count;
 }
 
-/* As _settled in refining.py. */
-static void widen_until_settled(Problem *p, Answer *a, double *memory) {
-  int n = (int)p->joints;
-  double before[6], wide[6], *places = memory, *known = places + p->count * n;
-  int believed = a->head->marginal > 0.0;
+/* As _settled in refining.py; leaves what observations say alone in the end, and returns free memory. */
+static double *widen_until_settled(Problem *p, Answer *a, Apart *apart, double *memory) {
+  int n = (int)p->joints, believed = a->head->marginal > 0.0;
+  double before[6], *rest = memory;
   for (int i = 0; i < n; i++) before[i] = 1.0 / sqrt(a->head->belief.precision[i]);
-  for (int64_t turn = 0; turn < p->turns; turn++) {
-    double most = 0.0;
-    Belief *belief = &a->head->belief, found;
-    slide(p, a, memory);
-    alone(p, a, 1.0, places, known);
-    widths(p, places, known, wide, found.mean, known + p->count * n * n);
-    for (int i = 0; i < n; i++) {
-      wide[i] = fmax(wide[i], p->narrowest);
-      most = fmax(most, fabs(log(wide[i] / before[i])));
-    }
-    if (believed && most < p->settled) return;
+  for (int64_t turn = 0;; turn++) {
+    double most = 0.0, *wide = apart->deviations;
+    Belief *belief = &a->head->belief;
+    if (turn < p->turns) slide(p, a, memory);
+    rest = take_apart(p, a, 1.0, apart, memory);
+    for (int i = 0; i < n; i++) most = fmax(most, fabs(log(fmax(wide[i], p->narrowest) / before[i])));
+    if (turn == p->turns || (believed && most < p->settled)) return rest;
     believed = 1;
     a->head->marginal = 1.0;
     for (int i = 0; i < n; i++) {
-      before[i] = wide[i];
-      belief->mean[i] = found.mean[i];
-      belief->precision[i] = 1.0 / (wide[i] * wide[i]);
+      before[i] = fmax(wide[i], p->narrowest);
+      belief->mean[i] = apart->mean[i];
+      belief->precision[i] = 1.0 / (before[i] * before[i]);
     }
     go_on(p, a, memory);
     exchange(p, a, memory);
   }
 }
 
-/* As refined in refining.py. */
-static void refine_from(Problem *p, Answer *a, double *noise, double *memory) {
-  if (!p->joints || !size_of(p)) return;
-  Answer other;
-  double *rest = lay(p, memory, &other);
+/* As refined in refining.py; leaves and returns the same. */
+static double *refine_from(Problem *p, Answer *a, Apart *apart, double *noise, double *memory) {
   int narrowing = p->softer && !(a->head->marginal > 0.0);
-  if (narrowing) copy(p, a, &other);
-  widen_until_settled(p, a, rest);
-  if (!narrowing) return;
-  double information[UNKNOWNS * UNKNOWNS], *values = rest, *covariances = values + p->count * p->joints;
-  double *more = covariances + p->count * p->joints * p->joints;
+  Answer other;
+  Apart of_other;
+  if (!p->joints || !size_of(p)) return take_apart(p, a, 1.0, apart, memory);
+  if (narrowing) {
+    memory = lay(p, memory, &other);
+    copy(p, a, &other);
+  }
+  memory = widen_until_settled(p, a, apart, memory);
+  if (!narrowing) return memory;
+  double *rest = memory;
   for (int64_t level = 0; level <= p->softer; level++) {
     soften(p, level, noise);
-    go_on(p, &other, rest);
-    exchange(p, &other, rest);
-    widen_until_settled(p, &other, rest);
+    go_on(p, &other, memory);
+    exchange(p, &other, memory);
+    rest = widen_until_settled(p, &other, &of_other, memory);
   }
-  if (evidence(p, &other, 1.0, values, covariances, information, more) >
-      evidence(p, a, 1.0, values, covariances, information, more))
-    copy(p, &other, a);
+  if (log_evidence(p, &other, &of_other, rest) <= log_evidence(p, a, apart, rest)) return memory;
+  copy(p, &other, a);
+  *apart = of_other;
+  return rest;
 }
 
 /* As solve in solving.py. */
@@ -79,6 +78,7 @@ EXPORT void likeliest(const Problem *problem, int64_t starts, const Motion *moti
                       double *memory, double *answer) {
   Problem p = *problem;
   Answer a;
+  Apart apart;
   double *noise = memory;
   memory = begin_stage(&p, memory, answer, &a);
   soften(&p, 0, noise);
@@ -89,36 +89,44 @@ EXPORT void likeliest(const Problem *problem, int64_t starts, const Motion *moti
   }
   exchange(&p, &a, memory);
   slide(&p, &a, memory);
-  a.head->log_evidence = honest(&p, &a, memory);
+  memory = take_apart(&p, &a, 1.0, &apart, memory);
+  judge(&p, &a, &apart, memory);
 }
 
 /* As refined in refining.py. */
 EXPORT void refine(const Problem *problem, double *memory, double *answer) {
   Problem p = *problem;
   Answer a;
+  Apart apart;
   double *noise = memory;
   memory = begin_stage(&p, memory, answer, &a);
-  refine_from(&p, &a, noise, memory);
-  a.head->log_evidence = honest(&p, &a, memory);
+  memory = refine_from(&p, &a, &apart, noise, memory);
+  judge(&p, &a, &apart, memory);
 }
 
 /* As continued in refining.py. */
 EXPORT void carry_on(const Problem *problem, double *memory, double *answer) {
   Problem p = *problem;
   Answer a;
+  Apart apart;
   memory = begin_stage(&p, memory, answer, &a);
+  settle_new(&p, &a, memory);
   go_on(&p, &a, memory);
-  if (p.marginal) widen_until_settled(&p, &a, memory);
-  else slide(&p, &a, memory);
-  a.head->log_evidence = honest(&p, &a, memory);
+  if (!p.marginal) slide(&p, &a, memory);
+  memory = p.marginal ? widen_until_settled(&p, &a, &apart, memory) : take_apart(&p, &a, 1.0, &apart, memory);
+  judge(&p, &a, &apart, memory);
 }
 
 /* As evidence in evidence.py, for errors that are larger by several factors; the rest is for the last. */
 EXPORT void rate(const Problem *problem, int64_t scales, const double *scale, double *memory,
                  double *answer, double *logs, double *values, double *covariances, double *information) {
   Answer a;
+  Apart apart;
   lay(problem, answer, &a);
-  for (int64_t i = 0; i < scales; i++)
-    logs[i] = evidence(problem, &a, scale[i] * scale[i], values, covariances, information, memory);
+  for (int64_t i = 0; i < scales; i++) {
+    double factor = scale[i] * scale[i];
+    take_apart(problem, &a, factor, &apart, memory);
+    logs[i] = evidence(problem, &a, factor, &apart, values, covariances, information);
+  }
 }
 """

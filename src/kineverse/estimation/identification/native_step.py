@@ -5,7 +5,7 @@ static void advance(const Problem *p, const Motion *m, const double *step, Motio
   double l[6] = {0}, r[6] = {0}, turned[9], moved[3];
   for (int i = 0; i < p->lefts; i++) l[p->left[i]] = step[i];
   for (int i = 0; i < p->rights; i++) r[p->right[i]] = step[p->lefts + i];
-  to->pitch = m->pitch + (p->pitched ? step[p->lefts + p->rights] : 0.0);
+  to->pitch = m->pitch + (p->pitches ? step[p->lefts + p->rights] : 0.0);
   exponential(l + 3, turned);
   times33(m->left_R, turned, to->left_R);
   apply(m->left_R, l, moved);
@@ -90,7 +90,7 @@ static void believe(const Problem *p, const Motion *m, double *normal, double *r
       for (int l = 0; l < n; l++) normal[MOST * j + l] += scale * row[j] * row[l];
     }
   }
-  if (!p->pitched) return;
+  if (!p->pitches) return;
   scale = 1.0 / (p->pitch_scale * p->pitch_scale);
   right[n - 1] -= scale * m->pitch;
   normal[(MOST + 1) * (n - 1)] += scale;

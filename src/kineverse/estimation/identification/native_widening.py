@@ -103,7 +103,7 @@ FAST void widen(const Problem *p, const Motion *m, const Observation *o, const d
     for (int r = 0; r < 3; r++) slope += by_lever[r] * J[MOST * r];
     if (i < p->lefts && p->left[i] >= 3)
       for (int r = 0; r < 3; r++) slope += m->left_R[3 * r + p->left[i] - 3] * by_turn[r];
-    if (p->pitched && i == n - 1)
+    if (p->pitches && i == n - 1)
       for (int r = 0; r < 3; r++) slope += o->gains[r] * m->left_R[3 * r + 2];
     for (int j = 0; j < joints; j++)
       for (int r = 0; r < rows; r++) slope -= own[j] * o->gains[6 * j + r] * J[MOST * r];

@@ -1,11 +1,15 @@
 """C text: joint values of each observation alone, and how wide the motion is, as in :mod:`.widths`."""
 
 WIDTHS = r"""
-/* As alone in widths.py, for errors whose covariances are larger by a factor. Returns the logarithm of the
-   likelihood. */
-static double alone(const Problem *p, const Answer *a, double factor, double *values, double *covariances) {
+/* What observations say alone, and how wide the motion is, as Alone and Widths in widths.py. */
+typedef struct {
+  double *values, *covariances, log_likelihood, deviations[6], mean[6], log_density;
+} Apart;
+
+/* As alone in widths.py, for errors whose covariances are larger by a factor. */
+static void alone(const Problem *p, const Answer *a, double factor, Apart *apart) {
   int m = (int)p->rows, n = (int)p->joints;
-  double log_likelihood = 0.0;
+  double log_likelihood = 0.0, *values = apart->values, *covariances = apart->covariances;
   memcpy(values, a->values, p->count * n * sizeof(double));
   for (int64_t k = 0; k < p->count; k++) {
     const double *J = a->by_joints + m * n * k, *e = a->residuals + m * k;
@@ -39,7 +43,7 @@ static double alone(const Problem *p, const Answer *a, double factor, double *va
     /* |C| is one over the square of the root that is known. */
     log_likelihood -= 0.5 * squared(left, W, m) + log(root * known) + 0.5 * (m - n) * log(TAU);
   }
-  return log_likelihood;
+  apart->log_likelihood = log_likelihood;
 }
 
 /* Fold products of at most eight weights into a logarithm: so many are far from what a double can hold. */
@@ -111,10 +115,11 @@ FAST double widened(const double *covariance, int n, const double *deviations, d
   return invert(total, n, inverse);
 }
 
-/* As widths in widths.py. Returns the logarithm of the density. */
-static double widths(const Problem *p, const double *values, const double *covariances,
-                     double *deviations, double *mean, double *memory) {
+/* As widths in widths.py. */
+static void widths(const Problem *p, Apart *apart, double *memory) {
   int n = (int)p->joints;
+  const double *values = apart->values, *covariances = apart->covariances;
+  double *deviations = apart->deviations, *mean = apart->mean;
   int64_t count = p->count;
   double result = 0.0, normal[36] = {0}, right[6] = {0}, inverse[36], W[36];
   double *variances = memory + count * n, *logs = variances + count * n;
@@ -153,6 +158,17 @@ static double widths(const Problem *p, const double *values, const double *covar
     for (int i = 0; i < n; i++) off[i] = values[n * k + i] - mean[i];
     result -= 0.5 * squared(off, W, n) + log(root) + 0.5 * n * log(TAU);
   }
-  return result;
+  apart->log_density = result;
+}
+
+/* Both of them, in memory of their own; returns what is free behind it. */
+static double *take_apart(const Problem *p, const Answer *a, double factor, Apart *apart, double *memory) {
+  apart->values = memory;
+  apart->covariances = memory + p->count * p->joints;
+  memory = apart->covariances + p->count * p->joints * p->joints;
+  alone(p, a, factor, apart);
+  apart->log_density = 0.0;
+  if (p->joints) widths(p, apart, memory);
+  return memory;
 }
 """

@@ -11,13 +11,14 @@ What is here is for families of one's own, and for those of joints where there i
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from dataclasses import dataclass
+from typing import NamedTuple, Self
 
 import numpy as np
 
 from .evidence import evidence, overrated
 from .mirrored import straightened
-from .motion import Member
+from .motion import Linear, Member, Prior
 from .observations import Observations
 from .rigid import Array
 from .sliding import slid
@@ -28,6 +29,36 @@ TURNS = 8
 # A width that changes by less has settled.
 SETTLED = 0.01
 NARROWEST = 1e-4
+
+
+@dataclass(frozen=True)
+class Still:
+    """A member of a family that stays as it is: only joint values are unknown."""
+
+    motion: Member
+    size: int = 0
+
+    @property
+    def joints(self) -> int:
+        """Number of joint values."""
+        return self.motion.joints
+
+    def at(self, values: Array) -> Linear:
+        """Return the poses at joint values (N, k)."""
+        linear = self.motion.at(values)
+        return linear._replace(by_parameters=linear.by_parameters[:, :, :0])
+
+    def moved(self, step: Array) -> Self:
+        """Return itself, whatever the step."""
+        return self
+
+    def bounded(self, values: Array, step: Array) -> Array:
+        """Return joint values (N, k) after a step."""
+        return self.motion.bounded(values, step)
+
+    def prior(self) -> Prior:
+        """Return nothing."""
+        return Prior(np.zeros(0), np.zeros((0, 0)))
 
 
 class Rated(NamedTuple):
@@ -62,7 +93,7 @@ def refined(seen: Observations, solution: Solution[Member]) -> Rated:
     return _rated(max(result, solution, key=lambda each: evidence(each).log_evidence))
 
 
-def continued(seen: Observations, start: Start, parent: Array, belief: Belief) -> Rated:
+def continued(seen: Observations, start: Start, parent: Array, belief: Belief, known: int) -> Rated:
     """Return the solution from where it was, as it was: with joint values integrated out, or without.
 
     Parameters
@@ -71,8 +102,16 @@ def continued(seen: Observations, start: Start, parent: Array, belief: Belief) -
         What was observed.
     start, parent, belief
         Motion and joint values, true poses of the parent, and what was believed.
+    known
+        How many of the observations are not new. Where the new ones are is not known well, so they are first
+        brought to the motion as it was.
     """
-    solution = solve(seen, start.motion, start.values, parent, belief)
+    motion, values, parent = start.motion, start.values.copy(), parent.copy()
+    new = slice(known, len(seen))
+    if known < len(seen):
+        brought = solve(seen.at(new), Still(motion), values[new], parent[new], belief)
+        values[new], parent[new] = brought.values, brought.parent
+    solution = solve(seen, motion, values, parent, belief)
     return _rated(_settled(seen, solution) if belief.marginal else slid(solution))
 
 

@@ -32,8 +32,8 @@ M_co = TypeVar("M_co", bound=Motion, covariant=True)
 STEPS = 40
 # Of each of several starts, before the best of them goes on.
 FIRST_STEPS = 2
-# What the last step promises to reduce the cost by: a hundredth of a standard deviation is as near as widths
-# are known.
+# What one more step would reduce the cost by: a hundredth of a standard deviation is as near as widths are
+# known. Steps promise less by a factor each time, which is known after two of them.
 CLOSE = 1e-4
 _DIFFERENCE = 1e-5
 
@@ -154,7 +154,7 @@ def solve(
     """
     belief = belief or Belief.vague(motion.joints)
     point = _point(seen, motion, values, seen.parent if parent is None else parent, belief)
-    damping, converged = 0.0, False
+    damping, converged, before = 0.0, False, 0.0
     for _ in range(steps):
         reduced = _step(seen, point, damping, belief)
         if reduced is None:
@@ -164,8 +164,8 @@ def solve(
             continue
         trial, gain = reduced
         if trial.cost <= point.cost + 1e-12 * abs(point.cost):
-            converged = gain < CLOSE
-            point, damping = trial, 0.1 * damping if damping > 1e-6 else 0.0
+            converged = gain < CLOSE or gain * gain < CLOSE * before
+            point, damping, before = trial, 0.1 * damping if damping > 1e-6 else 0.0, gain
             if converged:
                 break
         else:
