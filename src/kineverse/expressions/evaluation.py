@@ -17,7 +17,7 @@ from kineverse.errors import ExpressionError, NameTakenError, UnknownNameError, 
 from kineverse.number import real_number
 
 from .expression import Expression
-from .lowering import lower
+from .lowering import dense_column
 
 
 def evaluate(
@@ -28,7 +28,8 @@ def evaluate(
     if by_name and isinstance(values, Mapping):
         values = {**values, **by_name}
     vector = assign(symbols, values, exact=False)
-    (column,) = lower([expression])
+    # Looking for common parts would take longer than computing them twice, once.
+    column = dense_column(expression)
     inputs = ca.vertcat(*(s._sx for s in symbols)) if symbols else ca.SX(0, 1)
     result = np.array(ca.Function("e", [inputs], [column])(vector)).reshape(expression.shape)
     if np.isnan(result).any():

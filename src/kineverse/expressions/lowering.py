@@ -40,9 +40,14 @@ def _lower(expression: Expression) -> None:
         expression._lowered = expression._sx
 
 
+def dense_column(expression: Expression) -> SX:
+    """Return an expression as one dense column of its elements in C order."""
+    return ca.densify(layout.column(lowered(expression), expression.shape))
+
+
 def lower(expressions: Sequence[Expression]) -> list[SX]:
     """Return each expression as one dense column of its elements in C order, common parts shared."""
-    columns = [ca.densify(layout.column(lowered(e), e.shape)) for e in expressions]
+    columns = [dense_column(e) for e in expressions]
     if not columns:
         return []
     return [ca.densify(c) for c in ca.vertsplit(ca.cse(ca.vertcat(*columns)), _offsets(columns))]
