@@ -77,11 +77,14 @@ def agree(one: kv.Model, other: kv.Model) -> None:
         twin = other.constraints[name]
         pairs += [(constraint.lower, twin.lower), (constraint.upper, twin.upper)]
         pairs += [(constraint.expression, twin.expression)]
+    entries = list(pairs)
     for a, b in pairs:
         assert a.symbols == b.symbols
-        np.testing.assert_allclose(a(at), b(at), rtol=1e-13, atol=1e-14)
         for heuristic in (True, False):
-            one_by_one, others = a.gradient(heuristic), b.gradient(heuristic)
-            assert set(one_by_one) == set(others)
-            for key, entry in one_by_one.items():
-                np.testing.assert_allclose(entry(at), others[key](at), rtol=1e-13, atol=1e-14)
+            ours, theirs = a.gradient(heuristic), b.gradient(heuristic)
+            assert set(ours) == set(theirs)
+            entries += [(entry, theirs[key]) for key, entry in ours.items()]
+    assert all(a.shape == b.shape for a, b in entries)
+    # All at once: an evaluation is a function of casadi's that has to be made.
+    wanted, found = (np.concatenate([e.ravel() for e in side])(at) for side in zip(*entries, strict=True))
+    np.testing.assert_allclose(found, wanted, rtol=1e-13, atol=1e-14)
