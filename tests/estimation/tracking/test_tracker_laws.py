@@ -284,6 +284,40 @@ def test_compiled_and_numpy_do_the_same():
 
 
 @pytest.mark.compiler
+@pytest.mark.parametrize("place", [0.3, 1.5])
+def test_compiled_and_numpy_do_the_same_to_what_moves_by_others_speeds(place):
+    model = kv.Model()
+    with model.edit() as edit:
+        edit.apply(kv.Floating(name="box", parent="world", child="box"))
+        edit.apply(kv.Revolute(name="lid", parent="box", child="lid", axis=(0, 1, 0), lower=-1.5, upper=1.5))
+        edit.apply(kv.Ball(name="ball", parent="lid", child="hook"))
+    eyes = Eyes(model, ["box", "lid", "hook"], 0.05, 0.05)
+    observed = [ObservedPose(f, covariance=eyes.covariance) for f in eyes.frames]
+    noise = dict.fromkeys(model.speeds, 0.001)
+    fast, slow = (Tracker(model, observed, process_noise=noise) for _ in range(2))
+    slow._filter.native = None
+    assert fast.wait()
+    turns = Rotation.random(2, random_state=0).as_quat()
+    truth = {"box/x": 0.5, "box/y": 1.0, "box/z": -2.0, "lid": place}
+    for name, turn in zip(("box", "ball"), turns, strict=True):
+        truth |= dict(zip((f"{name}/q{c}" for c in "xyzw"), turn, strict=True))
+    for step in range(5):
+        seen = eyes(truth)
+        native = fast._filter.native.update(fast._modes.best, fast._filter.reader.read(seen), np.empty(0))
+        assert native is not None
+        for a, b in [
+            (fast.update(seen), slow.update(seen)),
+            tuple(tracker.predict(0.1, {"box/wx:velocity": 4.0 * (step == 2)}) for tracker in (fast, slow)),
+        ]:
+            assert np.allclose(list(a.state.values()), list(b.state.values()), rtol=0, atol=1e-10)
+            assert np.allclose(
+                a.information, b.information, rtol=1e-8, atol=1e-8 * np.abs(a.information).max()
+            )
+            assert (a.nis, a.dof, a.rounds) == (pytest.approx(b.nis), b.dof, b.rounds)
+            assert fast.log_evidence == pytest.approx(slow.log_evidence)
+
+
+@pytest.mark.compiler
 def test_what_is_not_doubted_is_found_in_c_as_well():
     model = kv.load("kitchen")
     eyes = Eyes(model, [f for f in model.frames if model.speeds_of(f)][:12])

@@ -58,6 +58,15 @@ class Charted:
             )
         return found
 
+    def wait(self, timeout: float | None) -> None:
+        """Wait until steps run in compiled code."""
+        for motion in self._steps.values():
+            motion.wait(timeout)
+
+    def motion(self, number: int) -> Motion | None:
+        """Return how a group moves with its tangent; None if its coordinates are that."""
+        return self._steps.get(number)
+
     @property
     def is_driven(self) -> bool:
         """Whether some coordinates move by rates, and not by speeds of their own alone."""

@@ -31,6 +31,8 @@ from .standing import Memory
 from .undoubted import Undoubted
 
 _OUTSIDE = 1e-9
+# So few deviations from its mean a belief is about that, as after an update.
+_SETTLED = 1e-5
 
 
 @dataclass(slots=True, eq=False)
@@ -80,12 +82,14 @@ class Filter:
         self.reader = Reader(layout)
         self.solver = Solver(layout, self.residuals, self.charted, limits)
         self.openness = Openness(layout)
-        self.memory = Memory(layout, self.reader, self.openness, self._found)
+        self.memory = Memory(layout, self.reader, self.solver, self.openness, self._found)
         boxes = self.solver.boxes
         self.ridge = Ridge(layout, self.residuals, self.charted, self.reader, boxes, self.openness)
         self.likeness = Likeness(layout, self.residuals, self.reader, self.charted, self.ridge)
         self.saddles = Saddles(layout, self.charted, self.openness, boxes)
-        self.native = NativeSolver(layout, limits, self.function) if NativeSolver.suits(layout) else None
+        self.native = (
+            NativeSolver(layout, limits, self.function, self.charted) if NativeSolver.suits(layout) else None
+        )
         self.undoubted = Undoubted(layout, self.native, outliers) if self.native and outliers else None
         self.turns: frozenset[Symbol] = frozenset()
         if self.native:
@@ -206,9 +210,17 @@ class Filter:
         if found is None:
             found = belief.copy()
             self.charted.predict(found, known, dt, speeds, noise)
-            found = self.solver.inside(found, self.reader.nothing(), known)
+            if not self._is_at_top(found):
+                found = self.solver.inside(found, self.reader.nothing(), known)
         self._settle(found)
         return found
+
+    def _is_at_top(self, belief: Belief) -> bool:
+        """Whether a belief is about its own mean, inside limits that are easily looked at."""
+        limits = self.limits
+        if self.layout.limits or (belief.x < limits.lower).any() or (belief.x > limits.upper).any():
+            return False
+        return float(belief.vector @ np.linalg.solve(belief.information, belief.vector)) < _SETTLED**2
 
     def is_possible(self, number: int, belief: Belief, known: Array) -> bool:
         """Whether a group can be at a place: inside its limits, and where the model says something."""

@@ -47,6 +47,13 @@ class Group:
     driven: Indices
 
     @property
+    def own(self) -> Indices:
+        """Which of its coordinates each direction of its tangent is; -1 if none."""
+        speeds = [x.derivative() for x in self.coordinates]
+        driven = set(self.driven.tolist())
+        return np.array([-1 if k in driven else speeds.index(v) for k, v in enumerate(self.tangent)])
+
+    @property
     def by_speeds(self) -> bool:
         """Whether some of its coordinates move by such speeds."""
         return len(self.driven) > 0

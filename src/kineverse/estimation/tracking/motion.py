@@ -32,6 +32,11 @@ class Motion:
         The order of the speeds.
     known
         What is handed in.
+
+    Attributes
+    ----------
+    bends
+        Whether the rate of a coordinate with a speed changes on the way (n, m).
     """
 
     def __init__(
@@ -56,9 +61,20 @@ class Motion:
         after = q + (k1 + 2 * k2 + 2 * k3 + k4) / 6
         inputs = (*self.coordinates, *self.speeds, *known)
         # What moves at a constant rate needs no short steps, however far it goes.
-        self._bends = np.array([[v in row and bool(row[v].symbols) for v in speeds] for row in rows])
+        self.bends = np.array([[v in row and bool(row[v].symbols) for v in speeds] for row in rows])
         self._rates = compile(matrix, (*self.coordinates, *known))
         self._step = compile([after, after.partial(self.coordinates), after.partial(self.speeds)], inputs)
+
+    def wait(self, timeout: float | None) -> None:
+        """Wait until it runs in compiled code."""
+        self._rates.wait(timeout)
+        self._step.wait(timeout)
+
+    @property
+    def addresses(self) -> tuple[int, int] | None:
+        """Where the C of rates and steps is; None while there is none."""
+        rates, step = self._rates.address, self._step.address
+        return None if rates is None or step is None else (rates, step)
 
     def rates(self, q: Array, known: Array) -> Array:
         """Return R (n, m) at a place."""
@@ -73,7 +89,7 @@ class Motion:
         ValueRejectedError
             If it cannot be followed.
         """
-        largest = float((self._bends * np.abs(self.rates(q, known))).sum(axis=0) @ np.abs(speeds))
+        largest = float((self.bends * np.abs(self.rates(q, known))).sum(axis=0) @ np.abs(speeds))
         if not math.isfinite(largest) or largest > _MOST_STEPS * _LONGEST:
             names = ", ".join(map(str, self.coordinates))
             raise ValueRejectedError(f"{names} cannot be followed so far in one step.")

@@ -1,6 +1,6 @@
 """Updates in C, compiled in the background and kept like compiled functions.
 
-Until then, without a compiler, and where coordinates are driven or limits curved, numpy does the same.
+Until then, without a compiler, and where limits are curved, numpy does the same.
 """
 
 from __future__ import annotations
@@ -16,9 +16,12 @@ from kineverse.compile.source_library import SourceLibrary
 from kineverse.estimation.noise import Array
 
 from .belief import Belief, Indices
+from .charted import Charted
 from .layout import Layout
 from .limits import Limits
+from .native_motion import MOTION
 from .native_quadratic import QUADRATIC
+from .native_residual import RESIDUAL
 from .native_source import UPDATE
 from .reading import RIGID, Reading
 from .solving import Found
@@ -26,11 +29,12 @@ from .solving import Found
 # What the C has room for.
 _MOST_UNKNOWNS, _MOST_NUMBERS = 64, 64
 
-_COUNTS = ("observations", "groups", "coordinates")
+_COUNTS = ("observations", "groups", "coordinates", "directions", "known")
 _INDICES = (
-    "is_pose", "size", "value", "slope", "seen", "white", "first", "place", "first_watch", "watch",
+    "is_pose", "size", "value", "slope", "seen", "white",
+    "first", "place", "own", "first_x", "place_x", "first_watch", "watch", "rates", "step", "first_bend",
 )  # fmt: skip
-_NUMBERS = ("period", "lower", "upper", "input", "output", "work", "squares")
+_NUMBERS = ("bend", "period", "lower", "upper", "input", "output", "work", "squares")
 
 
 class _Problem(ctypes.Structure):
@@ -49,7 +53,7 @@ def _declare(code: Any) -> None:
     code.first_broken.restype = ctypes.c_int64
 
 
-native_library = SourceLibrary(QUADRATIC + UPDATE, _declare)
+native_library = SourceLibrary(QUADRATIC + MOTION + RESIDUAL + UPDATE, _declare)
 """The compiled update, once there is one; for all trackers of the process."""
 
 
@@ -60,13 +64,15 @@ class NativeSolver:
 
     Parameters
     ----------
-    layout, limits, function
+    layout, limits, function, charted
         The parts of a tracker.
     """
 
-    def __init__(self, layout: Layout, limits: Limits, function: CompiledFunction) -> None:
-        self._layout, self._limits, self._function = layout, limits, function
-        count, size = len(layout.groups), len(layout.chart.coordinates)
+    def __init__(self, layout: Layout, limits: Limits, function: CompiledFunction, charted: Charted) -> None:
+        self._layout, self._limits, self._function, self._charted = layout, limits, function, charted
+        count, size, directions = len(layout.groups), len(layout.chart.coordinates), len(layout.chart.tangent)
+        self._motions = [charted.motion(number) for number in range(count)]
+        bends = [np.empty(0) if motion is None else motion.bends.reshape(-1) for motion in self._motions]
         self._input = np.zeros(len(layout.inputs))
         self._size = size
         widths = [len(group.tangent) for group in layout.groups]
@@ -78,28 +84,41 @@ class NativeSolver:
             "seen": [where.start for where in layout.seen_slices],
             "white": [where.start for where in layout.white_slices],
             "first": np.cumsum([0, *widths]),
-            "place": np.concatenate([group.x for group in layout.groups]),
+            "place": np.concatenate([group.t for group in layout.groups]),
+            "own": np.concatenate([group.own for group in layout.groups]),
+            "first_x": np.cumsum([0, *(len(group.x) for group in layout.groups)]),
+            "place_x": np.concatenate([group.x for group in layout.groups]),
             "first_watch": np.cumsum([0, *(len(group.seen) for group in layout.groups)]),
             "watch": [i for group in layout.groups for i in group.seen],
+            "rates": np.zeros(count),
+            "step": np.zeros(count),
+            "first_bend": np.cumsum([0, *map(len, bends)]),
         }
         self._indices: dict[str, Indices] = {name: np.array(v, dtype=np.int64) for name, v in kept.items()}
         self._squares = np.zeros(len(layout.observations))
         self._numbers = {
+            "bend": np.concatenate(bends).astype(np.float64),
             "period": np.array([one.period for one in layout.observations]),
             "lower": limits.lower,
             "upper": limits.upper,
             "input": self._input,
             "output": np.zeros(function.shapes[0]),
-            "work": np.zeros(sum(5 * w + w * w for w in widths)),
+            "work": np.zeros(sum(3 * len(g.t) + 3 * len(g.t) ** 2 + 2 * len(g.x) for g in layout.groups)),
             "squares": self._squares,
         }
-        self._problem = _Problem(observations=len(layout.observations), groups=count, coordinates=size)
+        self._problem = _Problem(
+            observations=len(layout.observations),
+            groups=count,
+            coordinates=size,
+            directions=directions,
+            known=len(layout.known),
+        )
         for name, array in (*self._indices.items(), *self._numbers.items()):
             setattr(self._problem, name, array.ctypes.data)
         self._results = np.zeros((2, count))
         self._motion = np.zeros((2, size))
         # Buffers that stay where they are: asking an array for its address takes longer than copying it.
-        self._belief = np.zeros(Belief((size, size, count)).numbers.shape)
+        self._belief = np.zeros(Belief((size, directions, count)).numbers.shape)
         self._reading = Reading(
             np.zeros(layout.seen_slices[-1].stop),
             np.zeros(len(layout.observations), dtype=bool),
@@ -115,24 +134,29 @@ class NativeSolver:
 
     def __reduce__(self) -> Any:
         # Addresses mean something in this process only.
-        return NativeSolver, (self._layout, self._limits, self._function)
+        return NativeSolver, (self._layout, self._limits, self._function, self._charted)
 
     @staticmethod
     def suits(layout: Layout) -> bool:
-        """Whether C can do it: coordinates that are their own tangent, limits of single ones."""
+        """Whether C can do it: limits of single coordinates only, and not too many of anything."""
         return (
-            tuple(x.derivative() for x in layout.chart.coordinates) == layout.chart.tangent
-            and not layout.limits
-            and all(len(group.tangent) <= _MOST_UNKNOWNS for group in layout.groups)
+            not layout.limits
+            and all(max(len(group.x), len(group.t)) <= _MOST_UNKNOWNS for group in layout.groups)
             and all(one.size <= _MOST_NUMBERS for one in layout.observations)
         )
 
     @property
     def is_ready(self) -> bool:
-        """Whether both the update and the model are compiled."""
+        """Whether the update, the model and how it moves are compiled."""
         if native_library.code is None or self._function.address is None:
             return False
         self._problem.compute = self._function.address
+        for number, motion in enumerate(self._motions):
+            if motion is not None:
+                addresses = motion.addresses
+                if addresses is None:
+                    return False
+                self._indices["rates"][number], self._indices["step"][number] = addresses
         return True
 
     def update(self, belief: Belief, reading: Reading, known: Array) -> Found | None:

@@ -24,7 +24,7 @@ from .layout import Layout
 from .observed import Observation, nearest
 from .openness import Openness
 from .reading import Reader, Reading, whitening
-from .solving import Found
+from .solving import Found, Solver
 
 Update: TypeAlias = Callable[[Belief, Reading, Array, list[int]], Found]
 
@@ -122,14 +122,17 @@ class Memory:
 
     Parameters
     ----------
-    layout, reader, openness
+    layout, reader, solver, openness
         The parts of a tracker.
     update
-        What makes of a belief, a reading, values of what is known and numbers of groups another belief.
+        What does the same as the solver, and faster where it can.
     """
 
-    def __init__(self, layout: Layout, reader: Reader, openness: Openness, update: Update) -> None:
-        self._layout, self._reader, self._openness, self._update = layout, reader, openness, update
+    def __init__(
+        self, layout: Layout, reader: Reader, solver: Solver, openness: Openness, update: Update
+    ) -> None:
+        self._layout, self._reader, self._solver, self._openness = layout, reader, solver, openness
+        self._update = update
         # A single coordinate has no other that it could move with.
         self._groups = {number for number, group in enumerate(layout.groups) if len(group.t) > 1}
 
@@ -170,8 +173,10 @@ class Memory:
                 evidence = float(before.evidence[number])
                 first = Standing(before.part(group.t), MappingProxyType({}), known, evidence)
                 standing = first.with_seen(new, self._layout.observations)
-                after.standing[number] = replace(standing, prior=self._prior(number, before, found))
-                continue
+                if found.priors is not None or not group.by_speeds:
+                    after.standing[number] = replace(standing, prior=self._prior(number, before, found))
+                    continue
+                old = first
             standing = old.with_seen(new, self._layout.observations)
             self._solve(number, before, after, standing, are_all_right=weights is None)
             # What was never seen yet may still say that all was taken for its mirror image.
@@ -197,7 +202,9 @@ class Memory:
         first.put(group.t, standing.prior)
         first.evidence[number] = standing.evidence
         reading = standing.reading(self._layout, self._reader)
-        found = self._update(first, reading, standing.known, [number])
+        # How a tangent turns on the way, C does not tell.
+        update = self._solver.update if group.by_speeds else self._update
+        found = update(first, reading, standing.known, [number])
         after.x[group.x] = found.belief.x[group.x]
         after.put(group.t, found.belief.part(group.t))
         if are_all_right:

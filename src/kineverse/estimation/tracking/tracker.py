@@ -271,6 +271,7 @@ class Tracker:
         if self._filter.native is None:
             return False
         self._filter.function.wait(timeout)
+        self._filter.charted.wait(timeout)
         native_library.prepare(wait=True)
         return self._filter.is_native
 
