@@ -258,6 +258,25 @@ def test_what_cannot_be_is_answered_in_a_line(rows, words, says, tmp_path, capsy
     assert error.count("\n") == 1
 
 
+@pytest.mark.parametrize(("count", "told"), [(300, True), (12, False)])
+def test_turns_are_counted_by_the_times(tmp_path, capsys, count, told):
+    """A wheel of five turns, whose errors are alike for long: as many rows are judged as it takes to count."""
+    rng = np.random.default_rng(5)
+    seen = noisy(hinge(np.linspace(0.0, 10 * math.pi, count)), rng)
+    seen[:, 0, 3] += 0.006 * np.sin(np.linspace(0, 4, count))
+    words = [write(tmp_path / "poses.csv", {"wheel": seen}), "--families", "prismatic,revolute,screw"]
+    main(["fit", *words, "--json"])
+    found = json.loads(capsys.readouterr().out)
+    assert found["family"] == "revolute"
+    (ends,) = found["fits"][0]["ranges"]
+    main(["fit", *words])
+    out = capsys.readouterr().out
+    assert ("it may be more turns, or fewer" in out) is not told
+    if told:
+        assert ends["upper"] - ends["lower"] == pytest.approx(10 * math.pi, abs=0.2)
+        assert 16 <= found["judged"] < 60
+
+
 def test_a_slow_error_is_no_screw(capsys):
     """What a hand does while it opens a microwave is off a circle for seconds, which says little however often seen."""
     handle = TRACKS / "microwave" / "microwave1.log"

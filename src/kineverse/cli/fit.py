@@ -45,6 +45,9 @@ examples:
 
 UNDECIDED = 1
 
+MOST_TURNED = 2.0
+"""Turns are counted where it turns by no more than this from one pose to the next [rad]."""
+
 
 @dataclass(frozen=True)
 class Noise:
@@ -190,14 +193,14 @@ def fitted(
     from kineverse.estimation.recording import evenly
 
     found, noise = learn(pair, stated, families)
-    count = telling(found, len(pair.lines)) if thins else len(pair.lines)
+    count = telling(found, pair) if thins else len(pair.lines)
     if count == len(pair.lines):
         return Learned(found, noise, count, found.best)
     judged = evenly(len(pair.lines), count)
     found, noise = learn(pair.at(judged), stated, families)
     covariance = covariance_of(noise.position, noise.orientation)
     seen = observations(pair.parent_poses, pair.child_poses, covariance, covariance)
-    fit = completed(found.best, seen, judged, outliers=Outliers(), stated=noise.given)
+    fit = completed(found.best, seen, judged, outliers=Outliers(), stated=noise.given, ordered=pair.timed)
     return Learned(found, noise, count, fit)
 
 
@@ -218,7 +221,14 @@ def learn(pair: Pair, stated: tuple[float, float | None] | None, families: str |
         raise ValueRejectedError("--noise: poses have two, of positions and orientations: 3mm,1deg")
     chosen = None if families is None else [name.strip() for name in families.split(",")]
     covariance = None if stated is None else covariance_of(*stated)
-    found = identify(pair.parent_poses, pair.child_poses, noise=covariance, families=chosen, outliers=True)
+    found = identify(
+        pair.parent_poses,
+        pair.child_poses,
+        noise=covariance,
+        families=chosen,
+        outliers=True,
+        ordered=pair.timed,
+    )
     position, orientation = stated or (found.noise_scale * one for one in UNKNOWN_NOISE)
     return found, Noise(position, orientation if pair.is_whole else None, stated is not None)
 
@@ -230,17 +240,22 @@ def covariance_of(position: float, orientation: float | None) -> Array:
     return pose_covariance(position, orientation or 1.0)
 
 
-def telling(found: Found, count: int) -> int:
+def telling(found: Found, pair: Pair) -> int:
     """Return how many of the poses tell something of their own, by what the best joint leaves of them."""
-    from kineverse.estimation.recording import independent_count
+    from kineverse.estimation.recording import evenly, independent_count
 
+    count = len(pair.lines)
     # What is free leaves nothing.
     fit = next((fit for fit in found if fit.family != "free"), None)
     if fit is None:
         return count
     # As many more as are wrong and tell nothing.
     right = len(fit.right)
-    return min(count, round(independent_count(fit.residuals[fit.right]) * count / right))
+    judged = min(count, round(independent_count(fit.residuals[fit.right]) * count / right))
+    # And enough to count turns.
+    while pair.timed and judged < count and fit.at(evenly(count, judged)).turned > MOST_TURNED:
+        judged += 1
+    return judged
 
 
 def write(arguments: argparse.Namespace, pair: Pair, learned: Learned) -> dict[str, Any]:

@@ -37,6 +37,7 @@ def as_text(source: str, pair: Pair, learned: Learned) -> str:
         said,
         *(f"  {name:10}{value}" for name, value in _parts(best)),
         *_misfits(best.outlying, count, what),
+        *_turned(best, pair),
         "",
         *_ranking(found),
     ]
@@ -105,6 +106,16 @@ def _misfits(outliers: Sequence[int], count: int, what: str) -> list[str]:
     more = ", …" if len(outliers) > _LISTED else ""
     do = "does" if len(outliers) == 1 else "do"
     return [f"  {len(outliers)} of {count} {what} {do} not fit: {numbers}{more} (counted from 0)"]
+
+
+def _turned(fit: Fit, pair: Pair) -> list[str]:
+    """Return that turns may have been counted wrongly."""
+    from kineverse.cli.fit import MOST_TURNED
+
+    if not pair.timed or fit.turned < MOST_TURNED:
+        return []
+    most = figure(math.degrees(fit.turned), 3)
+    return [f"  from one to the next it turns by up to {most} deg: it may be more turns, or fewer"]
 
 
 def ranges(fit: Fit) -> list[tuple[float, float, float, bool]]:

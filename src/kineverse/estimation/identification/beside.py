@@ -18,6 +18,7 @@ from .observations import Observations
 from .outlying import UNEVEN, is_right
 from .rigid import Array
 from .solving import Solution, solve
+from .turning import turning_joint
 
 
 @dataclass(frozen=True)
@@ -51,14 +52,21 @@ class Known:
         return Prior(np.zeros(0), np.zeros((0, 0)))
 
 
-def beside(motion: Motion, values: Array, seen: Observations) -> Solution[Known]:
+def beside(
+    motion: Motion, values: Array, seen: Observations, expected: Array | None = None
+) -> Solution[Known]:
     """Return the most likely joint values of a motion at observations that it need not be made of.
 
-    They begin at the nearest of some values, (N, k).
+    They begin at the nearest of some values, (N, k); what turns about an axis, at that of its turns which is
+    nearest to what is expected, if something is.
     """
     poses = motion.at(values).pose
     apart = np.sum((seen.relative[:, None] - poses[None])[:, :, :3] ** 2, axis=(2, 3))
-    return solve(seen, Known(motion), values[np.argmin(apart, axis=1)])
+    begin = values[np.argmin(apart, axis=1)]
+    joint = turning_joint(motion)
+    if expected is not None and joint is not None:
+        begin[:, joint] += math.tau * np.round((expected - begin[:, joint]) / math.tau)
+    return solve(seen, Known(motion), begin)
 
 
 def squared_errors(solution: Solution[Known]) -> Array:
@@ -75,6 +83,7 @@ def completed(
     scale: float = 1.0,
     outliers: Outliers | None = None,
     stated: bool = True,
+    ordered: bool = False,
 ) -> Fit:
     """Return a fit of some observations with the joint values of all, and which of the others are wrong.
 
@@ -92,11 +101,16 @@ def completed(
         How often the others are wrong; all of them are if None.
     stated
         Whether the size of the noise is known.
+    ordered
+        Whether turns were counted.
     """
     others: npt.NDArray[np.int_] = np.setdiff1d(np.arange(len(seen)), used)
     if not len(others):
         return fit
-    solution = beside(fit.motion, fit.joint_values, seen.at(others))
+    expected, joint = None, turning_joint(fit.motion)
+    if ordered and joint is not None:
+        expected = np.interp(others, used[fit.right], fit.joint_values[fit.right, joint])
+    solution = beside(fit.motion, fit.joint_values, seen.at(others), expected)
     by_joints = solution.linear.by_joints
     information = np.swapaxes(by_joints, 1, 2) @ inverted(solution.covariance) @ by_joints
     # Half a turn is as little as can be known of a turn that moves nothing.

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, field
-from typing import Any, NamedTuple
+from dataclasses import dataclass, field, replace
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 import numpy.typing as npt
@@ -16,6 +16,7 @@ from kineverse.model.operation import Operation
 from .groups import GroupMotion
 from .operations import joint_operation
 from .rigid import Array
+from .turning import turning_joint
 
 SURE = 0.95
 """From this probability on, a family is called the right one."""
@@ -104,6 +105,25 @@ class Fit:
         """What is left of positions [m] and orientations [rad], root mean square over what is right."""
         squares = np.mean(self.residuals[self.right] ** 2, axis=0)
         return math.sqrt(float(squares[:3].sum())), math.sqrt(float(squares[3:].sum()))
+
+    def at(self, rows: npt.NDArray[np.int_]) -> Self:
+        """Return the fit with some of its observations."""
+        return replace(
+            self,
+            joint_values=self.joint_values[rows],
+            deviations=self.deviations[rows],
+            residuals=self.residuals[rows],
+            outlying=tuple(np.flatnonzero(np.isin(rows, self.outlying)).tolist()),
+        )
+
+    @property
+    def turned(self) -> float:
+        """The most that it turned about its axis from one observation to the next [rad].
+
+        Where turns were counted and this is not well below half a turn, they may be more, or fewer.
+        """
+        joint = turning_joint(self.motion)
+        return 0.0 if joint is None else float(np.abs(np.diff(self.joint_values[self.right, joint])).max())
 
     def deviation(self, coordinate: str) -> float:
         """Return the standard deviation of a coordinate.

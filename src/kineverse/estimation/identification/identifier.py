@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import numpy.typing as npt
 
@@ -29,6 +31,7 @@ from .outlying import Rows
 from .refining import Rated
 from .rigid import Array
 from .solving import Solution, Start
+from .turning import is_screw
 
 # A family that is less probable than this rests until there are twice as many observations.
 _NO_CHANCE = 1e-6
@@ -48,6 +51,8 @@ class Identifier:
     families, noise, outliers
         As for :func:`.identify.identify`. A pose is taken for wrong as it comes, and perhaps for right when
         there are twice as many.
+    ordered
+        Whether poses come in the order in which they were seen, see :func:`.identify.identify`.
 
     Raises
     ------
@@ -63,7 +68,9 @@ class Identifier:
         families: Families = None,
         noise: npt.ArrayLike | None = None,
         outliers: Outliers | bool | None = None,
+        ordered: bool = True,
     ) -> None:
+        self._ordered = ordered
         self._outliers = as_outliers(outliers)
         self._weights = family_weights(families)
         self._noise = covariance_a, covariance_b, noise
@@ -132,14 +139,14 @@ class Identifier:
         seen = _joined(self._seen)
         if len(seen) >= 2 * self._whole:
             self._whole = len(seen)
-            sight = sight_of(seen, self._stated, self._outliers)
+            sight = sight_of(seen, self._stated, self._outliers, self._ordered)
             self._unit = sight.unit
             known = explained(sight, self._weights)
         else:
-            sight = sight_of(seen, self._stated, self._outliers, self._unit)
+            sight = sight_of(seen, self._stated, self._outliers, self._ordered, self._unit)
             right = {name: _right(sight, one, self._scale) for name, one in self._known.items()}
             found = {
-                name: _continued(sight.seen.at(right[name]), one.known.solution)
+                name: _continued(sight.seen.at(right[name]), one.known.solution, self._ordered)
                 for name, one in self._known.items()
             }
             known = explained_by(sight, found, right, self._weights)
@@ -160,14 +167,17 @@ def _joined(parts: list[Observations]) -> Observations:
     )
 
 
-def _continued(seen: Observations, before: Solution[Member]) -> Rated:
+def _continued(seen: Observations, before: Solution[Member], ordered: bool) -> Rated:
     """Return the solution of a family for more observations than it was found from."""
     known = len(before.values)
     values: list[Array] = [before.values]
     for k in range(known, len(seen)):
         # The new joint value is near that of the observation that looks most alike.
         apart = np.sum((seen.relative[:known] - seen.relative[k]) ** 2, axis=(1, 2))
-        values.append(before.values[int(np.argmin(apart))][None])
+        near = before.values[int(np.argmin(apart))][None]
+        if ordered and is_screw(before.motion):
+            near = near + math.tau * np.round((values[-1][-1] - near) / math.tau)
+        values.append(near)
     parent = np.concatenate([before.parent, seen.parent[known:]])
     return solver.continued(seen, Start(before.motion, np.concatenate(values)), parent, before.belief, known)
 

@@ -29,6 +29,7 @@ from .reporting import fit_of
 from .rigid import Array
 from .solving import Start
 from .starts import Overview, starts
+from .turning import counted, counted_start, log_counting
 
 Families: TypeAlias = "Iterable[str | Family] | Mapping[str | Family, float] | str | Family | None"
 """Families by name or of one's own; a mapping says how probable they are beforehand."""
@@ -68,6 +69,7 @@ def identify(
     families: Families = None,
     noise: npt.ArrayLike | None = None,
     outliers: Outliers | bool | None = None,
+    ordered: bool = False,
 ) -> Found:
     """Return how part b moves against part a, judged by poses of both that were observed with noise.
 
@@ -89,6 +91,9 @@ def identify(
     outliers
         Whether some observations may be wrong altogether: True for the usual :class:`.Outliers`, of which as
         many may be wrong as are not quite half.
+    ordered
+        Whether observations are in the order in which they were seen, with less than half a turn from one to
+        the next: then turns are counted, see :mod:`.turning`.
 
     Raises
     ------
@@ -100,7 +105,7 @@ def identify(
     weights = family_weights(families)
     of_a, of_b, stated = noise_of(a is not None, covariance_a, covariance_b, noise)
     seen = observations(a, b, of_a, of_b)
-    sight = sight_of(seen, stated, as_outliers(outliers))
+    sight = sight_of(seen, stated, as_outliers(outliers), ordered)
     return weighed(sight, explained(sight, weights), weights)
 
 
@@ -172,12 +177,15 @@ class Sight:
         Whether the size of the noise is known.
     outliers
         How often observations are wrong, and where they are then, with lengths in the unit; None if never.
+    ordered
+        Whether they are in the order in which they were seen.
     """
 
     seen: Observations
     unit: float
     stated: bool
     outliers: Outliers | None
+    ordered: bool
 
 
 @dataclass(frozen=True)
@@ -191,7 +199,8 @@ class Explained:
     right, count
         Their numbers, and the number of all.
     log_belief
-        The logarithm of the probability that these are right, and the density of the others.
+        What is added to the logarithm of the evidence: the probability that these are right, the density of
+        the others, and that turns were counted.
     """
 
     known: Rated
@@ -200,12 +209,14 @@ class Explained:
     log_belief: float
 
 
-def sight_of(seen: Observations, stated: bool, outliers: Outliers | None, unit: float | None = None) -> Sight:
+def sight_of(
+    seen: Observations, stated: bool, outliers: Outliers | None, ordered: bool, unit: float | None = None
+) -> Sight:
     """Return observations in a unit of length [m]; the ordinary one of these if None."""
     unit = unit_of(seen) if unit is None else unit
     if outliers is not None and outliers != Outliers():
         outliers = replace(outliers, reach=outliers.reach / unit)
-    return Sight(in_units(seen, unit), unit, stated, outliers)
+    return Sight(in_units(seen, unit), unit, stated, outliers, ordered)
 
 
 def explained(sight: Sight, weights: Mapping[str | Family, float]) -> dict[str | Family, Explained]:
@@ -221,6 +232,8 @@ def explained(sight: Sight, weights: Mapping[str | Family, float]) -> dict[str |
         right = right_rows(seen, found, sight.outliers, sight.stated, by)
         some = {name: rows for name, rows in right.items() if len(rows) < count}
         found |= {name: by(seen.at(rows), name) for name, rows in some.items()}
+    if sight.ordered:
+        found = {name: _counted(seen.at(right[name]), known) for name, known in found.items()}
     return explained_by(sight, found, right, weights)
 
 
@@ -236,8 +249,16 @@ def explained_by(
     beliefs = dict.fromkeys(found, 0.0)
     if outliers is not None:
         beliefs = {name: log_belief(outliers, count, len(some), seen.rows) for name, some in by.items()}
+    if sight.ordered:
+        beliefs = {name: beliefs[name] + log_counting(known.solution) for name, known in found.items()}
     known = judged(by, found, {name: math.log(weights[name]) + beliefs[name] for name in found})
     return {name: Explained(one, right[name], count, beliefs[name]) for name, one in known.items()}
+
+
+def _counted(seen: Observations, known: Rated) -> Rated:
+    """Return what was found, a screw as one that goes round as often as the observations do."""
+    start = counted_start(seen, known.solution)
+    return known if start is None else solver.likeliest(seen, [start])
 
 
 def solutions(
@@ -303,6 +324,6 @@ def weighed(
 
 
 def _fit(sight: Sight, one: Explained, scale: float, log_evidence: float, probability: float) -> Fit:
-    solution = canonical(one.known.solution)
+    solution = canonical(counted(one.known.solution) if sight.ordered else one.known.solution)
     fit = fit_of(solution, solver.evidence(solution, scale), log_evidence, probability)
-    return in_metres(completed(fit, sight.seen, one.right, scale), sight.unit)
+    return in_metres(completed(fit, sight.seen, one.right, scale, ordered=sight.ordered), sight.unit)

@@ -66,6 +66,8 @@ class Pair:
         (N,) where the child's are in the file.
     alone
         How often one of them was seen without the other.
+    timed
+        Whether they are in the order of their times.
     """
 
     parent: str
@@ -74,6 +76,7 @@ class Pair:
     child_poses: Array
     lines: Indices
     alone: int = 0
+    timed: bool = False
 
     @property
     def is_whole(self) -> bool:
@@ -159,7 +162,7 @@ class Recording:
             )
         name = child or "part"
         if parent == WORLD and WORLD not in self.tracks:
-            return Pair(parent, name, None, track.poses, track.lines)
+            return Pair(parent, name, None, track.poses, track.lines, timed=track.times is not None)
         return self._together(parent, name, self._track(parent), track)
 
     def _track(self, name: str) -> Track:
@@ -189,7 +192,7 @@ class Recording:
                 "a pose of both with the same time is expected."
             )
         alone = len(a) + len(b) - 2 * len(of_a)
-        return Pair(parent, child, a.poses[of_a], b.poses[of_b], b.lines[of_b], alone)
+        return Pair(parent, child, a.poses[of_a], b.poses[of_b], b.lines[of_b], alone, timed)
 
 
 def _listed(names: list[str]) -> str:
