@@ -28,8 +28,8 @@ def credible(left: Misfit, outliers: Outliers | None) -> Rows:
     if outliers is None or not len(left):
         return everything
     squares = np.sum(left.normal**2, axis=1)
-    if left.beyond.size:
-        squares = squares + np.maximum(left.beyond, 0.0).max(axis=1) ** 2
+    if left.against.size:
+        squares = squares + np.fmax(left.against, 0.0).max(axis=1) ** 2
     log_scale = left.log_scale + 0.5 * np.linalg.slogdet(2.0 * np.pi * left.covariances)[1]
     right = everything[is_right(squares, log_scale, outliers)]
     # More than chance makes of their fraction are no outliers, but something that is not understood.

@@ -26,8 +26,8 @@ _erf = np.vectorize(math.erf, otypes=[np.float64])
 def log_evidence(served: Served, seen: Misfit, still: bool = False) -> float:
     """Return the logarithm of the density of the observed relative poses, with joint values integrated out.
 
-    Limits cut off what is drawn only where there is one joint value. What is beyond those of several is less
-    probable by its distance.
+    Limits cut off what is drawn only where there is one joint value. What is beyond those of several, or
+    beyond ties, is less probable by its distance.
 
     Parameters
     ----------
@@ -37,6 +37,10 @@ def log_evidence(served: Served, seen: Misfit, still: bool = False) -> float:
         Whether it is taken as not moving, somewhere within its limits.
     """
     log = -float(np.sum(0.5 * np.sum(seen.normal**2, axis=1) + seen.log_scale))
+    log -= 0.5 * float(np.nansum(np.maximum(seen.tied, 0.0) ** 2))
+    # What others say of a coordinate differs by 1 on average if the model is right.
+    told = np.isfinite(seen.apart)
+    log -= 0.5 * float(np.maximum(np.nansum(seen.apart**2, axis=0) - told.sum(axis=0), 0.0).sum())
     widths = _STILL if still else _WIDTHS
     if served.joints == 1:
         lower, upper = float(served.lower[0]), float(served.upper[0])

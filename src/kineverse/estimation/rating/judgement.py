@@ -19,10 +19,11 @@ from kineverse.model.model import Model
 from kineverse.model.operation import Operation
 
 from .astray import agreeing, credible
+from .before import follows_another
 from .earlier import explained
 from .evidence import log_elsewhere, log_evidence
 from .links import Link
-from .misfit import Misfit
+from .misfit import Misfit, misfit
 from .proposal import proposal
 from .report import Rating
 from .served import Served
@@ -125,10 +126,29 @@ def _proposed(model: Model, seen: Seen, since: Seen, instead: Found | None) -> t
         return None, "it was seen too seldom since to say what it is instead"
     if not instead.best.told:
         return None, f"what it is instead is not known yet, {instead}"
+    if not follows_another(model, seen.link) and _stands_alone(model, since, instead):
+        # Another joint in its place would not help.
+        return None, "by itself it explains what is seen, but not together with what limits or moves it"
     try:
         used = np.searchsorted(seen.times, since.times)
         rows, fit = explained(instead.best, seen.observations, used)
         coordinates = seen.served.beyond_limits(seen.observations, seen.misfit.coordinates)[rows]
-        return proposal(model, seen.link, seen.served, coordinates, fit), ""
+        operation = proposal(model, seen.link, seen.served, coordinates, seen.misfit.others[rows], fit)
     except KineverseError as error:
         return None, f"what it is instead is no operation. {error}"
+    try:
+        with model.copy().edit() as edit:
+            edit.replace(seen.link.tag, operation)
+    except KineverseError as error:
+        return None, f"what it is instead cannot take its place. {error}"
+    return operation, ""
+
+
+def _stands_alone(model: Model, seen: Seen, instead: Found) -> bool:
+    """Whether an articulation explains what is seen without its ties to others, and with loops opened."""
+    if not (seen.misfit.tied.size or seen.misfit.apart.size):
+        return False
+    served = Served(model, seen.link.child, seen.link.parent, opened=True)
+    left = misfit(served, seen.observations)
+    alone = _probabilities(Seen(seen.link, served, seen.observations, left, seen.times), instead)
+    return alone["served"] >= SURE

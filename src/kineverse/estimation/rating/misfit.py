@@ -54,6 +54,13 @@ class Misfit:
     log_scale
         ½ log |2πS| of each observation less ½ log |2πC| of its joint values: with ½ |ρ|², what is left when
         joint values are integrated out, (N,).
+    tied
+        How far values are beyond limits that depend on several coordinates, in standard deviations; NaN where
+        that is not known, (N, c).
+    apart
+        How far values differ from what others say of the same coordinates, likewise, (N, e).
+    others
+        What these say, (N, e). See :mod:`.ties`, which fills the last three in.
     """
 
     coordinates: Array
@@ -64,9 +71,17 @@ class Misfit:
     beyond: Array
     residuals: Array
     log_scale: Array
+    tied: Array
+    apart: Array
+    others: Array
 
     def __len__(self) -> int:
         return len(self.normal)
+
+    @property
+    def against(self) -> Array:
+        """Everything that is beyond something, in standard deviations, (N, 2 k + c + 2 e)."""
+        return np.concatenate([self.beyond, self.tied, self.apart, -self.apart], axis=1)
 
     def at(self, rows: slice | npt.NDArray[np.int_]) -> Self:
         """Return the misfit of some of the observations."""
@@ -101,6 +116,7 @@ def misfit(served: Served, seen: Observations) -> Misfit:
         beyond / np.tile(deviations, (1, 2)),
         solution.residuals,
         0.5 * (_log_determinants(solution.covariance) - _log_determinants(covariances)),
+        *(np.zeros((len(seen), 0)) for _ in range(3)),
     )
 
 

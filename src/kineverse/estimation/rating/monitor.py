@@ -10,6 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from kineverse.errors import KineverseError, ShapeError, UnknownNameError, suggest
+from kineverse.estimation.identification.observations import Observations
 from kineverse.estimation.identification.pairs import Families
 from kineverse.estimation.identification.rigid import Array
 from kineverse.estimation.identification.tracks import Poses, Track, between, exactly, joined, tracks
@@ -19,10 +20,11 @@ from kineverse.model.model import Model
 
 from .judgement import Seen, judged
 from .links import Link, Links, find_links
-from .misfit import misfit
+from .misfit import Misfit, misfit
 from .plausibility import FALSE_ALARMS, check_false_alarms, untold
 from .report import Plausibility, Rating
 from .served import Served
+from .ties import Ties, Told
 from .watch import Watch
 
 
@@ -87,6 +89,7 @@ class PlausibilityMonitor:
         self._kept: deque[dict[str, Track]] = deque(maxlen=keep)
         self._watched: list[_Watched] = []
         self._links = Links((), {})
+        self._ties = Ties(model, {}, relative_to)
         self._look()
 
     @property
@@ -123,8 +126,7 @@ class PlausibilityMonitor:
         if self._relative_to is not None:
             seen[self._relative_to] = exactly(1)
         before = set(self.stopped)
-        for watched in self._watched:
-            self._add(watched, seen)
+        self._add(seen)
         self._kept.append(seen)
         self.count += 1
         return tuple(tag for tag in self.stopped if tag not in before)
@@ -134,23 +136,35 @@ class PlausibilityMonitor:
         if self.model.version != self._version:
             self._look()
         first = self.count - len(self._kept)
-        ratings = [self._rating(watched, first) for watched in self._watched]
+        told = {watched.link: self._told(watched, first) for watched in self._watched}
+        tied = self._ties.tied({link: known for link, known in told.items() if known is not None})
+        ratings = [self._rating(watched, tied.get(watched.link), first) for watched in self._watched]
         return Plausibility(tuple(ratings), self._links.left_out, self.false_alarms)
 
     def _look(self) -> None:
         """Find out what can be judged, and go on with what has not changed."""
         known = {watched.link: watched for watched in self._watched}
+        before = self._ties
         self._version = self.model.version
         self._links = find_links(self.model, self.frames, self._relative_to)
-        self._watched = []
+        judged_by: dict[Link, Served] = {}
+        reasons = dict.fromkeys(self._links.links, "")
         for link in self._links.links:
-            served, reason = None, ""
             try:
-                served = Served(self.model, link.child, link.parent)
+                judged_by[link] = Served(self.model, link.child, link.parent)
             except KineverseError as error:
-                reason = f"its pose cannot be computed. {error}"
-            old = known.get(link)
-            if old is not None and old.served is not None and served is not None and served.same(old.served):
+                reasons[link] = f"its pose cannot be computed. {error}"
+        self._ties = Ties(self.model, judged_by, self._relative_to)
+        self._watched = []
+        for link, reason in reasons.items():
+            old, served = known.get(link), judged_by.get(link)
+            if (
+                old is not None
+                and old.served is not None
+                and served is not None
+                and served.same(old.served)
+                and self._ties.same(link, before)
+            ):
                 self._watched.append(old)
             else:
                 self._watched.append(_Watched(link, served, reason, self._watch()))
@@ -158,27 +172,45 @@ class PlausibilityMonitor:
     def _watch(self) -> Watch:
         return Watch(self.false_alarms, self._outliers.fraction if self._outliers else 0.0)
 
-    def _add(self, watched: _Watched, seen: Mapping[str, Track]) -> None:
-        link = watched.link
-        if watched.served is None or not {link.parent, link.child} <= seen.keys():
-            return
-        parent, child = seen[link.parent], seen[link.child]
-        if not (parent.seen[0] and child.seen[0]):
-            return
-        left = misfit(watched.served, between(parent, child, np.array([0])))
-        watched.numbers.append(self.count)
-        watched.watch.add(left.normal[0], left.by_place[0], left.beyond[0])
+    def _add(self, seen: Mapping[str, Track]) -> None:
+        told: dict[Link, Told] = {}
+        for watched in self._watched:
+            link = watched.link
+            if watched.served is None or not {link.parent, link.child} <= seen.keys():
+                continue
+            parent, child = seen[link.parent], seen[link.child]
+            if parent.seen[0] and child.seen[0]:
+                now = np.array([0])
+                told[link] = Told(now, misfit(watched.served, between(parent, child, now)))
+        tied = self._ties.tied(told)
+        for watched in self._watched:
+            if watched.link in tied:
+                left = tied[watched.link]
+                watched.numbers.append(self.count)
+                watched.watch.add(left.normal[0], left.by_place[0], left.against[0])
 
-    def _rating(self, watched: _Watched, first: int) -> Rating:
-        link, numbers = watched.link, set(watched.numbers)
-        times = [first + k for k in range(len(self._kept)) if first + k in numbers]
+    def _told(self, watched: _Watched, first: int) -> Told | None:
+        """Return what the observations that are kept tell of an articulation; None if they tell nothing."""
+        times = self._times(watched, first)
         if watched.served is None or not times:
-            never = f"'{link.parent}' and '{link.child}' were not seen together"
-            return untold(link, 0, watched.reason or never)
+            return None
+        return Told(np.array(times), misfit(watched.served, self._poses(watched.link, times, first)))
+
+    def _times(self, watched: _Watched, first: int) -> list[int]:
+        return [number for number in watched.numbers if number >= first]
+
+    def _poses(self, link: Link, times: Iterable[int], first: int) -> Observations:
         kept = [self._kept[number - first] for number in times]
         parent, child = (joined([one[name] for one in kept]) for name in (link.parent, link.child))
-        poses = between(parent, child, np.arange(len(times)))
-        seen = Seen(link, watched.served, poses, misfit(watched.served, poses), np.array(times))
+        return between(parent, child, np.arange(len(kept)))
+
+    def _rating(self, watched: _Watched, left: Misfit | None, first: int) -> Rating:
+        link = watched.link
+        if watched.served is None or left is None:
+            never = f"'{link.parent}' and '{link.child}' were not seen together"
+            return untold(link, 0, watched.reason or never)
+        times = self._times(watched, first)
+        seen = Seen(link, watched.served, self._poses(link, times, first), left, np.array(times))
         return judged(self.model, seen, watched.stopped, self._families, self._outliers)
 
 

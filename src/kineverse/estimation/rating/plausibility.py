@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 from kineverse.errors import KineverseError, ValueRejectedError
 from kineverse.estimation.identification.pairs import Families
-from kineverse.estimation.identification.tracks import Poses, Track, between, exactly, tracks
+from kineverse.estimation.identification.tracks import Poses, between, exactly, tracks
 from kineverse.estimation.tracking.outliers import Outliers, as_outliers
 from kineverse.model.frame import WORLD
 from kineverse.model.model import Model, Snapshot
@@ -20,6 +20,7 @@ from .links import Link, find_links
 from .misfit import misfit
 from .report import Plausibility, Rating
 from .served import Served
+from .ties import Ties, Told
 from .watch import Watch
 
 FALSE_ALARMS = 1e-3
@@ -82,7 +83,34 @@ def plausibility(
     found = find_links(model, observations, relative_to)
     if relative_to is not None:
         seen[relative_to] = exactly(max((len(track.poses) for track in seen.values()), default=0))
-    ratings = [_rated(model, link, seen, families, false_alarms, wrong) for link in found.links]
+    told: dict[Link, Told] = {}
+    reasons: dict[Link, Rating] = {}
+    judged_by: dict[Link, Served] = {}
+    for link in found.links:
+        parent, child = seen[link.parent], seen[link.child]
+        times = np.flatnonzero(parent.seen & child.seen)
+        if not len(times):
+            reasons[link] = untold(link, 0, f"'{link.parent}' and '{link.child}' were never seen together")
+            continue
+        try:
+            served = Served(model, link.child, link.parent)
+            told[link] = Told(times, misfit(served, between(parent, child, times)))
+            judged_by[link] = served
+        except KineverseError as error:
+            reasons[link] = untold(link, len(times), f"its pose cannot be computed. {error}")
+    tied = Ties(model, judged_by, relative_to).tied(told)
+    ratings = []
+    for link in found.links:
+        if link in reasons:
+            ratings.append(reasons[link])
+            continue
+        times = told[link].times
+        poses = between(seen[link.parent], seen[link.child], times)
+        ratings.append(
+            _rated(
+                model, Seen(link, judged_by[link], poses, tied[link], times), families, false_alarms, wrong
+            )
+        )
     result = Plausibility(tuple(ratings), found.left_out, false_alarms)
     if strict:
         result.raise_if_implausible()
@@ -109,25 +137,11 @@ def untold(link: Link, count: int, reason: str) -> Rating:
 
 
 def _rated(
-    model: Model,
-    link: Link,
-    seen: Mapping[str, Track],
-    families: Families,
-    false_alarms: float,
-    outliers: Outliers | None,
+    model: Model, seen: Seen, families: Families, false_alarms: float, outliers: Outliers | None
 ) -> Rating:
-    parent, child = seen[link.parent], seen[link.child]
-    times = np.flatnonzero(parent.seen & child.seen)
-    if not len(times):
-        return untold(link, 0, f"'{link.parent}' and '{link.child}' were never seen together")
-    poses = between(parent, child, times)
-    try:
-        served = Served(model, link.child, link.parent)
-        left = misfit(served, poses)
-    except KineverseError as error:
-        return untold(link, len(times), f"its pose cannot be computed. {error}")
     watch = Watch(false_alarms, outliers.fraction if outliers else 0.0)
-    for row in zip(left.normal, left.by_place, left.beyond, strict=True):
+    left = seen.misfit
+    for row in zip(left.normal, left.by_place, left.against, strict=True):
         watch.add(*row)
-    stopped = None if watch.stopped is None else int(times[watch.stopped])
-    return judged(model, Seen(link, served, poses, left, times), stopped, families, outliers)
+    stopped = None if watch.stopped is None else int(seen.times[watch.stopped])
+    return judged(model, seen, stopped, families, outliers)

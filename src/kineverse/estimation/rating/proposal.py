@@ -2,12 +2,14 @@
 
 Whoever hangs below or looks at a coordinate goes on working: frames keep their names, and so does the
 coordinate where there is one before and one after. It keeps its direction and its zero as well, as far as it
-has them: joint values are aligned with those of the served articulation. What the old operation wrote beside
-the joint stays.
+has them: joint values are aligned with those of the served articulation. What followed another coordinate, as
+a mimic joint, goes on to follow it, geared otherwise if that is what was seen. What the old operation wrote
+beside the joint stays.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any, TypeAlias
@@ -15,6 +17,7 @@ from typing import Any, TypeAlias
 import numpy as np
 
 from kineverse.articulations import Joint
+from kineverse.articulations.joint import AxisJoint
 from kineverse.estimation.identification.fit import Fit
 from kineverse.estimation.identification.groups import WX, GroupMotion
 from kineverse.estimation.identification.operations import joint_operation, rigid_pose
@@ -34,10 +37,14 @@ from kineverse.model.operation import (
 )
 from kineverse.model.reader import Reader
 
+from .before import moved_before
 from .links import Link
 from .served import Served
 
 Writes: TypeAlias = Mapping[tuple[str, str], Any]
+
+# What follows another may be off by so many deviations, and is geared if its slope is off by so many.
+_FOLLOWS, _GEARED = 3.0, 4.0
 
 
 @dataclass(frozen=True)
@@ -84,7 +91,9 @@ class Relearned(Operation):
         return self.joint.default_tag()
 
 
-def proposal(model: Model, link: Link, served: Served, coordinates: Array, fit: Fit) -> Operation:
+def proposal(
+    model: Model, link: Link, served: Served, coordinates: Array, others: Array, fit: Fit
+) -> Operation:
     """Return the operation to replace the link's one by.
 
     Parameters
@@ -93,40 +102,49 @@ def proposal(model: Model, link: Link, served: Served, coordinates: Array, fit: 
         The model as it is served, and the articulation in question.
     coordinates
         The served articulation's coordinates at the fit's observations, (N, n).
+    others
+        What others say of coordinates that are theirs, (N, e); NaN where they say nothing.
     fit
         What was identified between the frames that were seen.
     """
     base_T_parent = _constant(model, link.parent, link.base)
     frame_T_child = _constant(model, link.child, link.frame)
-    if not isinstance(fit.motion, GroupMotion):
-        joint = fit.operation(_name(model, link, served, fit.joint_values.shape[1]), link.base, link.frame)
-        writes = model.history.entry(link.tag).writes
-        kept = _kept(writes, link, served, False, _records(writes, link))
-        places = rigid_pose(base_T_parent), rigid_pose(inverse(frame_T_child))
-        return Relearned(joint, next(iter(_records(writes, link)), None), kept, link.frame, *places)
-    motion, values = fit.motion, fit.joint_values
-    old = coordinates[:, 0] if served.joints == 1 and len(served.coordinates) == 1 else None
-    alike = False
-    if motion.joints == 1:
-        turns = motion.freedom.joints[0] >= WX
-        alike = old is not None and bool(served.turning[0]) == turns
-        if old is not None:
-            motion, values = _aligned(motion, values, old, alike)
-    limits = [
-        (float(low), float(high)) for low, high in zip(values.min(axis=0), values.max(axis=0), strict=True)
-    ]
-    if alike:
-        # Nothing was seen that contradicts the old limits; those that were left are wider now.
-        (low, high), *_ = limits
-        limits = [(min(low, float(served.lower[0])), max(high, float(served.upper[0])))]
-    motion = replace(motion, left=base_T_parent @ motion.left, right=motion.right @ inverse(frame_T_child))
     writes = model.history.entry(link.tag).writes
     records = _records(writes, link)
     record = next(iter(records), None)
-    name = _name(model, link, served, motion.joints)
+    if not isinstance(fit.motion, GroupMotion):
+        joint = fit.operation(_name(records, link, served, fit.joint_values.shape[1]), link.base, link.frame)
+        kept = _kept(writes, link, served, False, records)
+        places = rigid_pose(base_T_parent), rigid_pose(inverse(frame_T_child))
+        return Relearned(joint, record, kept, link.frame, *places)
+    motion, values = fit.motion, fit.joint_values
+    before = moved_before(model, link, served, records)
+    alike, position = False, None
+    if motion.joints == 1 and before is not None:
+        turns = motion.freedom.joints[0] >= WX
+        alike = bool(served.turning[0]) == turns
+        told = others[:, 0] if others.shape[1] else coordinates[:, 0]
+        old = before.at(np.where(np.isfinite(told), told, coordinates[:, 0]))
+        motion, values, slope = _aligned(motion, values, old, alike, before.led and bool(others.shape[1]))
+        alike = alike and slope == 1.0
+        if before.follows is not None:
+            off = values[:, 0] - slope * old
+            if float(np.std(off)) < _FOLLOWS * float(np.sqrt(np.mean(fit.deviations**2))):
+                position = before.follows if slope == 1.0 else slope * before.follows
+    limits = [
+        (float(low), float(high)) for low, high in zip(values.min(axis=0), values.max(axis=0), strict=True)
+    ]
+    if alike and before is not None:
+        # Nothing was seen that contradicts the old limits; those that were left are wider now.
+        (low, high), *_ = limits
+        limits = [(min(low, before.lower), max(high, before.upper))]
+    motion = replace(motion, left=base_T_parent @ motion.left, right=motion.right @ inverse(frame_T_child))
+    name = _name(records, link, served, motion.joints)
     joint = joint_operation(motion, limits, name, link.base, link.frame)
     if record is not None and isinstance(joint, Joint):
         joint = replace(joint, dynamics=records[record].dynamics)
+    if position is not None and isinstance(joint, AxisJoint):
+        joint = replace(joint, position=position)
     kept = _kept(writes, link, served, alike, records)
     if record in (None, name) and not kept:
         return joint
@@ -142,18 +160,22 @@ def _records(writes: Writes, link: Link) -> dict[str, Articulation]:
     }
 
 
-def _name(model: Model, link: Link, served: Served, joints: int) -> str:
-    """Return what the joint is called: like the old coordinate, where there was one and is one."""
-    if joints == 1 and len(served.coordinates) == 1:
-        return served.coordinates[0].path
-    return next(iter(_records(model.history.entry(link.tag).writes, link)), link.frame)
+def _name(records: Mapping[str, Articulation], link: Link, served: Served, joints: int) -> str:
+    """Return what the joint is called: like the old coordinate, where there was one of its own and is one."""
+    named = next(iter(records), link.frame)
+    if joints != 1 or len(served.coordinates) != 1:
+        return named
+    own = [x for value in records.values() for x in value.coordinates]
+    if len(own) == 1:
+        return own[0].path
+    return named if records else served.coordinates[0].path
 
 
 def _kept(
     writes: Writes, link: Link, served: Served, alike: bool, records: Mapping[str, Articulation]
 ) -> tuple[tuple[tuple[str, str], Any], ...]:
     """Return what has nothing to do with the pose between both frames."""
-    own = set(served.coordinates)
+    own = {*served.coordinates, *(x for value in records.values() for x in value.coordinates)}
     kept = []
     for (kind, name), value in writes.items():
         if (kind == FRAMES and name == link.frame) or (kind == ARTICULATIONS and name in records):
@@ -169,8 +191,13 @@ def _kept(
     return tuple(kept)
 
 
-def _aligned(motion: GroupMotion, values: Array, old: Array, alike: bool) -> tuple[GroupMotion, Array]:
-    """Return the same motion with joint values that grow with the old ones, and are 0 where those are."""
+def _aligned(
+    motion: GroupMotion, values: Array, old: Array, alike: bool, geared: bool
+) -> tuple[GroupMotion, Array, float]:
+    """Return the same motion with joint values that grow with the old ones, and are 0 where those are.
+
+    And how fast: as fast, if they are alike, unless ``geared`` says that the old ones were seen elsewhere.
+    """
     new = values[:, 0]
     slope = float(np.mean((old - old.mean()) * (new - new.mean())))
     if slope < 0.0:
@@ -178,16 +205,17 @@ def _aligned(motion: GroupMotion, values: Array, old: Array, alike: bool) -> tup
         motion = replace(motion, left=motion.left @ flip, right=flip @ motion.right)
         new, slope = -new, -slope
     variance = float(np.var(old))
-    if alike:
+    slope = slope / variance if variance > 0.0 else 0.0
+    off = new - new.mean() - slope * (old - old.mean())
+    known = math.sqrt(float(np.var(off)) / (variance * len(old))) if variance > 0.0 else math.inf
+    if alike and not (geared and abs(slope - 1.0) > _GEARED * known):
         slope = 1.0
-    else:
-        slope = slope / variance if variance > 0.0 else 0.0
     shift = float(new.mean()) - slope * float(old.mean())
     twist = np.zeros(6)
     twist[motion.freedom.joints[0]] = shift
     twist[2] += motion.pitch * twist[5]
     motion = replace(motion, left=motion.left @ pose(exponential(twist[3:]), twist[:3]))
-    return motion, (new - shift)[:, None]
+    return motion, (new - shift)[:, None], slope
 
 
 def _constant(model: Model, frame: str, relative_to: str) -> Array:

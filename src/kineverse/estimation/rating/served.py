@@ -16,6 +16,7 @@ from kineverse.estimation.identification.observations import Observations
 from kineverse.estimation.identification.rigid import Array
 from kineverse.estimation.identification.solving import Solution, solve
 from kineverse.expressions.expression import array, as_expression
+from kineverse.model.constraint import Constraint
 from kineverse.model.model import Model
 from kineverse.model.rates import plain
 from kineverse.symbols import Symbol
@@ -32,7 +33,7 @@ class Served:
     """The pose of a child in its parent as a function of k joint values.
 
     Joint values are the coordinates between both, or where a quaternion is among them, turns away from a
-    reference.
+    reference. If ``opened``, coordinates that loops determine are as if they were free.
 
     Attributes
     ----------
@@ -48,9 +49,10 @@ class Served:
         The coordinates in the model's default state, (n,), and where the child is then, (3,).
     """
 
-    def __init__(self, model: Model, child: str, parent: str) -> None:
+    def __init__(self, model: Model, child: str, parent: str, opened: bool = False) -> None:
         rates = model.rates
-        self.pose = pose = rates.resolve(plain(model.fk(child, parent)))
+        pose = plain(model.fk(child, parent))
+        self.pose = pose = pose if opened else rates.resolve(pose)
         self.coordinates = coordinates = tuple(s for s in pose.symbols if s.has_derivative)
         slopes, still = pose.gradient(heuristic=False), as_expression(np.zeros((4, 4)))
         by_coordinate = [slopes.get(x.derivative(), still) for x in coordinates]
@@ -106,6 +108,10 @@ class Served:
             change = (rates @ change[:, :, None])[:, :, 0]
         result: Array = coordinates + change
         return result
+
+    def per_joint(self, coordinates: Array, slopes: Array) -> Array:
+        """Return slopes (N, c, k) by joint values, of those by coordinates, (N, c, n)."""
+        return slopes if self._rates is None else slopes @ self._rates.batch(self._points(coordinates))
 
     def _ways(self) -> int:
         """Return in how many ways the child can move at home."""
@@ -193,17 +199,20 @@ UNLIMITED = (-math.inf, math.inf)
 
 
 def _limits(model: Model, coordinate: Symbol) -> tuple[float, float]:
-    """Return the limits of a coordinate by itself; those that depend on others may be wider."""
+    """Return the limits of a coordinate by itself; those that depend on others may be narrower."""
     lower, upper = UNLIMITED
     for constraint in model.constraints_for([coordinate]).values():
-        if constraint.line is None or constraint.expression.symbols != (coordinate,):
-            continue
-        if constraint.lower.symbols or constraint.upper.symbols:
-            continue
-        slope, offset = constraint.line
-        low, high = sorted((float(b) - offset) / slope for b in (constraint.lower, constraint.upper))
-        lower, upper = max(lower, low), min(upper, high)
+        if is_own_limit(constraint, coordinate):
+            slope, offset = constraint.line or (1.0, 0.0)
+            low, high = sorted((float(b) - offset) / slope for b in (constraint.lower, constraint.upper))
+            lower, upper = max(lower, low), min(upper, high)
     return lower, upper
+
+
+def is_own_limit(constraint: Constraint, coordinate: Symbol) -> bool:
+    """Whether a constraint holds a coordinate between two numbers."""
+    bounds = (*constraint.lower.symbols, *constraint.upper.symbols)
+    return constraint.line is not None and constraint.expression.symbols == (coordinate,) and not bounds
 
 
 @dataclass(frozen=True)

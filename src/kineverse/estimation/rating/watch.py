@@ -4,8 +4,8 @@ Under the articulation as served, ρ of each observation is standard normal. Aga
 
 - it, or the child on it, sits elsewhere: ρ = G δ + noise with an unknown δ, believed within some size;
 - nothing holds the child: ρ is normal with a larger deviation;
-- joint values beyond their limits, by z standard deviations: exp(λ z - λ²/2) is 1 on average at a limit, and
-  less inside.
+- joint values beyond their limits, or apart from what others say of them, by z standard deviations:
+  exp(λ z - λ²/2) is 1 on average at a limit, and less inside.
 
 Each may begin to hold at any observation j, the j-th with the weight 1/(j (j+1)). The ratio M of the
 densities of all that was seen, under the mixture of alternatives and under the articulation as served, is a
@@ -78,11 +78,14 @@ class Watch:
         self._beyond = _Beginnings(0, self._bet)
 
     def add(self, normal: Array, by_place: Array, beyond: Array) -> float:
-        """Take one observation, the rows of a :class:`.misfit.Misfit` of that name; return log M."""
+        """Take one observation; return log M.
+
+        They are rows of a :class:`.misfit.Misfit`, ``beyond`` of what is ``against`` it; NaN says nothing.
+        """
         self.count += 1
         weight = -math.log(self.count * (self.count + 1.0))
         if self.count == 1:
-            self._limited = np.isfinite(beyond)
+            self._limited = np.logical_not(np.isneginf(beyond))
             self._beyond = _Beginnings(int(self._limited.sum()) * len(_SLOPES), self._bet)
         parts: list[tuple[float, float, int]] = []
         if len(normal):
@@ -93,7 +96,7 @@ class Watch:
             parts.append((0.3, *self._loose.add(weight, self.count - 1, log)))
         if self._limited.any():
             z = np.maximum(beyond[self._limited], -1e3)
-            log = (_SLOPES[:, None] * z - 0.5 * _SLOPES[:, None] ** 2).ravel()
+            log = np.nan_to_num(_SLOPES[:, None] * z - 0.5 * _SLOPES[:, None] ** 2, nan=0.0).ravel()
             parts.append((0.2, *self._beyond.add(weight, self.count - 1, log)))
         if not parts:
             return 0.0
