@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import random
 from pathlib import Path
 
@@ -28,7 +29,7 @@ FOLDERS = {
 """How many of the files below load at least."""
 
 SUFFIXES = (".urdf", ".sdf", ".world", ".xml", ".mjcf")
-MOST = 5
+MOST = 3
 """Expressions of a kind that are compared for one model."""
 
 
@@ -40,8 +41,8 @@ def read(text: str) -> kv.Model:
     return model
 
 
-def sample(model: kv.Model) -> list[kv.Expression]:
-    """Return poses, constraints and bounds, and all gradients of them; of large models a part."""
+def sample(model: kv.Model) -> kv.Expression:
+    """Return the elements of poses, constraints and bounds, and of all their gradients; of large models a part."""
     draw = random.Random(1)
     frames, names = list(model.frames), list(model.constraints)
     frames = frames if len(frames) <= MOST else draw.sample(frames, MOST)
@@ -50,9 +51,10 @@ def sample(model: kv.Model) -> list[kv.Expression]:
     for name in names:
         constraint = model.constraints[name]
         found += [constraint.lower, constraint.expression, constraint.upper]
-    return [
+    parts = [
         part for e in found for part in (e, *e.gradient().values(), *e.gradient(heuristic=False).values())
     ]
+    return np.concatenate([part.ravel() for part in parts])  # type: ignore[arg-type, return-value]
 
 
 def survives(model: kv.Model) -> None:
@@ -62,20 +64,19 @@ def survives(model: kv.Model) -> None:
     assert again.snapshot() == model.snapshot()
     assert document_of(again) == text
     assert kv.from_bytes(kv.to_bytes(model)).snapshot() == model.snapshot()
-    assert kv.document_hash(again) == kv.document_hash(model.snapshot())
+    assert kv.document_hash(model.snapshot()) == json.loads(text)["sha256"]
     ours, theirs = sample(model), sample(again)
-    inputs = sorted({s for e in ours for s in e.symbols}, key=lambda s: s.sort_key)
-    f, g = (kv.compile(e, inputs, tier="interpreter") for e in (ours, theirs))
     home = model.default_state()
-    values = np.array([home.get(s, 0.3 if s.value is None else s.value) for s in inputs])
+    values = np.array([home.get(s, 0.3 if s.value is None else s.value) for s in ours.symbols])
     for scale in (0.0, 0.02):
-        at = values + np.random.default_rng(5).uniform(-scale, scale, len(inputs))
+        moved = values + np.random.default_rng(5).uniform(-scale, scale, len(values))
+        at = dict(zip(ours.symbols, moved, strict=True))
         results = []
-        for function in (f, g):
+        for elements in (ours, theirs):
             try:
-                results.append([np.asarray(part).tobytes() for part in function(at)])
+                results.append(elements(at).tobytes())
             except kv.UnsolvedError as error:
-                results.append([str(error).encode()])
+                results.append(str(error).encode())
         assert results[0] == results[1]
 
 
