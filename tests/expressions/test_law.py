@@ -14,15 +14,15 @@ WORDS = lp.Vocabulary("law")
 
 
 def test_random_programs():
-    lc.law(lc.general(), WORDS, 160)()
+    lc.law(lc.general(), WORDS, 100)()
 
 
 def test_augment_inside_augment():
-    lc.law(lc.nested(), WORDS, 120)()
+    lc.law(lc.nested(), WORDS, 80)()
 
 
 def test_composition():
-    lc.law(lc.compositions(), WORDS, 140)()
+    lc.law(lc.compositions(), WORDS, 90)()
 
 
 def test_third_order():
