@@ -183,8 +183,8 @@ def test_frames_in_a_circle_are_refused_by_whatever_edit_closes_it() -> None:
     assert model.fk("box")()[:3, 3].tolist() == [0, 0, 1]
 
 
-def test_a_chain_of_twenty_thousand_frames() -> None:
-    n = 20_000
+def test_a_chain_of_five_thousand_frames() -> None:
+    n = 5_000
     step = kv.Pose((1, 0, 0, 0, 0, 1, 0, 1e-3, 0, 0, 1, 0))
     model = kv.Model()
     with model.edit() as edit:
@@ -193,10 +193,10 @@ def test_a_chain_of_twenty_thousand_frames() -> None:
             edit.add_frame(f"f{i}", f"f{i - 1}" if i else "world", step if i % 100 else moving)
     at = {f"q{i}": 0.5 for i in range(5)}
     last = f"f{n - 1}"
-    expected = 200 * 0.5 + 1e-3 * (n - 200)
+    expected = 50 * 0.5 + 1e-3 * (n - 50)
     assert model.fk(last)({"q0": 0.5})[1, 3] == pytest.approx(expected)
     assert model.fk("f3", last)(at)[1, 3] == pytest.approx(-expected + 0.5 + 3e-3)
-    assert model.jacobian(last)(at)[1].tolist() == [200]
+    assert model.jacobian(last)(at)[1].tolist() == [50]
     assert model.speeds_of(last) == (kv.velocity("q0"),)
     with model.edit() as edit:
         edit.replace("frame f0", kv.Fixed(name="f0", parent="world", child="f0"))
@@ -204,8 +204,8 @@ def test_a_chain_of_twenty_thousand_frames() -> None:
     before = model.version
     with pytest.raises(kv.KineverseError, match="Cyclic frames"), model.edit() as edit:
         edit.attach("f0", last, np.eye(4))
-    with pytest.raises(kv.EditError, match="parent of frame 'f10001' is missing"), model.edit() as edit:
-        edit.remove("frame f10000")
+    with pytest.raises(kv.EditError, match="parent of frame 'f2501' is missing"), model.edit() as edit:
+        edit.remove("frame f2500")
     assert model.version == before
 
 
