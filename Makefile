@@ -24,6 +24,8 @@ test: $(VENV)/test.installed
 	$(BIN)/ruff format --check .
 	$(BIN)/ruff check .
 	$(BIN)/mypy
+	@# Tests start commands by the dozen: each would compile the package anew where Python is told to keep nothing.
+	$(BIN)/python -m compileall -q src
 	$(BIN)/python -m pytest -q -n $(JOBS) $(ARGS)
 
 fuzz: $(VENV)/fuzz.installed
