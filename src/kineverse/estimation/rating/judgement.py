@@ -18,7 +18,7 @@ from kineverse.estimation.tracking.outliers import Outliers
 from kineverse.model.model import Model
 from kineverse.model.operation import Operation
 
-from .astray import agreeing, credible
+from .astray import credible
 from .before import follows_another
 from .earlier import explained
 from .evidence import log_elsewhere, log_evidence
@@ -74,7 +74,9 @@ def judged(
         right = credible(seen.misfit, outliers)
     else:
         since = seen.at(slice(int(np.searchsorted(seen.times, stopped)), None))
-        right = agreeing(since.observations, families, outliers)
+        right = np.arange(len(since.times))
+        if outliers is not None and len(right) >= 2:
+            right = identified(since.observations, families, outliers).best.right
     good = since.at(right)
     instead = identified(good.observations, families) if len(right) >= 2 else None
     probabilities = _probabilities(good, instead)
