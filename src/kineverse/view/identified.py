@@ -150,15 +150,15 @@ def draw_side(axes: Axes, looked: Looked) -> None:
 
 
 def draw_values(axes: Axes, fit: Fit) -> None:
-    """Draw joint values over the observations, with their standard deviations."""
-    number = np.arange(len(fit.joint_values))
+    """Draw joint values over the observations that are right, with their standard deviations."""
+    number = fit.right
     # A family of one's own does not say which of its joint values are angles.
     freedom = getattr(fit.motion, "freedom", None)
     turning = [j >= 3 for j in freedom.joints] if freedom else [False] * fit.joint_values.shape[1]
     units = {"[deg]" if turns else "[m]" for turns in turning} if freedom else {"its own units"}
     for k, turns in enumerate(turning):
         scale = np.degrees(1.0) if turns else 1.0
-        value, spread = scale * fit.joint_values[:, k], scale * SIGMAS * fit.deviations[:, k]
+        value, spread = scale * fit.joint_values[number, k], scale * SIGMAS * fit.deviations[number, k]
         axes.fill_between(number, value - spread, value + spread, alpha=0.25, linewidth=0)
         axes.plot(number, value, ".-", markersize=3, linewidth=0.8)
     axes.set(title=f"joint values, ±{SIGMAS:g} σ", ylabel=", ".join(sorted(units)))
@@ -166,17 +166,18 @@ def draw_values(axes: Axes, fit: Fit) -> None:
 
 
 def draw_left(axes: Axes, fit: Fit) -> None:
-    """Draw what the fit leaves of each observation, those that do not fit with a line."""
-    number = np.arange(len(fit.residuals))
+    """Draw what the fit leaves of each observation, and a line for those that do not fit."""
+    number = fit.right
+    residuals = fit.residuals[number]
     for outlier in fit.outlying:
         axes.axvline(outlier, color=AXIS, linewidth=0.8, linestyle=":")
-    axes.plot(number, 1e3 * np.linalg.norm(fit.residuals[:, :3], axis=1), color=MODEL, linewidth=0.8)
+    axes.plot(number, 1e3 * np.linalg.norm(residuals[:, :3], axis=1), color=MODEL, linewidth=0.8)
     axes.set(xlabel="observation", title="left over")
     axes.set_ylabel("position [mm]", color=MODEL)
     axes.set_ylim(bottom=0.0)
     if fit.residuals.shape[1] > 3:
         other = axes.twinx()
-        angles = np.degrees(np.linalg.norm(fit.residuals[:, 3:], axis=1))
+        angles = np.degrees(np.linalg.norm(residuals[:, 3:], axis=1))
         other.plot(number, angles, color="tab:orange", linewidth=0.8)
         other.set_ylabel("orientation [deg]", color="tab:orange")
         other.set_ylim(bottom=0.0)
