@@ -3,46 +3,36 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import numpy.typing as npt
 
-from kineverse.errors import ShapeError, ValueRejectedError
+from kineverse.errors import ValueRejectedError
 from kineverse.estimation.tracking.outliers import Outliers, as_outliers
 
-from .beside import are_right, beside
+from .continuing import caught_up, is_surprised
 from .family import Family
-from .fit import Found
-from .identify import (
-    Explained,
-    Families,
-    Sight,
-    explained,
-    explained_by,
-    family_weights,
-    noise_of,
-    sight_of,
-    weighed,
-)
-from .motion import Member
-from .native import solver
-from .observations import Observations, observations
-from .outlying import Rows
-from .refining import Rated
-from .rigid import Array
-from .solving import Solution, Start
-from .turning import is_screw
+from .fit import Fit, Found, Offer
+from .gathered import Gathered
+from .identify import Explained, Families, Sight, explained, family_weights, noise_of, sight_of, weighed
+from .observations import observations
 
 # A family that is less probable than this rests until there are twice as many observations.
 _NO_CHANCE = 1e-6
+# One that is less probable than this is looked at when there are more observations by this part.
+_UNLIKELY, _MORE = 0.01, 0.125
 
 
 class Identifier:
     """How a part moves against another, learned while it moves.
 
     It gives what :func:`.identify.identify` gives of all poses so far, at a fraction of the cost: each family
-    goes on from where it was. A family that has no chance rests until there are twice as many observations,
-    and is not among what was found meanwhile.
+    goes on from where it was. A family below 1 % is compared with the others again when there are an eighth
+    more observations, or when a pose is a surprise to the best one; its fit is always by all poses. One that
+    has no chance rests until there are twice as many, and is not among what was found meanwhile.
 
     Parameters
     ----------
@@ -75,10 +65,12 @@ class Identifier:
         self._weights = family_weights(families)
         self._noise = covariance_a, covariance_b, noise
         self._stated = True
-        self._seen: list[Observations] = []
+        self._seen = Gathered()
         self._known: dict[str | Family, Explained] = {}
+        # By the family, the logarithm of how probable it was beside the best one when it was looked at.
+        self._odds: dict[str | Family, float] = {}
         self._found: Found | None = None
-        self._whole, self._unit, self._scale = 0, 1.0, 1.0
+        self._whole, self._count, self._unit, self._scale = 0, 0, 1.0, 1.0
 
     def __len__(self) -> int:
         return len(self._seen)
@@ -108,14 +100,8 @@ class Identifier:
         one = observations(
             None if a is None else np.asarray(a)[None], np.asarray(b)[None], of_a, of_b, fewest=1
         )
-        if self._seen:
-            first = self._seen[0]
-            if one.rows != first.rows or (one.parent_covariance is None) != (first.parent_covariance is None):
-                raise ShapeError(
-                    "Poses and positions do not mix, nor a parent that is the world with another."
-                )
+        self._seen.add(one)
         self._stated = stated
-        self._seen.append(one)
         self._found = None
 
     @property
@@ -136,7 +122,8 @@ class Identifier:
         return self._found
 
     def _find(self) -> Found:
-        seen = _joined(self._seen)
+        seen = self._seen.all
+        resting: dict[str | Family, Explained] = {}
         if len(seen) >= 2 * self._whole:
             self._whole = len(seen)
             sight = sight_of(seen, self._stated, self._outliers, self._ordered)
@@ -144,53 +131,58 @@ class Identifier:
             known = explained(sight, self._weights)
         else:
             sight = sight_of(seen, self._stated, self._outliers, self._ordered, self._unit)
-            right = {name: _right(sight, one, self._scale) for name, one in self._known.items()}
-            found = {
-                name: _continued(sight.seen.at(right[name]), one.known.solution, self._ordered)
-                for name, one in self._known.items()
-            }
-            known = explained_by(sight, found, right, self._weights)
-        result = weighed(sight, known, self._weights)
-        self._scale = result.noise_scale
-        chances = {name for name, probability in result.probabilities.items() if probability > _NO_CHANCE}
-        self._known = {name: one for name, one in known.items() if one.known.solution.motion.name in chances}
-        return result
+            known, resting = self._looked_at(sight)
+        found = weighed(sight, known | resting, self._weights)
+        self._scale, self._count = found.noise_scale, len(seen)
+        likely = {name: p for name, p in found.probabilities.items() if p > _NO_CHANCE}
+        best = max(likely.values())
+        self._known, self._odds = {}, {}
+        for name, one in (known | resting).items():
+            if (p := likely.get(one.known.solution.motion.name)) is not None:
+                self._known[name], self._odds[name] = one, math.log(p / best)
+        late = {
+            one.known.solution.motion.name: partial(_late, sight, name, one, self._scale, self._weights)
+            for name, one in resting.items()
+        }
+        return replace(found, offers=tuple(_offered(offer, late) for offer in found.offers))
+
+    def _looked_at(self, sight: Sight) -> tuple[dict[str | Family, Explained], dict[str | Family, Explained]]:
+        """Return what families make of all that was seen, and what those made of less that may rest."""
+        best = max(self._odds, key=self._odds.__getitem__)
+        rest = {name: one for name, one in self._known.items() if sight.stated and self._may_rest(name, one)}
+        due = {name: one for name, one in self._known.items() if name not in rest}
+        known = caught_up(sight, due, self._scale, self._weights)
+        leading = max(known, key=lambda name: self._log(name, known[name]))
+        if rest and (leading != best or is_surprised(sight, known[best], self._count)):
+            return known | caught_up(sight, rest, self._scale, self._weights), {}
+        # Beside the best one they are as probable as they were.
+        top = self._log(leading, known[leading])
+        for name, one in rest.items():
+            more = top + self._odds[name] - self._log(name, one)
+            rated = one.known._replace(log_evidence=one.known.log_evidence + more)
+            rest[name] = replace(one, known=rated)
+        return known, rest
+
+    def _may_rest(self, name: str | Family, one: Explained) -> bool:
+        return self._odds[name] < math.log(_UNLIKELY) and len(self._seen) < (1.0 + _MORE) * one.count
+
+    def _log(self, name: str | Family, one: Explained) -> float:
+        return one.known.log_evidence + one.log_belief + math.log(self._weights[name])
 
 
-def _joined(parts: list[Observations]) -> Observations:
-    parents = [p.parent_covariance for p in parts if p.parent_covariance is not None]
-    return Observations(
-        np.concatenate([p.parent for p in parts]),
-        np.concatenate([p.child for p in parts]),
-        np.concatenate(parents) if parents else None,
-        np.concatenate([p.child_covariance for p in parts]),
-    )
+def _offered(offer: Offer, late: Mapping[str, Callable[[float], Fit]]) -> Offer:
+    make = late.get(offer.family)
+    return offer if make is None else offer._replace(make=partial(make, offer.probability))
 
 
-def _continued(seen: Observations, before: Solution[Member], ordered: bool) -> Rated:
-    """Return the solution of a family for more observations than it was found from."""
-    known = len(before.values)
-    values: list[Array] = [before.values]
-    for k in range(known, len(seen)):
-        # The new joint value is near that of the observation that looks most alike.
-        apart = np.sum((seen.relative[:known] - seen.relative[k]) ** 2, axis=(1, 2))
-        near = before.values[int(np.argmin(apart))][None]
-        if ordered and is_screw(before.motion):
-            near = near + math.tau * np.round((values[-1][-1] - near) / math.tau)
-        values.append(near)
-    parent = np.concatenate([before.parent, seen.parent[known:]])
-    return solver.continued(seen, Start(before.motion, np.concatenate(values)), parent, before.belief, known)
-
-
-def _right(sight: Sight, one: Explained, scale: float) -> Rows:
-    """Return the numbers of what is right: of what was, and of what came and is where it may be expected."""
-    new, solution = np.arange(one.count, len(sight.seen)), one.known.solution
-    if sight.outliers is None or solution.motion.joints == sight.seen.rows:
-        return np.concatenate([one.right, new])
-    came = beside(solution.motion, solution.values, sight.seen.at(new))
-    by_parameters = solution.motion.at(came.values).by_parameters
-    # What is not known of the joint yet is no error of what was seen.
-    unknown = solver.evidence(solution).covariance
-    covariance = came.covariance + by_parameters @ unknown @ np.swapaxes(by_parameters, 1, 2)
-    came_right = are_right(came.residuals, scale**2 * covariance, sight.outliers, sight.stated)
-    return np.concatenate([one.right, new[came_right]])
+def _late(
+    sight: Sight,
+    name: str | Family,
+    one: Explained,
+    scale: float,
+    weights: Mapping[str | Family, float],
+    probability: float,
+) -> Fit:
+    """Return the fit of a family that rested, by all that was seen."""
+    fit = weighed(sight, caught_up(sight, {name: one}, scale, weights), weights).best
+    return replace(fit, probability=probability)

@@ -1,8 +1,8 @@
 """C text: whole stages of identification, as :mod:`.refining` has them in numpy, each one call."""
 
 STAGES = r"""
-/* How many numbers of memory a stage needs: covariances with their inverses, two answers with what observations
-   say apart, and observations three times, which is more than any sum needs. */
+/* How many numbers of memory a stage needs: covariances with their inverses, two answers with what their
+   observations say apart, and observations three times, which is more than any sum needs. */
 EXPORT int64_t memory_of(const Problem *p) {
   int64_t apart = p->joints * (1 + p->joints);
   return p->widths + 2 * answer_size(p) + p->count * (NOISE + 2 * apart + 3 * OBSERVATION);

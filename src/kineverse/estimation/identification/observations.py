@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from dataclasses import dataclass
 from functools import cached_property
@@ -191,7 +192,20 @@ def covariances(given: npt.ArrayLike, count: int, rows: int, part: str) -> Array
             f"The covariance of the {part} has shape ({rows}, {rows}), or ({count}, {rows}, {rows}) with one "
             f"for each pose, not {matrices.shape}."
         )
-    each = matrices.reshape(-1, rows, rows)
+    if matrices.ndim == 2:
+        _check_one_covariance(matrices.tobytes(), rows, part)
+    else:
+        _check_covariances(matrices, part)
+    return np.ascontiguousarray(np.broadcast_to(matrices, (count, rows, rows)))
+
+
+@functools.lru_cache(maxsize=64)
+def _check_one_covariance(numbers: bytes, rows: int, part: str) -> None:
+    """Check a covariance; the same ones are stated over and over."""
+    _check_covariances(np.frombuffer(numbers).reshape(1, rows, rows), part)
+
+
+def _check_covariances(each: Array, part: str) -> None:
     _check_finite(each.reshape(len(each), -1), part, "Covariance")
     scale = np.sqrt(np.abs(np.einsum("nii->ni", each)))
     scale[scale == 0.0] = 1.0
@@ -212,7 +226,6 @@ def covariances(given: npt.ArrayLike, count: int, rows: int, part: str) -> Array
             f"The covariance of the {part} says that something is known to {least:.2g} (metres or radians). "
             f"Less than {_SMALLEST:.0g} is not told apart from what numbers lose."
         )
-    return np.ascontiguousarray(np.broadcast_to(matrices, (count, rows, rows)))
 
 
 def _numbers(given: npt.ArrayLike, what: str) -> Array:
