@@ -173,3 +173,44 @@ def test_what_was_seen_at_other_values_of_what_is_known_is_not_linearised_anew()
     assert estimate.state[x] == pytest.approx(1, abs=1e-3)
     assert estimate.state[y] == pytest.approx(2, abs=1e-3)
     assert max(estimate.deviation[s] for s in (x, y)) < 0.02
+
+
+def hinged(**options) -> kv.Model:
+    model = kv.Model()
+    with model.edit() as edit:
+        edit.apply(kv.Revolute(name="q", parent="world", child="door", axis=(0, 0, 1), **options))
+    return model
+
+
+@pytest.mark.parametrize("truth", [0.3, 0.5, 0.9, 1.2])
+@pytest.mark.parametrize("kind", ["distance", "wave", "saw"])
+def test_what_explains_as_much_is_not_forgotten(kind, truth):
+    """Numbers that come twice leave two states, of which a pose chooses one."""
+    model = hinged(lower=0.0, upper=1.5)
+    q = model.symbol("q")
+    value = {"distance": np.abs(q - 0.7), "wave": np.cos(4 * q), "saw": kv.where(q < 0.75, q, q - 0.75)}[kind]
+    tracker = Tracker(model, ["door", ObservedExpression(kind, value, 0.01**2)])
+    for _ in range(5):
+        estimate = tracker.update({kind: float(value({"q": truth}))})
+    assert 0.45 < estimate.confidence[(q,)] < 0.6
+    estimate = tracker.update({"door": model.fk("door")({"q": truth})})
+    assert estimate.state["q"] == pytest.approx(truth, abs=1e-3)
+    assert estimate.confidence[(q,)] > 0.999
+
+
+def test_a_shut_door_is_told_open_by_what_noise_allows():
+    """The most probable state inside is max(0, z) for z about 0: .4 deviations open, a NEES of one half."""
+    model, rng = hinged(lower=0.0, upper=1.5), np.random.default_rng(0)
+    q = model.symbol("q")
+    first = Tracker(model, [ObservedExpression("dial", q, 0.02**2)])
+    errors, means = [], []
+    for _ in range(400):
+        tracker = first.copy()
+        for _ in range(10):
+            estimate = tracker.update({"dial": 0.02 * rng.standard_normal()})
+        errors.append(estimate.state["q"] / estimate.deviation["q"])
+        means.append(errors[-1] + estimate.mean[0] / estimate.deviation["q"])
+    assert np.mean(errors) == pytest.approx((2 * np.pi) ** -0.5, abs=0.1)
+    assert np.mean(np.square(errors)) == pytest.approx(0.5, abs=0.15)
+    assert np.mean(means) == pytest.approx(0, abs=0.15)
+    assert np.mean(np.square(means)) == pytest.approx(1, abs=0.25)

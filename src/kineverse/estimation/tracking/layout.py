@@ -53,6 +53,11 @@ class Group:
         driven = set(self.driven.tolist())
         return np.array([-1 if k in driven else speeds.index(v) for k, v in enumerate(self.tangent)])
 
+    def own_place(self, k: int) -> int:
+        """Return which direction of its tangent is its coordinate of a number; -1 if none."""
+        speed = self.coordinates[k].derivative()
+        return self.tangent.index(speed) if speed in self.tangent else -1
+
     @property
     def by_speeds(self) -> bool:
         """Whether some of its coordinates move by such speeds."""

@@ -14,7 +14,7 @@ from kineverse.symbols import Symbol
 
 from .belief import Belief
 from .filtering import Filter
-from .layout import Layout
+from .layout import Group, Layout
 from .modes import Modes
 from .observed import nearest
 
@@ -24,6 +24,8 @@ _MOST_STARTS = 32
 # Nobody is so many deviations from where one was told to begin.
 _FARTHEST = 5.5
 _SAME = 1e-9
+# Where between limits that is looked at.
+_SHARES = (0.125, 0.375, 0.625, 0.875)
 
 
 def turning(filter_: Filter, x: Array, known: Array) -> frozenset[Symbol]:
@@ -58,8 +60,9 @@ def starts(filter_: Filter, first: Belief, known: Array) -> Modes:
     """Return beliefs about several places, all of the same Gaussian, the given one first."""
     layout = filter_.layout
     beliefs, alive = [first], [np.ones(len(layout.groups), dtype=bool)]
+    ambiguous = _turning_back(filter_, first, known)
     for number, group in enumerate(layout.groups):
-        steps = [_steps_of(filter_, first, i) for i in group.x]
+        steps = [_steps_of(filter_, first, i, i in ambiguous) for i in group.x]
         offsets = [_in_tangent(layout, number, np.array(x)) for x in _some(itertools.product(*steps))]
         mode = 0
         for offset in offsets[1:] + _half_turns(layout, number):
@@ -87,7 +90,50 @@ def _some(places: Iterable[tuple[float, ...]]) -> list[tuple[float, ...]]:
     return every[::step]
 
 
-def _steps_of(filter_: Filter, first: Belief, i: int) -> list[float]:
+def _turning_back(filter_: Filter, first: Belief, known: Array) -> set[int]:
+    """Return the coordinates of which something that is seen goes back while they go on between their limits.
+
+    So the distance from a place says the same on both sides of it. Groups are looked at all at once.
+    """
+    layout, limits = filter_.layout, filter_.limits
+    width = limits.upper - limits.lower
+    found: set[int] = set()
+    for k in range(max(len(group.x) for group in layout.groups)):
+        groups = [
+            g for g in layout.groups if k < len(g.x) and g.own_place(k) >= 0 and np.isfinite(width[g.x[k]])
+        ]
+        said: list[Array] = []
+        for share in _SHARES if groups else ():
+            x = first.x.copy()
+            for group in groups:
+                x[group.x[k]] = limits.lower[group.x[k]] + share * width[group.x[k]]
+            try:
+                said.append(filter_.residuals.evaluate(x, known))
+            except KineverseError:  # nobody can be there
+                continue
+        if said:
+            found.update(int(g.x[k]) for g in groups if _goes_back(layout, g, g.own_place(k), np.array(said)))
+    return found
+
+
+def _goes_back(layout: Layout, group: Group, column: int, said: Array) -> bool:
+    """Whether something that is seen has opposite slopes at two places, or jumps against them in between."""
+    for i in group.seen:
+        one = layout.observations[i]
+        slopes = said[:, layout.slope_slices[i]].reshape(len(said), one.size, -1)[:, :, column]
+        white = np.linalg.inv(np.linalg.cholesky(one.covariance))
+        with np.errstate(invalid="ignore"):  # where the model says nothing finite
+            slopes = slopes @ white.T
+            if (slopes @ slopes.T < 0.0).any():
+                return True
+            if not one.is_pose:
+                changes = nearest(np.diff(said[:, layout.value_slices[i]], axis=0), one.period) @ white.T
+                if (np.einsum("ij,ij->i", changes, slopes[1:] + slopes[:-1]) < 0.0).any():
+                    return True
+    return False
+
+
+def _steps_of(filter_: Filter, first: Belief, i: int, is_ambiguous: bool) -> list[float]:
     """Return how far from the first place of a coordinate others are to be tried, itself first."""
     coordinate = filter_.layout.chart.coordinates[i]
     if coordinate in filter_.layout.chart.by_speeds:
@@ -95,8 +141,10 @@ def _steps_of(filter_: Filter, first: Belief, i: int) -> list[float]:
     if coordinate in filter_.turns:
         return [0.0, math.pi / 2, math.pi, -math.pi / 2]
     low, high = filter_.limits.lower[i], filter_.limits.upper[i]
-    if not math.isfinite(high - low) or high - low <= 2 * _APART + _SAME:
+    if not math.isfinite(high - low):
         return [0.0]
+    if high - low <= 2 * _APART + _SAME:
+        return [0.0, *(low + share * (high - low) - first.x[i] for share in _SHARES if is_ambiguous)]
     count = min(math.ceil((high - low) / _APART), _MOST_STARTS - 1)
     middles = low + (np.arange(count) + 0.5) * (high - low) / count - first.x[i]
     return [0.0, *middles.tolist()]
