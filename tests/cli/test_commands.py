@@ -11,7 +11,7 @@ import pytest
 
 import kineverse as kv
 
-COMMAND = [sys.executable, "-m", "kineverse.cli"]
+COMMAND = [sys.executable, "-m", "kineverse"]
 
 
 def python(*words):
@@ -196,7 +196,7 @@ def test_meshes_that_are_missing_are_counted(run, tmp_path):
 
 def test_a_closed_pipe_is_quiet():
     done = subprocess.run(
-        f"'{sys.executable}' -m kineverse.cli info kitchen --frames --constraints | head -n 1",
+        f"'{sys.executable}' -m kineverse info kitchen --frames --constraints | head -n 1",
         shell=True,
         capture_output=True,
         text=True,

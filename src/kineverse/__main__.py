@@ -1,4 +1,4 @@
-"""``python -m kineverse.cli``, for where the command is not on the path."""
+"""``python -m kineverse``, for where the command is not on the path."""
 
 from __future__ import annotations
 
