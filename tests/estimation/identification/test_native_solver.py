@@ -10,7 +10,7 @@ from part_recordings import JOINTS, recording
 
 from kineverse.errors import ShapeError
 from kineverse.estimation import identify
-from kineverse.estimation.identification import refining
+from kineverse.estimation.identification import native, refining
 from kineverse.estimation.identification.evidence import evidence, overrated
 from kineverse.estimation.identification.groups import GROUPS, Freedom, GroupMotion
 from kineverse.estimation.identification.library import library
@@ -146,6 +146,28 @@ def test_precise_positions_are_the_same(family: str, whole: bool) -> None:
     same(slow, fast, atol=0.02)
     near = slow.solution
     same(refining.refined(seen, near), solver.refined(seen, near), atol=0.02, log=0.2)
+
+
+@pytest.mark.compiler
+@pytest.mark.parametrize("family", [*JOINTS])
+@pytest.mark.parametrize("how", [*HOW, "precise"])
+def test_c_stays_within_the_memory_it_asks_for(
+    family: str, how: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    lent = []
+
+    def lend(size: int) -> np.ndarray:
+        lent.append(np.full(size + 64, 12345.0))
+        return lent[-1][:size]
+
+    monkeypatch.setattr(native._memory, "of", lend)
+    seen = precise(family, True) if how == "precise" else seen_as(how, family)
+    found = solver.likeliest(seen, [*starts(family, Overview(seen))]).solution
+    found = solver.refined(seen, found).solution
+    solver.continued(seen, Start(found.motion, found.values), found.parent, found.belief, 2)
+    solver.evidence(found)
+    assert len(lent) == 4
+    assert all((memory[-64:] == 12345.0).all() for memory in lent)
 
 
 @pytest.mark.compiler

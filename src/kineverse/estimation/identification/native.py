@@ -54,7 +54,7 @@ class Solver:
         return library.is_native
 
     def prepare(self, wait: bool = False) -> bool:
-        """Have C compiled, see :meth:`.library.Library.prepare`."""
+        """Have C compiled, see :meth:`.SourceLibrary.prepare`."""
         return library.prepare(wait)
 
     def solve(
