@@ -111,6 +111,13 @@ def test_a_single_part_may_have_any_name(tmp_path):
     assert recording.pair(child="door").child == "door"
 
 
+@pytest.mark.parametrize("column", ["part", "name", "link", "body", "object", "frame", "child_frame_id"])
+def test_the_column_of_parts_has_several_names(column, tmp_path):
+    recording = read_recording(written(tmp_path, f"t,{column},x,y,z\n0,wall,1,0,0\n0,door,2,0,0\n"))
+    assert recording.ignored == ()
+    assert set(recording.tracks) == {"wall", "door"}
+
+
 def test_a_part_called_world_is_a_part(tmp_path):
     recording = read_recording(
         written(tmp_path, "part,x,y,z,rx,ry,rz\nworld,1,0,0,0,0,0\ndoor,2,0,0,0,0,0\n")

@@ -22,7 +22,8 @@ ORIENTATIONS: Mapping[str, tuple[str, ...]] = MappingProxyType(
 
 TIME, PART, SKIP = "time", "part", "-"
 SYNONYMS: Mapping[str, str] = MappingProxyType(
-    {"t": TIME, "stamp": TIME, "timestamp": TIME, "name": PART, "link": PART, "body": PART}
+    dict.fromkeys(("t", "stamp", "timestamp"), TIME)
+    | dict.fromkeys(("name", "link", "body", "object", "frame", "child_frame_id"), PART)
 )
 
 _LENGTHS = {"m": 1.0, "cm": 0.01, "mm": 0.001}
