@@ -58,6 +58,11 @@ class Charted:
             )
         return found
 
+    def only_shakes(self, number: int, speeds: Mapping[Symbol, float]) -> bool:
+        """Whether a group moves by noise alone, in directions that are its coordinates."""
+        group = self._layout.groups[number]
+        return number not in self._flows and not any(speeds.get(v, 0.0) for v in group.tangent)
+
     def wait(self, timeout: float | None) -> None:
         """Wait until steps run in compiled code."""
         for motion in self._steps.values():

@@ -13,8 +13,9 @@ from kineverse.state import State
 from kineverse.symbols import Symbol
 
 from .belief import inverse
-from .filtering import Filter, Outcome
+from .filtering import Filter
 from .modes import Modes
+from .outcome import Outcome
 
 
 class Estimate:

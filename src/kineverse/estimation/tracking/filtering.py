@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
@@ -21,6 +20,7 @@ from .limits import Limits
 from .modes import Candidate, Modes
 from .native import NativeSolver, native_library
 from .openness import Openness
+from .outcome import Outcome
 from .outliers import Outliers
 from .reading import Reader, Reading
 from .residuals import Residuals
@@ -29,33 +29,11 @@ from .saddles import Saddles
 from .solving import Found, Solver
 from .standing import Memory
 from .undoubted import Undoubted
+from .widening import Widening
 
 _OUTSIDE = 1e-9
 # So few deviations from its mean a belief is about that, as after an update.
 _SETTLED = 1e-5
-
-
-@dataclass(slots=True, eq=False)
-class Outcome:
-    """What an update found.
-
-    Attributes
-    ----------
-    modes
-        After it.
-    nis, dof
-        The normalised innovation squared, and of how many numbers it is the sum.
-    outliers
-        The numbers of the observations that were not believed.
-    rounds
-        How many times the model was evaluated, at most for one explanation.
-    """
-
-    modes: Modes
-    nis: float
-    dof: int
-    outliers: tuple[int, ...]
-    rounds: int
 
 
 class Filter:
@@ -82,9 +60,10 @@ class Filter:
         self.reader = Reader(layout)
         self.solver = Solver(layout, self.residuals, self.charted, limits)
         self.openness = Openness(layout)
-        self.memory = Memory(layout, self.reader, self.solver, self.openness, self._found)
+        self.memory = Memory(layout, self.residuals, self.reader, self.solver, self.openness, self._found)
         boxes = self.solver.boxes
-        self.ridge = Ridge(layout, self.residuals, self.charted, self.reader, boxes, self.openness)
+        parts = (layout, self.residuals, self.charted, self.reader, boxes, self.openness)
+        self.ridge, self.widening = Ridge(*parts), Widening(*parts)
         self.likeness = Likeness(layout, self.residuals, self.reader, self.charted, self.ridge)
         self.saddles = Saddles(layout, self.charted, self.openness, boxes)
         self.native = (
@@ -186,7 +165,7 @@ class Filter:
         for number in groups:
             if belief.standing[number] is not None:
                 wide = belief.copy() if wide is belief else wide
-                self.ridge.widen(number, wide)
+                self.widening.widen(number, wide)
         return wide
 
     def predict(
@@ -201,7 +180,9 @@ class Filter:
 
         Speeds are commanded; noise is variances by second that add to that.
         """
-        belief = self._widened(belief, self.charted.moving(speeds, noise))
+        moving = self.charted.moving(speeds, noise)
+        shaken = [n for n in moving if belief.standing[n] is not None and self.charted.only_shakes(n, speeds)]
+        belief = self._widened(belief, set(moving).difference(shaken))
         found = None
         if self.native is not None and self.native.is_ready and not self.charted.is_driven:
             tangent = self.layout.chart.tangent
@@ -212,6 +193,14 @@ class Filter:
             self.charted.predict(found, known, dt, speeds, noise)
             if not self._is_at_top(found):
                 found = self.solver.inside(found, self.reader.nothing(), known)
+        for number in shaken:
+            # What is straight is a Gaussian, which has gone on as it should.
+            if self.widening.is_straight(number, belief):
+                found.standing[number] = None
+                continue
+            group = self.layout.groups[number]
+            grown = np.array([noise.get(v, 0.0) for v in group.tangent]) * dt
+            self.memory.loosen(number, belief, found, grown)
         self._settle(found)
         return found
 

@@ -10,6 +10,8 @@ from .layout import Layout
 
 # A direction is open as long as it is known no better than to this part of what was assumed at the start.
 _OPEN = 0.05
+# Rounding may leave nothing of what was known; no step is longer than a hundred deviations at the start.
+_LEAST = 1e-4
 
 
 class Openness:
@@ -37,8 +39,7 @@ class Openness:
         """
         scale = self.deviations[self._groups[number].t]
         values, vectors = np.linalg.eigh(information * np.outer(scale, scale))
-        # Rounding may leave nothing of what was known; no more is assumed than at the start.
-        steps = (vectors * np.maximum(values, 1.0) ** -0.5).T * scale
+        steps = (vectors * np.maximum(values, _LEAST) ** -0.5).T * scale
         is_open = values < _OPEN**-2
         return steps[is_open], steps[~is_open]
 

@@ -89,18 +89,7 @@ class Ridge:
             bend = self._bend(hill, one, other)
             is_straight &= float(np.linalg.norm(bend @ back)) < _STRAIGHT
             found = found + np.outer(bend, bend)
-        return straight if is_straight else symmetric(found)
-
-    def widen(self, number: int, belief: Belief) -> None:
-        """Believe in a Gaussian as wide as that, and forget what it follows from."""
-        if belief.standing[number] is None:
-            return
-        t = self._layout.groups[number].t
-        block = np.ix_(t, t)
-        mean = inverse(belief.information[block]) @ belief.vector[t]
-        belief.information[block] = inverse(self.covariance(number, belief))
-        belief.vector[t] = belief.information[block] @ mean
-        belief.standing[number] = None
+        return straight if is_straight else _no_narrower(found, np.concatenate([ways, across]))
 
     def _beyond(self, hill: _Hill, way: Array) -> tuple[Array, bool]:
         """Return what a walk along a way adds to the covariance, and whether that is straight."""
@@ -116,10 +105,7 @@ class Ridge:
                 log = math.log(density) + along**2 / 2
                 is_straight &= float(np.linalg.norm(aside)) < _STRAIGHT and abs(log) < _STRAIGHT
         found /= total
-        # What is narrower than a stride would not have been seen.
-        width = float(back[:, 0] @ found @ back[:, 0])
-        lacking = max((_STRIDE / 2) ** 2 - width, 0.0)
-        return found + (lacking - 1.0) * np.outer(way, way), is_straight
+        return found - np.outer(way, way), is_straight
 
     def _bend(self, hill: _Hill, one: Array, other: Array) -> Array:
         """Return by how much the ridge is bent where both ways are gone, beyond what each alone says."""
@@ -187,6 +173,14 @@ class Ridge:
         if not (math.isfinite(cost) and np.isfinite(information).all()):
             return None
         return _Place(step, cost, hill.across @ gradient, hill.across @ information @ hill.across.T)
+
+
+def _no_narrower(covariance: Array, steps: Array) -> Array:
+    """Return a covariance that is as wide as half of each step: what is narrower would not have been seen."""
+    back = np.linalg.inv(steps)
+    values, vectors = np.linalg.eigh(symmetric(back.T @ covariance @ back))
+    wide = steps.T @ vectors * np.sqrt(np.maximum(values, 0.25))
+    return symmetric(wide @ wide.T)
 
 
 @dataclass(frozen=True, eq=False)

@@ -11,7 +11,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from types import MappingProxyType
 from typing import TypeAlias
 
 import numpy as np
@@ -24,6 +23,7 @@ from .layout import Layout
 from .observed import Observation, nearest
 from .openness import Openness
 from .reading import Reader, Reading, whitening
+from .residuals import Residuals
 from .solving import Found, Solver
 
 Update: TypeAlias = Callable[[Belief, Reading, Array, list[int]], Found]
@@ -104,7 +104,7 @@ class Standing:
         seen = dict(self.seen)
         for i, one in new.items():
             seen[i] = seen[i].joined(one, observations[i]) if i in seen else one
-        return replace(self, seen=MappingProxyType(seen), looks=self.looks + 1)
+        return replace(self, seen=seen, looks=self.looks + 1)
 
     def reading(self, layout: Layout, reader: Reader) -> Reading:
         """Return all of it as one reading."""
@@ -122,17 +122,23 @@ class Memory:
 
     Parameters
     ----------
-    layout, reader, solver, openness
+    layout, residuals, reader, solver, openness
         The parts of a tracker.
     update
         What does the same as the solver, and faster where it can.
     """
 
     def __init__(
-        self, layout: Layout, reader: Reader, solver: Solver, openness: Openness, update: Update
+        self,
+        layout: Layout,
+        residuals: Residuals,
+        reader: Reader,
+        solver: Solver,
+        openness: Openness,
+        update: Update,
     ) -> None:
-        self._layout, self._reader, self._solver, self._openness = layout, reader, solver, openness
-        self._update = update
+        self._layout, self._residuals, self._reader = layout, residuals, reader
+        self._solver, self._openness, self._update = solver, openness, update
         # A single coordinate has no other that it could move with.
         self._groups = {number for number, group in enumerate(layout.groups) if len(group.t) > 1}
 
@@ -171,10 +177,12 @@ class Memory:
                 continue
             if old is None:
                 evidence = float(before.evidence[number])
-                first = Standing(before.part(group.t), MappingProxyType({}), known, evidence)
+                first = Standing(before.part(group.t), {}, known, evidence)
                 standing = first.with_seen(new, self._layout.observations)
                 if found.priors is not None or not group.by_speeds:
-                    after.standing[number] = replace(standing, prior=self._prior(number, before, found))
+                    after.standing[number] = replace(
+                        standing, prior=self._prior(number, before, first.prior, found)
+                    )
                     continue
                 old = first
             standing = old.with_seen(new, self._layout.observations)
@@ -182,6 +190,39 @@ class Memory:
             # What was never seen yet may still say that all was taken for its mirror image.
             if len(standing.seen) == len(group.seen) and not self._is_open(number, after):
                 after.standing[number] = None
+
+    def loosen(self, number: int, before: Belief, after: Belief, grown: Array) -> None:
+        """Let go of what noise takes away: of a group that moves by that alone, the rest is remembered.
+
+        Parameters
+        ----------
+        number
+            Of the group.
+        before, after
+            What was believed before and after, of which the latter is changed.
+        grown
+            The variances that have come to its tangent (t,).
+        """
+        standing, group = before.standing[number], self._layout.groups[number]
+        assert standing is not None
+        out = self._residuals.evaluate(after.x, standing.known)
+        seen = {}
+        for i, one in standing.seen.items():
+            size = self._layout.observations[i].size
+            slope = out[self._layout.slope_slices[i]].reshape(size, len(group.t))
+            # All that was seen moves alike. Taken to be independent, each is told of the motion of all.
+            noise = len(standing.seen) * (slope * grown) @ slope.T
+            information = inverse(inverse(one.information) + noise)
+            lost = np.linalg.slogdet(one.information)[1] - np.linalg.slogdet(information)[1]
+            seen[i] = replace(one, information=information, peak=one.peak - float(lost) / 2)
+        covariance = inverse(standing.prior.matrix)
+        matrix = inverse(covariance + np.diag(grown))
+        prior = Quadratic.of_density(matrix, matrix @ (covariance @ standing.prior.vector))
+        step = after.x[group.x] - before.x[group.x]
+        loose = replace(standing, prior=prior.carried(step, None), seen=seen, evidence=0.0)
+        # What was seen is as probable as it was; only what comes is judged by what is left.
+        as_told = self._from_all(number, after, loose).belief.evidence[number]
+        after.standing[number] = replace(loose, evidence=float(before.evidence[number] - as_told))
 
     def _is_open(self, number: int, belief: Belief) -> bool:
         t = self._layout.groups[number].t
@@ -198,23 +239,28 @@ class Memory:
     ) -> None:
         """Find the most probable state from where it was, and what is believed there."""
         group = self._layout.groups[number]
+        found = self._from_all(number, before, standing)
+        after.x[group.x] = found.belief.x[group.x]
+        after.put(group.t, found.belief.part(group.t))
+        if are_all_right:
+            after.evidence[number] = found.belief.evidence[number]
+        after.standing[number] = replace(standing, prior=self._prior(number, before, standing.prior, found))
+
+    def _from_all(self, number: int, before: Belief, standing: Standing) -> Found:
+        """Return what follows from all that is remembered, beginning at a place."""
+        group = self._layout.groups[number]
         first = before.copy()
         first.put(group.t, standing.prior)
         first.evidence[number] = standing.evidence
         reading = standing.reading(self._layout, self._reader)
         # How a tangent turns on the way, C does not tell.
         update = self._solver.update if group.by_speeds else self._update
-        found = update(first, reading, standing.known, [number])
-        after.x[group.x] = found.belief.x[group.x]
-        after.put(group.t, found.belief.part(group.t))
-        if are_all_right:
-            after.evidence[number] = found.belief.evidence[number]
-        after.standing[number] = replace(standing, prior=self._prior(number, first, found))
+        return update(first, reading, standing.known, [number])
 
-    def _prior(self, number: int, before: Belief, found: Found) -> Quadratic:
+    def _prior(self, number: int, before: Belief, prior: Quadratic, found: Found) -> Quadratic:
         """Return what was believed before, in the tangent at the place that was found."""
         if found.priors is not None:
             return found.priors[number]
         group = self._layout.groups[number]
         step = found.belief.x[group.x] - before.x[group.x]
-        return before.part(group.t).carried(step, None)
+        return prior.carried(step, None)

@@ -18,12 +18,13 @@ from kineverse.symbols import Symbol
 from .arrangement import arranged
 from .belief import Belief
 from .estimate import Estimate
-from .filtering import Filter, Outcome
+from .filtering import Filter
 from .limits import first_deviations, first_place
 from .locks import Locks
 from .modes import Modes
 from .native import native_library
 from .observed import ObservedLike, checked_number, checked_positive, observations
+from .outcome import Outcome
 from .outliers import Outliers, as_outliers
 from .reading import Reading
 from .starts import starts, turning
