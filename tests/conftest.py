@@ -77,6 +77,16 @@ def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
                 terminalreporter.line(name, red=True)
 
 
+@pytest.fixture(scope="session", autouse=True)
+def _models_are_remembered() -> Generator[None]:
+    """What one test has loaded is there for the next one: linkages take seconds to be closed."""
+    from kineverse.formats import loading
+
+    before, loading.MOST_REMEMBERED = loading.MOST_REMEMBERED, 100
+    yield
+    loading.MOST_REMEMBERED = before
+
+
 @pytest.fixture(scope="session")
 def chromium() -> str:
     """Path of the system's Chromium."""
