@@ -38,7 +38,7 @@ def opened(browser):
     """A viewer of the cabinet, and the page a browser has of it."""
     camera = Camera((-2.4, -1.6, 1.3), (0.0, 0.0, 0.5))
     with view(cabinet(), port=0, camera=camera) as viewer:
-        page = browser.new_page(viewport={"width": 900, "height": 560})
+        page = browser.new_page(viewport={"width": 660, "height": 400})
         page.set_default_timeout(PATIENCE)
         errors = []
         page.on("pageerror", lambda error: errors.append(str(error)))
@@ -61,8 +61,8 @@ def until(page, condition):
 
 
 def shot(page):
-    """The left half of the page, where nothing but the scene is drawn."""
-    clip = {"x": 0, "y": 0, "width": 500, "height": 560}
+    """The left of the page, where nothing but the scene is drawn."""
+    clip = {"x": 0, "y": 0, "width": 270, "height": 400}
     data = page.screenshot(clip=clip)
     return np.asarray(imaging.open(io.BytesIO(data)).convert("RGB")).astype(int)
 
@@ -156,7 +156,7 @@ def test_sliders_can_be_found_by_name_and_edits_arrive(opened):
 def test_a_second_browser_sees_what_the_first_one_moved(opened, browser):
     viewer, page = opened
     viewer.move({"cabinet/drawer": 0.4})
-    other = browser.new_page(viewport={"width": 900, "height": 560})
+    other = browser.new_page(viewport={"width": 660, "height": 400})
     other.set_default_timeout(PATIENCE)
     other.goto(viewer.address)
     other.wait_for_selector(SLIDERS)
@@ -168,7 +168,7 @@ def test_a_second_browser_sees_what_the_first_one_moved(opened, browser):
 def test_the_range_of_a_slider_follows_another_one(browser):
     """The latch of a door: while its bolt is in, the door's slider goes nowhere; drawn, all the way."""
     with view(held_door(), port=0) as viewer:
-        page = browser.new_page(viewport={"width": 900, "height": 560})
+        page = browser.new_page(viewport={"width": 660, "height": 400})
         page.set_default_timeout(PATIENCE)
         page.goto(viewer.address)
         page.wait_for_selector(SLIDERS)
