@@ -19,11 +19,14 @@ from pathlib import Path
 import pytest
 from hypothesis import settings
 
+from attempts import USUAL
+
 ROOT = Path(__file__).parents[1]
 SHARED = ROOT.parent / "shared" / "data"
 BROWSERS = ("chromium", "chromium-browser", "google-chrome")
 
 settings.register_profile("kineverse", deadline=None, derandomize=bool(os.environ.get("CI")))
+settings.register_profile("thorough", settings.get_profile("kineverse"), max_examples=10 * USUAL)
 settings.load_profile("kineverse")
 
 

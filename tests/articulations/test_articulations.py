@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 import kineverse as kv
+from attempts import attempts
 from kineverse.articulations import AxisJoint, Joint
 
 INF = float("inf")
@@ -83,7 +84,7 @@ def test_prismatic(axis: Any) -> None:
 
 
 @given(st.tuples(numbers, numbers, numbers).filter(lambda v: max(map(abs, v)) > 1e-3), numbers)
-@settings(max_examples=40, derandomize=True)
+@settings(max_examples=attempts(40), derandomize=True)
 def test_any_axis(axis: Any, q: float) -> None:
     expected = homogeneous(Rotation.from_rotvec(unit(axis) * q))
     where = {"name": "j", "parent": "world", "child": "c"}
@@ -112,7 +113,7 @@ def test_planar(axis: Any) -> None:
     st.tuples(numbers, numbers, numbers),
     st.tuples(*[st.floats(-1, 1)] * 4).filter(lambda q: sum(v * v for v in q) > 0.1),
 )
-@settings(max_examples=40, derandomize=True)
+@settings(max_examples=attempts(40), derandomize=True)
 def test_floating(xyz: Any, q: Any) -> None:
     values = dict(zip(("x", "y", "z", "qx", "qy", "qz", "qw"), (*xyz, *q), strict=True))
     expected = ORIGIN @ homogeneous(Rotation.from_quat(q), xyz)

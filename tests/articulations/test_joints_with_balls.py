@@ -23,6 +23,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 import kineverse as kv
+from attempts import attempts
 
 nan, inf = float("nan"), float("inf")
 FULL = kv.Ball(**WHERE, axis=(1, 2, 3), cone=0.8, twist=0.5, velocity=2)
@@ -34,7 +35,7 @@ def at(rotation: Rotation, length: float = 1.0) -> dict[str, float]:
     return dict(zip((f"j/q{c}" for c in "xyzw"), quaternion.tolist(), strict=True))
 
 
-@settings(max_examples=30, derandomize=True)
+@settings(max_examples=attempts(30), derandomize=True)
 @given(seed=st.integers(0, 10**6), length=st.sampled_from([1.0, -1.0, 0.1, 7.0]))
 def test_it_turns_by_its_quaternion(seed: int, length: float) -> None:
     rotation = Rotation.random(rng=np.random.default_rng(seed))
@@ -65,7 +66,7 @@ def test_it_moves_as_gradients_say() -> None:
     assert_motion_law(model, [model.fk("c"), model.jacobian("c"), *limited], seed=3)
 
 
-@settings(max_examples=60, derandomize=True)
+@settings(max_examples=attempts(60), derandomize=True)
 @given(seed=st.integers(0, 10**6), length=st.sampled_from([1.0, -2.0]))
 def test_cone_and_twist_are_the_angles_they_are_said_to_be(seed: int, length: float) -> None:
     rng = np.random.default_rng(seed)

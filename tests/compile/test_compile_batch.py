@@ -21,6 +21,7 @@ from compiled_programs import (
 from hypothesis import HealthCheck, given, settings
 
 import kineverse as kv
+from attempts import attempts
 from kineverse.compile import batch, batch_source, memory, rows
 from kineverse.expressions.expression import make
 
@@ -199,7 +200,7 @@ def test_every_operation() -> None:
 
 
 @pytest.mark.compiler
-@settings(max_examples=5, suppress_health_check=[HealthCheck.too_slow])
+@settings(max_examples=attempts(5), suppress_health_check=[HealthCheck.too_slow])
 @given(random_programs())
 def test_random_programs(program: RandomProgram) -> None:
     check_every_value(program, points(1003, 5))

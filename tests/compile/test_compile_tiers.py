@@ -13,6 +13,7 @@ from hypothesis import HealthCheck, given, settings
 from processes import states_of_group
 
 import kineverse as kv
+from attempts import attempts
 from kineverse.compile import compiler_information, worker
 from kineverse.compile.batch_source import batch_source
 from kineverse.compile.native import native
@@ -45,7 +46,7 @@ def test_tiers_agree_to_the_bit_on_every_operation() -> None:
 
 
 @pytest.mark.compiler
-@settings(max_examples=5, suppress_health_check=[HealthCheck.too_slow])
+@settings(max_examples=attempts(5), suppress_health_check=[HealthCheck.too_slow])
 @given(random_programs())
 def test_tiers_agree_to_the_bit_on_random_programs(program) -> None:
     symbols, values = program.expressions()

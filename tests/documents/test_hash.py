@@ -17,6 +17,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import kineverse as kv
+from attempts import attempts
 from kineverse.formats.document import document_of, operations_from
 
 MODEL = rich_model()
@@ -50,7 +51,7 @@ def test_it_is_sha256_of_the_text_without_it() -> None:
 @given(
     random=st.randoms(use_true_random=False), indent=st.sampled_from([None, 0, 2]), ascii_only=st.booleans()
 )
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=attempts(20), deadline=None)
 def test_the_layout_does_not_matter(random: Any, indent: int | None, ascii_only: bool) -> None:
     text = json.dumps(shuffled(json.loads(TEXT), random), indent=indent, ensure_ascii=ascii_only)
     assert operations_from(text) == operations_from(TEXT)
@@ -68,7 +69,7 @@ LEAVES = leaves_of(json.loads(TEXT))
 
 
 @given(st.data())
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=attempts(50), deadline=None)
 def test_whatever_is_changed_is_noticed(data: st.DataObject) -> None:
     tree = json.loads(TEXT)
     *path, last = data.draw(st.sampled_from([p for p in LEAVES if p[0] in ("nodes", "operations")]))

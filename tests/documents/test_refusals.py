@@ -13,6 +13,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 import kineverse as kv
+from attempts import attempts
 from kineverse.formats.document import document_of, operations_from
 
 TEXT = document_of(rich_model())
@@ -118,7 +119,7 @@ def test_a_long_way_down():
     assert outcome(NODE % ",".join(long)) == []
 
 
-@settings(max_examples=300, suppress_health_check=list(HealthCheck))
+@settings(max_examples=attempts(150), suppress_health_check=list(HealthCheck))
 @given(data=st.data())
 def test_anything_changed_is_read_or_refused(data):
     """Replace, drop or double any part of a real document: a model or one error of our own comes out."""
@@ -147,7 +148,7 @@ def test_anything_changed_is_read_or_refused(data):
             pass
 
 
-@settings(max_examples=200)
+@settings(max_examples=attempts(100))
 @given(place=st.integers(0, len(WITHOUT_HASH) - 1), what=st.characters())
 def test_any_character_changed_is_read_or_refused(place, what):
     outcome(TEXT[:place] + what + TEXT[place + 1 :])

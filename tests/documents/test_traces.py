@@ -15,6 +15,7 @@ from hypothesis import strategies as st
 from trace_models import KNOB, LIFT, WHEEL, Custom, agree, build, changed, reloaded
 
 import kineverse as kv
+from attempts import attempts
 from kineverse.formats.document import Recorded, document_of, operations_from
 
 
@@ -117,7 +118,7 @@ def programs(draw: st.DrawFn) -> Callable[[kv.Reader], kv.Effects]:
 
 
 @given(programs(), st.sampled_from(CHANGES))
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=attempts(30), deadline=None)
 def test_any_code_is_followed_rightly_or_the_change_refused(code: Any, change: dict[str, Any]) -> None:
     read = reloaded(build(code))
     before = read.snapshot()

@@ -14,6 +14,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 import kineverse as kv
+from attempts import attempts
 from kineverse.formats.document import document_of
 
 MODEL = rich_model()
@@ -70,7 +71,7 @@ def test_cut_off_anywhere() -> None:
         assert "the document" in refusal(SMALL[:length]), length
 
 
-@settings(max_examples=300, suppress_health_check=list(HealthCheck), deadline=None)
+@settings(max_examples=attempts(300), suppress_health_check=list(HealthCheck), deadline=None)
 @given(place=st.integers(0, len(SMALL) - 1), byte=st.integers(0, 255))
 def test_any_byte_changed_is_noticed(place: int, byte: int) -> None:
     changed = SMALL[:place] + bytes([byte]) + SMALL[place + 1 :]
@@ -78,7 +79,7 @@ def test_any_byte_changed_is_noticed(place: int, byte: int) -> None:
         refusal(changed)
 
 
-@settings(max_examples=300)
+@settings(max_examples=attempts(300))
 @given(st.binary(max_size=60))
 def test_any_bytes(data: bytes) -> None:
     refusal(data)

@@ -10,6 +10,7 @@ import numpy as np
 from hypothesis import HealthCheck, Phase, assume, given, settings
 from hypothesis import strategies as st
 
+from attempts import attempts
 from kineverse.expressions import array
 from kineverse.symbols import Symbol
 
@@ -81,7 +82,7 @@ SHAPES = st.sampled_from([lp.S, lp.V3, lp.M23, lp.M33])
 def examples(count, **options):
     """Settings: as many examples, always the same ones."""
     return settings(
-        max_examples=count,
+        max_examples=attempts(count),
         derandomize=True,
         database=None,
         deadline=None,

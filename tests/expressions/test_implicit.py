@@ -177,7 +177,7 @@ def _solved(kind, arguments):
 ARGUMENTS = st.one_of(lp.programs(lp.S, 2), lp.nested(lp.S, 2))
 
 
-@lc.examples(60)
+@lc.examples(30)
 @given(st.sampled_from(["Kepler", "polar"]), ARGUMENTS, ARGUMENTS, st.booleans())
 def test_the_law_holds_for_augmented_inputs_and_heuristics(kind, first, second, wrapped):
     programs = (first, second)
@@ -204,7 +204,7 @@ def test_the_law_holds_for_augmented_inputs_and_heuristics(kind, first, second, 
     lc.check(ours, theirs, WORDS.values)
 
 
-@lc.examples(40)
+@lc.examples(20)
 @given(st.sampled_from(["Kepler", "polar"]), ARGUMENTS, ARGUMENTS)
 def test_substitution_is_composition(kind, first, second):
     """The function of plain symbols, with programs in their places afterwards."""

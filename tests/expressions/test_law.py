@@ -29,7 +29,7 @@ def test_third_order():
     lc.law(st.one_of(lp.programs(lp.S, 2), lp.nested(lp.S, 2)), WORDS, 30, order=3)()
 
 
-@lc.examples(60)
+@lc.examples(40)
 @lc.given(lc.SHAPES.flatmap(lambda shape: lp.programs(shape, 3, lp.SMOOTH)))
 def test_finite_differences(program):
     e = array(lp.build(program, WORDS))

@@ -11,6 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import kineverse as kv
+from attempts import attempts
 from kineverse import logic
 from kineverse.errors import ExpressionError, ShapeError, ValueRejectedError
 from kineverse.expressions import array
@@ -211,21 +212,21 @@ def agree(e, f, at):
         np.testing.assert_allclose(first.get(key, 0 * e(at)), second.get(key, 0 * e(at)), atol=1e-12)
 
 
-@settings(max_examples=60)
+@settings(max_examples=attempts(60))
 @given(formulas(SOFT), SOFT_POINTS)
 def test_de_morgan(formula, point):
     """Values and trends alike, to any depth."""
     agree(~build(formula), build(dual(formula)), dict(zip(JOINTS, point, strict=False)))
 
 
-@settings(max_examples=40)
+@settings(max_examples=attempts(40))
 @given(formulas(SHARP, negated=True), SHARP_POINTS)
 def test_de_morgan_with_negations_anywhere(formula, point):
     """Where everything is true or false, it does not matter how a formula is written."""
     agree(~build(formula), build(dual(formula)), dict(zip(JOINTS, point, strict=False)))
 
 
-@settings(max_examples=40)
+@settings(max_examples=attempts(40))
 @given(formulas(SHARP, negated=True), SHARP_POINTS)
 def test_values_are_those_of_python(formula, point):
     at = dict(zip(JOINTS, point, strict=False))

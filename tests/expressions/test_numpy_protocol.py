@@ -17,12 +17,13 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 import kineverse as kv
+from attempts import attempts
 from kineverse.errors import ShapeError
 from kineverse.expressions import numpy_protocol as protocol
 
 SYMBOLS = [kv.position(f"np/{i:03}") for i in range(200)]
 a, b = SYMBOLS[:2]
-few = settings(max_examples=25)
+few = settings(max_examples=attempts(25))
 
 
 def symbolic(numbers, first=0):
@@ -86,7 +87,7 @@ def truths(ufunc):
 
 
 @pytest.mark.parametrize("ufunc", UNARY, ids=lambda u: u.__name__)
-@settings(max_examples=8)
+@settings(max_examples=attempts(8))
 @given(SHAPES)
 def test_unary_ufuncs(ufunc, shape):
     domain = DOMAINS.get(ufunc, (-2, 2))
@@ -95,7 +96,7 @@ def test_unary_ufuncs(ufunc, shape):
 
 
 @pytest.mark.parametrize("ufunc", BINARY, ids=lambda u: u.__name__)
-@settings(max_examples=12)
+@settings(max_examples=attempts(12))
 @given(PAIRS, SOME)
 def test_binary_ufuncs(ufunc, shapes, which):
     first, second = (filled(shape, seed=seed) for seed, shape in enumerate(shapes))
@@ -142,7 +143,7 @@ OPERATORS = [operator.add, operator.sub, operator.mul, operator.truediv, operato
 
 
 @pytest.mark.parametrize("op", OPERATORS, ids=lambda o: o.__name__)
-@settings(max_examples=12)
+@settings(max_examples=attempts(12))
 @given(PAIRS, SOME, st.sampled_from(["array", "list", "integers", "scalar", "float32"]))
 def test_operators_with_arrays_on_either_side(op, shapes, which, kind):
     first, second = (filled(shape, 0.3, 3, seed) for seed, shape in enumerate(shapes))

@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 from scipy.interpolate import CubicSpline
 
 import kineverse as kv
+from attempts import attempts
 
 x, y = kv.position("x"), kv.position("y")
 
@@ -31,7 +32,7 @@ def derivatives(e: kv.Expression) -> list[kv.Expression]:
     return [e, first, first.jacobian([x])]
 
 
-@settings(max_examples=40, derandomize=True)
+@settings(max_examples=attempts(40), derandomize=True)
 @given(seed=st.integers(0, 10**6), n=st.integers(2, 40), periodic=st.booleans())
 def test_values_and_derivatives_are_those_of_scipy(seed: int, n: int, periodic: bool) -> None:
     knots, values = profile(seed, n, periodic)

@@ -13,6 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import kineverse as kv
+from attempts import attempts
 from kineverse import State
 from kineverse.errors import ExpressionError, NameTakenError, UnknownNameError, ValueRejectedError
 
@@ -162,7 +163,7 @@ def test_states_that_differ():
     assert (state == 3) is False
 
 
-@settings(max_examples=30)
+@settings(max_examples=attempts(30))
 @given(VALUES, STAMPS)
 def test_pickle_and_copy(values, stamp):
     state = State(values, stamp=stamp, source="encoder")

@@ -17,6 +17,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import kineverse as kv
+from attempts import attempts
 from kineverse.errors import ExpressionError, NameTakenError, UnknownNameError, ValueRejectedError
 from kineverse.symbols import (
     ROLES,
@@ -202,7 +203,7 @@ def test_names_tell_symbols_apart(path, order, other_path, other_order):
     assert same == ((path, order) == (other_path, other_order))
 
 
-@settings(max_examples=50)
+@settings(max_examples=attempts(50))
 @given(PATHS, ORDERS)
 def test_names_stand_for_symbols_everywhere(path, order):
     s = symbol(path, order)
@@ -222,7 +223,7 @@ def test_names_with_an_order_that_is_none(name):
 # -- derivatives and parameters ----------------------------------------------------------------------------
 
 
-@settings(max_examples=50)
+@settings(max_examples=attempts(50))
 @given(PATHS, st.integers(0, 8), st.sampled_from([r for r in ROLES if r != "parameter"]))
 def test_up_and_down_the_orders(path, order, role):
     s = symbol(path, order, role)

@@ -11,6 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import kineverse as kv
+from attempts import attempts
 from kineverse.expressions import array, total_derivative
 from kineverse.logic import less, logic_and, logic_not, logic_or
 
@@ -86,7 +87,7 @@ def read_once(draw, joints=tuple(JOINTS), depth=3, wanted=True):
     return joint < threshold if kind == "below" else threshold < joint
 
 
-@settings(max_examples=50)
+@settings(max_examples=attempts(50))
 @given(read_once(), st.lists(st.sampled_from([-1.3, -0.3, 0.21, 1.17]), min_size=8, max_size=8))
 def test_the_trend_opens_locks_of_locks(lock, point):
     follow(lock, dict(zip(JOINTS, point, strict=True)))

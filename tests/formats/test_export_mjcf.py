@@ -15,6 +15,7 @@ from trees import KINDS, trees
 from written_mjcf import Reference, mujoco
 
 import kineverse as kv
+from attempts import attempts
 from kineverse.model.body import Body, Box, Ellipsoid, Inertia, Mesh, Shape
 
 FILES = described()
@@ -124,7 +125,7 @@ def test_what_ships_is_said_or_refused_by_name(name: str, tmp_path: Path) -> Non
     assert not without & set(again.bodies)
 
 
-@settings(max_examples=12, deadline=None)
+@settings(max_examples=attempts(6), deadline=None)
 @given(model=trees((*KINDS, "ball")), seed=st.integers(0, 99))
 def test_random_trees_against_mujoco(
     model: kv.Model, seed: int, tmp_path_factory: pytest.TempPathFactory

@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from round_trip import posing, random_values
 
 import kineverse as kv
+from attempts import attempts
 from kineverse.bounds import series
 from kineverse.bounds.enclosure import Enclosures
 from kineverse.bounds.terms import Terms
@@ -59,7 +60,7 @@ def sampled_errors(model: kv.Model, read: kv.Model, count: int = 60) -> dict[str
 
 
 @pytest.mark.parametrize("curve", CURVES, ids=[f"curve{k}" for k in range(len(CURVES))])
-@settings(max_examples=8, deadline=None)
+@settings(max_examples=attempts(8), deadline=None)
 @given(low=st.floats(-1, 1), width=st.floats(1e-3, 0.3), part=st.floats(0, 1))
 def test_series_contain_the_function_and_those_of_all_points(
     curve: kv.Expression, low: float, width: float, part: float

@@ -14,6 +14,7 @@ from round_trip import SCENES, SHIPPED, assert_same_bodies, assert_same_motion, 
 from trees import trees
 
 import kineverse as kv
+from attempts import attempts
 
 FILES = described()
 
@@ -96,7 +97,7 @@ def test_what_is_left_out_on_purpose(name: str, left_out: list[str], tmp_path: P
     assert_same_motion(model, kv.load(report.path))
 
 
-@settings(max_examples=12, deadline=None)
+@settings(max_examples=attempts(6), deadline=None)
 @given(model=trees(), seed=st.integers(0, 99))
 def test_random_trees_against_pinocchio(
     model: kv.Model, seed: int, tmp_path_factory: pytest.TempPathFactory

@@ -31,7 +31,7 @@ from fuzz.targets import TARGETS, Target  # noqa: E402
 from fuzz.ways import Way, way_of  # noqa: E402
 from fuzz.worker import place  # noqa: E402
 
-COUNTS = {"urdf": 300, "sdf": 100, "mjcf": 60, "document": 300}
+COUNTS = {"urdf": 150, "sdf": 60, "mjcf": 40, "document": 150}
 
 
 @pytest.fixture
@@ -42,7 +42,7 @@ def folder(tmp_path) -> Path:
 @pytest.mark.parametrize("name", TARGETS)
 def test_the_law_holds_for_a_while(name, folder):
     target, tally = TARGETS[name], Tally()
-    count = COUNTS.get(name, 100)
+    count = COUNTS.get(name, 60)
     for data in islice(inputs(target, target.own_seeds(), Random(7)), count):
         way = way_of(data)
         assert check(target, data, folder, tally, way) is None, (way, data)

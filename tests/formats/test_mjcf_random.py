@@ -8,6 +8,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from mujoco_oracle import Pair
 
+from attempts import attempts
+
 SHORT = st.floats(-2, 2).map(lambda x: round(x, 6))
 POINT = st.tuples(SHORT, SHORT, SHORT)
 DIRECTION = POINT.filter(lambda p: math.hypot(*p) > 0.1)
@@ -96,7 +98,7 @@ def trees(draw) -> str:
     return f"<mujoco>{compiler}<default>{defaults}</default><worldbody>{bodies}</worldbody></mujoco>"
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=attempts(12), deadline=None)
 @given(trees())
 def test_random_trees_are_where_mujoco_puts_them(text):
     Pair.of_text(text).compare(samples=2)

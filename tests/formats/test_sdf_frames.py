@@ -8,6 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import kineverse as kv
+from attempts import attempts
 from kineverse.formats.sdf import Root, parse_sdf
 from kineverse.formats.sdf.operations import scene_operations
 from kineverse.formats.urdf import parse_urdf
@@ -203,7 +204,7 @@ def written(tree: list, about: list[int]) -> str:
     return sdf(*parts)
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=attempts(25), deadline=None)
 @given(TREE, st.lists(st.integers(0, 99), min_size=12, max_size=12), st.lists(NUMBER, min_size=5, max_size=5))
 def test_what_poses_are_relative_to_changes_nothing(tree, about, q):
     state = {f"j{n}": q[n - 1] for n in range(1, len(tree) + 1)}
@@ -215,7 +216,7 @@ def test_what_poses_are_relative_to_changes_nothing(tree, about, q):
         np.testing.assert_allclose(a(values), b(values), atol=1e-7)  # angles from matrices near gimbal lock
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=attempts(25), deadline=None)
 @given(TREE, st.lists(NUMBER, min_size=5, max_size=5))
 def test_a_urdf_and_the_same_as_sdf(tree, q):
     urdf, parts = ['<robot name="r"><link name="l0"/>'], [link("l0")]

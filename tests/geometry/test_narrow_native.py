@@ -9,6 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scenes import arm_among_boxes, brute_force, by_names, random_state
 
+from attempts import attempts
 from kineverse.geometry import Scene, sweep
 from kineverse.geometry.narrow import Narrow
 from kineverse.geometry.sweep_native import SweepLibrary, sweep_library
@@ -42,7 +43,7 @@ def measured(table, limit=np.inf):
     return float(distances[0]), witnesses[0].reshape(3, 3)
 
 
-@settings(max_examples=400)
+@settings(max_examples=attempts(200))
 @given(kind=kinds, other=kinds, seed=seeds, spread=st.sampled_from([0.05, 0.3, 1.0, 30.0]))
 def test_a_distance_is_certain(kind, other, seed, spread):
     """The points are of the bodies and so no nearer; the normal shows a gap, so that nothing is nearer."""
@@ -66,7 +67,7 @@ def test_a_distance_is_certain(kind, other, seed, spread):
     assert a.support(normal, poses[0]) == pytest.approx(normal @ point_a, abs=small)
 
 
-@settings(max_examples=100)
+@settings(max_examples=attempts(100))
 @given(kind=kinds, other=kinds, seed=seeds)
 def test_the_other_way_round_it_is_the_same(kind, other, seed):
     rng = np.random.default_rng(seed)
@@ -79,7 +80,7 @@ def test_the_other_way_round_it_is_the_same(kind, other, seed):
         assert there == pytest.approx(back, abs=2e-9)
 
 
-@settings(max_examples=200)
+@settings(max_examples=attempts(100))
 @given(kind=kinds, other=kinds, seed=seeds, limit=st.sampled_from([0.0, 0.1, 0.5]))
 def test_a_limit_changes_no_distance_within_it(kind, other, seed, limit):
     rng = np.random.default_rng(seed)
@@ -123,7 +124,7 @@ def test_parallel_faces_edges_and_what_touches():
     assert np.isnan(measured(placed((box, other), (upright, upright)))[0])
 
 
-@settings(max_examples=12)
+@settings(max_examples=attempts(12))
 @given(seed=seeds, radius=st.sampled_from([0.0, 0.1, 0.4]))
 def test_a_scene_finds_the_same_with_c_and_without_and_by_brute_force(seed, radius):
     model, rng = arm_among_boxes(seed=seed % 7), np.random.default_rng(seed)
@@ -146,7 +147,7 @@ def test_a_scene_finds_the_same_with_c_and_without_and_by_brute_force(seed, radi
             assert list(answer.distances) == sorted(answer.distances)
 
 
-@settings(max_examples=60)
+@settings(max_examples=attempts(60))
 @given(seed=seeds, count=st.integers(0, 40), radius=st.sampled_from([0.0, 0.5, np.inf]))
 def test_ranks_in_numpy_and_c_agree(seed, count, radius):
     rng = np.random.default_rng(seed)

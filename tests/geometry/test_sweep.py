@@ -8,6 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
+from attempts import attempts
 from kineverse.geometry import sweep
 from kineverse.geometry.standing import tree_of
 from kineverse.geometry.sweep_native import SweepLibrary
@@ -61,7 +62,7 @@ class Cloud:
         return [(i, j) for i in moving for j in range(i + 1, count) if allowed[body[i], body[j]]]
 
 
-@settings(max_examples=40)
+@settings(max_examples=attempts(40))
 @given(
     seed=st.integers(0, 10**6),
     count=st.integers(2, 14),
@@ -85,7 +86,7 @@ def test_no_pair_is_missed_and_bounds_are_bounds(seed, count, reach, step):
 
 
 @pytest.mark.compiler
-@settings(max_examples=40)
+@settings(max_examples=attempts(40))
 @given(seed=st.integers(0, 10**6), count=st.integers(2, 60), reach=st.sampled_from([0.0, 0.1, 0.5, 9.0]))
 def test_numpy_and_c_agree(library, seed, count, reach):
     one, other = Cloud(seed, count, count // 2), Cloud(seed, count, count // 2)
@@ -141,7 +142,7 @@ def test_carried_bounds_spare_the_measuring():
     assert len(sweep.near(table, 0.1)[0]) == 1
 
 
-@settings(max_examples=60)
+@settings(max_examples=attempts(60))
 @given(seed=st.integers(0, 10**6), count=st.integers(0, 70))
 def test_a_tree_has_every_piece_once_below_boxes_that_hold_it(seed, count):
     rng = np.random.default_rng(seed)

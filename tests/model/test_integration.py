@@ -16,6 +16,7 @@ from scipy.spatial.transform import Rotation
 
 import kineverse as kv
 import motion_law
+from attempts import attempts
 from kineverse.errors import UnknownNameError, ValueRejectedError
 from kineverse.model.rates import plain
 
@@ -114,7 +115,7 @@ def test_rows_of_any_kind_are_followed(name: str) -> None:
     np.testing.assert_allclose(numbers(model, after), expected, rtol=1e-10, atol=1e-11)
 
 
-@settings(max_examples=30)
+@settings(max_examples=attempts(20))
 @given(left=st.floats(-8, 8), right=st.floats(-8, 8), heading=st.floats(-4, 4), dt=st.floats(-2, 2))
 def test_two_wheels_drive_an_arc(left: float, right: float, heading: float, dt: float) -> None:
     model = model_of(BASES["differential"])
@@ -129,7 +130,7 @@ def test_two_wheels_drive_an_arc(left: float, right: float, heading: float, dt: 
     assert after["base/angle"] == pytest.approx(heading + turn * dt, abs=1e-12)
 
 
-@settings(max_examples=30)
+@settings(max_examples=attempts(20))
 @given(seed=st.integers(0, 10**6), dt=st.floats(-3, 3))
 def test_a_quaternion_moves_by_its_exponential_and_keeps_its_length(seed: int, dt: float) -> None:
     rng = np.random.default_rng(seed)

@@ -30,8 +30,9 @@ from model_steps import (
 )
 
 import kineverse as kv
+from attempts import attempts
 
-MANY = 100
+MANY = attempts(50)
 NAMES = ("a", "b", "c", "d")
 FRAMES = ("f", "g", "h", "i")
 name = st.sampled_from(NAMES)

@@ -17,6 +17,7 @@ from hypothesis import strategies as st
 from scipy.optimize import linprog
 
 import kineverse as kv
+from attempts import attempts
 from kineverse.model.velocity import VelocityRows
 
 q = [kv.position(f"q{i}") for i in range(4)]
@@ -143,7 +144,7 @@ def sides(model: kv.Model, rows: VelocityRows, at: Mapping[kv.Symbol, float]) ->
     return found
 
 
-@settings(max_examples=80)
+@settings(max_examples=attempts(40))
 @given(seed=st.integers(0, 2**32), dt=st.sampled_from([0.01, 0.1, 1]), share=st.sampled_from([1, 0.2]))
 def test_all_rows_together_can_be_obeyed_from_anywhere(seed: int, dt: float, share: float) -> None:
     rng = np.random.default_rng(seed)
@@ -167,7 +168,7 @@ def test_all_rows_together_can_be_obeyed_from_anywhere(seed: int, dt: float, sha
 # -- as fast as limits allow -------------------------------------------------------------------------------------
 
 
-@settings(max_examples=30)
+@settings(max_examples=attempts(15))
 @given(seed=st.integers(0, 2**32), far=st.floats(0.001, 100))
 def test_a_bound_alone_asks_for_all_that_single_limits_give(seed: int, far: float) -> None:
     """The linear program that goes inside as fast as it can is no faster."""

@@ -19,6 +19,7 @@ from scipy.optimize import linprog
 from scipy.spatial import HalfspaceIntersection
 
 import kineverse as kv
+from attempts import attempts
 from kineverse.errors import ValueRejectedError
 from kineverse.model.velocity import VelocityRows
 
@@ -88,7 +89,7 @@ JOINTS: Triples = {
 }
 
 
-@settings(max_examples=25)
+@settings(max_examples=attempts(12))
 @given(seed=st.integers(0, 10**6), dt=st.floats(0.01, 1), share=st.floats(0.05, 1))
 def test_who_is_inside_stays_inside(seed: int, dt: float, share: float) -> None:
     rng = np.random.default_rng(seed)
@@ -109,7 +110,7 @@ def test_the_bound_is_reached() -> None:
     assert q[0] == pytest.approx(2)
 
 
-@settings(max_examples=25)
+@settings(max_examples=attempts(12))
 @given(seed=st.integers(0, 10**6), share=st.floats(0.2, 1))
 def test_bounds_that_move_are_kept_while_they_move(seed: int, share: float) -> None:
     """c is between two bounds that other joints move, and these may not catch it either."""
@@ -230,7 +231,7 @@ def test_the_way_back_is_as_fast_as_limits_allow() -> None:
     assert locked.upper({"a": 9.0, "b": 1.0})[locked.names.index("a")] == -1
 
 
-@settings(max_examples=40)
+@settings(max_examples=attempts(20))
 @given(seed=st.integers(0, 10**6))
 def test_rows_can_be_obeyed_wherever_it_starts(seed: int) -> None:
     """Random limits on speeds, single, summed, scaled, of norms; positions each limited by itself."""
@@ -271,7 +272,7 @@ def test_one_sided_limits_give_numbers() -> None:
 # -- braking ---------------------------------------------------------------------------------------------------
 
 
-@settings(max_examples=30)
+@settings(max_examples=attempts(15))
 @given(
     brake=st.floats(0.2, 5),
     weight=st.sampled_from([1.0, -2.0, 0.3]),

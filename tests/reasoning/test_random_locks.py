@@ -10,6 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import kineverse as kv
+from attempts import attempts
 from kineverse import reasoning
 from kineverse.reasoning import Box, Interval, interlocks
 from kineverse.reasoning.polynomial import roots
@@ -57,7 +58,7 @@ truths = logic(atoms | sums)
 LIMITS = {str(x): (-1, x, 1) for x in SYMBOLS}
 
 
-@settings(max_examples=30)
+@settings(max_examples=attempts(15))
 @given(truths, truths)
 def test_locks_on_speeds(one: kv.Expression, other: kv.Expression) -> None:
     subject = model(**LIMITS, lock=(-0.5 * one, kv.velocity("x"), other))
@@ -66,7 +67,7 @@ def test_locks_on_speeds(one: kv.Expression, other: kv.Expression) -> None:
     assert reasoning.contradictions(subject, result) == []
 
 
-@settings(max_examples=25)
+@settings(max_examples=attempts(12))
 @given(truths, NUMBERS, NUMBERS)
 def test_ranges_of_positions(truth: kv.Expression, low: float, high: float) -> None:
     x = kv.position("x")
@@ -77,7 +78,7 @@ def test_ranges_of_positions(truth: kv.Expression, low: float, high: float) -> N
     assert reasoning.contradictions(subject, result) == []
 
 
-@settings(max_examples=30)
+@settings(max_examples=attempts(15))
 @given(logic(comparisons(POLYNOMIALS)), logic(comparisons(POLYNOMIALS)))
 def test_de_morgan(one: kv.Expression, other: kv.Expression) -> None:
     left, right = (
