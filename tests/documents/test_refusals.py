@@ -174,6 +174,7 @@ def test_nothing_is_included_from_a_document_that_fails(tmp_path):
     content = json.loads(path.read_text())
     del content["sha256"]
     content["operations"][-1]["writes"] = {"frames": {"late": {"parent": "nowhere", "factors": []}}}
+    del content["operations"][-1]["parameters"]
     path.write_text(json.dumps(content))
     model = kv.load("kitchen")
     before = model.snapshot()

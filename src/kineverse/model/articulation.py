@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
+from kineverse.errors import ValueRejectedError
 from kineverse.expressions.expression import Expression
 from kineverse.symbols import Symbol
 
@@ -28,6 +29,11 @@ class Articulation:
     follows
         What its position is, if it has one but no coordinate of its own, as a mimic joint or a gearbox [m],
         [rad].
+
+    Raises
+    ------
+    ValueRejectedError
+        If there are homes for other coordinates than it has.
     """
 
     kind: str
@@ -38,6 +44,13 @@ class Articulation:
     speeds: tuple[Symbol, ...] = ()
     dynamics: tuple[tuple[str, Any], ...] = ()
     follows: Expression | None = None
+
+    def __post_init__(self) -> None:
+        if len(self.home) not in (0, len(self.coordinates)):
+            raise ValueRejectedError(
+                f"The record of {self.kind} '{self.child}' has {len(self.home)} homes for "
+                f"{len(self.coordinates)} coordinates; give one for each, or none."
+            )
 
     @property
     def position(self) -> Expression | None:

@@ -43,6 +43,8 @@ COST_OF_RATE = 20
 """What a rate costs for each coordinate whose rate leads to it."""
 COST_OF_NAME = 10
 """What a name costs for each operation that listed it."""
+COST_OF_FRAME = 5
+"""What a frame costs each time that a trace asks for a pose, and it is on the way."""
 COST_OF_STEP = 1000
 """What a Newton step costs, beside what is in it."""
 

@@ -9,13 +9,30 @@ the operation also wrote (``{"written": "frames/door"}``), and, for all else, it
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
+from types import MappingProxyType
 from typing import Any
 
-from kineverse.errors import FormatError
+from kineverse.articulations.limits import Limits
+from kineverse.errors import FormatError, KineverseError
 from kineverse.expressions.expression import Expression
-from kineverse.model.body import Pose
+from kineverse.model.articulation import Articulation
+from kineverse.model.body import (
+    Body,
+    Box,
+    Capsule,
+    Cone,
+    Cylinder,
+    Ellipsoid,
+    Inertia,
+    Mesh,
+    Pose,
+    Shape,
+    Sphere,
+)
+from kineverse.model.constraint import Constraint
+from kineverse.model.frame import Frame
 from kineverse.model.operation import Operation
 from kineverse.model.reader import Cell
 
@@ -48,6 +65,18 @@ class Unwritten:
     """A parameter that a document has no place for; only its type is known."""
 
     kind: str
+
+
+RECORDS: Mapping[str, type] = MappingProxyType(
+    {
+        kind.__name__: kind
+        for kind in (
+            *(Limits, Frame, Constraint, Articulation),
+            *(Body, Shape, Inertia, Box, Capsule, Cone, Cylinder, Ellipsoid, Mesh, Sphere),
+        )
+    }
+)
+"""What operations that ship are made with, by the name under which a document has it; a closed set."""
 
 
 def parameters_of(operation: Operation) -> dict[str, Any]:
@@ -103,19 +132,63 @@ def written_parameter(value: Any, writes: Mapping[Cell, Any], ref: Ref, depth: i
     return {"unwritten": type(value).__name__}
 
 
+def made(value: Any, writes: Mapping[str, Any]) -> Any:
+    """Return a parameter that was read as what an operation takes.
+
+    Parameters
+    ----------
+    value
+        As :func:`read_parameter` returns it.
+    writes
+        What the operation wrote, by ``kind/name``.
+    """
+    if isinstance(value, tuple):
+        return tuple(made(item, writes) for item in value)
+    if isinstance(value, dict):
+        return {made(key, writes): made(item, writes) for key, item in value.items()}
+    if isinstance(value, Written):
+        return writes.get(value.path, value)
+    if isinstance(value, Record) and value.kind in RECORDS:
+        try:
+            return RECORDS[value.kind](**{name: made(item, writes) for name, item in value.fields})
+        except (TypeError, KineverseError):  # it is somebody else's class of the same name
+            return value
+    return value
+
+
 def read_parameter(
-    value: Any, graph: Graph, rename: Rename, path: Callable[[str], str], depth: int = 0
+    value: Any,
+    graph: Graph,
+    rename: Rename,
+    path: Callable[[str], str],
+    written: Collection[str],
+    depth: int = 0,
 ) -> Any:
-    """Return a parameter that was written, and lies in so many others.
+    """Return a parameter as it was given, and lies in so many others.
+
+    Parameters
+    ----------
+    value
+        What stands in the document.
+    graph
+        The expressions.
+    rename
+        Puts the document's prefix in front of a name.
+    path
+        Does so with that of a cell, ``kind/name``.
+    written
+        The cells that the operation writes, so named.
+    depth
+        In how many others it lies.
 
     Raises
     ------
     RefusedError
-        For what is none.
+        For what is none, or said to be among the writes and is not.
     """
 
     def inner(item: Any) -> Any:
-        return read_parameter(item, graph, rename, path, depth + 1)
+        return read_parameter(item, graph, rename, path, written, depth + 1)
 
     check_depth(depth)
     if type(value) is list:
@@ -138,7 +211,10 @@ def read_parameter(
         parts = tuple((string(key), inner(item)) for key, item in given["fields"].items())
         return Record(string(given["record"]), parts)
     if tag == "written":
-        return Written(path(string(fields(value, (tag,))[tag])))
+        named = path(string(fields(value, (tag,))[tag]))
+        if named not in written:
+            raise RefusedError(f"{named[:60]!r} is said to be written, and is not")
+        return Written(named)
     if tag == "unwritten":
         return Unwritten(string(fields(value, (tag,))[tag]))
     if tag is None:

@@ -20,6 +20,7 @@ from kineverse.symbols import symbol_name
 
 from .canonical import HASH, check_hash
 from .checks import RefusedError, fields, listed, name, string
+from .consistency import Consistency, with_reads
 from .coupling import check_coupling
 from .graph import Graph
 from .limits import COST_OF_NAME, MAX_NODES, check_counts
@@ -86,6 +87,7 @@ class _Document:
         self._graph = Graph(prefix)
         self._cells: dict[Cell, Any] = {}
         self._names: dict[str, set[str]] = {kind: set() for kind in KINDS}
+        self._consistency = Consistency(self._graph, self._cells, self._names)
 
     def read(self, parse: Callable[[bytes], Any], content: bytes) -> list[tuple[str, Recorded]]:
         try:
@@ -164,17 +166,25 @@ class _Document:
                 cell = self._cell(*string(path).partition("/")[::2])
                 cells[cell] = cells.get(cell, Read(0)) | how
         kinds = [_kind(kind) for kind in listed(reads.get("listing", []), "listing")]
-        seen = {cell: self._cells.get(cell, ABSENT) for cell in cells}
-        self._graph.budget.spend(COST_OF_NAME * sum(len(self._names[kind]) for kind in kinds))
-        names = tuple((kind, tuple(sorted(self._names[kind]))) for kind in kinds)
         writes = self._writes(given["writes"], place)
         for expression in self._expressions(writes):
             if answers_in(expression):
                 raise RefusedError("a read node stands outside of a trace")
         trace = self._trace(given["trace"], f"{place}, trace") if "trace" in given else None
+        frozen = string(given.get("frozen", ""))
+        if trace is not None:
+            if frozen:
+                raise RefusedError("an operation with a trace is not frozen")
+            asked = self._consistency.reads_of(trace, writes)
+            cells = with_reads(cells, asked)
+            kinds += sorted(asked.listings.difference(kinds))
+        seen = {cell: self._cells.get(cell, ABSENT) for cell in cells}
+        self._graph.budget.spend(COST_OF_NAME * sum(len(self._names[kind]) for kind in kinds))
+        names = tuple((kind, tuple(sorted(self._names[kind]))) for kind in kinds)
         self._place = f"{place}, parameters"
+        written = {"/".join(cell) for cell, _ in writes}
         parameters = {
-            string(key): read_parameter(value, self._graph, self._rename, self._path)
+            string(key): read_parameter(value, self._graph, self._rename, self._path, written)
             for key, value in _members(given.get("parameters", {})).items()
         }
         self._cells.update(writes)
@@ -187,7 +197,7 @@ class _Document:
             names,
             writes,
             trace,
-            string(given.get("frozen", "")),
+            frozen,
             seen,
             self._rename(""),
         )

@@ -12,7 +12,7 @@ from kineverse.model.operation import Effects, Operation
 from kineverse.model.reader import ABSENT, Cell, Read, Reader, Reads
 from kineverse.model.traces import Trace
 
-from .parameters import Written
+from .parameters import made
 
 
 @dataclass(frozen=True)
@@ -63,10 +63,7 @@ class Recorded(Operation):
         Names in it are as they were saved, without a prefix that the document was loaded under.
         """
         writes = {f"{kind}/{name}": value for (kind, name), value in self.writes}
-        return {
-            name: writes.get(value.path, value) if isinstance(value, Written) else value
-            for name, value in self.given.items()
-        }
+        return {name: made(value, writes) for name, value in self.given.items()}
 
     def apply(self, model: Reader) -> Effects:
         """Write what the original wrote, or would write now.

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from typing import Any
 
@@ -22,10 +22,15 @@ _SEED = 20220
 Pair = tuple[Expression, Expression]
 
 
-def agree(one: Mapping[Cell, Any], other: Mapping[Cell, Any]) -> bool:
+def agree(
+    one: Mapping[Cell, Any],
+    other: Mapping[Cell, Any],
+    affordable: Callable[[list[Pair]], bool] = lambda _: True,
+) -> bool:
     """Return whether the same is written, in the same order, expressions compared by a few values.
 
-    A number and a constant expression are the same.
+    A number and a constant expression are the same. What is not structurally equal, and not ``affordable``,
+    is not compared.
     """
     if list(one) != list(other):
         return False
@@ -35,7 +40,8 @@ def agree(one: Mapping[Cell, Any], other: Mapping[Cell, Any]) -> bool:
         if found is None:
             return False
         pairs += found
-    return _close([(a, b) for a, b in pairs if a is not b and a != b])
+    different = [(a, b) for a, b in pairs if a is not b and a != b]
+    return not affordable(different) or _close(different)
 
 
 def _pairs(kind: str, a: Any, b: Any) -> list[Pair] | None:

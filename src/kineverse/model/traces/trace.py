@@ -119,6 +119,11 @@ def _check_size(reply: Reply) -> None:
         raise UntraceableError(f"an answer on the way to it is made of more than {MAX_ANSWER:,} nodes.")
 
 
+def replied(question: Question, model: Reader) -> Reply:
+    """Return the answer to a question, :data:`.question.FAILED` where asking is an error."""
+    return _reply(_answered(question, model))
+
+
 def _answered(question: Question, model: Reader) -> Reply | KineverseError:
     try:
         return question.ask(model)
