@@ -1,4 +1,4 @@
-"""Whether what a document says twice about an operation is the same: its trace, beside its reads and writes."""
+"""Whether what a document says twice of an operation is the same: its trace, its reads and its writes."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ class Consistency:
 
     Reads are derived from the questions of a trace, since an operation that is said to read less than it asks
     for would stay as it is when that changes. What the trace writes is compared with the writes. Comparing is
-    work: traces that are beyond all that documents contain, a million nodes and more, are taken at their word.
+    work: what is beyond all that documents contain, a million nodes and more, is taken at its word.
 
     Parameters
     ----------
