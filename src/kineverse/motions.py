@@ -7,12 +7,13 @@ most questions are about a few.
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import casadi as ca
 
 from .errors import ShapeError
-from .expressions.expression import Expression, ExpressionLike, as_expression
+from .expressions.expression import Expression, ExpressionLike, as_expression, make
 from .expressions.layout import SX
 
 Direction = tuple[float, float, float]
@@ -32,6 +33,8 @@ _TRANSFORMS = {
 }
 _TRANSLATION = ca.Sparsity.triplet(4, 4, [0, 1, 2, 0, 1, 2, 3], [0, 1, 2, 3, 3, 3, 3])
 _ONE = ca.SX(1)
+_UNIT = 1e-9
+"""How far the length of a direction may be from 1."""
 
 
 class AxisMotion(Expression):
@@ -108,3 +111,72 @@ def turn(axis: Direction, angle: ExpressionLike) -> AxisMotion:
 def slide(direction: Direction, distance: ExpressionLike) -> AxisMotion:
     """Return the 4×4 translation along a constant unit vector by ``distance`` [m]."""
     return AxisMotion(direction, distance, False)
+
+
+def as_motion(transform: Expression) -> Expression:
+    """Return a 4×4 transform as the motion that its matrix is, if it is one; else as it is.
+
+    So a motion is the same to kinematics however it was written down, and after it was sent as a matrix.
+    """
+    if isinstance(transform, AxisMotion):
+        # Along a skew line, factors of the amount and those of the direction are one in the matrix.
+        is_skew = not transform.turns and sum(d != 0 for d in transform.direction) > 1
+        return transform if not is_skew else _as_slide(transform)
+    sparsity = transform._sx.sparsity()
+    if sparsity == _TRANSLATION:
+        return _as_slide(transform)
+    for axis, pattern in _TRANSFORMS.items():
+        if sparsity == pattern:
+            return _as_turn(transform, axis)
+    return transform
+
+
+def _as_turn(transform: Expression, axis: Direction) -> Expression:
+    *entries, one = transform._sx.nonzeros()
+    sine = entries[_TURNS[axis][2].index(1)]
+    if sine.op() != ca.OP_SIN or not one.is_one():
+        return transform
+    motion = turn(axis, make(sine.dep(0), (), transform._nodes))
+    same = zip(entries, motion._entries(), strict=True)
+    return motion if all(ca.is_equal(a, b, 2) for a, b in same) else transform
+
+
+def _as_slide(transform: Expression) -> Expression:
+    nonzeros = transform._sx.nonzeros()
+    parts = nonzeros[3:6]
+    moving = [k for k, part in enumerate(parts) if not part.is_constant()]
+    if not moving or not all(e.is_one() for e in (*nonzeros[:3], nonzeros[6])):
+        return transform
+    if any(not part.is_zero() for k, part in enumerate(parts) if k not in moving):
+        return transform
+    if len(moving) == 1:
+        axis = (X, Y, Z)[moving[0]]
+        return slide(axis, make(parts[moving[0]], (), transform._nodes))
+    direction, amount = [0.0, 0.0, 0.0], None
+    for k in moving:
+        factor, rest = _multiple(parts[k])
+        if amount is not None and not ca.is_equal(amount, rest, 1):
+            return _opaque(transform)
+        direction[k], amount = factor, rest
+    motion = slide((direction[0], direction[1], direction[2]), make(amount, (), transform._nodes))
+    is_same = all(ca.is_equal(a, b, 2) for a, b in zip(parts, motion.offset.nonzeros(), strict=True))
+    return motion if is_same and abs(math.hypot(*direction) - 1) <= _UNIT else _opaque(transform)
+
+
+def _multiple(part: SX) -> tuple[float, SX]:
+    """Return a scalar as a number and what it is a multiple of."""
+    if part.op() == ca.OP_NEG:
+        factor, rest = _multiple(part.dep(0))
+        return -factor, rest
+    if part.op() == ca.OP_MUL:
+        for k in (0, 1):
+            if part.dep(k).is_constant():
+                return float(part.dep(k)), part.dep(1 - k)
+    return 1.0, part
+
+
+def _opaque(transform: Expression) -> Expression:
+    """Return a transform without what it knows beside its matrix."""
+    if not isinstance(transform, AxisMotion):
+        return transform
+    return make(transform._sx, transform.shape, transform._nodes)

@@ -42,7 +42,7 @@ def read(text: str) -> kv.Model:
 
 
 def sample(model: kv.Model) -> kv.Expression:
-    """Return the elements of poses, constraints and bounds, and of all their gradients; of large models a part."""
+    """Return the elements of poses, Jacobians, constraints, bounds, and their gradients; of large models a part."""
     draw = random.Random(1)
     frames, names = list(model.frames), list(model.constraints)
     frames = frames if len(frames) <= MOST else draw.sample(frames, MOST)
@@ -54,6 +54,9 @@ def sample(model: kv.Model) -> kv.Expression:
     parts = [
         part for e in found for part in (e, *e.gradient().values(), *e.gradient(heuristic=False).values())
     ]
+    parts += [model.jacobian(frame) for frame in frames]
+    if len(frames) > 1:
+        parts.append(model.jacobian(frames[-1], frames[0], "body"))
     return np.concatenate([part.ravel() for part in parts])  # type: ignore[arg-type, return-value]
 
 

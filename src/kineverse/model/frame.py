@@ -13,6 +13,7 @@ import numpy.typing as npt
 
 from kineverse.errors import ShapeError
 from kineverse.expressions.expression import Expression, as_expression, watcher_of
+from kineverse.motions import as_motion
 
 from .body import Pose
 
@@ -42,6 +43,11 @@ class Frame:
     factors: tuple[Pose | Expression, ...]
     # Where this was last found to be in the world: shared by all models that share the frame.
     placement: Placement | None = field(default=None, init=False, repr=False, compare=False)
+
+    def __post_init__(self) -> None:
+        # Those that are asked for one by one, while an operation is traced, are not looked at here.
+        if type(self.factors) is tuple:
+            object.__setattr__(self, "factors", tuple(map(_as_motion, self.factors)))
 
     def __reduce__(self) -> Any:
         return Frame, (self.parent, self.factors)
@@ -74,6 +80,11 @@ class Frame:
         for factor in self.factors:
             result = result @ (as_expression(factor.matrix) if isinstance(factor, Pose) else factor)
         return result
+
+
+def _as_motion(factor: Any) -> Any:
+    is_transform = isinstance(factor, Expression) and factor.shape == (4, 4)
+    return as_motion(factor) if is_transform else factor
 
 
 def _factor(transform: TransformLike) -> Pose | Expression:
