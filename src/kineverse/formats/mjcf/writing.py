@@ -65,7 +65,7 @@ def mjcf_of(
     """
     recognition = Recognition(model, MJCF, leave_out, tolerance)
     plan = recognition.plan()
-    home = {str(s): v for s, v in recognition.home().items()}
+    home = {s.path: v for s, v in recognition.home().items()}
     content = MjcfWriter(plan, path, recognition.refusals, home).document()
     return Written(content, tuple(plan.remarks), plan.errors)
 
