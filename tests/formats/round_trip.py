@@ -11,6 +11,7 @@ from robots import SHARED
 
 import kineverse as kv
 from kineverse import gallery
+from kineverse.formats.packages import locate
 from kineverse.formats.sources import shipped_models
 
 EXACT = 1e-12
@@ -102,5 +103,8 @@ def _form(shape: object) -> object:
     geometry = shape.geometry  # type: ignore[attr-defined]
     if not hasattr(geometry, "uri"):
         return geometry
-    file = geometry.uri if "://" in geometry.uri else Path(geometry.folder, geometry.uri).resolve()
+    try:
+        file = Path(locate(geometry.uri, geometry.folder)).resolve()
+    except kv.FormatError:  # it is not there, and is called what it was called
+        return Path(geometry.uri).name, geometry.scale
     return file, geometry.scale

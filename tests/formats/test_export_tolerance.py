@@ -207,7 +207,8 @@ def test_limits_of_what_follows_a_curve_hold_or_are_refused(tmp_path: Path) -> N
     assert "'b/position' is not written: it holds within the other limits" in report.remarks
     assert "'b/velocity' is not written: it holds within the other limits" in report.remarks
     with pytest.raises(kv.FormatError, match="'b/position' is no multiple of one coordinate"):
-        model(0.9).save(tmp_path / "m.urdf", tolerance=0.1)
+        model(0.9).save(tmp_path / "m.urdf", tolerance=0.1, strict=True)
+    assert list(model(0.9).save(tmp_path / "m.urdf", tolerance=0.1).left_out) == ["b/position"]
 
 
 @pytest.mark.parametrize("tolerance", [0, -1, np.nan, np.inf, "small"])

@@ -70,7 +70,7 @@ def test_what_ships_is_said_or_refused_by_name(name: str, tmp_path: Path) -> Non
     model = loaded(name)
     if name in REFUSED:
         with pytest.raises(kv.FormatError) as info:
-            model.save(tmp_path / "m.urdf")
+            model.save(tmp_path / "m.urdf", strict=True)
         message = str(info.value)
         names = [f"'{n}'" for n in (*model.frames, *model.constraints, *model.articulations)]
         assert any(n in message for n in names)
@@ -203,7 +203,7 @@ def test_one_error_names_everything_that_cannot_be_said(tmp_path: Path) -> None:
         edit.constrain("one way", 0, b.derivative(), 1)
         edit.constrain("mixture", 0, b.derivative() - a.derivative(), 1)
     with pytest.raises(kv.FormatError) as info:
-        model.save(tmp_path / "m.urdf")
+        model.save(tmp_path / "m.urdf", strict=True)
     message = str(info.value)
     assert "URDF cannot say 7 things" in message
     assert "and 1 more" in message

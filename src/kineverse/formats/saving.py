@@ -29,6 +29,9 @@ class Saved:
         Of the file.
     remarks
         What the file says other than the model, or not at all, though nothing was refused.
+    left_out
+        Constraints, and articulations whose speeds are tied to others', that the format cannot say, each with
+        the reason. All frames are where they should be without them.
     errors
         By how much frames are off at most [m], [rad], where that was tolerated: certain bounds over all
         values of coordinates within their limits. Frames that are not in here are exact.
@@ -37,6 +40,7 @@ class Saved:
     path: Path
     remarks: tuple[str, ...] = ()
     errors: Mapping[str, FrameError] = field(default_factory=dict)
+    left_out: Mapping[str, str] = field(default_factory=dict)
 
     @property
     def error(self) -> FrameError:
@@ -53,10 +57,13 @@ def save(
     *,
     tolerance: float | None = None,
     leave_out: Iterable[str] = (),
+    strict: bool = False,
 ) -> Saved:
     """Write a model to a file, whose ending says what it becomes.
 
-    The file is there whole or not at all; if it cannot be written, it is what it was before.
+    The file is there whole or not at all; if it cannot be written, it is what it was before. URDF and MJCF
+    are read again first, MJCF by MuJoCo where it is installed. Meshes that MuJoCo cannot read are converted,
+    into a folder beside the file.
 
     Parameters
     ----------
@@ -71,18 +78,22 @@ def save(
     leave_out
         Names of constraints that URDF or MJCF need not say, and of articulations that have speeds other than
         those of their coordinates, which it need not say either.
+    strict
+        Whether constraints, and ties between speeds, that URDF or MJCF cannot say are refused. Otherwise they
+        are left out, with a remark. Motions that it cannot say are always refused.
 
     Raises
     ------
     FormatError
-        If the name has another ending, the file cannot be written, or naming everything that the format
-        cannot say, with the reason.
+        If the name has another ending, the file cannot be written, what would be written cannot be read
+        again, or naming everything that the format cannot say, with the reason.
     UnknownNameError
         If something that is to be left out does not exist.
     ValueRejectedError
         For a tolerance that is no positive number.
     """
     target = _target(path)
+    _check(target)
     if target.name.endswith((".kv.json", ".kv.msgpack")):
         if tuple(leave_out) or tolerance is not None:
             what = "nothing can be left out" if tolerance is None else "it has no tolerance"
@@ -91,10 +102,35 @@ def save(
 
         write_document(model, target)
         return Saved(target)
-    written = _written(model, target, leave_out, _checked(tolerance))
+    written = _written(model, target, leave_out, _checked(tolerance), strict)
+    for path, content in written.beside.items():
+        try:
+            path.parent.mkdir(exist_ok=True)
+        except OSError as error:
+            raise FormatError(f"{path.parent} cannot be made: {error.strerror}.") from None
+        replace_file(path, content)
     replace_file(target, written.content)
     tell(f"{target.name}: {remark}" for remark in written.remarks)
-    return Saved(target, written.remarks, written.errors)
+    return Saved(target, written.remarks, written.errors, dict(written.left_out))
+
+
+def _check(target: Path) -> None:
+    """Look at the name of a file before anything is made, which may take a while.
+
+    Raises
+    ------
+    FormatError
+        If nothing is written that ends like this, or there is no such folder.
+    """
+    if not target.name.endswith(ENDINGS):
+        raise FormatError(
+            f"{target}: a model is saved to a name that ends in {', '.join(ENDINGS[:-1])} or {ENDINGS[-1]}, "
+            f"as in {target.stem + ENDINGS[0]!r}."
+        )
+    if target.is_dir():
+        raise FormatError(f"{target} is a folder; name a file in it, such as {target / f'model{ENDINGS[0]}'}.")
+    if not target.parent.is_dir():
+        raise FormatError(f"{target} cannot be written: the folder {target.parent} does not exist.")
 
 
 def _checked(tolerance: object) -> float | None:
@@ -106,22 +142,19 @@ def _checked(tolerance: object) -> float | None:
     raise ValueRejectedError(f"A tolerance is a positive number [m] and [rad], or None, not {tolerance!r}.")
 
 
-def _written(model: ModelView, target: Path, leave_out: Iterable[str], tolerance: float | None) -> Written:
+def _written(
+    model: ModelView, target: Path, leave_out: Iterable[str], tolerance: float | None, strict: bool
+) -> Written:
     try:
         if target.name.endswith(".urdf"):
             from .urdf.writing import urdf_of
 
-            return urdf_of(model, target, leave_out, tolerance)
-        if target.name.endswith((".xml", ".mjcf")):
-            from .mjcf.writing import mjcf_of
+            return urdf_of(model, target, leave_out, tolerance, strict)
+        from .mjcf.writing import mjcf_of
 
-            return mjcf_of(model, target, leave_out, tolerance)
+        return mjcf_of(model, target, leave_out, tolerance, strict)
     except FormatError as error:
         raise _named(target, error) from None
-    raise FormatError(
-        f"{target}: a model is saved to a name that ends in {', '.join(ENDINGS[:-1])} or {ENDINGS[-1]}, "
-        f"as in {target.stem + ENDINGS[0]!r}."
-    )
 
 
 def _named(target: Path, error: FormatError) -> FormatError:

@@ -207,11 +207,12 @@ class ModelView(Structure):
         *,
         tolerance: float | None = None,
         leave_out: Iterable[str] = (),
+        strict: bool = False,
     ) -> Saved:
         """Write the model to a file: a document (.kv.json), URDF (.urdf) or MJCF (.xml).
 
-        A document says all of it. What the others cannot say is refused by name, unless it is to be left out,
-        see :func:`kineverse.formats.saving.save`.
+        A document says all of it. Motions that the others cannot say are refused by name; constraints are left
+        out with a remark, see :func:`kineverse.formats.saving.save`.
 
         Parameters
         ----------
@@ -222,6 +223,8 @@ class ModelView(Structure):
             nowhere.
         leave_out
             Names of constraints and articulations.
+        strict
+            Whether constraints that the format cannot say are refused, too.
 
         Raises
         ------
@@ -230,7 +233,7 @@ class ModelView(Structure):
         """
         from kineverse.formats.saving import save
 
-        return save(self, path, tolerance=tolerance, leave_out=leave_out)
+        return save(self, path, tolerance=tolerance, leave_out=leave_out, strict=strict)
 
     # -- printing ------------------------------------------------------------------------------------------
 

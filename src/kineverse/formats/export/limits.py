@@ -61,24 +61,24 @@ def sort_constraints(
     resolve
         Puts an expression in terms of what depends on nothing.
     refusals
-        Those that are neither are added here, with the reason.
+        Those that are neither are left out there, with the reason.
     """
     for name, given in constraints.items():
         middle, bounds = resolve(given.expression), [resolve(b) for b in (given.lower, given.upper)]
         about = [s for b in bounds for s in b.symbols]
         if about:
             names = ", ".join(dict.fromkeys(map(str, about)))
-            refusals.add(name, f"has bounds that depend on {names}")
+            refusals.leave(name, f"has bounds that depend on {names}")
             continue
         lower, upper = map(float, bounds)
         if (lower, upper) == (-math.inf, math.inf):
             continue
         if not middle.symbols:
-            refusals.add(name, "is about nothing that moves")
+            refusals.leave(name, "is about nothing that moves")
         elif has_given_gradient(middle):
-            refusals.add(name, "has a gradient that was given and is not the derivative")
+            refusals.leave(name, "has a gradient that was given and is not the derivative")
         elif any(s.order > 1 for s in middle.symbols):
-            refusals.add(name, "limits accelerations")
+            refusals.leave(name, "limits accelerations")
         else:
             yield _range(name, middle, lower, upper)
 
@@ -127,16 +127,16 @@ def limit(
     sums, one_way
         Whether it can limit sums of several coordinates, and speeds other than alike in both directions.
     refusals
-        What has no place is added here.
+        What has no place is left out there.
     """
     joints = {joint.name: joint for joint in plan.joints}
     leaders = {joint.symbol: joint for joint in plan.joints if joint.leads}
     for item in found:
         if isinstance(item, Sum):
             if not sums:
-                refusals.add(item.name, f"limits a sum of {', '.join(map(str, item.factors))}")
+                refusals.leave(item.name, f"limits a sum of {', '.join(map(str, item.factors))}")
             elif any(s not in leaders for s in item.factors):
-                refusals.add(item.name, "is about coordinates of which no joint consists")
+                refusals.leave(item.name, "is about coordinates of which no joint consists")
             else:
                 plan.sums.append(item)
             continue
@@ -149,7 +149,7 @@ def limit(
             joint = leaders[coordinate]
             low, high = item.of_symbol
         else:
-            refusals.add(item.name, f"is about '{item.symbol}', which is the position or speed of no joint")
+            refusals.leave(item.name, f"is about '{item.symbol}', which is the position or speed of no joint")
             continue
         if not item.symbol.order:
             if what == "soft_limits" and joint.name == owner and joint.bounds.soft is None:
@@ -159,7 +159,7 @@ def limit(
         elif one_way or low == -high:
             joint.bounds.slow(low, high)
         else:
-            refusals.add(item.name, "limits a speed differently in its two directions")
+            refusals.leave(item.name, "limits a speed differently in its two directions")
     for joint in plan.joints:
         if joint.bounds.lower > joint.bounds.upper:
             refusals.add(joint.name, f"cannot be anywhere: {_shown(joint.bounds)}")

@@ -3,13 +3,59 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Callable
 from pathlib import Path
 
+from kineverse.errors import FormatError
+from kineverse.formats.packages import locate
 from kineverse.model.body import Mesh
 
+Note = Callable[[str], None]
+_TOP = 2
+"""Folders that have no more than so many parts, as ``/home``, have nothing in common but the machine."""
 
-def reference(mesh: Mesh, folder: Path) -> str:
-    """Return the reference to a mesh from a file in ``folder``: addresses and absolute paths as they are."""
-    if "://" in mesh.uri or os.path.isabs(mesh.uri) or not mesh.folder or Path(mesh.folder) == folder:
+
+def reference(mesh: Mesh, folder: Path, note: Note) -> str:
+    """Return the reference to a mesh from a file in ``folder``: the same file, wherever that is known.
+
+    Addresses as ``package://`` stay where they are found from there, too. A mesh that is nowhere is called
+    what it was called.
+
+    Parameters
+    ----------
+    mesh
+        The mesh.
+    folder
+        Where the file will lie.
+    note
+        Called with a remark where a reference is another one than it was.
+    """
+    if not mesh.folder or Path(mesh.folder) == folder or os.path.isabs(mesh.uri):
         return mesh.uri
-    return Path(os.path.relpath(Path(mesh.folder, mesh.uri), folder)).as_posix()
+    if "://" not in mesh.uri:
+        return path_from(Path(mesh.folder, mesh.uri), folder)
+    there = found(mesh.uri, mesh.folder)
+    if there is None or there == found(mesh.uri, str(folder)):
+        return mesh.uri
+    note(f"{mesh.uri} is written as a path, since that package is not found from {folder}")
+    return path_from(there, folder)
+
+
+def found(uri: str, folder: str) -> Path | None:
+    """Return the file that a description in ``folder`` means; None if there is none."""
+    try:
+        return Path(os.path.abspath(locate(uri, folder)))
+    except FormatError:
+        return None
+
+
+def path_from(path: Path, folder: Path) -> str:
+    """Return a path as seen from a folder: relative, unless they have nothing in common."""
+    path, folder = Path(os.path.abspath(path)), Path(os.path.abspath(folder))
+    try:
+        common = Path(os.path.commonpath((path, folder)))
+    except ValueError:  # two drives
+        return path.as_posix()
+    if len(common.parts) <= _TOP and common != folder:
+        return path.as_posix()
+    return Path(os.path.relpath(path, folder)).as_posix()

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any, Literal, TypeAlias
 
 import numpy as np
@@ -181,8 +182,22 @@ class Plan:
 
 @dataclass(frozen=True)
 class Written:
-    """The text of a file, and what it says other than the model."""
+    """The text of a file, and what it says other than the model.
+
+    Attributes
+    ----------
+    content
+        The text.
+    remarks, errors
+        As of the plan.
+    left_out
+        Why something of the model is not said, by name.
+    beside
+        Files that belong to it.
+    """
 
     content: bytes
     remarks: tuple[str, ...]
     errors: Mapping[str, FrameError]
+    left_out: Mapping[str, str] = field(default_factory=dict)
+    beside: Mapping[Path, bytes] = field(default_factory=dict)

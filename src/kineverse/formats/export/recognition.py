@@ -52,6 +52,8 @@ class Recognition:
         Names of constraints that are left out, and of articulations whose own speeds are.
     tolerance
         How far frames may be off [m], [rad]; None for nowhere.
+    strict
+        Whether constraints that the format cannot say are refused, rather than left out.
     """
 
     def __init__(
@@ -60,9 +62,10 @@ class Recognition:
         target: Target,
         leave_out: Iterable[str] = (),
         tolerance: float | None = None,
+        strict: bool = False,
     ) -> None:
         self.model, self.target = model, target
-        self.refusals = Refusals(target.name)
+        self.refusals = Refusals(target.name, strict)
         self.remarks: list[str] = []
         # What refused frames move by: its own limits need no complaint of their own.
         self._lost: set[Symbol] = set()
@@ -113,7 +116,7 @@ class Recognition:
             if isinstance(item, Curve):
                 curve = item.expression, item.lower, item.upper
                 if approximation is None or not approximation.implied(*curve):
-                    self.refusals.add(item.name, item.reason)
+                    self.refusals.leave(item.name, item.reason)
                 else:
                     self.remarks.append(f"'{item.name}' is not written: it holds within the other limits")
             elif isinstance(item, Sum) or item.symbol.position not in self._lost:
@@ -283,7 +286,7 @@ class Recognition:
             yield Link(frames.take(symbol.path, f"{symbol.path}/carrier"), parent, np.eye(4), [joint])
 
     def _check_rates(self, placed: Mapping[str, Placing]) -> None:
-        """Refuse coordinates that move by the speeds of others, except quaternions that turn."""
+        """Leave out that coordinates move by the speeds of others, except quaternions that turn."""
         fine = {s for found in placed.values() for s in _turned(found)}
         driven: dict[str, set[str]] = {}
         for coordinate, row in self._rates.items():
@@ -297,7 +300,7 @@ class Recognition:
                 continue
             driven.setdefault(owner, set()).update(map(str, row))
         for owner, speeds in driven.items():
-            self.refusals.add(owner, f"moves by speeds that are not its own, {', '.join(sorted(speeds))}")
+            self.refusals.leave_speeds(owner, f"moves by speeds that are not its own, {', '.join(sorted(speeds))}")
 
     def _plain_constraints(self) -> Iterator[tuple[str, Constraint]]:
         # Plain ones: with rates, what is handed out has coordinates as nodes that only look like curves.

@@ -1,4 +1,4 @@
-"""What a format cannot say, collected so that one error names all of it."""
+"""What a format cannot say, collected: one error names all that is refused, remarks what is left out."""
 
 from __future__ import annotations
 
@@ -49,13 +49,20 @@ class Refusals:
     ----------
     target
         The name of the format.
+    strict
+        Whether constraints are refused, too, rather than left out.
     curved
         Whether something among them could be approximated.
+    left_out
+        Why constraints, and speeds of articulations, are left out, by name.
     """
 
     target: str
+    strict: bool = False
     curved: bool = False
+    left_out: dict[str, str] = field(default_factory=dict)
     _reasons: dict[str, list[str]] = field(default_factory=dict)
+    _speeds: set[str] = field(default_factory=set)
 
     def add(self, name: str, reason: str) -> None:
         """Note that something cannot be said; its reasons are sentences without their beginning."""
@@ -63,8 +70,32 @@ class Refusals:
         if reason not in reasons:
             reasons.append(reason)
 
+    def leave(self, name: str, reason: str) -> None:
+        """Note that a constraint is left out; all frames are where they should be without it."""
+        if self.strict:
+            self.add(name, reason)
+        elif name not in self.left_out:
+            self.left_out[name] = reason
+        elif reason not in self.left_out[name]:
+            self.left_out[name] += f" and {reason}"
+
+    def leave_speeds(self, name: str, reason: str) -> None:
+        """Note that the ties between the speeds of an articulation are left out, as those of wheels are."""
+        self._speeds.add(name)
+        self.leave(name, reason)
+
     def __bool__(self) -> bool:
         return bool(self._reasons)
+
+    @property
+    def remarks(self) -> list[str]:
+        """What is left out, as sentences."""
+        return [
+            f"that '{name}' {reason} is left out: {self.target} cannot say it, and its coordinates are free"
+            if name in self._speeds
+            else f"'{name}' is left out, which {self.target} cannot say: it {reason}"
+            for name, reason in self.left_out.items()
+        ]
 
     def check(self, file: str) -> None:
         """Raise if there is something.

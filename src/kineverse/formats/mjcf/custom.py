@@ -6,10 +6,14 @@
 ``<tuple>`` ``kineverse:ends``           sites that are there only to tie bodies
 ``<tuple>`` ``kineverse:loop:NAME``      equalities and joints of a loop, those that follow with ``prm=1``
 =======================================  ================================================================
+
+A ``<tuple>`` in which there are names with spaces is a ``<text>`` of that name, whose data are its elements in
+JSON: ``[[objtype, objname, prm], ...]``.
 """
 
 from __future__ import annotations
 
+import json
 import math
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
@@ -24,6 +28,8 @@ Note = Callable[[Node | None, str], None]
 
 SPEED, LOOP = "kineverse:speed:", "kineverse:loop:"
 MASSLESS, ENDS = "kineverse:massless", "kineverse:ends"
+ELEMENT = ("objtype", "objname", "prm")
+"""The attributes of an element of a tuple."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,6 +70,8 @@ def custom_of(root: Node, note: Note) -> Custom:
     named: dict[str, set[str]] = {MASSLESS: set(), ENDS: set()}
     for node in (child for section in root.children if section.tag == "custom" for child in section.children):
         name = node.attributes.get("name", "")
+        if node.tag == "text" and (name in named or name.startswith(LOOP)):
+            node = _as_tuple(node)
         if node.tag == "numeric" and name.startswith(SPEED):
             found = _range(node.attributes.get("data", ""))
             if found is None:
@@ -80,6 +88,17 @@ def custom_of(root: Node, note: Note) -> Custom:
                 node,
             )
     return Custom(speeds, frozenset(named[MASSLESS]), frozenset(named[ENDS]), loops)
+
+
+def _as_tuple(node: Node) -> Node:
+    """Return the tuple that a text stands for, or the text if it stands for none."""
+    try:
+        given = json.loads(node.attributes.get("data", ""))
+        elements = [dict(zip(ELEMENT, map(str, item), strict=True)) for item in given]
+    except (ValueError, TypeError, RecursionError):
+        return node
+    children = [Node("element", attributes, [], node.source, node.line) for attributes in elements]
+    return Node("tuple", node.attributes, children, node.source, node.line)
 
 
 def closed_as_said(

@@ -84,9 +84,15 @@ def compiled(spec: Any, prepared: Prepared, source: str) -> Any:
 def refusal(error: Exception, prepared: Prepared, source: str) -> FormatError:
     """Return the error that people see for one of MuJoCo's."""
     text = str(error)
-    reason = _NOISE.sub("", text.strip()).partition("\n")[0].strip().rstrip(".")
+    reason = reason_of(text)
     lines = [int(number) for number in _LINE.findall(text)]
     # The innermost comes first: an attached model is complained about at the element that attaches it, too.
     node = prepared.node(f"line {lines[0]}") if lines else None
     where = source if node is None else node.where
     return FormatError(f"{where}: MuJoCo refuses it: {reason or 'it gives no reason'}.")
+
+
+def reason_of(text: str, whole: bool = False) -> str:
+    """Return the first line of what MuJoCo says, or all of its lines in one, without its own preamble."""
+    lines = _NOISE.sub("", text.strip()).splitlines() or [""]
+    return ", ".join(line.strip() for line in (lines if whole else lines[:1])).rstrip(".")

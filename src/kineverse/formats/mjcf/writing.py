@@ -7,11 +7,12 @@ anywhere; what moves by a polynomial of a coordinate is an equality, and loops s
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from pathlib import Path
 
 import numpy as np
 
+from kineverse.errors import FormatError
 from kineverse.formats import rpy
 from kineverse.formats.export.markup import Tag, document
 from kineverse.formats.export.names import Names
@@ -21,6 +22,7 @@ from kineverse.formats.export.recognition import Recognition
 from kineverse.formats.export.refusals import Refusals
 from kineverse.formats.export.target import Target
 from kineverse.formats.mjcf.custom import ENDS, MASSLESS
+from kineverse.formats.mjcf.verification import complaint_about, mesh_in
 from kineverse.formats.mjcf.writing_bodies import BodyWriter, placed
 from kineverse.formats.mjcf.writing_custom import add_loop, add_names, add_speeds, interval
 from kineverse.model.frame import WORLD
@@ -43,7 +45,11 @@ _DYNAMICS = {
 
 
 def mjcf_of(
-    model: ModelView, path: Path, leave_out: Iterable[str] = (), tolerance: float | None = None
+    model: ModelView,
+    path: Path,
+    leave_out: Iterable[str] = (),
+    tolerance: float | None = None,
+    strict: bool = False,
 ) -> Written:
     """Return the text of a file, and what it says other than the model, or not at all.
 
@@ -57,28 +63,52 @@ def mjcf_of(
         Names of constraints that are not to be said, and of articulations whose speeds are not.
     tolerance
         How far frames may be off where motions are approximated [m], [rad]; None for no approximation.
+    strict
+        Whether constraints that it cannot say are refused, rather than left out with a remark.
 
     Raises
     ------
     FormatError
-        Naming what MJCF cannot say, and why.
+        Naming what MJCF cannot say, and why; or if MuJoCo, where it is installed, does not open the result.
     """
-    recognition = Recognition(model, MJCF, leave_out, tolerance)
+    recognition = Recognition(model, MJCF, leave_out, tolerance, strict)
     plan = recognition.plan()
     home = {s.path: v for s, v in recognition.home().items()}
-    content = MjcfWriter(plan, path, recognition.refusals, home).document()
-    return Written(content, tuple(plan.remarks), plan.errors)
+    refusals, remarks = recognition.refusals, plan.remarks
+    without: dict[str, str] = {}
+    while True:
+        plan.remarks = remarks + [
+            f"the mesh {file} is left out: MuJoCo refuses it, {why}" for file, why in without.items()
+        ]
+        writer = MjcfWriter(plan, path, refusals, home, without)
+        root = writer.root()
+        complaint = complaint_about(root, path.absolute().parent, writer.converted)
+        if complaint is None:
+            content = document(root, [*plan.remarks, *plan.said_errors])
+            return Written(content, tuple(plan.remarks), plan.errors, refusals.left_out, writer.converted)
+        file = mesh_in(complaint, root)
+        if file is None or file in without:
+            raise FormatError(f"MuJoCo does not open what would be written: {complaint}.")
+        without[file] = complaint
 
 
 class MjcfWriter:
     """Writes one plan.
 
-    ``home`` has a value for every coordinate, which becomes the key of that name.
+    ``home`` has a value for every coordinate, by its path, which becomes the key of that name; ``without``
+    are files of meshes that are left out.
     """
 
-    def __init__(self, plan: Plan, path: Path, refusals: Refusals, home: Mapping[str, float]) -> None:
+    def __init__(
+        self,
+        plan: Plan,
+        path: Path,
+        refusals: Refusals,
+        home: Mapping[str, float],
+        without: Collection[str] = (),
+    ) -> None:
         self._plan, self._path, self._refusals, self._home = plan, path, refusals, home
-        self._bodies = BodyWriter(path.absolute().parent, plan.remarks)
+        self._bodies = BodyWriter(path, plan.remarks, without)
         self._children: dict[str, list[Link]] = {}
         for link in plan.links:
             self._children.setdefault(link.parent, []).append(link)
@@ -89,8 +119,13 @@ class MjcfWriter:
         self._ends: dict[str, str] = {}
         self._ties: dict[str, list[str]] = {}
 
-    def document(self) -> bytes:
-        """Return the text.
+    @property
+    def converted(self) -> Mapping[Path, bytes]:
+        """Meshes that MuJoCo cannot read, in a format that it can, by where they will lie."""
+        return self._bodies.files.converted
+
+    def root(self) -> Tag:
+        """Return the document.
 
         Raises
         ------
@@ -109,6 +144,7 @@ class MjcfWriter:
             self._link(link)
             waiting += self._children.get(link.name, [])[::-1]
         self._refusals.check(self._path.name)
+        self._plan.remarks += self._refusals.remarks
         equality, tendon, key = self._equalities(), self._tendons(), Tag("keyframe")
         for name, value in self._bodies.settings().items():
             compiler.give(name, value)
@@ -116,7 +152,7 @@ class MjcfWriter:
             key.add("key", name="home", qpos=self._qpos)
         parts = (self._said(), self._bodies.assets, world, tendon, equality, key)
         root.inside += [part for part in parts if part.inside or part is world]
-        return document(root, [*self._plan.remarks, *self._plan.said_errors])
+        return root
 
     def _link(self, link: Link) -> None:
         if deviation(link.pose) > RIGID:

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import json
 import math
 from collections.abc import Collection, Iterable
+from string import whitespace as WHITESPACE
 
 from kineverse.formats.export.markup import Tag
 from kineverse.formats.export.plan import Joint, Loop
 from kineverse.symbols import parse_symbol_name
 
-from .custom import LOOP, SPEED
+from .custom import ELEMENT, LOOP, SPEED
 
 
 def add_speeds(custom: Tag, joints: Iterable[Joint]) -> bool:
@@ -30,12 +32,12 @@ def add_names(custom: Tag, what: str, kind: str, names: Iterable[str]) -> None:
     for name in names:
         listed.add("element", objtype=kind, objname=name)
     if listed.inside:
-        custom.inside.append(listed)
+        custom.inside.append(_as_it_can_be(listed))
 
 
 def add_loop(custom: Tag, loop: Loop, equalities: Iterable[str], joints: Collection[str]) -> None:
     """Add which coordinates of a loop follow; several of them may belong to one of the joints."""
-    listed = custom.add("tuple", name=f"{LOOP}{loop.name}")
+    listed = Tag("tuple", {"name": f"{LOOP}{loop.name}"})
     for name in equalities:
         listed.add("element", objtype="equality", objname=name)
     for names, follows in ((loop.free, 0), (loop.dependent, 1)):
@@ -43,6 +45,15 @@ def add_loop(custom: Tag, loop: Loop, equalities: Iterable[str], joints: Collect
         owners = [path if path in joints else path.rpartition("/")[0] for path in paths]
         for joint in dict.fromkeys(owners):
             listed.add("element", objtype="joint", objname=joint, prm=follows)
+    custom.inside.append(_as_it_can_be(listed))
+
+
+def _as_it_can_be(listed: Tag) -> Tag:
+    """Return a tuple, as a text where there are names with spaces: MuJoCo takes each for several."""
+    if not any(set(tag.attributes["objname"]) & set(WHITESPACE) for tag in listed.inside):
+        return listed
+    elements = [[tag.attributes.get(key, "0") for key in ELEMENT] for tag in listed.inside]
+    return Tag("text", {"name": listed.attributes["name"], "data": json.dumps(elements, ensure_ascii=False)})
 
 
 def interval(lower: float, upper: float) -> str:

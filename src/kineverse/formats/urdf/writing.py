@@ -16,6 +16,8 @@ import numpy as np
 import numpy.typing as npt
 
 from kineverse.articulations.free_joints import from_z
+from kineverse.collection import no_collection
+from kineverse.errors import FormatError, KineverseError
 from kineverse.formats.export.markup import Tag, document
 from kineverse.formats.export.names import Names
 from kineverse.formats.export.plan import ITSELF, NO_BODY, BallJoint, Joint, Link, Plan, Written
@@ -23,6 +25,9 @@ from kineverse.formats.export.poses import RIGID, angles, deviation
 from kineverse.formats.export.recognition import Recognition
 from kineverse.formats.export.refusals import Refusals
 from kineverse.formats.export.target import Target
+from kineverse.formats.remarks import listening
+from kineverse.formats.urdf.operations import robot_operations
+from kineverse.formats.urdf.reader import parse_urdf
 from kineverse.formats.urdf.writing_bodies import BodyWriter
 from kineverse.model.frame import WORLD
 from kineverse.model.view import ModelView
@@ -39,7 +44,11 @@ _SPACE = (("x", (1.0, 0.0, 0.0)), ("y", (0.0, 1.0, 0.0)), ("z", (0.0, 0.0, 1.0))
 
 
 def urdf_of(
-    model: ModelView, path: Path, leave_out: Iterable[str] = (), tolerance: float | None = None
+    model: ModelView,
+    path: Path,
+    leave_out: Iterable[str] = (),
+    tolerance: float | None = None,
+    strict: bool = False,
 ) -> Written:
     """Return the text of a file, and what it says other than the model, or not at all.
 
@@ -53,16 +62,39 @@ def urdf_of(
         Names of constraints that are not to be said, and of articulations whose speeds are not.
     tolerance
         How far frames may be off where motions are approximated [m], [rad]; None for no approximation.
+    strict
+        Whether constraints that it cannot say are refused, rather than left out with a remark.
 
     Raises
     ------
     FormatError
-        Naming what URDF cannot say, and why.
+        Naming what URDF cannot say, and why; or if the result could not be read again.
     """
-    recognition = Recognition(model, URDF, leave_out, tolerance)
+    recognition = Recognition(model, URDF, leave_out, tolerance, strict)
     plan = recognition.plan()
     content = UrdfWriter(plan, path, recognition.refusals).document()
-    return Written(content, tuple(plan.remarks), plan.errors)
+    _check(content, path)
+    return Written(content, tuple(plan.remarks), plan.errors, recognition.refusals.left_out)
+
+
+def _check(content: bytes, path: Path) -> None:
+    """Read again what was written.
+
+    Raises
+    ------
+    FormatError
+        If there is something wrong with it.
+    """
+    from kineverse.model.model import Model
+
+    model = Model()
+    try:
+        with listening(), model.edit() as edit, no_collection():
+            robot = parse_urdf(content, path.name, str(path.absolute().parent))
+            for operation in robot_operations(robot):
+                edit.apply(operation)
+    except KineverseError as error:
+        raise FormatError(f"What would be written cannot be read again: {error}") from error
 
 
 class UrdfWriter:
@@ -92,6 +124,7 @@ class UrdfWriter:
         for link in links:
             self._link(link, link is root)
         self._refusals.check(self._path.name)
+        self._plan.remarks += self._refusals.remarks
         return document(self._root, [*self._plan.remarks, *self._plan.said_errors])
 
     def _root_link(self) -> Link | None:
@@ -175,7 +208,8 @@ class UrdfWriter:
             element.add("dynamics", damping=_number(known, "damping"), friction=_number(known, "friction"))
         soft = joint.bounds.soft
         if soft is not None and kind == "continuous":
-            self._refusals.add(f"{joint.name}/soft_limits", "are soft limits of a joint that has no others")
+            self._refusals.leave(f"{joint.name}/soft_limits", "are soft limits of a joint that has no others")
+            soft = None
         if soft is not None or "k_velocity" in known:
             lower, upper = soft or (None, None)
             element.add(

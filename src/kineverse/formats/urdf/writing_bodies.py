@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 from kineverse.formats.export.markup import Tag
@@ -77,19 +78,28 @@ class BodyWriter:
             element.add("sphere", radius=form.radius)
         elif isinstance(form, Mesh):
             scale = None if form.scale == (1.0, 1.0, 1.0) else form.scale
-            element.add("mesh", filename=reference(form, self._folder), scale=scale)
+            element.add("mesh", filename=reference(form, self._folder, self._remark), scale=scale)
 
     def _material(self, visual: Tag, shape: Shape) -> None:
         if shape.color is None and not shape.texture:
             return
-        key = shape.color, shape.texture
+        folder = shape.geometry.folder if shape.texture and isinstance(shape.geometry, Mesh) else ""
+        key = shape.color, shape.texture, folder
         # Equal ones share a name, because a name that means two things is an error for some readers.
         name = self._materials.setdefault(key, f"material_{len(self._materials) + 1}")
         material = visual.add("material", name=name)
         if shape.color is not None:
             material.add("color", rgba=shape.color)
         if shape.texture:
-            material.add("texture", filename=shape.texture)
+            material.add("texture", filename=self._texture(shape))
+
+    def _texture(self, shape: Shape) -> str:
+        """Return what the file calls a texture; where a relative one is, only a mesh beside it knows."""
+        if isinstance(shape.geometry, Mesh) and shape.geometry.folder:
+            return reference(Mesh(shape.texture, folder=shape.geometry.folder), self._folder, self._remark)
+        if "://" not in shape.texture and not os.path.isabs(shape.texture):
+            self._remark(f"the texture {shape.texture} is written as it is, relative to some other folder")
+        return shape.texture
 
     def _remark(self, text: str) -> None:
         if text not in self._remarks:

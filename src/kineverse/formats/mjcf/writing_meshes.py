@@ -1,0 +1,111 @@
+"""Meshes and textures as MuJoCo opens them: by paths, in its formats, and only where they are."""
+
+from __future__ import annotations
+
+import os
+import struct
+from collections.abc import Collection
+from pathlib import Path
+
+import numpy as np
+
+from kineverse.errors import FormatError, MissingExtraError
+from kineverse.formats.export.meshes import Note, found, path_from
+from kineverse.formats.packages import locate
+from kineverse.model.body import Mesh
+
+_HEADER, _TRIANGLE = 84, 50
+MOST_FACES = 200_000
+"""Faces of an STL that MuJoCo reads."""
+
+
+class MeshFiles:
+    """Finds the meshes of one file, and converts those that MuJoCo cannot read.
+
+    Parameters
+    ----------
+    path
+        Where the file will lie; converted meshes lie beside it, in a folder ``NAME_meshes``.
+    note
+        Called with remarks.
+    without
+        Files, as the description names them, that are left out, since MuJoCo refuses them.
+
+    Attributes
+    ----------
+    converted
+        The content of files that are to be written beside the description.
+    """
+
+    def __init__(self, path: Path, note: Note, without: Collection[str] = ()) -> None:
+        self._folder = path.absolute().parent
+        self._beside = self._folder / f"{path.name.removesuffix(path.suffix)}_meshes"
+        self._note, self._without = note, without
+        self._known: dict[tuple[str, str], str | None] = {}
+        self.converted: dict[Path, bytes] = {}
+
+    def file(self, mesh: Mesh) -> str | None:
+        """Return what the description calls the file of a mesh; None if it is left out, with a remark."""
+        key = mesh.uri, mesh.folder
+        if key not in self._known:
+            self._known[key] = self._file(mesh)
+        named = self._known[key]
+        return None if named in self._without else named
+
+    def texture(self, uri: str, folder: str) -> str | None:
+        """Return what the description calls the file of a texture; None if it is left out, with a remark."""
+        there = found(uri, folder)
+        if there is None or there.suffix.lower() != ".png":
+            why = "it is not there" if there is None else "MuJoCo reads PNG"
+            self._note(f"the texture {uri} is left out: {why}")
+            return None
+        return path_from(there, self._folder)
+
+    def _file(self, mesh: Mesh) -> str | None:
+        try:
+            there = Path(os.path.abspath(locate(mesh.uri, mesh.folder)))
+        except FormatError as error:
+            self._note(f"the mesh {mesh.uri} is left out: it is not there. {error}")
+            return None
+        if there.suffix.lower() in (".obj", ".msh") or _is_binary_stl(there):
+            return path_from(there, self._folder)
+        return self._convert(mesh, there)
+
+    def _convert(self, mesh: Mesh, there: Path) -> str | None:
+        # Where meshes are read is a layer above, as it needs an extra; only who converts asks for it.
+        from kineverse.geometry.mesh_files import find, read_faces
+
+        try:
+            triangles = read_faces(find(mesh))
+        except (FormatError, MissingExtraError, OSError) as error:
+            self._note(f"the mesh {mesh.uri} is left out: MuJoCo cannot read it, and {error}")
+            return None
+        content = _as_obj(triangles.vertices, triangles.faces)
+        names = {path.name for path, known in self.converted.items() if known != content}
+        name, count = f"{there.stem}.obj", 1
+        while name in names:
+            count += 1
+            name = f"{there.stem}_{count}.obj"
+        self.converted[self._beside / name] = content
+        self._note(f"the mesh {mesh.uri} is converted to {self._beside.name}/{name}, which MuJoCo can read")
+        return f"{self._beside.name}/{name}"
+
+
+def _is_binary_stl(path: Path) -> bool:
+    """Whether a file is an STL as MuJoCo reads them: binary, with as many faces as there is room for."""
+    if path.suffix.lower() != ".stl":
+        return False
+    with path.open("rb") as file:
+        start = file.read(_HEADER)
+        size = os.fstat(file.fileno()).st_size
+    if len(start) < _HEADER:
+        return False
+    count: int = struct.unpack("<I", start[-4:])[0]
+    return 0 < count <= MOST_FACES and size == _HEADER + _TRIANGLE * count
+
+
+def _as_obj(vertices: np.ndarray, faces: np.ndarray) -> bytes:
+    """Return triangles as an OBJ, coordinates to the last bit."""
+    lines = [f"v {x!r} {y!r} {z!r}" for x, y, z in vertices.tolist()]
+    lines += [f"f {a} {b} {c}" for a, b, c in (faces + 1).tolist()]
+    return ("\n".join(lines) + "\n").encode()
