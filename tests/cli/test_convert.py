@@ -84,7 +84,7 @@ def test_a_dash_is_standard_output(robot, tmp_path, capfdbinary):
     captured = capfdbinary.readouterr()
     assert captured.out == (tmp_path / "robot.kv.json").read_bytes()
     assert b"2 frames, 1 DoF" in captured.err
-    for option in (["--json"], ["--leave-out", "j/position"], ["--tolerance", "0.1"]):
+    for option in (["--json"], ["--leave-out", "j/position"], ["--tolerance", "0.1"], ["--strict"]):
         assert main(["convert", "robot.urdf", "-", *option]) == 2
         captured = capfdbinary.readouterr()
         assert captured.out == b""
@@ -100,12 +100,22 @@ def test_what_is_left_out_is_missing_and_nothing_else(run, tmp_path, monkeypatch
         edit.constrain("range", 0, q, 1)
         edit.constrain("lock", -(bolt > 1), q.derivative(), bolt > 1)
     model.save("door.kv.json")
-    status, out, err = run("door.kv.json", "door.urdf")
+    status, out, err = run("door.kv.json", "door.urdf", "--strict")
     assert (status, out) == (2, "")
-    assert "lock" in err
+    assert "'lock' has bounds that depend on bolt" in err
+    assert "leave constraints out with --leave-out NAME, or all of them without --strict." in err
     assert not (tmp_path / "door.urdf").exists()
-    assert run("door.kv.json", "door.urdf", "--leave-out", "lock")[0] == 0
+    assert run("door.kv.json", "door.urdf", "--strict", "--leave-out", "lock")[0] == 0
     assert kv.load("door.urdf").limits("door") == (0.0, 1.0)
+    status, out, err = run("door.kv.json", "default.urdf")
+    assert status == 0
+    assert err.splitlines() == [
+        "default.urdf leaves out 1 thing that it cannot say; --strict refuses instead:",
+        "  lock has bounds that depend on bolt",
+    ]
+    assert kv.load("default.urdf").snapshot() == kv.load("door.urdf").snapshot()
+    status, out, err = run("door.kv.json", "json.urdf", "--json")
+    assert json.loads(out)["left_out"] == {"lock": "has bounds that depend on bolt"}
     status, _, err = run("door.kv.json", "again.urdf", "--leave-out", "lokc")
     assert status == 2
     assert "lock" in err
@@ -117,7 +127,7 @@ def test_curves_are_approximated_when_asked_to_and_by_how_much_is_told(run, tmp_
     status, out, err = run(source, "door.urdf")
     assert (status, out) == (2, "")
     assert "approximated with --tolerance" in err
-    assert "--leave-out NAME" in err
+    assert "--leave-out" not in err  # there is no constraint among what is refused
     assert "leave_out=" not in err
     status, out, err = run(source, "door.urdf", "--tolerance", "0.05", "--json")
     assert (status, err) == (0, "")
@@ -132,6 +142,27 @@ def test_curves_are_approximated_when_asked_to_and_by_how_much_is_told(run, tmp_
     assert kv.load("door.urdf").degrees_of_freedom == kv.load(source).degrees_of_freedom
     status, _, err = run(source, "door.urdf", "--tolerance", "-1", "--force")
     assert (status, "positive number" in err) == (2, True)
+
+
+@pytest.mark.parametrize("ending", ["urdf", "xml"])
+@pytest.mark.parametrize("name", ["pr2", "fetch", "hsr", "kitchen", "shelf_door"])
+def test_models_that_ship_are_converted(run, tmp_path, monkeypatch, name, ending):
+    if ending == "xml":
+        pytest.importorskip("mujoco")
+    monkeypatch.chdir(tmp_path)
+    status, out, err = run(name, f"{name}.{ending}")
+    assert status == 0
+    missing = {
+        "pr2": "  pr2/base/speed is no multiple",
+        "hsr": "  hsr/base/speed",
+        "fetch": "  fetch/base moves",
+    }
+    assert (missing[name] in err) if name in missing else not err
+    assert kv.load(f"{name}.{ending}").degrees_of_freedom == kv.load(name).degrees_of_freedom
+    if name in missing:
+        status, out, err = run(name, f"strict.{ending}", "--strict")
+        assert (status, out) == (2, "")
+        assert not (tmp_path / f"strict.{ending}").exists()
 
 
 def test_a_file_is_replaced_only_by_force(run, robot, tmp_path):

@@ -191,7 +191,10 @@ def test_loops_are_ties(tmp_path: Path) -> None:
 
 def test_bodies(tmp_path: Path) -> None:
     body = Body(
-        (Shape(Box((1, 2, 3)), name="seen", color=(1, 0, 0.5, 1)), Shape(Mesh("a.stl", (1, 1, 2), str(tmp_path)))),
+        (
+            Shape(Box((1, 2, 3)), name="seen", color=(1, 0, 0.5, 1)),
+            Shape(Mesh("a.stl", (1, 1, 2), str(tmp_path))),
+        ),
         (Shape(Ellipsoid((1, 2, 3)), kv.Pose.of(kv.translation(0, 0, 1)), name="touched"),),
         Inertia(2, (3, 0.1, 0, 3, 0, 3), kv.Pose.of(kv.translation(0, 1, 0) @ kv.rotation_x(1.0))),
     )

@@ -20,10 +20,15 @@ if TYPE_CHECKING:
 HELP = """write a model to a file, in the format that its name ends in
 
 IN is whatever can be opened. OUT is a document (.kv.json), which says all of a model, URDF (.urdf) or MJCF
-(.xml). What the format cannot say is refused by name, and nothing is written; --leave-out names what may be
-missing. With --tolerance, motions by curves are approximated; by how much frames are off at most is certain,
-and printed. OUT is written whole or not at all, and replaces a file only with --force. If OUT is a dash, a
-document goes to standard output.
+(.xml). A motion that the format cannot say is refused by name, and nothing is written; with --tolerance,
+motions by curves are approximated, and by how much frames are off at most is certain, and printed.
+Constraints that it cannot say, as locks and how wheels tie speeds, are left out, and named on standard
+error; --strict refuses these, too, and --leave-out names those that may be missing nevertheless. OUT is read
+again before it is there. It is written whole or not at all, and replaces a file only with --force. If OUT is
+a dash, a document goes to standard output.
+
+Meshes keep their files, by paths that are right from where OUT is. Those that MuJoCo cannot read are
+converted, into a folder beside OUT; those that are not there are left out of MJCF.
 
 To see whether the result moves as it should: kineverse diff IN OUT --values
 
@@ -31,7 +36,8 @@ examples:
   kineverse convert robot.sdf robot.urdf
   kineverse convert robot.urdf robot.kv.json --prefix left --force
   kineverse convert kitchen - | gzip > kitchen.kv.json.gz
-  kineverse convert garage.kv.json garage.urdf --leave-out garage/lock
+  kineverse convert pr2 pr2.xml
+  kineverse convert garage.kv.json garage.urdf --strict --leave-out garage/lock
   kineverse convert articulations/pedal_bin bin.xml --tolerance 0.01"""
 
 STDOUT = "-"
@@ -45,6 +51,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("target", metavar="OUT", help="path of the file to write; - for standard output")
     parser.add_argument("--prefix", metavar="NAME", help="put in front of all names, with a slash")
     parser.add_argument("--force", action="store_true", help="replace OUT if it is there")
+    parser.add_argument(
+        "--strict", action="store_true", help="refuse constraints that OUT cannot say, and write nothing"
+    )
     parser.add_argument(
         "--leave-out",
         metavar="NAME",
@@ -68,11 +77,18 @@ def run(arguments: argparse.Namespace) -> int:
     if not to_stdout:
         # Before the model is loaded: a name that cannot be written to should not take seconds to be found.
         check(arguments.target, arguments.source, arguments.force)
-    elif arguments.json or arguments.leave_out or arguments.tolerance is not None:
-        option = "--json" if arguments.json else "--leave-out" if arguments.leave_out else "--tolerance"
-        raise ValueRejectedError(
-            f"{option} and - exclude each other: the output is a document, which says all."
-        )
+    else:
+        given = {
+            "--json": arguments.json,
+            "--leave-out": arguments.leave_out,
+            "--tolerance": arguments.tolerance is not None,
+            "--strict": arguments.strict,
+        }
+        option = next((name for name, there in given.items() if there), None)
+        if option is not None:
+            raise ValueRejectedError(
+                f"{option} and - exclude each other: the output is a document, which says all."
+            )
 
     import kineverse as kv
     from kineverse.formats.remarks import listening
@@ -86,6 +102,8 @@ def run(arguments: argparse.Namespace) -> int:
         else:
             saved = _saved(model, arguments)
             size = os.path.getsize(saved.path)
+    if saved.left_out:
+        print("\n".join(_left_out(arguments, saved)), file=sys.stderr)
     if arguments.json:
         print(json.dumps(_as_json(arguments, model, size, left_out, saved), allow_nan=False))
     else:
@@ -98,9 +116,14 @@ def _saved(model: kv.Model, arguments: argparse.Namespace) -> Saved:
     from kineverse.formats.export.refusals import UnsayableError
 
     try:
-        return model.save(arguments.target, tolerance=arguments.tolerance, leave_out=arguments.leave_out)
+        return model.save(
+            arguments.target,
+            tolerance=arguments.tolerance,
+            leave_out=arguments.leave_out,
+            strict=arguments.strict,
+        )
     except UnsayableError as error:
-        raise error.told_with("--leave-out NAME", "--tolerance 0.001") from None
+        raise error.told_with("--tolerance 0.001", "--leave-out NAME", "without --strict") from None
 
 
 def check(target: str, source: str, force: bool = False) -> None:
@@ -170,6 +193,16 @@ def _report(
     return lines
 
 
+def _left_out(arguments: argparse.Namespace, saved: Saved) -> list[str]:
+    """Return what the file does not say, for standard error."""
+    from kineverse.cli.wording import number
+
+    count = number(len(saved.left_out), "thing")
+    lines = [f"  {name} {reason}" for name, reason in saved.left_out.items()]
+    head = f"{arguments.target} leaves out {count} that it cannot say; --strict refuses instead:"
+    return [head, *bounded(lines, None if arguments.all else SHOWN, "  ")]
+
+
 def _errors(saved: Saved) -> str:
     """Return by how much frames are off at most, and which ones."""
     from kineverse.cli.wording import apart, number
@@ -207,5 +240,6 @@ def _as_json(
         "approximated": [
             {"name": name, "distance": error.position, "angle": error.angle} for name, error in worst_first
         ],
+        "left_out": dict(saved.left_out),
         "remarks": {"reading": left_out, "writing": list(saved.remarks)},
     }

@@ -128,7 +128,9 @@ def _check(target: Path) -> None:
             f"as in {target.stem + ENDINGS[0]!r}."
         )
     if target.is_dir():
-        raise FormatError(f"{target} is a folder; name a file in it, such as {target / f'model{ENDINGS[0]}'}.")
+        raise FormatError(
+            f"{target} is a folder; name a file in it, such as {target / f'model{ENDINGS[0]}'}."
+        )
     if not target.parent.is_dir():
         raise FormatError(f"{target} cannot be written: the folder {target.parent} does not exist.")
 
@@ -160,7 +162,9 @@ def _written(
 def _named(target: Path, error: FormatError) -> FormatError:
     """Return an error with the name of the file in front, once."""
     text = str(error)
-    return error if target.name in text else FormatError(f"{target.name} is not written. {text}")
+    return (
+        error if text.startswith(f"{target.name} ") else FormatError(f"{target.name} is not written. {text}")
+    )
 
 
 def _target(path: Any) -> Path:

@@ -211,8 +211,8 @@ class ModelView(Structure):
     ) -> Saved:
         """Write the model to a file: a document (.kv.json), URDF (.urdf) or MJCF (.xml).
 
-        A document says all of it. Motions that the others cannot say are refused by name; constraints are left
-        out with a remark, see :func:`kineverse.formats.saving.save`.
+        A document says all of it. Motions that the others cannot say are refused by name; constraints are
+        left out with a remark, see :func:`kineverse.formats.saving.save`.
 
         Parameters
         ----------

@@ -300,7 +300,9 @@ class Recognition:
                 continue
             driven.setdefault(owner, set()).update(map(str, row))
         for owner, speeds in driven.items():
-            self.refusals.leave_speeds(owner, f"moves by speeds that are not its own, {', '.join(sorted(speeds))}")
+            self.refusals.leave_speeds(
+                owner, f"moves by speeds that are not its own, {', '.join(sorted(speeds))}"
+            )
 
     def _plain_constraints(self) -> Iterator[tuple[str, Constraint]]:
         # Plain ones: with rates, what is handed out has coordinates as nodes that only look like curves.

@@ -18,27 +18,32 @@ class UnsayableError(FormatError):
         What that is.
     curved
         Whether some of it could be approximated.
-    leave_out, tolerance
-        How whoever reads the message leaves constraints out and has curves approximated.
+    strict
+        Whether constraints are among it, which could be left out.
+    said
+        How whoever reads the message has curves approximated, leaves out one constraint, and all of them.
     """
 
     def __init__(
         self,
         problem: str,
         curved: bool = False,
-        leave_out: str = "leave_out=(name, ...)",
-        tolerance: str = "tolerance=0.001",
+        strict: bool = False,
+        said: tuple[str, str, str] = ("tolerance=0.001", "leave_out=(name, ...)", "without strict=True"),
     ) -> None:
+        tolerance, leave_out, all_of_them = said
         remedies = ["Write a document (.kv.json), which says all of it"]
         if curved:
             remedies.append(f"have curves approximated with {tolerance}")
-        remedies.append(f"leave constraints out on purpose with {leave_out}")
-        super().__init__(f"{problem} {', '.join(remedies[:-1])}, or {remedies[-1]}.")
-        self._problem, self._curved = problem, curved
+        if strict:
+            remedies.append(f"leave constraints out with {leave_out}, or all of them {all_of_them}")
+        *first, last = remedies
+        super().__init__(f"{problem} {', '.join(first)}, or {last}." if first else f"{problem} {last}.")
+        self._problem, self._curved, self._strict = problem, curved, strict
 
-    def told_with(self, leave_out: str, tolerance: str) -> UnsayableError:
+    def told_with(self, tolerance: str, leave_out: str, all_of_them: str) -> UnsayableError:
         """Return the same for somebody who says that in another way."""
-        return UnsayableError(self._problem, self._curved, leave_out, tolerance)
+        return UnsayableError(self._problem, self._curved, self._strict, (tolerance, leave_out, all_of_them))
 
 
 @dataclass
@@ -117,4 +122,5 @@ class Refusals:
             f"{file} is not written: {self.target} cannot say {things} of this model. "
             f"{'; '.join(shown)}{more}.",
             self.curved,
+            self.strict,
         )

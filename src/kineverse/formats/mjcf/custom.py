@@ -7,8 +7,8 @@
 ``<tuple>`` ``kineverse:loop:NAME``      equalities and joints of a loop, those that follow with ``prm=1``
 =======================================  ================================================================
 
-A ``<tuple>`` in which there are names with spaces is a ``<text>`` of that name, whose data are its elements in
-JSON: ``[[objtype, objname, prm], ...]``.
+A ``<tuple>`` in which there are names with spaces is a ``<text>`` of that name, whose data are its elements
+in JSON: ``[[objtype, objname, prm], ...]``.
 """
 
 from __future__ import annotations

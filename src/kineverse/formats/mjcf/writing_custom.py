@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Collection, Iterable
-from string import whitespace as WHITESPACE
 
 from kineverse.formats.export.markup import Tag
 from kineverse.formats.export.plan import Joint, Loop
@@ -50,7 +49,7 @@ def add_loop(custom: Tag, loop: Loop, equalities: Iterable[str], joints: Collect
 
 def _as_it_can_be(listed: Tag) -> Tag:
     """Return a tuple, as a text where there are names with spaces: MuJoCo takes each for several."""
-    if not any(set(tag.attributes["objname"]) & set(WHITESPACE) for tag in listed.inside):
+    if all(len(tag.attributes["objname"].split()) == 1 for tag in listed.inside):
         return listed
     elements = [[tag.attributes.get(key, "0") for key in ELEMENT] for tag in listed.inside]
     return Tag("text", {"name": listed.attributes["name"], "data": json.dumps(elements, ensure_ascii=False)})

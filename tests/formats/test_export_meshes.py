@@ -1,0 +1,203 @@
+"""Meshes of what is written: found from where the file lies, and opened by whoever reads it."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+import written_meshes as made
+
+import kineverse as kv
+from kineverse.formats.packages import locate
+from kineverse.model.body import Body, Mesh, Shape
+
+REFERENCES = [
+    "package://cups/meshes/{}",
+    "model://cups/meshes/{}",
+    "../meshes/{}",
+    "file://{folder}/{}",
+    "{folder}/{}",
+]
+FILES = {
+    "cup.stl": made.tetrahedron(),
+    "cup.STL": made.tetrahedron(),
+    "text.stl": made.tetrahedron_as_text(),
+    "cup.ply": made.tetrahedron_as_ply(),
+    "cup.dae": made.tetrahedron_as_collada(),
+    "inches.dae": made.tetrahedron_as_collada(0.0254),
+}
+
+
+@pytest.fixture
+def package(tmp_path: Path) -> Path:
+    """Return a package of meshes, which is found from its own folder and those above it alone."""
+    folder = tmp_path / "work" / "cups"
+    (folder / "meshes").mkdir(parents=True)
+    (folder / "urdf").mkdir()
+    (folder / "package.xml").write_text("<package><name>cups</name></package>")
+    for name, content in FILES.items():
+        (folder / "meshes" / name).write_bytes(content)
+    return folder
+
+
+def robot(package: Path, *references: str) -> kv.Model:
+    """Return a model whose link has these meshes."""
+    visuals = "".join(
+        f'<visual><geometry><mesh filename="{r}" scale="1 2 1"/></geometry></visual>' for r in references
+    )
+    text = f"""<robot name="r"><link name="a"/><link name="b">{visuals}</link>
+<joint name="j" type="continuous"><parent link="a"/><child link="b"/><axis xyz="0 0 1"/></joint></robot>"""
+    (package / "urdf" / "r.urdf").write_text(text)
+    return kv.load(package / "urdf" / "r.urdf")
+
+
+def said(reference: str, name: str, package: Path) -> str:
+    return reference.format(name, folder=package / "meshes")
+
+
+def corners(file: Path) -> np.ndarray:
+    """Return the corners of a mesh as MuJoCo has them, in the frame of the file."""
+    mujoco = pytest.importorskip("mujoco")
+    model = mujoco.MjModel.from_xml_path(str(file))
+    (kind,) = {int(t) for t in model.geom_type}
+    assert kind == int(mujoco.mjtGeom.mjGEOM_MESH)
+    turn = np.zeros(9)
+    mujoco.mju_quat2Mat(turn, model.mesh_quat[0])
+    return np.array(model.mesh_vert @ turn.reshape(3, 3).T + model.mesh_pos[0])
+
+
+@pytest.mark.parametrize("reference", REFERENCES)
+@pytest.mark.parametrize("name", FILES)
+def test_mujoco_opens_what_is_written(reference: str, name: str, package: Path, tmp_path: Path) -> None:
+    (tmp_path / "out").mkdir()
+    target = tmp_path / "out" / "r.xml"
+    saved = robot(package, said(reference, name, package)).save(target)
+    found = corners(target)
+    expected = np.array(made.CORNERS) * (1, 2, 1)
+    distances = np.linalg.norm(found[:, None] - expected[None], axis=-1)
+    assert distances.min(axis=1).max() < 1e-6
+    assert distances.min(axis=0).max() < 1e-6
+    is_converted = not name.lower().startswith("cup.stl")
+    assert (tmp_path / "out" / "r_meshes").exists() is is_converted
+    remark = f"is converted to r_meshes/{Path(name).stem}.obj, which MuJoCo can read"
+    assert any(remark in r for r in saved.remarks) is is_converted
+    (shape,) = kv.load(target).bodies["b"].visuals
+    assert isinstance(shape.geometry, Mesh)
+    assert locate(shape.geometry.uri, shape.geometry.folder).is_file()
+
+
+def test_what_is_not_there_or_no_mesh_is_left_out_and_the_rest_is_written(
+    package: Path, tmp_path: Path
+) -> None:
+    pytest.importorskip("mujoco")
+    (package / "meshes" / "noise.stl").write_bytes(b"\1" * 84 + os.urandom(16))
+    (package / "meshes" / "noise.dae").write_bytes(b"<COLLADA")
+    (package / "meshes" / "noise.obj").write_bytes(b"v 0 0\nf 1 2 9\n")
+    (package / "meshes" / "notes.txt").write_text("hello")
+    names = ("missing.stl", "noise.stl", "noise.dae", "noise.obj", "notes.txt", "cup.stl")
+    model = robot(package, *(f"package://cups/meshes/{name}" for name in names), "https://a.b/c.stl")
+    saved = model.save(tmp_path / "r.xml")
+    again = kv.load(tmp_path / "r.xml").bodies["b"]
+    assert [Path(s.geometry.uri).name for s in again.visuals] == ["cup.stl"]  # type: ignore[union-attr]
+    for name in names[:-1]:
+        assert any(name in r and "is left out" in r for r in saved.remarks), name
+    assert any("https://a.b/c.stl" in r and "not fetched" in r for r in saved.remarks)
+
+
+def test_flat_meshes_are_written(package: Path, tmp_path: Path) -> None:
+    pytest.importorskip("mujoco")
+    (package / "meshes" / "flat.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nv 1 1 0\nf 1 2 3\nf 2 4 3\n")
+    saved = robot(package, "package://cups/meshes/flat.obj").save(tmp_path / "r.xml")
+    assert len(kv.load(tmp_path / "r.xml").bodies["b"].visuals) == 1
+    assert not [r for r in saved.remarks if "mesh" in r]
+
+
+def test_meshes_of_one_name_do_not_overwrite_each_other(package: Path, tmp_path: Path) -> None:
+    pytest.importorskip("mujoco")
+    (package / "more").mkdir()
+    (package / "more" / "cup.dae").write_bytes(made.tetrahedron_as_collada(0.5))
+    references = [f"package://cups/{name}/cup.dae" for name in ("meshes", "more", "meshes")]
+    robot(package, *references).save(tmp_path / "r.xml")
+    assert sorted(p.name for p in (tmp_path / "r_meshes").iterdir()) == ["cup.obj"]  # equal in metres
+    (package / "more" / "cup.dae").write_bytes(FILES["inches.dae"].replace(b'meter="0.0254"', b'meter="1"'))
+    robot(package, *references).save(tmp_path / "r.xml")
+    assert sorted(p.name for p in (tmp_path / "r_meshes").iterdir()) == ["cup.obj", "cup_2.obj"]
+
+
+def test_without_the_extra_what_needs_it_is_left_out_by_name(
+    package: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from kineverse.geometry import mesh_files
+
+    def missing(file: object) -> None:
+        raise kv.MissingExtraError("reading meshes needs trimesh: install it")
+
+    monkeypatch.setattr(mesh_files, "read_faces", missing)
+    saved = robot(package, "../meshes/cup.dae", "../meshes/cup.stl").save(tmp_path / "r.xml")
+    assert any(
+        "cup.dae is left out: MuJoCo cannot read it, and reading meshes needs trimesh" in r
+        for r in saved.remarks
+    )
+    assert len(kv.load(tmp_path / "r.xml").bodies["b"].visuals) == 1
+
+
+def test_textures_that_are_not_there_cost_their_colour_only(tmp_path: Path) -> None:
+    pytest.importorskip("mujoco")
+    from PIL import Image
+
+    Image.new("RGB", (2, 2)).save(tmp_path / "wood.png")
+    (tmp_path / "cup.stl").write_bytes(made.tetrahedron())
+    cup = Mesh("cup.stl", folder=str(tmp_path))
+    shapes = [Shape(cup, texture=name, color=(1, 0, 0, 1)) for name in ("wood.png", "no.png", "wood.jpg")]
+    model = kv.Model()
+    with model.edit() as edit:
+        edit.add_frame(
+            "cup", parent="world", transform=kv.rotation_z(kv.position("q")), body=Body(tuple(shapes))
+        )
+    (tmp_path / "out").mkdir()
+    saved = model.save(tmp_path / "out" / "m.xml")
+    assert [r for r in saved.remarks if "texture" in r] == [
+        "the texture no.png is left out: it is not there",
+        "the texture wood.jpg is left out: it is not there",
+    ]
+    assert len(kv.load(tmp_path / "out" / "m.xml").bodies["cup"].visuals) == 3
+
+
+@pytest.mark.parametrize("ending", ["urdf", "kv.json"])
+@pytest.mark.parametrize("reference", REFERENCES)
+def test_meshes_are_found_from_elsewhere(reference: str, ending: str, package: Path, tmp_path: Path) -> None:
+    there = tmp_path / "some" / "where"
+    there.mkdir(parents=True)
+    model = robot(package, said(reference, "cup.stl", package))
+    model.save(there / f"r.{ending}")
+    (shape,) = kv.load(there / f"r.{ending}").bodies["b"].visuals
+    assert isinstance(shape.geometry, Mesh)
+    found = locate(shape.geometry.uri, shape.geometry.folder)
+    assert found.resolve() == package / "meshes" / "cup.stl"
+
+
+def test_addresses_stay_where_they_are_found_from_there_too(
+    package: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    model = robot(package, "package://cups/meshes/cup.stl")
+    saved = model.save(package / "meshes" / "beside.urdf")
+    assert "package://cups/meshes/cup.stl" in (package / "meshes" / "beside.urdf").read_text()
+    assert not saved.remarks
+    saved = model.save(tmp_path / "far.urdf")
+    assert 'filename="work/cups/meshes/cup.stl"' in (tmp_path / "far.urdf").read_text()
+    assert (
+        "package://cups/meshes/cup.stl is written as a path, since that package is not found"
+        in saved.remarks[0]
+    )
+    monkeypatch.setenv("ROS_PACKAGE_PATH", str(package.parent))
+    assert not model.save(tmp_path / "far.urdf").remarks
+    assert "package://cups/meshes/cup.stl" in (tmp_path / "far.urdf").read_text()
+
+
+def test_what_is_nowhere_is_called_what_it_was_called(tmp_path: Path) -> None:
+    (tmp_path / "urdf").mkdir()
+    model = robot(tmp_path, "package://nobody/a.stl")
+    model.save(tmp_path / "r.urdf")
+    assert "package://nobody/a.stl" in (tmp_path / "r.urdf").read_text()
