@@ -182,9 +182,9 @@ class _Document:
         self._graph.budget.spend(COST_OF_NAME * sum(len(self._names[kind]) for kind in kinds))
         names = tuple((kind, tuple(sorted(self._names[kind]))) for kind in kinds)
         self._place = f"{place}, parameters"
-        written = {"/".join(cell) for cell, _ in writes}
+        written_cells = {"/".join(cell) for cell, _ in writes}
         parameters = {
-            string(key): read_parameter(value, self._graph, self._rename, self._path, written)
+            string(key): read_parameter(value, self._graph, self._rename, self._path, written_cells)
             for key, value in _members(given.get("parameters", {})).items()
         }
         self._cells.update(writes)

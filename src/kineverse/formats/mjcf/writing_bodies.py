@@ -30,7 +30,7 @@ SEEN, TOUCHED = "1", "3"
 
 _SMALLEST_MASS, _SMALLEST_INERTIA = 1e-3, 1e-6
 _LIGHTEST = 1e-13
-"""What is less is none for MuJoCo, a mass [kg] or a moment of inertia [kg m²]: it asks for 1e-15 and 1e-14."""
+"""What is less is none for MuJoCo, a mass [kg] or a moment of inertia [kg m²]: it wants 1e-15 and 1e-14."""
 _ROUNDING = 1e-12
 
 
@@ -109,7 +109,7 @@ class BodyWriter:
             mass = 0.0
         pose, diagonal = inertia.origin.matrix, not (xy or xz or yz)
         floor = max(_LIGHTEST, _ROUNDING * most)
-        if 0 < abs(most) < _LIGHTEST or 0 < abs(least) < _LIGHTEST > most:
+        if most < _LIGHTEST and tensor.any():
             self._remark(f"the inertia of '{name}' is as good as none for MuJoCo, so it has none")
             tensor, diagonal = np.zeros((3, 3)), True
             xx = yy = zz = least = middle = most = 0.0
