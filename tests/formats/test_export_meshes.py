@@ -124,6 +124,35 @@ def test_meshes_of_one_name_do_not_overwrite_each_other(package: Path, tmp_path:
     (package / "more" / "cup.dae").write_bytes(FILES["inches.dae"].replace(b'meter="0.0254"', b'meter="1"'))
     robot(package, *references).save(tmp_path / "r.xml")
     assert sorted(p.name for p in (tmp_path / "r_meshes").iterdir()) == ["cup.obj", "cup_2.obj"]
+    kv.load(tmp_path / "r.xml").save(tmp_path / "again.xml")  # OBJ stays where it is
+    assert not (tmp_path / "again_meshes").exists()
+
+
+def test_files_that_are_there_stay(package: Path, tmp_path: Path) -> None:
+    pytest.importorskip("mujoco")
+    (tmp_path / "r_meshes").mkdir()
+    (tmp_path / "r_meshes" / "cup.obj").write_text("precious")
+    robot(package, "../meshes/cup.dae").save(tmp_path / "r.xml")
+    assert (tmp_path / "r_meshes" / "cup.obj").read_text() == "precious"
+    assert 'file="r_meshes/cup_2.obj"' in (tmp_path / "r.xml").read_text()
+
+
+def test_what_fails_leaves_no_meshes_behind(
+    package: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pytest.importorskip("mujoco")
+    (tmp_path / "out").mkdir()
+    replace = os.replace
+
+    def refuse(source: object, target: Path) -> None:
+        if Path(target).suffix == ".xml":
+            raise PermissionError(13, "Permission denied")
+        replace(source, target)  # type: ignore[call-overload]
+
+    monkeypatch.setattr(os, "replace", refuse)
+    with pytest.raises(kv.FormatError, match="Permission denied"):
+        robot(package, "../meshes/cup.dae").save(tmp_path / "out" / "r.xml")
+    assert not list((tmp_path / "out").iterdir())
 
 
 def test_without_the_extra_what_needs_it_is_left_out_by_name(

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from round_trip import assert_same_motion, loaded
 
 import kineverse as kv
 from attempts import attempts
@@ -126,7 +127,8 @@ def test_what_cannot_be_read_again_is_not_written(tmp_path: Path, monkeypatch: p
         edit.apply(kv.Planar(name="p", parent="f", child="p", lower=-1, upper=1))
     monkeypatch.setattr(urdf_writing.Names, "take", lambda self, *wishes: "f")
     with pytest.raises(
-        kv.FormatError, match=r"^m\.urdf is not written\. What would be written cannot be read again: .*has the name"
+        kv.FormatError,
+        match=r"^m\.urdf is not written\. What would be written cannot be read again: .*has the name",
     ):
         model.save(tmp_path / "m.urdf")
     assert not list(tmp_path.iterdir())
@@ -163,6 +165,27 @@ def test_constraints_that_cannot_be_said_are_left_out_and_motions_are_not(
     with pytest.raises(kv.FormatError, match=r"cannot say one thing of this model\. 'odd' turns by no"):
         model.save(tmp_path / f"motion.{ending}")
     assert not (tmp_path / f"motion.{ending}").exists()
+
+
+LOCKED = ("garage_door", "door_with_handle", "ratchet", "ball")
+DRIVEN = ("omni_base", "differential_drive", "mecanum")
+
+
+@pytest.mark.parametrize("ending", ["urdf", "xml"])
+@pytest.mark.parametrize("name", [*LOCKED, *DRIVEN])
+def test_scenes_with_locks_and_wheels_are_written_and_move_alike(
+    name: str, ending: str, tmp_path: Path
+) -> None:
+    model = loaded(f"articulations/{name}")
+    if (name, ending) == ("ball", "urdf"):
+        with pytest.raises(kv.FormatError, match="turns by a quaternion"):
+            model.save(tmp_path / "m.urdf")
+        return
+    saved = model.save(tmp_path / f"m.{ending}")
+    assert saved.left_out
+    for left in saved.left_out:
+        assert left in model.constraints or left in model.articulations
+    assert_same_motion(model, kv.load(tmp_path / f"m.{ending}"))
 
 
 @pytest.mark.parametrize("name", ["m.sdf", "m", "m.xml.txt"])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
 import os
 from collections.abc import Iterable, Mapping
@@ -103,15 +104,30 @@ def save(
         write_document(model, target)
         return Saved(target)
     written = _written(model, target, leave_out, _checked(tolerance), strict)
-    for path, content in written.beside.items():
-        try:
-            path.parent.mkdir(exist_ok=True)
-        except OSError as error:
-            raise FormatError(f"{path.parent} cannot be made: {error.strerror}.") from None
-        replace_file(path, content)
-    replace_file(target, written.content)
+    _put(target, written)
     tell(f"{target.name}: {remark}" for remark in written.remarks)
     return Saved(target, written.remarks, written.errors, dict(written.left_out))
+
+
+def _put(target: Path, written: Written) -> None:
+    """Write a file and those that belong to it: all of them, or none."""
+    new = [path for path in written.beside if not path.exists()]
+    folders = [folder for folder in dict.fromkeys(path.parent for path in new) if not folder.exists()]
+    try:
+        for folder in folders:
+            folder.mkdir()
+        for path in new:
+            replace_file(path, written.beside[path])
+        replace_file(target, written.content)
+    except (FormatError, OSError) as error:
+        for path in new:
+            path.unlink(missing_ok=True)
+        for folder in folders:
+            with contextlib.suppress(OSError):
+                folder.rmdir()
+        if isinstance(error, OSError):
+            raise FormatError(f"{error.filename} cannot be made: {error.strerror}.") from None
+        raise
 
 
 def _check(target: Path) -> None:

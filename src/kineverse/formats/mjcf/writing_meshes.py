@@ -81,14 +81,22 @@ class MeshFiles:
             self._note(f"the mesh {mesh.uri} is left out: MuJoCo cannot read it, and {error}")
             return None
         content = _as_obj(triangles.vertices, triangles.faces)
-        names = {path.name for path, known in self.converted.items() if known != content}
         name, count = f"{there.stem}.obj", 1
-        while name in names:
+        while self._is_another(self._beside / name, content):
             count += 1
             name = f"{there.stem}_{count}.obj"
         self.converted[self._beside / name] = content
         self._note(f"the mesh {mesh.uri} is converted to {self._beside.name}/{name}, which MuJoCo can read")
         return f"{self._beside.name}/{name}"
+
+    def _is_another(self, path: Path, content: bytes) -> bool:
+        """Whether a path is that of another mesh, or of a file that is there and that nobody gave up."""
+        if path in self.converted:
+            return self.converted[path] != content
+        try:
+            return os.path.lexists(path) and path.read_bytes() != content
+        except OSError:
+            return True
 
 
 def _is_binary_stl(path: Path) -> bool:
