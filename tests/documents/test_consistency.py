@@ -184,3 +184,30 @@ def test_custom_code_is_written_as_before() -> None:
     model = build(placed)
     assert isinstance(model.history.operation("custom"), Custom)
     assert kv.document_hash(model) == kv.document_hash(read(json.loads(document_of(model))))
+
+
+def implicit(content: dict[str, Any]) -> list[Any]:
+    found: list[Any] = next(node for node in content["nodes"] if node[0] == "implicit")
+    return found
+
+
+@pytest.mark.parametrize(
+    ("place", "change", "message"),
+    [
+        (3, lambda u, x: [], "the residual is about"),
+        (3, lambda u, x: [*u, *u], "a symbol is given twice"),
+        (3, lambda u, x: [*u, x[0]], "a symbol is given twice"),
+        (2, lambda x, _: x[:1], "has 1 unknowns; seed and rows are as many"),
+        (5, lambda rows, _: [0] * len(rows), "rows are 2 different ones"),
+        (5, lambda rows, _: [99] * len(rows), "rows are 2 different ones"),
+        (8, lambda u, _: [*u, *u], "2 arguments for 1 inputs"),
+    ],
+)
+def test_loops_that_contradict_themselves_are_refused(
+    place: int, change: Callable[[list[Any], list[Any]], list[Any]], message: str
+) -> None:
+    content = json.loads(document_of(kv.load("articulations/four_bar")))
+    node = implicit(content)
+    node[place] = change(node[place], node[2])
+    with pytest.raises(kv.FormatError, match=rf"nodes\[\d+\]: .*{message}"):
+        operations_from(sealed(content))
