@@ -46,9 +46,9 @@ def test_the_page_is_served_to_this_computer_only(page, capfd):
 
 def test_there_is_a_slider_inside_its_limits_for_each_degree_of_freedom(page):
     found = sliders(page)
-    assert found["cabinet/drawer"] == ("drawer [m]", 0.0, 0.4, 0.0)
-    assert found["cabinet/door"] == ("door [rad]", 0.0, 1.5, 0.0)
-    assert found["cabinet/knob"] == ("knob [rad]", -np.pi, np.pi, 0.0)
+    assert found["cabinet/drawer"] == ("drawer [m]   0 to 0.4", 0.0, 0.4, 0.0)
+    assert found["cabinet/door"] == ("door [rad]   0 to 1.5", 0.0, 1.5, 0.0)
+    assert found["cabinet/knob"] == ("knob [rad]   −3.14 to 3.14", -np.pi, np.pi, 0.0)
 
 
 def test_moving_and_resetting(page):
@@ -90,7 +90,7 @@ def test_the_page_follows_edits_and_keeps_what_is_still_there(page):
         edit.add_frame("lid", parent="world", transform=kv.translation(0, 0, kv.position("lid")))
         edit.constrain("lid/range", 0.1, kv.position("lid"), 0.5)
     assert page.settled()
-    assert sliders(page)["lid"] == ("lid [m]", 0.1, 0.5, 0.1)
+    assert sliders(page)["lid"] == ("lid [m]   0.1 to 0.5", 0.1, 0.5, 0.1)
     assert sliders(page)["cabinet/drawer"][3] == 0.25
     np.testing.assert_allclose(page.pose("lid")[2, 3], 0.1)
 
