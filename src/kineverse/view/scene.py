@@ -221,9 +221,10 @@ class Scene:
         """Return the scene node of a frame; added at its pose if there is none yet."""
         if frame not in self._nodes:
             k = self._kinematics.index(frame)
-            # Slashes would make viser nest the nodes, and our poses are all relative to the world.
+            # Slashes would make viser nest the nodes, and our poses are all relative to the world. The number
+            # tells names apart that look the same.
             self._nodes[frame] = self._server.scene.add_frame(
-                f"{ROOT}/{frame.replace('/', '∕')}",
+                f"{ROOT}/{k} {frame.replace('/', '∕')}",
                 show_axes=False,
                 visible=frame not in self.unplaced,
                 position=self.poses[k, :3, 3],

@@ -6,7 +6,6 @@ import contextlib
 import dataclasses
 import errno
 import html
-import io
 import logging
 import socket
 from collections.abc import Callable
@@ -102,9 +101,15 @@ def stop(server: Any) -> None:
 
 @contextlib.contextmanager
 def quiet() -> Any:
-    """Keep a library from printing: standard output belongs to the caller."""
-    with contextlib.redirect_stdout(io.StringIO()):
+    """Keep viser from printing: standard output, and what is below a cell of a notebook, are the caller's."""
+    import rich
+
+    console = rich.get_console()
+    before, console.quiet = console.quiet, True
+    try:
         yield
+    finally:
+        console.quiet = before
 
 
 class _Instead:

@@ -81,13 +81,11 @@ def show(
                 open_page(page.address)
         if waits:
             page.wait()
-    except KeyboardInterrupt:
-        print(file=sys.stderr)
-    except BaseException:
+    except BaseException as error:
         page.stop()
-        raise
-    if waits:
-        page.stop()
+        if not (waits and isinstance(error, KeyboardInterrupt)):
+            raise
+        print(file=sys.stderr)  # where the terminal has written ^C
     return page
 
 
