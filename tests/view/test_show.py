@@ -93,7 +93,15 @@ def test_without_a_screen_no_browser_is_looked_for(monkeypatch, opened):
     assert opened == []
 
 
-def test_a_real_script_ends_with_ctrl_c():
+@pytest.fixture
+def hears_ctrl_c():
+    """Have processes started here hear Ctrl-C, which they would not if this one was started with ``&``."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
+def test_a_real_script_ends_with_ctrl_c(hears_ctrl_c):
     hidden = ("DISPLAY", "WAYLAND_DISPLAY", "BROWSER")
     with subprocess.Popen(
         [sys.executable, "-c", SCRIPT],

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 from kineverse.cli.assignments import add_set_option, parse_assignments, parse_length
 from kineverse.cli.listing import asked_for, print_articulations, print_models
 from kineverse.cli.progress import progress
+from kineverse.errors import ValueRejectedError
 
 if TYPE_CHECKING:
     import kineverse as kv
@@ -76,7 +77,9 @@ def run(arguments: argparse.Namespace) -> int:
     """Serve the page until interrupted."""
     assigned = parse_assignments(arguments.assignments)
     near = None if arguments.near is None else parse_length(arguments.near)
-    if arguments.model is None and arguments.picture is None:
+    if arguments.model is None:
+        if arguments.picture is not None:
+            raise ValueRejectedError("--picture needs a MODEL to draw; 'kineverse view' alone lists them")
         return print_models()
     if asked_for(arguments.model):
         return print_articulations()
