@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import socket
 import sys
+import threading
 import urllib.request
 
 import numpy as np
@@ -143,6 +144,28 @@ def test_the_page_follows_edits_and_keeps_what_is_still_there(page):
     assert sliders(page)["lid"] == ("lid [m]   0.1 to 0.5", 0.1, 0.5, 0.1)
     assert sliders(page)["cabinet/drawer"][3] == 0.25
     np.testing.assert_allclose(page.pose("lid")[2, 3], 0.1)
+
+
+def test_what_is_moved_while_the_page_is_made_anew_is_not_lost(page, monkeypatch):
+    from kineverse.view import viewer
+
+    def then_moved(model, fixed=viewer._fixed):
+        found = fixed(model)
+        if threading.current_thread() is page._worker:
+            monkeypatch.setattr(viewer, "_fixed", fixed)
+            other = threading.Thread(target=page.move, args=({"cabinet/door": 0.7},))
+            other.start()
+            other.join()
+        return found
+
+    monkeypatch.setattr(viewer, "_fixed", then_moved)
+    with page.model.edit() as edit:
+        # And a program may move what it is editing.
+        page.move({"cabinet/drawer": 0.2})
+        edit.add_frame("lid", parent="world", transform=kv.rotation_x(kv.position("lid")))
+    assert page.settled()
+    assert page.values == {"cabinet/door": 0.7, "cabinet/drawer": 0.2, "cabinet/knob": 0.0, "lid": 0.0}
+    assert sliders(page)["cabinet/door"][3] == 0.7
 
 
 def test_the_show_moves_what_has_limits(page):

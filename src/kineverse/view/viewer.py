@@ -10,6 +10,7 @@ from collections.abc import Iterable, Mapping
 from typing import Any
 
 from kineverse.errors import KineverseError, UnknownNameError, ValueRejectedError, suggest
+from kineverse.model.model import Model
 from kineverse.model.view import ModelView
 from kineverse.state import State
 from kineverse.view import server as web
@@ -20,7 +21,7 @@ from kineverse.view.hypertext import element
 from kineverse.view.motion import Show, played
 from kineverse.view.orientations import Orientations
 from kineverse.view.panel import Panel
-from kineverse.view.poses import complete
+from kineverse.view.poses import complete, kept
 from kineverse.view.ranges import Ranges
 from kineverse.view.scene import Scene
 from kineverse.view.title import title_of
@@ -93,7 +94,9 @@ class Viewer:
             hint = f" Read it first: kv.load({model!r})." if isinstance(model, str | os.PathLike) else ""
             raise ValueRejectedError(f"A page shows a kineverse.Model, not {_kind(model)}.{hint}")
         self.model = model
-        self._initial = complete(model, state)
+        # What the page is made of stays what it is while the model is edited, and is exchanged as a whole.
+        self._shown = _fixed(model)
+        self._initial = complete(self._shown, state)
         self._values = dict(self._initial)
         self._change = threading.Condition()
         self._asked, self._done = 1, 0
@@ -109,7 +112,7 @@ class Viewer:
             )
             self._server.gui.main_panel.dock_right()
             self._server.gui.main_panel.set_width(PANEL)
-            self._scene = Scene(self._server, model, self._values, camera)
+            self._scene = Scene(self._server, self._shown, self._values, camera)
             self.collisions = Collisions(self._server, self._scene, model, self._values)
             self._panel = self._build_panel(degrees)
         except BaseException:
@@ -153,8 +156,14 @@ class Viewer:
         UnknownNameError
             If the model has no such symbol; nothing has moved then.
         """
+        # The model may have been edited since. It is not waited for with the lock held: whoever edits it may
+        # be waiting for the lock.
+        model = _fixed(self.model)
+        given = {str(symbol): value for symbol, value in values.items()}
         with self._change:
-            self._values = complete(self.model, {**self._values, **{str(k): v for k, v in values.items()}})
+            moved = complete(model, {**kept(model, self._values), **given})
+            # What has been removed from the model goes with the page that was made of it.
+            self._values = {**self._values, **moved}
             self._orientations.read(self._values)
             self._ask(str(name) for name in values)
 
@@ -256,10 +265,10 @@ class Viewer:
         self.stop()
 
     def _build_panel(self, degrees: bool) -> Panel:
-        self._ranges = Ranges(self.model)
-        self._orientations = Orientations(self.model, self._values)
-        self._driving = Driving(self.model)
-        self._units = units(self.model, self._values, self._ranges.names)
+        self._ranges = Ranges(self._shown)
+        self._orientations = Orientations(self._shown, self._values)
+        self._driving = Driving(self._shown)
+        self._units = units(self._shown, self._values, self._ranges.names)
         self._units.update(dict.fromkeys(self._orientations.angles, "rad"))
         return Panel(
             self._server.gui,
@@ -279,7 +288,7 @@ class Viewer:
 
     def _to_be_played(self) -> dict[str, tuple[float, float]]:
         limits, angles = self._ranges.at(self._values), self._orientations.angles
-        return played(self.model, limits, angles, self._values, self._units)
+        return played(self._shown, limits, angles, self._values, self._units)
 
     def _moved(self, name: str, value: float) -> None:
         """Take the value of a slider that somebody moved; what is locked stays and its slider goes back."""
@@ -341,15 +350,18 @@ class Viewer:
             self._orientations.read(self._values)
         self._drawn = now
 
-    def _rebuild(self, values: Mapping[str, float]) -> dict[str, float]:
+    def _rebuild(self) -> dict[str, float]:
         """Build the page anew for a model that was edited, and return the values of its symbols."""
-        known = {str(symbol) for symbol in self.model.symbols}
-        current = complete(self.model, {name: value for name, value in values.items() if name in known})
+        model = _fixed(self.model)
         with self._change:
-            self._initial = complete(self.model, {k: v for k, v in self._initial.items() if k in known})
-            self._values = dict(current)
+            # Not the values that were to be drawn: somebody may have moved something since.
+            current = complete(model, kept(model, self._values))
+            # After yet another edit there may be values of symbols that this model does not have yet.
+            self._values = {**self._values, **current} if self._edited else dict(current)
+            self._initial = complete(model, kept(model, self._initial))
+            self._shown = model
             self._show = None
-        self._scene.refresh(self.model, current)
+        self._scene.refresh(model, current)
         self._panel.remove()
         self._panel = self._build_panel(self._panel.degrees)
         return current
@@ -358,7 +370,7 @@ class Viewer:
         """Show values, or why they cannot be shown; then everything stays where it was drawn last."""
         try:
             if edited:
-                values = self._rebuild(values)
+                values = self._rebuild()
             self._panel.update(values, driven)
             self._scene.update(values)
             self.collisions.watch.update(values, edited)
@@ -366,7 +378,7 @@ class Viewer:
                 self._panel.show(failure(f"Not finite, and hidden: {', '.join(self.unplaced)}."))
                 return
             # A mapping of nothing says nothing, a state of nothing is that of a model that cannot move.
-            violated = self.model.violations(values or State())
+            violated = self._shown.violations(State(values))
             self._panel.show(report(violated, violated.unchecked))
         except KineverseError as error:
             self._panel.show(failure(str(error)))
@@ -378,3 +390,8 @@ class Viewer:
 
 def _kind(thing: object) -> str:
     return f"{thing!r:.60}" if isinstance(thing, str | os.PathLike) else f"a {type(thing).__name__}"
+
+
+def _fixed(model: ModelView) -> ModelView:
+    """Return a model as it is now, whatever edits come."""
+    return model.snapshot() if isinstance(model, Model) else model
