@@ -3,7 +3,7 @@
 ``import kineverse as kv`` gives the whole public face: symbols and expressions (layer 1), :func:`compile`
 (layer 2), models, operations and :func:`load` (layer 3). Articulations are in :mod:`kineverse.articulations`;
 :mod:`kineverse.geometry` (layer 4), :mod:`kineverse.estimation` and :mod:`kineverse.reasoning` (layer 5) are
-imported when they are used.
+imported when they are used, and so is the viewer by :func:`show`.
 """
 
 from typing import TYPE_CHECKING
@@ -105,6 +105,7 @@ from .symbols import Symbol, parameter, position, symbol, velocity
 if TYPE_CHECKING:
     from . import estimation, geometry, reasoning
     from .formats.document import document_hash, from_bytes, to_bytes
+    from .view.show import show
 
 __all__ = [
     "Ackermann",
@@ -206,6 +207,7 @@ __all__ = [
     "rotation_z",
     "rpy",
     "shipped_models",
+    "show",
     "spatial",
     "spline",
     "symbol",
@@ -227,6 +229,8 @@ def __getattr__(name: str) -> object:
         return importlib.import_module(f"kineverse.{name}")
     if name in ("document_hash", "from_bytes", "to_bytes"):
         return getattr(importlib.import_module("kineverse.formats.document"), name)
+    if name == "show":
+        return importlib.import_module("kineverse.view.show").show
     raise AttributeError(f"module 'kineverse' has no attribute {name!r}")
 
 

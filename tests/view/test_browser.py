@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import io
+import re
 
 import numpy as np
 import pytest
 from small_models import cabinet, held_door
 
 from kineverse.view import Camera, view
+from kineverse.view.parts import parts
+from kineverse.view.surfaces import Surfaces
 
 pytest.importorskip("viser", reason="the page needs the extra 'view'")
 playwright = pytest.importorskip("playwright.sync_api", reason="driving a browser needs playwright")
@@ -44,6 +47,8 @@ def opened(browser):
         page.on("pageerror", lambda error: errors.append(str(error)))
         page.goto(viewer.address)
         page.wait_for_selector(SLIDERS)
+        # viser's warning of slow computers has a red bar, and slides in over the scene at some time.
+        page.add_style_tag(content=".mantine-Notifications-root { display: none }")
         # The picture is there once the red front of the drawer is.
         until(page, lambda: reddish(shot(page)).sum() > 300)
         yield viewer, page
@@ -72,9 +77,9 @@ def reddish(image):
     return (r > 1.6 * g) & (r > 1.6 * b)
 
 
-def row(page, label):
-    """The line of controls with a label."""
-    return page.get_by_text(label, exact=True)
+def row(page, label, end=""):
+    """The line of controls with a label, which goes on with its range and ends in some way."""
+    return page.get_by_text(re.compile(f"^{re.escape(label)} .* to .*{re.escape(end)}$"))
 
 
 def slider(page, viewer, name):
@@ -185,7 +190,7 @@ def test_the_range_of_a_slider_follows_another_one(browser):
         row(page, "lid [rad]").wait_for()
         door.focus()
         page.keyboard.press("Home")
-        row(page, "lid [rad] · locked").wait_for()
+        row(page, "lid [rad]", " · locked").wait_for()
         page.close()
 
 
@@ -214,3 +219,53 @@ def test_what_is_near_is_shown_and_follows_the_sliders(opened):
     page.get_by_label("nearest pairs").uncheck()
     page.get_by_text("50.0 mm").wait_for(state="detached")
     until(page, lambda: not greenish(shot(page)).any())
+
+
+def corners(viewer, camera):
+    """Where the corners of the scene are in the picture of a browser, (N, 2) in [-1, 1] if they are in it."""
+    poses = {name: viewer.pose(name) for name in viewer.model.frames}
+    points = Surfaces.of(parts(viewer.model), poses).corners.reshape(-1, 3)
+    place = Camera(tuple(camera.position), tuple(camera.look_at), field_of_view=camera.fov)
+    seen = (points - place.position) @ place.axes.T
+    assert (seen[:, 2] > 0).all()
+    half = np.tan(camera.fov / 2) * np.array([camera.image_width / camera.image_height, 1.0])
+    return seen[:, :2] / seen[:, 2:] / half
+
+
+def test_all_is_in_view_in_any_window_until_the_camera_is_moved_and_names_fit(browser):
+    with view(cabinet(), port=0) as viewer:
+        page = browser.new_page(viewport={"width": 900, "height": 420})
+        page.set_default_timeout(PATIENCE)
+        page.goto(viewer.address)
+        page.wait_for_selector(SLIDERS)
+        until(page, lambda: len(viewer._server.get_clients()) == 1)
+        (client,) = viewer._server.get_clients().values()
+        camera = client.camera
+        for size in ((900, 420), (640, 700)):
+            page.set_viewport_size({"width": size[0], "height": size[1]})
+            # As large as it can be, with some room at the edges.
+            until(page, lambda: 0.75 < np.abs(corners(viewer, camera)).max() < 0.95)
+        assert camera.image_width < camera.image_height
+        moved = camera.position + 0.3
+        camera.position = moved
+        page.set_viewport_size({"width": 900, "height": 420})
+        until(page, lambda: camera.image_width > camera.image_height)
+        np.testing.assert_allclose(camera.position, moved, atol=1e-3)
+
+        # Names stand on a line of their own, and the client's own numbers at the ends do not.
+        door = row(page, "door [rad]")
+        assert door.text_content() == "door [rad]   0 to 1.5"
+        assert door.bounding_box()["height"] < 25
+        assert door.bounding_box()["y"] < slider(page, viewer, "cabinet/door").bounding_box()["y"] - 8
+        assert page.locator(".mantine-Slider-markLabel:visible").count() == 0
+        page.get_by_label("degrees").check()
+        row(page, "door [°]").wait_for()
+        assert row(page, "door [°]").text_content() == "door [°]   0 to 85.94"
+        assert row(page, "drawer [m]").text_content() == "drawer [m]   0 to 0.4"
+        slider(page, viewer, "cabinet/door").focus()
+        page.keyboard.press("End")
+        until(page, lambda: viewer.values["cabinet/door"] == 1.5)
+        page.get_by_text("All constraints hold.").wait_for()
+        page.get_by_label("degrees").uncheck()
+        until(page, lambda: slider(page, viewer, "cabinet/door").get_attribute("aria-valuenow") == "1.5")
+        page.close()

@@ -31,7 +31,8 @@ def test_a_page_waits_for_who_looks_and_leaves_nothing_behind():
         assert page.address.startswith("http://127.0.0.1:")
         page.stop()
         assert page.life.time == 0.0
-        page.wait()  # is over
+        with pytest.raises(kv.KineverseError, match="There is no page to wait for"):
+            page.wait()
     page.stop()
     assert "kineverse-living" not in threads()
     port = int(page.address.rpartition(":")[2])

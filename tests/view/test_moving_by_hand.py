@@ -193,10 +193,10 @@ def test_ranges_and_locks_follow_other_sliders():
     with view(lock(), port=0) as viewer:
         sliders = viewer._panel._sliders
         assert sliders["door"].disabled
-        assert sliders["door"].label == "door [rad] · locked"
+        assert sliders["door"].label == "door [rad]   0 to 1.5 · locked"
         by_hand(viewer, "bolt", 0.1)
         assert not sliders["door"].disabled
-        assert sliders["door"].label == "door [rad]"
+        assert sliders["door"].label == "door [rad]   0 to 1.5"
         by_hand(viewer, "door", 1.0)
         assert sliders["drawer"].max == pytest.approx(0.2)
         by_hand(viewer, "bolt", 0.0)

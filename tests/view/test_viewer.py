@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import socket
 import sys
+import threading
 import urllib.request
 
 import numpy as np
@@ -46,9 +47,9 @@ def test_the_page_is_served_to_this_computer_only(page, capfd):
 
 def test_there_is_a_slider_inside_its_limits_for_each_degree_of_freedom(page):
     found = sliders(page)
-    assert found["cabinet/drawer"] == ("drawer [m]", 0.0, 0.4, 0.0)
-    assert found["cabinet/door"] == ("door [rad]", 0.0, 1.5, 0.0)
-    assert found["cabinet/knob"] == ("knob [rad]", -np.pi, np.pi, 0.0)
+    assert found["cabinet/drawer"] == ("drawer [m]   0 to 0.4", 0.0, 0.4, 0.0)
+    assert found["cabinet/door"] == ("door [rad]   0 to 1.5", 0.0, 1.5, 0.0)
+    assert found["cabinet/knob"] == ("knob [rad]   −3.14 to 3.14", -np.pi, np.pi, 0.0)
 
 
 def test_moving_and_resetting(page):
@@ -62,6 +63,56 @@ def test_moving_and_resetting(page):
     assert sliders(page)["cabinet/door"][3] == 0.0
     with pytest.raises(UnknownNameError, match="cabinet/door"):
         page.move({"cabinet/dor": 1.0})
+
+
+def test_angles_are_shown_in_degrees_on_demand_also_after_edits(page):
+    page.move({"cabinet/door": 0.5, "cabinet/drawer": 0.1})
+    assert page.settled()
+    page._panel._convert(True)
+    door = pytest.approx(np.degrees(0.5))
+    assert sliders(page)["cabinet/door"] == ("door [°]   0 to 85.94", 0.0, np.degrees(1.5), door)
+    assert sliders(page)["cabinet/drawer"] == ("drawer [m]   0 to 0.4", 0.0, 0.4, 0.1)
+    page.move({"cabinet/door": 2.0})
+    assert page.settled()
+    assert sliders(page)["cabinet/door"][0] == "door [°]   0 to 114.59"
+    assert page._panel._value("cabinet/door") == pytest.approx(2.0)
+    with page.model.edit() as edit:
+        edit.constrain("cabinet/knob/range", -1, kv.position("cabinet/knob"), 0.0123)
+    assert page.settled()
+    assert sliders(page)["cabinet/knob"][0] == "knob [°]   −57.3 to 0.7"
+    page._panel._convert(False)
+    assert sliders(page)["cabinet/knob"][:3] == ("knob [rad]   −1 to 0.012", -1.0, 0.0123)
+    assert page.values["cabinet/door"] == 2.0
+
+
+def test_speeds_are_shown_in_degrees_too():
+    with view(kv.load("articulations/differential_drive"), port=0, degrees=True) as page:
+        speeds = page._panel._speeds
+        assert speeds
+        turning = [s for name, s in speeds.items() if page._panel._units[name] == "rad/s"]
+        assert turning
+        assert all(" [°/s] " in s.label for s in turning)
+
+
+def test_what_is_seen_through_throws_no_shadows(page):
+    def shadows():
+        return {(node.cast_shadow, node.receive_shadow) for node, _ in page._scene._visuals}
+
+    assert shadows() == {(True, True)}
+    page._scene.show_through(True)
+    assert shadows() == {(False, False)}
+    page._scene.show_through(False)
+    assert shadows() == {(True, True)}
+
+
+def test_frames_that_differ_by_a_character_like_a_slash_are_two_nodes():
+    model = kv.Model()
+    cube = Body(visuals=(Shape(Box((1.0, 1.0, 1.0))),))
+    with model.edit() as edit:
+        edit.add_frame("a/b", "world", kv.translation(1, 0, 0), cube)
+        edit.add_frame("a∕b", "world", kv.translation(2, 0, 0), cube)
+    with view(model, port=0) as page:
+        assert len({node.name for node in page._scene._nodes.values()}) == 2
 
 
 def test_violated_constraints_are_shown_also_those_on_several(page):
@@ -90,9 +141,31 @@ def test_the_page_follows_edits_and_keeps_what_is_still_there(page):
         edit.add_frame("lid", parent="world", transform=kv.translation(0, 0, kv.position("lid")))
         edit.constrain("lid/range", 0.1, kv.position("lid"), 0.5)
     assert page.settled()
-    assert sliders(page)["lid"] == ("lid [m]", 0.1, 0.5, 0.1)
+    assert sliders(page)["lid"] == ("lid [m]   0.1 to 0.5", 0.1, 0.5, 0.1)
     assert sliders(page)["cabinet/drawer"][3] == 0.25
     np.testing.assert_allclose(page.pose("lid")[2, 3], 0.1)
+
+
+def test_what_is_moved_while_the_page_is_made_anew_is_not_lost(page, monkeypatch):
+    from kineverse.view import viewer
+
+    def then_moved(model, fixed=viewer._fixed):
+        found = fixed(model)
+        if threading.current_thread() is page._worker:
+            monkeypatch.setattr(viewer, "_fixed", fixed)
+            other = threading.Thread(target=page.move, args=({"cabinet/door": 0.7},))
+            other.start()
+            other.join()
+        return found
+
+    monkeypatch.setattr(viewer, "_fixed", then_moved)
+    with page.model.edit() as edit:
+        # And a program may move what it is editing.
+        page.move({"cabinet/drawer": 0.2})
+        edit.add_frame("lid", parent="world", transform=kv.rotation_x(kv.position("lid")))
+    assert page.settled()
+    assert page.values == {"cabinet/door": 0.7, "cabinet/drawer": 0.2, "cabinet/knob": 0.0, "lid": 0.0}
+    assert sliders(page)["cabinet/door"][3] == 0.7
 
 
 def test_the_show_moves_what_has_limits(page):

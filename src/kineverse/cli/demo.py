@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 from kineverse.cli.progress import progress
 from kineverse.cli.table import figure, table
-from kineverse.cli.view import add_page_options, announce, until_interrupted
+from kineverse.cli.view import add_page_options, announce, page_options, until_interrupted
 from kineverse.errors import ValueRejectedError
 
 if TYPE_CHECKING:
@@ -102,7 +102,9 @@ def run(arguments: argparse.Namespace) -> int:
 
     with (
         until_interrupted(),
-        LivingPage(Life(stranger=arguments.stranger), port=arguments.port, label="Kineverse demo") as page,
+        LivingPage(
+            Life(stranger=arguments.stranger), label="Kineverse demo", **page_options(arguments)
+        ) as page,
     ):
         announce(page, browser=not arguments.no_browser)
         print(f"{page.life.kitchen}, tracked; a {page.life.stranger.name}, learned", flush=True)
@@ -161,7 +163,9 @@ def _by_hand(arguments: argparse.Namespace) -> int:
 
     with (
         until_interrupted(),
-        Viewer(model, _state(model), port=arguments.port, label="Kineverse demo", camera=_camera()) as page,
+        Viewer(
+            model, _state(model), label="Kineverse demo", camera=_camera(), **page_options(arguments)
+        ) as page,
     ):
         announce(page, browser=not arguments.no_browser)
         print(_contents(model), flush=True)

@@ -1,4 +1,4 @@
-"""The list of the articulations that can be opened by name."""
+"""The list of what can be opened by name."""
 
 from __future__ import annotations
 
@@ -26,3 +26,11 @@ def print_articulations(as_json: bool = False) -> int:
         print(table(("model", "shows"), rows, "<<"))
         print(f"\nMove one with: kineverse view {rows[0][0]}")
     return 0
+
+
+def print_models() -> int:
+    """Print a line for each shipped model and each articulation, and return the exit status."""
+    from kineverse.formats import shipped_models
+
+    print("models: " + ", ".join(shipped_models()), end="\n\n")
+    return print_articulations()

@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 import argparse
-import os
 import signal
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from kineverse.cli.assignments import add_set_option, parse_assignments, parse_length
-from kineverse.cli.listing import asked_for, print_articulations
+from kineverse.cli.listing import asked_for, print_articulations, print_models
 from kineverse.cli.progress import progress
+from kineverse.errors import ValueRejectedError
 
 if TYPE_CHECKING:
     import kineverse as kv
@@ -21,13 +21,14 @@ if TYPE_CHECKING:
 
 HELP = """show a model in the browser, with a slider for everything that moves
 
-The page is served to this computer only, until Ctrl-C. With --picture there is no page: a picture of the
+The page is served to this computer only, until Ctrl-C; with --host to others, who need the address with its
+token. With --picture there is no page: a picture of the
 state is written. That needs neither a browser nor anything beyond the core, but for meshes and --near.
 
 examples:
   kineverse view kitchen
   kineverse view articulations/folding_door      any articulation of the library
-  kineverse view articulations                   the list of them
+  kineverse view                                 the list of all that can be named
   kineverse view my_robot.urdf --set elbow=45deg --port 8090
   kineverse view kitchen --near 5cm              which bodies are how near to each other
   kineverse view articulations/ratchet --near 0.1 --collisions --picture ratchet.png"""
@@ -35,7 +36,12 @@ examples:
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
-    parser.add_argument("model", metavar="MODEL", help="name of a shipped model, or path of a file")
+    parser.add_argument(
+        "model",
+        metavar="MODEL",
+        nargs="?",
+        help="name of a shipped model, or path of a file; none for a list",
+    )
     add_set_option(parser)
     parser.add_argument(
         "--near",
@@ -46,6 +52,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--decomposed", action="store_true", help="both with meshes as the hulls of kineverse decompose"
     )
+    parser.add_argument("--degrees", action="store_true", help="show angles in degrees")
     parser.add_argument("--picture", metavar="PATH", help="write a picture (.png) instead of opening a page")
     add_page_options(parser)
 
@@ -53,27 +60,46 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def add_page_options(parser: argparse.ArgumentParser) -> None:
     """Declare the options of a command that opens a page."""
     parser.add_argument("--port", type=int, metavar="N", help="port of the page (8080, or any free one)")
+    parser.add_argument(
+        "--host",
+        metavar="ADDRESS",
+        help="let others look: listen on this address of the computer (0.0.0.0: all)",
+    )
     parser.add_argument("--no-browser", action="store_true", help="only print the address")
+
+
+def page_options(arguments: argparse.Namespace) -> dict[str, Any]:
+    """Return what was said about a page, as it is given to one."""
+    return {"port": arguments.port, **({"host": arguments.host} if arguments.host else {})}
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Serve the page until interrupted."""
     assigned = parse_assignments(arguments.assignments)
     near = None if arguments.near is None else parse_length(arguments.near)
+    if arguments.model is None:
+        if arguments.picture is not None:
+            raise ValueRejectedError("--picture needs a MODEL to draw; 'kineverse view' alone lists them")
+        return print_models()
     if asked_for(arguments.model):
         return print_articulations()
 
     import kineverse as kv
     from kineverse.view import meshes
+    from kineverse.view.title import title_of_file
     from kineverse.view.viewer import Viewer
 
-    label = os.path.basename(arguments.model)
+    label = title_of_file(arguments.model)
     model = kv.load(arguments.model)
     for mesh in progress(meshes.seen_in(model), "reading meshes", "file"):
         meshes.load(mesh)  # and remembered: whoever draws them finds them read
     if arguments.picture is not None:
         return _write_picture(arguments, model, assigned, near)
-    with until_interrupted(), Viewer(model, assigned, port=arguments.port, label=label) as page:
+    options = page_options(arguments)
+    with (
+        until_interrupted(),
+        Viewer(model, assigned, label=label, degrees=arguments.degrees, **options) as page,
+    ):
         if near is not None:
             page.collisions.show_near(near)
         if arguments.decomposed:
@@ -111,13 +137,10 @@ def _write_picture(
 def announce(page: Viewer | LivingPage, browser: bool) -> None:
     """Print the address of a page and open it, if there is a screen to open it on."""
     print(f"{page.address}   (Ctrl-C ends)", flush=True)
-    has_screen = sys.platform in ("win32", "darwin") or any(
-        os.environ.get(name) for name in ("DISPLAY", "WAYLAND_DISPLAY", "BROWSER")
-    )
-    if browser and has_screen:
-        import webbrowser
+    if browser:
+        from kineverse.view.show import open_page
 
-        webbrowser.open(page.address)
+        open_page(page.address)
 
 
 def note_problems(problems: list[str]) -> None:

@@ -6,8 +6,9 @@
 >>> save("kitchen.png", kv.load("kitchen"))
 >>> with view(kv.load("kitchen")) as page:                                # needs the extra "view"
 ...     print(page.address)
+>>> kv.show(kv.load("kitchen"))                                           # the same, until Ctrl-C
 
-Pictures are drawn by numpy; the page is served by viser to this computer alone.
+Pictures are drawn by numpy; the page is served by viser to this computer alone, unless it is told otherwise.
 """
 
 from __future__ import annotations
@@ -17,12 +18,13 @@ from typing import TYPE_CHECKING, Any
 
 from kineverse.view.camera import Camera
 from kineverse.view.drawing import picture, save
+from kineverse.view.show import show
 
 if TYPE_CHECKING:
     from kineverse.model.view import ModelView
     from kineverse.view.viewer import Viewer
 
-__all__ = ["Camera", "picture", "save", "view"]
+__all__ = ["Camera", "picture", "save", "show", "view"]
 
 
 def view(
@@ -30,10 +32,15 @@ def view(
     state: Mapping[Any, float] | None = None,
     *,
     port: int | None = None,
-    label: str = "Kineverse",
+    label: str | None = None,
     camera: Camera | None = None,
+    host: str = "127.0.0.1",
+    degrees: bool = False,
 ) -> Viewer:
-    """Show a model on a web page of this computer; see :class:`kineverse.view.viewer.Viewer`."""
+    """Put a model on a web page and go on; :func:`kineverse.show` waits, and opens the browser.
+
+    Parameters, result and errors are those of :class:`kineverse.view.viewer.Viewer`.
+    """
     from kineverse.view.viewer import Viewer
 
-    return Viewer(model, state, port=port, label=label, camera=camera)
+    return Viewer(model, state, port=port, label=label, camera=camera, host=host, degrees=degrees)

@@ -13,6 +13,7 @@ from kineverse.errors import ValueRejectedError
 from kineverse.geometry.left_out import is_installed
 from kineverse.geometry.solids import coal_engine
 from kineverse.model.view import ModelView
+from kineverse.view.hypertext import Html, HtmlBox, element
 from kineverse.view.marks import BALL, CONTACT, HEAD, SHAFT, TIP, Marks
 from kineverse.view.near import RADIUS, Nearness
 from kineverse.view.near_report import boxed, near_failure, near_report
@@ -28,9 +29,11 @@ LONGEST = 0.2
 LABELS = 8
 """Depths that are written beside their arrows; more would cover what they are about."""
 
-MISSING = boxed(["Distances need the extra <b>geometry</b>: pip install 'kineverse-articulation[geometry]'"])
+MISSING = boxed(
+    "Distances need the extra ", element("b", "geometry"), ": pip install 'kineverse-articulation[geometry]'"
+)
 
-WAITING = boxed(["<b>Reading shapes …</b>"])
+WAITING = boxed(element("b", "Reading shapes …"))
 
 
 class Collisions:
@@ -48,7 +51,7 @@ class Collisions:
 
     def __init__(self, server: Any, scene: Scene, model: ModelView, values: Mapping[str, float]) -> None:
         self._server, self._scene = server, scene
-        self._report: Any = None
+        self._report: HtmlBox | None = None
         self._folder: Any = None
         self._shapes: Any = None
         self._controls: tuple[Any, ...] = ()
@@ -137,7 +140,7 @@ class Collisions:
             )
             self._shapes.on_update(lambda event: self._scene.show_collisions(event.target.value))
             if not is_installed():
-                self._report = gui.add_html("")
+                self._report = HtmlBox(gui, Html())
                 return
             near = gui.add_checkbox("nearest pairs", wanted.on, hint="Lines where bodies are nearest.")
             radius = gui.add_slider(
@@ -155,7 +158,7 @@ class Collisions:
             decomposed = gui.add_checkbox(
                 "decomposed meshes", wanted.decomposed, hint="Meshes as the hulls of kineverse decompose."
             )
-            self._report = gui.add_html("")
+            self._report = HtmlBox(gui, Html())
         self._controls = near, radius, only, ignored, decomposed
         for control in self._controls:
             control.on_update(self._set_by_hand)
@@ -197,15 +200,15 @@ class Collisions:
         """Write the report of what was seen last, which is ``new`` if given."""
         with self._lock:
             self.seen = seen = new or self.seen
-            text = "" if is_installed() else MISSING
+            text = Html() if is_installed() else MISSING
             if seen.failure:
                 text = near_failure(seen.failure)
             elif seen.nearness is not None:
                 text = near_report(seen.nearness, seen.problems or {})
             elif self.watch.wanted.on:
                 text = WAITING
-            if self._report is not None and self._report.content != text:
-                self._report.content = text
+            if self._report is not None:
+                self._report.show(text)
 
     @property
     def _length(self) -> float:

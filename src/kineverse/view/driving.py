@@ -7,6 +7,7 @@ from collections.abc import Mapping
 
 from kineverse.errors import KineverseError
 from kineverse.model.view import ModelView
+from kineverse.state import State
 
 UNLIMITED = 2.0
 """The fastest that is offered where the model sets no limit [m/s], [rad/s]."""
@@ -56,10 +57,10 @@ class Driving:
     def after(self, values: Mapping[str, float], seconds: float) -> dict[str, float]:
         """Return the values that are others after a time [s]; stop where a constraint would be broken."""
         try:
-            moved = self._model.integrate(values, self.speeds, min(seconds, LONGEST))
+            moved = self._model.integrate(State(values), self.speeds, min(seconds, LONGEST))
             changed = {name: moved[name] for name in values if moved[name] != values[name]}
-            broken = {v.name for v in self._model.violations({**values, **changed})}
-            stuck = bool(broken) and not broken <= {v.name for v in self._model.violations(values)}
+            broken = {v.name for v in self._model.violations(State({**values, **changed}))}
+            stuck = bool(broken) and not broken <= {v.name for v in self._model.violations(State(values))}
         except KineverseError:
             stuck = True
         if stuck:

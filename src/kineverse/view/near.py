@@ -9,6 +9,7 @@ from itertools import takewhile
 from kineverse.geometry import Closest, Rule, Scene
 from kineverse.geometry.left_out import RIGID, Ignored, remarks, unusable
 from kineverse.model.view import ModelView
+from kineverse.state import State
 
 RADIUS = 0.1
 """Within what distance pairs are shown unless somebody says otherwise [m]."""
@@ -115,7 +116,8 @@ class Near:
         KineverseError
             If there are no distances at these values, as where a pose is not finite.
         """
-        self._scene.update(values)
+        # A state, for the values may be of more symbols than the scene has.
+        self._scene.update(State(values))
         found = _named(self._scene.within(radius), containing)
         looked_at, not_looked_at = self._ignored.counts
         return Nearness(
@@ -133,7 +135,7 @@ class Near:
     ) -> list[tuple[Closest, str]]:
         if self._all is None:
             self._all = self._scene_with([Rule("*", "*", check=True)])
-        self._all.update(values)
+        self._all.update(State(values))
         found = _named(self._all.within(radius), containing)
         reasons = ((pair, self._ignored.why(pair.a, pair.b)) for pair in found)
         return [(pair, why) for pair, why in reasons if why not in ("", RIGID)][:MOST]

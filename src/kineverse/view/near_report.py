@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import html
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 
 from kineverse.geometry import Closest
+from kineverse.view.hypertext import BREAK, FONT, Html, element, joined
 from kineverse.view.marks import color, millimetres
 from kineverse.view.near import Nearness
 from kineverse.view.violations import number
@@ -22,32 +22,29 @@ TOUCHING = 5e-6
 _GREY = "#868e96"
 
 
-def near_report(found: Nearness, problems: Mapping[str, str]) -> str:
+def near_report(found: Nearness, problems: Mapping[str, str]) -> Html:
     """Return HTML: how many pairs are near, the nearest of them with their distances, what is left out."""
-    lines = [f"<b>{_summary(found)}</b>"]
+    lines = [element("b", _summary(found))]
     lines += [_line(pair, color(pair.distance, found.radius)) for pair in found.pairs[:LINES]]
     lines += _more(found.found - LINES)
     if found.ignored:
-        lines.append('<div style="margin-top:5px"><b>Near, but not looked at</b></div>')
+        lines.append(_heading("Near, but not looked at"))
         lines += [_line(pair, None, why) for pair, why in found.ignored[:LINES]]
         lines += _more(len(found.ignored) - LINES)
     lines += _left_out(problems)
     pairs = f"{found.looked_at} pairs are looked at, {found.not_looked_at} are not"
-    lines.append(f'<div style="color:{_GREY};margin-top:5px">{pairs}</div>')
-    return boxed(lines)
+    lines.append(element("div", pairs, style=f"color:{_GREY};margin-top:5px"))
+    return boxed(*lines)
 
 
-def near_failure(message: str) -> str:
+def near_failure(message: str) -> Html:
     """Return HTML that says why there are no distances."""
-    return boxed([f'<b style="color:#c92a2a">There are no distances now.</b><br>{html.escape(message)}'])
+    return boxed(element("b", "There are no distances now.", style="color:#c92a2a"), BREAK, message)
 
 
-def boxed(lines: Iterable[str]) -> str:
-    """Return lines of HTML in the font of the panel."""
-    return (
-        '<div class="kineverse-near" style="font-size:0.8em;line-height:1.35;padding:2px 9px 8px;'
-        f'overflow-wrap:anywhere">{"".join(lines)}</div>'
-    )
+def boxed(*content: str) -> Html:
+    """Return content in the font of the panel."""
+    return element("div", *content, class_="kineverse-near", style=f"{FONT}padding:2px 9px 8px")
 
 
 def _summary(found: Nearness) -> str:
@@ -59,29 +56,31 @@ def _summary(found: Nearness) -> str:
     return f"{near}, {found.touching} touch{'es' if found.touching == 1 else ''}"
 
 
-def _line(pair: Closest, rgb: tuple[float, float, float] | None, why: str = "") -> str:
+def _line(pair: Closest, rgb: tuple[float, float, float] | None, why: str = "") -> Html:
     shade = _GREY if rgb is None else f"rgb({','.join(str(round(255 * c)) for c in rgb)})"
     distance = millimetres(pair.distance)
     if pair.touches:
         distance = f"{millimetres(-pair.distance)} deep" if pair.distance < -TOUCHING else "touching"
-    dot = f'<span style="color:{shade}">●</span>'
-    names = f"{html.escape(pair.a)} – {html.escape(pair.b)}"
-    aside = f' <span style="color:{_GREY}">{html.escape(why)}</span>' if why else ""
-    return (
-        '<div style="display:flex;gap:6px;margin-top:2px">'
-        f'{dot}<span style="flex:1">{names}{aside}</span>'
-        f'<span style="white-space:nowrap">{distance}</span></div>'
+    aside = joined(" ", element("span", why, style=f"color:{_GREY}")) if why else ""
+    return element(
+        "div",
+        element("span", "●", style=f"color:{shade}"),
+        element("span", f"{pair.a} – {pair.b}", aside, style="flex:1"),
+        element("span", distance, style="white-space:nowrap"),
+        style="display:flex;gap:6px;margin-top:2px",
     )
 
 
-def _more(count: int) -> list[str]:
-    return [f'<div style="color:{_GREY}">and {count} more</div>'] if count > 0 else []
+def _heading(text: str) -> Html:
+    return element("div", element("b", text), style="margin-top:5px")
 
 
-def _left_out(problems: Mapping[str, str]) -> list[str]:
+def _more(count: int) -> list[Html]:
+    return [element("div", f"and {count} more", style=f"color:{_GREY}")] if count > 0 else []
+
+
+def _left_out(problems: Mapping[str, str]) -> list[Html]:
     if not problems:
         return []
-    lines = ['<div style="margin-top:5px"><b>No distances to</b></div>']
-    for name, why in list(problems.items())[:LEFT_OUT]:
-        lines.append(f"<div>{html.escape(name)}: {html.escape(why)}</div>")
-    return lines + _more(len(problems) - LEFT_OUT)
+    lines = [element("div", f"{name}: {why}") for name, why in list(problems.items())[:LEFT_OUT]]
+    return [_heading("No distances to"), *lines, *_more(len(problems) - LEFT_OUT)]

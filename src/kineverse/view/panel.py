@@ -2,21 +2,39 @@
 
 from __future__ import annotations
 
+import math
+import threading
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
 from kineverse.view.collisions import Collisions
 from kineverse.view.driving import Driving
+from kineverse.view.hypertext import Html, HtmlBox, element
 from kineverse.view.orientations import Orientations
 from kineverse.view.ranges import Ranges, offered, step
 from kineverse.view.scene import Scene
-from kineverse.view.violations import number, report
+from kineverse.view.violations import missing_meshes, number, report
 
 BEYOND = 0.2
 """How much wider sliders get on demand, as a part of their range, so that limits can be crossed."""
 
 OPEN = 100
 """With at most so many degrees of freedom all groups are unfolded at first."""
+
+DEGREES = {"rad": ("°", math.degrees(1.0)), "rad/s": ("°/s", math.degrees(1.0))}
+"""What angles are shown in on demand: another unit, and how many of it one radian is."""
+
+STYLE = """
+.mantine-Slider-markLabel { display: none }
+.mantine-Flex-root:has(> div > p > label):has(.mantine-Slider-root) { display: block }
+.mantine-Flex-root:has(> div > p > label):has(.mantine-Slider-root) > div:first-child {
+  width: auto !important }
+.mantine-Flex-root:has(.mantine-Slider-root) > div > p > label {
+  display: block; white-space: pre; overflow: hidden; text-overflow: ellipsis }
+.mantine-Flex-root:has(> div > p > label):has(.mantine-Checkbox-root) > div:first-child {
+  width: auto !important; min-width: 6.5em; white-space: nowrap }
+"""
+"""Sliders below their names, which do not fit beside them; the names say the range."""
 
 
 class Panel:
@@ -46,6 +64,8 @@ class Panel:
         Called with the name and value of a speed that somebody set.
     reset, play
         Called when somebody wants the initial state, or starts (True) and stops (False) the show.
+    degrees
+        Whether angles are shown in degrees; somebody may switch that.
     """
 
     def __init__(
@@ -63,8 +83,14 @@ class Panel:
         driven: Callable[[str, float], None],
         reset: Callable[[], None],
         play: Callable[[bool], None],
+        degrees: bool = False,
     ) -> None:
-        self._gui, self._ranges, self._units, self._moved = gui, ranges, units, moved
+        self._gui, self._ranges, self._units, self._moved = gui, ranges, dict(units), moved
+        self._shown: Mapping[str, float] = {**values, **orientations.angles}
+        self._locked: dict[str, bool] = {}
+        # Switches on the page and the motion of the model come from different threads.
+        self._changing = threading.RLock()
+        self._in_degrees = degrees
         self._orientations, self._driving, self._collisions = orientations, driving, collisions
         self._limits = {**ranges.at(values), **orientations.limits}
         self._sliders: dict[str, Any] = {}
@@ -72,7 +98,8 @@ class Panel:
         self._folders: dict[str, Any] = {}
         self._root = gui.add_folder(None)
         with self._root:
-            self._status = gui.add_html(report(()))
+            HtmlBox(gui, element("style", Html(STYLE)))
+            self._status = HtmlBox(gui, report(()))
             collisions.add_folder(gui)
             tabs = gui.add_tab_group()
             with tabs.add_tab("Move"):
@@ -89,10 +116,9 @@ class Panel:
         self._collisions.forget_folder()
         self._root.remove()
 
-    def show(self, status: str) -> None:
-        """Show a text in HTML above the sliders: what is violated, or what went wrong."""
-        if self._status.content != status:
-            self._status.content = status
+    def show(self, status: Html) -> None:
+        """Show HTML above the sliders: what is violated, or what went wrong."""
+        self._status.show(status)
 
     def update(self, values: Mapping[str, float], driven: Iterable[str] = ()) -> None:
         """Set sliders to values that did not come from them, and all ranges to what the values allow.
@@ -104,26 +130,35 @@ class Panel:
         driven
             The names of those that were set by a program.
         """
-        shown = {**values, **self._orientations.angles}
-        for name in self._orientations.in_place(driven):
-            slider = self._sliders.get(name)
-            if slider is not None:
-                if not slider.min <= shown[name] <= slider.max:
-                    self._fit(name, shown[name])
-                slider.value = float(shown[name])
-        if self._ranges.varying:
-            self._limits.update(self._ranges.at(values))
-            for name in self._ranges.varying:
-                self._fit(name, float(self._sliders[name].value))
-        self._lock(values)
-        for name, speed in self._driving.speeds.items():
-            if self._speeds[name].value != speed:
-                self._speeds[name].value = speed
+        with self._changing:
+            self._update({**values, **self._orientations.angles}, values, driven)
 
     @property
     def beyond(self) -> bool:
         """Whether limits and locks may be crossed."""
         return bool(self._beyond.value)
+
+    @property
+    def degrees(self) -> bool:
+        """Whether angles are shown in degrees."""
+        return self._in_degrees
+
+    def _update(self, shown: Mapping[str, float], values: Mapping[str, float], driven: Iterable[str]) -> None:
+        self._shown = shown
+        for name in self._orientations.in_place(driven):
+            slider = self._sliders.get(name)
+            if slider is not None:
+                if not slider.min <= self._to_shown(name, shown[name]) <= slider.max:
+                    self._fit(name, shown[name])
+                slider.value = self._to_shown(name, shown[name])
+        if self._ranges.varying:
+            self._limits.update(self._ranges.at(values))
+            for name in self._ranges.varying:
+                self._fit(name, self._value(name))
+        self._lock(values)
+        for name, speed in self._driving.speeds.items():
+            if self._speeds[name].value != self._to_shown(name, speed):
+                self._speeds[name].value = self._to_shown(name, speed)
 
     def _add_controls(self, reset: Callable[[], None], play: Callable[[bool], None]) -> None:
         gui = self._gui
@@ -136,6 +171,10 @@ class Panel:
             hint=f"Widen all sliders by {BEYOND:.0%}, and ignore locks, to see limits violated.",
         )
         self._beyond.on_update(lambda _: self._widen())
+        degrees = gui.add_checkbox(
+            "degrees", self._in_degrees, hint="Show angles in degrees instead of radians."
+        )
+        degrees.on_update(lambda event: self._convert(event.target.value))
         self.playing = gui.add_checkbox("play", False, hint="Move everything through its range.")
         self.playing.on_update(lambda event: play(event.target.value) if event.client is not None else None)
 
@@ -156,19 +195,20 @@ class Panel:
         gui, limits = self._gui, self._driving.limits
         with gui.add_folder("drive"):
             for name in self._driving.speeds:
-                low, high = limits[name]
                 path = name.removesuffix(":velocity")
-                unit = f" [{self._units[path]}/s]" if self._units.get(path) else ""
+                self._units[name] = f"{self._units[path]}/s" if self._units.get(path) else ""
+                low, high = (self._to_shown(name, limit) for limit in limits[name])
                 slider = gui.add_slider(
-                    path.rpartition("/")[2] + unit,
+                    self._label(name, limits[name]),
                     min=low,
                     max=high,
                     step=step((low, high)),
                     initial_value=0.0,
-                    hint=f"{name}, from {number(low)} to {number(high)}; it goes on until this is 0",
+                    hint=f"{name}, from {number(limits[name][0])} to {number(limits[name][1])} "
+                    f"{self._units[name]}; it goes on until this is 0",
                 )
                 slider.precision = _digits(low, high)
-                slider.on_update(lambda event, name=name: self._set(driven, name, event))
+                slider.on_update(lambda event, name=name: self._set(driven, name, limits[name], event))
                 self._speeds[name] = slider
 
             def stop(_: Any) -> None:
@@ -179,38 +219,69 @@ class Panel:
 
     def _slider(self, name: str, value: float) -> Any:
         lower, upper = self._limits[name]
-        low, high = self._range(name, value)
+        range_ = self._range(name, value)
+        low, high = (self._to_shown(name, end) for end in range_)
         unit = self._units.get(name, "")
         slider = self._gui.add_slider(
-            self._label(name),
+            self._label(name, range_),
             min=low,
             max=high,
             step=step((low, high)),
-            initial_value=float(value),
+            initial_value=self._to_shown(name, value),
             hint=f"{name}, limits {number(lower)} to {number(upper)} {unit}".rstrip(),
         )
         slider.precision = _digits(low, high)
-        slider.on_update(lambda event: self._set(self._moved, name, event))
+        slider.on_update(lambda event: self._set(self._moved, name, self._limits[name], event))
         return slider
 
-    def _label(self, name: str, locked: bool = False) -> str:
-        unit = self._units.get(name, "")
-        return name.rpartition("/")[2] + (f" [{unit}]" if unit else "") + (" · locked" if locked else "")
+    def _label(self, name: str, range_: tuple[float, float], locked: bool = False) -> str:
+        """Return the last part of a name with unit and range, such as ``door [rad]   0 to 1.57``."""
+        unit = self._unit(name)
+        low, high = (_short(self._to_shown(name, end)) for end in range_)
+        last = name.removesuffix(":velocity").rpartition("/")[2]
+        return f"{last}{f' [{unit}]' if unit else ''}   {low} to {high}{' · locked' if locked else ''}"
 
-    @staticmethod
-    def _set(call: Callable[[str, float], None], name: str, event: Any) -> None:
+    def _unit(self, name: str) -> str:
+        unit = self._units.get(name, "")
+        return DEGREES[unit][0] if self.degrees and unit in DEGREES else unit
+
+    def _factor(self, name: str) -> float:
+        """Return what values are multiplied by to be shown."""
+        unit = self._units.get(name, "")
+        return DEGREES[unit][1] if self.degrees and unit in DEGREES else 1.0
+
+    def _to_shown(self, name: str, value: float) -> float:
+        return float(value) * self._factor(name)
+
+    def _value(self, name: str) -> float:
+        """Return what a slider is set to, in the units of the model."""
+        return float(self._sliders[name].value) / self._factor(name)
+
+    def _set(
+        self, call: Callable[[str, float], None], name: str, limits: tuple[float, float], event: Any
+    ) -> None:
         # Values that this program has set come back without a client.
-        if event.client is not None:
-            call(name, float(event.target.value))
+        if event.client is None:
+            return
+        value = float(event.target.value) / self._factor(name)
+        # There and back between units a limit is no longer quite itself, and would be violated.
+        near = [limit for limit in limits if abs(value - limit) < 1e-12]
+        call(name, near[0] if near else value)
 
     def _lock(self, values: Mapping[str, float]) -> None:
         """Show what cannot move at these values, and keep its slider from being moved."""
         for name, held in self._ranges.held(values).items():
             locked, slider = all(held), self._sliders[name]
-            if slider.label != self._label(name, locked):
-                slider.label = self._label(name, locked)
+            self._locked[name] = locked
+            self._relabel(name)
             if slider.disabled != (locked and not self.beyond):
                 slider.disabled = locked and not self.beyond
+
+    def _relabel(self, name: str) -> None:
+        slider, factor = self._sliders[name], self._factor(name)
+        label = self._label(name, (slider.min / factor, slider.max / factor), self._locked.get(name, False))
+        if slider.label != label:
+            slider.label = label
 
     def _range(self, name: str, value: float) -> tuple[float, float]:
         beyond = BEYOND if self.beyond else 0.0
@@ -218,16 +289,27 @@ class Panel:
 
     def _fit(self, name: str, value: float) -> None:
         """Give a slider the range it should have now."""
-        slider, (low, high) = self._sliders[name], self._range(name, value)
-        if (slider.min, slider.max) != (low, high):
-            slider.min, slider.max, slider.step = low, high, step((low, high))
-            slider.precision = _digits(low, high)
+        _stretch(self._sliders[name], *(self._to_shown(name, end) for end in self._range(name, value)))
+        self._relabel(name)
 
     def _widen(self) -> None:
-        for name, slider in self._sliders.items():
-            self._fit(name, float(slider.value))
-            if self.beyond:
-                slider.disabled = False
+        with self._changing:
+            for name, slider in self._sliders.items():
+                self._fit(name, self._value(name))
+                if self.beyond:
+                    slider.disabled = False
+
+    def _convert(self, degrees: bool) -> None:
+        """Show angles in degrees or radians."""
+        with self._changing:
+            self._in_degrees = degrees
+            for name, slider in self._sliders.items():
+                self._fit(name, self._shown[name])
+                slider.value = self._to_shown(name, self._shown[name])
+            for name, slider in self._speeds.items():
+                _stretch(slider, *(self._to_shown(name, limit) for limit in self._driving.limits[name]))
+                slider.value = self._to_shown(name, self._driving.speeds[name])
+                slider.label = self._label(name, self._driving.limits[name])
 
     def _find(self, text: str) -> None:
         shown = {name: text.lower() in name.lower() for name in self._sliders}
@@ -252,10 +334,23 @@ class Panel:
         ground = gui.add_checkbox("floor", True)
         ground.on_update(lambda event: scene.show_ground(event.target.value))
         if scene.problems:
-            lines = "\n".join(f"- {line}" for line in scene.problems[:10])
-            gui.add_markdown(f"**{len(scene.problems)} meshes could not be loaded**\n\n{lines}")
+            HtmlBox(gui, missing_meshes(scene.problems))
 
 
 def _digits(low: float, high: float) -> int:
     """Return the decimals shown of a value in a range: as many as its steps have."""
     return max(0, len(f"{step((low, high)):.9f}".rstrip("0").partition(".")[2]))
+
+
+def _stretch(slider: Any, low: float, high: float) -> None:
+    if (slider.min, slider.max) != (low, high):
+        slider.min, slider.max, slider.step = low, high, step((low, high))
+        slider.precision = _digits(low, high)
+
+
+def _short(value: float) -> str:
+    """Return a number with two decimals, or as many as a small one needs to have two digits."""
+    digits = 2 if abs(value) >= 0.1 or value == 0.0 else 1 - math.floor(math.log10(abs(value)))
+    text = f"{value:.{digits}f}" if abs(value) < 1e6 else f"{value:.3g}"
+    text = text.rstrip("0").rstrip(".") if "." in text and "e" not in text else text
+    return text.replace("-", "−")

@@ -97,3 +97,9 @@ def complete(model: ModelView, state: Mapping[Any, float] | None = None) -> dict
                 raise UnknownNameError(f"'{name}' is a speed; where things are depends on positions only.")
             raise UnknownNameError(f"The model has no symbol '{name}'. {suggest(name, known, 'symbol')}")
     return values
+
+
+def kept(model: ModelView, values: Mapping[str, float]) -> dict[str, float]:
+    """Return those of values by name that a model has symbols for."""
+    known = {str(symbol) for symbol in model.symbols}
+    return {name: value for name, value in values.items() if name in known}

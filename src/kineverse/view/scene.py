@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -12,12 +13,13 @@ from kineverse.model.view import ModelView
 from kineverse.view import stage
 from kineverse.view.axes import axis_length
 from kineverse.view.camera import Camera
+from kineverse.view.client_cameras import ClientCameras
 from kineverse.view.parts import Kind, Part, parts
 from kineverse.view.poses import Poses
 from kineverse.view.rotation import quaternions
 from kineverse.view.surfaces import Surfaces
 from kineverse.view.triangles import Floats, Integers, Triangles
-from kineverse.view.viewpoint import automatic, importance
+from kineverse.view.viewpoint import automatic, importance, outermost, reframed
 
 FIELD_OF_VIEW, ASPECT = 0.8, 1.25
 ROOT = "/model"
@@ -56,6 +58,7 @@ class Scene:
         self, server: Any, model: ModelView, values: Mapping[str, float], camera: Camera | None = None
     ) -> None:
         self._server, self._camera = server, camera
+        self._cameras: ClientCameras | None = None
         # Switches on the page and the motion of the model come from different threads.
         self._lock = threading.RLock()
         self._frames_shown, self._labels_shown, self._filter = False, False, ""
@@ -191,6 +194,9 @@ class Scene:
             wanted = min(opacity or 1.0, SEE_THROUGH) if through else opacity
             if node.opacity != wanted:
                 node.opacity = wanted
+            if node.cast_shadow == through:
+                # Shadows know no opacity: half transparent bodies would throw black ones into themselves.
+                node.cast_shadow = node.receive_shadow = not through
 
     def _add(self, items: Iterable[Part], kind: Kind) -> list[tuple[Any, float | None]]:
         """Add shapes below the nodes of their frames; return their nodes and how opaque they are."""
@@ -215,9 +221,10 @@ class Scene:
         """Return the scene node of a frame; added at its pose if there is none yet."""
         if frame not in self._nodes:
             k = self._kinematics.index(frame)
-            # Slashes would make viser nest the nodes, and our poses are all relative to the world.
+            # Slashes would make viser nest the nodes, and our poses are all relative to the world. The number
+            # tells names apart that look the same.
             self._nodes[frame] = self._server.scene.add_frame(
-                f"{ROOT}/{frame.replace('/', '∕')}",
+                f"{ROOT}/{k} {frame.replace('/', '∕')}",
                 show_axes=False,
                 visible=frame not in self.unplaced,
                 position=self.poses[k, :3, 3],
@@ -249,11 +256,19 @@ class Scene:
         camera = self._camera
         if camera is None:
             camera = automatic(surfaces, importance(self._model, visuals), at, ASPECT, FIELD_OF_VIEW)
+            shown = outermost(points) if len(surfaces.corners) else np.concatenate([points, points + 0.2])
+            self._follow(camera, partial(reframed, camera, shown))
         start = self._server.initial_camera
         start.position, start.look_at = np.array(camera.position), np.array(camera.target)
         start.fov = camera.field_of_view
         away = np.subtract(camera.position, camera.target)
         stage.set_lamp(self._server, float(np.arctan2(away[1], away[0])))
+
+    def _follow(self, first: Camera, framed: Callable[[float], Camera]) -> None:
+        if self._cameras is None:
+            self._cameras = ClientCameras(self._server, first, framed)
+        else:
+            self._cameras.follow(first, framed)
 
 
 def _by_color(part: Part) -> list[tuple[Triangles, tuple[float, ...]]]:

@@ -1,20 +1,35 @@
-"""The web server behind the page: on this computer only, and silent."""
+"""The web server behind the page: for its own page only, and silent."""
 
 from __future__ import annotations
 
 import contextlib
-import io
+import dataclasses
+import errno
+import html
+import logging
 import socket
+from collections.abc import Callable
+from types import FunctionType
 from typing import Any
 
-from kineverse.errors import MissingExtraError, ValueRejectedError
+from kineverse.errors import KineverseError, MissingExtraError, ValueRejectedError
+from kineverse.view.access_control import AccessControl
+
+logger = logging.getLogger(__name__)
 
 HOST = "127.0.0.1"
 PREFERRED_PORT = 8080
 
+TAKEN_DOWN = (
+    "There is no page to wait for: it has been taken down. Wait inside of the 'with' that opened it; "
+    "kv.show(model) waits by itself."
+)
 
-def start(port: int | None = None, label: str = "") -> Any:
-    """Start a viser server that only this computer can reach.
+_TITLE = b"<title>Viser</title>"
+
+
+def start(port: int | None = None, label: str = "", host: str = HOST) -> Any:
+    """Start a viser server that answers its own page alone.
 
     Parameters
     ----------
@@ -22,29 +37,60 @@ def start(port: int | None = None, label: str = "") -> Any:
         The port, 0 for any free one; None for 8080, or any free one if that is taken.
     label
         The title of the page.
+    host
+        The address to listen on. Unless it is this computer's own (127.0.0.1, localhost, ::1), the address of
+        the page has a random token in it, and whoever does not know that is refused.
+
+    Returns
+    -------
+    A :class:`viser.ViserServer`, whose attribute ``address`` is the address of the page.
 
     Raises
     ------
     MissingExtraError
         If viser is not installed.
     ValueRejectedError
-        If the given port is taken or not a port.
+        If the given port is taken or not a port, or if the host is not one of this computer.
+    KineverseError
+        If this version of viser cannot be kept from answering others.
     """
     try:
         import viser
+        from viser import infra
     except ImportError as error:
         raise MissingExtraError(
             "the page in the browser needs viser: pip install 'kineverse-articulation[view]'"
         ) from error
 
+    access = AccessControl.of(host)
+    gate = _Gate(access, label)
+
+    class GuardedWebsockServer(infra.WebsockServer):
+        _background_worker = _seeing(infra.WebsockServer._background_worker, "websockets", gate)
+
     class LocalServer(viser.ViserServer):
         """A server that cannot be told, by whoever opens the page, to publish itself on the internet."""
+
+        __init__ = _seeing(
+            viser.ViserServer.__init__, "infra", _Instead(infra, WebsockServer=GuardedWebsockServer)
+        )
 
         def request_share_url(self, verbose: bool = True) -> str | None:
             return None
 
+        @property
+        def address(self) -> str:
+            return access.address(self.get_port())
+
     with quiet():
-        return LocalServer(host=HOST, port=_free_port(port), label=label, verbose=False)
+        server = LocalServer(host=host, port=_free_port(host, port), label=label, verbose=False)
+    if not gate.installed:
+        stop(server)
+        raise KineverseError(
+            f"viser {viser.__version__} serves pages in a way that is not known here: any other page in the "
+            "browser could read them. Install another version: pip install 'viser==1.1.1'"
+        )
+    return server
 
 
 def stop(server: Any) -> None:
@@ -55,21 +101,107 @@ def stop(server: Any) -> None:
 
 @contextlib.contextmanager
 def quiet() -> Any:
-    """Keep a library from printing: standard output belongs to the caller."""
-    with contextlib.redirect_stdout(io.StringIO()):
+    """Keep viser from printing: standard output, and what is below a cell of a notebook, are the caller's."""
+    import rich
+
+    console = rich.get_console()
+    before, console.quiet = console.quiet, True
+    try:
         yield
+    finally:
+        console.quiet = before
 
 
-def _free_port(port: int | None) -> int:
+class _Instead:
+    """A module with other things under some of its names."""
+
+    def __init__(self, module: Any, **names: Any) -> None:
+        self.__dict__.update(names, _module=module)
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._module, name)
+
+
+class _Gate(_Instead):
+    """The module ``websockets`` as one server sees it: what it serves passes through access control.
+
+    viser has no hook for that. What is replaced is what the functions of one server of ours see under a
+    global name; viser and websockets remain what they are for everybody else.
+    """
+
+    def __init__(self, access: AccessControl, title: str) -> None:
+        import websockets.asyncio.server
+
+        server = _Instead(websockets.asyncio.server, serve=self._serve)
+        super().__init__(websockets, asyncio=_Instead(websockets.asyncio, server=server))
+        self.installed = False
+        self._access, self._title = access, title
+
+    def _serve(self, *arguments: Any, process_request: Any, **options: Any) -> Any:
+        import websockets.asyncio.server
+
+        self.installed = True
+        checked = self._checked(process_request)
+        return websockets.asyncio.server.serve(*arguments, process_request=checked, **options)
+
+    def _checked(self, process_request: Callable[[Any, Any], Any]) -> Callable[[Any, Any], Any]:
+        """Return a handler that refuses requests, or hands them on without the token."""
+        from websockets.http11 import Response
+
+        access = self._access
+
+        def process(connection: Any, request: Any) -> Any:
+            headers = request.headers.copy()
+            hosts, origins = headers.get_all("Host"), headers.get_all("Origin")
+            upgrades = bool(headers.get_all("Upgrade"))
+            reason = access.refusal(request.path, hosts, origins, connection.local_address[1], upgrades)
+            if reason:
+                logger.info("a request was refused: %s (host %r, origin %r)", reason, hosts, origins)
+                text = f"Refused: {reason}.\n".encode()
+                about = {"Content-Type": "text/plain; charset=utf-8", "Content-Length": str(len(text))}
+                return Response(403, "Forbidden", type(headers)(about), text)
+            # The page is changed below, which it cannot be when it is compressed.
+            headers.pop("Accept-Encoding", None)
+            inner = dataclasses.replace(request, path=access.inner_path(request.path), headers=headers)
+            response = process_request(connection, inner)
+            if response is not None:
+                title = f"<title>{html.escape(self._title)}</title>" if self._title else _TITLE.decode()
+                response.body = (response.body or b"").replace(_TITLE, title.encode(), 1)
+                response.headers.pop("Content-Length", None)
+                response.headers.update(
+                    access.headers(hosts[0]), **{"Content-Length": str(len(response.body))}
+                )
+            return response
+
+        return process
+
+
+def _seeing(function: Any, name: str, thing: Any) -> Any:
+    """Return a copy of a function that sees another thing under one global name."""
+    seen = {**function.__globals__, name: thing}
+    copy = FunctionType(
+        function.__code__, seen, function.__name__, function.__defaults__, function.__closure__
+    )
+    copy.__kwdefaults__ = function.__kwdefaults__
+    return copy
+
+
+def _free_port(host: str, port: int | None) -> int:
     if port is not None and not 0 <= port <= 65535:
         raise ValueRejectedError(f"{port} is not a port; ports are numbers from 0 (any free one) to 65535")
+    try:
+        family, _, _, _, place = socket.getaddrinfo(host, None, type=socket.SOCK_STREAM)[0]
+    except OSError as error:
+        raise ValueRejectedError(f"there is no host {host!r}: {error.strerror}") from None
     wanted = [PREFERRED_PORT, 0] if port is None else [port]
     for candidate in wanted:
-        with socket.socket(socket.AF_INET, socket.SOCK_STREAM) as probe:
+        with socket.socket(family, socket.SOCK_STREAM) as probe:
             probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
             try:
-                probe.bind((HOST, candidate))
-            except OSError:
+                probe.bind((place[0], candidate, *place[2:]))
+            except OSError as error:
+                if error.errno == errno.EADDRNOTAVAIL:
+                    raise ValueRejectedError(f"{host!r} is no address of this computer") from None
                 continue
             return int(probe.getsockname()[1])
     raise ValueRejectedError(f"port {port} is taken; leave --port away to get a free one")

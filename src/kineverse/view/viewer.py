@@ -3,24 +3,28 @@
 from __future__ import annotations
 
 import logging
+import os
 import threading
 import time
 from collections.abc import Iterable, Mapping
 from typing import Any
 
-from kineverse.errors import KineverseError, UnknownNameError, suggest
+from kineverse.errors import KineverseError, UnknownNameError, ValueRejectedError, suggest
+from kineverse.model.model import Model
 from kineverse.model.view import ModelView
 from kineverse.state import State
 from kineverse.view import server as web
 from kineverse.view.camera import Camera
 from kineverse.view.collisions import Collisions
 from kineverse.view.driving import Driving
+from kineverse.view.hypertext import element
 from kineverse.view.motion import Show, played
 from kineverse.view.orientations import Orientations
 from kineverse.view.panel import Panel
-from kineverse.view.poses import complete
+from kineverse.view.poses import complete, kept
 from kineverse.view.ranges import Ranges
 from kineverse.view.scene import Scene
+from kineverse.view.title import title_of
 from kineverse.view.triangles import Floats
 from kineverse.view.units import units
 from kineverse.view.violations import failure, report
@@ -29,6 +33,9 @@ logger = logging.getLogger(__name__)
 
 PERIOD = 1.0 / 30.0
 """Least time between two updates of the page [s]; what happens in between is drawn once."""
+
+EMBEDDED = 600
+"""Height of the page in a notebook [pixels]."""
 
 PANEL = 380
 """Width of the controls: room for the names of joints [pixels]."""
@@ -48,9 +55,14 @@ class Viewer:
     port
         The port, 0 for any free one; None for 8080 or any free one.
     label
-        The title of the page.
+        The title of the page; None for the names in front of all frames.
     camera
-        Where the page is seen from at first; None for a place from which much of what moves is seen.
+        Where the page is seen from at first; None for a place from which all is seen.
+    host
+        The address to listen on. Unless it is this computer's own, :attr:`address` has a token in it, and
+        only who knows that sees the page.
+    degrees
+        Whether angles are shown in degrees at first.
 
     Attributes
     ----------
@@ -63,6 +75,8 @@ class Viewer:
         If viser is not installed.
     UnknownNameError
         If the state names what the model does not have.
+    ValueRejectedError
+        If the model is none, the port is taken or no port, or the host is not one of this computer.
     """
 
     def __init__(
@@ -71,11 +85,18 @@ class Viewer:
         state: Mapping[Any, float] | None = None,
         *,
         port: int | None = None,
-        label: str = "Kineverse",
+        label: str | None = None,
         camera: Camera | None = None,
+        host: str = web.HOST,
+        degrees: bool = False,
     ) -> None:
+        if not isinstance(model, ModelView):
+            hint = f" Read it first: kv.load({model!r})." if isinstance(model, str | os.PathLike) else ""
+            raise ValueRejectedError(f"A page shows a kineverse.Model, not {_kind(model)}.{hint}")
         self.model = model
-        self._initial = complete(model, state)
+        # What the page is made of stays what it is while the model is edited, and is exchanged as a whole.
+        self._shown = _fixed(model)
+        self._initial = complete(self._shown, state)
         self._values = dict(self._initial)
         self._change = threading.Condition()
         self._asked, self._done = 1, 0
@@ -84,16 +105,16 @@ class Viewer:
         self._ended = threading.Event()
         self._show: Show | None = None
         self._drawn = 0.0
-        self._server = web.start(port, label)
+        self._server = web.start(port, label or title_of(model), host)
         try:
             self._server.gui.configure_theme(
                 show_logo=False, show_share_button=False, brand_color=(34, 104, 172)
             )
             self._server.gui.main_panel.dock_right()
             self._server.gui.main_panel.set_width(PANEL)
-            self._scene = Scene(self._server, model, self._values, camera)
+            self._scene = Scene(self._server, self._shown, self._values, camera)
             self.collisions = Collisions(self._server, self._scene, model, self._values)
-            self._panel = self._build_panel()
+            self._panel = self._build_panel(degrees)
         except BaseException:
             web.stop(self._server)
             raise
@@ -105,7 +126,7 @@ class Viewer:
     @property
     def address(self) -> str:
         """The address of the page."""
-        return f"http://{web.HOST}:{self._server.get_port()}"
+        return str(self._server.address)
 
     @property
     def values(self) -> dict[str, float]:
@@ -135,8 +156,14 @@ class Viewer:
         UnknownNameError
             If the model has no such symbol; nothing has moved then.
         """
+        # The model may have been edited since. It is not waited for with the lock held: whoever edits it may
+        # be waiting for the lock.
+        model = _fixed(self.model)
+        given = {str(symbol): value for symbol, value in values.items()}
         with self._change:
-            self._values = complete(self.model, {**self._values, **{str(k): v for k, v in values.items()}})
+            moved = complete(model, {**kept(model, self._values), **given})
+            # What has been removed from the model goes with the page that was made of it.
+            self._values = {**self._values, **moved}
             self._orientations.read(self._values)
             self._ask(str(name) for name in values)
 
@@ -194,7 +221,15 @@ class Viewer:
         return drawn and self.collisions.watch.settled(timeout - (time.monotonic() - begin))
 
     def wait(self) -> None:
-        """Keep the page up until :meth:`stop` or Ctrl-C."""
+        """Keep the page up until :meth:`stop` or Ctrl-C; shutting it in the browser changes nothing.
+
+        Raises
+        ------
+        KineverseError
+            If there is no page any more.
+        """
+        if self._stopping:
+            raise KineverseError(web.TAKEN_DOWN)
         # A join that Ctrl-C interrupts takes the thread for finished (Python 3.11), and a wait without a
         # limit cannot be interrupted on every platform.
         while not self._ended.wait(timeout=0.5):
@@ -214,17 +249,26 @@ class Viewer:
         web.stop(self._server)
         self._ended.set()
 
+    def __repr__(self) -> str:
+        return f"<page of {self.model!r}, {'taken down' if self._stopping else self.address}>"
+
+    def _repr_html_(self) -> str:
+        """Return the page as a part of a notebook."""
+        if self._stopping:
+            return str(element("i", "This page has been taken down."))
+        return str(element("iframe", src=self.address, width="100%", height=EMBEDDED, style="border:none"))
+
     def __enter__(self) -> Viewer:
         return self
 
     def __exit__(self, *_: object) -> None:
         self.stop()
 
-    def _build_panel(self) -> Panel:
-        self._ranges = Ranges(self.model)
-        self._orientations = Orientations(self.model, self._values)
-        self._driving = Driving(self.model)
-        self._units = units(self.model, self._values, self._ranges.names)
+    def _build_panel(self, degrees: bool) -> Panel:
+        self._ranges = Ranges(self._shown)
+        self._orientations = Orientations(self._shown, self._values)
+        self._driving = Driving(self._shown)
+        self._units = units(self._shown, self._values, self._ranges.names)
         self._units.update(dict.fromkeys(self._orientations.angles, "rad"))
         return Panel(
             self._server.gui,
@@ -239,11 +283,12 @@ class Viewer:
             driven=lambda name, speed: self.drive({name: speed}),
             reset=self.reset,
             play=self.play,
+            degrees=degrees,
         )
 
     def _to_be_played(self) -> dict[str, tuple[float, float]]:
         limits, angles = self._ranges.at(self._values), self._orientations.angles
-        return played(self.model, limits, angles, self._values, self._units)
+        return played(self._shown, limits, angles, self._values, self._units)
 
     def _moved(self, name: str, value: float) -> None:
         """Take the value of a slider that somebody moved; what is locked stays and its slider goes back."""
@@ -305,24 +350,27 @@ class Viewer:
             self._orientations.read(self._values)
         self._drawn = now
 
-    def _rebuild(self, values: Mapping[str, float]) -> dict[str, float]:
+    def _rebuild(self) -> dict[str, float]:
         """Build the page anew for a model that was edited, and return the values of its symbols."""
-        known = {str(symbol) for symbol in self.model.symbols}
-        current = complete(self.model, {name: value for name, value in values.items() if name in known})
+        model = _fixed(self.model)
         with self._change:
-            self._initial = complete(self.model, {k: v for k, v in self._initial.items() if k in known})
-            self._values = dict(current)
+            # Not the values that were to be drawn: somebody may have moved something since.
+            current = complete(model, kept(model, self._values))
+            # After yet another edit there may be values of symbols that this model does not have yet.
+            self._values = {**self._values, **current} if self._edited else dict(current)
+            self._initial = complete(model, kept(model, self._initial))
+            self._shown = model
             self._show = None
-        self._scene.refresh(self.model, current)
+        self._scene.refresh(model, current)
         self._panel.remove()
-        self._panel = self._build_panel()
+        self._panel = self._build_panel(self._panel.degrees)
         return current
 
     def _draw(self, values: Mapping[str, float], driven: Iterable[str], edited: bool) -> None:
         """Show values, or why they cannot be shown; then everything stays where it was drawn last."""
         try:
             if edited:
-                values = self._rebuild(values)
+                values = self._rebuild()
             self._panel.update(values, driven)
             self._scene.update(values)
             self.collisions.watch.update(values, edited)
@@ -330,7 +378,7 @@ class Viewer:
                 self._panel.show(failure(f"Not finite, and hidden: {', '.join(self.unplaced)}."))
                 return
             # A mapping of nothing says nothing, a state of nothing is that of a model that cannot move.
-            violated = self.model.violations(values or State())
+            violated = self._shown.violations(State(values))
             self._panel.show(report(violated, violated.unchecked))
         except KineverseError as error:
             self._panel.show(failure(str(error)))
@@ -338,3 +386,12 @@ class Viewer:
             # The thread outlives whatever one state of a model does to it, and says so.
             logger.exception("the page could not be updated")
             self._panel.show(failure(f"{type(error).__name__}: {error}"))
+
+
+def _kind(thing: object) -> str:
+    return f"{thing!r:.60}" if isinstance(thing, str | os.PathLike) else f"a {type(thing).__name__}"
+
+
+def _fixed(model: ModelView) -> ModelView:
+    """Return a model as it is now, whatever edits come."""
+    return model.snapshot() if isinstance(model, Model) else model

@@ -60,11 +60,11 @@ def automatic(
         origins = np.array([pose[:3, 3] for pose in poses.values()])
         return framing(np.concatenate([origins, origins + 0.2]), FRONT, ELEVATION, aspect, field_of_view)
     points = scene.corners.reshape(-1, 3)
-    outermost, corners = _outermost(points), scene.corners.astype(np.float32)
+    extreme, corners = outermost(points), scene.corners.astype(np.float32)
     trials = []
     for k in range(TRIALS):
         azimuth = FRONT + 2 * np.pi * k / TRIALS
-        camera = framing(outermost, azimuth, ELEVATION, aspect, field_of_view)
+        camera = framing(extreme, azimuth, ELEVATION, aspect, field_of_view)
         projection = Projection.of(camera, max(int(LOOK * aspect), 8), LOOK)
         seen, _ = visible(projection, corners, scene.closed)
         area = np.bincount(scene.source[seen[seen >= 0]], minlength=len(weights))
@@ -75,7 +75,15 @@ def automatic(
     return framing(points, azimuth, ELEVATION, aspect, field_of_view)
 
 
-def _outermost(points: Floats) -> Floats:
+def reframed(camera: Camera, points: Floats, aspect: float) -> Camera:
+    """Return the nearest camera of the same direction that sees points (N, 3), for another aspect."""
+    away = np.subtract(camera.position, camera.target)
+    azimuth = float(np.arctan2(away[1], away[0]))
+    elevation = float(np.arctan2(away[2], np.hypot(away[0], away[1])))
+    return framing(points, azimuth, elevation, aspect, camera.field_of_view)
+
+
+def outermost(points: Floats) -> Floats:
     """Return those of many points that lie farthest out in some hundred directions."""
     k = np.arange(128)
     z, angle = 1.0 - (2.0 * k + 1.0) / len(k), 2.399963 * k

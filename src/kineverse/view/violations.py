@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
-import html
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from typing import Any
+
+from kineverse.view.hypertext import BREAK, Html, element, note
 
 MOST = 12
 """Lines of the panel: more than these are counted, not listed."""
 
+_RED, _LIGHT_RED = "#c92a2a", "#fff5f5"
 
-def report(violations: Iterable[Any], unchecked: Iterable[Any] = ()) -> str:
+
+def report(violations: Iterable[Any], unchecked: Iterable[Any] = ()) -> Html:
     """Return HTML: that all is well, or each violated constraint with its value, bounds and excess.
 
     Parameters
@@ -22,34 +25,42 @@ def report(violations: Iterable[Any], unchecked: Iterable[Any] = ()) -> str:
     """
     found = sorted(violations, key=lambda v: -abs(v.excess))
     rest = len(list(unchecked))
-    aside = f'<span style="color:#868e96"> · {rest} on speeds not checked</span>' if rest else ""
+    aside = [element("span", f" · {rest} on speeds not checked", style="color:#868e96")] if rest else []
     if not found:
-        return _box("#2b8a3e", "#ebfbee", f"<b>All constraints hold.</b>{aside}")
+        return note("#2b8a3e", "#ebfbee", element("b", "All constraints hold."), *aside)
     noun = "constraint" if len(found) == 1 else "constraints"
-    lines = [f"<b>{len(found)} {noun} violated</b>{aside}"]
+    lines = [element("b", f"{len(found)} {noun} violated"), *aside]
     lines += [
-        f'<div class="kineverse-violation" style="margin-top:3px"><b>{html.escape(v.name)}</b><br>'
-        f"{number(v.value)} is not in [{number(v.lower)}, {number(v.upper)}], by {number(v.excess)}</div>"
+        element(
+            "div",
+            element("b", v.name),
+            BREAK,
+            f"{number(v.value)} is not in [{number(v.lower)}, {number(v.upper)}], by {number(v.excess)}",
+            class_="kineverse-violation",
+            style="margin-top:3px",
+        )
         for v in found[:MOST]
     ]
     if len(found) > MOST:
-        lines.append(f"<div>and {len(found) - MOST} more</div>")
-    return _box("#c92a2a", "#fff5f5", "".join(lines))
+        lines.append(element("div", f"and {len(found) - MOST} more"))
+    return note(_RED, _LIGHT_RED, *lines)
 
 
-def failure(message: str) -> str:
+def failure(message: str) -> Html:
     """Return HTML that says why the state on the page cannot be shown."""
-    return _box("#c92a2a", "#fff5f5", f"<b>This state cannot be shown.</b><br>{html.escape(message)}")
+    return note(_RED, _LIGHT_RED, element("b", "This state cannot be shown."), BREAK, message)
+
+
+def missing_meshes(problems: Sequence[str]) -> Html:
+    """Return HTML that lists what could not be loaded."""
+    lines = [element("div", line, style="margin-top:3px") for line in problems[:MOST]]
+    if len(problems) > MOST:
+        lines.append(element("div", f"and {len(problems) - MOST} more"))
+    noun = "mesh" if len(problems) == 1 else "meshes"
+    return note(_RED, _LIGHT_RED, element("b", f"{len(problems)} {noun} could not be loaded"), *lines)
 
 
 def number(value: float) -> str:
     """Return a number in at most 4 significant digits, with a minus sign one can see."""
     text = f"{value:.4g}"
     return text.replace("-", "−").replace("inf", "∞")
-
-
-def _box(color: str, background: str, content: str) -> str:
-    return (
-        f'<div style="font-size:0.8em;line-height:1.35;padding:6px 9px;margin:2px 8px 10px;border-radius:4px;'
-        f'overflow-wrap:anywhere;color:{color};background:{background}">{content}</div>'
-    )

@@ -6,6 +6,7 @@ import logging
 import threading
 import time
 
+from kineverse.errors import KineverseError
 from kineverse.view import server as web
 
 from .life import Life
@@ -44,6 +45,8 @@ class LivingPage:
         The port, 0 for any free one; None for 8080 or any free one.
     label
         The title of the page.
+    host
+        The address to listen on, as that of a :class:`kineverse.view.viewer.Viewer`.
 
     Raises
     ------
@@ -54,9 +57,14 @@ class LivingPage:
     """
 
     def __init__(
-        self, life: Life | None = None, *, port: int | None = None, label: str = "Kineverse"
+        self,
+        life: Life | None = None,
+        *,
+        port: int | None = None,
+        label: str = "Kineverse",
+        host: str = web.HOST,
     ) -> None:
-        self._server = web.start(port, label)
+        self._server = web.start(port, label, host)
         try:
             self.life = life or Life()
             gui = self._server.gui
@@ -78,10 +86,12 @@ class LivingPage:
     @property
     def address(self) -> str:
         """The address of the page."""
-        return f"http://{web.HOST}:{self._server.get_port()}"
+        return str(self._server.address)
 
     def wait(self) -> None:
-        """Keep the page up until :meth:`stop` or Ctrl-C."""
+        """Keep the page up until :meth:`stop` or Ctrl-C; without a page this is an error."""
+        if self._stopping.is_set():
+            raise KineverseError(web.TAKEN_DOWN)
         # A wait without a limit cannot be interrupted on every platform.
         while not self._ended.wait(timeout=0.5):
             pass

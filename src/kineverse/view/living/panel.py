@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-import html
 from collections.abc import Callable, Sequence
 from typing import Any
+
+from kineverse.view.hypertext import BREAK, Html, HtmlBox, element, joined
 
 from .learning import Thought
 from .life import Life
@@ -30,9 +31,16 @@ COLORS = {
 WIDTH, HEIGHT, SHOWN = 300, 64, 40
 """The size of the picture of probabilities [pixels], and how many thoughts it shows."""
 
-INTRODUCTION = """<b>Left: the truth</b>, with the markers as they are seen, through noise.<br>
-<b>Right: what is believed</b> from the markers. Bars: ± 2σ; blue is sure, orange not.<br>
-<b>In front: a stranger</b>. Nobody says how it moves; that is learned."""
+INTRODUCTION = joined(
+    element("b", "Left: the truth"),
+    ", with the markers as they are seen, through noise.",
+    BREAK,
+    element("b", "Right: what is believed"),
+    " from the markers. Bars: ± 2σ; blue is sure, orange not.",
+    BREAK,
+    element("b", "In front: a stranger"),
+    ". Nobody says how it moves; that is learned.",
+)
 
 
 class Panel:
@@ -50,7 +58,7 @@ class Panel:
 
     def __init__(self, gui: Any, life: Life, meet: Callable[[str], None]) -> None:
         self._life = life
-        gui.add_html(_box(INTRODUCTION))
+        HtmlBox(gui, _box(INTRODUCTION))
         self._paused = gui.add_checkbox("pause", False)
         self._speed = gui.add_slider("speed", 0.25, 3.0, 0.25, 1.0)
         with gui.add_folder("What is seen"):
@@ -58,12 +66,12 @@ class Panel:
             self._wrong = gui.add_checkbox(f"{WRONG:.0%} outliers", False)
             self._hidden = gui.add_checkbox(f"{MISSING:.0%} hidden", False)
         with gui.add_folder("The kitchen, tracked"):
-            self._kitchen = gui.add_html("")
+            self._kitchen = HtmlBox(gui, Html())
         with gui.add_folder("The stranger, learned"):
             names = list(STRANGERS)
             self._stranger = gui.add_dropdown("stranger", names, initial_value=life.stranger.name)
             again = gui.add_button("Forget, and learn again")
-            self._learned = gui.add_html("")
+            self._learned = HtmlBox(gui, Html())
         self._stranger.on_update(lambda event: self._choose(event.target.value))
         again.on_click(lambda _: meet(self._stranger.value))
         self._meet = meet
@@ -90,13 +98,13 @@ class Panel:
 
     def update(self) -> None:
         """Say how it is now."""
-        self._kitchen.content = kitchen_report(self._life)
-        self._learned.content = stranger_report(self._life)
+        self._kitchen.show(kitchen_report(self._life))
+        self._learned.show(stranger_report(self._life))
         if self._stranger.value != self._life.stranger.name:
             self._stranger.value = self._life.stranger.name
 
 
-def kitchen_report(life: Life) -> str:
+def kitchen_report(life: Life) -> Html:
     """Return HTML: how far markers and the belief are off, how honest it is, and what it costs."""
     now = life.figures
     rejected = len(life.following.estimate.outliers)
@@ -106,19 +114,18 @@ def kitchen_report(life: Life) -> str:
     return _box(_table(rows))
 
 
-def stranger_report(life: Life) -> str:
+def stranger_report(life: Life) -> Html:
     """Return HTML: what is thought of the stranger, how that came about, and how far it is off."""
     learner, found = life.learner, life.learner.found
     if found is None:
-        return _box("<b>looking …</b>")
-    words = html.escape(str(found))
+        return _box(element("b", "looking …"))
     # Families have bars, and the words say what comes of them.
     elsewhere = {fit.family for fit in found} | {"conclusion"}
     rows = [row for row in table_of_learning(life)[1] if row[0] not in elsewhere]
-    return _box(f"<b>{words}</b>{_table(rows)}{_bars(learner.thoughts)}{_history(learner.thoughts)}")
+    return _box(element("b", str(found)), _table(rows), _bars(learner.thoughts), *_history(learner.thoughts))
 
 
-def _bars(thoughts: Sequence[Thought]) -> str:
+def _bars(thoughts: Sequence[Thought]) -> Html:
     """Return a bar for each family that is not out of the question."""
     lines = []
     for family, color in COLORS.items():
@@ -126,18 +133,22 @@ def _bars(thoughts: Sequence[Thought]) -> str:
         if share < 0.005:
             continue
         lines.append(
-            f'<div style="display:flex;align-items:center;gap:6px"><span style="width:5.5em">{family}</span>'
-            f'<span style="background:{color};height:0.7em;width:{150 * share:.0f}px"></span>'
-            f"<span>{share:.2f}</span></div>"
+            element(
+                "div",
+                element("span", family, style="width:5.5em"),
+                element("span", style=f"background:{color};height:0.7em;width:{150 * share:.0f}px"),
+                element("span", f"{share:.2f}"),
+                style="display:flex;align-items:center;gap:6px",
+            )
         )
-    return f'<div style="margin:4px 0">{"".join(lines)}</div>'
+    return element("div", *lines, style="margin:4px 0")
 
 
-def _history(thoughts: Sequence[Thought]) -> str:
-    """Return a picture of probabilities over time."""
+def _history(thoughts: Sequence[Thought]) -> list[Html]:
+    """Return a picture of probabilities over time, and what it is."""
     shown = thoughts[-SHOWN:]
     if len(shown) < 2:
-        return ""
+        return []
     begin, end = shown[0].time, shown[-1].time
     lines = []
     for family, color in COLORS.items():
@@ -148,21 +159,20 @@ def _history(thoughts: Sequence[Thought]) -> str:
             f"{WIDTH * (thought.time - begin) / (end - begin):.1f},{2 + (HEIGHT - 4) * (1.0 - value):.1f}"
             for thought, value in zip(shown, values, strict=True)
         )
-        lines.append(f'<polyline points="{points}" fill="none" stroke="{color}" stroke-width="2"/>')
-    return (
-        f'<svg viewBox="0 0 {WIDTH} {HEIGHT}" width="100%" height="{HEIGHT}" preserveAspectRatio="none" '
-        f'style="background:#fff;border:1px solid #dee2e6">{"".join(lines)}</svg>'
-        f"<div>probabilities over the last {end - begin:.0f} s</div>"
-    )
+        lines.append(element("polyline", points=points, fill="none", stroke=color, stroke_width=2))
+    size = {"viewBox": f"0 0 {WIDTH} {HEIGHT}", "width": "100%", "height": HEIGHT}
+    white = "background:#fff;border:1px solid #dee2e6"
+    return [
+        element("svg", *lines, style=white, preserveAspectRatio="none", **size),
+        element("div", f"probabilities over the last {end - begin:.0f} s"),
+    ]
 
 
-def _table(rows: Sequence[tuple[str, str]]) -> str:
-    cells = "".join(
-        f'<tr><td style="padding-right:10px;color:#868e96">{name}</td><td>{value}</td></tr>'
-        for name, value in rows
-    )
-    return f'<table style="font-variant-numeric:tabular-nums">{cells}</table>'
+def _table(rows: Sequence[tuple[str, str]]) -> Html:
+    left = "padding-right:10px;color:#868e96"
+    cells = [element("tr", element("td", name, style=left), element("td", value)) for name, value in rows]
+    return element("table", *cells, style="font-variant-numeric:tabular-nums")
 
 
-def _box(content: str) -> str:
-    return f'<div style="font-size:0.8em;line-height:1.4;padding:2px 10px 8px">{content}</div>'
+def _box(*content: str) -> Html:
+    return element("div", *content, style="font-size:0.8em;line-height:1.4;padding:2px 10px 8px")

@@ -1,0 +1,114 @@
+"""Showing a model from Python: in a script until Ctrl-C, at a prompt and in a notebook beside it."""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from kineverse.model.view import ModelView
+    from kineverse.view.camera import Camera
+    from kineverse.view.viewer import Viewer
+
+
+def show(
+    model: ModelView,
+    state: Mapping[Any, float] | None = None,
+    *,
+    block: bool | None = None,
+    open_browser: bool = True,
+    port: int | None = None,
+    host: str = "127.0.0.1",
+    label: str | None = None,
+    camera: Camera | None = None,
+    degrees: bool = False,
+) -> Viewer:
+    """Show a model on a web page, with a slider for everything that moves.
+
+    In a script this opens the browser and blocks until Ctrl-C, upon which the page is taken down and the
+    script goes on; shutting the page in the browser changes nothing. At a prompt it returns at once. So it
+    does in a notebook, in which the result of a cell is the page itself. The address is written to standard
+    error, for without it nobody could look.
+
+    Parameters
+    ----------
+    model
+        The model. The page follows its edits.
+    state
+        Values by symbol or name [m], [rad]; the default state for the others.
+    block
+        Whether to wait for Ctrl-C; None for scripts only.
+    open_browser
+        Whether to open the page in the browser, where there is a screen and it is no notebook.
+    port
+        The port, 0 for any free one; None for 8080 or any free one.
+    host
+        The address to listen on: this computer alone, unless another one is given. Then the address of the
+        page has a random token in it, and whoever has it may look and move.
+    label
+        The title of the page; None for the names in front of all frames.
+    camera
+        Where the page is seen from at first; None for a place from which all is seen, and much of what moves.
+    degrees
+        Whether angles are shown in degrees at first.
+
+    Returns
+    -------
+    The page, up unless this has waited: ``move``, ``play`` and ``stop`` are among its methods.
+
+    Raises
+    ------
+    MissingExtraError
+        If viser is not installed.
+    UnknownNameError
+        If the state names what the model does not have.
+    ValueRejectedError
+        If the model is none, the port is taken or no port, or the host is not one of this computer.
+    """
+    from kineverse.view.viewer import Viewer
+
+    notebook = in_notebook()
+    waits = not (notebook or at_prompt()) if block is None else block
+    page = Viewer(model, state, port=port, host=host, label=label, camera=camera, degrees=degrees)
+    try:
+        if not notebook:
+            print(
+                f"{page.address}   ({'Ctrl-C' if waits else 'page.stop()'} ends)", file=sys.stderr, flush=True
+            )
+            if open_browser:
+                open_page(page.address)
+        if waits:
+            page.wait()
+    except BaseException as error:
+        page.stop()
+        if not (waits and isinstance(error, KeyboardInterrupt)):
+            raise
+        print(file=sys.stderr)  # where the terminal has written ^C
+    return page
+
+
+def in_notebook() -> bool:
+    """Return whether this runs in a kernel of IPython, whose front end shows results of cells as HTML."""
+    return getattr(_ipython(), "kernel", None) is not None
+
+
+def at_prompt() -> bool:
+    """Return whether somebody types commands one after the other, or will when the script has ended."""
+    return hasattr(sys, "ps1") or bool(sys.flags.interactive) or _ipython() is not None
+
+
+def _ipython() -> Any:
+    """Return the shell of IPython if this runs in one; what is not imported yet is not running."""
+    ipython = sys.modules.get("IPython")
+    return ipython.get_ipython() if ipython is not None else None
+
+
+def open_page(address: str) -> None:
+    """Open an address in the browser, if there is a screen to open it on."""
+    screens = ("DISPLAY", "WAYLAND_DISPLAY", "BROWSER")
+    if sys.platform in ("win32", "darwin") or any(os.environ.get(name) for name in screens):
+        import webbrowser
+
+        webbrowser.open(address)

@@ -1,0 +1,81 @@
+"""The name of what a page shows."""
+
+from __future__ import annotations
+
+import os
+from contextlib import suppress
+
+from kineverse.errors import KineverseError
+from kineverse.formats.files import read_file
+from kineverse.formats.markup import Element, Visit, parse
+from kineverse.formats.sources import locate_model
+from kineverse.model.frame import WORLD
+from kineverse.model.view import ModelView
+
+UNNAMED = "Kineverse"
+
+MOST = 3
+"""Names in a title: there may be more models in one."""
+
+LONGEST = 60
+"""The most characters of one of them."""
+
+SUFFIXES = (".urdf", ".xml", ".mjcf", ".sdf", ".world")
+"""Those of files that give what they describe a name."""
+
+NAMED_BY = {"robot": "name", "mujoco": "model", "model": "name", "world": "name"}
+"""The attributes in which elements of URDF, MJCF and SDF have the name of what they describe."""
+
+
+class _NamedError(Exception):
+    """Ends the reading of a file whose name is known."""
+
+
+def title_of(model: ModelView) -> str:
+    """Return the names that are in front of all frames, such as ``kitchen, pr2``, or ``Kineverse``."""
+    frames = [name for name in model.frames if name != WORLD]
+    prefixes = list(dict.fromkeys(name.partition("/")[0] for name in frames))
+    if not frames or not all("/" in name for name in frames):
+        return UNNAMED
+    return ", ".join(map(_shortened, prefixes[:MOST])) + (" …" if len(prefixes) > MOST else "")
+
+
+def title_of_file(source: str) -> str:
+    """Return the name that a description has in its file, or that of the file.
+
+    Parameters
+    ----------
+    source
+        The path of a file, or the name of a shipped model, as :func:`kineverse.load` takes it.
+    """
+    plain = os.path.basename(source.rstrip("/"))
+    try:
+        found = locate_model(source)
+        if found.shipped or not found.path.name.endswith(SUFFIXES):
+            return plain
+        return _shortened(_declared(read_file(found.path), plain) or plain)
+    except KineverseError:
+        return plain
+
+
+def _declared(content: bytes, source: str) -> str:
+    """Return the name that a document of XML gives to what it describes, empty if it gives none."""
+    names: list[str] = []
+
+    def note(element: Element) -> None:
+        tag, attributes, _, _ = element
+        names.extend(filter(None, [attributes.get(NAMED_BY.get(tag, ""), "").strip()]))
+        if names or tag != "sdf":
+            raise _NamedError
+
+    def begin(root: Element) -> Visit:
+        note(root)
+        return note
+
+    with suppress(_NamedError):
+        parse(content, source, begin=begin)
+    return names[0] if names else ""
+
+
+def _shortened(name: str) -> str:
+    return name if len(name) <= LONGEST else f"{name[: LONGEST - 1]}…"
