@@ -17,6 +17,7 @@ from .seed import FEW, Interval
 _SAMPLES = {1: 65, 2: 17, 3: 9}
 _SCATTERED = 400
 _TRIED = 200
+_MOST_CORNERED = 8
 
 
 class Samples:
@@ -58,7 +59,7 @@ class Samples:
         else:  # a grid would have more points than anybody waits for
             parts = generator.uniform(size=(_SCATTERED, k))
             grid = np.column_stack([i.spread(p) for i, p in zip(intervals, parts.T, strict=True)])
-        corners = np.vstack([_corners(limits), _corners(intervals)])
+        corners = np.vstack([_corners(limits, generator), _corners(intervals, generator)])
         tried = np.vstack([corners, generator.uniform(lower, upper, (_TRIED, k))])
         everywhere = np.vstack([home, grid, tried])
         solutions = self._everywhere(x, everywhere)
@@ -140,8 +141,13 @@ class Samples:
         return np.linalg.svd(by_x, compute_uv=False).astype(np.float64)
 
 
-def _corners(intervals: Sequence[Interval]) -> Array:
-    return _grid([np.array([i.lower, i.upper]) for i in intervals])
+def _corners(intervals: Sequence[Interval], generator: np.random.Generator) -> Array:
+    """Return the corners of a box, or some of them if there are many."""
+    ends = np.array([(i.lower, i.upper) for i in intervals]).reshape(-1, 2)
+    if len(ends) <= _MOST_CORNERED:
+        return _grid(list(ends))
+    which = generator.integers(0, 2, (1 << _MOST_CORNERED, len(ends)))
+    return np.take_along_axis(ends, which.T, axis=1).T
 
 
 def _grid(axes: Sequence[Array]) -> Array:

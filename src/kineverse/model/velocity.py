@@ -24,6 +24,7 @@ from dataclasses import dataclass
 from kineverse.errors import ValueRejectedError
 from kineverse.expressions.expression import Expression, array
 from kineverse.expressions.functions import sqrt
+from kineverse.expressions.implicit import held
 from kineverse.number import real_number
 from kineverse.symbols import Symbol
 
@@ -143,11 +144,12 @@ def velocity_rows(
     rows = limits.rows + _position_rows(constraints, gaps, limits.of(moving), moving, gamma, dt, brakes)
     rows = [row for row in rows if any(s in row.weights for s in columns)]
     weights = [row.weights.get(s, ZERO) for row in rows for s in columns]
+    # Farther out than closed loops are known, rows have to lead back as well: as they do where that begins.
     return VelocityRows(
         columns,
-        array(weights).reshape(len(rows), len(columns)),
-        array([row.lower for row in rows]),
-        array([row.upper for row in rows]),
+        held(array(weights).reshape(len(rows), len(columns))),
+        held(array([row.lower for row in rows])),
+        held(array([row.upper for row in rows])),
         tuple(row.name for row in rows),
         tuple(skipped),
     )

@@ -16,6 +16,7 @@ from kineverse.symbols import Symbol, parse_symbol_name
 from .constraint import Constraint
 from .integration import integrate
 from .operation import ARTICULATIONS, CONSTRAINTS
+from .projection import TOLERANCE, Projection
 from .structure import Structure
 from .velocity import VelocityRows, velocity_rows
 from .violations import Checks, Violations, find_violations
@@ -200,6 +201,41 @@ class ModelView(Structure):
         with self._lock:
             coordinates, rates = self.degrees_of_freedom, self.rates
         return integrate(coordinates, rates, state, speeds, dt)
+
+    def project(
+        self, state: Mapping[Any, float], *, fixed: Iterable[Symbol | str] = (), tolerance: float = TOLERANCE
+    ) -> State:
+        """Return the state with coordinates moved as little as it takes for equality constraints to hold.
+
+        These are constraints on positions whose bounds are the same, such as closures of loops, see
+        :mod:`kineverse.model.projection`. Coordinates are moved that broken ones are about, and those that
+        share equalities with these; whatever else limits these is kept, and all other values stay.
+
+        Parameters
+        ----------
+        state
+            A state, or a mapping from symbols or names to numbers.
+        fixed
+            Names, or symbols, of coordinates and articulations that do not move.
+        tolerance
+            How far an equality may be off, in its unit.
+
+        Raises
+        ------
+        UnsolvedError
+            If no such place is found, naming what does not hold, by how much, and what was tried; or if a loop
+            does not close at the state.
+        UnknownNameError
+            If a value is missing, or a name is unknown.
+        """
+        with self._lock:
+            self._catch_up()
+            if self._projection is None:
+                constraints = dict(self._head[CONSTRAINTS])
+                self._projection = Projection(constraints, self.rates, self._head[ARTICULATIONS])
+            if not isinstance(state, State):
+                state = State({self.symbol(k) if isinstance(k, str) else k: v for k, v in state.items()})
+            return self._projection.of(state, fixed, tolerance)
 
     def save(
         self,
