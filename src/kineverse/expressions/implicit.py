@@ -100,7 +100,9 @@ class ImplicitFunction:
         domain = tuple((float(lower), float(upper)) for lower, upper in self.domain)
         for (lower, upper), symbol in zip(domain, self.inputs, strict=False):
             if not lower <= upper:
-                raise ValueRejectedError(f"'{self.name}': no value lies within {lower} <= {symbol} <= {upper}.")
+                raise ValueRejectedError(
+                    f"'{self.name}': no value lies within {lower} <= {symbol} <= {upper}."
+                )
         bounded = any(math.isfinite(end) for ends in domain for end in ends)
         object.__setattr__(self, "domain", domain if bounded else ())
         known = {*self.unknowns, *self.inputs}
@@ -163,7 +165,8 @@ class ImplicitFunction:
 
     def __reduce__(self) -> Any:
         return ImplicitFunction, (
-            self.name, self.unknowns, self.inputs, self.residual, self.rows, self.seed, self.steps, self.domain,
+            self.name, self.unknowns, self.inputs, self.residual, self.rows, self.seed, self.steps,
+            self.domain,
         )  # fmt: skip
 
 
@@ -290,9 +293,9 @@ def explain(
             for symbol, x, (lower, upper) in zip(names, inputs, node.function.domain, strict=False):
                 if not lower <= x <= upper:
                     return UnsolvedError(
-                        f"'{node.label}' has no solution at {symbol} = {x:.6g}, or not one that is known to be "
-                        f"on its branch: it holds for {lower:.6g} <= {symbol} <= {upper:.6g}, the limits it "
-                        "was made for with a margin. Stay within, or make it for wider limits."
+                        f"'{node.label}' has no solution at {symbol} = {x:.6g} that is known to be on its "
+                        f"branch: it holds for {lower:.6g} <= {symbol} <= {upper:.6g}, the limits it was made "
+                        "for and a margin around them. Stay within, or make it for wider limits."
                     )
             where = ", ".join(f"{s} = {x:.6g}" for s, x in zip(names, inputs, strict=True))
             return UnsolvedError(

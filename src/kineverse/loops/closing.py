@@ -267,7 +267,7 @@ def _fitted(
 def _reaches(
     equations: Equations, limits: Sequence[Interval], x: Array, u: Array
 ) -> list[tuple[float, float]]:
-    """Return which parts of the margin below and above each limit the branch goes on in, other inputs at home."""
+    """Return in which parts of the margin below and above each limit the branch goes on, others at home."""
     home = u.copy()
     home[: len(limits)] = [min(max(v, i.lower), i.upper) for v, i in zip(u, limits, strict=False)]
     x = follow(equations, x, u, home).solution
@@ -283,7 +283,9 @@ def _reaches(
             if part < 1.0:
                 # Branches meet at a dead centre. What this loop is built on ends without one.
                 stop = there + part * (beyond - there)
-                meet = _regularity(equations, way.solution, stop) < 0.5 * _regularity(equations, at_edge, there)
+                meet = _regularity(equations, way.solution, stop) < 0.5 * _regularity(
+                    equations, at_edge, there
+                )
                 part *= _BEFORE_MEETING if meet else _BEFORE_ENDING
             parts.append(part)
         reaches.append((parts[0], parts[1]))

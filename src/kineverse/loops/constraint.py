@@ -6,8 +6,8 @@ import math
 from dataclasses import dataclass
 
 from kineverse.errors import ModelError, NameTakenError
-from kineverse.expressions.functions import norm
 from kineverse.expressions.expression import Expression, array
+from kineverse.expressions.functions import norm
 from kineverse.model.constraint import Constraint
 from kineverse.model.frame import WORLD
 from kineverse.model.operation import Effects, Operation

@@ -24,7 +24,7 @@ _SINGULAR = 1e-9
 
 
 MOST_EFFORT = 150_000.0
-"""How much is spent on closing one loop; loops of usual size take a fifth of it, and this some ten seconds."""
+"""How much is spent on closing one loop: some ten seconds. Loops of usual size take a fifth of it."""
 
 
 @dataclass

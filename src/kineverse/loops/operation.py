@@ -23,6 +23,7 @@ __all__ = ["AXES", "CloseLoop"]
 
 Item = TypeVar("Item", bound=tuple[Any, ...])
 
+
 @dataclass(frozen=True, kw_only=True)
 class CloseLoop(Operation):
     """Two frames coincide: the coordinates of the loop between them follow the free ones.

@@ -88,9 +88,7 @@ def loops_of(model: ModelView) -> Iterator[LoopRecord]:
             continue
         loop = _as_named(name, record, known)
         there = followers >= set(loop.dependent) and all(c in model.constraints for c in loop.constraints)
-        if there and all(
-            frame in model.frames or frame == WORLD for pair in loop.ends for frame in pair
-        ):
+        if there and all(frame in model.frames or frame == WORLD for pair in loop.ends for frame in pair):
             yield loop
 
 

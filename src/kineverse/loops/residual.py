@@ -14,7 +14,9 @@ def check_mask(mask: object, name: str) -> None:
     """Raise unless a mask has different names out of :data:`AXES`."""
     known = isinstance(mask, tuple) and all(axis in AXES for axis in mask)
     if not known or not mask or len(set(mask)) < len(mask):  # type: ignore[arg-type]
-        raise ValueRejectedError(f"The mask of loop '{name}' has names out of {', '.join(AXES)}, not {mask!r}.")
+        raise ValueRejectedError(
+            f"The mask of loop '{name}' has names out of {', '.join(AXES)}, not {mask!r}."
+        )
 
 
 def residual_rows(pose: Expression, mask: Sequence[str]) -> dict[str, Expression]:

@@ -1,8 +1,8 @@
 """Moving a state to where equality constraints hold: projection on their manifold.
 
-Of the free coordinates q, those are moved that broken equalities are about, and what shares equalities with
-these. With rows c(q) = 0 for the equalities and h(q) <= 0 for all other constraints on positions, Gauss-Newton
-steps of least change,
+Of the free coordinates q, those are moved that broken equalities are about, and what shares equalities
+with these. With rows c(q) = 0 for the equalities and h(q) <= 0 for all other constraints on positions,
+Gauss-Newton steps of least change,
 
     min ‖Δq‖  subject to  J Δq = -(c, max(h, 0)),  lower <= q + Δq <= upper,
 
@@ -101,7 +101,7 @@ class Projection:
                 f"No value for '{missing}', which a projection has to know. Start from "
                 "model.default_state().updated({...}) to have a value for everything."
             )
-        at = np.array([state[s] if s in state else s.value for s in self.symbols], dtype=np.float64)
+        at = np.array([state.get(s, s.value) for s in self.symbols], dtype=np.float64)
         search = self._search(at, held, tolerance)
         if search is None:
             return state
@@ -126,7 +126,8 @@ class Projection:
             else:
                 available = {*by_name, *self._dependent, *self._articulations}
                 raise UnknownNameError(
-                    f"{name!r} cannot stay fixed: it is no coordinate. {suggest(name, available, 'coordinate')}"
+                    f"{name!r} cannot stay fixed: it is no coordinate. "
+                    f"{suggest(name, available, 'coordinate')}"
                 )
         return frozenset(found)
 
@@ -141,7 +142,7 @@ class Projection:
         return compile([values, values.partial(self.coordinates)], self.symbols, tier="interpreter").bind()
 
     def _search(self, at: Array, held: Collection[Symbol], tolerance: float) -> _Search | None:
-        """Return what is to be solved: the equalities that are broken, with those about the same coordinates."""
+        """Return what is to be solved: broken equalities, with those about the same coordinates."""
         if not self.count:
             return None
         evaluate = self._function
@@ -282,7 +283,7 @@ class _Search:
         return x, float(np.abs(wrong).max(initial=0.0))
 
     def _step(self, x: Array, wrong: Array, by_x: Array, damping: float) -> Array:
-        """Return the shortest step that mends rows to first order; what would leave its limits stops there."""
+        """Return the shortest step that mends rows to first order; who would leave limits stops there."""
         step = np.zeros(len(x))
         free = np.ones(len(x), dtype=bool)
         rows = wrong != 0.0
@@ -378,7 +379,9 @@ class _Search:
         sizes = {self._projection.rows[self._rows[i]].name: off[i] for i in worst}
         listed = ", ".join(f"'{n}' is off by {size:.3g}" for n, size in list(sizes.items())[:4])
         more = f" and {len(sizes) - 4} more" if len(sizes) > 4 else ""
-        ends = (np.isfinite(self._lower) & (x <= self._lower)) | (np.isfinite(self._upper) & (x >= self._upper))
+        ends = (np.isfinite(self._lower) & (x <= self._lower)) | (
+            np.isfinite(self._upper) & (x >= self._upper)
+        )
         moved, stopped = self._names(range(len(x))), self._names(np.flatnonzero(ends).tolist())
         held = sorted(str(s) for s in self._held if s in self._projection.coordinates)
         tried = [f"moved were {_some(moved)}" if moved else "nothing was free to move"]
@@ -397,7 +400,7 @@ def _some(names: Sequence[str]) -> str:
 
 def is_equality(constraint: Constraint) -> bool:
     """Return whether a constraint is one on positions whose bounds are the same."""
-    if constraint.order or not constraint.lower == constraint.upper:
+    if constraint.order or constraint.lower != constraint.upper:
         return False
     return bool(constraint.lower.symbols) or abs(float(constraint.lower)) < np.inf
 

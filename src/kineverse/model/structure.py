@@ -21,9 +21,9 @@ from .constraint import Constraint
 from .frame import WORLD, Frame
 from .listing import Listing
 from .operation import ARTICULATIONS, BODIES, CONSTRAINTS, DATA, FRAMES, RATES
+from .projection import Projection
 from .rates import Rates
 from .reader import ABSENT, Cell, missing
-from .projection import Projection
 from .relevance import Relevance
 from .symbol_index import SymbolIndex
 from .violations import Checks

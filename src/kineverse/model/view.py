@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -223,19 +223,23 @@ class ModelView(Structure):
         Raises
         ------
         UnsolvedError
-            If no such place is found, naming what does not hold, by how much, and what was tried; or if a loop
-            does not close at the state.
+            If no such place is found, naming what does not hold, by how much, and what was tried; or if a
+            loop does not close at the state.
         UnknownNameError
             If a value is missing, or a name is unknown.
         """
         with self._lock:
             self._catch_up()
             if self._projection is None:
-                constraints = dict(self._head[CONSTRAINTS])
-                self._projection = Projection(constraints, self.rates, self._head[ARTICULATIONS])
+                self._projection = self._projection_on(None)
             if not isinstance(state, State):
                 state = State({self.symbol(k) if isinstance(k, str) else k: v for k, v in state.items()})
             return self._projection.of(state, fixed, tolerance)
+
+    def _projection_on(self, names: Collection[str] | None) -> Projection:
+        """Return the projection on some of the equalities, or on all."""
+        self._catch_up()
+        return Projection(dict(self._head[CONSTRAINTS]), self.rates, self._head[ARTICULATIONS], names)
 
     def save(
         self,
