@@ -294,8 +294,8 @@ def explain(
                 if not lower <= x <= upper:
                     return UnsolvedError(
                         f"'{node.label}' has no solution at {symbol} = {x:.6g} that is known to be on its "
-                        f"branch: it holds for {lower:.6g} <= {symbol} <= {upper:.6g}, the limits it was made "
-                        "for and a margin around them. Stay within, or make it for wider limits."
+                        f"branch: it holds for {lower:.6g} <= {symbol} <= {upper:.6g}, the limits it was "
+                        "made for and a margin around them. Stay within, or make it for wider limits."
                     )
             where = ", ".join(f"{s} = {x:.6g}" for s, x in zip(names, inputs, strict=True))
             return UnsolvedError(

@@ -10,13 +10,13 @@ import numpy.typing as npt
 
 from kineverse.errors import FormatError, KineverseError, UnsolvedError
 from kineverse.expressions.expression import Expression, array
-from kineverse.loops.constraint import LoopConstraint
+from kineverse.loops.constraint import APART, LoopConstraint
 from kineverse.loops.operation import CloseLoop
 from kineverse.loops.record import loops_of
 from kineverse.loops.residual import residual_rows
 from kineverse.model.edit import Edit
 from kineverse.model.operation import Operation
-from kineverse.model.projection import TOLERANCE
+from kineverse.model.projection import project
 from kineverse.model.samples import Samples
 from kineverse.model.view import ModelView
 from kineverse.state import State
@@ -75,10 +75,11 @@ class Closures:
 
     def _not_solved(self, tag: str, loop: CloseLoop, error: KineverseError) -> Iterator[str]:
         """Close a loop without the rows that nothing moves, as far as files are exact, or keep it."""
-        moving = self._moving(loop)
-        if moving and moving != loop.mask:
+        mended = self._mended(loop)
+        if mended and mended != loop.mask:
+            loop = replace(loop, mask=mended)
             try:
-                yield self.edit.apply(replace(loop, mask=moving), tag)
+                yield self.edit.apply(loop, tag)
             except KineverseError as other:
                 error = other
             else:
@@ -98,7 +99,6 @@ class Closures:
                 f"{error} Remove the {self.element}, and close the loop with kv.CloseLoop; or keep it as a "
                 'constraint, with loops="solve".'
             ) from error
-        moving = self._moving(loop)
         if not any(row.symbols for rows in self._rows(loop) for row in rows.values()):
             self._tell(
                 loop,
@@ -106,8 +106,9 @@ class Closures:
                 "between its ends",
             )
             return
+        mask = self._mended(loop) or loop.mask
         yield self.edit.apply(
-            LoopConstraint(name=loop.name, frame=loop.frame, to=loop.to, mask=moving, more=loop.more), tag
+            LoopConstraint(name=loop.name, frame=loop.frame, to=loop.to, mask=mask, more=loop.more), tag
         )
         self.kept.append(loop.name)
         if error is not None:
@@ -147,7 +148,7 @@ class Closures:
         if not broken:
             return
         try:
-            found = self.model._projection_on(wanted).of(state, (), TOLERANCE)
+            found = project(self.model._equalities_of(wanted), state)
         except UnsolvedError as error:
             tell([f"{self.source}: loops that were kept as constraints are open at default_state(). {error}"])
             return
@@ -176,11 +177,15 @@ class Closures:
             f"{self.source}: its home is moved to where limits and loops hold: {', '.join(listed)}{more}."
         ]
 
-    def _moving(self, loop: CloseLoop) -> tuple[str, ...]:
-        """Return the mask of a loop without axes along which nothing moves and next to nothing is left."""
-        still = set(loop.mask)
-        for rows in self._rows(loop):
-            still -= {axis for axis, row in rows.items() if row.symbols or abs(float(row)) > CLOSED}
+    def _mended(self, loop: CloseLoop) -> tuple[str, ...]:
+        """Return the mask of a loop without axes along which nothing moves, and rounding is left over."""
+        all_rows = self._rows(loop)
+        still = [
+            axis
+            for axis in loop.mask
+            if not any(rows[axis].symbols for rows in all_rows)
+            and APART < max(abs(float(rows[axis])) for rows in all_rows) <= CLOSED
+        ]
         return tuple(axis for axis in loop.mask if axis not in still)
 
     def _rows(self, loop: CloseLoop) -> list[dict[str, Expression]]:
@@ -195,7 +200,8 @@ class Closures:
         rows = array([row for rows in self._rows(loop) for row in rows.values()])
         (values,) = Samples(self.model, count=_LOOKED_AT).values([rows])
         gaps = np.linalg.norm(values, axis=1)
-        return gaps[np.isfinite(gaps)]
+        found: npt.NDArray[np.float64] = gaps[np.isfinite(gaps)]
+        return found
 
     def _tell(self, loop: CloseLoop, text: str) -> None:
         tell([f"{self.source}: the {self.element} '{_shown(loop.name)}' {text}."])

@@ -18,7 +18,7 @@ from kineverse.symbols import Symbol
 from .branches import find_branches, nearest_closed
 from .continuation import follow
 from .equations import CLOSED, Array, Effort, Equations, periodic
-from .samples import Samples
+from .samples import Samples, place
 from .seed import Interval, Seed, products_of
 
 RANK = 1e-7
@@ -115,7 +115,7 @@ def close(
     effort = Effort(name)
     unknown = Equations(residual, coordinates, parameters, effort)
     if not np.isfinite(unknown.gap(values, given)):
-        at = ", ".join(f"{s} = {v:.6g}" for s, v in zip(coordinates, values, strict=True))
+        at = place(coordinates, values)
         raise UnsolvedError(f"Loop '{name}' is not defined at {at}. Begin elsewhere, with home={{...}}.")
     start, gap = nearest_closed(unknown, values, given)
     if gap > CLOSED:
@@ -135,7 +135,7 @@ def close(
     reach = np.where(angles, np.pi, np.where(np.isfinite(spans), spans, np.pi) + 1.0)
     stands = None if upright is None else compile(upright, [*followers, *inputs], tier="interpreter")
     found, gap = find_branches(equations, x, u, angles, reach, stands)
-    where = ", ".join(f"{s} = {home[s]:.6g}" for s in free) or "all configurations"
+    where = place(free, u[: len(free)]) or "all configurations"
     if not found:
         raise UnsolvedError(
             f"Loop '{name}' does not close at {where}: {gap:.6g} is left between its ends. "
@@ -322,8 +322,7 @@ def _chosen_seed(name: str, samples: Samples) -> tuple[Seed, int, tuple[int, ...
 
 
 def _too_close(name: str, samples: Samples) -> UnsolvedError:
-    pairs = zip(samples.equations.inputs, samples.worst, strict=False)
-    at = ", ".join(f"{s} = {v:.6g}" for s, v in pairs)
+    at = place(samples.equations.inputs, samples.worst)
     return UnsolvedError(
         f"Loop '{name}' is singular, or too close to it, near {at} (condition {samples.condition:.2g}) for "
         "Newton's method to be sure of its branch. Narrow the limits, or the loop's within={...}."

@@ -6,7 +6,7 @@ import math
 from dataclasses import dataclass
 
 from kineverse.errors import ModelError, NameTakenError
-from kineverse.expressions.expression import Expression, array
+from kineverse.expressions.expression import array
 from kineverse.expressions.functions import norm
 from kineverse.model.constraint import Constraint
 from kineverse.model.frame import WORLD
@@ -87,19 +87,20 @@ class LoopConstraint(Operation):
     def _between(self, model: Reader, frame: str, to: str, name: str) -> dict[str, Constraint]:
         pose = model.fk(frame, to)
         rows = residual_rows(pose, self.mask)
-        moving = {axis: row for axis, row in rows.items() if row.symbols}
+        # Each by itself, so that a trace knows what is decided by: whether anything moves it.
+        alone = {axis: model.resolve(row) for axis, row in rows.items()}
+        moving = [axis for axis, row in alone.items() if row.symbols] if pose.symbols else []
         if not moving:
             raise ModelError(
                 f"Loop '{self.name}' cannot move: nothing changes what its mask names between '{frame}' and "
                 f"'{to}'."
             )
-        found = {f"{name}/{axis}": Constraint.of(0.0, row, 0.0) for axis, row in moving.items()}
-        still = [row for axis, row in rows.items() if axis not in moving]
-        if any(abs(float(row)) > APART for row in still):
+        found = {f"{name}/{axis}": Constraint.of(0.0, rows[axis], 0.0) for axis in moving}
+        if any(abs(float(row)) > APART for axis, row in alone.items() if axis not in moving):
             found[f"{name}/apart"] = Constraint.of(0.0, norm(array(list(rows.values()))), 0.0)
-        signs: list[Expression] = [sign for sign in upright(pose, self.mask) if sign.symbols]
-        for k, sign in enumerate(signs):
-            found[f"{name}/upright{k or ''}"] = Constraint.of(0.0, sign, math.inf)
+        for k, sign in enumerate(upright(pose, self.mask)):
+            if model.resolve(sign).symbols:
+                found[f"{name}/upright{k or ''}"] = Constraint.of(0.0, sign, math.inf)
         return found
 
 

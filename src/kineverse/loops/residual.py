@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 from kineverse.errors import ValueRejectedError
 from kineverse.expressions.expression import Expression, array
@@ -10,10 +11,10 @@ from kineverse.expressions.expression import Expression, array
 AXES = ("x", "y", "z", "rx", "ry", "rz")
 
 
-def check_mask(mask: object, name: str) -> None:
+def check_mask(mask: Any, name: str) -> None:
     """Raise unless a mask has different names out of :data:`AXES`."""
     known = isinstance(mask, tuple) and all(axis in AXES for axis in mask)
-    if not known or not mask or len(set(mask)) < len(mask):  # type: ignore[arg-type]
+    if not known or not mask or len(set(mask)) < len(mask):
         raise ValueRejectedError(
             f"The mask of loop '{name}' has names out of {', '.join(AXES)}, not {mask!r}."
         )

@@ -9,6 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from kineverse.errors import UnsolvedError
+from kineverse.symbols import Symbol
 
 from .continuation import follow
 from .equations import Array, Equations
@@ -18,6 +19,7 @@ _SAMPLES = {1: 65, 2: 17, 3: 9}
 _SCATTERED = 400
 _TRIED = 200
 _MOST_CORNERED = 8
+_SHOWN = 6
 
 
 class Samples:
@@ -90,9 +92,7 @@ class Samples:
         reached = follow(self.equations, x, self.all_inputs(start), self.all_inputs(end))
         if reached.part < 1.0:
             there = start + reached.part * (end - start)
-            names = [str(s) for s in self.equations.inputs]
-            at = ", ".join(f"{s} = {v:.6g}" for s, v in zip(names, there, strict=False))
-            to = ", ".join(f"{v:.6g}" for v in end)
+            at, to = place(self.equations.inputs, there), place(self.equations.inputs, end, named=False)
             raise UnsolvedError(
                 f"Loop '{self.name}' does not close on the way to {to}: it ends, or is singular, at {at}. "
                 "Narrow the limits, or the loop's within={...}, so that it closes everywhere."
@@ -139,6 +139,13 @@ class Samples:
     def _singular_values(self, q: Array, x: Array) -> Array:
         by_x = self.equations(x, self.all_inputs(q))[1]
         return np.linalg.svd(by_x, compute_uv=False).astype(np.float64)
+
+
+def place(symbols: Sequence[Symbol], values: Array, named: bool = True) -> str:
+    """Return where some inputs are, the first few of them, for a message."""
+    pairs = list(zip(symbols, values.tolist(), strict=False))
+    shown = ", ".join(f"{s} = {v:.6g}" if named else f"{v:.6g}" for s, v in pairs[:_SHOWN])
+    return shown + (", ..." if len(pairs) > _SHOWN else "")
 
 
 def _corners(intervals: Sequence[Interval], generator: np.random.Generator) -> Array:

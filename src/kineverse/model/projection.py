@@ -13,25 +13,15 @@ of unit length.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
-from functools import cached_property
-from typing import Any
+from collections.abc import Collection, Iterable, Sequence
 
 import numpy as np
-import numpy.typing as npt
 
-from kineverse.compile import compile  # noqa: A004
 from kineverse.errors import UnknownNameError, UnsolvedError, suggest
-from kineverse.expressions.expression import Expression, array
 from kineverse.state import State
 from kineverse.symbols import Symbol
 
-from .articulation import Articulation
-from .constraint import Constraint
-from .rates import Rates
-
-Array = npt.NDArray[np.float64]
+from .equalities import Array, Equalities
 
 TOLERANCE = 1e-9
 """How far from holding a constraint may be, as in :meth:`kineverse.Model.violations`."""
@@ -41,168 +31,70 @@ _LONGEST = 0.5
 """How far a step goes at most [m], [rad]: farther away, derivatives say little."""
 _STARTS = 12
 _SINGULAR, _AT_BOUND = 1e-9, 1e-9
-_QUATERNION = ("qx", "qy", "qz", "qw")
 
 
-@dataclass(frozen=True)
-class _Row:
-    """What a constraint asks for: that an expression is zero, or that it is not positive."""
-
-    name: str
-    value: Expression
-    equality: bool
-
-
-class Projection:
-    """The equalities of a model and what else its coordinates have to keep, as functions of numbers.
-
-    Parameters
-    ----------
-    constraints
-        All of a model's, plain.
-    rates
-        Its table.
-    articulations
-        Its records, which know quaternions.
-    wanted
-        The names of the equalities that are to hold; None for all.
-    """
-
-    def __init__(
-        self,
-        constraints: Mapping[str, Constraint],
-        rates: Rates,
-        articulations: Mapping[str, Articulation],
-        wanted: Collection[str] | None = None,
-    ) -> None:
-        self._rates = rates
-        self._dependent = {str(s): s for s in rates.dependent}
-        self._articulations = articulations
-        rows = list(_rows(constraints, rates, wanted))
-        self._simple = [row for row in rows if not row.equality and _about_one(row)]
-        equal = [row for row in rows if row.equality]
-        moved = _closure(equal)
-        self._rows = equal + [
-            row for row in rows if not row.equality and not _about_one(row) and moved & set(row.value.symbols)
-        ]
-        self.count = len(equal)
-        self.symbols = tuple(
-            sorted({s for row in self._rows for s in row.value.symbols} | moved, key=lambda s: s.sort_key)
+def project(
+    equalities: Equalities, state: State, fixed: Iterable[Symbol | str] = (), tolerance: float = TOLERANCE
+) -> State:
+    """Move coordinates so that equalities hold, and return the state, see :meth:`ModelView.project`."""
+    held = _held(equalities, fixed)
+    symbols = equalities.symbols
+    missing = [s for s in symbols if s not in state and s.value is None]
+    if missing:
+        raise UnknownNameError(
+            f"No value for '{missing[0]}', which a projection has to know. Start from "
+            "model.default_state().updated({...}) to have a value for everything."
         )
-        self.coordinates = tuple(s for s in self.symbols if s in moved)
+    at = np.array([state[s] if s in state else s.value or 0.0 for s in symbols], dtype=np.float64)  # noqa: SIM401
+    search = _search(equalities, at, held, tolerance)
+    if search is None:
+        return state
+    found = search.nearest()
+    moved = {s: float(found[i]) for i, s in enumerate(symbols) if found[i] != at[i]}
+    return state.updated(moved) if moved else state
 
-    def of(self, state: State, fixed: Iterable[Symbol | str], tolerance: float) -> State:
-        """Return the state with coordinates moved so that all holds, see :meth:`ModelView.project`."""
-        held = self._held(fixed)
-        known = [s for s in self.symbols if s in state or s.value is not None]
-        if len(known) < len(self.symbols):
-            missing = next(s for s in self.symbols if s not in state and s.value is None)
+
+def _held(equalities: Equalities, fixed: Iterable[Symbol | str]) -> frozenset[Symbol]:
+    """Return the coordinates that stay, those behind what depends on others among them."""
+    dependent = {str(s): e for s, e in equalities.rates.dependent.items()}
+    records = equalities.articulations
+    by_name = {str(s): s for s in equalities.symbols}
+    by_name |= {str(s): s for record in records.values() for s in record.coordinates}
+    found: set[Symbol] = set()
+    for item in [fixed] if isinstance(fixed, (str, Symbol)) else fixed:
+        name = str(item)
+        if name in dependent:
+            found.update(s for s in dependent[name].symbols if s.has_derivative)
+        elif name in by_name:
+            found.add(by_name[name])
+        elif name in records:
+            found.update(records[name].coordinates)
+        else:
+            available = {*by_name, *dependent, *records}
             raise UnknownNameError(
-                f"No value for '{missing}', which a projection has to know. Start from "
-                "model.default_state().updated({...}) to have a value for everything."
+                f"{name!r} cannot stay fixed: it is no coordinate. {suggest(name, available, 'coordinate')}"
             )
-        at = np.array([state.get(s, s.value) for s in self.symbols], dtype=np.float64)
-        search = self._search(at, held, tolerance)
-        if search is None:
-            return state
-        found = search.nearest()
-        moved = {s: float(found[i]) for i, s in enumerate(self.symbols) if found[i] != at[i]}
-        return state.updated(moved) if moved else state
+    return frozenset(found)
 
-    def _held(self, fixed: Iterable[Symbol | str]) -> frozenset[Symbol]:
-        """Return the coordinates that stay, those behind what depends on others among them."""
-        given = [fixed] if isinstance(fixed, (str, Symbol)) else list(fixed)
-        by_name = {str(s): s for s in self._known_coordinates()}
-        found: set[Symbol] = set()
-        for item in given:
-            name = str(item)
-            if name in self._dependent:
-                inside = self._rates.dependent[self._dependent[name]].symbols
-                found.update(s for s in inside if s.has_derivative)
-            elif name in by_name:
-                found.add(by_name[name])
-            elif name in self._articulations:
-                found.update(self._articulations[name].coordinates)
-            else:
-                available = {*by_name, *self._dependent, *self._articulations}
-                raise UnknownNameError(
-                    f"{name!r} cannot stay fixed: it is no coordinate. "
-                    f"{suggest(name, available, 'coordinate')}"
-                )
-        return frozenset(found)
 
-    def _known_coordinates(self) -> Iterator[Symbol]:
-        yield from self.symbols
-        for record in self._articulations.values():
-            yield from record.coordinates
-
-    @cached_property
-    def _function(self) -> Any:
-        values = array([row.value for row in self._rows])
-        return compile([values, values.partial(self.coordinates)], self.symbols, tier="interpreter").bind()
-
-    def _search(self, at: Array, held: Collection[Symbol], tolerance: float) -> _Search | None:
-        """Return what is to be solved: broken equalities, with those about the same coordinates."""
-        if not self.count:
-            return None
-        evaluate = self._function
-        evaluate(at)
-        broken = {i for i in range(self.count) if not abs(evaluate.outputs[0][i]) <= tolerance}
-        if not broken:
-            return None
-        about = [set(row.value.symbols) & set(self.coordinates) for row in self._rows]
-        moved: set[Symbol] = set()
-        chosen: set[int] = set()
-        while more := {
-            i for i in range(self.count) if i not in chosen and (i in broken or about[i] & moved - held)
-        }:
-            chosen |= more
-            moved |= set[Symbol]().union(*(about[i] for i in more))
-        chosen |= {i for i in range(self.count, len(about)) if about[i] & moved - held}
-        columns = [i for i, s in enumerate(self.coordinates) if s in moved and s not in held]
-        return _Search(self, sorted(chosen), columns, at, tolerance, held)
-
-    def evaluated(self, at: Array) -> tuple[Array, Array] | None:
-        """Return all rows and their derivatives; None where a closed loop among them does not close."""
-        try:
-            self._function(at)
-        except UnsolvedError:
-            return None
-        values, by_all = self._function.outputs
-        return values.copy(), by_all.copy()
-
-    @property
-    def rows(self) -> Sequence[_Row]:
-        """Equalities first."""
-        return self._rows
-
-    @cached_property
-    def limits(self) -> tuple[Array, Array]:
-        """Lower and upper limits of the coordinates, ±inf where there are none."""
-        lower, upper = np.full(len(self.coordinates), -np.inf), np.full(len(self.coordinates), np.inf)
-        for row in self._simple:
-            (symbol,) = row.value.symbols
-            if symbol not in self.coordinates:
-                continue
-            k = self.coordinates.index(symbol)
-            slope, offset = _line(row.value) or (1.0, 0.0)
-            end = -offset / slope
-            if slope > 0:
-                upper[k] = min(upper[k], end)
-            else:
-                lower[k] = max(lower[k], end)
-        return lower, upper
-
-    @cached_property
-    def quaternions(self) -> list[list[int]]:
-        """Where the four numbers of each quaternion are among the coordinates."""
-        place = {s: i for i, s in enumerate(self.coordinates)}
-        found = []
-        for record in self._articulations.values():
-            four = [s for s in record.coordinates if s.path.rpartition("/")[2] in _QUATERNION]
-            if len(four) == 4 and all(s in place and s in self._rates for s in four):
-                found.append([place[s] for s in four])
-        return found
+def _search(equalities: Equalities, at: Array, held: frozenset[Symbol], tolerance: float) -> _Search | None:
+    """Return what is to be solved: broken equalities, with those about the same coordinates."""
+    count = equalities.count
+    if not count:
+        return None
+    equalities.evaluate(at)
+    broken = {i for i in range(count) if not abs(equalities.evaluate.outputs[0][i]) <= tolerance}
+    if not broken:
+        return None
+    about = [set(row.value.symbols) & set(equalities.coordinates) for row in equalities.rows]
+    moved: set[Symbol] = set()
+    chosen: set[int] = set()
+    while more := {i for i in range(count) if i not in chosen and (i in broken or about[i] & (moved - held))}:
+        chosen |= more
+        moved |= set[Symbol]().union(*(about[i] for i in more))
+    chosen |= {i for i in range(count, len(about)) if about[i] & (moved - held)}
+    columns = [i for i, s in enumerate(equalities.coordinates) if s in moved and s not in held]
+    return _Search(equalities, sorted(chosen), columns, at, tolerance, held)
 
 
 class _Search:
@@ -210,24 +102,24 @@ class _Search:
 
     def __init__(
         self,
-        projection: Projection,
+        equalities: Equalities,
         rows: list[int],
         columns: list[int],
         at: Array,
         tolerance: float,
         held: Collection[Symbol],
     ) -> None:
-        self._projection, self._rows, self._columns = projection, rows, columns
+        self._equalities, self._rows, self._columns = equalities, rows, columns
         self._tolerance, self._held = tolerance, held
-        self._equal = np.array([projection.rows[i].equality for i in rows], dtype=bool)
-        place = {s: i for i, s in enumerate(projection.symbols)}
-        self._places = [place[projection.coordinates[c]] for c in columns]
+        self._equal = np.array([equalities.rows[i].equality for i in rows], dtype=bool)
+        place = {s: i for i, s in enumerate(equalities.symbols)}
+        self._places = [place[equalities.coordinates[c]] for c in columns]
         self._at = at
-        lower, upper = projection.limits
+        lower, upper = equalities.limits
         self._lower, self._upper = lower[columns], upper[columns]
         of_column = {c: k for k, c in enumerate(columns)}
         self._turns = [
-            [of_column[c] for c in four] for four in projection.quaternions if set(four) <= set(columns)
+            [of_column[c] for c in four] for four in equalities.quaternions if set(four) <= set(columns)
         ]
 
     def nearest(self) -> Array:
@@ -335,7 +227,7 @@ class _Search:
 
     def _look(self, x: Array) -> tuple[Array, Array] | None:
         """Return the values of rows and their derivatives; None where something has none."""
-        found = self._projection.evaluated(self._all(x))
+        found = self._equalities.evaluated(self._all(x))
         if found is None:
             return None
         values, by_x = found[0][self._rows], found[1][self._rows][:, self._columns]
@@ -358,7 +250,7 @@ class _Search:
         return x
 
     def _names(self, columns: Iterable[int]) -> list[str]:
-        return [str(self._projection.coordinates[self._columns[k]]) for k in columns]
+        return [str(self._equalities.coordinates[self._columns[k]]) for k in columns]
 
     def _elsewhere(self, start: Array, generator: np.random.Generator, attempt: int) -> Array:
         """Return another place to begin at, first near by, then anywhere within limits."""
@@ -376,14 +268,14 @@ class _Search:
             )
         off = np.abs(self._off(there[0]))
         worst = [i for i in np.argsort(-off) if off[i] > self._tolerance]
-        sizes = {self._projection.rows[self._rows[i]].name: off[i] for i in worst}
+        sizes = {self._equalities.rows[self._rows[i]].name: off[i] for i in worst}
         listed = ", ".join(f"'{n}' is off by {size:.3g}" for n, size in list(sizes.items())[:4])
         more = f" and {len(sizes) - 4} more" if len(sizes) > 4 else ""
         ends = (np.isfinite(self._lower) & (x <= self._lower)) | (
             np.isfinite(self._upper) & (x >= self._upper)
         )
         moved, stopped = self._names(range(len(x))), self._names(np.flatnonzero(ends).tolist())
-        held = sorted(str(s) for s in self._held if s in self._projection.coordinates)
+        held = sorted(str(s) for s in self._held if s in self._equalities.coordinates)
         tried = [f"moved were {_some(moved)}" if moved else "nothing was free to move"]
         tried += [f"at their limits are {_some(stopped)}"] if stopped else []
         tried += [f"fixed were {_some(held)}"] if held else []
@@ -396,43 +288,3 @@ class _Search:
 def _some(names: Sequence[str]) -> str:
     shown = ", ".join(f"'{name}'" for name in names[:6])
     return shown + (f" and {len(names) - 6} more" if len(names) > 6 else "")
-
-
-def is_equality(constraint: Constraint) -> bool:
-    """Return whether a constraint is one on positions whose bounds are the same."""
-    if constraint.order or constraint.lower != constraint.upper:
-        return False
-    return bool(constraint.lower.symbols) or abs(float(constraint.lower)) < np.inf
-
-
-def _rows(
-    constraints: Mapping[str, Constraint], rates: Rates, wanted: Collection[str] | None
-) -> Iterator[_Row]:
-    for name, c in constraints.items():
-        if any(s.order for s in c.symbols):
-            continue
-        if is_equality(c):
-            if wanted is None or name in wanted:
-                yield _Row(name, rates.resolve(c.expression - c.lower), True)
-            continue
-        for low, high in ((c.expression, c.upper), (c.lower, c.expression)):
-            difference = rates.resolve(low - high)
-            if difference.symbols and not _is_infinite(low) and not _is_infinite(high):
-                yield _Row(name, difference, False)
-
-
-def _is_infinite(bound: Expression) -> bool:
-    return not bound.symbols and not abs(float(bound)) < np.inf
-
-
-def _line(value: Expression) -> tuple[float, float] | None:
-    return Constraint(value, value, value).line
-
-
-def _about_one(row: _Row) -> bool:
-    """Return whether a row limits a single coordinate."""
-    return len(row.value.symbols) == 1 and _line(row.value) is not None
-
-
-def _closure(equalities: Iterable[_Row]) -> set[Symbol]:
-    return {s for row in equalities for s in row.value.symbols if s.has_derivative}

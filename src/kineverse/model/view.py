@@ -14,9 +14,10 @@ from kineverse.state import State
 from kineverse.symbols import Symbol, parse_symbol_name
 
 from .constraint import Constraint
+from .equalities import Equalities
 from .integration import integrate
 from .operation import ARTICULATIONS, CONSTRAINTS
-from .projection import TOLERANCE, Projection
+from .projection import TOLERANCE, project
 from .structure import Structure
 from .velocity import VelocityRows, velocity_rows
 from .violations import Checks, Violations, find_violations
@@ -230,16 +231,16 @@ class ModelView(Structure):
         """
         with self._lock:
             self._catch_up()
-            if self._projection is None:
-                self._projection = self._projection_on(None)
+            if self._equalities is None:
+                self._equalities = self._equalities_of(None)
             if not isinstance(state, State):
                 state = State({self.symbol(k) if isinstance(k, str) else k: v for k, v in state.items()})
-            return self._projection.of(state, fixed, tolerance)
+            return project(self._equalities, state, fixed, tolerance)
 
-    def _projection_on(self, names: Collection[str] | None) -> Projection:
-        """Return the projection on some of the equalities, or on all."""
+    def _equalities_of(self, names: Collection[str] | None) -> Equalities:
+        """Return the equalities of these names, or all."""
         self._catch_up()
-        return Projection(dict(self._head[CONSTRAINTS]), self.rates, self._head[ARTICULATIONS], names)
+        return Equalities(dict(self._head[CONSTRAINTS]), self.rates, self._head[ARTICULATIONS], names)
 
     def save(
         self,
