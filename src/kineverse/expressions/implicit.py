@@ -33,7 +33,7 @@ from .layout import SX
 from .leaves import bottom_up, leaves
 from .lowering import lowered
 from .node import Node
-from .substitution import apply, replace_nodes
+from .substitution import apply
 
 if TYPE_CHECKING:
     from kineverse.symbols import Symbol
@@ -243,21 +243,30 @@ def _solved(matrix: Expression, right: Expression) -> Expression:
 
 
 def held(expression: Expression) -> Expression:
-    """Hold implicit functions at the edge of their domains: beyond it, they have the value from there.
+    """Hold what implicit functions are about at the edge of their domains, in all of an expression.
 
-    For whoever leads back into the domain and so has to look at what is outside of it. The values are all
-    that means something: the gradient stops at the edge, too.
+    For whoever leads back into the domain and so has to look at what is outside of it: there, the expression
+    is worth what it is at the edge.
     """
-    if not any(node.function.domain for node in implicit_nodes([expression])):
+    bounded = [n for n in implicit_nodes([expression]) if n.function.domain] if expression._nodes else []
+    if not bounded:
         return expression
-    images: dict[Node, Expression] = {}
-    for node in bottom_up(leaves(expression)[1], lambda n: n.arguments, images.__contains__):
-        arguments = [replace_nodes(a, images) for a in node.arguments]
-        if isinstance(node, Implicit):
-            for i, (lower, upper) in enumerate(node.function.domain):
-                arguments[i] = maximum(lower, minimum(upper, arguments[i]))
-        images[node] = type(node).of(tuple(arguments), node.shape, node.options)
-    return replace_nodes(expression, images)
+    ends: dict[Symbol, tuple[float, float]] = {}
+    for node in bounded:
+        for argument, (lower, upper) in zip(node.arguments, node.function.domain, strict=True):
+            symbol = _symbol_of(argument)
+            if symbol is not None:
+                low, high = ends.get(symbol, (-math.inf, math.inf))
+                ends[symbol] = max(low, lower), min(high, upper)
+    return apply(expression, {s: maximum(low, minimum(high, s)) for s, (low, high) in ends.items()})
+
+
+def _symbol_of(argument: Expression) -> Symbol | None:
+    """Return the symbol that an argument is worth; None if it is something else."""
+    symbols = argument.symbols
+    if len(symbols) == 1 and ca.is_equal(lowered(argument), symbols[0]._sx):
+        return symbols[0]
+    return None
 
 
 def implicit_nodes(expressions: Sequence[Expression]) -> tuple[Implicit, ...]:
