@@ -1,8 +1,8 @@
 """Moving a state to where equality constraints hold: projection on their manifold.
 
-Of the free coordinates q, those are moved that broken equalities are about, and what shares equalities
-with these. With rows c(q) = 0 for the equalities and h(q) <= 0 for all other constraints on positions,
-Gauss-Newton steps of least change,
+Of the free coordinates q that equalities are about, those are moved for which something does not hold, and
+what shares equalities with these. With rows c(q) = 0 for the equalities and h(q) <= 0 for all other
+constraints on positions, Gauss-Newton steps of least change,
 
     min ‖Δq‖  subject to  J Δq = -(c, max(h, 0)),  lower <= q + Δq <= upper,
 
@@ -78,16 +78,20 @@ def _held(equalities: Equalities, fixed: Iterable[Symbol | str]) -> frozenset[Sy
 
 
 def _search(equalities: Equalities, at: Array, held: frozenset[Symbol], tolerance: float) -> _Search | None:
-    """Return what is to be solved: broken equalities, with those about the same coordinates."""
+    """Return what is to be solved: what is broken, with all equalities about the same coordinates."""
     count = equalities.count
     if not count:
         return None
     equalities.evaluate(at)
-    broken = {i for i in range(count) if not abs(equalities.evaluate.outputs[0][i]) <= tolerance}
-    if not broken:
-        return None
+    values = equalities.evaluate.outputs[0]
     about = [set(row.value.symbols) & set(equalities.coordinates) for row in equalities.rows]
-    moved: set[Symbol] = set()
+    broken = {i for i in range(count) if not abs(values[i]) <= tolerance}
+    moved = {s for i in range(count, len(about)) if not values[i] <= tolerance for s in about[i]}
+    for symbol, lower, upper in zip(equalities.coordinates, *equalities.limits, strict=True):
+        if not lower - tolerance <= at[equalities.symbols.index(symbol)] <= upper + tolerance:
+            moved.add(symbol)
+    if not broken and not moved - held:
+        return None
     chosen: set[int] = set()
     while more := {i for i in range(count) if i not in chosen and (i in broken or about[i] & (moved - held))}:
         chosen |= more

@@ -209,8 +209,8 @@ class ModelView(Structure):
         """Return the state with coordinates moved as little as it takes for equality constraints to hold.
 
         These are constraints on positions whose bounds are the same, such as closures of loops, see
-        :mod:`kineverse.model.projection`. Coordinates are moved that broken ones are about, and those that
-        share equalities with these; whatever else limits these is kept, and all other values stay.
+        :mod:`kineverse.model.projection`. Coordinates that they are about are moved to where they hold, with
+        whatever else limits these coordinates. What holds already and all other values stay.
 
         Parameters
         ----------
