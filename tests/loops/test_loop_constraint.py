@@ -157,19 +157,24 @@ def test_mjcf_says_it_as_an_equality_and_urdf_names_it(tmp_path):
         partly.save(tmp_path / "partly.xml")
 
 
-def test_velocity_rows_close_it():
+def test_velocity_rows_keep_it_closed():
+    """Where it is closed its rows are equalities; where it is not, nothing may open it further."""
     model = kept()
     rows = model.velocity_rows(0.1)
     ask = kv.compile([rows.matrix, rows.lower, rows.upper], model.degrees_of_freedom, tier="interpreter")
-    q = np.array([STATE[str(s)] for s in model.degrees_of_freedom])
-    closing = [[i for i, n in enumerate(rows.names) if n == f"four-bar/{axis}"] for axis in "xy"]
-    columns = [rows.speeds.index(s.derivative()) for s in model.degrees_of_freedom]
-    for _ in range(200):
-        matrix, lower, upper = ask(q)
-        wanted = [np.clip(0, lower[sides].max(), upper[sides].min()) for sides in closing]
-        q = (
-            q
-            + 0.1
-            * np.linalg.lstsq(matrix[[sides[0] for sides in closing]][:, columns], wanted, rcond=None)[0]
-        )
-    assert len(model.violations(dict(zip(model.degrees_of_freedom, q, strict=True)))) == 0
+    closed = model.project(STATE)
+    for state, is_closed in ((closed, True), (STATE, False)):
+        matrix, lower, upper = ask([state[str(s)] for s in model.degrees_of_freedom])
+        for axis in "xy":
+            sides = [i for i, n in enumerate(rows.names) if n == f"four-bar/{axis}"]
+            constraint = model.constraints[f"four-bar/{axis}"].expression
+            slope = constraint.jacobian([s.integral() for s in rows.speeds])(state)
+            for side in sides:
+                np.testing.assert_allclose(matrix[side], slope, rtol=0, atol=1e-12)
+            least, most = lower[sides].max(), upper[sides].min()
+            if is_closed:
+                assert (least, most) == pytest.approx((0, 0), abs=1e-7)
+            else:
+                value = constraint(state)
+                assert least <= most
+                assert (least >= 0 and most > 0) if value < 0 else (most <= 0 and least < 0)

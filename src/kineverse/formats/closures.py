@@ -128,7 +128,7 @@ class Closures:
         moved: dict[Symbol, tuple[float, float]] = {}
         if self.kept:
             yield from self._close_home(moved)
-        state = self.model.default_state()
+        state = self.model.default_state() if self.homes else None
         for name, home in self.homes:
             record = self.model.articulations[name]
             for symbol, value in zip(record.coordinates, home, strict=False):
