@@ -128,13 +128,13 @@ class Closures:
         moved: dict[Symbol, tuple[float, float]] = {}
         if self.kept:
             yield from self._close_home(moved)
-        state = self.model.default_state() if self.homes else None
-        for name, home in self.homes:
-            record = self.model.articulations[name]
-            for symbol, value in zip(record.coordinates, home, strict=False):
-                now = self._at_home(symbol, state)
-                if now is not None and abs(now - value) > _MOVED:
-                    moved[symbol] = value, now
+        if self.homes:
+            state = self.model.default_state()
+            for name, home in self.homes:
+                for symbol, value in zip(self.model.articulations[name].coordinates, home, strict=False):
+                    now = self._at_home(symbol, state)
+                    if now is not None and abs(now - value) > _MOVED:
+                        moved[symbol] = value, now
         if moved:
             tell(self._moved(moved))
 
