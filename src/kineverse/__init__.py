@@ -63,7 +63,7 @@ from .expressions.piecewise import spline
 from .formats import load, shipped_models
 from .locks import blocked_unless, limit_table, unlocked_while
 from .logic import less, logic_and, logic_not, logic_or
-from .loops import CloseLoop
+from .loops import CloseLoop, LoopConstraint
 from .model import (
     AddFrame,
     Articulation,
@@ -143,6 +143,7 @@ __all__ = [
     "KineverseError",
     "Latch",
     "Limits",
+    "LoopConstraint",
     "Mecanum",
     "Microwave",
     "MissingExtraError",

@@ -363,6 +363,7 @@ def test_random_tables_are_read_or_refused() -> None:
                         ["composed", ref(), [[2, ref()]]],
                         ["dependent", ref(), 3],
                         ["implicit", "f", [3], [2], ref(), [0], ref(), 2, [ref()]],
+                        ["implicit", "f", [3], [2], ref(), [0], ref(), 2, [ref()], [[ref(), draw.random()]]],
                     ]
                 )
             )

@@ -127,6 +127,8 @@ WRITES = OPERATION.replace('"writes": {}%s', '"writes": %s')
         NODE % '["carried", 0, []]',
         NODE % '["read", 0, 0, [1], [[0, 1]]]',
         NODE % '["implicit", "a", [], [], 0, [], 0, 1, []]',
+        NODE % '["implicit", "a", [1], [0], 0, [0], 0, 1, [0], [[0]]]',
+        NODE % '["implicit", "a", [1], [0], 0, [0], 0, 1, [0], [[0, "one"]]]',
         OPERATION % ', "parameters": []',
         OPERATION % ', "parameters": {"a": {"b": 1}}',
         OPERATION % ', "parameters": {"a": {"pose": [1]}}',

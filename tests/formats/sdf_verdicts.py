@@ -105,10 +105,10 @@ sdf_joint_types/sdformat_test/world_frame_invalid_attached_to_scope.sdf | line 1
 sdf_joint_types/sdformat_test/world_frame_invalid_relative_to.sdf | line 13, <model name="M">: <pose> refers
 sdf_joint_types/sdformat_test/world_frame_relative_to.sdf | 14 28
 sdf_joint_types/sdformat_test/world_invalid_root_reference.sdf | line 36, <include>: <uri> "test_model_with_f
-sdf_joint_types/sdformat_test/world_joint_child_frame.sdf | the joint 'p/J2' closes a loop, which cannot be f
+sdf_joint_types/sdformat_test/world_joint_child_frame.sdf | 8 11
 sdf_joint_types/sdformat_test/world_joint_invalid_child_world.sdf | line 22, <joint name="J2">: has the world
 sdf_joint_types/sdformat_test/world_joint_invalid_resolved_parent_same_as_child.sdf | line 21, <joint name="J
-sdf_joint_types/sdformat_test/world_joint_parent_frame.sdf | the joint 'p/J2' closes a loop, which cannot be
+sdf_joint_types/sdformat_test/world_joint_parent_frame.sdf | 8 11
 sdf_joint_types/sdformat_test/world_model_frame_same_name.sdf | line 15, <frame name="ground">: has the name
 sdf_joint_types/sdformat_test/world_model_frame_same_name_1_6.sdf | 5 14
 sdf_joint_types/sdformat_test/world_nested_frame.sdf | 7 7

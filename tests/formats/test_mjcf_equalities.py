@@ -7,6 +7,7 @@ from test_mjcf_kinematics import body, mjcf
 
 import kineverse as kv
 from kineverse.formats.mjcf import parse_mjcf
+from kineverse.formats.remarks import listening
 
 TWO = body(
     "a", '<joint name="x" ref="10" range="-60 60"/>' + body("b", '<joint name="y" ref="-20"/>', 'pos="1 0 0"')
@@ -111,10 +112,13 @@ def test_circles_that_agree_are_one():
     assert list(model.constraints) == ["x/position"]
 
 
-def test_joints_held_in_two_places_are_refused():
+def test_joints_held_in_two_places_are_told():
     text = scene(TWO, '<joint joint1="y" polycoef=".1"/>\n<joint name="no" joint1="y" polycoef=".3"/>')
-    with pytest.raises(kv.FormatError, match=r'line 3, <joint name="no">: it holds its joint 0.2 away'):
-        model_of(parse_mjcf(text, "x.xml"))
+    with listening() as remarks:
+        model = model_of(parse_mjcf(text, "x.xml"))
+    (remark,) = remarks
+    assert 'line 3, <joint name="no"> is left out, and never holds: it holds its joint 0.2 away' in remark
+    assert [str(s) for s in model.degrees_of_freedom] == ["x"]
 
 
 def test_inactive_ones_are_left_out_with_a_remark():
@@ -258,18 +262,18 @@ def test_loops_that_cannot_be_followed_are_refused_by_name(tmp_path):
     with pytest.raises(
         kv.FormatError, match=r"^x\.xml: the equality 'end' closes a loop, which cannot be followed"
     ):
-        kv.load(tmp_path / "x.xml")
+        kv.load(tmp_path / "x.xml", loops="refuse")
 
 
-def test_what_is_rigid_is_left_out_or_refused():
+def test_what_is_rigid_is_left_out_or_closes_nothing():
     fixed = body("a", "") + body("b", "", 'pos="1 0 0"')
     assert parse_mjcf(scene(fixed, '<weld name="w" body1="a" body2="b"/>')).remarks == (
         'line 2, <weld name="w"> is left out: it ties bodies that are rigidly connected anyway.',
     )
-    with pytest.raises(
-        kv.FormatError, match=r'<weld name="w">: it ties bodies that are rigidly connected, and 0\.5 is left'
-    ):
-        parse_mjcf(scene(fixed, '<weld name="w" body1="a" body2="b" relpose=".5 0 0 1 0 0 0"/>'))
+    apart = parse_mjcf(scene(fixed, '<weld name="w" body1="a" body2="b" relpose=".5 0 0 1 0 0 0"/>'))
+    assert [closure.name for closure in apart.closures] == ["w"]
+    with pytest.raises(kv.ModelError, match="rigidly connected"):
+        model_of(apart)
 
 
 def test_a_loop_may_leave_nothing_free():

@@ -8,12 +8,14 @@ earlier calls. Derivatives come from the implicit function theorem and not from 
 
 and again from it where these are differentiated, so they are exact to every order. Where the steps do not
 arrive, because there is no solution or it is singular, the value is NaN inside the graph; whoever evaluates
-asks :func:`explain` and raises.
+asks :func:`explain` and raises. So it is outside of the *domain*, the inputs for which the seed is known to
+lead to its branch: another solution has a residual of zero as well.
 """
 
 from __future__ import annotations
 
 import hashlib
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -26,6 +28,7 @@ import numpy.typing as npt
 from kineverse.errors import ShapeError, UnsolvedError, ValueRejectedError
 
 from .expression import Expression, make, union
+from .functions import maximum, minimum
 from .layout import SX
 from .leaves import bottom_up, leaves
 from .lowering import lowered
@@ -58,13 +61,16 @@ class ImplicitFunction:
         The first guess of x, of shape (n,), a function of u alone.
     steps
         How many Newton steps.
+    domain
+        Pairs (lower, upper), one for each input, outside of which there is no value; empty for none. What is
+        infinite at all ends becomes empty.
 
     Raises
     ------
     ShapeError
         If the parts do not fit together.
     ValueRejectedError
-        If residual or seed are about other symbols, or steps are negative.
+        If residual or seed are about other symbols, steps are negative, or the domain is empty in between.
     """
 
     name: str
@@ -74,6 +80,7 @@ class ImplicitFunction:
     rows: tuple[int, ...]
     seed: Expression
     steps: int
+    domain: tuple[tuple[float, float], ...] = ()
 
     def __post_init__(self) -> None:
         n = len(self.unknowns)
@@ -86,6 +93,18 @@ class ImplicitFunction:
             raise ShapeError(f"'{self.name}': rows are {n} different ones of {self.residual.shape[0]}.")
         if self.steps < 0:
             raise ValueRejectedError(f"'{self.name}' cannot make {self.steps} steps.")
+        if self.domain and len(self.domain) != len(self.inputs):
+            raise ShapeError(
+                f"'{self.name}' has {len(self.inputs)} inputs, and a domain for {len(self.domain)}."
+            )
+        domain = tuple((float(lower), float(upper)) for lower, upper in self.domain)
+        for (lower, upper), symbol in zip(domain, self.inputs, strict=False):
+            if not lower <= upper:
+                raise ValueRejectedError(
+                    f"'{self.name}': no value lies within {lower} <= {symbol} <= {upper}."
+                )
+        bounded = any(math.isfinite(end) for ends in domain for end in ends)
+        object.__setattr__(self, "domain", domain if bounded else ())
         known = {*self.unknowns, *self.inputs}
         if len(known) < n + len(self.inputs):
             raise ValueRejectedError(f"'{self.name}': a symbol is given twice.")
@@ -104,6 +123,8 @@ class ImplicitFunction:
         symbols = [[s.sort_key for s in group] for group in (self.unknowns, self.inputs)]
         digest.update(repr((self.name, symbols, self.rows, self.steps)).encode())
         digest.update(self.residual.key + self.seed.key)
+        if self.domain:  # without one, the digest is what it was before there were any
+            digest.update(repr(self.domain).encode())
         return digest.digest()
 
     @cached_property
@@ -145,6 +166,7 @@ class ImplicitFunction:
     def __reduce__(self) -> Any:
         return ImplicitFunction, (
             self.name, self.unknowns, self.inputs, self.residual, self.rows, self.seed, self.steps,
+            self.domain,
         )  # fmt: skip
 
 
@@ -185,6 +207,11 @@ class Implicit(Node):
             x = x - _solved(matrix, residual)
         error = f.at(f.residual, [x[i] for i in range(n)], u)
         fits = ca.sumsqr(error._sx) <= TOLERANCE**2
+        for argument, (lower, upper) in zip(u, f.domain, strict=False):
+            if lower > -math.inf:
+                fits = ca.logic_and(fits, lower <= argument._sx)
+            if upper < math.inf:
+                fits = ca.logic_and(fits, argument._sx <= upper)
         return make(ca.if_else(fits, x._sx, ca.SX.nan(n, 1)), (n,), union((x, error)))
 
     def _gradient(self, heuristic: bool) -> Mapping[Symbol, Expression]:
@@ -213,6 +240,33 @@ def _solved(matrix: Expression, right: Expression) -> Expression:
     a, b = matrix._sx, right._sx
     sx: SX = b / a if a.numel() == 1 else ca.solve(ca.densify(a), ca.densify(b))
     return make(sx, right.shape, union((matrix, right)))
+
+
+def held(expression: Expression) -> Expression:
+    """Hold what implicit functions are about at the edge of their domains, in all of an expression.
+
+    For whoever leads back into the domain and so has to look at what is outside of it: there, the expression
+    is worth what it is at the edge.
+    """
+    bounded = [n for n in implicit_nodes([expression]) if n.function.domain] if expression._nodes else []
+    if not bounded:
+        return expression
+    ends: dict[Symbol, tuple[float, float]] = {}
+    for node in bounded:
+        for argument, (lower, upper) in zip(node.arguments, node.function.domain, strict=True):
+            symbol = _symbol_of(argument)
+            if symbol is not None:
+                low, high = ends.get(symbol, (-math.inf, math.inf))
+                ends[symbol] = max(low, lower), min(high, upper)
+    return apply(expression, {s: maximum(low, minimum(high, s)) for s, (low, high) in ends.items()})
+
+
+def _symbol_of(argument: Expression) -> Symbol | None:
+    """Return the symbol that an argument is worth; None if it is something else."""
+    symbols = argument.symbols
+    if len(symbols) == 1 and ca.is_equal(lowered(argument), symbols[0]._sx):
+        return symbols[0]
+    return None
 
 
 def implicit_nodes(expressions: Sequence[Expression]) -> tuple[Implicit, ...]:
@@ -245,6 +299,13 @@ def explain(
         # What was asked for at NaN owes no answer; if another function is to blame for it, that came first.
         if np.isnan(value).any() and not np.isnan(inputs).any():
             names = node.function.inputs
+            for symbol, x, (lower, upper) in zip(names, inputs, node.function.domain, strict=False):
+                if not lower <= x <= upper:
+                    return UnsolvedError(
+                        f"'{node.label}' has no solution at {symbol} = {x:.6g} that is known to be on its "
+                        f"branch: it holds for {lower:.6g} <= {symbol} <= {upper:.6g}, the limits it was "
+                        "made for and a margin around them. Stay within, or make it for wider limits."
+                    )
             where = ", ".join(f"{s} = {x:.6g}" for s, x in zip(names, inputs, strict=True))
             return UnsolvedError(
                 f"'{node.label}' has no solution at {where}. Stay within the limits it was made for, "

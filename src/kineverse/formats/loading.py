@@ -11,7 +11,6 @@ from pathlib import Path
 
 from kineverse.collection import no_collection
 from kineverse.errors import FormatError, KineverseError, MissingExtraError
-from kineverse.loops.operation import CloseLoop
 from kineverse.model.edit import Edit
 from kineverse.model.frame import WORLD
 from kineverse.model.model import Model, Snapshot
@@ -19,6 +18,7 @@ from kineverse.model.operation import Operation
 from kineverse.shipped.bases import base_of
 
 from .files import read_file
+from .loops import Loops, check_loops
 from .markup import root_tag
 from .prefixes import check_prefix
 from .remarks import listening, tell
@@ -31,10 +31,10 @@ LARGEST_REMEMBERED = 1 << 22
 """Models whose files are larger than this [byte] are not remembered, they would take too much memory."""
 
 # Models loaded by this process and remarks on them, the latest last, by everything that they follow from.
-_REMEMBERED: OrderedDict[tuple[Source, str | None, bytes], tuple[Snapshot, list[str]]] = OrderedDict()
+_REMEMBERED: OrderedDict[tuple[Source, str | None, str, bytes], tuple[Snapshot, list[str]]] = OrderedDict()
 
 
-def load(source: str | os.PathLike[str], prefix: str | None = None) -> Model:
+def load(source: str | os.PathLike[str], prefix: str | None = None, *, loops: Loops = "solve") -> Model:
     """Load a model from a file or by name.
 
     Parameters
@@ -47,6 +47,11 @@ def load(source: str | os.PathLike[str], prefix: str | None = None) -> Model:
         Put in front of the names of all frames and degrees of freedom, with a slash. A model that ships has
         its own name as prefix unless another is given (``screw`` for ``articulations/screw``); ``""`` means
         none.
+    loops
+        What becomes of loops that an SDF or MJCF closes. ``"solve"``: coordinates follow others, see
+        :class:`kineverse.CloseLoop`; where that cannot be done, the closure is kept as an equality
+        constraint, :class:`kineverse.LoopConstraint`, with a remark. ``"constraint"``: all are kept so.
+        ``"refuse"``: what cannot be solved is an error.
 
     Raises
     ------
@@ -54,18 +59,21 @@ def load(source: str | os.PathLike[str], prefix: str | None = None) -> Model:
         If there is no such model.
     FormatError
         If the file is not what it should be, with file, line, element and reason; or if the prefix is not.
+    ValueRejectedError
+        If ``loops`` is none of these.
     """
     check_prefix(prefix)
+    check_loops(loops)
     found = locate_model(source)
     content = _content(found)
     remembered = _stands_alone(found, content)
-    key = found, prefix, hashlib.blake2b(content).digest()
+    key = found, prefix, loops, hashlib.blake2b(content).digest()
     known = _REMEMBERED.pop(key, None)
     if known is None:
         model = Model()
         with listening() as remarks, _blaming(found.path), model.edit() as edit, no_collection():
-            for tag, operation in _operations(found, content, prefix):
-                _apply(edit, tag, operation, found.path)
+            for _ in _applied(edit, found, content, prefix, loops):
+                pass
         if len(content) > LARGEST_REMEMBERED or not remembered:
             return model
         known = model.snapshot(), remarks
@@ -91,27 +99,31 @@ def _blaming(path: Path) -> Iterator[None]:
         raise
 
 
-def _apply(edit: Edit, tag: str, operation: Operation, path: Path) -> None:
-    """Apply an operation; a loop that a description asks for and that cannot be closed is its fault."""
-    try:
-        edit.apply(operation, tag)
-    except KineverseError as error:
-        what = "joint" if _is_sdf(path.name) else "equality" if path.name.endswith((".xml", ".mjcf")) else ""
-        if isinstance(operation, CloseLoop) and what:
-            raise FormatError(
-                f"{path.name}: the {what} '{operation.name.removesuffix('/loop')}' closes a loop, which "
-                f"cannot be followed here: {error} Remove the {what}, and close the loop with kv.CloseLoop."
-            ) from error
-        raise
-
-
-def operations_of(
-    source: str | os.PathLike[str], prefix: str | None = None
-) -> Iterator[tuple[str, Operation]]:
-    """Yield the operations of a file or shipped model, each with its tag."""
+def include(
+    edit: Edit, source: str | os.PathLike[str], prefix: str | None = None, loops: Loops = "solve"
+) -> list[str]:
+    """Append the operations of a file or shipped model to an edit, see :func:`load`; return their tags."""
     check_prefix(prefix)
+    check_loops(loops)
     found = locate_model(source)
-    yield from _operations(found, _content(found), prefix)
+    return list(_applied(edit, found, _content(found), prefix, loops))
+
+
+def _applied(edit: Edit, source: Source, content: bytes, prefix: str | None, loops: Loops) -> Iterator[str]:
+    """Apply the operations of a source, and yield their tags."""
+    name = source.path.name
+    closing = "joint" if _is_sdf(name) else "equality" if _is_mjcf(name, content) else ""
+    operations = _operations(source, content, prefix)
+    if not closing or source.scene:
+        for tag, operation in operations:
+            yield edit.apply(operation, tag)
+        return
+    from .closures import Closures  # of what few files close
+
+    closures = Closures(edit, edit.model, name, closing, loops)
+    for tag, operation in operations:
+        yield from closures.apply(tag, operation)
+    yield from closures.finish()
 
 
 def _content(source: Source) -> bytes:

@@ -16,8 +16,9 @@ from kineverse.expressions.implicit import ImplicitFunction
 from kineverse.symbols import Symbol
 
 from .branches import find_branches, nearest_closed
-from .equations import CLOSED, Array, Equations, periodic
-from .samples import Samples
+from .continuation import follow
+from .equations import CLOSED, Array, Effort, Equations, periodic
+from .samples import Samples, place
 from .seed import Interval, Seed, products_of
 
 RANK = 1e-7
@@ -29,6 +30,12 @@ _SMALL = 1e-3
 _DEGREES = (2, 3, 4, 6, 8, 10, 12, 16, 20, 24, 32)
 _MORE_STEPS = 4
 _STEPS = (1, 2, 3, 4, 5, 6, 8, 10)
+
+_PARTS = (1.0, 0.6, 0.3, 0.1, 0.03)
+"""Parts of the margin that are tried, largest first, where all of it is too much."""
+
+_BEFORE_MEETING, _BEFORE_ENDING = 0.9, 1 - 1e-4
+"""Which part of the way through the margin counts, up to where branches meet or loops below end."""
 
 
 @dataclass(frozen=True)
@@ -97,16 +104,18 @@ def close(
     Raises
     ------
     UnsolvedError
-        If it does not close at home, or not within all of the limits; if there is no such branch.
+        If it does not close at home, or not within all of the limits; if there is no such branch; if finding
+        out takes too much work.
     ValueRejectedError
         If the choice of coordinates does not fit the mobility, or limits are missing.
     """
     parameters = tuple(s for s in residual.symbols if not s.has_derivative)
     values = np.array([home[s] for s in coordinates])
     given = np.array([home[s] for s in parameters])
-    unknown = Equations(residual, coordinates, parameters)
+    effort = Effort(name)
+    unknown = Equations(residual, coordinates, parameters, effort)
     if not np.isfinite(unknown.gap(values, given)):
-        at = ", ".join(f"{s} = {v:.6g}" for s, v in zip(coordinates, values, strict=True))
+        at = place(coordinates, values)
         raise UnsolvedError(f"Loop '{name}' is not defined at {at}. Begin elsewhere, with home={{...}}.")
     start, gap = nearest_closed(unknown, values, given)
     if gap > CLOSED:
@@ -117,7 +126,7 @@ def close(
     followers = _followers(name, unknown, start, given, rank, dependent)
     free = tuple(s for s in coordinates if s not in followers)
     inputs = (*free, *parameters)
-    equations = Equations(residual, followers, inputs)
+    equations = Equations(residual, followers, inputs, effort)
 
     u = np.array([home[s] for s in inputs])
     x = np.array([home[s] for s in followers])
@@ -126,7 +135,7 @@ def close(
     reach = np.where(angles, np.pi, np.where(np.isfinite(spans), spans, np.pi) + 1.0)
     stands = None if upright is None else compile(upright, [*followers, *inputs], tier="interpreter")
     found, gap = find_branches(equations, x, u, angles, reach, stands)
-    where = ", ".join(f"{s} = {home[s]:.6g}" for s in free) or "all configurations"
+    where = place(free, u[: len(free)]) or "all configurations"
     if not found:
         raise UnsolvedError(
             f"Loop '{name}' does not close at {where}: {gap:.6g} is left between its ends. "
@@ -143,7 +152,8 @@ def close(
     if parameters:
         # The seed knows one value of them only; from there it is further to others.
         steps += _MORE_STEPS
-    function = ImplicitFunction(name, followers, inputs, residual, rows, seed.expression(free), steps)
+    domain = (*map(_domain, seed.intervals), *((-np.inf, np.inf) for _ in parameters))
+    function = ImplicitFunction(name, followers, inputs, residual, rows, seed.expression(free), steps, domain)
     return Closed(
         function, free, followers, len(coordinates) - rank, len(found), branch,
         sampled.condition, tuple(sampled.worst.tolist()),
@@ -214,27 +224,78 @@ def _interval(name: str, symbol: Symbol, limits: tuple[float, float] | None, ang
     return Interval(float(lower), float(upper))
 
 
+def _domain(interval: Interval) -> tuple[float, float]:
+    """Return where an input may be; rounding at the edge is no reason to refuse it."""
+    if interval.whole:
+        return -np.inf, np.inf
+    slack = 1e-9 * max(1.0, interval.upper - interval.lower)
+    return interval.lower - slack, interval.upper + slack
+
+
 def _fitted(
     name: str,
     equations: Equations,
-    intervals: Sequence[Interval],
+    limits: Sequence[Interval],
     x: Array,
     u: Array,
     angles: npt.NDArray[np.bool_],
 ) -> tuple[Samples, Seed, int, tuple[int, ...]]:
     """Return what was sampled, and the seed for it with its steps and rows.
 
-    If possible it is good for a little more than the limits: estimates and controllers overstep them.
+    It is good for more than the limits, by as much of the margin around them as the branch can be followed.
     """
-    wider = [i.wider() for i in intervals]
-    if wider != intervals:
+
+    def fitted(intervals: Sequence[Interval]) -> tuple[Samples, Seed, int, tuple[int, ...]]:
+        samples = Samples(name, equations, limits, intervals, x, u, angles)
+        return samples, *_chosen_seed(name, samples)
+
+    if all(i.whole for i in limits):
+        return fitted(limits)
+    reaches = _reaches(equations, limits, x, u)
+    alone: tuple[Samples, Seed, int, tuple[int, ...]] | None = None
+    for part in _PARTS:
+        wider = [i.wider(part * r[0], part * r[1]) for i, r in zip(limits, reaches, strict=True)]
         try:
-            samples = Samples(name, equations, intervals, wider, x, u, angles)
-            return samples, *_chosen_seed(name, samples)
+            return fitted(wider)
         except UnsolvedError:
-            pass
-    samples = Samples(name, equations, intervals, intervals, x, u, angles)
-    return samples, *_chosen_seed(name, samples)
+            # If it cannot be closed within the limits, no margin is narrow enough: that is told at once.
+            alone = alone or fitted(limits)
+    assert alone is not None
+    return alone
+
+
+def _reaches(
+    equations: Equations, limits: Sequence[Interval], x: Array, u: Array
+) -> list[tuple[float, float]]:
+    """Return in which parts of the margin below and above each limit the branch goes on, others at home."""
+    home = u.copy()
+    home[: len(limits)] = [min(max(v, i.lower), i.upper) for v, i in zip(u, limits, strict=False)]
+    x = follow(equations, x, u, home).solution
+    reaches = []
+    for k, (limit, wide) in enumerate(zip(limits, [i.wider() for i in limits], strict=True)):
+        parts = []
+        for edge, end in ((limit.lower, wide.lower), (limit.upper, wide.upper)):
+            there, beyond = home.copy(), home.copy()
+            there[k], beyond[k] = edge, end
+            at_edge = follow(equations, x, home, there).solution
+            way = follow(equations, at_edge, there, beyond)
+            part = way.part
+            if part < 1.0:
+                # Branches meet at a dead centre. What this loop is built on ends without one.
+                stop = there + part * (beyond - there)
+                meet = _regularity(equations, way.solution, stop) < 0.5 * _regularity(
+                    equations, at_edge, there
+                )
+                part *= _BEFORE_MEETING if meet else _BEFORE_ENDING
+            parts.append(part)
+        reaches.append((parts[0], parts[1]))
+    return reaches
+
+
+def _regularity(equations: Equations, x: Array, u: Array) -> float:
+    """Return the smallest singular value of ∂r/∂x over the largest."""
+    values = np.linalg.svd(equations(x, u)[1], compute_uv=False)
+    return float(values[-1] / max(values[0], 1e-30))
 
 
 def _chosen_seed(name: str, samples: Samples) -> tuple[Seed, int, tuple[int, ...]]:
@@ -261,8 +322,7 @@ def _chosen_seed(name: str, samples: Samples) -> tuple[Seed, int, tuple[int, ...
 
 
 def _too_close(name: str, samples: Samples) -> UnsolvedError:
-    pairs = zip(samples.equations.inputs, samples.worst, strict=False)
-    at = ", ".join(f"{s} = {v:.6g}" for s, v in pairs)
+    at = place(samples.equations.inputs, samples.worst)
     return UnsolvedError(
         f"Loop '{name}' is singular, or too close to it, near {at} (condition {samples.condition:.2g}) for "
         "Newton's method to be sure of its branch. Narrow the limits, or the loop's within={...}."

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import TypeAlias
 
 import numpy as np
@@ -22,6 +23,40 @@ _NEWTON = 30
 _SINGULAR = 1e-9
 
 
+MOST_EFFORT = 150_000.0
+"""How much is spent on closing one loop: some ten seconds. Loops of usual size take a fifth of it."""
+
+
+@dataclass
+class Effort:
+    """How much may still be spent on analysing a loop, the same in every process and on every machine.
+
+    Attributes
+    ----------
+    name
+        Of the loop.
+    left
+        What is left; an evaluation of a few equations is 1.
+
+    Raises
+    ------
+    UnsolvedError
+        When nothing is left.
+    """
+
+    name: str
+    left: float = MOST_EFFORT
+
+    def spend(self, amount: float) -> None:
+        """Take something from what is left."""
+        self.left -= amount
+        if self.left < 0:
+            raise UnsolvedError(
+                f"Loop '{self.name}' is too much work: its branch is not known after {MOST_EFFORT:.0f} "
+                "evaluations. Narrow the limits, or close it in parts."
+            )
+
+
 class Equations:
     """A residual r(x, u) with its derivatives, at numbers.
 
@@ -31,16 +66,22 @@ class Equations:
         Of shape (m,).
     unknowns, inputs
         The symbols x, shape (n,), and u, shape (k,).
+    effort
+        What may be spent on evaluations.
     """
 
-    def __init__(self, residual: Expression, unknowns: Sequence[Symbol], inputs: Sequence[Symbol]) -> None:
+    def __init__(
+        self, residual: Expression, unknowns: Sequence[Symbol], inputs: Sequence[Symbol], effort: Effort
+    ) -> None:
         self.unknowns, self.inputs = tuple(unknowns), tuple(inputs)
+        self._effort, self._size = effort, 1 + residual.size * len(self.unknowns) / 100
         by_all = residual.partial([*unknowns, *inputs])
         function = compile([residual, by_all], [*unknowns, *inputs], tier="interpreter")
         self._evaluate = function.bind()
 
     def __call__(self, x: Array, u: Array) -> tuple[Array, Array, Array]:
         """Return r, ∂r/∂x and ∂r/∂u; r is infinite where they are not defined."""
+        self._effort.spend(self._size)
         n = len(self.unknowns)
         self._evaluate.input[:n] = x
         self._evaluate.input[n:] = u

@@ -17,10 +17,11 @@ from kineverse.symbols import Symbol
 
 from .closing import Closed, close
 from .record import loop_record
+from .residual import AXES, check_mask, residual_rows, upright
+
+__all__ = ["AXES", "CloseLoop"]
 
 Item = TypeVar("Item", bound=tuple[Any, ...])
-
-AXES = ("x", "y", "z", "rx", "ry", "rz")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -87,11 +88,7 @@ class CloseLoop(Operation):
             given = getattr(self, field)
             if isinstance(given, list) or (field == "mask" and isinstance(given, str)):
                 object.__setattr__(self, field, tuple(given))
-        known = isinstance(self.mask, tuple) and all(a in AXES for a in self.mask)
-        if not known or not self.mask or len(set(self.mask)) < len(self.mask):
-            raise ValueRejectedError(
-                f"The mask of loop '{self.name}' has names out of {', '.join(AXES)}, not {self.mask!r}."
-            )
+        check_mask(self.mask, self.name)
         if isinstance(self.branch, bool) or not isinstance(self.branch, int):
             raise ValueRejectedError(
                 f"The branch of loop '{self.name}' is a number from 0, not {self.branch!r}."
@@ -131,7 +128,11 @@ class CloseLoop(Operation):
                 f"There is an articulation '{self.name}' already; give loop '{self.name}' another name."
             )
         residual = array([row for frame, to in self._ends for row in self._rows(model, frame, to)])
-        signs = [sign for frame, to in self._ends for sign in self._upright(model, frame, to)]
+        signs = [
+            sign
+            for frame, to in self._ends
+            for sign in upright(model.resolve(model.fk(frame, to)), self.mask)
+        ]
         moving = {s for s in residual.symbols if s.has_derivative}
         on_the_way = [s for frame, to in self._ends for s in model.coordinates_between(frame, to)]
         coordinates = list(dict.fromkeys([s for s in on_the_way if s in moving] + sorted(moving, key=str)))
@@ -189,38 +190,20 @@ class CloseLoop(Operation):
         pose = model.resolve(model.fk(frame, to))
         if not any(s.has_derivative for s in pose.symbols):
             raise ModelError(f"Loop '{self.name}' cannot move: '{frame}' and '{to}' are rigidly connected.")
-        p, r = pose[:3, 3], pose[:3, :3]
-        axis = [(r[2, 1] - r[1, 2]) / 2, (r[0, 2] - r[2, 0]) / 2, (r[1, 0] - r[0, 1]) / 2]
-        rows = dict(zip(AXES, [p[0], p[1], p[2], *axis], strict=True))
         kept = []
-        for axis_name in self.mask:
-            row = rows[axis_name]
+        for axis, row in residual_rows(pose, self.mask).items():
             if row.symbols:
                 kept.append(row)
             elif abs(float(row)) > 1e-9:
                 raise UnsolvedError(
                     f"Loop '{self.name}' does not close: '{frame}' and '{to}' are {float(row):.6g} apart "
-                    f"along '{axis_name}', whatever moves."
+                    f"along '{axis}', whatever moves."
                 )
         if not kept:
             raise ModelError(
                 f"Loop '{self.name}' is closed already: nothing of '{frame}' that its mask names moves."
             )
         return kept
-
-    def _upright(self, model: Reader, frame: str, to: str) -> list[Expression]:
-        """Return what is positive where angles that the mask makes zero are not half a turn."""
-        turning = [axis for axis in "xyz" if f"r{axis}" in self.mask]
-        if not turning:
-            return []
-        r = model.resolve(model.fk(frame, to))[:3, :3]
-        x, y, z = r[0, 0], r[1, 1], r[2, 2]
-        if len(turning) == 3:
-            return [x + y + z]
-        diagonal = dict(zip("xyz", (x, y, z), strict=True))
-        if len(turning) == 2:
-            return [diagonal[axis] for axis in "xyz" if axis not in turning]
-        return [sum((diagonal[axis] for axis in "xyz" if axis not in turning), array(0.0))]
 
     def _limits(self, model: Reader, symbol: Symbol) -> tuple[float, float] | None:
         """Return the position limits that the joint of a coordinate wrote, if they are numbers."""

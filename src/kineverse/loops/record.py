@@ -13,7 +13,8 @@ from kineverse.symbols import symbol_name
 
 from .closing import Closed
 
-KIND = "closedloop"
+KIND, CONSTRAINED = "closedloop", "loopconstraint"
+KINDS = (KIND, CONSTRAINED)
 
 
 @dataclass(frozen=True)
@@ -30,6 +31,8 @@ class LoopRecord:
         Names out of ``x y z rx ry rz``.
     free, dependent
         The names of the coordinates that move by themselves, and of those that follow.
+    constraints
+        The names of the constraints that keep it closed, where nothing follows.
     """
 
     name: str
@@ -37,6 +40,7 @@ class LoopRecord:
     mask: tuple[str, ...]
     free: tuple[str, ...]
     dependent: tuple[str, ...]
+    constraints: tuple[str, ...] = ()
 
 
 def loop_record(ends: tuple[tuple[str, str], ...], mask: tuple[str, ...], closed: Closed) -> Articulation:
@@ -56,7 +60,18 @@ def loop_record(ends: tuple[tuple[str, str], ...], mask: tuple[str, ...], closed
             ("branch", closed.branch),
             ("condition", closed.condition),
             ("worst at", closed.worst),
+            ("domain", closed.function.domain),
         ),
+    )
+
+
+def constrained_record(
+    ends: tuple[tuple[str, str], ...], mask: tuple[str, ...], constraints: tuple[str, ...]
+) -> Articulation:
+    """Return what is put on record of a loop that constraints keep closed."""
+    frame, to = ends[0]
+    return Articulation(
+        CONSTRAINED, to, frame, dynamics=(("ends", ends), ("mask", mask), ("constraints", constraints))
     )
 
 
@@ -69,19 +84,19 @@ def loops_of(model: ModelView) -> Iterator[LoopRecord]:
     followers = set(map(str, model.rates.dependent))
     for name, record in model.articulations.items():
         known = dict(record.dynamics)
-        if record.kind != KIND or not _is_complete(known):
+        if record.kind not in KINDS or not _is_complete(known, record.kind):
             continue
         loop = _as_named(name, record, known)
-        if followers >= set(loop.dependent) and all(
-            frame in model.frames or frame == WORLD for pair in loop.ends for frame in pair
-        ):
+        there = followers >= set(loop.dependent) and all(c in model.constraints for c in loop.constraints)
+        if there and all(frame in model.frames or frame == WORLD for pair in loop.ends for frame in pair):
             yield loop
 
 
-def _is_complete(known: Mapping[str, Any]) -> bool:
+def _is_complete(known: Mapping[str, Any], kind: str) -> bool:
     """Whether a record has what it should have: documents may contain anything under these names."""
     ends = known.get("ends")
-    texts = (known.get(key) for key in ("mask", "free", "dependent"))
+    said = ("mask", "free", "dependent") if kind == KIND else ("mask", "constraints")
+    texts = (known.get(key) for key in said)
     return (
         isinstance(ends, tuple)
         and bool(ends)
@@ -104,8 +119,9 @@ def _as_named(name: str, record: Articulation, known: Mapping[str, Any]) -> Loop
     prefix = renamed.removesuffix(saved)
     before = symbol_name(prefix, 0)
     ends = tuple((_below(prefix, one), _below(prefix, other)) for one, other in known["ends"])
-    free, dependent = (tuple(f"{before}{s}" for s in known[key]) for key in ("free", "dependent"))
-    return LoopRecord(name, ends, known["mask"], free, dependent)
+    free, dependent = (tuple(f"{before}{s}" for s in known.get(key, ())) for key in ("free", "dependent"))
+    constraints = tuple(f"{prefix}{c}" for c in known.get("constraints", ()))
+    return LoopRecord(name, ends, known["mask"], free, dependent, constraints)
 
 
 def _below(prefix: str, frame: str) -> str:

@@ -9,6 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from kineverse.errors import UnsolvedError
+from kineverse.symbols import Symbol
 
 from .continuation import follow
 from .equations import Array, Equations
@@ -17,6 +18,8 @@ from .seed import FEW, Interval
 _SAMPLES = {1: 65, 2: 17, 3: 9}
 _SCATTERED = 400
 _TRIED = 200
+_MOST_CORNERED = 8
+_SHOWN = 6
 
 
 class Samples:
@@ -58,7 +61,7 @@ class Samples:
         else:  # a grid would have more points than anybody waits for
             parts = generator.uniform(size=(_SCATTERED, k))
             grid = np.column_stack([i.spread(p) for i, p in zip(intervals, parts.T, strict=True)])
-        corners = np.vstack([_corners(limits), _corners(intervals)])
+        corners = np.vstack([_corners(limits, generator), _corners(intervals, generator)])
         tried = np.vstack([corners, generator.uniform(lower, upper, (_TRIED, k))])
         everywhere = np.vstack([home, grid, tried])
         solutions = self._everywhere(x, everywhere)
@@ -89,9 +92,7 @@ class Samples:
         reached = follow(self.equations, x, self.all_inputs(start), self.all_inputs(end))
         if reached.part < 1.0:
             there = start + reached.part * (end - start)
-            names = [str(s) for s in self.equations.inputs]
-            at = ", ".join(f"{s} = {v:.6g}" for s, v in zip(names, there, strict=False))
-            to = ", ".join(f"{v:.6g}" for v in end)
+            at, to = place(self.equations.inputs, there), place(self.equations.inputs, end, named=False)
             raise UnsolvedError(
                 f"Loop '{self.name}' does not close on the way to {to}: it ends, or is singular, at {at}. "
                 "Narrow the limits, or the loop's within={...}, so that it closes everywhere."
@@ -140,8 +141,20 @@ class Samples:
         return np.linalg.svd(by_x, compute_uv=False).astype(np.float64)
 
 
-def _corners(intervals: Sequence[Interval]) -> Array:
-    return _grid([np.array([i.lower, i.upper]) for i in intervals])
+def place(symbols: Sequence[Symbol], values: Array, named: bool = True) -> str:
+    """Return where some inputs are, the first few of them, for a message."""
+    pairs = list(zip(symbols, values.tolist(), strict=False))
+    shown = ", ".join(f"{s} = {v:.6g}" if named else f"{v:.6g}" for s, v in pairs[:_SHOWN])
+    return shown + (", ..." if len(pairs) > _SHOWN else "")
+
+
+def _corners(intervals: Sequence[Interval], generator: np.random.Generator) -> Array:
+    """Return the corners of a box, or some of them if there are many."""
+    ends = np.array([(i.lower, i.upper) for i in intervals]).reshape(-1, 2)
+    if len(ends) <= _MOST_CORNERED:
+        return _grid(list(ends))
+    which = generator.integers(0, 2, (1 << _MOST_CORNERED, len(ends)))
+    return np.take_along_axis(ends, which.T, axis=1).T
 
 
 def _grid(axes: Sequence[Array]) -> Array:

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from kineverse.expressions.expression import Expression, array
-from kineverse.expressions.functions import cos, maximum, minimum, sin
+from kineverse.expressions.functions import cos, sin
 from kineverse.symbols import Symbol
 
 from .equations import Array
@@ -22,8 +22,9 @@ from .equations import Array
 FEW = 3
 """Up to how many inputs all products are used, and samples lie on a grid."""
 
-_MARGIN = 0.05
-"""How much further than its limits a loop is to be evaluated on each side, of their distance."""
+MARGIN = 0.2
+"""How much further than its limits a loop is continued on each side: of their distance, and at least [m] or
+[rad]. Estimates and controllers overstep limits."""
 
 
 @dataclass(frozen=True)
@@ -42,10 +43,12 @@ class Interval:
     upper: float
     whole: bool = False
 
-    def wider(self) -> Interval:
-        """Return limits with a margin around them; whole turns have none."""
-        margin = 0.0 if self.whole else _MARGIN * (self.upper - self.lower)
-        return Interval(self.lower - margin, self.upper + margin, self.whole)
+    def wider(self, below: float = 1.0, above: float = 1.0) -> Interval:
+        """Return limits with parts of a margin around them; whole turns have none."""
+        if self.whole:
+            return self
+        margin = MARGIN * max(self.upper - self.lower, 1.0)
+        return Interval(self.lower - below * margin, self.upper + above * margin)
 
     def samples(self, count: int) -> Array:
         """Return points at which fits are well behaved, in order."""
@@ -89,7 +92,7 @@ class Interval:
                 result += [ck, sk]
                 ck, sk = ck * c - sk * s, sk * c + ck * s
             return result
-        t = maximum(-1.0, minimum(1.0, (2 * u - self.lower - self.upper) / (self.upper - self.lower)))
+        t = (2 * u - self.lower - self.upper) / (self.upper - self.lower)
         result = [one, t]
         while len(result) <= degree:
             result.append(2 * t * result[-1] - result[-2])

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from kineverse.collection import no_collection
 from kineverse.errors import EditError
@@ -18,6 +18,11 @@ from .history import History
 from .operation import Effects, Operation
 from .rates import Row, as_row
 from .reader import Reader
+
+if TYPE_CHECKING:
+    from kineverse.formats.loops import Loops
+
+    from .view import ModelView
 
 
 @dataclass(frozen=True)
@@ -111,8 +116,9 @@ class Edit:
     shows the edit so far; other threads wait.
     """
 
-    def __init__(self, history: History) -> None:
+    def __init__(self, history: History, model: ModelView) -> None:
         self._history = history
+        self._model = model
         self._open = True
         self._added: dict[str, None] = {}
         self._removed: dict[str, None] = {}
@@ -242,12 +248,17 @@ class Edit:
         """Store an immutable value under ``data``."""
         return self.apply(Write(name, value), tag)
 
-    def include(self, source: Any, prefix: str | None = None) -> list[str]:
+    def include(self, source: Any, prefix: str | None = None, *, loops: Loops = "solve") -> list[str]:
         """Append the operations of a file or shipped model, see :func:`kineverse.load`; return their tags."""
-        from kineverse.formats.loading import operations_of
+        from kineverse.formats.loading import include
 
         with no_collection():
-            return [self.apply(operation, tag) for tag, operation in operations_of(source, prefix)]
+            return include(self, source, prefix, loops)
+
+    @property
+    def model(self) -> ModelView:
+        """The model that is edited, which shows the edit so far."""
+        return self._model
 
     # -- inside --------------------------------------------------------------------------------------------
 

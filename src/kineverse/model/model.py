@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from kineverse.errors import EditError
 from kineverse.symbols import Symbol
@@ -15,6 +15,9 @@ from .history import Entry, History
 from .listeners import Listener, Listeners
 from .reader import ABSENT
 from .view import ModelView
+
+if TYPE_CHECKING:
+    from kineverse.formats.loops import Loops
 
 
 class Model(ModelView):
@@ -56,7 +59,7 @@ class Model(ModelView):
                 raise EditError("The model is being edited already; use that edit.")
             self._history.begin()
             runs = self._history.runs
-            self._edit = edit = Edit(self._history)
+            self._edit = edit = Edit(self._history, self)
             try:
                 yield edit
                 self._history.settle()
@@ -98,10 +101,10 @@ class Model(ModelView):
             runs,
         )
 
-    def include(self, source: Any, prefix: str | None = None) -> list[str]:
+    def include(self, source: Any, prefix: str | None = None, *, loops: Loops = "solve") -> list[str]:
         """Add a file or a shipped model in one edit; returns the tags. See :func:`kineverse.load`."""
         with self.edit() as edit:
-            return edit.include(source, prefix)
+            return edit.include(source, prefix, loops=loops)
 
     def listen(
         self,

@@ -12,6 +12,7 @@ import casadi as ca
 from kineverse.expressions.expression import Expression, as_expression, binary, unary
 from kineverse.expressions.functions import norm
 from kineverse.expressions.gradient import partial
+from kineverse.expressions.implicit import held
 from kineverse.symbols import Symbol
 
 from .constraint import Constraint
@@ -84,7 +85,7 @@ class SpeedLimits:
         if affine is None:
             return "it is neither affine in the speeds nor a norm of speeds"
         weights, offset = affine
-        row = Row(name, weights, less(lower, offset), less(upper, offset))
+        row = Row(name, weights, less(held(lower), offset), less(held(upper), offset))
         self.rows.append(row)
         self._affine.append(row)
         return None
@@ -128,7 +129,7 @@ class SpeedLimits:
         parts = [part for c in components if (part := _affine(self._rates.eliminate(c))) is not None]
         if len(parts) < len(components):
             return "the norm is of something that is not affine in the speeds"
-        inner = upper * inner_radius(len(components))
+        inner = held(upper) * inner_radius(len(components))
         for direction in directions(len(components)):
             weights: dict[Symbol, Expression] = {}
             offset = ZERO
@@ -203,4 +204,4 @@ def _affine(expression: Expression) -> tuple[dict[Symbol, Expression], Expressio
     if any(s.order for s in slopes.symbols):
         return None
     offset = expression.substitute(dict.fromkeys(speeds, 0.0))
-    return {s: slopes[i] for i, s in enumerate(speeds)}, offset
+    return {s: held(slopes[i]) for i, s in enumerate(speeds)}, held(offset)

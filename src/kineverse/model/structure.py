@@ -18,6 +18,7 @@ from . import kinematics
 from .articulation import Articulation
 from .body import Body
 from .constraint import Constraint
+from .equalities import Equalities
 from .frame import WORLD, Frame
 from .listing import Listing
 from .operation import ARTICULATIONS, BODIES, CONSTRAINTS, DATA, FRAMES, RATES
@@ -57,6 +58,7 @@ class Structure:
         self._carried_constraints: dict[str, Constraint] = {}
         self._all_symbols: tuple[Symbol, ...] | None = None
         self._checks: Checks | None = None
+        self._equalities: Equalities | None = None
 
     def _changed(self, changes: Sequence[tuple[Cell, Any, Any]]) -> None:
         """Drop what no longer holds."""
@@ -71,6 +73,8 @@ class Structure:
         if FRAMES in kinds:
             self._poses.clear()
             self._jacobians.clear()
+        if kinds & {CONSTRAINTS, RATES, ARTICULATIONS}:
+            self._equalities = None
         if CONSTRAINTS in kinds or RATES in kinds:
             self._checks = None
             for (kind, name), _, _ in changes:

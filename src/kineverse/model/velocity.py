@@ -13,6 +13,9 @@ below what can be braked within the distance left, on the way back as well.
 A constraint that is affine in speeds is the row itself. A limited norm of two speeds becomes the 16 sides of
 the polygon inscribed in the circle, which gives away 1.9 % at most and never exceeds the limit; one of three
 becomes the 128 faces of a polyhedron inscribed in the sphere, which gives away 3.8 %.
+
+Farther out than a closed loop is known, what it determines has the rows that it has where that begins: the
+way back needs no value from there.
 """
 
 from __future__ import annotations
@@ -24,6 +27,7 @@ from dataclasses import dataclass
 from kineverse.errors import ValueRejectedError
 from kineverse.expressions.expression import Expression, array
 from kineverse.expressions.functions import sqrt
+from kineverse.expressions.implicit import held
 from kineverse.number import real_number
 from kineverse.symbols import Symbol
 
@@ -207,7 +211,8 @@ def _gaps(constraint: Constraint, rates: Rates) -> list[_Gap]:
         if not is_infinite(bound):
             distance = sign * (bound - constraint.expression)
             away = _over_free_speeds(distance.gradient(heuristic=False), rates)
-            found.append(_Gap(sign, distance, only(away, away)))
+            away = {s: held(weight) for s, weight in away.items()}
+            found.append(_Gap(sign, held(distance), only(away, away)))
     return found
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -14,8 +14,10 @@ from kineverse.state import State
 from kineverse.symbols import Symbol, parse_symbol_name
 
 from .constraint import Constraint
+from .equalities import Equalities
 from .integration import integrate
 from .operation import ARTICULATIONS, CONSTRAINTS
+from .projection import TOLERANCE, project
 from .structure import Structure
 from .velocity import VelocityRows, velocity_rows
 from .violations import Checks, Violations, find_violations
@@ -200,6 +202,45 @@ class ModelView(Structure):
         with self._lock:
             coordinates, rates = self.degrees_of_freedom, self.rates
         return integrate(coordinates, rates, state, speeds, dt)
+
+    def project(
+        self, state: Mapping[Any, float], *, fixed: Iterable[Symbol | str] = (), tolerance: float = TOLERANCE
+    ) -> State:
+        """Return the state with coordinates moved as little as it takes for equality constraints to hold.
+
+        These are constraints on positions whose bounds are the same, such as closures of loops, see
+        :mod:`kineverse.model.projection`. Coordinates that they are about are moved to where they hold, with
+        whatever else limits these coordinates. What holds already and all other values stay.
+
+        Parameters
+        ----------
+        state
+            A state, or a mapping from symbols or names to numbers.
+        fixed
+            Names, or symbols, of coordinates and articulations that do not move.
+        tolerance
+            How far an equality may be off, in its unit.
+
+        Raises
+        ------
+        UnsolvedError
+            If no such place is found, naming what does not hold, by how much, and what was tried; or if a
+            loop does not close at the state.
+        UnknownNameError
+            If a value is missing, or a name is unknown.
+        """
+        with self._lock:
+            self._catch_up()
+            if self._equalities is None:
+                self._equalities = self._equalities_of(None)
+            if not isinstance(state, State):
+                state = State({self.symbol(k) if isinstance(k, str) else k: v for k, v in state.items()})
+            return project(self._equalities, state, fixed, tolerance)
+
+    def _equalities_of(self, names: Collection[str] | None) -> Equalities:
+        """Return the equalities of these names, or all."""
+        self._catch_up()
+        return Equalities(dict(self._head[CONSTRAINTS]), self.rates, self._head[ARTICULATIONS], names)
 
     def save(
         self,

@@ -109,6 +109,9 @@ def _scaled(term: Term, known: list[Fraction]) -> Growth:
 def _around(function: ImplicitFunction, inputs: tuple[Fraction, ...]) -> tuple[Growth, ...]:
     """Return how unknowns grow with turns of the inputs: as the seed does, if the equations stay the same."""
     moving = {s: g for s, g in zip(function.inputs, inputs, strict=True) if g}
+    ends = dict(zip(function.inputs, function.domain, strict=False))
+    if any(math.isfinite(end) for s in moving for end in ends.get(s, ())):
+        return (None,) * len(function.unknowns)  # after a turn it is where the function has no value
     by = _growths(function.seed, moving)
     moving |= {s: g for s, g in zip(function.unknowns, by, strict=True) if g}
     same = None not in by and all(g == 0 for g in _growths(function.chosen, moving))

@@ -27,8 +27,10 @@ node                                                                  meaning
 ``["dependent", ref, symbol]``                                        a coordinate that is an expression of
                                                                       others
 ``["implicit", name, [symbol, ...], [symbol, ...], ref, [row, ...],   unknowns as a function of inputs:
-ref, steps, [ref, ...]]``                                             residual, its rows that are solved,
-                                                                      seed, Newton steps, and the inputs here
+ref, steps, [ref, ...], [[lower, upper], ...]]``                      residual, its rows that are solved,
+                                                                      seed, Newton steps, the inputs here, and
+                                                                      for each input where the function holds,
+                                                                      left out if that is everywhere
 ``["read", question, part, shape, [[symbol, trends], ...]]``          in traces: a part of the answer to a
                                                                       question, or an entry of its gradient
 ====================================================================  =====================================
@@ -182,7 +184,10 @@ class Table:
         if type(node) is Dependent:
             return self._shared(f'["dependent",{joined},{self.ref(node.coordinate)}]')
         if type(node) is Implicit:
-            return self._shared(f'["implicit",{self._function(node.function)},[{joined}]]')
+            f = node.function
+            within = ",".join(_numbers(ends) for ends in f.domain)
+            domain = f",[{within}]" if within else ""
+            return self._shared(f'["implicit",{self._function(f)},[{joined}]{domain}]')
         if type(node) in _PLAIN:
             return self._shared(f'["{node.kind}",{joined}]')
         raise FormatError(

@@ -13,14 +13,17 @@ from kineverse.expressions.node import Node
 from kineverse.model.rates import all_symbols
 from kineverse.symbols import Symbol
 
-from .checks import RefusedError, exactly, listed, name, whole
+from .checks import RefusedError, exactly, listed, name, numbers, whole
 from .graph import Graph
 from .limits import COST_OF_STEP, MAX_LENGTH, MAX_STEPS
 
 
 def read_implicit(graph: Graph, node: list[Any]) -> None:
     """Add an implicit function at some inputs."""
-    _, label, unknowns, inputs, residual, rows, seed, steps, arguments = exactly(node, 9)
+    # Where it holds is said by those that are known to hold within bounds, and by none of earlier versions.
+    _, label, unknowns, inputs, residual, rows, seed, steps, arguments, *domain = exactly(
+        node, 10 if len(node) > 9 else 9
+    )
     x = tuple(graph.symbol(ref) for ref in listed(unknowns, "the unknowns"))
     u = tuple(graph.symbol(ref) for ref in listed(inputs, "the inputs"))
     r, first = graph.expression(residual), graph.expression(seed)
@@ -36,12 +39,20 @@ def read_implicit(graph: Graph, node: list[Any]) -> None:
         rows=tuple(whole(row, MAX_LENGTH) for row in listed(rows, "the rows that are solved")),
         seed=first,
         steps=steps,
+        domain=tuple(_interval(ends) for given in domain for ends in listed(given, "a domain")),
     )
+    if domain and not function.domain:
+        raise RefusedError("a domain has a bound, or is left out")
     graph.work[function.key] = work
     if len(listed(arguments, "the arguments")) != len(u):
         raise RefusedError(f"{len(arguments)} arguments for {len(u)} inputs")
     refs = [graph.scalar_at(ref) for ref in arguments]
     graph.add_opaque(Implicit, refs, (len(x),), (function,), (residual, seed))
+
+
+def _interval(ends: Any) -> tuple[float, float]:
+    lower, upper = numbers(ends, 2)
+    return lower, upper
 
 
 def _work(graph: Graph, residual: Expression, unknowns: tuple[Symbol, ...], steps: int) -> int:

@@ -23,7 +23,7 @@ def tied(model: ModelView) -> Iterator[Loop]:
     for loop in loops_of(model):
         kind = _kind(model, loop)
         if kind is not None:
-            yield Loop(loop.name, kind, loop.ends, loop.free, loop.dependent)
+            yield Loop(loop.name, kind, loop.ends, loop.free, loop.dependent, loop.constraints)
 
 
 def _kind(model: ModelView, loop: LoopRecord) -> Literal["connect", "weld"] | None:

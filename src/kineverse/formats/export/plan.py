@@ -116,7 +116,8 @@ class Sum:
 class Loop:
     """Pairs of frames that are tied: their origins coincide (``connect``), or all of them does (``weld``).
 
-    ``free`` and ``dependent`` are the names of the coordinates in the loop, those that follow last.
+    ``free`` and ``dependent`` are the names of the coordinates in the loop, those that follow last, or
+    ``constraints`` those of what keeps it closed where none follows.
     """
 
     name: str
@@ -124,6 +125,7 @@ class Loop:
     ends: tuple[tuple[str, str], ...]
     free: tuple[str, ...]
     dependent: tuple[str, ...]
+    constraints: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)

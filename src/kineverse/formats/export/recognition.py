@@ -11,7 +11,7 @@ import numpy as np
 from kineverse.bounds.terms import Terms
 from kineverse.expressions.expression import Expression, as_expression
 from kineverse.expressions.substitution import apply
-from kineverse.loops.record import KIND as LOOP
+from kineverse.loops.record import KINDS as LOOPS
 from kineverse.model.articulation import Articulation
 from kineverse.model.body import Pose
 from kineverse.model.constraint import Constraint
@@ -85,7 +85,8 @@ class Recognition:
 
     def plan(self) -> Plan:
         """Return the plan; what cannot be said is in :attr:`refusals`."""
-        kept = {n: c for n, c in self._plain_constraints() if n not in self._left_out}
+        tied = {name for loop in self._loops for name in loop.constraints}
+        kept = {n: c for n, c in self._plain_constraints() if n not in self._left_out and n not in tied}
         found = list(sort_constraints(kept, self.resolve, self.refusals))
         ranges = limits_of(item for item in found if isinstance(item, Range))
         approximation = None
@@ -320,7 +321,7 @@ class Recognition:
 
 def _own_records(model: ModelView) -> Iterator[tuple[str, Articulation]]:
     for name, record in model.articulations.items():
-        if record.kind != LOOP:
+        if record.kind not in LOOPS:
             yield name, record
 
 

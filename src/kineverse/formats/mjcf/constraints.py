@@ -7,7 +7,6 @@ from typing import Literal
 
 import numpy as np
 
-from kineverse.errors import FormatError
 from kineverse.formats.poses import IDENTITY, inverse, product
 from kineverse.model.body import Pose
 
@@ -151,14 +150,9 @@ class Constraints:
                 product(self._rest[self._bodies.body_names[b]], pose)
                 for b, pose in zip(bodies, poses, strict=True)
             )
-            gap = _gap(first, second, kind)
-            if gap > _CLOSED:
-                raise FormatError(
-                    f"{where}: it ties bodies that are rigidly connected, and {gap:.3g} is left between its "
-                    "ends. Remove it, or move one of them."
-                )
-            self._note(node, "is left out: it ties bodies that are rigidly connected anyway.")
-            return
+            if _gap(first, second, kind) <= _CLOSED:
+                self._note(node, "is left out: it ties bodies that are rigidly connected anyway.")
+                return
         yield Closure(self._names[number], kind, names[0], names[1], inside[0], inside[1], where)
 
     # -- tendons ---------------------------------------------------------------------------------------------

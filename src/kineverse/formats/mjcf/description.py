@@ -136,7 +136,8 @@ class Scene:
     """All of a file.
 
     ``links`` begin with the world, and each comes after its parent. ``remarks`` say what was left out or read
-    in a way its author may not have meant; each names its line.
+    in a way its author may not have meant; each names its line. ``has_home`` says that a key of the file has
+    where joints are at home.
     """
 
     links: tuple[Link, ...] = ()
@@ -147,3 +148,4 @@ class Scene:
     tendon_couplings: tuple[Coupling, ...] = ()
     source: str = ""
     remarks: tuple[str, ...] = ()
+    has_home: bool = False

@@ -8,17 +8,19 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
 
-from kineverse.errors import FormatError
 from kineverse.expressions.expression import Expression, as_expression
 from kineverse.formats.groups import Groups
+from kineverse.formats.remarks import tell
 from kineverse.model.constraint import Constraint
 from kineverse.model.edit import Constrain
 from kineverse.symbols import position
 
-from .description import Coupling, Quartic
+from .description import Coupling, Joint, Quartic
 
 _FIXED = "\0"
 """Stands for what leads a joint that an equality holds where it is: no name has it."""
+
+_SAME = 1e-6
 
 
 class Followers:
@@ -67,13 +69,7 @@ class Followers:
         return end
 
     def constraints(self) -> Iterator[Constrain]:
-        """Yield the equalities that are left over.
-
-        Raises
-        ------
-        FormatError
-            If one says of joints that stand still that they are elsewhere.
-        """
+        """Yield the equalities that are left over; tell of those that can never hold."""
         for coupling in self.left_over:
             leader = as_expression(0.0) if coupling.leader is None else self.position(coupling.leader)
             along = polynomial(coupling.coefficients, leader - coupling.leader_rest)
@@ -82,10 +78,28 @@ class Followers:
                 name = self._named(coupling.name)
                 yield Constrain(name, Constraint.of(0.0, residual, 0.0))
             elif abs(float(residual)) > 1e-9:
-                raise FormatError(
-                    f"{coupling.where}: it holds its joint {abs(float(residual)):.6g} away from where "
-                    "another equality does. Remove one of them."
+                tell(
+                    [
+                        f"{coupling.where} is left out, and never holds: it holds its joint "
+                        f"{abs(float(residual)):.6g} away from where another equality does."
+                    ]
                 )
+
+    def tell_homes(self, joints: Iterable[Joint], source: str) -> None:
+        """Tell of followers that a file says to be elsewhere at home than where they follow to."""
+        homes = {joint.name: joint.home[0] for joint in joints if len(joint.home) == 1}
+        known = {position(self._named(name)): home for name, home in homes.items()}
+        for name in self.leaders:
+            follows = self.position(name)
+            if name in homes and all(s in known for s in follows.symbols):
+                there = float(follows({s: known[s] for s in follows.symbols}))
+                if abs(there - homes[name]) > _SAME:
+                    tell(
+                        [
+                            f"{source}: its home is moved to where equalities hold: '{self._named(name)}' "
+                            f"from {homes[name]:.6g} to {there:.6g}."
+                        ]
+                    )
 
 
 def polynomial(coefficients: Quartic, x: Expression) -> Expression:

@@ -16,6 +16,7 @@ from kineverse.expressions.expression import array
 from kineverse.expressions.gradient import total_derivative
 from kineverse.formats.poses import IDENTITY, product
 from kineverse.formats.set_body import SetBody, is_empty
+from kineverse.formats.set_home import SetHome
 from kineverse.model.body import Pose, Vector3
 from kineverse.model.constraint import Constraint
 from kineverse.model.edit import AddFrame, Constrain
@@ -28,7 +29,6 @@ from kineverse.symbols import position
 from .carrying import carried
 from .description import WORLD, Coupling, Joint, Link, Scene
 from .following import Followers
-from .home import SetHome
 from .loops import loop_operations
 from .tendons import Tendon, TendonCoupling
 
@@ -45,11 +45,6 @@ def scene_operations(scene: Scene, prefix: str | None = None) -> Iterator[Operat
     prefix
         Put in front of the names of frames and degrees of freedom, with a slash. The world of the file is
         the frame ``prefix/world`` then.
-
-    Raises
-    ------
-    FormatError
-        If two equalities contradict each other.
     """
 
     def named(name: str) -> str:
@@ -67,6 +62,8 @@ def scene_operations(scene: Scene, prefix: str | None = None) -> Iterator[Operat
     for site in scene.sites:
         yield AddFrame(named(site.name), Frame(named(site.parent), (site.pose,)))
     yield from followers.constraints()
+    if scene.has_home:
+        followers.tell_homes((joint for link in scene.links for joint in link.joints), scene.source)
     yield from loop_operations(scene, named, followers)
     for tendon in scene.tendons:
         yield Tendon(
@@ -81,7 +78,7 @@ def scene_operations(scene: Scene, prefix: str | None = None) -> Iterator[Operat
         yield _tendon_coupling(coupling, named)
     for link in scene.links:
         for joint in link.joints:
-            if joint.name not in followers and any(joint.home[:6]):
+            if joint.name not in followers and (any(joint.home[:6]) or _is_outside(joint, scene.has_home)):
                 yield SetHome(named(joint.name), joint.home)
 
 
@@ -105,6 +102,14 @@ def _link(link: Link, named: Named, followers: Followers) -> Iterator[Operation]
         place, parent = _offset((-x, -y, -z)), moved
     if parent != child:
         yield AddFrame(child, Frame(parent, (place,)))
+
+
+def _is_outside(joint: Joint, said: bool) -> bool:
+    """Return whether a file says that a joint is at home where it cannot be."""
+    if not said or joint.kind not in ("hinge", "slide") or not joint.home:
+        return False
+    lower, upper = joint.lower, joint.upper
+    return (lower is not None and joint.home[0] < lower) or (upper is not None and upper < joint.home[0])
 
 
 def _joint(

@@ -67,6 +67,7 @@ def parse_mjcf(text: str | bytes, source: str = "<mjcf>", folder: str = "") -> S
         found.tendon_couplings,
         source,
         tuple(notes.texts),
+        compiled.home is not None,
     )
 
 

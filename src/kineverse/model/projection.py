@@ -1,0 +1,294 @@
+"""Moving a state to where equality constraints hold: projection on their manifold.
+
+Of the free coordinates q that equalities are about, those are moved for which something does not hold, and
+what shares equalities with these. With rows c(q) = 0 for the equalities and h(q) <= 0 for all other
+constraints on positions, Gauss-Newton steps of least change,
+
+    min ‖Δq‖  subject to  J Δq = -(c, max(h, 0)),  lower <= q + Δq <= upper,
+
+lead to where they hold; coordinates that would leave their limits stay at them, and the rest makes up for it.
+From there, steps along the manifold lead to the place on it nearest to where the state was. Quaternions stay
+of unit length.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterable, Sequence
+
+import numpy as np
+
+from kineverse.errors import UnknownNameError, UnsolvedError, suggest
+from kineverse.state import State
+from kineverse.symbols import Symbol
+
+from .equalities import Array, Equalities
+
+TOLERANCE = 1e-9
+"""How far from holding a constraint may be, as in :meth:`kineverse.Model.violations`."""
+
+_STEPS, _NEARER = 100, 40
+_LONGEST = 0.5
+"""How far a step goes at most [m], [rad]: farther away, derivatives say little."""
+_STARTS = 12
+_SINGULAR, _AT_BOUND = 1e-9, 1e-9
+
+
+def project(
+    equalities: Equalities, state: State, fixed: Iterable[Symbol | str] = (), tolerance: float = TOLERANCE
+) -> State:
+    """Move coordinates so that equalities hold, and return the state, see :meth:`ModelView.project`."""
+    held = _held(equalities, fixed)
+    symbols = equalities.symbols
+    missing = [s for s in symbols if s not in state and s.value is None]
+    if missing:
+        raise UnknownNameError(
+            f"No value for '{missing[0]}', which a projection has to know. Start from "
+            "model.default_state().updated({...}) to have a value for everything."
+        )
+    at = np.array([state[s] if s in state else s.value or 0.0 for s in symbols], dtype=np.float64)  # noqa: SIM401
+    search = _search(equalities, at, held, tolerance)
+    if search is None:
+        return state
+    found = search.nearest()
+    moved = {s: float(found[i]) for i, s in enumerate(symbols) if found[i] != at[i]}
+    return state.updated(moved) if moved else state
+
+
+def _held(equalities: Equalities, fixed: Iterable[Symbol | str]) -> frozenset[Symbol]:
+    """Return the coordinates that stay, those behind what depends on others among them."""
+    dependent = {str(s): e for s, e in equalities.rates.dependent.items()}
+    records = equalities.articulations
+    by_name = {str(s): s for s in equalities.symbols}
+    by_name |= {str(s): s for record in records.values() for s in record.coordinates}
+    found: set[Symbol] = set()
+    for item in [fixed] if isinstance(fixed, (str, Symbol)) else fixed:
+        name = str(item)
+        if name in dependent:
+            found.update(s for s in dependent[name].symbols if s.has_derivative)
+        elif name in by_name:
+            found.add(by_name[name])
+        elif name in records:
+            found.update(records[name].coordinates)
+        else:
+            available = {*by_name, *dependent, *records}
+            raise UnknownNameError(
+                f"{name!r} cannot stay fixed: it is no coordinate. {suggest(name, available, 'coordinate')}"
+            )
+    return frozenset(found)
+
+
+def _search(equalities: Equalities, at: Array, held: frozenset[Symbol], tolerance: float) -> _Search | None:
+    """Return what is to be solved: what is broken, with all equalities about the same coordinates."""
+    count = equalities.count
+    if not count:
+        return None
+    equalities.evaluate(at)
+    values = equalities.evaluate.outputs[0]
+    about = [set(row.value.symbols) & set(equalities.coordinates) for row in equalities.rows]
+    broken = {i for i in range(count) if not abs(values[i]) <= tolerance}
+    moved = {s for i in range(count, len(about)) if not values[i] <= tolerance for s in about[i]}
+    for symbol, lower, upper in zip(equalities.coordinates, *equalities.limits, strict=True):
+        if not lower - tolerance <= at[equalities.symbols.index(symbol)] <= upper + tolerance:
+            moved.add(symbol)
+    if not broken and not moved - held:
+        return None
+    chosen: set[int] = set()
+    while more := {i for i in range(count) if i not in chosen and (i in broken or about[i] & (moved - held))}:
+        chosen |= more
+        moved |= set[Symbol]().union(*(about[i] for i in more))
+    chosen |= {i for i in range(count, len(about)) if about[i] & (moved - held)}
+    columns = [i for i, s in enumerate(equalities.coordinates) if s in moved and s not in held]
+    return _Search(equalities, sorted(chosen), columns, at, tolerance, held)
+
+
+class _Search:
+    """The search for one state: some rows, and some of the coordinates."""
+
+    def __init__(
+        self,
+        equalities: Equalities,
+        rows: list[int],
+        columns: list[int],
+        at: Array,
+        tolerance: float,
+        held: Collection[Symbol],
+    ) -> None:
+        self._equalities, self._rows, self._columns = equalities, rows, columns
+        self._tolerance, self._held = tolerance, held
+        self._equal = np.array([equalities.rows[i].equality for i in rows], dtype=bool)
+        place = {s: i for i, s in enumerate(equalities.symbols)}
+        self._places = [place[equalities.coordinates[c]] for c in columns]
+        self._at = at
+        lower, upper = equalities.limits
+        self._lower, self._upper = lower[columns], upper[columns]
+        of_column = {c: k for k, c in enumerate(columns)}
+        self._turns = [
+            [of_column[c] for c in four] for four in equalities.quaternions if set(four) <= set(columns)
+        ]
+
+    def nearest(self) -> Array:
+        """Return all numbers where everything holds, as near as can be to where they were.
+
+        Raises
+        ------
+        UnsolvedError
+            Naming what does not hold, by how much, and what was tried.
+        """
+        start = self._unit(np.clip(self._at[self._places], self._lower, self._upper))
+        best, found = start, []
+        least = np.inf
+        generator = np.random.default_rng(0)
+        for attempt in range(_STARTS + 1):
+            begin = start if not attempt else self._elsewhere(start, generator, attempt)
+            x, off = self._restored(begin)
+            if off <= self._tolerance:
+                found.append(self._drawn_back(x, start))
+                if not attempt or len(found) == 3:
+                    break
+            elif off < least:
+                best, least = x, off
+        if not found:
+            raise self._unsolved(best)
+        x = min(found, key=lambda x: float(np.linalg.norm(x - start)))
+        return self._all(x)
+
+    def _restored(self, x: Array) -> tuple[Array, float]:
+        """Return where rows hold, or where it goes on nowhere, and by how much the worst is off there."""
+        damping = 0.0
+        there = self._look(x)
+        if there is None:
+            return x, np.inf
+        wrong, by_x = self._off(there[0]), there[1]
+        for _ in range(_STEPS):
+            if not wrong.any():
+                break
+            step = self._step(x, wrong, by_x, damping)
+            for scale in (1.0, 0.5, 0.1):
+                tried = self._unit(np.clip(x + scale * step, self._lower, self._upper))
+                there = self._look(tried)
+                if there is not None and np.linalg.norm(self._off(there[0])) < np.linalg.norm(wrong):
+                    break
+                there = None
+            if there is not None:
+                x, wrong, by_x = tried, self._off(there[0]), there[1]
+                damping = damping / 10 if damping > 1e-8 else 0.0
+            elif np.abs(wrong).max() <= 0.1 * self._tolerance or damping > 1e4:
+                break
+            else:
+                damping = max(10 * damping, 1e-6)
+        return x, float(np.abs(wrong).max(initial=0.0))
+
+    def _step(self, x: Array, wrong: Array, by_x: Array, damping: float) -> Array:
+        """Return the shortest step that mends rows to first order; who would leave limits stops there."""
+        step = np.zeros(len(x))
+        free = np.ones(len(x), dtype=bool)
+        rows = wrong != 0.0
+        target = -wrong[rows]
+        for _ in range(len(x)):
+            if not free.any():
+                break
+            matrix = by_x[rows][:, free]
+            rest = target - by_x[rows][:, ~free] @ step[~free]
+            if damping:
+                scale = damping * max(float(np.trace(matrix @ matrix.T)) / max(len(rest), 1), 1e-12)
+                step[free] = matrix.T @ np.linalg.solve(matrix @ matrix.T + scale * np.eye(len(rest)), rest)
+            else:
+                step[free] = np.linalg.lstsq(matrix, rest, rcond=_SINGULAR)[0]
+            length = float(np.abs(step[free]).max())
+            if length > _LONGEST:
+                step[free] *= _LONGEST / length
+            reached = np.clip(x + step, self._lower, self._upper)
+            left = free & (np.abs(reached - (x + step)) > 1e-15)
+            if not left.any():
+                break
+            step[left] = (reached - x)[left]
+            free &= ~left
+        return step
+
+    def _drawn_back(self, x: Array, start: Array) -> Array:
+        """Return where rows hold as well, and nearer to where the search began: along the manifold."""
+        pull = 1.0
+        for _ in range(_NEARER):
+            there = self._look(x)
+            if there is None or pull < 1e-3:
+                break
+            way, (values, by_x) = start - x, there
+            free = ~(((x <= self._lower) & (way < 0)) | ((x >= self._upper) & (way > 0)))
+            along = np.zeros(len(x))
+            # What is at a bound may leave it, and not go on.
+            kept = self._equal | ((by_x @ way > 0) & (values > -_AT_BOUND))
+            matrix = by_x[kept][:, free]
+            along[free] = way[free] - np.linalg.lstsq(matrix, matrix @ way[free], rcond=_SINGULAR)[0]
+            if np.linalg.norm(along) <= 1e-9:
+                break
+            tried, off = self._restored(self._unit(np.clip(x + pull * along, self._lower, self._upper)))
+            nearer = np.linalg.norm(tried - start) < np.linalg.norm(x - start) - 1e-14
+            if off <= self._tolerance and nearer:
+                x, pull = tried, min(1.0, 2 * pull)
+            else:
+                pull /= 2
+        return x
+
+    def _look(self, x: Array) -> tuple[Array, Array] | None:
+        """Return the values of rows and their derivatives; None where something has none."""
+        found = self._equalities.evaluated(self._all(x))
+        if found is None:
+            return None
+        values, by_x = found[0][self._rows], found[1][self._rows][:, self._columns]
+        return (values, by_x) if np.isfinite(values).all() and np.isfinite(by_x).all() else None
+
+    def _off(self, values: Array) -> Array:
+        """Return by how much rows are off: bounds that are kept by nothing."""
+        off = np.where(self._equal | (values > 0), values, 0.0)
+        return np.where(np.abs(off) < 1e-15, 0.0, off)  # what rounding leaves is no reason to move
+
+    def _all(self, x: Array) -> Array:
+        at = self._at.copy()
+        at[self._places] = x
+        return at
+
+    def _unit(self, x: Array) -> Array:
+        for four in self._turns:
+            length = float(np.linalg.norm(x[four]))
+            x[four] = x[four] / length if length > 1e-9 else [s.endswith("qw") for s in self._names(four)]
+        return x
+
+    def _names(self, columns: Iterable[int]) -> list[str]:
+        return [str(self._equalities.coordinates[self._columns[k]]) for k in columns]
+
+    def _elsewhere(self, start: Array, generator: np.random.Generator, attempt: int) -> Array:
+        """Return another place to begin at, first near by, then anywhere within limits."""
+        reach = np.where(np.isfinite(self._upper - self._lower), (self._upper - self._lower) / 2, np.pi)
+        reach = np.minimum(reach, np.pi) * min(1.0, 0.1 * attempt)
+        moved = start + generator.uniform(-1, 1, len(start)) * reach
+        return self._unit(np.clip(moved, self._lower, self._upper))
+
+    def _unsolved(self, x: Array) -> UnsolvedError:
+        there = self._look(x)
+        if there is None:
+            return UnsolvedError(
+                "The state cannot be projected: a closed loop that the equalities are about has no solution "
+                "there. Begin where it closes."
+            )
+        off = np.abs(self._off(there[0]))
+        worst = [i for i in np.argsort(-off) if off[i] > self._tolerance]
+        sizes = {self._equalities.rows[self._rows[i]].name: off[i] for i in worst}
+        listed = ", ".join(f"'{n}' is off by {size:.3g}" for n, size in list(sizes.items())[:4])
+        more = f" and {len(sizes) - 4} more" if len(sizes) > 4 else ""
+        ends = (np.isfinite(self._lower) & (x <= self._lower)) | (
+            np.isfinite(self._upper) & (x >= self._upper)
+        )
+        moved, stopped = self._names(range(len(x))), self._names(np.flatnonzero(ends).tolist())
+        held = sorted(str(s) for s in self._held if s in self._equalities.coordinates)
+        tried = [f"moved were {_some(moved)}" if moved else "nothing was free to move"]
+        tried += [f"at their limits are {_some(stopped)}"] if stopped else []
+        tried += [f"fixed were {_some(held)}"] if held else []
+        return UnsolvedError(
+            f"The state cannot be projected: at best {listed}{more}, from {_STARTS + 1} starts. "
+            f"{'; '.join(tried).capitalize()}. Begin nearer to where it closes, or let more coordinates move."
+        )
+
+
+def _some(names: Sequence[str]) -> str:
+    shown = ", ".join(f"'{name}'" for name in names[:6])
+    return shown + (f" and {len(names) - 6} more" if len(names) > 6 else "")
