@@ -53,6 +53,7 @@ from .errors import (
     ModelError,
     NameTakenError,
     ShapeError,
+    UnknownAttributeError,
     UnknownNameError,
     UnsolvedError,
     ValueRejectedError,
@@ -78,6 +79,7 @@ from .model import (
     Inertia,
     Model,
     Operation,
+    Override,
     Pose,
     Reader,
     SetRate,
@@ -150,6 +152,7 @@ __all__ = [
     "NameTakenError",
     "OmniBase",
     "Operation",
+    "Override",
     "PedalBin",
     "PistonAndRod",
     "Planar",
@@ -169,6 +172,7 @@ __all__ = [
     "State",
     "Symbol",
     "Universal",
+    "UnknownAttributeError",
     "UnknownNameError",
     "UnsolvedError",
     "ValueRejectedError",
@@ -227,7 +231,9 @@ def __getattr__(name: str) -> object:
         return importlib.import_module(f"kineverse.{name}")
     if name in ("document_hash", "from_bytes", "to_bytes"):
         return getattr(importlib.import_module("kineverse.formats.document"), name)
-    raise AttributeError(f"module 'kineverse' has no attribute {name!r}")
+    from .vocabulary import MODULE, unknown_attribute
+
+    raise unknown_attribute("The package kineverse", name, __dir__(), MODULE)
 
 
 def __dir__() -> list[str]:

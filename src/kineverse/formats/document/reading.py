@@ -177,6 +177,7 @@ class _Document:
             string(key): read_parameter(value, self._graph, self._rename, self._path)
             for key, value in _members(given.get("parameters", {})).items()
         }
+        overrides = any(cell in self._cells for cell, _ in writes)
         self._cells.update(writes)
         for kind, written in (cell for cell, _ in writes):
             self._names[kind].add(written)
@@ -190,6 +191,7 @@ class _Document:
             string(given.get("frozen", "")),
             seen,
             self._rename(""),
+            overrides,
         )
 
     def _writes(self, given: Any, place: str) -> tuple[tuple[Cell, Any], ...]:
