@@ -20,7 +20,8 @@ TAKERS = {
     "call": lambda x: (2 * a)({"a": x}) / 2,
     "compiled": lambda x: COMPILED({"a": x}) / 2,
     "state": lambda x: kv.State({"a": x})["a"],
-    "updated": lambda x: kv.State().updated({a: x})[a],
+    "updated": lambda x: kv.State({a: 0}).updated({a: x})[a],
+    "extended": lambda x: kv.State().extended({a: x})[a],
     "parameter": lambda x: kv.parameter("p", x).value,
     "violations": lambda x: MODEL.violations({"a": x}, tolerance=-2)[0].value,
 }

@@ -53,6 +53,7 @@ from .errors import (
     ModelError,
     NameTakenError,
     ShapeError,
+    UnknownAttributeError,
     UnknownNameError,
     UnsolvedError,
     ValueRejectedError,
@@ -78,6 +79,7 @@ from .model import (
     Inertia,
     Model,
     Operation,
+    Override,
     Pose,
     Reader,
     SetRate,
@@ -152,6 +154,7 @@ __all__ = [
     "NameTakenError",
     "OmniBase",
     "Operation",
+    "Override",
     "PedalBin",
     "PistonAndRod",
     "Planar",
@@ -171,6 +174,7 @@ __all__ = [
     "State",
     "Symbol",
     "Universal",
+    "UnknownAttributeError",
     "UnknownNameError",
     "UnsolvedError",
     "ValueRejectedError",
@@ -232,7 +236,9 @@ def __getattr__(name: str) -> object:
         return getattr(importlib.import_module("kineverse.formats.document"), name)
     if name == "show":
         return importlib.import_module("kineverse.view.show").show
-    raise AttributeError(f"module 'kineverse' has no attribute {name!r}")
+    from .vocabulary import MODULE, unknown_attribute
+
+    raise unknown_attribute("The package kineverse", name, __dir__(), MODULE)
 
 
 def __dir__() -> list[str]:

@@ -8,7 +8,7 @@ A message says what was wrong, where, what was available and what to do.
 from __future__ import annotations
 
 import difflib
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 
 
 class KineverseError(Exception):
@@ -52,7 +52,21 @@ class ModelError(KineverseError, ValueError):
 
 
 class EditError(KineverseError, RuntimeError):
-    """An edit was refused, and the model is what it was before."""
+    """An edit was refused, and the model is what it was before.
+
+    Attributes
+    ----------
+    failures
+        The operations that cannot be applied, by tag, with what each says.
+    """
+
+    def __init__(self, message: str, failures: Mapping[str, KineverseError] | None = None) -> None:
+        super().__init__(message)
+        self.failures: dict[str, KineverseError] = dict(failures or {})
+
+
+class UnknownAttributeError(KineverseError, AttributeError):
+    """Something has no such attribute; the message says what is called like that."""
 
 
 class FormatError(KineverseError, ValueError):
@@ -61,6 +75,14 @@ class FormatError(KineverseError, ValueError):
 
 class MissingExtraError(KineverseError, ImportError):
     """An optional dependency is not installed; the message names the extra that brings it."""
+
+
+def given_twice(symbol: object) -> NameTakenError:
+    """Return the error for a symbol with one value by symbol and another by name."""
+    return NameTakenError(
+        f"There are two values for '{symbol}', by symbol and by name. "
+        f"Instead of {{**state, '{symbol}': ...}} write state.updated({{'{symbol}': ...}})."
+    )
 
 
 _LONGEST = 100

@@ -4,19 +4,31 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Iterator, Mapping
-from typing import Any
+from collections.abc import Iterable, Iterator, Mapping
+from typing import TYPE_CHECKING, Any
 
-from .errors import ExpressionError, NameTakenError, UnknownNameError, ValueRejectedError, suggest
+from .errors import (
+    ExpressionError,
+    KineverseError,
+    NameTakenError,
+    UnknownNameError,
+    ValueRejectedError,
+    given_twice,
+    suggest,
+)
+from .html_table import html_table
 from .number import real_number
 from .symbols import Symbol, parse_symbol_name
+from .vocabulary import STATE, unknown_attribute
 
 
 class State(Mapping[Symbol, float]):
     """An immutable mapping from symbols to numbers, with the time it was true at and who said so.
 
     Whatever takes values takes a state; other than a plain mapping it may know more symbols than are asked
-    for. It can be indexed by symbols and by their names.
+    for. It can be indexed by symbols and by their names. :meth:`updated` changes values of symbols that it
+    knows, :meth:`extended` adds symbols; ``state | {...}`` is ``state.updated({...})``, and ``state | other``
+    has the symbols of two states.
 
     Parameters
     ----------
@@ -41,13 +53,11 @@ class State(Mapping[Symbol, float]):
     def __init__(
         self, values: Mapping[Any, float] | None = None, *, stamp: float | None = None, source: str = ""
     ) -> None:
-        if not isinstance(values, Mapping | None):
-            raise ExpressionError(f"A state is made from a mapping {{name: number}}, not {values!r}.")
         known: dict[Symbol, float] = {}
-        for key, value in (values or {}).items():
+        for key, value in _items({} if values is None else values):
             symbol = _symbol(key)
             if symbol in known:
-                raise NameTakenError(f"There are two values for '{symbol}'.")
+                raise given_twice(symbol)
             known[symbol] = _number(symbol, value)
         self._values = known
         self._by_name: dict[str, Symbol | None] = {str(s): s for s in known}
@@ -65,18 +75,52 @@ class State(Mapping[Symbol, float]):
             raise ExpressionError("States are immutable; use updated({symbol: number}, stamp=...).")
         object.__setattr__(self, name, value)
 
-    def __getitem__(self, key: Symbol | str) -> float:
-        symbol = self._by_name.get(key) if isinstance(key, str) else key
-        if symbol is None and key in self._by_name:
-            raise NameTakenError(
-                f"Several symbols have the name '{key}'; ask for one by symbol, not by name."
+    if not TYPE_CHECKING:  # a type checker says so on its own
+
+        def __getattr__(self, name):
+            raise unknown_attribute("A state", name, dir(type(self)), STATE)
+
+        def __setitem__(self, key: object, value: object) -> None:
+            raise ExpressionError(
+                f"States are immutable; state.updated({{'{key}': {value!r}}}) returns another one."
             )
+
+        def __delitem__(self, key: object) -> None:
+            raise ExpressionError(
+                f"States are immutable, and '{key}' stays; "
+                "state.updated({symbol: number}) returns one with other values."
+            )
+
+    def __getitem__(self, key: Symbol | str) -> float:
         try:
-            return self._values[symbol]  # type: ignore[index]
+            return self._values[self._known(key)]
         except KeyError:
             raise UnknownNameError(
                 f"The state says nothing about '{key}'. {suggest(str(key), self._by_name, 'symbol')}"
             ) from None
+
+    def _known(self, key: object) -> Symbol:
+        """Return the symbol that a key stands for; a KeyError if there is none."""
+        if not isinstance(key, str):
+            if key in self._values:
+                return key  # type: ignore[return-value]
+            raise KeyError(key)
+        symbol = self._by_name[key]
+        if symbol is None:
+            raise NameTakenError(
+                f"Several symbols have the name '{key}'; ask for one by symbol, not by name."
+            )
+        return symbol
+
+    def given(self, symbol: Symbol) -> float | None:
+        """Return the value of a symbol, else what was given by its name alone, None if there is neither.
+
+        A name in a state stands for a degree of freedom until somebody asks for a parameter of that name.
+        """
+        value = self._values.get(symbol)
+        if value is None and symbol.role != "dof":
+            return self._values.get(Symbol(symbol.path, symbol.order))
+        return value
 
     def __contains__(self, key: object) -> bool:
         return key in self._by_name if isinstance(key, str) else key in self._values
@@ -90,12 +134,71 @@ class State(Mapping[Symbol, float]):
     def updated(
         self, values: Mapping[Any, float], *, stamp: float | None = None, source: str | None = None
     ) -> State:
-        """Return a state with some values changed or added; stamp and source are kept unless given."""
-        other = State(values)
+        """Return a state with other values for some of its symbols; stamp and source are kept unless given.
+
+        Raises
+        ------
+        UnknownNameError
+            For a symbol or name that the state says nothing about, with similar ones.
+        """
+        changed: dict[Symbol, float] = {}
+        for key, value in _items(values):
+            try:
+                symbol = self._known(key)
+            except (KeyError, TypeError):  # of a name, and of what cannot be a key at all
+                raise self._unknown(key) from None
+            if symbol in changed:
+                raise given_twice(symbol)
+            changed[symbol] = _number(symbol, value)
+        return self._with(changed, stamp, source)
+
+    def extended(
+        self, values: Mapping[Any, float], *, stamp: float | None = None, source: str | None = None
+    ) -> State:
+        """Return a state that knows more symbols, too; stamp and source are kept unless given.
+
+        Raises
+        ------
+        NameTakenError
+            For a symbol that the state has a value for, which :meth:`updated` changes.
+        """
+        added = State(values)._values
+        for symbol in added:
+            if symbol in self._values:
+                raise NameTakenError(
+                    f"The state has a value for '{symbol}' already; updated({{'{symbol}': ...}}) changes it."
+                )
+        return self._with(added, stamp, source)
+
+    def __or__(self, other: Mapping[Any, float]) -> State:
+        if isinstance(other, State):
+            return self._with(other._values, None, None)
+        return self.updated(other) if isinstance(other, Mapping) else NotImplemented
+
+    def __ror__(self, other: object) -> State:
+        raise ExpressionError(
+            "A state stands on the left of |: state | {...} changes values, and "
+            "State({...}) | state joins two states."
+        )
+
+    def _with(self, values: Mapping[Symbol, float], stamp: float | None, source: str | None) -> State:
         return State(
-            {**self._values, **other._values},
+            {**self._values, **values},
             stamp=self.stamp if stamp is None else stamp,
             source=self.source if source is None else source,
+        )
+
+    def _unknown(self, key: object) -> KineverseError:
+        symbol = _symbol(key)
+        about = f"The state says nothing about '{symbol}', so there is nothing to update."
+        if str(symbol) in self._by_name:
+            return UnknownNameError(
+                f"{about} It knows another symbol of that name, of another role or value; "
+                "give the value by name."
+            )
+        return UnknownNameError(
+            f"{about} {suggest(str(symbol), self._by_name, 'symbol')} "
+            f"extended({{'{symbol}': ...}}) adds what is new."
         )
 
     def __eq__(self, other: object) -> bool:
@@ -114,6 +217,20 @@ class State(Mapping[Symbol, float]):
         more = f", ... {len(self) - 8} more" if len(self) > 8 else ""
         when = "" if self.stamp is None else f", stamp={self.stamp:g}"
         return f"State({{{shown}{more}}}{when})"
+
+    def _repr_html_(self) -> str:
+        about = [f"{len(self)} values"]
+        about += [] if self.stamp is None else [f"at {self.stamp:g} s"]
+        about += [f"from {self.source}"] if self.source else []
+        return html_table(
+            ", ".join(about), ("symbol", "value"), [(str(s), f"{v:g}") for s, v in self.items()]
+        )
+
+
+def _items(values: object) -> Iterable[tuple[Any, Any]]:
+    if not isinstance(values, Mapping):
+        raise ExpressionError(f"A state is made from a mapping {{name: number}}, not {values!r}.")
+    return values.items()
 
 
 def _symbol(key: object) -> Symbol:

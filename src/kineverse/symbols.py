@@ -250,6 +250,10 @@ def check_symbols(symbols: Iterable[object]) -> Sequence[Symbol]:
     """
     if isinstance(symbols, Symbol):
         raise ExpressionError(f"A sequence of symbols is wanted: [{symbols}].")
+    if isinstance(symbols, str):
+        raise ExpressionError(
+            f"A sequence of symbols is wanted, not the text {symbols!r}: [model.symbol({symbols!r})]."
+        )
     checked = []
     for item in symbols:
         if not isinstance(item, Symbol):

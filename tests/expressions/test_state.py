@@ -109,8 +109,16 @@ def test_what_it_was_made_from_may_change():
 def test_updated(values, changes, stamp, new_stamp, source, new_source):
     state = State(values, stamp=stamp, source=source)
     before = dict(state)
-    updated = state.updated(changes, stamp=new_stamp, source=new_source)
+    known = {s: v for s, v in changes.items() if s in values}
+    new = {s: v for s, v in changes.items() if s not in values}
+    updated = state.updated(known, stamp=new_stamp).extended(new, source=new_source)
     assert dict(updated) == {**values, **changes}
+    for symbol in new:
+        with pytest.raises(UnknownNameError):
+            state.updated({symbol: 1.0})
+    for symbol in values:
+        with pytest.raises(NameTakenError, match=r"has a value for '.*' already; updated\(\{"):
+            state.extended({symbol: 1.0})
     assert updated.stamp == (stamp if new_stamp is None else new_stamp)
     assert updated.source == (source if new_source is None else new_source)
     assert (dict(state), state.stamp, state.source) == (before, stamp, source)
@@ -120,13 +128,86 @@ def test_updated(values, changes, stamp, new_stamp, source, new_source):
 def test_updated_by_name():
     state = State({a: 1, b: 2}, stamp=3.5, source="encoder")
     expected = State({a: 1, b: 5, da: 6}, stamp=3.5, source="encoder")
-    assert state.updated({"arm/b": 5, "arm/a:velocity": 6}) == expected
-    assert state.updated(State({b: 5, da: 6}, stamp=9)) == expected  # of another state, the values
+    assert state.updated({"arm/b": 5}).extended({"arm/a:velocity": 6}) == expected
+    assert state.updated(State({b: 5}, stamp=9)) == State({a: 1, b: 5}, stamp=3.5, source="encoder")
+    with pytest.raises(ExpressionError, match="A state has symbols or their names as keys"):
+        state.updated({3: 5})
+    with pytest.raises(ExpressionError, match="A state has symbols or their names as keys"):
+        state.updated({a + b: 5})
     with pytest.raises(ValueRejectedError, match="'arm/b' is NaN"):
         state.updated({"arm/b": math.nan})
     with pytest.raises(ExpressionError, match="mapping"):
         state.updated([(b, 5)])
     assert state["arm/b"] == 2
+
+
+def test_names_that_a_state_does_not_hold_are_no_update():
+    state = State({"kitchen/fridge_door": 0.0, "kitchen/oven_door": 0.0, kv.parameter("length", 2.0): 3.0})
+    with pytest.raises(UnknownNameError) as error:
+        state.updated({"fridge_door": 1.0})
+    assert str(error.value) == (
+        "The state says nothing about 'fridge_door', so there is nothing to update. "
+        "Did you mean 'kitchen/fridge_door'? extended({'fridge_door': ...}) adds what is new."
+    )
+    assert state.updated({"length": 5})[kv.parameter("length", 2.0)] == 5
+    with pytest.raises(UnknownNameError, match="It knows another symbol of that name"):
+        state.updated({kv.position("length"): 5})
+    with pytest.raises(NameTakenError) as error:
+        state.updated({**state, "kitchen/oven_door": 1.0})
+    assert str(error.value) == (
+        "There are two values for 'kitchen/oven_door', by symbol and by name. Instead of "
+        "{**state, 'kitchen/oven_door': ...} write state.updated({'kitchen/oven_door': ...})."
+    )
+    for values in ({**state, "kitchen/oven_door": 1.0},):
+        for asked in (State, kv.position("kitchen/oven_door"), kv.compile(kv.position("kitchen/oven_door"))):
+            with pytest.raises(
+                NameTakenError, match=r"write state\.updated\(\{'kitchen/oven_door': \.\.\.\}\)"
+            ):
+                asked(values)
+
+
+@given(VALUES, VALUES, STAMPS)
+def test_a_state_and_another_one(values, others, stamp):
+    state = State(values, stamp=stamp, source="encoder")
+    union = state | State(others, stamp=7.0, source="camera")
+    assert dict(union) == {**values, **others}
+    assert (union.stamp, union.source) == (stamp, "encoder")
+    if others.keys() <= values.keys():
+        assert state | others == state.updated(others)
+    else:
+        with pytest.raises(UnknownNameError, match="so there is nothing to update"):
+            state | others
+
+
+def test_a_state_on_the_other_side():
+    with pytest.raises(
+        ExpressionError, match=r"A state stands on the left of \|: state \| \{\.\.\.\} changes values"
+    ):
+        {a: 1.0} | State({a: 2.0})
+    with pytest.raises(TypeError):
+        State({a: 2.0}) | 3
+
+
+def test_a_state_in_a_notebook():
+    shown = State({"<b>": 1.5, "x": 2}, stamp=3.0, source="encoder")._repr_html_()
+    assert "<td>&lt;b&gt;</td><td>1.5</td>" in shown
+    assert "2 values, at 3 s, from encoder" in shown
+    assert len(State({f"j{i}": i for i in range(10_000)})._repr_html_()) < 5_000
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("update", "A state has no 'update'. Here that is state.updated({...}); a state is immutable."),
+        ("update_d", "A state has no 'update_d'. Did you mean 'updated'?"),
+        ("zzz", "A state has no 'zzz'. dir(...) lists what there is."),
+    ],
+)
+def test_attributes_that_a_state_lacks(name, message):
+    with pytest.raises(kv.UnknownAttributeError) as error:
+        getattr(State({a: 1}), name)
+    assert str(error.value) == message
+    assert not hasattr(State(), name)
 
 
 # -- equality, hashes, copies ------------------------------------------------------------------------------
@@ -180,10 +261,14 @@ def test_states_are_immutable():
     for name in ("stamp", "source", "_values", "anything"):
         with pytest.raises(ExpressionError, match=r"States are immutable; use updated\("):
             setattr(state, name, None)
-    with pytest.raises(TypeError):
-        state[a] = 2
-    with pytest.raises(TypeError):
-        del state[a]
+    with pytest.raises(ExpressionError, match=r"^States are immutable; ") as error:
+        state["arm/a"] = 2
+    assert str(error.value) == "States are immutable; state.updated({'arm/a': 2}) returns another one."
+    with pytest.raises(ExpressionError) as error:
+        del state["arm/a"]
+    assert str(error.value) == (
+        "States are immutable, and 'arm/a' stays; state.updated({symbol: number}) returns one with other values."
+    )
     assert state == State({a: 1}, stamp=2.0, source="encoder")
 
 

@@ -37,7 +37,7 @@ def test_the_gradient_is_that_of_the_distance():
         for pair in (("hand", "box0"), ("link2", "box3"), ("hand", "ball/body"), ("ball/body", "box1")):
             scene.update(state)
             distance = scene.expression(*pair)
-            values = state.updated(scene.expression_values(distance))
+            values = state | kv.State(scene.expression_values(distance))
             measured = scene.distance(*pair)
             assert distance.expression(values) == pytest.approx(measured.distance, abs=1e-9)
             exact = distance.expression.jacobian(symbols)(values)
@@ -82,7 +82,7 @@ def test_it_is_a_constraint_and_survives_a_document(tmp_path):
     model.save(tmp_path / "m.kv.json")
     again = kv.load(tmp_path / "m.kv.json")
     constraint = again.constraints["clear"]
-    values = state.updated(scene.expression_values(distance))
+    values = state | kv.State(scene.expression_values(distance))
     assert constraint.expression(values) == pytest.approx(scene.distance("hand", "box0").distance, abs=1e-9)
     # Without other values the parameters have those of where it was made.
     assert constraint.expression(state) == pytest.approx(float(constraint.expression(values)))
@@ -148,7 +148,7 @@ def test_another_scene_takes_over_the_parameters_that_the_model_has(tmp_path):
         other.update(state)
         distance = other.expression(*pair)
         kept = again.constraints["clear"].expression
-        values = state.updated(other.expression_values(distance))
+        values = state | kv.State(other.expression_values(distance))
         assert (kept - distance.expression)(values) == pytest.approx(0, abs=1e-12)
         assert kept(values) == pytest.approx(other.distance(*pair).distance, abs=1e-9)
         kv.compile([kept, distance.expression])

@@ -120,6 +120,8 @@ class Fragile(kv.Operation):
 class Place(kv.Operation):
     """Puts a frame somewhere, again if it is there already."""
 
+    overrides = True
+
     name: str
     parent: str
     offset: float = 0.0
@@ -128,6 +130,13 @@ class Place(kv.Operation):
     def apply(self, model: Reader) -> kv.Effects:
         x = kv.position(self.name) if self.moving else 0
         return kv.Effects(frames={self.name: (self.parent, kv.translation(x, self.offset, 0))})
+
+
+@dataclass(frozen=True)
+class Fresh(Place):
+    """Puts a frame somewhere that is not there yet."""
+
+    overrides = False
 
 
 @dataclass(frozen=True)
@@ -157,6 +166,8 @@ class Limit(kv.Operation):
 @dataclass(frozen=True)
 class Row(kv.Operation):
     """Says how a coordinate moves, by a datum."""
+
+    overrides = True
 
     name: str
     speed: str
@@ -198,7 +209,7 @@ def fold(sequence: Sequence[Sequenced]) -> Fold:
                 reads.add(("frames", value.parent), Read.EXISTENCE)
                 if value.parent == name or value.parent not in result.head["frames"]:
                     raise kv.ModelError(name)
-            if kind == "constraints" and name in result.head[kind]:
+            if name in result.head[kind] and not _may_write(operation, reads, (kind, name)):
                 raise kv.NameTakenError(name)
         seen: dict[Any, Any] = {}
         for cell, how in reads.cells.items():
@@ -210,10 +221,16 @@ def fold(sequence: Sequence[Sequenced]) -> Fold:
         for cell, value in writes.items():
             result.head[cell[0]][cell[1]] = value
             result.writers.setdefault(cell, []).append(tag)
-    for name in result.head["frames"]:
-        ancestors(name, result.head["frames"].__getitem__)
+        for name in result.head["frames"]:
+            ancestors(name, result.head["frames"].__getitem__)
     Rates(dict(result.head["rates"].values()))
     return result
+
+
+def _may_write(operation: kv.Operation, reads: Reads, cell: tuple[str, str]) -> bool:
+    if cell[0] == "constraints":
+        return False
+    return cell[0] == "data" or operation.overrides or cell in reads.cells
 
 
 def check(model: kv.Model, sequence: Sequence[Sequenced]) -> Fold:

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 import kineverse as kv
 from kineverse.model.body import Mesh
 from kineverse.model.delta import deltas
-from kineverse.model.difference import _moved
+from kineverse.model.diff import moved_tags
 from kineverse.model.samples import Samples
 
 
@@ -73,7 +73,7 @@ def test_back_is_the_other_way_round():
 
 @given(st.permutations(range(8)))
 def test_as_few_operations_as_possible_have_moved(order):
-    moved = _moved(range(8), order)
+    moved = moved_tags(range(8), order, range(8))
     rest = [item for item in order if item not in moved]
     assert rest == sorted(rest)
     longest = [1] * 8

@@ -13,6 +13,7 @@ from model_steps import (
     Exists,
     Fold,
     Fragile,
+    Fresh,
     Limit,
     Listing,
     Next,
@@ -51,6 +52,7 @@ operations = st.one_of(
     st.builds(Pick, name, name, name),
     st.builds(Fragile, name, name),
     st.builds(Place, frame, parent, value.map(float), st.booleans()),
+    st.builds(Fresh, frame, parent, value.map(float), st.booleans()),
     st.builds(Watch, name, frame, parent),
     st.builds(Limit, name, name),
     st.builds(Row, name, name, name),
@@ -465,3 +467,27 @@ def test_appending_costs_the_same_runs_however_long_the_model_is() -> None:
         edit.apply(Place("new", "f7"))
     assert model.history.runs - before == 1
     assert runs(model, "7", Place("f7", "world", 2.0)) == 1
+
+
+def test_copies_and_snapshots_do_not_see_places_given_out_anew() -> None:
+    model, sequence = started()
+    copied, snapshot = model.copy(), model.snapshot()
+    own = list(sequence)
+    with pytest.raises(KeyError), model.edit() as edit:
+        for i in range(80):  # halves the gap between two places until there is none
+            edit.insert(Put("a", i), f"n{i}", after="start 0")
+        assert model.data["c"] == 2  # the last one that stands before the sum is the first one inserted
+        raise KeyError
+    check(model, sequence)
+    with model.edit() as edit:
+        for i in range(80):
+            edit.insert(Put("a", i), f"n{i}", after="start 0")
+            sequence.insert(1, (f"n{i}", Put("a", i)))
+    check(model, sequence)
+    for other in (copied, snapshot.model(), copied.copy()):
+        check(other, own)
+        with other.edit() as edit:
+            edit.replace("start 1", Put("b", 7))
+            edit.insert(Next("e", "b"), "e", after="start 1")
+        check(other, [*own[:1], ("start 1", Put("b", 7)), ("e", Next("e", "b")), *own[2:]])
+    check(model, sequence)

@@ -56,7 +56,7 @@ def test_whatever_is_raised_in_the_block_undoes_all_of_it(error: type[BaseExcept
     with pytest.raises(error), model.edit() as edit:
         edit.apply(Put("x", 1))
         edit.remove("data colour")
-        edit.add_frame("door", "world", np.eye(4), tag="again")
+        edit.add_frame("door", "world", np.eye(4), tag="again", override=True)
         assert model.fk("door") == kv.array(np.eye(4))
         raise error
     assert state_of(model) == before

@@ -19,6 +19,8 @@ NAMES = "abcd"
 class Several(kv.Operation):
     """Writes data, and frames beside them, in the order given; may ask what there is before."""
 
+    overrides = True
+
     names: tuple[str, ...]
     asks: str = ""
 

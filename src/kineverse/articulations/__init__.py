@@ -1,5 +1,7 @@
 """The library of articulations: operations that connect frames."""
 
+from kineverse.vocabulary import MODULE, unknown_attribute
+
 from .axis_joints import Continuous, Cylindrical, Prismatic, Revolute, Screw
 from .bases import Ackermann, Base, DifferentialDrive, Mecanum, OmniBase
 from .couplings import Cam, Coupling, Gearbox, RackAndPinion
@@ -60,3 +62,7 @@ __all__ = [
     "ScrewAndNut",
     "Universal",
 ]
+
+
+def __getattr__(name: str) -> object:
+    raise unknown_attribute("The package kineverse.articulations", name, __all__, MODULE)

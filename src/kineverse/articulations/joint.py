@@ -12,7 +12,8 @@ from typing import Any
 from kineverse.errors import KineverseError, NameTakenError, ValueRejectedError
 from kineverse.expressions.expression import Expression, ExpressionLike
 from kineverse.model.articulation import Articulation
-from kineverse.model.body import Pose, Vector3
+from kineverse.model.body import AxisLike, Pose, Vector3
+from kineverse.model.frame import TransformLike
 from kineverse.model.operation import Effects, Operation
 from kineverse.model.reader import Reader
 from kineverse.number import real_number
@@ -38,7 +39,7 @@ class Placed(Operation):
 
     name: str
     parent: str
-    origin: Pose = Pose()
+    origin: TransformLike = Pose()
 
     def __post_init__(self) -> None:
         self.check_texts("name", "parent")
@@ -50,7 +51,8 @@ class Placed(Operation):
             object.__setattr__(self, "origin", Pose.of(self.origin))
         except (KineverseError, TypeError, ValueError) as error:
             raise ValueRejectedError(
-                f"The origin of the {self.noun} '{self.name}' is none. {error}"
+                f"The origin of the {self.noun} '{self.name}' is not a pose. {error} It is a 4×4 transform: "
+                f"{_place(self.origin)}, a kv.Pose, or a 4×4 array of numbers."
             ) from None
 
     @property
@@ -106,6 +108,15 @@ class Placed(Operation):
                     f"There is {what} '{name}' already, so the {self.noun} '{self.name}' cannot create it. "
                     "Choose another name, or replace the operation that wrote it."
                 )
+
+
+def _place(given: object) -> str:
+    """Return how a place is written, if that is what was given."""
+    try:
+        x, y, z = map(real_number, given)  # type: ignore[call-overload]
+    except (TypeError, ValueError, OverflowError):
+        return "kv.translation(x, y, z) @ kv.rpy(roll, pitch, yaw) or the like"
+    return f"kv.translation({x:g}, {y:g}, {z:g})"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -181,7 +192,7 @@ class AxialJoint(Joint):
         Limit of the speed, either way [m/s] or [rad/s]; None for no limit.
     """
 
-    axis: Vector3 = (1.0, 0.0, 0.0)
+    axis: AxisLike = (1.0, 0.0, 0.0)
     lower: ExpressionLike | None = None
     upper: ExpressionLike | None = None
     velocity: float | None = None
@@ -233,7 +244,7 @@ class AxisJoint(AxialJoint):
         return self.moved_by(self.q)
 
 
-def checked_axis(axis: Vector3, name: str) -> Vector3:
+def checked_axis(axis: AxisLike, name: str) -> Vector3:
     """Return the axis of a joint as a tuple of numbers.
 
     Raises

@@ -33,12 +33,14 @@ def joint_replaced(robot: Robot) -> Contender:
     """Return who replaces an operation, and evaluates the new pose."""
     model = robot.model.copy()
     tag, joint = _joint_on_the_way(robot)
+    origin = joint.origin
+    assert isinstance(origin, Pose)  # descriptions have no others
     values = dict.fromkeys(robot.chain, _EVERYWHERE)
     shifts = count(1)
 
     def at(shift: float) -> Array:
         with model.edit() as edit:
-            edit.replace(tag, replace(joint, origin=_shifted(joint.origin, shift)))
+            edit.replace(tag, replace(joint, origin=_shifted(origin, shift)))
         return np.asarray(model.fk(robot.frame)(values))
 
     # Every time by another shift: a model that is what it was before would be done at once.

@@ -16,6 +16,7 @@ from .timing import Contender, timed
 
 TO_EMPTY, TO_LARGE = "append an operation to an empty model", "append it to a large model"
 REPLACE = "replace an operation that others read"
+COPY = "copy a large model, per operation"
 RELEVANT, RELEVANT_NEW = "constraints_for a pose", "constraints_for a new expression"
 
 READERS = 7
@@ -91,6 +92,8 @@ def on_large(large: Model) -> Iterator[Contender]:
             edit.replace("measured source", Measured("source", float(next(values))))
 
     yield Contender(REPLACE, timed(replaced))
+
+    yield Contender(COPY, timed(lambda: large.copy() and None, len(large.history.tags)))
 
     ends = range(7, len(large.frames), 8)
     poses = [large.fk(f"link {k}") for k in ends[:_ASKED]]

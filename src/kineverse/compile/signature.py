@@ -14,6 +14,7 @@ from kineverse.errors import (
     ShapeError,
     UnknownNameError,
     ValueRejectedError,
+    given_twice,
     suggest,
 )
 from kineverse.expressions import Expression
@@ -75,6 +76,9 @@ class Signature:
         return np.ascontiguousarray(array) if array.flags.aligned else array.copy()
 
     def _from_mapping(self, values: Mapping[Any, Any]) -> npt.NDArray[np.float64]:
+        if isinstance(values, State):  # it describes a whole world, and may know more
+            held = [(s, values.given(s)) for s in self.inputs]
+            return self._complete([s.value if value is None else value for s, value in held])
         positions = self.positions
         vector = [s.value for s in self.inputs]
         unknown = []
@@ -85,15 +89,17 @@ class Signature:
                 unknown.append(str(key))
                 continue
             if position in given:
-                raise NameTakenError(f"'{self.names[position]}' is given twice, by name and as a symbol.")
+                raise given_twice(self.names[position])
             given.add(position)
             vector[position] = self._number(position, value)
-        # A state describes the whole world; other mappings are written for this function, typing errors
-        # included.
-        if unknown and not isinstance(values, State):
+        # Such mappings are written for this function, typing errors included.
+        if unknown:
             raise UnknownNameError(
                 f"Not among the inputs: {_listed(unknown)}. {suggest(unknown[0], self.names, 'input')}"
             )
+        return self._complete(vector)
+
+    def _complete(self, vector: list[float | None]) -> npt.NDArray[np.float64]:
         missing = [name for name, value in zip(self.names, vector, strict=True) if value is None]
         if missing:
             raise UnknownNameError(f"No value is given for {_listed(missing)}.")

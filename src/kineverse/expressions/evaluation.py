@@ -13,7 +13,14 @@ import casadi as ca
 import numpy as np
 import numpy.typing as npt
 
-from kineverse.errors import ExpressionError, NameTakenError, UnknownNameError, ValueRejectedError, suggest
+from kineverse.errors import (
+    ExpressionError,
+    NameTakenError,
+    UnknownNameError,
+    ValueRejectedError,
+    given_twice,
+    suggest,
+)
 from kineverse.number import real_number
 
 from .expression import Expression
@@ -72,7 +79,7 @@ def assign(
         raise UnknownNameError(f"Unknown symbol {unknown[0]!r}. {suggest(unknown[0], names, 'symbol')}")
     twice = [s for s in symbols if s in given and str(s) in given]
     if twice:
-        raise NameTakenError(f"There are two values for '{twice[0]}', by symbol and by name.")
+        raise given_twice(twice[0])
     ambiguous = [n for n, count in Counter(names).items() if count > 1 and n in given]
     if ambiguous:
         raise NameTakenError(

@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from kineverse.compile.function import compile as compile_expressions
-from kineverse.errors import KineverseError, UnknownNameError, ValueRejectedError, suggest
+from kineverse.errors import KineverseError, UnknownNameError, ValueRejectedError, given_twice, suggest
 from kineverse.model.view import ModelView
 from kineverse.state import State
 from kineverse.symbols import Symbol
@@ -160,9 +160,11 @@ class Mirror:
         if isinstance(state, State):
             return state
         inputs = {key for symbol in self.inputs for key in (symbol, str(symbol))}
-        for key in state:
-            if key not in inputs:
-                self.model.symbol(str(key))
+        others = [str(key) for key in state if key not in inputs]
+        for name in others:
+            self.model.symbol(name)
+        if len(set(others)) < len(others):
+            raise given_twice(next(name for name in others if others.count(name) > 1))
         return {key: value for key, value in state.items() if key in inputs}
 
     def _place(self) -> None:

@@ -163,7 +163,7 @@ class Scene:
         return pair_distance(self.model, a, b, self._parameters[a, b])
 
     def expression_values(self, pairs: PairDistance | Iterable[PairDistance]) -> dict[Symbol, float]:
-        """Return the values that the parameters of distances have now: to be added to a state."""
+        """Return the values that the parameters of distances have now, for ``state | kv.State(values)``."""
         values: dict[Symbol, float] = {}
         for pair in [pairs] if isinstance(pairs, PairDistance) else pairs:
             values.update(pair.values(*self._with_poses(pair.a, pair.b)))

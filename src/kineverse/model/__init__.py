@@ -5,7 +5,7 @@ from .body import Body, Box, Capsule, Cone, Cylinder, Ellipsoid, Inertia, Mesh, 
 from .constraint import Constraint
 from .diff import Change, Diff
 from .difference import difference
-from .edit import AddFrame, Attach, Constrain, Edit, SetRate, Write
+from .edit import AddFrame, Attach, Constrain, Edit, Override, SetRate, Write
 from .frame import WORLD, Frame
 from .model import Model, Snapshot
 from .operation import Effects, Operation
@@ -35,6 +35,7 @@ __all__ = [
     "Mesh",
     "Model",
     "Operation",
+    "Override",
     "Pose",
     "Rates",
     "Reader",

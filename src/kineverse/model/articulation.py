@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -56,3 +57,25 @@ class Articulation:
     def position(self) -> Expression | None:
         """How far it has moved: its one coordinate, or what it follows; None if it is not one number."""
         return self.coordinates[0] if len(self.coordinates) == 1 else self.follows
+
+
+def check_home(name: str, record: Articulation) -> None:
+    """Look whether an articulation has a home in which its frames have a pose.
+
+    Raises
+    ------
+    ValueRejectedError
+        If a number of it is not finite, or its orientation is a quaternion of length zero.
+    """
+    for symbol, value in zip(record.coordinates, record.home, strict=False):
+        if isinstance(value, float | int) and not math.isfinite(value):
+            raise ValueRejectedError(
+                f"The home of the articulation '{name}' is finite, and not {value!r} for '{symbol}'."
+            )
+    home = {str(s): value for s, value in zip(record.coordinates, record.home, strict=False)}
+    x = next((path for path in home if path.endswith("/qx")), None)
+    if x is not None and not any(home.get(f"{x[:-1]}{part}", 1.0) for part in "xyzw"):
+        raise ValueRejectedError(
+            f"The home of the articulation '{name}' has the quaternion 0 0 0 0, which is no orientation; "
+            "that of no rotation is 0 0 0 1, with w last."
+        )

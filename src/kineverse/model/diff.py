@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import math
+from bisect import bisect_left
+from collections.abc import Container, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -41,11 +44,14 @@ class Diff:
         Values that changed, in no particular order.
     added, removed, replaced
         Tags of operations, in the order of the edit.
-    moved
-        Tags of operations that come earlier or later than before, relative to the others: between models
-        (:func:`kineverse.difference`), as no edit moves one.
     runs
         How many times operations were applied to get there.
+    moved
+        Tags of operations that come earlier or later than before, relative to the others; in a commit, those
+        that were removed and added again elsewhere, which are among ``replaced`` as well.
+    rerun
+        Tags of operations that were run again because what they read had changed, in their order; whether
+        they wrote something else than before shows in ``changes``. Not known between models.
     """
 
     version: int
@@ -55,6 +61,7 @@ class Diff:
     replaced: tuple[str, ...] = ()
     runs: int = 0
     moved: tuple[str, ...] = ()
+    rerun: tuple[str, ...] = ()
 
     @property
     def is_empty(self) -> bool:
@@ -68,5 +75,55 @@ class Diff:
 
     @property
     def tags(self) -> frozenset[str]:
-        """Every tag that was added, removed, replaced or moved."""
-        return frozenset((*self.added, *self.removed, *self.replaced, *self.moved))
+        """Every tag that was added, removed, replaced, moved or run again."""
+        return frozenset((*self.added, *self.removed, *self.replaced, *self.moved, *self.rerun))
+
+
+def moved_tags(before: Sequence[str], after: Sequence[str], among: Container[str]) -> tuple[str, ...]:
+    """Return the tags that stand elsewhere among the others, as few as possible, in the new order.
+
+    Parameters
+    ----------
+    before, after
+        Tags in their old and in their new order, each once; those that are in one of them only do not count.
+    among
+        The tags that may have been moved; all others are known to stand as they did.
+    """
+    present = set(after)
+    place = {tag: i for i, tag in enumerate(tag for tag in before if tag in present)}
+    common = [tag for tag in after if tag in place]
+    kept = _longest_in_order([place[tag] for tag in common], [tag not in among for tag in common])
+    return tuple(tag for i, tag in enumerate(common) if i not in kept)
+
+
+def _longest_in_order(places: Sequence[int], wanted: Sequence[bool]) -> set[int]:
+    """Return the indices of a longest increasing part that has all that are wanted, which increase."""
+    # What stands still leaves room for the others only in between.
+    kept: set[int] = set()
+    low, start = -1, 0
+    for end in (*(i for i, is_wanted in enumerate(wanted) if is_wanted), len(places)):
+        high = places[end] if end < len(places) else max(places, default=0) + 1
+        inside = [i for i in range(start, end) if low < places[i] < high]
+        kept.update(inside[k] for k in _longest([places[i] for i in inside]))
+        if end < len(places):
+            kept.add(end)
+            low, start = high, end + 1
+    return kept
+
+
+def _longest(places: Sequence[int]) -> set[int]:
+    """Return the indices of a longest increasing part."""
+    # ends[k]: the least end of an increasing part of k + 1 places.
+    ends: list[int] = []
+    lengths: list[int] = []
+    for place in places:
+        length = bisect_left(ends, place)
+        lengths.append(length)
+        ends[length : length + 1] = [place]
+    kept: set[int] = set()
+    length, last = len(ends) - 1, math.inf
+    for i in range(len(places) - 1, -1, -1):
+        if lengths[i] == length and places[i] < last:
+            kept.add(i)
+            length, last = length - 1, places[i]
+    return kept

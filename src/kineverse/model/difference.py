@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from bisect import bisect_left
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 
-from .diff import Change, Diff
+from .diff import Change, Diff, moved_tags
 from .history import Entry
 from .model import Model, Snapshot
 from .operation import KINDS
@@ -33,7 +32,7 @@ def difference(before: Model | Snapshot, after: Model | Snapshot) -> Diff:
         added=tuple(tag for tag in later if tag not in entries),
         removed=tuple(tag for tag in entries if tag not in later),
         replaced=tuple(tag for tag in common if _write_otherwise(entries[tag], later[tag])),
-        moved=_moved(common, [tag for tag in later if tag in entries]),
+        moved=moved_tags(common, list(later), entries),
     )
 
 
@@ -57,20 +56,3 @@ def _changes(old: Snapshot, new: Snapshot) -> Iterator[Change]:
 
 def _write_otherwise(one: Entry, other: Entry) -> bool:
     return one is not other and one.writes != other.writes
-
-
-def _moved(before: Sequence[str], after: Sequence[str]) -> tuple[str, ...]:
-    """Return the tags outside of a longest sequence that both orders have, in the new order."""
-    place = {tag: i for i, tag in enumerate(before)}
-    # ends[k]: the earliest end, in the old order, of a common sequence of k + 1 tags.
-    ends: list[int] = []
-    length: dict[str, int] = {}
-    for tag in after:
-        length[tag] = bisect_left(ends, place[tag])
-        ends[length[tag] : length[tag] + 1] = [place[tag]]
-    wanted, last, kept = len(ends) - 1, len(before), set()
-    for tag in reversed(after):
-        if length[tag] == wanted and place[tag] < last:
-            kept.add(tag)
-            wanted, last = wanted - 1, place[tag]
-    return tuple(tag for tag in after if tag not in kept)

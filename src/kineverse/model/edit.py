@@ -2,19 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from kineverse.collection import no_collection
-from kineverse.errors import EditError
+from kineverse.errors import EditError, NameTakenError, UnknownAttributeError
 from kineverse.expressions.expression import ExpressionLike
 from kineverse.symbols import Symbol
+from kineverse.vocabulary import EDIT, unknown_attribute
 
 from .body import Body
 from .constraint import Constraint
+from .diff import Change, Diff, moved_tags
 from .frame import WORLD, Frame, TransformLike
-from .history import History
+from .history import Entry, History
 from .operation import Effects, Operation
 from .rates import Row, as_row
 from .reader import Reader
@@ -23,6 +26,27 @@ if TYPE_CHECKING:
     from kineverse.formats.loops import Loops
 
     from .view import ModelView
+
+
+class Opening(AbstractContextManager["Edit"]):
+    """What :meth:`Model.edit` returns: it opens the edit when its ``with`` block begins."""
+
+    def __init__(self, transaction: AbstractContextManager[Edit]) -> None:
+        self._transaction = transaction
+
+    def __enter__(self) -> Edit:
+        return self._transaction.__enter__()
+
+    def __exit__(self, *raised: Any) -> bool | None:
+        return self._transaction.__exit__(*raised)
+
+    if not TYPE_CHECKING:  # a type checker says so on its own
+
+        def __getattr__(self, name: str) -> Any:
+            raise UnknownAttributeError(
+                f"model.edit() has to be opened before .{name}: write `with model.edit() as edit:`, and in "
+                f"the block edit.{name if hasattr(Edit, name) else 'add_frame'}(...)."
+            )
 
 
 @dataclass(frozen=True)
@@ -109,6 +133,28 @@ class Attach(Operation):
         return f"attach {self.name} to {self.frame.parent}"
 
 
+@dataclass(frozen=True)
+class Override(Operation):
+    """Applies an operation that may write over what operations before it wrote."""
+
+    overrides = True
+
+    operation: Operation
+
+    @property
+    def traceable(self) -> bool:  # type: ignore[override]
+        """Whether what the operation computes can be written down as expressions of what it reads."""
+        return self.operation.traceable
+
+    def apply(self, model: Reader) -> Effects:
+        """Write what the operation writes."""
+        return self.operation.apply(model)
+
+    def default_tag(self) -> str:
+        """Return the tag of the operation."""
+        return self.operation.default_tag()
+
+
 class Edit:
     """A transaction on a model; made by :meth:`Model.edit`, used in a ``with`` block.
 
@@ -123,20 +169,37 @@ class Edit:
         self._added: dict[str, None] = {}
         self._removed: dict[str, None] = {}
         self._replaced: dict[str, None] = {}
+        self._again: dict[str, None] = {}
+        self._order: list[Entry] = []
+
+    if not TYPE_CHECKING:  # a type checker says so on its own
+
+        def __getattr__(self, name):
+            raise unknown_attribute("An edit", name, dir(self), EDIT)
 
     # -- operations ----------------------------------------------------------------------------------------
 
-    def apply(self, operation: Operation, tag: str | None = None) -> str:
+    def apply(self, operation: Operation, tag: str | None = None, *, override: bool = False) -> str:
         """Append an operation; returns its tag.
+
+        Parameters
+        ----------
+        operation, tag
+            What is appended under which tag.
+        override
+            Whether it may write over frames, bodies, articulations and rates of operations before it.
 
         Raises
         ------
         NameTakenError
-            If the tag, or the name of one of its constraints, is taken.
+            If the tag is taken, or the name of something that it writes; data may be written anew. An
+            operation that has looked at what is there, as :class:`Attach` does, may write over it.
         EditError
             If the operation raises something that is not an error of this package; those pass as they are.
         """
         chosen = self._tag(operation, tag)
+        if override and isinstance(operation, Operation):
+            operation = Override(operation)
         self._changing().append(chosen, operation)
         return self._note_added(chosen)
 
@@ -182,8 +245,12 @@ class Edit:
 
     def remove(self, tag: str) -> None:
         """Take an operation out, with its constraints and everything else it wrote."""
-        self._changing().remove(tag)
+        history = self._changing()
+        before = [] if self._order else list(history.sequence)
+        history.remove(tag)
+        self._order = self._order or before
         self._replaced.pop(tag, None)
+        self._again.pop(tag, None)
         if tag in self._added:
             del self._added[tag]
         else:
@@ -198,9 +265,14 @@ class Edit:
         transform: TransformLike | Sequence[TransformLike],
         body: Body | None = None,
         tag: str | None = None,
+        *,
+        override: bool = False,
     ) -> str:
-        """Place a frame in its parent by a 4×4 transform parent_T_frame, or by several (their product)."""
-        return self.apply(AddFrame(name, Frame.of(parent, transform), body), tag)
+        """Place a frame in its parent by a 4×4 transform parent_T_frame, or by several (their product).
+
+        A frame that is there already is refused unless ``override`` is given; :meth:`attach` moves it.
+        """
+        return self.apply(AddFrame(name, Frame.of(parent, transform), body), tag, override=override)
 
     def constrain(
         self,
@@ -229,10 +301,18 @@ class Edit:
         return self.apply(loop, tag)
 
     def set_rate(
-        self, coordinate: Symbol, row: Mapping[Symbol, ExpressionLike], tag: str | None = None
+        self,
+        coordinate: Symbol,
+        row: Mapping[Symbol, ExpressionLike],
+        tag: str | None = None,
+        *,
+        override: bool = False,
     ) -> str:
-        """Say that the coordinate's rate is ``Σ expression·speed`` over the row."""
-        return self.apply(SetRate(coordinate, as_row(coordinate, row)), tag)
+        """Say that the coordinate's rate is ``Σ expression·speed`` over the row.
+
+        A rate that is there already is refused unless ``override`` is given.
+        """
+        return self.apply(SetRate(coordinate, as_row(coordinate, row)), tag, override=override)
 
     def attach(
         self,
@@ -245,7 +325,7 @@ class Edit:
         return self.apply(Attach(frame, Frame.of(parent, transform)), tag)
 
     def write(self, name: str, value: Any, tag: str | None = None) -> str:
-        """Store an immutable value under ``data``."""
+        """Store an immutable value under ``data``; the last one written under a name counts."""
         return self.apply(Write(name, value), tag)
 
     def include(self, source: Any, prefix: str | None = None, *, loops: Loops = "solve") -> list[str]:
@@ -253,7 +333,12 @@ class Edit:
         from kineverse.formats.loading import include
 
         with no_collection():
-            return include(self, source, prefix, loops)
+            try:
+                return include(self, source, prefix, loops)
+            except NameTakenError as error:
+                raise NameTakenError(
+                    f"{error} include(source, prefix=...) puts a prefix in front of all names."
+                ) from None
 
     @property
     def model(self) -> ModelView:
@@ -271,6 +356,26 @@ class Edit:
             )
         return operation.default_tag()
 
+    def _diff(self, version: int, changes: Iterable[Change], runs: int) -> Diff:
+        """Return what the edit did, at its end."""
+        moved: tuple[str, ...] = ()
+        if self._again:
+            old = [entry.tag for entry in self._order if entry.tag not in self._added]
+            moved = moved_tags(old, [entry.tag for entry in self._history.sequence], self._again)
+        exchanged = self._added.keys() | self._replaced.keys()
+        entries = self._history.entries
+        rerun = [entries[tag] for tag in self._history.run_again - exchanged if tag in entries]
+        return Diff(
+            version,
+            tuple(changes),
+            tuple(self._added),
+            tuple(self._removed),
+            tuple(self._replaced),
+            runs,
+            moved,
+            tuple(entry.tag for entry in sorted(rerun, key=lambda entry: entry.place)),
+        )
+
     def _changing(self) -> History:
         if not self._open:
             raise EditError("This edit is over; start another one with model.edit().")
@@ -279,7 +384,7 @@ class Edit:
     def _note_added(self, tag: str) -> str:
         if tag in self._removed:
             del self._removed[tag]
-            self._replaced[tag] = None
+            self._replaced[tag] = self._again[tag] = None
         else:
             self._added[tag] = None
         return tag

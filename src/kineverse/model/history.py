@@ -14,14 +14,18 @@ from contextlib import contextmanager
 from operator import attrgetter
 from typing import Any
 
+from kineverse.collection import no_collection
 from kineverse.errors import EditError, KineverseError, ModelError, NameTakenError, UnknownNameError, suggest
 
 from .frame import WORLD, Frame
-from .kinematics import ancestors
-from .operation import CONSTRAINTS, FRAMES, KINDS, Effects, Operation
+from .operation import DATA, FRAMES, KINDS, Effects, Operation
+from .ownership import may_override, taken
 from .reader import ABSENT, Cell, Read, Reader, Reads, missing
 
 _GAP = 1 << 32
+_BEFORE_ALL = -1 << 200
+_LISTED = 10
+_FEW = 4
 _PLACE = attrgetter("place")
 
 
@@ -55,15 +59,45 @@ class History:
         self._before: dict[Cell, Any] = {}
         self._events: list[tuple[Cell, Any, Any]] = []
         self._dirty: list[tuple[int, str]] = []
-        self._moved_frames: dict[str, None] = {}
-        self._contested: dict[str, None] = {}
+        self._moved_frames: dict[tuple[str, int], None] = {}
+        self._contested: dict[Cell, None] = {}
+        self.run_again: set[str] = set()
         self._disordered: set[str] = set()
-        for i, e in enumerate(entries):
-            # Placed anew: entries are shared with snapshots, and only some have been renumbered since.
-            self._link(Entry(e.tag, e.operation, i * _GAP, e.reads, e.writes))
-        for (kind, name), writers in self.cells.items():
-            self.head[kind][name] = writers[-1].writes[kind, name]
-        self.begin()
+        with no_collection():
+            self._fill(entries)
+
+    def _fill(self, entries: Iterable[Entry]) -> None:
+        """Take over operations that have been applied, in their order."""
+        cells, reading, head = self.cells, self.reading, self.head
+        for i, given in enumerate(entries):
+            # Placed anew: these may come from several models.
+            entry = Entry(given.tag, given.operation, i * _GAP, given.reads, given.writes)
+            self.entries[entry.tag] = entry
+            self.sequence.append(entry)
+            for cell, value in entry.writes.items():
+                if cell in cells:
+                    cells[cell].append(entry)
+                else:
+                    cells[cell] = [entry]
+                head[cell[0]][cell[1]] = value
+            for cell, how in entry.reads.cells.items():
+                if cell in reading:
+                    reading[cell][entry.tag] = how
+                else:
+                    reading[cell] = {entry.tag: how}
+            for kind in entry.reads.listings:
+                self.listing[kind].add(entry.tag)
+
+    def copy(self) -> History:
+        """Return a history that goes on from here by itself, without running anything; entries are shared."""
+        other = History()
+        other.entries = self.entries.copy()
+        other.sequence = self.sequence.copy()
+        other.cells = {cell: writers.copy() for cell, writers in self.cells.items()}
+        other.reading = {cell: tags.copy() for cell, tags in self.reading.items()}
+        other.listing = {kind: tags.copy() for kind, tags in self.listing.items()}
+        other.head = {kind: self.ordered(kind).copy() for kind in self.head}
+        return other
 
     # -- questions -----------------------------------------------------------------------------------------
 
@@ -203,6 +237,7 @@ class History:
             done.add(item)
             try:
                 self._run(tag)
+                self.run_again.add(tag)
             except KineverseError as error:
                 failures[tag] = error
                 failed.append(item)
@@ -213,10 +248,37 @@ class History:
         if failures:
             # Whoever catches this inside an edit may mend it; what is not mended fails again at the end.
             self._dirty = failed
-            lines = "".join(f"\n  {tag!r}: {error}" for tag, error in failures.items())
-            raise EditError(f"The edit is refused, because these operations cannot be applied:{lines}")
+            raise EditError(self._refusal(failures), failures)
         self._contested.clear()
         self._moved_frames.clear()
+
+    def _refusal(self, failures: Mapping[str, KineverseError]) -> str:
+        lines = [f"  {tag!r}: {error}" for tag, error in list(failures.items())[:_LISTED]]
+        if len(failures) > _LISTED:
+            lines.append(f"  and {len(failures) - _LISTED} more operations.")
+        needing = self._needing(failures)
+        if needing:
+            some = ", ".join(map(repr, needing[:_FEW]))
+            more = f" and {len(needing) - _FEW} more" if len(needing) > _FEW else ""
+            lines.append(f"What these write is needed by {some}{more}.")
+        listed = "\n".join(lines)
+        return f"The edit is refused, because these operations cannot be applied:\n{listed}"
+
+    def _needing(self, tags: Iterable[str]) -> list[str]:
+        """Return the tags of the operations that read what others write, and so on, in order."""
+        waiting = list(tags)
+        found = set(waiting)
+        first = len(found)
+        while waiting:
+            entry = self.entries[waiting.pop()]
+            for cell in entry.writes:
+                for tag in self.reading.get(cell, ()):
+                    if tag not in found and self.entries[tag].place > entry.place:
+                        found.add(tag)
+                        waiting.append(tag)
+        if len(found) == first:
+            return []
+        return sorted(found.difference(tags), key=lambda tag: self.entries[tag].place)
 
     def _run(self, tag: str) -> None:
         old = self.entries[tag]
@@ -272,42 +334,58 @@ class History:
             raise UnknownNameError(f"The parent of frame '{name}' is missing. {error}")
 
     def _check_free(self, entry: Entry) -> None:
-        for kind, name in entry.writes:
-            if kind == CONSTRAINTS:
-                # One that comes later may yet be called something else when it is run again.
-                for other in self.cells.get((kind, name), ()):
-                    if other.place < entry.place:
-                        raise _taken(name, other.tag)
+        """Refuse an operation that silently writes over what one before it wrote."""
+        for cell in entry.writes:
+            writers = self.cells.get(cell)
+            # One that comes later may yet be called something else when it is run again.
+            if writers and writers[0].place < entry.place and not may_override(entry, cell):
+                raise taken(cell, entry, writers[0].tag)
 
     def _check_names(self, failures: dict[str, KineverseError]) -> None:
-        """Look for constraints that have two makers."""
-        for name in self._contested:
-            first, *others = self.cells.get((CONSTRAINTS, name), (None,))
+        """Look for what has two writers of which the second does not know about the first."""
+        for cell in self._contested:
+            first, *others = self.cells.get(cell, (None,))
             for entry in others:
-                if first is not None and entry is not None:
-                    failures.setdefault(entry.tag, _taken(name, first.tag))
+                if first is not None and entry is not None and not may_override(entry, cell):
+                    failures.setdefault(entry.tag, taken(cell, entry, first.tag))
 
     def _check_frames(self, failures: dict[str, KineverseError]) -> None:
-        """Look for circles, which only frames that were written anew can close."""
-        frames = self.head[FRAMES]
-        sound = {WORLD}
-        for name in self._moved_frames:
-            if name not in frames:
-                continue
-            chain: dict[str, None] = {}
+        """Look for circles, at any place of the sequence; only frames that were written anew close them."""
+        for name, place in self._moved_frames:
+            circle = self._circle(name, place)
+            if circle is not None:
+                tag, names = circle
+                failures.setdefault(tag, ModelError(f"Cyclic frames: {' -> '.join([*names, names[0]])}."))
+
+    def _circle(self, name: str, place: int) -> tuple[str, list[str]] | None:
+        """Return the first circle through a frame, from a place on to where it is written again.
+
+        It comes with the tag of the operation that closes it.
+        """
+        end = None if place == _BEFORE_ALL else self._next_writer(name, place)
+        while True:
+            chain: dict[str, Entry] = {}
+            until = end
             link = name
-            while link not in sound and link not in chain and link in frames:
-                chain[link] = None
-                link = frames[link].parent
-            if link in sound:
-                sound.update(chain)
-                continue
-            try:
-                ancestors(name, frames.__getitem__)
-            except ModelError as error:
-                failures[self.cells[FRAMES, name][-1].tag] = error
-            except KeyError as error:
-                failures.setdefault(self.cells[FRAMES, name][-1].tag, missing(FRAMES, error.args[0], frames))
+            while link != WORLD and link not in chain:
+                writers = self.cells.get((FRAMES, link), [])
+                index = bisect_right(writers, place, key=_PLACE)
+                if index < len(writers) and (until is None or writers[index].place < until):
+                    until = writers[index].place
+                if not index:
+                    break  # it is not there yet
+                chain[link] = writers[index - 1]
+                link = writers[index - 1].writes[FRAMES, link].parent
+            if link == name and chain:
+                return max(chain.values(), key=_PLACE).tag, list(chain)
+            if until is None or until == end:
+                return None
+            place = until
+
+    def _next_writer(self, name: str, place: int) -> int | None:
+        writers = self.cells.get((FRAMES, name), [])
+        index = bisect_right(writers, place, key=_PLACE)
+        return writers[index].place if index < len(writers) else None
 
     def _touched(self, cell: Cell, old: Any, new: Any, place: int) -> None:
         """Note that a write at ``place`` changed, for those who read it."""
@@ -327,8 +405,9 @@ class History:
         following = writers[index].place if index < len(writers) else None
         if following is None:
             self._set_head(cell, writers[-1].writes[cell] if writers else ABSENT)
-            if kind == FRAMES and (old is not ABSENT or len(writers) > 1 or cell in self.reading):
-                self._moved_frames[name] = None
+        if kind == FRAMES and new is not ABSENT:
+            if cell in self.reading if old is ABSENT else old.parent != new.parent:
+                self._moved_frames[name, place] = None
         existence = (old is ABSENT) != (new is ABSENT)
         for tag, how in self.reading.get(cell, {}).items():
             reader = self.entries[tag].place
@@ -383,6 +462,7 @@ class History:
         self._dirty.clear()
         self._moved_frames.clear()
         self._contested.clear()
+        self.run_again.clear()
 
     def roll_back(self) -> None:
         """Undo everything since :meth:`begin`."""
@@ -440,8 +520,8 @@ class History:
             else:
                 insort(writers, entry, key=_PLACE)
                 self._disordered.add(cell[0])
-                if cell[0] == CONSTRAINTS:
-                    self._contested[cell[1]] = None
+                if cell[0] != DATA:
+                    self._contested[cell] = None
         for cell, how in entry.reads.cells.items():
             self.reading.setdefault(cell, {})[entry.tag] = how
         for kind in entry.reads.listings:
@@ -482,17 +562,21 @@ class History:
             self._disordered.update(kind for kind, _ in (*old.writes, *new.writes))
 
     def _renumber(self) -> None:
-        entries = self.sequence
-        self._undo.append((self._restore_places, ([(e, e.place) for e in entries],)))
-        self._restore_places([(e, i * _GAP) for i, e in enumerate(entries)])
+        # Entries may be shared with copies and snapshots, so others are put in their place.
+        anew = [Entry(e.tag, e.operation, i * _GAP, e.reads, e.writes) for i, e in enumerate(self.sequence)]
+        self._undo.append((self._put_entries, (self.sequence,)))
+        self._put_entries(anew)
         self._dirty = [(self.entries[tag].place, tag) for _, tag in self._dirty if tag in self.entries]
         heapq.heapify(self._dirty)
 
-    @staticmethod
-    def _restore_places(places: list[tuple[Entry, int]]) -> None:
+    def _put_entries(self, sequence: list[Entry]) -> None:
         # The order stays the same, so every sorted list of entries stays sorted.
-        for entry, place in places:
-            entry.place = place
+        self.sequence = sequence
+        self.entries = {entry.tag: entry for entry in sequence}
+        for writers in self.cells.values():
+            writers[:] = [self.entries[entry.tag] for entry in writers]
+        # Where frames were moved is not known any more, so they are looked at from the beginning on.
+        self._moved_frames = {(name, _BEFORE_ALL): None for name, _ in self._moved_frames}
 
 
 def as_cell(path: str) -> Cell:
@@ -514,10 +598,3 @@ def as_cell(path: str) -> Cell:
 def _check_operation(operation: object) -> None:
     if not isinstance(operation, Operation):
         raise EditError(f"{operation!r} is not an operation; subclass kv.Operation as a frozen dataclass.")
-
-
-def _taken(name: str, maker: str) -> NameTakenError:
-    return NameTakenError(
-        f"There is a constraint '{name}' already, made by {maker!r}; "
-        "choose another name or replace that operation."
-    )

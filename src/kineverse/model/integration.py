@@ -1,4 +1,7 @@
-"""Moving a state along constant speeds: q̇ = R(q) u, exactly enough that nobody writes a rule by hand."""
+"""Moving a state along constant speeds: q̇ = R(q) u, exactly enough that nobody writes a rule by hand.
+
+Limits and other constraints stop nothing here; ``model.integrate(..., clip=True)`` brings coordinates back.
+"""
 
 from __future__ import annotations
 
@@ -11,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from kineverse.compile import compile  # noqa: A004
-from kineverse.errors import UnknownNameError, ValueRejectedError, suggest
+from kineverse.errors import UnknownNameError, ValueRejectedError, given_twice, suggest
 from kineverse.expressions.evaluation import assign
 from kineverse.expressions.expression import Expression, array
 from kineverse.state import State
@@ -32,7 +35,7 @@ _SHORTEST = 1e-9
 def integrate(
     coordinates: tuple[Symbol, ...],
     rates: Rates,
-    state: Mapping[Any, float],
+    state: State,
     speeds: Mapping[Any, float],
     dt: float,
 ) -> State:
@@ -47,7 +50,7 @@ def integrate(
     coordinates, rates
         What moves, and how.
     state
-        A state, or a mapping from symbols or names to numbers: values of at least all coordinates that move.
+        Values of at least all coordinates that move.
     speeds
         From free speeds or their names to numbers; those not given are 0.
     dt
@@ -62,17 +65,21 @@ def integrate(
     """
     if not math.isfinite(dt):
         raise ValueRejectedError(f"The time step is a finite number of seconds, not {dt!r}.")
-    state = state if isinstance(state, State) else State(state)
     free = {c.derivative(): c for c in coordinates if c not in rates}
     flow = flow_of(rates) if rates else None
     wheels = flow.speeds if flow else ()
     by_name = {str(s): s for s in (*free, *wheels)}
     given: dict[Symbol, float] = {}
     for key, value in speeds.items():
-        if str(key) not in by_name:
+        speed = by_name.get(str(key))
+        if speed is None:
+            if isinstance(speeds, State):
+                continue  # it may know more
             raise UnknownNameError(f"Nothing moves with '{key}'. {suggest(str(key), by_name, 'speed')}")
-        given[by_name[str(key)]] = float(value)
-        if not math.isfinite(given[by_name[str(key)]]):
+        if speed in given:
+            raise given_twice(speed)
+        given[speed] = float(value)
+        if not math.isfinite(given[speed]):
             raise ValueRejectedError(f"The speed '{key}' is {value!r}; it must be finite.")
     result = {free[v]: state[free[v]] + dt * value for v, value in given.items() if v in free}
     if flow and any(given.get(v) for v in wheels):
@@ -127,7 +134,7 @@ class Flow:
         _StuckError
             If they run to infinity on the way.
         """
-        known = {s: state[s] for s in self._inputs if s in state}
+        known = {s: value for s in self._inputs if (value := state.given(s)) is not None}
         known.update({v: speeds.get(v, 0.0) for v in self.speeds})
         evaluator = self._function.bind()
         evaluator.input[:] = assign(self._inputs, State(known))

@@ -44,12 +44,11 @@ class Listener:
             return diff
         changes = tuple(c for c in diff.changes if self._wants(c))
         tags = self.tags or frozenset()
-        added, removed, replaced = (
-            tuple(t for t in group if t in tags) for group in (diff.added, diff.removed, diff.replaced)
-        )
-        if not (changes or added or removed or replaced):
+        groups = ("added", "removed", "replaced", "moved", "rerun")
+        heard = {name: tuple(t for t in getattr(diff, name) if t in tags) for name in groups}
+        if not (changes or any(heard.values())):
             return None
-        return replace(diff, changes=changes, added=added, removed=removed, replaced=replaced)
+        return replace(diff, changes=changes, **heard)  # type: ignore[arg-type]
 
     def _wants(self, change: Change) -> bool:
         if self.paths is not None and any(_below(change.path, p) for p in self.paths):

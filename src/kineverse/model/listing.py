@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import ItemsView, Iterator, Mapping, ValuesView
 from typing import TYPE_CHECKING, Any
 
+from .display import as_html, as_lines
 from .reader import missing
 
 if TYPE_CHECKING:
@@ -54,6 +55,18 @@ class Listing(Mapping[str, Any]):
     def __contains__(self, name: object) -> bool:
         with self._view._lock:
             return name in self._values()
+
+    def __str__(self) -> str:
+        with self._view._lock:
+            return as_lines(self._title, self.items(), len(self))
+
+    def _repr_html_(self) -> str:
+        with self._view._lock:
+            return as_html(self._title, self.items(), len(self))
+
+    @property
+    def _title(self) -> str:
+        return f"{len(self)} {self._kind}"
 
     def __repr__(self) -> str:
         names = list(self)

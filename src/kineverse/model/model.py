@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from typing import TYPE_CHECKING, Any
 
-from kineverse.errors import EditError
+from kineverse.collection import no_collection
+from kineverse.errors import EditError, ExpressionError
 from kineverse.symbols import Symbol
 
 from .diff import Change, Diff
-from .edit import Edit
+from .edit import Edit, Opening
 from .history import Entry, History
 from .listeners import Listener, Listeners
 from .reader import ABSENT
@@ -32,8 +34,12 @@ class Model(ModelView):
     One thread edits at a time, and readers in other threads wait for it; a :meth:`snapshot` never changes.
     """
 
-    def __init__(self, _entries: Iterable[Entry] = (), _version: int = 0) -> None:
-        self._history = History(_entries)
+    def __init__(self, _entries: Iterable[Entry] | History = (), _version: int = 0) -> None:
+        if isinstance(_entries, str | os.PathLike):
+            raise ExpressionError(
+                f"A model begins empty, with kv.Model(). To load one: kv.load({os.fspath(_entries)!r})."
+            )
+        self._history = _entries if isinstance(_entries, History) else History(_entries)
         self._edit: Edit | None = None
         self._listeners = Listeners()
         super().__init__(self._history.head, _version)
@@ -45,15 +51,19 @@ class Model(ModelView):
 
     # -- editing -------------------------------------------------------------------------------------------
 
-    @contextmanager
-    def edit(self) -> Iterator[Edit]:
+    def edit(self) -> AbstractContextManager[Edit]:
         """Open a transaction: it is committed at the end of the ``with`` block, or nothing has happened.
 
         Raises
         ------
         EditError
-            At the end of the block, if operations cannot be run after the edit: all of them are listed.
+            At the end of the block, if operations cannot be run after the edit: the first ones are listed,
+            and all of them are in its ``failures``.
         """
+        return Opening(self._transaction())
+
+    @contextmanager
+    def _transaction(self) -> Iterator[Edit]:
         with self._lock:
             if self._edit is not None:
                 raise EditError("The model is being edited already; use that edit.")
@@ -82,24 +92,21 @@ class Model(ModelView):
         if events:
             self._changed(events)
 
+    def _writers(self, path: str) -> list[str]:
+        return self._history.writers(path)
+
     def _ordered(self, kind: str) -> dict[str, Any]:
         return self._history.ordered(kind)
 
     def _commit(self, edit: Edit, runs: int) -> Diff:
-        changes = list(self._history.changes())
+        changes = [
+            Change(kind, name, None if before is ABSENT else before, None if after is ABSENT else after)
+            for (kind, name), before, after in self._history.changes()
+        ]
+        diff = edit._diff(self._version + 1, changes, runs)
         self._history.begin()
         self._version += 1
-        return Diff(
-            self._version,
-            tuple(
-                Change(kind, name, None if before is ABSENT else before, None if after is ABSENT else after)
-                for (kind, name), before, after in changes
-            ),
-            tuple(edit._added),
-            tuple(edit._removed),
-            tuple(edit._replaced),
-            runs,
-        )
+        return diff
 
     def include(self, source: Any, prefix: str | None = None, *, loops: Loops = "solve") -> list[str]:
         """Add a file or a shipped model in one edit; returns the tags. See :func:`kineverse.load`."""
@@ -126,7 +133,7 @@ class Model(ModelView):
         symbols
             Constraints about the coordinates of these symbols, in their expression, bounds or gradient.
         tags
-            Operations that are added, removed or replaced.
+            Operations that are added, removed, replaced, moved or run again.
         """
         return self._listeners.add(callback, paths, symbols, tags)
 
@@ -134,14 +141,17 @@ class Model(ModelView):
 
     def snapshot(self) -> Snapshot:
         """Return the model as it is now; it never changes and can be kept, compared and sent."""
-        with self._lock:
+        with self._lock, no_collection():
             self._settle()
             head = {kind: dict(self._history.ordered(kind)) for kind in self._history.head}
             return Snapshot(head, tuple(self._history.sequence), self._version)
 
     def copy(self) -> Model:
         """Return an independent model with the same operations, without running them again."""
-        return self.snapshot().model()
+        # The collector would look again and again at what is made here, all of which is kept.
+        with self._lock, no_collection():
+            self._settle()
+            return Model(self._history.copy(), self._version)
 
     __copy__ = copy
 

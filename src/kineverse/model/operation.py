@@ -16,10 +16,11 @@ from kineverse.errors import ValueRejectedError
 from kineverse.expressions.expression import Expression, ExpressionLike
 from kineverse.symbols import Symbol
 
-from .articulation import Articulation
+from .articulation import Articulation, check_home
 from .body import Body, Pose
 from .constraint import Constraint, ConstraintLike, as_constraint
 from .frame import Frame, TransformLike
+from .keywords import check_keywords
 from .rates import as_entry, plain
 
 if TYPE_CHECKING:
@@ -133,6 +134,8 @@ _TYPES = {BODIES: Body, ARTICULATIONS: Articulation}
 def _check_value(kind: str, name: str, value: object) -> None:
     if kind in _TYPES and not isinstance(value, _TYPES[kind]):
         raise ValueRejectedError(f"{kind}/{name} is a kv.{_TYPES[kind].__name__}, not {value!r}.")
+    if isinstance(value, Articulation):
+        check_home(name, value)
     try:
         hash(value)
     except TypeError:
@@ -162,6 +165,16 @@ class Operation(ABC):
 
     traceable: ClassVar[bool] = True
     """Whether what it computes can be written down as expressions of what it reads; False saves the try."""
+
+    overrides: ClassVar[bool] = False
+    """Whether it may write over frames, bodies, articulations and rates that it has not looked at."""
+
+    if not TYPE_CHECKING:  # a type checker knows the keywords
+
+        def __new__(cls, *args, **keywords):
+            """Make an operation; wrong arguments are answered with the right ones."""
+            check_keywords(cls, args, keywords)
+            return object.__new__(cls)
 
     @abstractmethod
     def apply(self, model: Reader) -> Effects:

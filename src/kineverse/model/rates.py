@@ -18,14 +18,16 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from functools import cached_property
-from typing import TYPE_CHECKING, TypeAlias
+from typing import TYPE_CHECKING, Any, TypeAlias
 
-from kineverse.errors import ModelError, ValueRejectedError
+from kineverse.errors import ModelError, UnknownNameError, ValueRejectedError, suggest
 from kineverse.expressions.expression import Expression, ExpressionLike, as_expression
 from kineverse.expressions.leaves import bottom_up, leaves
 from kineverse.expressions.node import Node
 from kineverse.expressions.substitution import apply, compose_gradient, replace_nodes
 from kineverse.symbols import Symbol
+
+from .display import as_html, as_lines
 
 if TYPE_CHECKING:
     from kineverse.expressions.substitution import Substitution
@@ -160,14 +162,52 @@ class Rates(Mapping[Symbol, Mapping[Symbol, Expression]]):
         """Whether all coordinates are free."""
         return not self._given
 
-    def __getitem__(self, coordinate: Symbol) -> Mapping[Symbol, Expression]:
-        return self._rows[coordinate]
+    def __getitem__(self, coordinate: Symbol | str) -> Mapping[Symbol, Expression]:
+        row: Mapping[Symbol, Expression] | None = self.get(coordinate)
+        if row is not None:
+            return row
+        name = str(coordinate)
+        if name in map(str, self.dependent):
+            raise UnknownNameError(
+                f"'{name}' has no row, because it depends on other coordinates: see rates.dependent and "
+                "rates.row(coordinate)."
+            )
+        if not self._rows:
+            raise UnknownNameError(f"'{name}' has no row: every coordinate moves freely, by its own speed.")
+        raise UnknownNameError(
+            f"There is no rate {name!r}; a coordinate without one moves freely, by its own speed. "
+            f"{suggest(name, map(str, self._rows), 'rate')}"
+        )
+
+    def get(self, coordinate: object, default: Any = None) -> Any:
+        """Return the row of a coordinate, by symbol or name, or the default."""
+        if isinstance(coordinate, str):
+            return self._by_name.get(coordinate, default)
+        return self._rows.get(coordinate, default)  # type: ignore[call-overload]
+
+    def __contains__(self, coordinate: object) -> bool:
+        return coordinate in (self._by_name if isinstance(coordinate, str) else self._rows)
+
+    @cached_property
+    def _by_name(self) -> dict[str, Mapping[Symbol, Expression]]:
+        return {str(coordinate): row for coordinate, row in self._rows.items()}
 
     def __iter__(self) -> Iterator[Symbol]:
         return iter(self._rows)
 
     def __len__(self) -> int:
         return len(self._rows)
+
+    def __repr__(self) -> str:
+        return as_lines(self._title, self._by_name.items(), len(self))
+
+    def _repr_html_(self) -> str:
+        return as_html(self._title, self._by_name.items(), len(self))
+
+    @property
+    def _title(self) -> str:
+        beside = f" and {len(self.dependent)} dependent coordinates" if self.dependent else ""
+        return f"{len(self)} rates{beside}"
 
     def __eq__(self, other: object) -> bool:
         return self.key == other.key if isinstance(other, Rates) else NotImplemented

@@ -204,6 +204,12 @@ def missing(kind: str, name: str, available: Any) -> UnknownNameError:
     if not isinstance(name, str):
         return UnknownNameError(f"A {noun} is asked for by its name, a text, not by {name!r}.")
     names = list(available)
+    if kind == FRAMES:
+        if name == WORLD:
+            return UnknownNameError(
+                f"The frame '{WORLD}' is the root of all others, and is not listed among them."
+            )
+        names.append(WORLD)
     if len(names) > _MANY:
         # An edit may miss thousands of things at once, and comparing letters with every name takes long.
         start, end = name[: len(name) // 2 + 1], name[-len(name) // 2 :]

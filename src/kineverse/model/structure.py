@@ -4,15 +4,16 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Mapping, Sequence
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import casadi as ca
 import numpy as np
 
-from kineverse.errors import UnknownNameError
+from kineverse.errors import UnknownAttributeError, UnknownNameError
 from kineverse.expressions.expression import NO_NODES, Expression, as_expression, make
 from kineverse.motions import AxisMotion
 from kineverse.symbols import Symbol, check_symbols
+from kineverse.vocabulary import EDITING, MODEL, unknown_attribute
 
 from . import kinematics
 from .articulation import Articulation
@@ -41,15 +42,22 @@ class Structure:
         self._forget_index({})
         self._forget_all()
 
+    if not TYPE_CHECKING:  # a type checker says so on its own
+
+        def __getattr__(self, name):
+            if name in EDITING:
+                raise UnknownAttributeError(
+                    f"A model is changed in an edit: write `with model.edit() as edit:`, and in the block "
+                    f"edit.{name}(...)."
+                )
+            raise unknown_attribute("A model", name, dir(self), MODEL)
+
     def _forget_index(self, dependent: Mapping[Symbol, Expression]) -> None:
         self._dependent = dependent
         self._relevance = Relevance(dependent)
         self._index = SymbolIndex()
-        self._pending: list[tuple[Cell, Any, Any]] = [
-            ((kind, name), ABSENT, value)
-            for kind in (FRAMES, CONSTRAINTS)
-            for name, value in self._head[kind].items()
-        ]
+        self._pending: list[tuple[Cell, Any, Any]] = []
+        self._is_indexed = False
 
     def _forget_all(self) -> None:
         self._rates: Rates | None = None
@@ -63,7 +71,8 @@ class Structure:
     def _changed(self, changes: Sequence[tuple[Cell, Any, Any]]) -> None:
         """Drop what no longer holds."""
         kinds = {cell[0] for cell, _, _ in changes}
-        self._pending += changes
+        if self._is_indexed:
+            self._pending += changes
         self._all_symbols = None
         if RATES in kinds:
             self._rates = None
@@ -93,6 +102,13 @@ class Structure:
         if self.rates.dependent != self._dependent:
             self._forget_index(self.rates.dependent)
         pending, self._pending = self._pending, []
+        if not self._is_indexed:
+            pending = [
+                ((kind, name), ABSENT, value)
+                for kind in (FRAMES, CONSTRAINTS)
+                for name, value in self._head[kind].items()
+            ]
+            self._is_indexed = True
         for (kind, name), before, after in pending:
             if kind not in (FRAMES, CONSTRAINTS):
                 continue
@@ -330,5 +346,5 @@ class Structure:
         try:
             frame: Frame = self._head[FRAMES][name]
         except (KeyError, TypeError):
-            raise missing(FRAMES, name, (*self._head[FRAMES], WORLD)) from None
+            raise missing(FRAMES, name, self._head[FRAMES]) from None
         return frame

@@ -29,7 +29,7 @@ from kineverse.expressions.expression import Expression, array
 from kineverse.expressions.functions import sqrt
 from kineverse.expressions.implicit import held
 from kineverse.number import real_number
-from kineverse.symbols import Symbol
+from kineverse.symbols import Symbol, check_symbols
 
 from .constraint import Constraint
 from .rates import Rates
@@ -131,6 +131,7 @@ def velocity_rows(
     moving = {s for found in gaps.values() for gap in found for s in gap.away}
     moving.update(s for row in limits.rows for s in row.weights)
     if speeds is not None:
+        speeds = check_symbols(speeds)
         moving = set(speeds)
     waiting = {
         name: (constraint, _speeds_of(constraint, table))

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import math
 import os
 from collections.abc import Collection, Iterable, Mapping, Sequence
+from html import escape
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from kineverse.errors import UnknownNameError, suggest
+from kineverse.errors import UnknownNameError, ValueRejectedError, suggest
 from kineverse.expressions.expression import Expression
 from kineverse.state import State
 from kineverse.symbols import Symbol, parse_symbol_name
@@ -19,6 +21,7 @@ from .integration import integrate
 from .operation import ARTICULATIONS, CONSTRAINTS
 from .projection import TOLERANCE, project
 from .structure import Structure
+from .values import as_state
 from .velocity import VelocityRows, velocity_rows
 from .violations import Checks, Violations, find_violations
 
@@ -33,7 +36,7 @@ class ModelView(Structure):
 
     def constraints_for(
         self,
-        subject: Expression | Iterable[Symbol | Expression],
+        subject: Expression | str | Iterable[Symbol | Expression | str],
         exact: bool = False,
         bounds: bool = False,
         closure: bool = False,
@@ -46,7 +49,7 @@ class ModelView(Structure):
         Parameters
         ----------
         subject
-            An expression, or several, or symbols.
+            An expression, or several, or symbols; the name of a frame stands for its pose.
         exact
             The papers' formula, ``V(φ_c) ∩ V(ψ) ≠ ∅``: symbols rather than coordinates, values only.
         bounds
@@ -57,8 +60,29 @@ class ModelView(Structure):
         with self._lock:
             self._catch_up()
             head = self._head[CONSTRAINTS]
-            names = self._relevance.of(subject, head, exact=exact, bounds=bounds, closure=closure)
+            names = self._relevance.of(
+                self._expressions(subject), head, exact=exact, bounds=bounds, closure=closure
+            )
             return {name: self._carried(name, head[name]) for name in names}
+
+    def _expressions(self, subject: Expression | str | Iterable[Symbol | Expression | str]) -> Any:
+        """Return what a subject is, with poses in place of the names of frames."""
+        if isinstance(subject, str):
+            subject = [subject]
+        if isinstance(subject, Expression) or not isinstance(subject, Iterable):
+            return subject
+        return [self._pose_of(item) if isinstance(item, str) else item for item in subject]
+
+    def _pose_of(self, frame: str) -> Expression:
+        try:
+            return self.fk(frame)
+        except UnknownNameError as error:
+            if any(str(s.position) == frame.partition(":")[0] for s in (*self.symbols, *self.speeds)):
+                raise UnknownNameError(
+                    f"There is no frame {frame!r}, and the text stands for one. For the symbol of that name "
+                    f"pass model.symbol({frame!r})."
+                ) from None
+            raise error
 
     def violations(self, values: Mapping[Any, float], tolerance: float = 1e-9) -> Violations:
         """Return the constraints that values break: (name, value, lower, upper, excess) each, worst first.
@@ -86,8 +110,16 @@ class ModelView(Structure):
             if self._checks is None:
                 followed = {name: self._followed(c) for name, c in self._head[CONSTRAINTS].items()}
                 self._checks = Checks(followed, self.rates.dependent.values())
-            known = self._index.sorted() if not isinstance(values, State) else ()
-            return find_violations(self._checks, values, (*known, *self.rates, *self.speeds), tolerance)
+            return find_violations(self._checks, values, self._known(values), tolerance)
+
+    def _known(self, values: object) -> tuple[Symbol, ...]:
+        """Return the symbols that plain values may be about; a state may be about anything."""
+        if isinstance(values, State):
+            return ()
+        self._catch_up()
+        found = dict.fromkeys((*self._index.sorted(), *self.symbols, *self.rates, *self.speeds))
+        found.update(dict.fromkeys(self.rates.dependent))
+        return tuple(found)
 
     def limits(self, symbol: Symbol | str, values: Mapping[Any, float] | None = None) -> tuple[float, float]:
         """Return the bounds that constraints put on a single symbol, ±inf where there are none.
@@ -98,6 +130,8 @@ class ModelView(Structure):
         with self._lock:
             self._catch_up()
             wanted = symbol if isinstance(symbol, Symbol) else self.symbol(symbol)
+            if values is not None:
+                values = as_state(values, self._known(values))
             lower, upper = -np.inf, np.inf
             for name in self._relevance.on(wanted):
                 c = self._head[CONSTRAINTS][name]
@@ -111,13 +145,7 @@ class ModelView(Structure):
     def _bound(self, bound: Expression, values: Mapping[Any, float] | None) -> float | None:
         if not bound.symbols:
             return float(bound)
-        known = (
-            values
-            if isinstance(values, State)
-            else State(values)
-            if values is not None
-            else self.default_state()
-        )
+        known = self.default_state() if values is None else values
         if any(s not in known and s.value is None for s in bound.symbols):
             return None
         return float(bound(known))
@@ -155,32 +183,61 @@ class ModelView(Structure):
                 for symbol, home in zip(record.coordinates, record.home, strict=False):
                     if symbol in values:
                         values[symbol] = home
-            later = []
-            for symbol in symbols:
-                for name in self._relevance.about(symbol):
-                    c = self._head[CONSTRAINTS][name]
-                    if c.line is None:
-                        continue
-                    if c.lower.symbols or c.upper.symbols:
-                        later.append((symbol, c))
-                    else:
-                        values[symbol] = c.nearest(values[symbol], float(c.lower), float(c.upper))
-            # Bounds may be about symbols that have such bounds too: at most so many rounds until all fit.
-            for _ in later:
-                before = dict(values)
-                for symbol, c in later:
-                    known = State(values)
-                    if all(s in known or s.value is not None for s in (*c.lower.symbols, *c.upper.symbols)):
-                        low, high = float(c.lower(known)), float(c.upper(known))
-                        values[symbol] = c.nearest(values[symbol], low, high)
-                if values == before:
-                    break
+            self._clip(values, symbols)
+            wrong = [s for s, value in values.items() if not math.isfinite(value)]
+            if wrong:  # parameters first, as others follow from them
+                symbol = min(wrong, key=lambda s: s.value is None)
+                raise self._no_default(symbol, values[symbol])
             return State(values, source="default")
+
+    def _clip(self, values: dict[Symbol, float], symbols: Iterable[Symbol]) -> None:
+        """Bring values within the limits of each symbol alone."""
+        self._catch_up()
+        later = []
+        for symbol in symbols:
+            for name in self._relevance.about(symbol):
+                c = self._head[CONSTRAINTS][name]
+                if c.line is None:
+                    continue
+                if c.lower.symbols or c.upper.symbols:
+                    later.append((symbol, c))
+                else:
+                    values[symbol] = c.nearest(values[symbol], float(c.lower), float(c.upper))
+        # Bounds may be about symbols that have such bounds too: at most so many rounds until all fit.
+        for _ in later:
+            before = dict(values)
+            for symbol, c in later:
+                known = State(values)
+                if all(s in known or s.value is not None for s in (*c.lower.symbols, *c.upper.symbols)):
+                    low, high = float(c.lower(known)), float(c.upper(known))
+                    values[symbol] = c.nearest(values[symbol], low, high)
+            if values == before:
+                break
+
+    def _no_default(self, symbol: Symbol, value: float) -> ValueRejectedError:
+        """Return the error for a default that is not finite, with who is to blame."""
+        names = [n for n, a in self._head[ARTICULATIONS].items() if symbol in a.coordinates]
+        paths = [f"{ARTICULATIONS}/{name}" for name in names]
+        paths += [f"{CONSTRAINTS}/{name}" for name in self._relevance.about(symbol)]
+        if symbol.value is not None and not math.isfinite(symbol.value):
+            why = "that is its value as a parameter"
+        else:
+            why = f"it follows from {', '.join(paths[:4])}" if paths else "nothing gives it another one"
+        writers = dict.fromkeys(tag for path in paths[:4] for tag in self._writers(path))
+        by = f", written by {', '.join(map(repr, writers))}" if writers else ""
+        return ValueRejectedError(
+            f"The default of '{symbol}' is {value:g}, which is not finite: {why}{by}. Give it a finite home, "
+            "limits or value."
+        )
+
+    def _writers(self, path: str) -> list[str]:
+        """Return the tags that write a path, as far as that is known here."""
+        return []
 
     def velocity_rows(
         self,
         dt: float,
-        subject: Expression | Iterable[Symbol | Expression] | None = None,
+        subject: Expression | str | Iterable[Symbol | Expression | str] | None = None,
         *,
         speeds: Sequence[Symbol] | None = None,
         gain: float | None = None,
@@ -188,7 +245,7 @@ class ModelView(Structure):
         """Return the linear rows in speeds that keep the constraints over a step of ``dt`` seconds.
 
         Of the constraints relevant for ``subject`` and of the speed limits of whatever they let move, or of
-        all; see :mod:`kineverse.model.velocity`.
+        all; see :meth:`constraints_for` and :mod:`kineverse.model.velocity`.
         """
         with self._lock:
             every = dict(self.constraints)
@@ -197,11 +254,44 @@ class ModelView(Structure):
                 constraints, dt, rates=self.rates, speeds=speeds, gain=gain, speed_limits=every
             )
 
-    def integrate(self, state: Mapping[Any, float], speeds: Mapping[Any, float], dt: float) -> State:
-        """Return the state ``dt`` seconds later, at constant speeds: :mod:`kineverse.model.integration`."""
+    def integrate(
+        self, state: Mapping[Any, float], speeds: Mapping[Any, float], dt: float, *, clip: bool = False
+    ) -> State:
+        """Return the state ``dt`` seconds later, at constant speeds: :mod:`kineverse.model.integration`.
+
+        Surprise first: **limits and other constraints stop nothing**. At 100 rad/s a door of 1.57 rad is at
+        100 rad after one second, and :meth:`violations` says so.
+
+        Parameters
+        ----------
+        state
+            Values of at least all coordinates that move: a state, or a mapping from symbols or names of this
+            model to numbers.
+        speeds
+            From free speeds or their names to numbers [m/s], [rad/s]; those not given are 0.
+        dt
+            [s]; may be negative.
+        clip
+            Whether each coordinate is brought back to the nearest end of its limits afterwards, as in
+            :meth:`default_state`: constraints on a straight line over it alone. Others, as on the sum of two,
+            or locks of speeds, are not looked at.
+
+        Raises
+        ------
+        UnknownNameError
+            For a speed that moves nothing here, and a value of something that is not in the model.
+        ValueRejectedError
+            For NaN or an infinite step, or if coordinates run to infinity on the way.
+        """
         with self._lock:
             coordinates, rates = self.degrees_of_freedom, self.rates
-        return integrate(coordinates, rates, state, speeds, dt)
+            given = as_state(state, self._known(state))
+            after = integrate(coordinates, rates, given, speeds, dt)
+            if not clip:
+                return after
+            values = dict(after)
+            self._clip(values, [s for s in coordinates if s in values])
+            return after.updated(values)
 
     def project(
         self, state: Mapping[Any, float], *, fixed: Iterable[Symbol | str] = (), tolerance: float = TOLERANCE
@@ -274,7 +364,8 @@ class ModelView(Structure):
         """
         from kineverse.formats.saving import save
 
-        return save(self, path, tolerance=tolerance, leave_out=leave_out, strict=strict)
+        names = (leave_out,) if isinstance(leave_out, str) else leave_out
+        return save(self, path, tolerance=tolerance, leave_out=names, strict=strict)
 
     # -- printing ------------------------------------------------------------------------------------------
 
@@ -286,3 +377,15 @@ class ModelView(Structure):
 
     def __repr__(self) -> str:
         return f"<{type(self).__name__}: {self}>"
+
+    def _repr_html_(self) -> str:
+        with self._lock:
+            mappings = [self.frames, self.articulations, self.constraints, self.bodies, self.data]
+            parts = [part._repr_html_() for part in mappings if part]  # type: ignore[attr-defined]
+            parts += [self.rates._repr_html_()] if self.rates else []
+        tables = "".join(
+            f"<details><summary>{escape(part.partition('<caption>')[2].partition('</caption>')[0])}</summary>"
+            f"{part}</details>"
+            for part in parts
+        )
+        return f"<div><p>{escape(str(self))}</p>{tables}</div>"

@@ -9,15 +9,16 @@ from typing import Any, NamedTuple
 import casadi as ca
 import numpy as np
 
-from kineverse.errors import ExpressionError, NameTakenError, UnknownNameError, suggest
-from kineverse.expressions.evaluation import assign
+from kineverse.errors import UnknownNameError
 from kineverse.expressions.expression import Expression, as_expression
 from kineverse.expressions.implicit import implicit_nodes
 from kineverse.expressions.lowering import lower
+from kineverse.html_table import html_table
 from kineverse.state import State
 from kineverse.symbols import Symbol
 
 from .constraint import Constraint
+from .values import as_state
 
 
 class Violation(NamedTuple):
@@ -49,6 +50,13 @@ class Violations(tuple[Violation, ...]):
             for v in self
         ]
         return f"{len(self)} violated\n" + "\n".join(lines) if lines else "none violated"
+
+    def _repr_html_(self) -> str:
+        rows = [(v.name, f"{v.lower:g}", f"{v.value:g}", f"{v.upper:g}", f"{v.excess:g}") for v in self]
+        caption = f"{len(self) or 'none'} violated"
+        if self.unchecked:
+            caption += f", {len(self.unchecked)} unchecked"
+        return html_table(caption, ("constraint", "lower", "value", "upper", "excess"), rows)
 
 
 class Checks:
@@ -90,10 +98,12 @@ def find_violations(
     checks: Checks, values: Mapping[Any, float], known: Iterable[Symbol], tolerance: float
 ) -> Violations:
     """Return the violations at ``values``, see :meth:`ModelView.violations`."""
-    state = values if isinstance(values, State) else _checked(values, (*known, *checks.symbols))
+    known = (*known, *checks.symbols)
+    state = as_state(values, known)
+    if known and not len(state) and not isinstance(values, State):
+        raise UnknownNameError("No values given; model.default_state() has one for everything.")
     vector = np.zeros(len(checks.symbols))
-    given = [s for s in checks.symbols if s in state]
-    vector_of = dict(zip(given, assign(tuple(given), State({s: state[s] for s in given})), strict=True))
+    vector_of = {s: value for s in checks.symbols if (value := state.given(s)) is not None}
     for i, symbol in enumerate(checks.symbols):
         vector[i] = vector_of.get(symbol, symbol.value or 0.0)
     unchecked, checked = [], []
@@ -118,33 +128,3 @@ def find_violations(
         if not excess <= tolerance:
             broken.append(Violation(checks.names[i], value, low, high, excess))
     return Violations(broken, unchecked)
-
-
-def _checked(values: Mapping[Any, float], known: Iterable[Symbol]) -> State:
-    """Return the values as a state, refusing names the model does not know."""
-    if not isinstance(values, Mapping):
-        raise ExpressionError(
-            f"Values are given as a mapping {{name: number}} or a state, not as {type(values).__name__}."
-        )
-    by_name: dict[str, set[Symbol]] = {}
-    for symbol in known:
-        by_name.setdefault(str(symbol), set()).add(symbol)
-    result: dict[Symbol, float] = {}
-    for key, value in values.items():
-        name = str(key)
-        meant = by_name.get(name, set())
-        if isinstance(key, Symbol):
-            meant = meant & {key}
-        if not meant:
-            raise UnknownNameError(f"Unknown symbol {name!r}. {suggest(name, by_name, 'symbol')}")
-        if len(meant) > 1:
-            raise NameTakenError(
-                f"Several symbols have the name {name!r}; give their values by symbol, not by name."
-            )
-        (symbol,) = meant
-        if symbol in result:
-            raise NameTakenError(f"There are two values for '{symbol}', by symbol and by name.")
-        result[symbol] = value
-    if not result and by_name:
-        raise UnknownNameError("No values given; model.default_state() has one for everything.")
-    return State(result)

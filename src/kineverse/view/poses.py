@@ -9,8 +9,9 @@ import numpy as np
 import numpy.typing as npt
 
 import kineverse as kv
-from kineverse.errors import UnknownNameError, suggest
+from kineverse.errors import UnknownNameError, given_twice, suggest
 from kineverse.model.view import ModelView
+from kineverse.state import State
 from kineverse.symbols import parse_symbol_name
 from kineverse.view.triangles import Floats
 
@@ -88,11 +89,15 @@ def complete(model: ModelView, state: Mapping[Any, float] | None = None) -> dict
     """
     values = {str(symbol): float(value) for symbol, value in model.default_state().items()}
     known = values.keys() | {str(symbol) for symbol in model.symbols}
+    given = set[str]()
     for key, value in (state or {}).items():
         name = str(key)
+        if name in given and not isinstance(state, State):
+            raise given_twice(name)
+        given.add(name)
         if name in known:
             values[name] = float(value)
-        elif isinstance(key, str):
+        elif not isinstance(state, State):
             if parse_symbol_name(name)[1] and name.partition(":")[0] in known:
                 raise UnknownNameError(f"'{name}' is a speed; where things are depends on positions only.")
             raise UnknownNameError(f"The model has no symbol '{name}'. {suggest(name, known, 'symbol')}")

@@ -12,8 +12,9 @@ from kineverse.articulations.limits import Limits, check_limits
 from kineverse.errors import ValueRejectedError
 from kineverse.expressions.expression import Expression, ExpressionLike, as_expression
 from kineverse.model.articulation import Articulation
-from kineverse.model.body import Pose, Shape
+from kineverse.model.body import Shape
 from kineverse.model.constraint import ConstraintLike
+from kineverse.model.frame import TransformLike
 from kineverse.model.operation import Effects
 from kineverse.model.reader import Reader
 from kineverse.symbols import Symbol, position
@@ -27,7 +28,7 @@ class Part(NamedTuple):
     """One frame of a mechanism: which other part it is placed in, where, and what is seen of it."""
 
     below: str
-    place: tuple[Pose | Expression, ...]
+    place: tuple[TransformLike, ...]
     shapes: tuple[Shape, ...] = ()
 
 

@@ -71,8 +71,9 @@ class Tracker:
         process_noise: Mapping[Any, float] | None = None,
         outliers: Outliers | bool | None = None,
         locks: bool = False,
-        known: Iterable[Symbol | str] = (),
+        known: Symbol | str | Iterable[Symbol | str] = (),
     ) -> None:
+        known = (known,) if isinstance(known, str | Symbol) else known
         handed = frozenset(k if isinstance(k, Symbol) else model.symbol(k) for k in known)
         layout, limits = arranged(model, observations(model, observed), handed)
         self._layout = layout

@@ -187,6 +187,7 @@ class _Document:
             string(key): read_parameter(value, self._graph, self._rename, self._path, written_cells)
             for key, value in _members(given.get("parameters", {})).items()
         }
+        overrides = any(cell in self._cells for cell, _ in writes)
         self._cells.update(writes)
         for kind, written in (cell for cell, _ in writes):
             self._names[kind].add(written)
@@ -200,6 +201,7 @@ class _Document:
             frozen,
             seen,
             self._rename(""),
+            overrides,
         )
 
     def _writes(self, given: Any, place: str) -> tuple[tuple[Cell, Any], ...]:

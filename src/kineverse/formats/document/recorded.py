@@ -44,6 +44,8 @@ class Recorded(Operation):
         What the cells contained.
     scope
         What all names of the document begin with.
+    overrides
+        Whether it writes over what operations before it in the document wrote.
     """
 
     kind: str
@@ -55,6 +57,7 @@ class Recorded(Operation):
     frozen: str = ""
     seen: Mapping[Cell, Any] = field(default_factory=dict, repr=False, compare=False)
     scope: str = ""
+    overrides: bool = field(default=False, repr=False, compare=False)  # type: ignore[misc]
 
     @property
     def parameters(self) -> dict[str, Any]:

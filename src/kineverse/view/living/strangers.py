@@ -83,6 +83,7 @@ class Stranger:
     def axis(self) -> tuple[Floats, Floats]:
         """A point on the true axis [m], and its direction, in the base."""
         direction = np.array(self.joint.axis)
+        assert isinstance(self.joint.origin, Pose)  # as they are made here
         frame = self.joint.origin.matrix
         return frame[:3, 3], frame[:3, :3] @ direction / np.linalg.norm(direction)
 
