@@ -64,7 +64,7 @@ def test_the_figure_is_drawn(fig3, tmp_path, suffix):
 
 def test_without_matplotlib_the_extra_is_named(fig3, tmp_path, monkeypatch):
     monkeypatch.setitem(__import__("sys").modules, "matplotlib.figure", None)
-    with pytest.raises(MissingExtraError, match=r"kineverse-articulation\[figures\]"):
+    with pytest.raises(MissingExtraError, match=r"pip install -e '.*\[figures\]'"):
         fig3.figure.save(tmp_path / "door.png")
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import html
 import threading
 from collections.abc import Mapping
 from dataclasses import replace
@@ -12,6 +13,7 @@ import numpy as np
 from kineverse.errors import ValueRejectedError
 from kineverse.geometry.left_out import is_installed
 from kineverse.geometry.solids import coal_engine
+from kineverse.installation import install_command
 from kineverse.model.view import ModelView
 from kineverse.view.marks import BALL, CONTACT, HEAD, SHAFT, TIP, Marks
 from kineverse.view.near import RADIUS, Nearness
@@ -27,8 +29,6 @@ LONGEST = 0.2
 
 LABELS = 8
 """Depths that are written beside their arrows; more would cover what they are about."""
-
-MISSING = boxed(["Distances need the extra <b>geometry</b>: pip install 'kineverse-articulation[geometry]'"])
 
 WAITING = boxed(["<b>Reading shapes …</b>"])
 
@@ -197,7 +197,7 @@ class Collisions:
         """Write the report of what was seen last, which is ``new`` if given."""
         with self._lock:
             self.seen = seen = new or self.seen
-            text = "" if is_installed() else MISSING
+            text = "" if is_installed() else _missing()
             if seen.failure:
                 text = near_failure(seen.failure)
             elif seen.nearness is not None:
@@ -240,3 +240,7 @@ class Collisions:
         for k, (ends, depth) in enumerate(zip(marks.arrows[:LABELS], marks.depths, strict=False)):
             nodes.append(scene.add_label(f"/near/depth{k}", depth, position=ends[1], font_screen_scale=0.8))
         return {node.name: node for node in nodes}
+
+
+def _missing() -> str:
+    return boxed([f"Distances need the extra <b>geometry</b>: {html.escape(install_command('geometry'))}"])

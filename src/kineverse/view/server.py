@@ -8,6 +8,7 @@ import socket
 from typing import Any
 
 from kineverse.errors import MissingExtraError, ValueRejectedError
+from kineverse.installation import install_command
 
 HOST = "127.0.0.1"
 PREFERRED_PORT = 8080
@@ -33,9 +34,7 @@ def start(port: int | None = None, label: str = "") -> Any:
     try:
         import viser
     except ImportError as error:
-        raise MissingExtraError(
-            "the page in the browser needs viser: pip install 'kineverse-articulation[view]'"
-        ) from error
+        raise MissingExtraError(f"the page in the browser needs viser: {install_command('view')}") from error
 
     class LocalServer(viser.ViserServer):
         """A server that cannot be told, by whoever opens the page, to publish itself on the internet."""
