@@ -91,6 +91,17 @@ class Report:
     figure: Figure
 
 
+def check_drawing() -> None:
+    """Look whether figures can be drawn here.
+
+    Raises
+    ------
+    MissingExtraError
+        Without matplotlib.
+    """
+    _matplotlib("matplotlib.figure")
+
+
 def _matplotlib(module: str) -> ModuleType:
     import importlib
 
