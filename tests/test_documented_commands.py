@@ -154,6 +154,6 @@ def test_targets_extras_and_tests_that_pages_name_exist(page):
 
 
 def _parsed(command: str) -> None:
-    words = shlex.split(re.split(r"\s{3,}", command)[0])[1:]
+    words = shlex.split(re.split(r"\s{3,}| [|>]", command)[0])[1:]
     with suppress(SystemExit) if "--help" in words else nullcontext():
         parser().parse_args(words)
