@@ -109,7 +109,7 @@ RESULT = Result(
         Comparison("good, beside peer", 4.0, "x", Bar(2.0, at_least=True), "good", "peer"),
         Comparison("bad", 0.03, "s", Bar(0.02, at_least=False)),
         Comparison("away, beside nobody", None, "x", Bar(2.0, at_least=True), "away", "nobody"),
-        Comparison("so so, beside peer", 1.5, "x", None, "so so", "peer"),
+        Comparison("so so, beside peer", 15432.1, "x", None, "so so", "peer"),
         Comparison("much over little", 1.25, "x", Bar(2.0, at_least=False)),
     ),
     ("peer is missing: get it",),
@@ -127,7 +127,7 @@ def test_tables_say_how_fast_who_is():
         "times as fast  is     as\n"
         "-------------  -----  ----\n"
         "            4  good   peer\n"
-        "          1.5  so so  peer\n"
+        "        15432  so so  peer\n"
         "\n"
         "times as long\n"
         "-------------  ----------------\n"

@@ -53,5 +53,5 @@ class Settings:
     progress: Progress = _silent
 
 
-QUICK = Settings(rounds=5, processes=3, steps=20, operations=2_000)
+QUICK = Settings(rounds=5, processes=3, steps=20, operations=1_000)
 """Enough to see an order of magnitude."""

@@ -143,7 +143,8 @@ def quantity(value: float, unit: str) -> str:
 
 
 def _times(comparison: Comparison) -> str:
-    return figure(math.nan if comparison.value is None else comparison.value, 3)
+    value = math.nan if comparison.value is None else comparison.value
+    return f"{value:.0f}" if abs(value) >= 1000.0 else figure(value, 3)
 
 
 def _value(comparison: Comparison) -> str:
