@@ -7,6 +7,9 @@ VENV := .venv
 BIN := $(VENV)/bin
 INSTALL := $(BIN)/python -m pip install --quiet --no-input --disable-pip-version-check --no-deps
 
+# What the demo and every command in the README need.
+DEMO := $(patsubst %,requirements/%.txt,build core view figures geometry)
+
 .PHONY: help demo test fuzz format clean
 .NOTPARALLEL:
 
@@ -44,9 +47,9 @@ $(BIN)/python:
 	$(PYTHON) -m venv $(VENV)
 
 # The package goes in last and as it lies here, so that an edit needs no second installation.
-$(VENV)/demo.installed: requirements/build.txt requirements/core.txt requirements/view.txt pyproject.toml | $(BIN)/python
+$(VENV)/demo.installed: $(DEMO) pyproject.toml | $(BIN)/python
 	@echo "Installing into $(VENV); this takes a minute, once."
-	$(INSTALL) -r requirements/build.txt -r requirements/core.txt -r requirements/view.txt
+	$(INSTALL) $(DEMO:%=-r %)
 	$(INSTALL) --no-build-isolation --editable .
 	@touch $@
 

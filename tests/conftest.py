@@ -1,9 +1,9 @@
 """What holds for every test: where models are found, a cache of its own, and what is skipped where.
 
 A test that drives a browser carries the marker ``browser`` and asks for the fixture ``chromium``, the path of
-the system's Chromium. Without one it is skipped and the summary names it, or with
-``KINEVERSE_REQUIRE_BROWSER=1`` it fails. A test that needs compiled code carries the marker ``compiler``;
-without a C compiler it is skipped and named as well.
+the system's Chromium. Without one it is skipped, or with ``KINEVERSE_REQUIRE_BROWSER=1`` it fails. A test that
+needs compiled code carries the marker ``compiler``; without a C compiler it is skipped as well. What reads data
+that is not ours is skipped where there is none. The summary has a line for each cause.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ import gc
 import os
 import shutil
 import tempfile
+from collections import Counter
 from collections.abc import Generator
 from pathlib import Path
 
@@ -67,17 +68,25 @@ def pytest_runtest_setup(item: pytest.Item) -> None:
 
 
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
-    """Say loudly what did not run."""
-    skipped = terminalreporter.stats.get("skipped", [])
-    for marker, what, there in (
-        ("browser", "A CHROMIUM", _browser() is not None),
-        ("compiler", "A C COMPILER", _has_compiler()),
+    """Say what did not run, in a line for each cause; ``-rs`` names the tests."""
+    causes = Counter(_cause(report) for report in terminalreporter.stats.get("skipped", []))
+    for cause, count in causes.most_common():
+        tests = "1 test was" if count == 1 else f"{count} tests were"
+        terminalreporter.write_line(f"{tests} skipped: {cause}", yellow=True)
+
+
+def _cause(report: pytest.TestReport) -> str:
+    """Return why a test did not run, and how to have it run."""
+    why = str(report.longrepr[2] if isinstance(report.longrepr, tuple) else report.longrepr)
+    if SHARED.as_posix() in why:
+        return "what they read is not ours and not in ../shared/data; tests/DATA.md says where to get it"
+    for marker, cause in (
+        ("browser", "there is no Chromium; install the package 'chromium'"),
+        ("compiler", "there is no C compiler; install the package 'gcc'"),
     ):
-        names = [report.nodeid for report in skipped if marker in report.keywords]
-        if names and not there:
-            terminalreporter.section(f"NOT TESTED, FOR WANT OF {what}", sep="!", red=True, bold=True)
-            for name in sorted(names):
-                terminalreporter.line(name, red=True)
+        if marker in report.keywords and "and there is none" in why:
+            return cause
+    return why.removeprefix("Skipped: ")
 
 
 @pytest.fixture(scope="session", autouse=True)

@@ -61,14 +61,14 @@ def run(file: Path) -> None:
             pytest.fail(f"{where} says\n{example.output}\nbut it prints\n{printed.getvalue()}", pytrace=False)
 
 
-def agree(wanted: str, got: str) -> bool:
+def agree(wanted: str, got: str, rel: float = 1e-6) -> bool:
     """Compare without regard to white space and the last digits; ``...`` stands for anything."""
     if doctest.OutputChecker().check_output(wanted, got, _FLAGS):
         return True
     if _words(wanted) != _words(got):
         return False
     pairs = zip(_NUMBER.findall(wanted), _NUMBER.findall(got), strict=True)
-    return all(float(a) == pytest.approx(float(b), rel=1e-6, abs=1e-9) for a, b in pairs)
+    return all(float(a) == pytest.approx(float(b), rel=rel, abs=1e-3 * rel) for a, b in pairs)
 
 
 def _words(text: str) -> str:

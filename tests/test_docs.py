@@ -21,6 +21,7 @@ def _name(page: Path) -> str:
 
 @pytest.mark.parametrize("page", [p for p in PAGES if any(examples(p))], ids=_name)
 def test_the_examples_run(page: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "examples").symlink_to(ROOT / "examples")
     monkeypatch.chdir(tmp_path)
     run(page)
 

@@ -1,6 +1,8 @@
 from __future__ import annotations
 
 import json
+import subprocess
+import sys
 
 import pytest
 
@@ -64,13 +66,25 @@ def test_json_is_one_object_and_nothing_else(run, asked):
     assert {c["status"] for c in result["comparisons"]} <= {"met", "missed", "missing", "no bar"}
 
 
-def test_words_say_where_and_what(run, asked, without):
-    without("mujoco")
+def test_words_say_where_and_what(run, asked):
     status, out, err = run("frames")
     assert (status, err) == (0, "")
-    for word in ("tier", "vector unit", "compiler", "processor", "casadi", "frames: ", "bar", "median"):
+    for word in ("tier", "vector unit", "compiler", "processor", "casadi", "frames: ", "median"):
         assert word in out
-    assert "mujoco is missing: pip install" in out
+    for word in ("bar", "target", "missed"):
+        assert word not in out
+
+
+def test_who_is_missing_is_named_once_at_the_end_and_all_is_well(run, asked, without):
+    without("mujoco", "pinocchio", "coal", "pybullet")
+    status, out, err = run("frames", "geometry", "edit")
+    assert (status, err) == (0, "")
+    _, _, end = out.partition("not measured here:\n")
+    lines = end.splitlines()
+    assert [line.split()[0] for line in lines] == ["pinocchio", "mujoco", "geometry"]
+    assert all("install -e '" in line for line in lines)
+    assert "geometry: " not in out
+    assert "edit: " in out
 
 
 def test_options_reach_the_measurements(run, asked):
@@ -87,28 +101,63 @@ def test_a_robot_that_does_not_exist_is_one_line(run):
     assert len(err.splitlines()) == 1
 
 
-def test_tables_say_whether_bars_are_met():
-    result = Result(
-        "game",
-        "playing",
-        (Measurement("ours", "s", (1e-6,)), Measurement("packages", "packages", (4.0,))),
-        (
-            Comparison("good", 4.0, "x", Bar(2.0, at_least=True)),
-            Comparison("bad", 0.03, "s", Bar(0.02, at_least=False)),
-            Comparison("away", None, "x", Bar(2.0, at_least=True)),
-            Comparison("so so", 1.5, "x"),
-        ),
-        ("peer is missing: get it",),
+RESULT = Result(
+    "game",
+    "playing",
+    (Measurement("ours", "s", (1e-6,)), Measurement("packages", "packages", (4.0,))),
+    (
+        Comparison("good, beside peer", 4.0, "x", Bar(2.0, at_least=True), "good", "peer"),
+        Comparison("bad", 0.03, "s", Bar(0.02, at_least=False)),
+        Comparison("away, beside nobody", None, "x", Bar(2.0, at_least=True), "away", "nobody"),
+        Comparison("so so, beside peer", 15432.1, "x", None, "so so", "peer"),
+        Comparison("much over little", 1.25, "x", Bar(2.0, at_least=False)),
+    ),
+    ("peer is missing: get it",),
+)
+
+
+def test_tables_say_how_fast_who_is():
+    assert as_text(RESULT) == (
+        "game: playing\n"
+        "              median        best\n"
+        "--------  ----------  ----------\n"
+        "ours            1 µs        1 µs\n"
+        "packages  4 packages  4 packages\n"
+        "\n"
+        "times as fast  is     as\n"
+        "-------------  -----  ----\n"
+        "            4  good   peer\n"
+        "        15432  so so  peer\n"
+        "\n"
+        "times as long\n"
+        "-------------  ----------------\n"
+        "         1.25  much over little"
     )
-    lines = as_text(result).splitlines()
-    assert lines[0] == "game: playing"
-    by_name = {line.split("  ")[0]: line.split() for line in lines[1:] if line}
-    assert by_name["ours"][1:] == ["1", "µs", "1", "µs"]
-    assert by_name["good"][1:] == ["4", "x", ">=", "2", "x", "met"]
-    assert by_name["bad"][1:] == ["30", "ms", "<=", "20", "ms", "missed"]
-    assert by_name["away"][1:] == ["-", ">=", "2", "x", "missing"]
-    assert by_name["so so"][2:] == ["1.5", "x", "-", "no", "bar"]
-    assert lines[-1] == "peer is missing: get it"
+
+
+def test_tables_of_targets_say_whether_they_are_met():
+    lines = as_text(RESULT, targets=True).partition("target ")[2].splitlines()
+    by_name = {line.partition("  ")[0]: line.partition("  ")[2].split() for line in lines[2:]}
+    assert by_name == {
+        "good, beside peer": ["4", "x", ">=", "2", "x", "met"],
+        "bad": ["30", "ms", "<=", "20", "ms", "missed"],
+        "away, beside nobody": ["-", ">=", "2", "x", "missing"],
+        "much over little": ["1.25", "x", "<=", "2", "x", "met"],
+    }
+
+
+def test_targets_are_said_on_request(run, asked):
+    status, out, _ = run("call", "--targets")
+    assert status == 0
+    assert "target " in out
+    assert ">= 8 x" in out
+
+
+def test_bullet_does_not_greet():
+    pytest.importorskip("pybullet")
+    program = "from kineverse.bench.peers import installed; assert installed('pybullet')"
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    assert done.stdout == done.stderr == ""
 
 
 @pytest.mark.parametrize(

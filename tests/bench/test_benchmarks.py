@@ -45,9 +45,18 @@ def test_peers_that_are_not_installed_are_reported(name, tiny, without):
     missing = [c for c in result.comparisons if c.status == "missing"]
     assert missing
     assert all("pinocchio" in c.name or "mujoco" in c.name for c in missing)
-    assert any("pip install 'kineverse-articulation[bench]'" in line for line in result.missing)
+    assert any("[bench]' brings it" in line for line in result.missing)
     assert any("'pin'" in line for line in result.missing)
     assert not any("pinocchio" in m.name for m in result.measurements)
+
+
+def test_a_benchmark_without_its_extra_is_left_out(tiny, without):
+    without("coal")
+    (result,) = measure(["geometry"], tiny)
+    assert (result.measurements, result.comparisons) == ((), ())
+    (line,) = result.missing
+    assert line.startswith("geometry is left out: distances need coal: ")
+    assert line.endswith("[geometry]'")
 
 
 def test_a_missing_compiler_is_reported(tiny, monkeypatch, tmp_path):

@@ -55,9 +55,7 @@ def test_version(run):
     assert (status, out) == (0, f"kineverse {kv.__version__}\n")
 
 
-@pytest.mark.parametrize(
-    "words", [[], ["nothing"], ["info"], ["fk", "kitchen"], ["view", "kitchen", "--port", "x"]]
-)
+@pytest.mark.parametrize("words", [["info"], ["fk", "kitchen"], ["view", "kitchen", "--port", "x"]])
 def test_wrong_words_are_status_2(run, words):
     status, out, err = run(*words)
     assert (status, out) == (2, "")
@@ -148,7 +146,7 @@ def test_a_posture_beyond_limits_is_evaluated_and_said(run):
     )
     assert status == 0
     assert json.loads(out)
-    assert "violated" in err
+    assert "beyond its limits [0, 1.571]" in err
     assert len(err.splitlines()) == 1
 
 

@@ -44,7 +44,7 @@ def test_fk_says_that_the_pose_is_not_finite(run, garage, options):
     status, out, err = run("fk", garage, "garage/door", "--set", "garage/door=3", *options)
     assert (status, out) == (2, "")
     note, line = err.splitlines()
-    assert "garage/range is violated" in note
+    assert "garage/door = 3 is beyond its limits [0, 2]" in note
     assert "'garage/door' in 'world' is not finite at garage/door=3" in line
 
 

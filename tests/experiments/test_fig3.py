@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import sys
 
 import numpy as np
 import pytest
@@ -63,8 +64,8 @@ def test_the_figure_is_drawn(fig3, tmp_path, suffix):
 
 
 def test_without_matplotlib_the_extra_is_named(fig3, tmp_path, monkeypatch):
-    monkeypatch.setitem(__import__("sys").modules, "matplotlib.figure", None)
-    with pytest.raises(MissingExtraError, match=r"kineverse-articulation\[figures\]"):
+    monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
+    with pytest.raises(MissingExtraError, match=r"pip install -e '.*\[figures\]'"):
         fig3.figure.save(tmp_path / "door.png")
 
 
@@ -134,3 +135,39 @@ def test_nonsense_is_answered_in_a_line(words, says, tmp_path, monkeypatch, caps
 def test_all_experiments_are_listed(capsys):
     assert main(["reproduce", "--list", "--json"]) == 0
     assert json.loads(capsys.readouterr().out) == dict(EXPERIMENTS)
+
+
+@pytest.fixture
+def no_matplotlib(monkeypatch):
+    monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
+
+
+def test_without_matplotlib_there_are_tables_and_a_line(tmp_path, monkeypatch, capsys, no_matplotlib):
+    monkeypatch.chdir(tmp_path)
+    assert main(["reproduce", "fig3"]) == 0
+    out, err = capsys.readouterr()
+    assert err == ""
+    assert "no bound" in out
+    last = out.splitlines()[-1]
+    assert last.startswith("There is no figure. Figures need matplotlib: ")
+    assert last.endswith("[figures]'")
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("options", [[], ["--json"]])
+def test_a_figure_that_is_asked_for_is_refused_at_once(options, monkeypatch, capsys, no_matplotlib):
+    monkeypatch.setattr("kineverse.experiments.reproduce", lambda *_: pytest.fail("computed in vain"))
+    assert main(["reproduce", "fig3", "--figure", "door.svg", *options]) == 2
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert "[figures]" in err
+
+
+def test_a_folder_that_cannot_be_written_to_costs_the_figure_only(tmp_path, monkeypatch, capsys):
+    pytest.importorskip("matplotlib")
+    (tmp_path / "fig3.png").mkdir()
+    monkeypatch.chdir(tmp_path)
+    assert main(["reproduce", "fig3"]) == 2
+    out, err = capsys.readouterr()
+    assert "no bound" in out
+    assert "cannot be written to 'fig3.png'" in err

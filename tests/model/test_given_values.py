@@ -205,7 +205,7 @@ def test_no_default_state_is_silently_not_finite() -> None:
     ],
 )
 def test_homes_without_a_pose(home: tuple[float, ...], message: str) -> None:
-    from kineverse.formats.mjcf.home import SetHome
+    from kineverse.formats.set_home import SetHome
 
     model = kv.Model()
     with model.edit() as edit:

@@ -233,7 +233,7 @@ def test_stopping_twice_is_fine_and_frees_the_port():
 
 def test_without_viser_the_extra_is_named(monkeypatch):
     monkeypatch.setitem(sys.modules, "viser", None)
-    with pytest.raises(MissingExtraError, match=r"pip install 'kineverse-articulation\[view\]'"):
+    with pytest.raises(MissingExtraError, match=r"pip install -e '.*\[view\]'"):
         view(cabinet(), port=0)
 
 

@@ -17,7 +17,7 @@ from .agreement import Array, check_agreement
 from .crowd import LINKS, RADIUS, RULES, crowd
 from .crowd_peers import Finder, Mujoco, MujocoPairs, OurScene, PlainCoal
 from .kitchen_robot import KitchenRobot, kitchen_robot
-from .peers import Field, installed
+from .peers import Field, advice, installed
 from .result import Bar, Comparison, Measurement, Result, at_most, faster
 from .room_peers import BulletInRoom, MujocoInRoom, Room
 from .settings import Settings
@@ -46,7 +46,7 @@ class Entry:
 def measure(settings: Settings) -> Result:
     """Measure an arm among boxes, among more boxes with as many near, and a robot in a kitchen."""
     sweep_library.prepare(wait=True)
-    steps = min(settings.configurations, 200)
+    steps = min(settings.configurations, settings.steps)
     sizes = [settings.boxes // part for part in (30, 10, 3, 1)]
     field = Field()
     with tempfile.TemporaryDirectory(prefix="kineverse-bench-") as folder:
@@ -128,7 +128,7 @@ def _among_boxes(field: Field, folder: Path, steps: int) -> Iterator[Entry]:
 
         yield Entry(BULLET, Bullet(arm), _MARGINS)
     else:
-        field.missing.append("pybullet is missing: pip install pybullet brings it, where there is a wheel")
+        field.missing.append(advice("pybullet"))
 
 
 def _in_a_room(robot: KitchenRobot) -> Iterator[Entry]:

@@ -15,7 +15,7 @@ from kineverse.estimation.identification.rigid import pose
 from kineverse.estimation.rotations import exponential, logarithm
 
 from .agreement import Array
-from .peers import Field, installed
+from .peers import Field, advice, installed
 from .result import Result, at_most
 from .settings import Settings
 from .timing import Contender, race, timed
@@ -40,7 +40,7 @@ def measure(settings: Settings) -> Result:
         if installed(module):
             field.contenders.append(peer(parents, children))
         else:
-            field.missing.append(f"{module} is missing: pip install {module.replace('_', '-')}")
+            field.missing.append(advice(module))
     measured = race("identification", field.contenders, settings.rounds, settings.progress)
     return Result(
         name="identification",

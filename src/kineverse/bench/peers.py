@@ -2,19 +2,25 @@
 
 from __future__ import annotations
 
+import contextlib
 import importlib
-from collections.abc import Callable, Iterable, Mapping
+import os
+import sys
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from types import MappingProxyType
+
+from kineverse.installation import install_command
 
 from .timing import Contender
 
 DISTRIBUTIONS: Mapping[str, str] = MappingProxyType(
-    {"pinocchio": "pin", "mujoco": "mujoco", "casadi": "casadi", "packaging": "packaging"}
+    {"pinocchio": "pin", "ripl_articulation": "ripl-articulation"}
 )
-"""What brings each module."""
+"""What brings a module that is called otherwise."""
 
-EXTRA = "pip install 'kineverse-articulation[bench]'"
+IN_THE_EXTRA = ("pinocchio", "mujoco", "pybullet")
+"""The modules that the extra ``bench`` brings."""
 
 
 @dataclass(slots=True)
@@ -43,7 +49,8 @@ class Field:
 def installed(module: str) -> bool:
     """Whether a peer can be imported."""
     try:
-        importlib.import_module(module)
+        with _ungreeted() if module == "pybullet" else contextlib.nullcontext():
+            importlib.import_module(module)
     except ImportError:
         return False
     return True
@@ -52,5 +59,21 @@ def installed(module: str) -> bool:
 def advice(module: str) -> str:
     """Return how to get a peer."""
     distribution = DISTRIBUTIONS.get(module, module)
-    called = "" if distribution == module else f" (the package {distribution!r})"
-    return f"{module} is missing: {EXTRA} brings it{called}"
+    if module in IN_THE_EXTRA:
+        called = "" if distribution == module else f" (the package {distribution!r})"
+        return f"{module} is not installed: {install_command('bench')} brings it{called}"
+    return f"{module} is not installed: it is the package {distribution!r}"
+
+
+@contextlib.contextmanager
+def _ungreeted() -> Iterator[None]:
+    """Keep what C code prints off standard error: Bullet greets whoever imports it."""
+    sys.stderr.flush()
+    kept, nowhere = os.dup(2), os.open(os.devnull, os.O_WRONLY)
+    os.dup2(nowhere, 2)
+    try:
+        yield
+    finally:
+        os.dup2(kept, 2)
+        os.close(kept)
+        os.close(nowhere)

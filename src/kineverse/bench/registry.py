@@ -6,7 +6,7 @@ import importlib
 from collections.abc import Iterator, Mapping, Sequence
 from types import MappingProxyType
 
-from kineverse.errors import UnknownNameError, suggest
+from kineverse.errors import MissingExtraError, UnknownNameError, suggest
 
 from .result import Result
 from .settings import Settings
@@ -50,6 +50,8 @@ def chosen(names: Sequence[str]) -> list[str]:
 def measure(names: Sequence[str] = (), settings: Settings | None = None) -> Iterator[Result]:
     """Run benchmarks, and yield each result when it is there.
 
+    One that needs an extra which is not installed has nothing but a line about that.
+
     Parameters
     ----------
     names
@@ -67,5 +69,8 @@ def measure(names: Sequence[str] = (), settings: Settings | None = None) -> Iter
     for name in chosen(names):
         # A benchmark is imported when it is run, as it brings its peers.
         module = importlib.import_module(f"{__package__}.measure_{name}")
-        result: Result = module.measure(settings or Settings())
+        try:
+            result: Result = module.measure(settings or Settings())
+        except MissingExtraError as error:
+            result = Result(name, BENCHMARKS[name], (), (), (f"{name} is left out: {error}",))
         yield result

@@ -68,12 +68,16 @@ class Comparison:
         ``x`` for ratios, else as in measurements.
     bar
         What it is to reach, in the same unit; None if it is for information.
+    ours, theirs
+        Where it is a ratio of speeds: whose they are; empty where it is something else.
     """
 
     name: str
     value: float | None
     unit: str
     bar: Bar | None = None
+    ours: str = ""
+    theirs: str = ""
 
     @property
     def status(self) -> Status:
@@ -130,9 +134,10 @@ def faster(
     bar = None if at_least is None else Bar(at_least, at_least=True)
     name = f"{ours}, beside {theirs}"
     if theirs not in measured:
-        return Comparison(name, None, "x", bar)
+        return Comparison(name, None, "x", bar, ours, theirs)
     pairs = zip(measured[theirs].samples, measured[ours].samples, strict=True)
-    return Comparison(name, statistics.median(their / our for their, our in pairs), "x", bar)
+    ratio = statistics.median(their / our for their, our in pairs)
+    return Comparison(name, ratio, "x", bar, ours, theirs)
 
 
 def at_most(measurement: Measurement, limit: float) -> Comparison:

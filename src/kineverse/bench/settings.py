@@ -29,6 +29,8 @@ class Settings:
         The same where every turn is a fresh process.
     configurations
         How many configurations single calls go through in one turn.
+    steps
+        Through how many states, at most, things move among others.
     rows
         How many configurations a batch has.
     operations
@@ -44,11 +46,12 @@ class Settings:
     rounds: int = 25
     processes: int = 9
     configurations: int = 1000
+    steps: int = 200
     rows: int = 100_000
     operations: int = 10_000
     boxes: int = 3000
     progress: Progress = _silent
 
 
-QUICK = Settings(rounds=5, processes=3)
+QUICK = Settings(rounds=5, processes=3, steps=20, operations=1_000)
 """Enough to see an order of magnitude."""

@@ -61,6 +61,12 @@ def parse_assignments(texts: Iterable[str]) -> dict[str, float]:
     return values
 
 
+def has_unit(text: str) -> bool:
+    """Whether a value says what it is measured in; parts of pi are angles."""
+    match = _VALUE.fullmatch(text.rpartition("=")[2].strip())
+    return match is not None and bool(match["unit"] or match["pi"])
+
+
 def parse_length(text: str) -> float:
     """Return the number [m] of a text such as ``0.05``, ``5cm``, ``2 mm``.
 

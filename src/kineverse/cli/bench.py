@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import argparse
 import json
+import math
+import textwrap
 from collections.abc import Iterable
 from dataclasses import asdict, replace
 from typing import TYPE_CHECKING, Any
@@ -17,10 +19,12 @@ if TYPE_CHECKING:
 HELP = """measure the speed of this installation, beside its peers where they are installed
 
 Everything is measured unless names are given. Everybody takes turns on the same work and has to compute the
-same; so compare ratios, as times drift. A bar that is missed is no failure of the command.
+same. Printed are times, and how many times as fast Kineverse is as each peer: compare these ratios, as times
+drift. Peers that are not installed are named at the end.
 
 examples:
   kineverse bench
+  kineverse bench --quick                            in a minute or two
   kineverse bench call batch --quick
   kineverse bench load --robot my_robot.urdf --frame tool0
   kineverse bench --list"""
@@ -31,6 +35,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("names", metavar="NAME", nargs="*", help="what to measure, see --list")
     parser.add_argument("--list", action="store_true", help="say what each benchmark measures, and end")
     parser.add_argument("--quick", action="store_true", help="few rounds: an order of magnitude")
+    parser.add_argument(
+        "--targets", action="store_true", help="also what the developers aim at, met or missed"
+    )
     parser.add_argument("--robot", metavar="MODEL", help="a URDF file, or a name; a PR2 if left out")
     parser.add_argument("--frame", metavar="FRAME", help="whose pose and Jacobian; a gripper if left out")
     parser.add_argument("--json", action="store_true", help="one JSON object on standard output")
@@ -57,9 +64,20 @@ def run(arguments: argparse.Namespace) -> int:
         print(json.dumps(answer, indent=2, allow_nan=False))
         return 0
     print(_where(here), flush=True)
+    print(f"\n{RATIOS}")
+    missing: dict[str, None] = {}
     for result in bench.measure(names, settings):
-        print(f"\n{as_text(result)}", flush=True)
+        if result.measurements:
+            print(f"\n{as_text(result, arguments.targets)}", flush=True)
+        missing.update(dict.fromkeys(result.missing))
+    if missing:
+        print("\n" + "\n".join(["not measured here:", *(f"  {line}" for line in missing)]))
     return 0
+
+
+RATIOS = """\
+"Times as fast" is how many times as long the other one takes for the same work; below 1, Kineverse is slower.
+Times drift on a machine that others use, ratios hardly."""
 
 
 def as_json(result: Result) -> dict[str, Any]:
@@ -86,14 +104,30 @@ def as_json(result: Result) -> dict[str, Any]:
     }
 
 
-def as_text(result: Result) -> str:
-    """Return a result as tables."""
+def as_text(result: Result, targets: bool = False) -> str:
+    """Return a result as tables; who is missing is left to whoever prints several.
+
+    Parameters
+    ----------
+    result
+        What was measured.
+    targets
+        Whether to say what the developers aim at.
+    """
     measured = [(m.name, quantity(m.median, m.unit), quantity(m.best, m.unit)) for m in result.measurements]
-    lines = [f"{result.name}: {result.work}", table(("", "median", "best"), measured, "<>>")]
-    if result.comparisons:
-        compared = [(c.name, _value(c), _bar(c), c.status) for c in result.comparisons]
-        lines += ["", table(("", "", "bar", ""), compared, "<>><")]
-    return "\n".join([*lines, *result.missing])
+    work = textwrap.fill(f"{result.name}: {result.work}", 100, subsequent_indent="  ")
+    parts = [f"{work}\n{table(('', 'median', 'best'), measured, '<>>')}"]
+    known = [c for c in result.comparisons if c.value is not None]
+    speeds = [(_times(c), c.ours, c.theirs) for c in known if c.theirs]
+    if speeds:
+        parts.append(table(("times as fast", "is", "as"), speeds, "><<"))
+    lengths = [(_times(c), c.name) for c in known if c.unit == "x" and not c.theirs]
+    if lengths:
+        parts.append(table(("times as long", ""), lengths, "><"))
+    aimed = [(c.name, _value(c), _bar(c), c.status) for c in result.comparisons if c.bar is not None]
+    if targets and aimed:
+        parts.append(table(("target", "", "bar", ""), aimed, "<>><"))
+    return "\n\n".join(parts)
 
 
 def quantity(value: float, unit: str) -> str:
@@ -106,6 +140,11 @@ def quantity(value: float, unit: str) -> str:
         if abs(value) * factor >= 0.9995:
             return f"{figure(value * factor, 3)} {prefix}s"
     return f"{figure(value * 1e9, 3)} ns"
+
+
+def _times(comparison: Comparison) -> str:
+    value = math.nan if comparison.value is None else comparison.value
+    return f"{value:.0f}" if abs(value) >= 1000.0 else figure(value, 3)
 
 
 def _value(comparison: Comparison) -> str:

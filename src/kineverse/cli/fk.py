@@ -4,15 +4,15 @@ from __future__ import annotations
 
 import argparse
 import json
-import sys
 from typing import TYPE_CHECKING
 
 from kineverse.cli.assignments import add_set_option, parse_assignments
+from kineverse.cli.beyond_limits import note, remarks
 from kineverse.cli.table import figure
 from kineverse.errors import ValueRejectedError
 
 if TYPE_CHECKING:
-    import kineverse as kv
+    pass
 
 HELP = """print where a frame is, for given positions
 
@@ -50,7 +50,7 @@ def run(arguments: argparse.Namespace) -> int:
     pose = np.asarray(expression(kv.State(values)), dtype=float)
     used = {str(s): values[str(s)] for s in expression.symbols if str(s) in values}
     if not np.isfinite(pose).all():
-        _warn_of_violations(model, kv.State(values))
+        note(remarks(model, values, arguments.assignments))
         where = ", ".join(f"{name}={figure(value, 6)}" for name, value in used.items()) or "all values"
         raise ValueRejectedError(
             f"The pose of '{arguments.frame}' in '{arguments.relative_to}' is not finite at {where}; "
@@ -80,14 +80,5 @@ def run(arguments: argparse.Namespace) -> int:
             print(f"  {name:<16}" + "".join(f"{figure(x, 6):>12}" for x in numbers) + f"  {unit}".rstrip())
         if used:
             print("  at " + ", ".join(f"{name}={figure(value, 6)}" for name, value in used.items()))
-    _warn_of_violations(model, kv.State(values))
+    note(remarks(model, values, arguments.assignments))
     return 0
-
-
-def _warn_of_violations(model: kv.Model, values: kv.State) -> None:
-    for violation in model.violations(values):
-        print(
-            f"kineverse: note: {violation.name} is violated: {figure(violation.value)} is not in "
-            f"[{figure(violation.lower)}, {figure(violation.upper)}]",
-            file=sys.stderr,
-        )

@@ -12,7 +12,12 @@ from typing import TextIO
 
 from kineverse._version import __version__
 from kineverse.cli import bench, convert, decompose, demo, diff, fit, fk, info, reproduce, validate, view
-from kineverse.errors import KineverseError
+from kineverse.errors import KineverseError, UnknownNameError, suggest
+
+COMMANDS = {
+    module.__name__.rpartition(".")[2]: module
+    for module in (info, fk, view, convert, diff, validate, decompose, fit, demo, bench, reproduce)
+}
 
 WRONG, INTERRUPTED, PIPE_CLOSED = 2, 130, 141
 """Exit statuses: what was asked for cannot be done; Ctrl-C; nobody reads on (128 and the signal's number)."""
@@ -40,17 +45,25 @@ def main(argv: Sequence[str] | None = None) -> int:
     Parameters
     ----------
     argv
-        The arguments, without the name of the program; those of the process if None.
+        The arguments, without the name of the program; those of the process if None. Without any, the help is
+        printed.
 
     Returns
     -------
     0 if all went well; 2 if what was asked for cannot be done, with one line on standard error that says why;
     130 after Ctrl-C; 141 if whoever read the output went away.
     """
+    words = sys.argv[1:] if argv is None else list(argv)
+    if not set(words) - {"-v", "--verbose"}:
+        parser().print_help()
+        return 0
     try:
-        arguments = parser().parse_args(argv)
+        arguments = _parsed(words)
     except SystemExit as stop:  # argparse ends the process itself; a function returns.
         return stop.code if isinstance(stop.code, int) else WRONG
+    except UnknownNameError as error:
+        print(f"kineverse: {one_line(error)}", file=sys.stderr)
+        return WRONG
     try:
         with _warnings_on(sys.stderr, arguments.verbose):
             status: int = arguments.run(arguments)
@@ -78,8 +91,7 @@ def parser() -> argparse.ArgumentParser:
     top.add_argument("--version", action="version", version=f"kineverse {__version__}")
     top.add_argument("-v", "--verbose", action="store_true", help="say more on standard error")
     commands = top.add_subparsers(title="commands", metavar="COMMAND", required=True)
-    for command in (info, fk, view, convert, diff, validate, decompose, fit, demo, bench, reproduce):
-        name = command.__name__.rpartition(".")[2]
+    for name, command in COMMANDS.items():
         summary, _, description = command.HELP.partition("\n")
         sub = commands.add_parser(
             name,
@@ -88,8 +100,43 @@ def parser() -> argparse.ArgumentParser:
             formatter_class=argparse.RawDescriptionHelpFormatter,
         )
         command.add_arguments(sub)
-        sub.set_defaults(run=command.run)
+        sub.set_defaults(run=command.run, command=sub)
     return top
+
+
+def _parsed(words: Sequence[str]) -> argparse.Namespace:
+    """Return the arguments that words are.
+
+    Raises
+    ------
+    SystemExit
+        If they are wrong for their command, which has been said, or were asking for help.
+    UnknownNameError
+        For a command or an option that does not exist, with similar ones.
+    """
+    name = next((word for word in words if not word.startswith("-")), None)
+    if name is not None and name not in COMMANDS:
+        raise UnknownNameError(f"There is no command {name!r}. {_instead(name)}")
+    arguments, unknown = parser().parse_known_args(words)
+    if unknown:
+        sub: argparse.ArgumentParser = arguments.command
+        word = unknown[0].partition("=")[0]
+        if not word.startswith("-"):
+            raise UnknownNameError(
+                f"{sub.prog} has no use for {word!r}. '{sub.prog} --help' says what it takes."
+            )
+        options = [option for option in sub._option_string_actions if option.startswith("--")]
+        raise UnknownNameError(f"{sub.prog} has no option {word!r}. {suggest(word, options, 'option')}")
+    return arguments
+
+
+def _instead(name: str) -> str:
+    """Return what may have been meant by a command that does not exist."""
+    from kineverse.formats.sources import shipped_models
+
+    if name in shipped_models() or os.path.exists(name):
+        return f"It is a model or file: 'kineverse info {name}' says what it consists of."
+    return f"{suggest(name, COMMANDS, 'command')} 'kineverse --help' says what each does."
 
 
 def one_line(error: BaseException) -> str:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 from kineverse.cli.progress import progress
 from kineverse.cli.table import figure, table
-from kineverse.errors import UnknownNameError
+from kineverse.errors import MissingExtraError, UnknownNameError
 
 if TYPE_CHECKING:
     from kineverse.experiments import Report, Table
@@ -43,6 +43,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Run the experiment, print its tables, write its figure."""
     from kineverse.experiments import EXPERIMENTS, Options, reproduce
+    from kineverse.experiments.report import check_drawing
 
     if arguments.list:
         listing = dict(EXPERIMENTS)
@@ -51,31 +52,37 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.name is None:
         raise UnknownNameError(f"Which experiment? There are: {', '.join(EXPERIMENTS)}.")
     options = Options(quick=arguments.quick, data=arguments.data, model=arguments.model)
+    if arguments.figure is not None:
+        check_drawing()  # before minutes are spent on numbers
     report = reproduce(arguments.name, progress, options)
-    drawn = _where(arguments, report.name)
-    if drawn:
-        report.figure.save(drawn)
     if arguments.json:
+        if arguments.figure is not None:
+            report.figure.save(arguments.figure)
         answer = {
             "name": report.name,
             "title": report.title,
-            "figure": drawn and str(drawn),
+            "figure": arguments.figure and str(arguments.figure),
             **report.numbers,
         }
         print(json.dumps(answer, indent=2, allow_nan=False))
         return 0
-    print(as_text(report))
-    if drawn:
-        print(f"\nThe figure is in {drawn}.")
+    print(as_text(report), flush=True)
+    if not arguments.no_figure:
+        _draw(report, arguments.figure)
     return 0
 
 
-def _where(arguments: argparse.Namespace, name: str) -> Path | None:
-    """Return where the figure goes: a program that asks for numbers gets no files it did not ask for."""
-    if arguments.no_figure:
-        return None
-    given: Path | None = arguments.figure
-    return given if given or arguments.json else Path(f"{name}.png")
+def _draw(report: Report, asked: Path | None) -> None:
+    """Write the figure where it is asked for; without being asked, only if there is what it takes."""
+    path = asked or Path(f"{report.name}.png")
+    try:
+        report.figure.save(path)
+    except MissingExtraError as error:
+        if asked:
+            raise
+        print(f"\nThere is no figure. {error}")
+    else:
+        print(f"\nThe figure is in {path}.")
 
 
 def as_text(report: Report) -> str:

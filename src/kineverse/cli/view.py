@@ -10,6 +10,7 @@ from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
 from kineverse.cli.assignments import add_set_option, parse_assignments, parse_length
+from kineverse.cli.beyond_limits import note, remarks
 from kineverse.cli.listing import asked_for, print_articulations, print_models
 from kineverse.cli.progress import progress
 from kineverse.errors import ValueRejectedError
@@ -86,11 +87,14 @@ def run(arguments: argparse.Namespace) -> int:
 
     import kineverse as kv
     from kineverse.view import meshes
+    from kineverse.view.poses import complete
     from kineverse.view.title import title_of_file
     from kineverse.view.viewer import Viewer
 
     label = title_of_file(arguments.model)
     model = kv.load(arguments.model)
+    if assigned:
+        note(remarks(model, complete(model, assigned), arguments.assignments))
     for mesh in progress(meshes.seen_in(model), "reading meshes", "file"):
         meshes.load(mesh)  # and remembered: whoever draws them finds them read
     if arguments.picture is not None:

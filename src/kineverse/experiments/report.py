@@ -9,6 +9,7 @@ from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
 from kineverse.errors import FormatError, MissingExtraError
+from kineverse.installation import install_command
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure as Canvas
@@ -90,12 +91,21 @@ class Report:
     figure: Figure
 
 
+def check_drawing() -> None:
+    """Look whether figures can be drawn here.
+
+    Raises
+    ------
+    MissingExtraError
+        Without matplotlib.
+    """
+    _matplotlib("matplotlib.figure")
+
+
 def _matplotlib(module: str) -> ModuleType:
     import importlib
 
     try:
         return importlib.import_module(module)
     except ImportError:
-        raise MissingExtraError(
-            "Figures need matplotlib: pip install 'kineverse-articulation[figures]', or do without a figure."
-        ) from None
+        raise MissingExtraError(f"Figures need matplotlib: {install_command('figures')}") from None

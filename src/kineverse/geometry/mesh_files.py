@@ -17,6 +17,7 @@ import numpy.typing as npt
 
 from kineverse.errors import FormatError, MissingExtraError
 from kineverse.formats.packages import locate
+from kineverse.installation import install_command
 from kineverse.model.body import Mesh
 
 Floats: TypeAlias = npt.NDArray[np.float64]
@@ -117,9 +118,7 @@ def parts(file: MeshFile) -> list[Any]:
     try:
         import trimesh
     except ImportError as error:
-        raise MissingExtraError(
-            "reading meshes needs trimesh: pip install 'kineverse-articulation[geometry]'"
-        ) from error
+        raise MissingExtraError(f"reading meshes needs trimesh: {install_command('geometry')}") from error
     with _quiet("trimesh"):
         scene = trimesh.load_scene(file.path, process=False)
         found = [g for g in scene.dump() if isinstance(g, trimesh.Trimesh) and len(g.faces)]

@@ -11,6 +11,7 @@ from typing import Any, TypeAlias
 import numpy as np
 
 from kineverse.errors import MissingExtraError, ValueRejectedError
+from kineverse.installation import install_command
 from kineverse.model.body import Box, Capsule, Cone, Cylinder, Ellipsoid, Geometry, Mesh, Sphere
 
 from .hulls import check_extent, hull
@@ -165,9 +166,7 @@ def coal_engine() -> Any:
     try:
         import coal
     except ImportError as error:
-        raise MissingExtraError(
-            "distances need coal: pip install 'kineverse-articulation[geometry]'"
-        ) from error
+        raise MissingExtraError(f"distances need coal: {install_command('geometry')}") from error
     return coal
 
 

@@ -12,6 +12,7 @@ import numpy as np
 from kineverse.errors import ValueRejectedError
 from kineverse.geometry.left_out import is_installed
 from kineverse.geometry.solids import coal_engine
+from kineverse.installation import install_command
 from kineverse.model.view import ModelView
 from kineverse.view.hypertext import Html, HtmlBox, element
 from kineverse.view.marks import BALL, CONTACT, HEAD, SHAFT, TIP, Marks
@@ -28,10 +29,6 @@ LONGEST = 0.2
 
 LABELS = 8
 """Depths that are written beside their arrows; more would cover what they are about."""
-
-MISSING = boxed(
-    "Distances need the extra ", element("b", "geometry"), ": pip install 'kineverse-articulation[geometry]'"
-)
 
 WAITING = boxed(element("b", "Reading shapes …"))
 
@@ -200,7 +197,7 @@ class Collisions:
         """Write the report of what was seen last, which is ``new`` if given."""
         with self._lock:
             self.seen = seen = new or self.seen
-            text = Html() if is_installed() else MISSING
+            text = Html() if is_installed() else _missing()
             if seen.failure:
                 text = near_failure(seen.failure)
             elif seen.nearness is not None:
@@ -243,3 +240,7 @@ class Collisions:
         for k, (ends, depth) in enumerate(zip(marks.arrows[:LABELS], marks.depths, strict=False)):
             nodes.append(scene.add_label(f"/near/depth{k}", depth, position=ends[1], font_screen_scale=0.8))
         return {node.name: node for node in nodes}
+
+
+def _missing() -> Html:
+    return boxed("Distances need the extra ", element("b", "geometry"), f": {install_command('geometry')}")

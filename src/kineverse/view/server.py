@@ -13,6 +13,7 @@ from types import FunctionType
 from typing import Any
 
 from kineverse.errors import KineverseError, MissingExtraError, ValueRejectedError
+from kineverse.installation import install_command
 from kineverse.view.access_control import AccessControl
 
 logger = logging.getLogger(__name__)
@@ -58,9 +59,7 @@ def start(port: int | None = None, label: str = "", host: str = HOST) -> Any:
         import viser
         from viser import infra
     except ImportError as error:
-        raise MissingExtraError(
-            "the page in the browser needs viser: pip install 'kineverse-articulation[view]'"
-        ) from error
+        raise MissingExtraError(f"the page in the browser needs viser: {install_command('view')}") from error
 
     access = AccessControl.of(host)
     gate = _Gate(access, label)

@@ -6,6 +6,7 @@ import json
 from typing import Any
 
 from kineverse.errors import MissingExtraError
+from kineverse.installation import install_command
 
 from .checks import RefusedError
 from .limits import MAX_LISTS
@@ -57,6 +58,6 @@ def _msgpack() -> Any:
         import msgspec.msgpack
     except ImportError as error:
         raise MissingExtraError(
-            "Documents as msgpack need msgspec: pip install 'kineverse-articulation[exchange]'"
+            f"Documents as msgpack need msgspec: {install_command('exchange')}"
         ) from error
     return msgspec.msgpack

@@ -10,6 +10,7 @@ from contextlib import contextmanager
 from typing import Any
 
 from kineverse.errors import FormatError, MissingExtraError
+from kineverse.installation import install_command
 
 from .preparing import Prepared
 
@@ -29,9 +30,7 @@ def mujoco() -> Any:
     try:
         import mujoco as package
     except ImportError as error:
-        raise MissingExtraError(
-            "Reading MJCF needs MuJoCo's parser: pip install 'kineverse-articulation[mjcf]'"
-        ) from error
+        raise MissingExtraError(f"Reading MJCF needs MuJoCo's parser: {install_command('mjcf')}") from error
     return package
 
 

@@ -17,6 +17,7 @@ import numpy as np
 
 from kineverse.errors import KineverseError, MissingExtraError
 from kineverse.geometry.mesh_files import Floats
+from kineverse.installation import install_command
 
 from .surface import Surface
 
@@ -75,9 +76,7 @@ def run(surface: Surface, error: float, limits: Limits, stop: threading.Event | 
         If it crashes, answers nothing that could be right, exceeds its limits, or is stopped.
     """
     if importlib.util.find_spec("coacd") is None:
-        raise MissingExtraError(
-            "decomposing meshes needs CoACD: pip install 'kineverse-articulation[decomposition]'"
-        )
+        raise MissingExtraError(f"decomposing meshes needs CoACD: {install_command('decomposition')}")
     with tempfile.TemporaryDirectory(prefix="kineverse-decompose-", ignore_cleanup_errors=True) as folder:
         source, target, said = (Path(folder) / name for name in ("in.npz", "out.npz", "said.txt"))
         np.savez(source, vertices=surface.faces.vertices, faces=surface.faces.faces, parts=surface.parts)

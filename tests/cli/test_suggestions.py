@@ -1,0 +1,107 @@
+"""What is said to somebody who mistypes, forgets a prefix or a unit, or says nothing at all."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+
+import pytest
+
+HANDLE = ("fk", "kitchen", "kitchen/fridge_door_handle")
+
+
+@pytest.mark.parametrize("words", [(), ("-v",)])
+def test_without_a_command_the_help_is_printed(run, words):
+    status, out, err = run(*words)
+    assert (status, err) == (0, "")
+    assert out == run("--help")[1]
+    assert "kineverse info kitchen" in out
+
+
+def test_the_module_is_the_same_command():
+    said = subprocess.run([sys.executable, "-m", "kineverse"], capture_output=True, text=True, check=True)
+    assert said.stdout.startswith("usage: kineverse ")
+    assert said.stderr == ""
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (
+            ("inof", "kitchen"),
+            "There is no command 'inof'. Did you mean 'info'? 'kineverse --help' says what each does.",
+        ),
+        (
+            ("kitchen",),
+            "There is no command 'kitchen'. It is a model or file: 'kineverse info kitchen' says what it "
+            "consists of.",
+        ),
+        (("info", "kitchen", "--jsno"), "kineverse info has no option '--jsno'. Did you mean '--json'?"),
+        (
+            ("fk", "kitchen", "world", "--sett=a"),
+            "kineverse fk has no option '--sett'. Did you mean '--set'?",
+        ),
+        (
+            ("info", "kitchen", "pr2"),
+            "kineverse info has no use for 'pr2'. 'kineverse info --help' says what it takes.",
+        ),
+        (
+            ("fk", "kitchen", "fridge_door_handle"),
+            "There is no frame 'fridge_door_handle'. Did you mean 'kitchen/fridge_door_handle' or "
+            "'kitchen/oven_door_handle' or 'kitchen/fridge_lower_drawer_handle'?",
+        ),
+        (
+            (*HANDLE, "--set", "fridge_door=1"),
+            "The model has no symbol 'fridge_door'. Did you mean 'kitchen/fridge_door'?",
+        ),
+    ],
+)
+def test_a_line_says_what_may_have_been_meant(run, words, said):
+    assert run(*words) == (2, "", f"kineverse: {said}\n")
+
+
+@pytest.mark.parametrize(
+    ("assignment", "said"),
+    [
+        (
+            "kitchen/fridge_door=30",
+            "kitchen/fridge_door = 30 rad is beyond its limits [0, 1.571]; in degrees it is "
+            "--set kitchen/fridge_door=30deg",
+        ),
+        ("kitchen/fridge_door=300", "kitchen/fridge_door = 300 rad is beyond its limits [0, 1.571]"),
+        ("kitchen/fridge_door=95deg", "kitchen/fridge_door = 1.65806 rad is beyond its limits [0, 1.571]"),
+        (
+            "kitchen/sink_trash_drawer=30",
+            "kitchen/sink_trash_drawer = 30 m is beyond its limits [0, 0.48]; in cm it is "
+            "--set kitchen/sink_trash_drawer=30cm",
+        ),
+        (
+            "kitchen/sink_trash_drawer=300",
+            "kitchen/sink_trash_drawer = 300 m is beyond its limits [0, 0.48]; in mm it is "
+            "--set kitchen/sink_trash_drawer=300mm",
+        ),
+    ],
+)
+def test_a_forgotten_unit_is_remarked(run, assignment, said):
+    status, out, err = run(*HANDLE, "--set", assignment)
+    assert status == 0
+    assert out
+    assert err == f"kineverse: note: {said}\n"
+
+
+def test_what_turns_for_ever_may_be_meant_in_degrees(run):
+    words = ("fk", "pr2", "pr2/r_gripper_tool_frame", "--set")
+    _, _, err = run(*words, "pr2/r_forearm_roll_joint=90")
+    assert err == (
+        "kineverse: note: pr2/r_forearm_roll_joint = 90 rad is 14.3 turns; in degrees it is "
+        "--set pr2/r_forearm_roll_joint=90deg\n"
+    )
+    for value in ("3", "90rad", "90deg", "20pi"):
+        assert run(*words, f"pr2/r_forearm_roll_joint={value}")[2] == ""
+
+
+def test_a_picture_comes_with_the_same_remark(run, tmp_path):
+    picture = tmp_path / "kitchen.png"
+    _, _, err = run("view", "kitchen", "--set", "kitchen/fridge_door=30", "--picture", picture)
+    assert "--set kitchen/fridge_door=30deg" in err
+    assert picture.exists()
