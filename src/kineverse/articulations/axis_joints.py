@@ -9,7 +9,7 @@ import numpy as np
 
 from kineverse.errors import ValueRejectedError
 from kineverse.expressions.expression import Expression
-from kineverse.model.body import Pose, Vector3
+from kineverse.model.body import Pose, VectorLike
 from kineverse.model.operation import Effects
 from kineverse.model.reader import Reader
 from kineverse.motions import X, Y, Z, slide, turn
@@ -100,7 +100,7 @@ class Cylindrical(Joint):
         For an articulation or a frame that exists.
     """
 
-    axis: Vector3 = (1.0, 0.0, 0.0)
+    axis: VectorLike = (1.0, 0.0, 0.0)
     slide: Limits = FREE
     turn: Limits = FREE
 
@@ -127,7 +127,7 @@ class Cylindrical(Joint):
         )
 
 
-def unit_axis(axis: Vector3) -> tuple[float, float, float]:
+def unit_axis(axis: VectorLike) -> tuple[float, float, float]:
     """Return the axis at length one."""
     numbers = normalised(axis)
     assert numbers is not None  # joints check their axis when they are made
@@ -135,7 +135,7 @@ def unit_axis(axis: Vector3) -> tuple[float, float, float]:
     return x, y, z
 
 
-def rotation_factors(axis: Vector3, q: Expression) -> tuple[Pose | Expression, ...]:
+def rotation_factors(axis: VectorLike, q: Expression) -> tuple[Pose | Expression, ...]:
     """Return the rotation about any axis as constants around one about x, y or z.
 
     Such factors keep the Jacobian constant in q and the chain short: A · rotation_z(q) · Aᵀ with A's last

@@ -12,7 +12,7 @@ import numpy as np
 from kineverse.errors import ValueRejectedError
 from kineverse.expressions.expression import Expression, array
 from kineverse.expressions.functions import norm
-from kineverse.model.body import Pose, Vector3
+from kineverse.model.body import Pose, VectorLike
 from kineverse.model.constraint import Constraint
 from kineverse.model.operation import Effects
 from kineverse.model.reader import Reader
@@ -45,7 +45,7 @@ class Planar(Joint):
         Limit of the speeds of x and y alike [m/s]; None for no limit.
     """
 
-    axis: Vector3 = (0.0, 0.0, 1.0)
+    axis: VectorLike = (0.0, 0.0, 1.0)
     lower: float | None = None
     upper: float | None = None
     velocity: float | None = None
@@ -96,8 +96,8 @@ class Universal(Joint):
         For an articulation or a frame that exists.
     """
 
-    first: Vector3 = (1.0, 0.0, 0.0)
-    second: Vector3 = (0.0, 1.0, 0.0)
+    first: VectorLike = (1.0, 0.0, 0.0)
+    second: VectorLike = (0.0, 1.0, 0.0)
     first_limits: Limits = FREE
     second_limits: Limits = FREE
 
@@ -168,7 +168,7 @@ class Ball(Joint):
         For an articulation or a frame that exists.
     """
 
-    axis: Vector3 = (0.0, 0.0, 1.0)
+    axis: VectorLike = (0.0, 0.0, 1.0)
     cone: float | None = None
     twist: float | None = None
     velocity: float | None = None
@@ -254,7 +254,7 @@ def orientation(name: str) -> Orientation:
     return Orientation(q, omega, rows)
 
 
-def from_z(axis: Vector3) -> np.ndarray[tuple[int, int], np.dtype[np.float64]]:
+def from_z(axis: VectorLike) -> np.ndarray[tuple[int, int], np.dtype[np.float64]]:
     """Return the smallest rotation that turns z into the axis, 4×4."""
     n = np.array(unit_axis(axis))
     turn = np.eye(4)

@@ -12,7 +12,8 @@ from typing import Any
 from kineverse.errors import KineverseError, NameTakenError, ValueRejectedError
 from kineverse.expressions.expression import Expression, ExpressionLike
 from kineverse.model.articulation import Articulation
-from kineverse.model.body import Pose, Vector3
+from kineverse.model.body import Pose, Vector3, VectorLike
+from kineverse.model.frame import TransformLike
 from kineverse.model.operation import Effects, Operation
 from kineverse.model.reader import Reader
 from kineverse.number import real_number
@@ -38,7 +39,7 @@ class Placed(Operation):
 
     name: str
     parent: str
-    origin: Pose = Pose()
+    origin: TransformLike = Pose()
 
     def __post_init__(self) -> None:
         self.check_texts("name", "parent")
@@ -181,7 +182,7 @@ class AxialJoint(Joint):
         Limit of the speed, either way [m/s] or [rad/s]; None for no limit.
     """
 
-    axis: Vector3 = (1.0, 0.0, 0.0)
+    axis: VectorLike = (1.0, 0.0, 0.0)
     lower: ExpressionLike | None = None
     upper: ExpressionLike | None = None
     velocity: float | None = None
@@ -233,7 +234,7 @@ class AxisJoint(AxialJoint):
         return self.moved_by(self.q)
 
 
-def checked_axis(axis: Vector3, name: str) -> Vector3:
+def checked_axis(axis: VectorLike, name: str) -> Vector3:
     """Return the axis of a joint as a tuple of numbers.
 
     Raises

@@ -6,6 +6,7 @@ is opened before somebody asks for it.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, TypeAlias
 
@@ -20,6 +21,8 @@ _FARTHEST = 1e100
 """A chain of poses within that does not overflow [m]."""
 
 Vector3: TypeAlias = tuple[float, float, float]
+VectorLike: TypeAlias = Sequence[float] | npt.NDArray[Any]
+"""Three numbers, as they may be given."""
 Rgba: TypeAlias = tuple[float, float, float, float]
 
 
