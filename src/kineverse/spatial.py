@@ -51,7 +51,10 @@ def _taken_apart(
     ShapeError
         For more or fewer, and for arrays among them.
     """
-    wanted = f"{what} is given as {len(names)} numbers {', '.join(names)} or as one vector of them"
+    wanted = (
+        f"{what} is given as {len(names)} numbers {', '.join(names)} or as one vector of "
+        f"shape ({len(names)},) alone"
+    )
     present = [as_expression(part) for part in given if part is not None]
     if len(present) == 1 and present[0].shape:
         (vector,) = present
@@ -60,7 +63,7 @@ def _taken_apart(
         return tuple(vector)
     for part in present:
         if part.shape:
-            raise ShapeError(f"{wanted} alone, not by something of shape {part.shape} among others.")
+            raise ShapeError(f"{wanted}, not by something of shape {part.shape} among others.")
     if len(present) != len(names):
         raise ShapeError(f"{wanted}, not as {len(present)}.")
     return tuple(present)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from itertools import count
 from pathlib import Path
+from typing import cast
 from xml.etree import ElementTree
 
 import numpy as np
@@ -38,7 +39,7 @@ def joint_replaced(robot: Robot) -> Contender:
 
     def at(shift: float) -> Array:
         with model.edit() as edit:
-            edit.replace(tag, replace(joint, origin=_shifted(joint.origin, shift)))
+            edit.replace(tag, replace(joint, origin=_shifted(cast(Pose, joint.origin), shift)))
         return np.asarray(model.fk(robot.frame)(values))
 
     # Every time by another shift: a model that is what it was before would be done at once.

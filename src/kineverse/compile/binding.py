@@ -101,7 +101,7 @@ def pooled(
         vector, run, copies, _ = binding
         try:
             # This assignment refuses everything but doubles of the right number; it would not see a mask.
-            vector[:] = x if type(x) is np.ndarray else convert(x)
+            vector[:] = x if type(x) is np.ndarray else convert(x)  # type: ignore[assignment]
         except (ValueError, TypeError):
             vector[:] = convert(x)
         run()

@@ -161,7 +161,7 @@ def tensordot(a: ExpressionLike, b: ExpressionLike, axes: Any = 2) -> Expression
         if isinstance(axes, (int, np.integer)):
             of_x, of_y = [*range(x.ndim - int(axes), x.ndim)], [*range(int(axes))]
         else:
-            of_x, of_y = ([k] if isinstance(k, (int, np.integer)) else list(k) for k in axes)
+            of_x, of_y = ([int(k)] if isinstance(k, (int, np.integer)) else [*map(int, k)] for k in axes)
         pairs = [(range(x.ndim)[i], range(y.ndim)[j]) for i, j in zip(of_x, of_y, strict=True)]
         if any(x.shape[i] != y.shape[j] for i, j in pairs):
             raise IndexError

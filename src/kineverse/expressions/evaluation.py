@@ -73,7 +73,8 @@ def assign(
         given[place] = value
         if place not in asked and not (derived and isinstance(key, Expression)):
             unknown.append(place)
-    if unknown and not isinstance(values, State):
+    # What depends on nothing is the same whatever the values: a Jacobian of a drawer, say.
+    if unknown and not isinstance(values, State) and (names or not derived):
         more = " Values that know more than is asked for go into kv.State({...})." if derived else ""
         raise UnknownNameError(f"Unknown symbol {unknown[0]!r}. {suggest(unknown[0], names, 'symbol')}{more}")
     twice = [s for s in symbols if s in given and str(s) in given]

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from typing import TYPE_CHECKING, Any, NoReturn, TypeAlias
+from typing import TYPE_CHECKING, Any, NoReturn, TypeAlias, overload
 from weakref import WeakValueDictionary
 
 import casadi as ca
@@ -24,6 +24,8 @@ from .array_methods import ArrayMethods
 from .layout import SX, Shape
 
 if TYPE_CHECKING:
+    from typing_extensions import deprecated
+
     from kineverse.symbols import Symbol
 
     from .node import Node, Watcher
@@ -390,8 +392,8 @@ class Expression(ArrayMethods):
         values
             A mapping from symbols or their names to numbers, or a :class:`~kineverse.State`. A state may know
             more symbols than there are here, and other symbols may be given as such, as a derivative depends
-            on fewer than its function; names have to be those of symbols in here. Parameters that are not
-            given have their own values.
+            on fewer than its function; names have to be those of symbols in here, if there are any.
+            Parameters that are not given have their own values.
 
         Raises
         ------
@@ -426,15 +428,35 @@ class Expression(ArrayMethods):
 
         return structural_key(looked_at(self))
 
-    def __eq__(self, other: object) -> bool:
-        if self is other:
-            return True
-        if not isinstance(other, Expression):
-            try:
-                other = as_expression(other)  # type: ignore[arg-type]
-            except (ExpressionError, ValueRejectedError, ShapeError):
-                return NotImplemented
-        return self._shape == other._shape and self.key == other.key
+    if TYPE_CHECKING:
+        # For checkers that report deprecated calls: nobody means to ask whether a symbol is a number.
+        @overload
+        def __eq__(self, other: Expression) -> bool: ...
+        @overload
+        @deprecated("== compares structure, so an expression equals no number; call it with values first")
+        def __eq__(self, other: float) -> bool: ...
+        @overload
+        def __eq__(self, other: object) -> bool: ...
+        def __eq__(self, other: object) -> bool: ...
+        @overload
+        def __ne__(self, other: Expression) -> bool: ...
+        @overload
+        @deprecated("!= compares structure, so an expression equals no number; call it with values first")
+        def __ne__(self, other: float) -> bool: ...
+        @overload
+        def __ne__(self, other: object) -> bool: ...
+        def __ne__(self, other: object) -> bool: ...
+    else:
+
+        def __eq__(self, other: object) -> bool:
+            if self is other:
+                return True
+            if not isinstance(other, Expression):
+                try:
+                    other = as_expression(other)
+                except (ExpressionError, ValueRejectedError, ShapeError):
+                    return NotImplemented
+            return self._shape == other._shape and self.key == other.key
 
     def __hash__(self) -> int:
         return hash(self.key)

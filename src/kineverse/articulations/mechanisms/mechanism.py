@@ -5,7 +5,7 @@ from __future__ import annotations
 from abc import abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, ClassVar, NamedTuple, cast
 
 from kineverse.articulations.joint import Placed, checked_number
 from kineverse.articulations.limits import Limits, check_limits
@@ -122,7 +122,7 @@ class Mechanism(Placed):
 
     def base(self, *shapes: Shape) -> Part:
         """Return the part that stands still."""
-        return Part("", (self.origin,), shapes)
+        return Part("", (cast(Pose | Expression, self.origin),), shapes)
 
     def number(self, field: str, *, positive: bool = False) -> float:
         """Return a field that is a finite number.

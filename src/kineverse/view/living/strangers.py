@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
@@ -83,7 +83,7 @@ class Stranger:
     def axis(self) -> tuple[Floats, Floats]:
         """A point on the true axis [m], and its direction, in the base."""
         direction = np.array(self.joint.axis)
-        frame = self.joint.origin.matrix
+        frame = cast(Pose, self.joint.origin).matrix
         return frame[:3, 3], frame[:3, :3] @ direction / np.linalg.norm(direction)
 
 
