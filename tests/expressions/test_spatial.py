@@ -245,7 +245,7 @@ BAD = [
     (lambda: spatial.rotation_x([1, 2]), r"angle is a scalar, not of shape \(2,\)"),
     (lambda: spatial.rotation_y([0.0]), r"angle is a scalar, not of shape \(1,\)"),
     (lambda: spatial.rotation_z(FLAT), r"angle is a scalar, not of shape \(3, 4\)"),
-    (lambda: spatial.rpy([1, 2], 0, 0), "angle is a scalar"),
+    (lambda: spatial.rpy([1, 2], 0, 0), "3 numbers roll, pitch, yaw"),
     (lambda: spatial.axis_angle([1, 2], 0), r"axis of a rotation has shape \(3,\), not \(2,\)"),
     (lambda: spatial.axis_angle([1, 0, 0], [1, 2]), r"\(2,\)|Ragged"),
     (lambda: spatial.quaternion(0, 0, [0, 1], 1), r"\(2,\)|Ragged"),
@@ -256,8 +256,8 @@ BAD = [
     (lambda: spatial.transform(np.eye(2), [1, 2, 3]), r"4×4 matrix, not of shape \(2, 2\)"),
     (lambda: spatial.skew(1.0), r"vector has shape \(3,\), not \(\)"),
     (lambda: spatial.unit([[1.0, 0, 0]]), r"vector has shape \(3,\), not \(1, 3\)"),
-    (lambda: spatial.point([1, 2], 0, 0), "Ragged"),
-    (lambda: spatial.vector([1, 2], 0, 0), "Ragged"),
+    (lambda: spatial.point([1, 2], 0, 0), r"A point .* \(2,\) among others"),
+    (lambda: spatial.vector([1, 2], 0, 0), r"A direction .* \(2,\) among others"),
 ]  # fmt: skip
 OF_A_TRANSFORM = [
     spatial.rpy_of, spatial.quaternion_of, spatial.rotation_vector, spatial.rotation_angle, spatial.rotation_of,

@@ -63,14 +63,15 @@ def latex(expression: Expression) -> str | None:
     writer = _Latex()
     if not expression.shape:
         formula = writer.bounded(expression._sx)
-        return formula if len(formula) <= _LONGEST_FORMULA else None
+        return formula if len(formula) <= _LONGEST_FORMULA and formula != writer.ellipsis else None
     rows, columns = expression._sx.shape
     if expression.ndim > 2 or rows > 6 or columns > 6:
         return None
     lines = []
     for i in range(rows):
-        lines.append(" & ".join(writer.bounded(expression._sx[i, j]) for j in range(columns)))
-        if sum(map(len, lines)) > _LONGEST_FORMULA:
+        entries = [writer.bounded(expression._sx[i, j]) for j in range(columns)]
+        lines.append(" & ".join(entries))
+        if sum(map(len, lines)) > _LONGEST_FORMULA or writer.ellipsis in entries:
             return None
     return r"\begin{bmatrix}" + r" \\ ".join(lines) + r"\end{bmatrix}"
 
