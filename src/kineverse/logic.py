@@ -32,8 +32,8 @@ from typing import ClassVar
 import casadi as ca
 
 from .errors import ExpressionError, ValueRejectedError
-from .expressions.expression import Expression, ExpressionLike, as_expression, broadcast
-from .expressions.functions import tanh
+from .expressions.expression import Expression, ExpressionLike, as_expression, binary, broadcast
+from .expressions.functions import absolute, tanh
 from .expressions.node import Node
 from .symbols import Symbol
 
@@ -41,7 +41,7 @@ CONTRAST = 1e10
 
 
 def less(a: ExpressionLike, b: ExpressionLike, contrast: float = CONTRAST) -> Expression:
-    """Return the truth of a < b: 1 or 0, and 0.5 at equality.
+    """Return the truth of a < b: 1 or 0, and 0.5 at equality, that of two infinities included.
 
     Parameters
     ----------
@@ -121,12 +121,25 @@ class Less(_Logic):
     kind = "less"
 
     def _value(self) -> Expression:
+        return (1 + tanh(self._excess() * self.options[0])) / 2
+
+    def _excess(self) -> Expression:
+        """Return b - a, and 0 where both are the same infinity."""
         a, b = self.arguments
-        return (1 + tanh((b - a) * self.options[0])) / 2
+        difference = b - a
+        if _is_finite(a) or _is_finite(b):
+            return difference
+        # Infinities that are equal differ by NaN; NaN differs from itself, so it stays.
+        number = binary(ca.OP_LE, absolute(difference), math.inf)
+        return binary(ca.OP_IF_ELSE_ZERO, binary(ca.OP_OR, number, binary(ca.OP_NE, a, b)), difference)
 
     def _trend(self) -> Mapping[Symbol, Expression]:
         a, b = self.arguments
         return weighted_sum([(-1, a.gradient()), (1, b.gradient())])
+
+
+def _is_finite(x: Expression) -> bool:
+    return bool(x._sx.is_constant()) and all(math.isfinite(float(e)) for e in x._sx.elements())
 
 
 class Not(_Logic):

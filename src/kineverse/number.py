@@ -8,7 +8,8 @@ from typing import Any
 def real_number(value: Any) -> float:
     """Return a value as a float, NaN and infinities included.
 
-    Text is none, though ``float`` reads it, and nothing is cut off: no imaginary parts, no further elements.
+    Text is none, though ``float`` reads it, and nothing is cut off: no imaginary parts, no further elements,
+    no mask.
 
     Raises
     ------
@@ -19,7 +20,8 @@ def real_number(value: Any) -> float:
         return value
     dtype = getattr(value, "dtype", None)
     if isinstance(value, (str, bytes, bytearray, complex)) or (
-        dtype is not None and (getattr(dtype, "kind", "") not in "fiub" or value.ndim)
+        dtype is not None
+        and (getattr(dtype, "kind", "") not in "fiub" or value.ndim or getattr(value, "mask", False))
     ):
         raise TypeError(f"{value!r} is not a real number")
     return float(value)

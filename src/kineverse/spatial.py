@@ -32,18 +32,41 @@ def translation(
     What is not given is 0.
     """
     first = as_expression(x)
-    if first.shape == (3,) and y is None and z is None:
-        parts = tuple(first)
+    if first.shape and y is None and z is None:
+        parts = _taken_apart("A translation", ("x", "y", "z"), (first,))
     else:
-        parts = (first, as_expression(0.0 if y is None else y), as_expression(0.0 if z is None else z))
-    for part in parts:
-        if part.shape:
-            raise ShapeError(
-                "A translation is given as three numbers x, y, z or as one vector of shape (3,) alone, "
-                f"not by something of shape {part.shape}."
-            )
+        others = (0.0 if y is None else y, 0.0 if z is None else z)
+        parts = _taken_apart("A translation", ("x", "y", "z"), (first, *others))
     column = ca.vertcat(_ONE, _ONE, _ONE, *(p._sx for p in parts), _ONE)
     return make(ca.SX(_TRANSLATION, column), (4, 4), union(parts))
+
+
+def _taken_apart(
+    what: str, names: tuple[str, ...], given: tuple[ExpressionLike | None, ...]
+) -> tuple[Expression, ...]:
+    """Return the numbers that are given one by one, or as one vector alone.
+
+    Raises
+    ------
+    ShapeError
+        For more or fewer, and for arrays among them.
+    """
+    wanted = (
+        f"{what} is given as {len(names)} numbers {', '.join(names)} or as one vector of "
+        f"shape ({len(names)},) alone"
+    )
+    present = [as_expression(part) for part in given if part is not None]
+    if len(present) == 1 and present[0].shape:
+        (vector,) = present
+        if vector.shape != (len(names),):
+            raise ShapeError(f"{wanted}, not by something of shape {vector.shape}.")
+        return tuple(vector)
+    for part in present:
+        if part.shape:
+            raise ShapeError(f"{wanted}, not by something of shape {part.shape} among others.")
+    if len(present) != len(names):
+        raise ShapeError(f"{wanted}, not as {len(present)}.")
+    return tuple(present)
 
 
 _ONE = ca.SX(1)
@@ -86,9 +109,16 @@ def axis_angle(axis: Vector, angle: ExpressionLike) -> Expression:
     )
 
 
-def rpy(roll: ExpressionLike, pitch: ExpressionLike, yaw: ExpressionLike) -> Expression:
-    """Return the 4×4 rotation by roll about x, then pitch about y, then yaw about z, all fixed axes [rad]."""
-    return rotation_z(yaw) @ rotation_y(pitch) @ rotation_x(roll)
+def rpy(
+    roll: ExpressionLike, pitch: ExpressionLike | None = None, yaw: ExpressionLike | None = None
+) -> Expression:
+    """Return the 4×4 rotation by roll about x, then pitch about y, then yaw about z, all fixed axes [rad].
+
+    The three are given one by one, or as one vector of shape (3,) alone.
+    """
+    names = ("roll", "pitch", "yaw")
+    about_x, about_y, about_z = _taken_apart("A rotation by roll, pitch and yaw", names, (roll, pitch, yaw))
+    return rotation_z(about_z) @ rotation_y(about_y) @ rotation_x(about_x)
 
 
 def rpy_of(a_R_b: ExpressionLike) -> Expression:
@@ -110,15 +140,24 @@ def rpy_of(a_R_b: ExpressionLike) -> Expression:
     )
 
 
-def quaternion(x: ExpressionLike, y: ExpressionLike, z: ExpressionLike, w: ExpressionLike) -> Expression:
-    """Return the 4×4 rotation of the quaternion (x, y, z, w) of any length but zero.
+def quaternion(
+    x: ExpressionLike,
+    y: ExpressionLike | None = None,
+    z: ExpressionLike | None = None,
+    w: ExpressionLike | None = None,
+) -> Expression:
+    """Return the 4×4 rotation of the quaternion (x, y, z, w) of any length but zero: the scalar is last.
+
+    The four are given one by one, or as one vector of shape (4,) alone.
 
     Raises
     ------
+    ShapeError
+        For more or fewer than four.
     ValueRejectedError
         For a constant quaternion of length zero, or infinite.
     """
-    q = array([x, y, z, w])
+    q = array(list(_taken_apart("A quaternion", ("x", "y", "z", "w"), (x, y, z, w))))
     watcher = watcher_of(q)
     if watcher is not None:
         anew: Expression = watcher.ask("quaternion", q)
@@ -255,14 +294,20 @@ def position_of(a_T_b: ExpressionLike) -> Expression:
     return transform_like(a_T_b)[:3, 3]
 
 
-def point(x: ExpressionLike, y: ExpressionLike, z: ExpressionLike) -> Expression:
-    """Return the homogeneous coordinates (x, y, z, 1) of a point: transforms move it."""
-    return array([x, y, z, 1])
+def point(x: ExpressionLike, y: ExpressionLike | None = None, z: ExpressionLike | None = None) -> Expression:
+    """Return the homogeneous coordinates (x, y, z, 1) of a point: transforms move it.
+
+    The three are given one by one, or as one vector of shape (3,) alone.
+    """
+    return array([*_taken_apart("A point", ("x", "y", "z"), (x, y, z)), 1])
 
 
-def vector(x: ExpressionLike, y: ExpressionLike, z: ExpressionLike) -> Expression:
-    """Return the homogeneous coordinates (x, y, z, 0) of a direction: transforms only turn it."""
-    return array([x, y, z, 0])
+def vector(x: ExpressionLike, y: ExpressionLike | None = None, z: ExpressionLike | None = None) -> Expression:
+    """Return the homogeneous coordinates (x, y, z, 0) of a direction: transforms only turn it.
+
+    The three are given one by one, or as one vector of shape (3,) alone.
+    """
+    return array([*_taken_apart("A direction", ("x", "y", "z"), (x, y, z)), 0])
 
 
 def skew(v: Vector) -> Expression:

@@ -10,7 +10,7 @@ from __future__ import annotations
 import re
 import threading
 from collections.abc import Iterable, Sequence
-from typing import Any, Literal, TypeAlias, get_args
+from typing import TYPE_CHECKING, Any, Literal, TypeAlias, get_args
 
 import casadi as ca
 
@@ -144,12 +144,14 @@ class Symbol(Expression):
     def __hash__(self) -> int:
         return self._hash
 
-    def __eq__(self, other: object) -> bool:
-        if self is other:
-            return True
-        if isinstance(other, Symbol):
-            return False
-        return Expression.__eq__(self, other)
+    if not TYPE_CHECKING:
+
+        def __eq__(self, other: object) -> bool:
+            if self is other:
+                return True
+            if isinstance(other, Symbol):
+                return False
+            return Expression.__eq__(self, other)
 
     def __reduce__(self) -> Any:
         return Symbol, (self.path, self.order, self.role, self.value)

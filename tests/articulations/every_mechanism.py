@@ -36,7 +36,7 @@ KINDS: tuple[type[Mechanism], ...] = tuple({type(m): None for m in EVERY.values(
 
 def pose(operation: Mechanism, part: str, at: Mapping[str, float]) -> Matrix:
     """Return base_T_part as numbers."""
-    found: Matrix = model_of(operation).fk(f"m/{part}", "m/base")(at)
+    found: Matrix = model_of(operation).fk(f"m/{part}", "m/base")(kv.State(at))
     return found
 
 

@@ -130,7 +130,7 @@ def test_the_speeds_of_a_floating_joint_are_angular_velocities_in_the_child() ->
         **dict(zip(("j/qx", "j/qy", "j/qz", "j/qw"), q.as_quat(), strict=True)),
     }
     speeds = [str(s) for s in model.speeds_of("c")]
-    body = model.jacobian("c", form="body")(at)
+    body = model.jacobian("c", form="body")(kv.State(at))
     for axis, name in enumerate("xyz"):
         np.testing.assert_allclose(body[3:, speeds.index(f"j/w{name}:velocity")], np.eye(3)[axis], atol=1e-15)
         np.testing.assert_allclose(
@@ -140,7 +140,7 @@ def test_the_speeds_of_a_floating_joint_are_angular_velocities_in_the_child() ->
     assert (len(record.coordinates), len(record.speeds)) == (7, 6)
     assert record.home == (0, 0, 0, 0, 0, 0, 1)
     rate = [
-        sum(row(at) * v for row, v in zip(model.rates[c].values(), (0.3, -0.7, 0.2), strict=True))
+        sum(row(kv.State(at)) * v for row, v in zip(model.rates[c].values(), (0.3, -0.7, 0.2), strict=True))
         for c in record.coordinates[3:]
     ]
     half = Rotation.from_rotvec(np.array([0.3, -0.7, 0.2]) * 1e-6)
@@ -163,7 +163,7 @@ def test_wheels() -> None:
     )
     assert [str(s) for s in model.speeds] == ["l:velocity", "r:velocity"]
     angle = 0.8
-    columns = model.jacobian("c")({"j/x": 4, "j/y": 5, "j/angle": angle})
+    columns = model.jacobian("c")(kv.State({"j/x": 4, "j/y": 5, "j/angle": angle}))
     forward = [r / 2 * np.cos(angle), r / 2 * np.sin(angle), 0, 0, 0]
     np.testing.assert_allclose(columns.T, [[*forward, -r / b], [*forward, r / b]], atol=1e-15)
     assert [model.limits(s) for s in model.speeds] == [(-3, 3), (-3, 3)]

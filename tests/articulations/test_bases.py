@@ -114,7 +114,7 @@ def test_the_limits_of_a_car() -> None:
 @pytest.mark.parametrize("angle", [0.0, 0.8, -2.0])
 def test_four_wheels_move_three_coordinates(angle: float) -> None:
     model = model_of(WHEELED)
-    jacobian = model.jacobian("c", form="body")({"j/x": 1.0, "j/y": 2.0, "j/angle": angle})
+    jacobian = model.jacobian("c", form="body")(kv.State({"j/x": 1.0, "j/y": 2.0, "j/angle": angle}))
     columns = {s: jacobian[:, i] for i, s in enumerate(map(str, model.speeds_of("c")))}
     r, reach = 0.1, (0.5 + 0.7) / 2
 

@@ -162,7 +162,7 @@ def test_a_ratchet_turns_one_way_until_its_pawl_is_lifted() -> None:
 def test_a_tap_lifts_and_turns_and_knows_its_flow() -> None:
     tap = kv.Faucet(**WHERE)
     for lift, turn in ((0.0, -0.8), (0.2, 0.3), (0.5, 0.8)):
-        where = {"m/lift": lift, "m/turn": turn}
+        where = kv.State({"m/lift": lift, "m/turn": turn})
         lever = at(z=0.16) @ turned((0, 0, 1), turn) @ about_y(lift)
         np.testing.assert_allclose(pose(tap, "lever", where), lever, atol=1e-15)
         data = model_of(tap).data

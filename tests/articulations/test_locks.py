@@ -209,7 +209,7 @@ def test_locks_are_data(tmp_path: Path) -> None:
     assert read.snapshot() == model.snapshot()
     for name in ("lock", "block", "table"):
         for b in (0.0, 0.01, 0.02):
-            at = {"door": 0.0, "bolt": b}
+            at = kv.State({"door": 0.0, "bolt": b})
             ours, theirs = (m.constraints[name].upper for m in (model, read))
             assert ours(at) == theirs(at)
             assert trend(ours, at) == trend(theirs, at)

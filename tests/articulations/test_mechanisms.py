@@ -114,9 +114,9 @@ def test_it_is_a_value_and_a_document(mechanism: Mechanism, tmp_path: Path) -> N
     assert_is_a_value(mechanism, model, tmp_path)
     read = kv.load(tmp_path / "model.kv.json", prefix="new")
     for at in across(mechanism, 3):
-        there = {f"new/{s}": v for s, v in at.items()}
+        there = kv.State({f"new/{s}": v for s, v in at.items()})
         for frame in model.frames:
-            ours, theirs = model.fk(frame)(at), read.fk(f"new/{frame}")(there)
+            ours, theirs = model.fk(frame)(kv.State(at)), read.fk(f"new/{frame}")(there)
             assert np.array_equal(ours, theirs, equal_nan=True)
     there = {f"new/{s}": v for s, v in {**model.default_state(), **dict.fromkeys(model.speeds, 0.5)}.items()}
     broken = model.violations({k.removeprefix("new/"): v for k, v in there.items()})

@@ -219,3 +219,16 @@ def test_an_evaluator_outlives_its_function(tier: str) -> None:
     for i in range(100):
         evaluator([i, 2.0])
         assert evaluator.outputs[0] == 2.0 * i
+
+
+def test_a_function_of_constants_is_called_without_anything():
+    for tier in ("interpreter", "auto"):
+        f = kv.compile([kv.rotation_z(0.0), kv.array(3.0)], tier=tier)
+        assert f.inputs == ()
+        assert f()[1] == f([])[1] == f({})[1] == 3
+        np.testing.assert_array_equal(f()[0], np.eye(4))
+        assert f.batch(np.zeros((2, 0)))[1].tolist() == [3, 3]
+    with pytest.raises(
+        kv.ShapeError, match=r"Nothing is given; a call takes a vector of 1 numbers \('q'\), or a mapping"
+    ):
+        kv.compile(kv.position("q"))()

@@ -71,7 +71,7 @@ def agree(one: kv.Model, other: kv.Model) -> None:
     """Compare everything that two models contain by its values and gradients."""
     assert list(one.frames) == list(other.frames)
     assert list(one.constraints) == list(other.constraints)
-    at = {"lift": 0.3, "knob": -0.4, "hinge": 0.2, "wheel:velocity": 0.7, "lift:velocity": 1.1}
+    at = kv.State({"lift": 0.3, "knob": -0.4, "hinge": 0.2, "wheel:velocity": 0.7, "lift:velocity": 1.1})
     pairs = [(one.fk(f), other.fk(f)) for f in one.frames]
     for name, constraint in one.constraints.items():
         twin = other.constraints[name]

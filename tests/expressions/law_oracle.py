@@ -126,6 +126,26 @@ def mod(a, b):
     return sub(a, mul(floor(div(a, b)), b))
 
 
+def floor_divide(a, b):
+    return floor(div(a, b))
+
+
+def fmod(a, b):
+    return sub(a, mul(trunc(div(a, b)), b))
+
+
+def einsum(a, b):
+    return matmul(a, linear(np.transpose, b))
+
+
+def tensordot(a, b):
+    return matmul(linear(np.transpose, a), b)
+
+
+def solve(a, b):
+    return matmul(inverse(a), b)
+
+
 def matmul(a, b):
     return bilinear(np.matmul, a, b)
 
@@ -234,6 +254,18 @@ def log(a):
     return chain(np.log(a.v), (lambda: reciprocal(a), a))
 
 
+def cbrt(a):
+    return power(a, Value(1 / 3))
+
+
+def exp2(a):
+    return power(Value(2.0), a)
+
+
+def log2(a):
+    return div(log(a), Value(np.log(2.0)))
+
+
 def log1p(a):
     return chain(np.log1p(a.v), (lambda: reciprocal(add(Value(1.0), a)), a))
 
@@ -271,6 +303,16 @@ def ceil(a):
     return Value(np.ceil(a.v))
 
 
+def rint(a):
+    compared(a, Value(np.floor(a.v) + 0.5))
+    return Value(np.round(a.v))
+
+
+def trunc(a):
+    compared(a, Value(np.round(a.v)))
+    return Value(np.trunc(a.v))
+
+
 def where(c, a, b):
     compared(c, Value(0.5))
     return selected(c.v >= 0.5, a, b)
@@ -294,6 +336,10 @@ def clip(x, lower, upper):
 
 def norm(a):
     return sqrt(linear(np.sum, square(a)))
+
+
+def norms(a):
+    return sqrt(linear(lambda x: np.sum(x, axis=1), square(a)))
 
 
 def hypot(a, b):

@@ -62,7 +62,8 @@ ELEMENTWISE = {
     "sinh": np.sinh, "cosh": f.cosh, "tanh": np.tanh, "arcsinh": np.arcsinh, "arccosh": np.arccosh,
     "arctanh": f.arctanh, "exp": np.exp, "expm1": np.expm1, "log": np.log, "log1p": f.log1p, "sqrt": np.sqrt,
     "square": np.square, "absolute": abs, "sign": np.sign, "floor": np.floor, "ceil": f.ceil, "neg": operator.neg,
-    "reciprocal": np.reciprocal, "logic_not": operator.invert,
+    "reciprocal": np.reciprocal, "logic_not": operator.invert, "cbrt": np.cbrt, "log2": np.log2, "exp2": np.exp2,
+    "rint": np.round, "trunc": np.trunc,
 }  # fmt: skip
 
 PAIRWISE = {
@@ -72,6 +73,8 @@ PAIRWISE = {
     "logic_and": operator.and_, "logic_or": operator.or_,
     "iadd": operator.iadd, "isub": operator.isub, "imul": operator.imul, "itruediv": operator.itruediv,
     "imatmul": operator.imatmul, "matmul": operator.matmul, "cross": np.cross, "outer": np.outer,
+    "floor_divide": operator.floordiv, "fmod": np.fmod, "solve": np.linalg.solve,
+    "einsum": lambda a, b: np.einsum("ij,kj->ik", a, b), "tensordot": lambda a, b: np.tensordot(a, b, (0, 0)),
 }  # fmt: skip
 
 STRUCTURAL = {
@@ -80,7 +83,8 @@ STRUCTURAL = {
     "last": lambda x: x[..., -1], "ravel": lambda x: x.ravel()[1:4], "rows": lambda x: x[1:],
     "reversed": lambda x: x[::-1], "reshape": lambda x: x.reshape(3, -1)[:, 0], "masked": lambda x: x[[2, 0, 1]],
     "element": lambda x: x[-1, 1], "roll": lambda x: np.roll(x, 1), "diagonal": np.diagonal,
-    "index": lambda x: x[1], "column": lambda x: x[:, 1],
+    "index": lambda x: x[1], "column": lambda x: x[:, 1], "norms": lambda x: np.linalg.norm(x, axis=1),
+    "cumsum": lambda x: np.cumsum(x, axis=0), "diag": np.diag,
 }  # fmt: skip
 
 JOINING = {
@@ -134,7 +138,7 @@ def build(program, vocabulary):
 
 _SAME = {"iadd": "add", "isub": "sub", "imul": "mul", "itruediv": "div", "imatmul": "matmul"}
 _LINEAR = {
-    **{k: STRUCTURAL[k] for k in STRUCTURAL if k not in ("inverse", "det", "norm")},
+    **{k: STRUCTURAL[k] for k in STRUCTURAL if k not in ("inverse", "det", "norm", "norms")},
     **{k: JOINING[k] for k in JOINING if k not in ("array", "nested")},
     "array": lambda *x: np.array(x),
     "nested": None,
@@ -210,7 +214,7 @@ def _bounded(x):
 _DOMAIN = {
     "arcsin": _bounded, "arccos": _bounded, "arctanh": _bounded, "log": _positive, "log1p": _positive,
     "sqrt": _positive, "reciprocal": _positive, "arccosh": lambda x: apply("add", _positive(x), const(1.0)),
-    "tan": _bounded, "sinh": _bounded, "cosh": _bounded, "exp": _bounded, "expm1": _bounded,
+    "cbrt": _positive, "log2": _positive, "exp2": _bounded, "tan": _bounded, "sinh": _bounded, "cosh": _bounded, "exp": _bounded, "expm1": _bounded,
 }  # fmt: skip
 
 
@@ -260,11 +264,12 @@ def programs(draw, shape=S, depth=3, kinds=EVERYTHING):
 
     def pairwise():
         names = ["add", "sub", "mul", "mul", "div", "power", "integer", "mod", "arctan2", "copysign", "hypot"]
+        names += ["floor_divide", "fmod"]
         kind = draw(choice(*names, "minimum", "maximum", "iadd", "isub", "imul", "itruediv"))
         a, b = inner(), fitting()
         if draw(st.booleans()) and not kind.startswith("i"):
             a, b = b, a
-        if kind in ("div", "mod", "itruediv"):
+        if kind in ("div", "mod", "floor_divide", "fmod", "itruediv"):
             b = _positive(b)
         elif kind in ("arctan2", "hypot"):
             a = _positive(a)
@@ -314,8 +319,15 @@ def programs(draw, shape=S, depth=3, kinds=EVERYTHING):
             return apply("index", apply("ravel", source)) if kind == "raveled" else apply(kind, source)
         if shape == V3:
             kind = draw(
-                choice("first", "column", "ravel", "diagonal", "masked", "sum0", "Mv", "vM", "cross", "array")
+                choice(
+                    *("first", "column", "ravel", "diagonal", "masked", "sum0", "Mv", "vM", "cross", "array"),
+                    *("solve", "norms", "cumsum"),
+                )
             )
+            if kind == "solve":
+                return apply("solve", invertible(), inner(V3))
+            if kind == "norms":
+                return apply("norms", apply("stack1", inner(V3), inner(V3), const([0.3, 0.4, 0.5])))
             if kind == "array":
                 return apply("array", inner(S), inner(S), inner(S))
             if kind == "cross":
@@ -323,7 +335,7 @@ def programs(draw, shape=S, depth=3, kinds=EVERYTHING):
             if kind in ("Mv", "vM"):
                 pair = inner(M33), inner(V3)
                 return apply("matmul", *(pair if kind == "Mv" else pair[::-1]))
-            source = {"column": M33, "diagonal": M33, "masked": V3}.get(kind, M23)
+            source = {"column": M33, "diagonal": M33, "masked": V3, "cumsum": V3}.get(kind, M23)
             return apply(kind, inner(source))
         if shape == M23:
             kind = draw(choice("rows", "stack", "vstack", "matmul", "imatmul"))
@@ -332,7 +344,30 @@ def programs(draw, shape=S, depth=3, kinds=EVERYTHING):
             if kind in ("stack", "vstack"):
                 return apply(kind, inner(V3), inner(V3))
             return apply(kind, inner(M23), inner(M33))
-        kind = draw(choice("inverse", "T", "matmul", "outer", "vstack", "stack1", "flip", "roll", "reversed"))
+        kind = draw(
+            choice(
+                "inverse",
+                "T",
+                "matmul",
+                "outer",
+                "vstack",
+                "stack1",
+                "flip",
+                "roll",
+                "reversed",
+                "einsum",
+                "tensordot",
+                "crosses",
+                "diag",
+                "cumsum",
+            )
+        )
+        if kind == "einsum" or kind == "tensordot":
+            return apply(kind, inner(), inner())
+        if kind == "crosses":
+            return apply("cross", inner(), inner(V3))
+        if kind == "diag":
+            return apply(kind, inner(V3))
         if kind == "inverse":
             return apply(kind, invertible())
         if kind == "outer":

@@ -51,5 +51,6 @@ def test_finite_differences(program):
 
 def _steps(program):
     """Whether a program has steps or kinks, where finite differences say little."""
-    kinks = {"floor", "ceil", "mod", "sign", "absolute", "copysign", "minimum", "maximum"}
+    kinks = {"floor", "ceil", "mod", "sign", "absolute", "copysign", "minimum", "maximum", "rint", "trunc"}
+    kinks |= {"floor_divide", "fmod"}
     return program[0] in kinks or any(_steps(p) for p in program[2:] if isinstance(p, tuple))

@@ -69,6 +69,12 @@ def cases(vocabulary):
     moved = a.augment({wheel: 1}).substitute({a: b.augment({jerk: 1}, heuristic=True)})
     assert gradient_at(moved) == {db: 1, wheel: 1, jerk: 1}
     assert gradient_at(moved, heuristic=False) == {db: 1, wheel: 1}
+    # Terms that meet at one key, and an entry that only a node deep inside is about.
+    dc = vocabulary.keys[2]
+    met = (a * b).augment({wheel: 1}).substitute({a: 2 * c, b: 3 * c})
+    assert gradient_at(met) == pytest.approx({dc: 12 * at[c], wheel: 1})
+    deep = maximum(b.augment({wheel: a}), array(-10.0)).substitute({a: 3 * c})
+    assert gradient_at(deep) == pytest.approx({db: 1, wheel: 3 * at[c]})
     p = vocabulary.others[2]
     assert gradient_at((p * c).augment({wheel: p}).substitute({p: a * 3})) == pytest.approx(
         {da: 3 * at[c], vocabulary.keys[2]: 1.5, wheel: 1.5}

@@ -70,12 +70,13 @@ def filled(shape, low=-2.0, high=2.0, seed=0):
 # -- ufuncs ------------------------------------------------------------------------------------------------
 
 DOMAINS = {np.arcsin: (-1, 1), np.arccos: (-1, 1), np.arctanh: (-0.9, 0.9), np.arccosh: (1, 3), np.log: (0.1, 3),
-           np.log1p: (-0.9, 2), np.sqrt: (0, 3), np.reciprocal: (0.5, 2), np.logical_not: None, np.invert: None}  # fmt: skip
+           np.log1p: (-0.9, 2), np.sqrt: (0, 3), np.reciprocal: (0.5, 2), np.log10: (0.1, 3), np.log2: (0.1, 3), np.logical_not: None, np.invert: None}  # fmt: skip
 LOGIC = {np.logical_and, np.logical_or, np.bitwise_and, np.bitwise_or}
 STRUCTURAL = {np.equal, np.not_equal}
+OF_MATRICES = {getattr(np, name, np.matmul) for name in ("matmul", "vecdot", "matvec", "vecmat")}
 UFUNCS = [*protocol._UNARY_OPS, *protocol._BINARY_OPS, *protocol._UFUNCS]
 UNARY = [u for u in UFUNCS if u.nin == 1]
-BINARY = [u for u in UFUNCS if u.nin == 2 and u not in STRUCTURAL | {np.matmul}]
+BINARY = [u for u in UFUNCS if u.nin == 2 and u not in STRUCTURAL | OF_MATRICES]
 
 
 def truths(ufunc):
@@ -108,7 +109,9 @@ def test_binary_ufuncs(ufunc, shapes, which):
 
 
 @pytest.mark.parametrize(
-    "ufunc", [u for u in UNARY if u not in (np.log, np.reciprocal, np.arccosh)], ids=lambda u: u.__name__
+    "ufunc",
+    [u for u in UNARY if u not in (np.log, np.log2, np.log10, np.reciprocal, np.arccosh)],
+    ids=lambda u: u.__name__,
 )
 def test_unary_ufuncs_at_special_points(ufunc):
     points = np.array([0.0, 1.0]) if ufunc in DOMAINS else np.array([0.0, 1.0, -1.0, -2.0, 3.5, -3.5])
@@ -164,7 +167,7 @@ def test_operators_with_arrays_on_either_side(op, shapes, which, kind):
 @given(st.integers(0, 3), st.integers(0, 3), st.integers(0, 3), st.booleans(), st.booleans(), SOME)
 def test_matrix_products(n, k, m, left, right, which):
     first, second = filled((k,) if left else (n, k)), filled((k,) if right else (k, m), seed=1)
-    for product in (operator.matmul, np.matmul, np.dot):
+    for product in (operator.matmul, np.matmul, np.dot, getattr(np.linalg, "matmul", np.matmul)):
         same(product, first, second, which=which)
     same(lambda x, y: np.inner(x, y.T), first, second, which=which)
     if 0 in which:
@@ -225,7 +228,23 @@ def test_rearranging(data):
         same(lambda y: np.rot90(y, shift), x)
         same(lambda y: np.diagonal(y, shift % 3 - 1), x)
         same(lambda y: np.diagonal(y, axis1=-1, axis2=0), x)
-        same(np.trace, x)
+        for offset in (-1, 0, 2):
+            same(lambda y, k=offset: np.trace(y, k), x)
+            same(lambda y, k=offset: np.trace(y, k, axis1=-1, axis2=0), x)
+            same(lambda y, k=offset: np.tril(y, k), x)
+            same(lambda y, k=offset: np.triu(y, k), x)
+            same(lambda y, k=offset: np.diagflat(y, k), x)
+            same(lambda y, k=offset: np.diag(y, k), x) if x.ndim == 2 else None
+    else:
+        same(lambda y: np.diag(y, shift), x)
+    for cut in (
+        lambda y: np.array_split(y, 2, axis=axis), lambda y: np.split(y, [1], axis=axis), lambda y: np.vsplit(y, [1]) if y.ndim > 1 else np.hsplit(y, [1]),
+        lambda y: np.dsplit(y, [1, 2]) if y.ndim > 2 else (y,), lambda y: np.split(y, y.shape[axis], axis) if y.shape[axis] else (y,),
+        lambda y: getattr(np, "unstack", tuple)(y),
+    ):  # fmt: skip
+        same(lambda y, cut=cut: tuple(cut(y)), x)
+    same(lambda y: np.delete(y, [0], axis=axis), x) if x.shape[axis] else None
+    same(np.copy, x)
 
 
 @few
@@ -246,6 +265,10 @@ def test_joining(data):
     for join in (np.stack, np.vstack, np.hstack, np.dstack, np.column_stack):
         same(lambda y, z, join=join: join([y, z, 1.0]), scalar, -scalar, which=which)
     same(lambda y, z: np.atleast_2d(y, z), x, scalar, which=which)
+    same(lambda y, z: np.append(y, z), x, longer, which=which)
+    same(lambda y, z: np.append(y, z, axis=axis), x, longer, which=which)
+    same(lambda y, z: np.block([[y, y], [y, y]]), x, x, which=(0,))
+    same(lambda y, z: np.block([y, z]), scalar, x, which=which) if x.ndim == 1 else None
 
 
 @few
@@ -278,13 +301,14 @@ def test_sums_and_their_kin(x):
     x = x - 3
     axes = [None, *range(-x.ndim, x.ndim), tuple(range(x.ndim)), ()]
     for axis in axes:
-        for function in (np.sum, np.prod, np.mean, np.min, np.max, np.amin, np.amax):
+        for function in (np.sum, np.prod, np.mean, np.min, np.max, np.amin, np.amax, np.ptp):
             found = call_quietly(function, x, axis)
             if found is None:
                 with pytest.raises(ShapeError, match="Nothing has no"):
                     function(symbolic(x)[0], axis=axis)
             elif found.size:
                 same(lambda y, function=function, axis=axis: function(y, axis=axis), x)
+                same(lambda y, function=function, axis=axis: function(y, axis=axis, keepdims=True), x)
         same(lambda y, axis=axis: y.sum(axis), x)
     if x.size:
         same(np.linalg.norm, x) if x.ndim else None
@@ -292,6 +316,13 @@ def test_sums_and_their_kin(x):
         same(lambda y: np.linalg.norm(y, 2), x) if x.ndim == 1 else None
     e, _ = symbolic(x)
     assert (np.shape(e), np.ndim(e), np.size(e)) == (x.shape, x.ndim, x.size)
+    assert [np.size(e, k) for k in range(x.ndim)] == list(x.shape)
+    for axis in [None, *range(-x.ndim, x.ndim)]:
+        same(lambda y, axis=axis: np.cumsum(y, axis), x) if x.ndim or axis is None else None
+        same(lambda y, axis=axis: np.cumprod(y, axis=axis), x)
+        if axis is not None:
+            same(lambda y, axis=axis: np.diff(y, axis=axis), x)
+            same(lambda y, axis=axis: np.diff(y, 2, axis), x)
     for like, number in ((np.zeros_like, 0), (np.ones_like, 1)):
         assert like(e).is_constant
         assert like(e)().tolist() == np.full(x.shape, number).tolist()
@@ -303,10 +334,124 @@ def test_matrices(n):
     same(np.linalg.inv, x, rtol=1e-10)
     same(np.linalg.det, x, rtol=1e-11)
     same(np.trace, x)
+    for power in (-2, -1, 0, 1, 2, 5):
+        same(lambda y, n=power: np.linalg.matrix_power(y, n), x, rtol=1e-9)
+    for right in (filled((n,)), filled((n, 2))):
+        same(np.linalg.solve, x, right, rtol=1e-10)
+        same(np.linalg.solve, x, right, which=(0,), rtol=1e-10)
+        same(np.linalg.solve, x, right, which=(1,), rtol=1e-10)
+
+
+@few
+@given(PAIRS, st.data())
+def test_products_of_stacks(stacks, data):
+    """Stacks of matrices and vectors are broadcast against each other, as numpy does it."""
+    (first, second), which = stacks, data.draw(SOME)
+    assume(len(first) < 3 and len(second) < 3 and np.prod(first) * np.prod(second) < 30)
+    n, k, m = (data.draw(SIDES) for _ in range(3))
+    a, b = filled((*first, n, k)), filled((*second, k, m), seed=1)
+    same(operator.matmul, a, b, which=which)
+    same(lambda x, y: np.einsum("...ij,...jk->...ik", x, y), a, b, which=which)
+    vectors = filled((*second, k), seed=2)
+    for name, given_ in {"vecdot": (filled((*first, k)), vectors), "matvec": (a, vectors), "vecmat": (vectors, b)}.items():  # fmt: skip
+        if hasattr(np, name):
+            same(getattr(np, name), *given_, which=which)
+    if hasattr(np.linalg, "vecdot"):
+        same(np.linalg.vecdot, filled((*first, k)), vectors, which=which)
+    same(np.kron, a, vectors, which=which)
+    same(np.dot, a, filled((*first, k, 2), seed=3), which=which)
+    same(np.inner, a, filled((*second, 2, k), seed=3), which=which)
+    same(lambda x, y: np.tensordot(x, y, (-1, len(second))), a, b, which=which)
+    same(lambda x, y: np.tensordot(x, y, 0), a, vectors, which=which)
+    if n and m:
+        same(lambda x, y: np.linalg.multi_dot([x, y, y.T]), filled((n, k)), filled((k, m)), which=which)
+    threes = filled((*first, 3)), filled((*second, 3), seed=1)
+    same(np.cross, *threes, which=which)
+    same(lambda x, y: np.cross(x, y, axisa=0, axisc=0), np.moveaxis(threes[0], -1, 0), threes[1], which=which)
+
+
+@pytest.mark.parametrize("subscripts", [
+    "ij->ji", "ij->", "ii", "ii->i", "ij,jk", "ij,kj->ik", "ij,ij->i", "ij,jk,kl->il", "i,j", "i,j->ji", "i,i", "ij,j,i->",
+    "...i->...", "...i,...i", "...ij,...jk->...ik", "i...,i...->...", "ab, bc -> ca", "ii,ij->j", "ij,k->kij",
+])  # fmt: skip
+def test_einstein(subscripts):
+    operands = subscripts.split("->")[0].replace(" ", "").split(",")
+    numbers = [
+        filled((2,) * (len(o.replace("...", "")) + 2 * ("..." in o)), seed=k) for k, o in enumerate(operands)
+    ]
+    same(lambda *x: np.einsum(subscripts, *x), *numbers)
+    same(lambda *x: np.einsum(subscripts, *x), *numbers, which=(0,))
+
+
+def test_norms_along_axes():
+    x = filled((2, 3, 3))
+    for axis in (0, 1, -1):
+        for order in (None, 2, 1, np.inf, -np.inf):
+            for keepdims in (False, True):
+                same(lambda y, o=order, a=axis, k=keepdims: np.linalg.norm(y, o, a, k), x)
+                if hasattr(np.linalg, "vector_norm") and order:
+                    same(
+                        lambda y, o=order, a=axis, k=keepdims: np.linalg.vector_norm(
+                            y, ord=o, axis=a, keepdims=k
+                        ),
+                        x,
+                    )
+    same(lambda y: np.linalg.norm(y, axis=(0, 2)), x)
+    same(lambda y: np.linalg.norm(y, "fro", axis=(1, 2), keepdims=True), x)
+    same(lambda y: np.linalg.norm(y, 1), x[0, 0])
+    if hasattr(np.linalg, "matrix_norm"):
+        same(np.linalg.matrix_norm, x)
+        same(lambda y: np.linalg.vector_norm(y), x)
+    for name in ("matrix_transpose", "diagonal", "trace"):
+        same(getattr(np.linalg, name), x) if hasattr(np.linalg, name) else None
+    same(lambda y: np.linalg.diagonal(y, offset=1), x) if hasattr(np.linalg, "diagonal") else None
+    for name in ("cross", "tensordot"):
+        if hasattr(np.linalg, name):
+            same(getattr(np.linalg, name), x[0], x[1])
+    same(np.linalg.outer, x[0, 0], x[1, 1]) if hasattr(np.linalg, "outer") else None
+
+
+@pytest.mark.parametrize("call", [
+    lambda y: y.sum(), lambda y: y.sum(0, keepdims=True), lambda y: y.prod(axis=1), lambda y: y.mean(), lambda y: y.mean(axis=(0, 1)),
+    lambda y: y.min(axis=0), lambda y: y.max(), lambda y: y.clip(-1, 1), lambda y: y.clip(max=0.5), lambda y: y.copy(),
+    lambda y: y.trace(), lambda y: y.trace(1), lambda y: y.diagonal(), lambda y: y.diagonal(-1), lambda y: y[:, None].squeeze(),
+    lambda y: y.astype(float), lambda y: np.asarray(y.item(1, 2)) if isinstance(y, np.ndarray) else y.item(1, 2),
+    lambda y: np.asarray(y.item(4)) if isinstance(y, np.ndarray) else y.item(4), lambda y: y.dot(y[0]), lambda y: y.round(1),
+    lambda y: y.flatten(), lambda y: y.ravel(), lambda y: y.reshape(9), lambda y: y.reshape((1, -1)), lambda y: y.transpose(1, 0),
+    lambda y: y.cumsum(), lambda y: y.cumprod(axis=1), lambda y: y.swapaxes(0, 1), lambda y: y.repeat(2, axis=0),
+    lambda y: y.take([0, 2], axis=1), lambda y: divmod(y, 0.7), lambda y: divmod(2.5, y), lambda y: np.divmod(y, 0.7),
+    lambda y: np.fix(y), lambda y: np.around(y, 2), lambda y: np.round(100 * y, -1), lambda y: getattr(np, "astype", lambda z, _: z)(y, float),
+])  # fmt: skip
+def test_methods_of_arrays(call):
+    same(call, filled((3, 3)))
+
+
+def test_methods_that_give_scalars():
+    e = kv.array([[a, 2 * b]])
+    assert e.tolist() == [[a, 2 * b]]
+    assert a.tolist() is a
+    assert a.item() is a
+    assert round(a / 3, 2)({a: 1.0}) == 0.33
+    assert round(a)({a: 2.5}) == 2
+    for call, message in (
+        (e.item, r"item\(\) is the element of an array that has one, and this has shape \(1, 2\)"),
+        (lambda: e.astype(int), "64-bit floats, not int64. Call it with values"),
+        (lambda: int(a), r"float\(\) needs a constant scalar"),
+    ):
+        with pytest.raises(kv.ExpressionError, match=message):
+            call()
 
 
 def test_every_function_is_compared():
     """What is added to the tables is to be added here."""
-    names = {f.__name__ for f in (*protocol._FUNCTIONS, *protocol._REARRANGING, *protocol._JOINING)}
+    names = {
+        f.__name__
+        for f in (
+            *protocol._FUNCTIONS,
+            *protocol._REARRANGING,
+            *protocol._SPREADING,
+            *protocol._JOINING,
+        )
+    }
     here = Path(__file__).read_text(encoding="utf-8")
     assert [name for name in sorted(names) if not re.search(rf"\b{name}\b", here)] == []

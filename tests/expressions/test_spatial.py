@@ -245,7 +245,7 @@ BAD = [
     (lambda: spatial.rotation_x([1, 2]), r"angle is a scalar, not of shape \(2,\)"),
     (lambda: spatial.rotation_y([0.0]), r"angle is a scalar, not of shape \(1,\)"),
     (lambda: spatial.rotation_z(FLAT), r"angle is a scalar, not of shape \(3, 4\)"),
-    (lambda: spatial.rpy([1, 2], 0, 0), "angle is a scalar"),
+    (lambda: spatial.rpy([1, 2], 0, 0), "3 numbers roll, pitch, yaw"),
     (lambda: spatial.axis_angle([1, 2], 0), r"axis of a rotation has shape \(3,\), not \(2,\)"),
     (lambda: spatial.axis_angle([1, 0, 0], [1, 2]), r"\(2,\)|Ragged"),
     (lambda: spatial.quaternion(0, 0, [0, 1], 1), r"\(2,\)|Ragged"),
@@ -256,8 +256,8 @@ BAD = [
     (lambda: spatial.transform(np.eye(2), [1, 2, 3]), r"4×4 matrix, not of shape \(2, 2\)"),
     (lambda: spatial.skew(1.0), r"vector has shape \(3,\), not \(\)"),
     (lambda: spatial.unit([[1.0, 0, 0]]), r"vector has shape \(3,\), not \(1, 3\)"),
-    (lambda: spatial.point([1, 2], 0, 0), "Ragged"),
-    (lambda: spatial.vector([1, 2], 0, 0), "Ragged"),
+    (lambda: spatial.point([1, 2], 0, 0), r"A point .* \(2,\) among others"),
+    (lambda: spatial.vector([1, 2], 0, 0), r"A direction .* \(2,\) among others"),
 ]  # fmt: skip
 OF_A_TRANSFORM = [
     spatial.rpy_of, spatial.quaternion_of, spatial.rotation_vector, spatial.rotation_angle, spatial.rotation_of,
@@ -305,3 +305,39 @@ def test_nan_is_refused(name):
         x[i] = math.nan
         with pytest.raises(ValueRejectedError, match="NaN"):
             function(x)
+
+
+def test_vectors_are_taken_apart():
+    """What takes numbers one by one takes them as one vector too: list, tuple, array or expression."""
+    a, b = kv.position("spatial/a"), kv.position("spatial/b")
+    at = {a: 0.3, b: -0.4}
+    for function, numbers in (
+        (kv.translation, [a, 2.0, b]), (kv.point, [a, 2.0, b]), (kv.vector, [1.0, b, 3.0]), (kv.rpy, [a, 0.1, b]),
+        (kv.quaternion, [a, b, 0.5, 1.0]),
+    ):  # fmt: skip
+        apart = function(*numbers)
+        for together in (
+            numbers,
+            tuple(numbers),
+            kv.array(numbers),
+            *([np.array(numbers)] if a not in numbers and b not in numbers else []),
+        ):
+            assert function(together) == apart
+        np.testing.assert_array_equal(
+            function(np.arange(len(numbers)) + 1.0)(), function(*range(1, len(numbers) + 1))()
+        )
+        assert apart(at).shape in ((4,), (4, 4))
+    assert kv.translation(1.0)()[:3, 3].tolist() == [1, 0, 0]
+
+
+@pytest.mark.parametrize(("call", "message"), [
+    (lambda: kv.quaternion([1, 2, 3]), r"A quaternion is given as 4 numbers x, y, z, w or as one vector of shape \(4,\) alone, not by something of shape \(3,\)"),
+    (lambda: kv.quaternion(0, 0, 1), r"4 numbers x, y, z, w or as one vector of shape \(4,\) alone, not as 3"),
+    (lambda: kv.quaternion([0, 0, 0, 1], 1, 2, 3), r"alone, not by something of shape \(4,\) among others"),
+    (lambda: kv.rpy(0.1, 0.2), "3 numbers roll, pitch, yaw .* not as 2"), (lambda: kv.rpy(np.eye(3)), r"shape \(3, 3\)"),
+    (lambda: kv.point([1, 2]), r"A point .* shape \(2,\)"), (lambda: kv.vector(1), "A direction .* not as 1"),
+    (lambda: kv.translation([1, 2, 3, 4]), r"A translation .* shape \(4,\)"),
+])  # fmt: skip
+def test_another_number_of_numbers(call, message):
+    with pytest.raises(kv.ShapeError, match=message):
+        call()

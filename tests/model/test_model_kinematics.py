@@ -119,7 +119,7 @@ def test_a_fact_that_is_overridden_shows_in_the_jacobian() -> None:
     model = kv.Model()
     with model.edit() as edit:
         edit.add_frame("f", "world", [kv.rotation_z(x), kv.translation(y.augment({y.derivative(): x}), 0, 0)])
-    at = {"x": 0.5, "y": 2.0}
+    at = kv.State({"x": 0.5, "y": 2.0})
     expected = model.fk("f").gradient()[y.derivative()](at)[:2, 3]
     np.testing.assert_allclose(model.jacobian("f")(at)[:2, 1], expected)
     np.testing.assert_allclose(expected, [0.5 * np.cos(0.5), 0.5 * np.sin(0.5)])
@@ -143,7 +143,7 @@ def test_what_is_picked_up_keeps_its_own_articulation() -> None:
     model = cupboard()
     with model.edit() as edit:
         edit.attach("box", "gripper", kv.translation(0, 0, 0.1))
-    at = {"y": 0.4, "lid": 0.7}
+    at = kv.State({"y": 0.4, "lid": 0.7})
     expected = np.eye(4)
     expected[:3, :3] = Rotation.from_euler("ZY", [0.4, 0.7]).as_matrix()
     expected[:3, 3] = [np.cos(0.4), np.sin(0.4), 0.1]
@@ -193,7 +193,7 @@ def test_a_chain_of_five_thousand_frames() -> None:
         for i in range(n):
             moving = kv.translation(0, kv.position(f"q{i % 5}"), 0)
             edit.add_frame(f"f{i}", f"f{i - 1}" if i else "world", step if i % 100 else moving)
-    at = {f"q{i}": 0.5 for i in range(5)}
+    at = kv.State({f"q{i}": 0.5 for i in range(5)})
     last = f"f{n - 1}"
     expected = 50 * 0.5 + 1e-3 * (n - 50)
     assert model.fk(last)({"q0": 0.5})[1, 3] == pytest.approx(expected)
@@ -220,7 +220,7 @@ def test_a_chain_of_thousands_of_moving_frames() -> None:
             parent = f"f{i - 1}" if i else "world"
             edit.apply(kv.Revolute(name=f"q{i}", parent=parent, child=f"f{i}", axis=(0, 0, 1), origin=step))
     last = f"f{n - 1}"
-    at = {f"q{i}": 0.0 for i in range(n)}
+    at = kv.State({f"q{i}": 0.0 for i in range(n)})
     assert model.fk(last)(at)[0, 3] == pytest.approx(n * 1e-3)
     jacobian = model.jacobian(last)(at)
     by_name = dict(zip(map(str, model.speeds_of(last)), jacobian.T, strict=True))

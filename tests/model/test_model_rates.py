@@ -124,7 +124,7 @@ def test_wheels_as_in_the_paper() -> None:
     gradient = model.fk("base").gradient()
     assert set(gradient) == {left, right}
     for angle in (0.0, 0.7, 2.5):
-        at = {"base/x": 1, "base/y": 2, "base/angle": angle}
+        at = kv.State({"base/x": 1, "base/y": 2, "base/angle": angle})
         for speed, sign in ((left, -1), (right, 1)):
             expected = [0.05 * np.cos(angle), 0.05 * np.sin(angle)]
             np.testing.assert_allclose(gradient[speed](at)[:2, 3], expected, atol=1e-15)
@@ -141,7 +141,7 @@ def test_the_heading_turns_inside_the_rows() -> None:
     rate = kv.total_derivative(model.fk("base")[0, 3])
     acceleration = sum(e * k for k, e in rate.gradient().items() if k.order == 1)
     forward, turn = 0.05 * 4, 0.25 * 2
-    at = {"base/x": 0, "base/y": 0, "base/angle": 0.3, **speeds}
+    at = kv.State({"base/x": 0, "base/y": 0, "base/angle": 0.3, **speeds})
     assert acceleration(at) == pytest.approx(-forward * turn * np.sin(0.3))
 
 
@@ -207,7 +207,7 @@ def test_composition_with_carried_coordinates_is_the_chain_rule() -> None:
     rates = table(x={u: np.cos(y), v: x}, y={v: 1.0})
     b, c = kv.position("b"), kv.position("c")
     e = rates.carry(x * y + np.sin(x) * z)
-    at = {"b": 0.3, "c": -0.4, "y": 0.7, "z": 1.1, "x": 0.2}
+    at = kv.State({"b": 0.3, "c": -0.4, "y": 0.7, "z": 1.1, "x": 0.2})
     for substitution in (
         {z: b * c},
         {x: 2 * b + c},
@@ -313,7 +313,7 @@ def test_left_over_rates_are_eliminated() -> None:
     rates = table(x={u: np.cos(y), v: 2.0})
     e = 3 * x.derivative() + z.derivative() * x
     result = rates.eliminate(e)
-    at = {"x": 2.0, "y": 0.4, "u": 0, "z:velocity": 0.5, "u:velocity": 1.5, "v:velocity": -1.0}
+    at = kv.State({"x": 2.0, "y": 0.4, "u": 0, "z:velocity": 0.5, "u:velocity": 1.5, "v:velocity": -1.0})
     assert result(at) == pytest.approx(3 * (np.cos(0.4) * 1.5 - 2.0) + 0.5 * 2)
     assert x.derivative() not in result.symbols
     assert rates.eliminate(x * y) == x * y

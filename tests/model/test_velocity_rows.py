@@ -266,7 +266,7 @@ def test_one_sided_limits_give_numbers() -> None:
     rows = rows_of({"n": (-1, np.sin(a) + b, 1), "m": (-1, a - b, 1), **speeds})
     for values in ({"a": 0.0, "b": 7.0}, {"a": math.pi / 2, "b": -7.0}):
         for part in (rows.matrix, rows.lower, rows.upper):
-            assert not np.isnan(part(values)).any()
+            assert not np.isnan(part(kv.State(values))).any()
 
 
 # -- braking ---------------------------------------------------------------------------------------------------
@@ -331,7 +331,7 @@ def test_a_brake_without_bounds_is_none() -> None:
 def test_a_constraint_on_speeds_is_the_row_itself() -> None:
     expression = 2 * va - np.cos(c) * vb + np.sin(a)
     rows = rows_of({"n": (-1, expression, b)})
-    at = {"a": 0.4, "b": 3.0, "c": 0.9}
+    at = kv.State({"a": 0.4, "b": 3.0, "c": 0.9})
     np.testing.assert_allclose(rows.matrix(at), [[2, -np.cos(0.9)]])
     np.testing.assert_allclose(rows.lower(at), [-1 - np.sin(0.4)])
     np.testing.assert_allclose(rows.upper(at), [3 - np.sin(0.4)])

@@ -58,7 +58,7 @@ def measure(settings: Settings) -> Result:
 def _ours(robot: Robot, points: Array) -> Iterator[Contender]:
     model = robot.model
     tier = "c" if compiler_information().compiler else "auto"
-    function = compile([model.fk(robot.frame), model.jacobian(robot.frame)], robot.chain, tier=tier)  # type: ignore[arg-type]
+    function = compile([model.fk(robot.frame), model.jacobian(robot.frame)], robot.chain, tier=tier)  # type: ignore[call-overload]
     outputs = function.batch(points)
 
     def run() -> None:

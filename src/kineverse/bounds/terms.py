@@ -17,7 +17,7 @@ import casadi as ca
 from kineverse.expressions import layout
 from kineverse.expressions.expression import NODES, SYMBOLS, Expression
 from kineverse.expressions.implicit import Implicit
-from kineverse.expressions.kinks import Extremum, Select
+from kineverse.expressions.kinks import Extremum, Norm, Select
 from kineverse.expressions.leaves import bottom_up, leaves
 from kineverse.expressions.node import Node
 from kineverse.expressions.piecewise import Piecewise
@@ -178,7 +178,7 @@ class Terms:
         if isinstance(node, Less | Select | Extremum | Piecewise):
             rows = list(zip(*(self._graph(a) for a in node.arguments), strict=True))
             return [self._choice(node, row) for row in rows]
-        return self._graph(node.value)
+        return self._graph(_formula(node))
 
     def _choice(self, node: Node, args: tuple[Term, ...]) -> Term:
         if isinstance(node, Less):
@@ -203,7 +203,11 @@ class Terms:
 
 def _parts(node: Node) -> tuple[Expression, ...]:
     choices = Less | Select | Extremum | Piecewise | Implicit
-    return node.arguments if isinstance(node, choices) else (node.value,)
+    return node.arguments if isinstance(node, choices) else (_formula(node),)
+
+
+def _formula(node: Node) -> Expression:
+    return node.unscaled if isinstance(node, Norm) else node.value
 
 
 def reachable(roots: tuple[Term, ...]) -> list[Term]:

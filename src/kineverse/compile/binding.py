@@ -100,8 +100,8 @@ def pooled(
             binding = new()
         vector, run, copies, _ = binding
         try:
-            # This assignment refuses everything but doubles of the right number.
-            vector[:] = x
+            # This assignment refuses everything but doubles of the right number; it would not see a mask.
+            vector[:] = x if type(x) is np.ndarray else convert(x)  # type: ignore[assignment]
         except (ValueError, TypeError):
             vector[:] = convert(x)
         run()

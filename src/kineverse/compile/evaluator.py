@@ -55,7 +55,7 @@ class Evaluator(metaclass=ABCMeta):
         """
         if x is not None:
             try:
-                self._view[:] = x
+                self._view[:] = x if type(x) is np.ndarray else self._convert(x)  # type: ignore[call-overload]
             except (ValueError, TypeError):
                 self.input[:] = self._convert(x)
         self._run()

@@ -5,9 +5,9 @@ from __future__ import annotations
 import ctypes
 import logging
 import threading
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
-from typing import Any, Literal, TypeAlias
+from typing import TYPE_CHECKING, Any, Generic, Literal, TypeAlias, overload
 from weakref import WeakSet
 
 import casadi as ca
@@ -26,6 +26,16 @@ from .native import MOST_OUTPUTS, native
 from .program import NAME, CasadiFunction, Program, Vector
 from .signature import signature
 
+if TYPE_CHECKING:
+    from typing_extensions import TypeVar
+
+    # Without brackets it is a function of anything.
+    Results = TypeVar("Results", default=Any)
+else:
+    from typing import TypeVar
+
+    Results = TypeVar("Results")
+
 logger = logging.getLogger("kineverse.compile")
 
 Tier: TypeAlias = Literal["interpreter", "c"]
@@ -38,13 +48,33 @@ _WORTH_COMPILING = 4
 _LENGTHY = 5000
 
 
+@overload
+def compile(  # noqa: A001
+    outputs: list[Any] | tuple[Any, ...],
+    inputs: Iterable[Symbol] | None = None,
+    *,
+    tier: WantedTier = "auto",
+    wait: bool = False,
+) -> CompiledFunction[tuple[Array, ...]]: ...
+
+
+@overload
+def compile(  # noqa: A001
+    outputs: Expression | float | npt.NDArray[Any],
+    inputs: Iterable[Symbol] | None = None,
+    *,
+    tier: WantedTier = "auto",
+    wait: bool = False,
+) -> CompiledFunction[Array]: ...
+
+
 def compile(  # noqa: A001
     outputs: ExpressionLike | Sequence[ExpressionLike],
     inputs: Iterable[Symbol] | None = None,
     *,
     tier: WantedTier = "auto",
     wait: bool = False,
-) -> CompiledFunction:
+) -> CompiledFunction[Any]:
     """Return a fast function of numbers that evaluates expressions.
 
     The function can be called at once, by CasADi's interpreter. Meanwhile C is generated and compiled in the
@@ -56,7 +86,7 @@ def compile(  # noqa: A001
         An expression (calls return one array), or a list or tuple of them (calls return a tuple of arrays).
     inputs
         The symbols that make up the input vector, in this order; by default all symbols of the outputs,
-        sorted.
+        sorted by name, which is not the order of a chain: that is ``model.symbols_of(frame)``.
     tier
         ``"auto"`` as described; without a C compiler, or where C is of no use, the interpreter stays.
         ``"interpreter"`` never compiles. ``"c"`` insists on C.
@@ -83,8 +113,11 @@ def compile(  # noqa: A001
     return CompiledFunction(expressions, inputs, single=single, tier=tier, wait=wait)
 
 
-class CompiledFunction:
+class CompiledFunction(Generic[Results]):
     """A function of a vector of numbers, made by :func:`compile`.
+
+    To a type checker ``CompiledFunction[R]`` is one whose calls return R: an array for a function of a single
+    expression, a tuple of arrays otherwise.
 
     It may be called from any number of threads.
 
@@ -120,6 +153,7 @@ class CompiledFunction:
     names: tuple[str, ...]
     shapes: tuple[Shape, ...]
     tier: Tier
+    _call: Callable[[Any], Results]
 
     def __init__(
         self,
@@ -158,8 +192,10 @@ class CompiledFunction:
             if wait:
                 self.wait()
 
-    def __call__(self, x: Any, /) -> Any:
+    def __call__(self, x: Any = (), /) -> Results:
         """Return the outputs at ``x``, in arrays that belong to the caller.
+
+        A function without inputs, of constants, is called without anything.
 
         Parameters
         ----------
@@ -183,7 +219,7 @@ class CompiledFunction:
         """
         return self._call(x)
 
-    def batch(self, x: npt.ArrayLike, out: Any = None) -> Any:
+    def batch(self, x: npt.ArrayLike, out: Any = None) -> Results:
         """Return the outputs at many points.
 
         Rows are spread over all cores. The numbers are those of single calls but for the last digits (4 ulp)
@@ -209,7 +245,8 @@ class CompiledFunction:
         """
         if self._batch is None:
             self._batch = Batch(self._program, self._signature, self.shapes, self._single, self._wanted)
-        return self._batch(x, out, self._function)
+        results: Results = self._batch(x, out, self._function)
+        return results
 
     def bind(self) -> Evaluator:
         """Return an evaluator of one's own, which writes its results in place, for one thread."""

@@ -68,6 +68,8 @@ class Signature:
         """
         if isinstance(x, Mapping):
             return self._from_mapping(x)
+        if self.size and isinstance(x, tuple) and not x:
+            raise ShapeError(f"Nothing is given; a call takes a vector of {self._described()}, or a mapping.")
         array = numbers(x, f"a vector of {self._described()}")
         if array.shape != (self.size,):
             raise ShapeError(
@@ -168,6 +170,11 @@ def numbers(x: Any, wanted: str) -> npt.NDArray[np.float64]:
     ShapeError
         If it does not; the message says what was ``wanted``.
     """
+    if isinstance(x, np.ma.MaskedArray):
+        raise ShapeError(
+            f"Expected {wanted}, not a masked array, some of whose entries have no value. Write "
+            "x.filled(number) to give them one."
+        )
     try:
         array = np.asarray(x)
     except (TypeError, ValueError):

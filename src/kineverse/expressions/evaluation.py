@@ -34,7 +34,7 @@ def evaluate(
     symbols = expression.symbols
     if by_name and isinstance(values, Mapping):
         values = {**values, **by_name}
-    vector = assign(symbols, values, exact=False)
+    vector = assign(symbols, values, derived=True)
     # Looking for common parts would take longer than computing them twice, once.
     column = dense_column(expression)
     inputs = ca.vertcat(*(s._sx for s in symbols)) if symbols else ca.SX(0, 1)
@@ -49,12 +49,13 @@ def evaluate(
 
 
 def assign(
-    symbols: tuple[Any, ...], values: Mapping[Any, Any], exact: bool = True
+    symbols: tuple[Any, ...], values: Mapping[Any, Any], derived: bool = False
 ) -> npt.NDArray[np.float64]:
     """Return the numbers of ``symbols`` in their order, from a mapping by symbol or by name.
 
-    A value by name is for the symbol of that name, whatever its role. If ``exact``, names that are not among
-    the symbols are an error, unless ``values`` is a :class:`~kineverse.State`, which describes a whole world.
+    A value by name is for the symbol of that name, whatever its role. Names that are not among the symbols
+    are an error, unless ``values`` is a :class:`~kineverse.State`, which describes a whole world. If
+    ``derived``, other symbols may be given as such: a derivative depends on fewer than its function.
 
     Raises
     ------
@@ -73,10 +74,16 @@ def assign(
         )
     names = [str(s) for s in symbols]
     asked = {*names, *symbols}
-    given = {k if k in asked else str(k): v for k, v in values.items()}
-    unknown = [] if not exact or isinstance(values, State) else [k for k in given if k not in asked]
-    if unknown:
-        raise UnknownNameError(f"Unknown symbol {unknown[0]!r}. {suggest(unknown[0], names, 'symbol')}")
+    given, unknown = {}, []
+    for key, value in values.items():
+        place = key if key in asked else str(key)
+        given[place] = value
+        if place not in asked and not (derived and isinstance(key, Expression)):
+            unknown.append(place)
+    # What depends on nothing is the same whatever the values: a Jacobian of a drawer, say.
+    if unknown and not isinstance(values, State) and (names or not derived):
+        more = " Values that know more than is asked for go into kv.State({...})." if derived else ""
+        raise UnknownNameError(f"Unknown symbol {unknown[0]!r}. {suggest(unknown[0], names, 'symbol')}{more}")
     twice = [s for s in symbols if s in given and str(s) in given]
     if twice:
         raise given_twice(twice[0])

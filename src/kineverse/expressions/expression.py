@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import TYPE_CHECKING, Any, NoReturn, TypeAlias, overload
 from weakref import WeakValueDictionary
 
 import casadi as ca
@@ -20,9 +20,12 @@ import numpy.typing as npt
 from kineverse.errors import ExpressionError, ShapeError, ValueRejectedError
 
 from . import layout
+from .array_methods import ArrayMethods
 from .layout import SX, Shape
 
 if TYPE_CHECKING:
+    from typing_extensions import deprecated
+
     from kineverse.symbols import Symbol
 
     from .node import Node, Watcher
@@ -39,7 +42,7 @@ SYMBOLS: dict[int, Symbol] = {}
 NODES: WeakValueDictionary[int, Node] = WeakValueDictionary()
 
 
-class Expression:
+class Expression(ArrayMethods):
     """An immutable array of symbolic expressions.
 
     Arithmetic, slicing and numpy's functions work as on arrays. Three things differ, each on purpose: ``==``
@@ -153,7 +156,7 @@ class Expression:
     def _rearranged(self, index: layout.Indices) -> Expression:
         return make(layout.gather(self._sx, self._shape, index), index.shape, self._nodes)
 
-    # -- rearranging ---------------------------------------------------------------------------------------
+    # -- rearranging (the other methods of arrays are in ArrayMethods) ---------------------------------------
 
     def reshape(self, *shape: Any) -> Expression:
         """Return the same elements, in C order, in another shape; one length may be -1."""
@@ -176,16 +179,6 @@ class Expression:
         if len(self._shape) == 2 and not axes:
             return make(self._sx.T, self._shape[::-1], self._nodes)
         return self._rearranged(layout.indices(self._shape).transpose(*axes))
-
-    def sum(self, axis: int | tuple[int, ...] | None = None) -> Expression:
-        """Return the sum over all elements, or along one axis or several."""
-        from .functions import sum_along
-
-        return sum_along(self, axis)
-
-    def dot(self, other: ExpressionLike) -> Expression:
-        """Return the matrix product, as ``@``."""
-        return self @ other
 
     # -- arithmetic ----------------------------------------------------------------------------------------
 
@@ -214,22 +207,45 @@ class Expression:
         return binary(ca.OP_DIV, other, self)
 
     def __pow__(self, other: ExpressionLike) -> Expression:
-        return binary(ca.OP_POW, self, other)
+        from .kinks import power
+
+        return power(self, other)
 
     def __rpow__(self, other: ExpressionLike) -> Expression:
-        return binary(ca.OP_POW, other, self)
+        from .kinks import power
+
+        return power(other, self)
 
     def __mod__(self, other: ExpressionLike) -> Expression:
-        return self - floor_divide(self, other) * as_expression(other)
+        from .rounding import remainder
+
+        return remainder(self, other)
 
     def __rmod__(self, other: ExpressionLike) -> Expression:
-        return as_expression(other) % self
+        from .rounding import remainder
+
+        return remainder(other, self)
 
     def __floordiv__(self, other: ExpressionLike) -> Expression:
+        from .rounding import floor_divide
+
         return floor_divide(self, other)
 
     def __rfloordiv__(self, other: ExpressionLike) -> Expression:
+        from .rounding import floor_divide
+
         return floor_divide(other, self)
+
+    def __divmod__(self, other: ExpressionLike) -> tuple[Expression, Expression]:
+        return self // other, self % other
+
+    def __rdivmod__(self, other: ExpressionLike) -> tuple[Expression, Expression]:
+        return self.__rfloordiv__(other), self.__rmod__(other)
+
+    def __round__(self, decimals: int | None = None) -> Expression:
+        from .rounding import around
+
+        return around(self, decimals or 0)
 
     def __neg__(self) -> Expression:
         return unary(ca.OP_NEG, self)
@@ -318,7 +334,9 @@ class Expression:
         Raises
         ------
         ExpressionError
-            If something else than symbols is given, or a parameter, which has no derivative.
+            If something else than symbols is given, or a parameter, which has no derivative; and for speeds
+            where positions are meant: if no column has an entry, while D(e) has the symbols themselves as
+            keys.
         """
         from .gradient import jacobian
 
@@ -372,14 +390,15 @@ class Expression:
         Parameters
         ----------
         values
-            A mapping from symbols or their names to numbers, or a :class:`~kineverse.State`. It may know more
-            symbols than there are here, as a derivative depends on fewer than its function. Parameters that
-            are not given have their own values.
+            A mapping from symbols or their names to numbers, or a :class:`~kineverse.State`. A state may know
+            more symbols than there are here, and other symbols may be given as such, as a derivative depends
+            on fewer than its function; names have to be those of symbols in here, if there are any.
+            Parameters that are not given have their own values.
 
         Raises
         ------
         UnknownNameError
-            Listing what is missing.
+            Listing what is missing, or naming what is not in here, and similar names.
         """
         from .evaluation import evaluate
 
@@ -389,11 +408,16 @@ class Expression:
         if not self._shape and self._sx.is_constant():
             return float(self._sx)
         if self._shape or self.symbols:
+            names = ", ".join(map(str, self.symbols[:6])) + (" ..." if len(self.symbols) > 6 else "")
             raise ExpressionError(
-                f"float() needs a constant scalar; this has shape {self._shape} and the symbols "
-                f"{', '.join(map(str, self.symbols[:6]))}. Call it with values: e({{name: number}})."
+                f"float() needs a constant scalar; this has shape {self._shape} and the symbols {names}. "
+                "Of expressions write numpy's functions rather than those of math: np.sin(q), not "
+                "math.sin(q). For a number call it with values: e({name: number})."
             )
         return float(self())
+
+    def __int__(self) -> int:
+        return int(float(self))
 
     # -- identity ------------------------------------------------------------------------------------------
 
@@ -404,15 +428,35 @@ class Expression:
 
         return structural_key(looked_at(self))
 
-    def __eq__(self, other: object) -> bool:
-        if self is other:
-            return True
-        if not isinstance(other, Expression):
-            try:
-                other = as_expression(other)  # type: ignore[arg-type]
-            except (ExpressionError, ValueRejectedError, ShapeError):
-                return NotImplemented
-        return self._shape == other._shape and self.key == other.key
+    if TYPE_CHECKING:
+        # For checkers that report deprecated calls: nobody means to ask whether a symbol is a number.
+        @overload
+        def __eq__(self, other: Expression) -> bool: ...
+        @overload
+        @deprecated("== compares structure, so an expression equals no number; call it with values first")
+        def __eq__(self, other: float) -> bool: ...
+        @overload
+        def __eq__(self, other: object) -> bool: ...
+        def __eq__(self, other: object) -> bool: ...
+        @overload
+        def __ne__(self, other: Expression) -> bool: ...
+        @overload
+        @deprecated("!= compares structure, so an expression equals no number; call it with values first")
+        def __ne__(self, other: float) -> bool: ...
+        @overload
+        def __ne__(self, other: object) -> bool: ...
+        def __ne__(self, other: object) -> bool: ...
+    else:
+
+        def __eq__(self, other: object) -> bool:
+            if self is other:
+                return True
+            if not isinstance(other, Expression):
+                try:
+                    other = as_expression(other)
+                except (ExpressionError, ValueRejectedError, ShapeError):
+                    return NotImplemented
+            return self._shape == other._shape and self.key == other.key
 
     def __hash__(self) -> int:
         return hash(self.key)
@@ -435,10 +479,17 @@ class Expression:
 
         return text(looked_at(self))
 
-    def _repr_latex_(self) -> str:
+    def _repr_latex_(self) -> str | None:
         from .printing import latex
 
-        return f"$\\displaystyle {latex(looked_at(self))}$"
+        formula = latex(looked_at(self))
+        return None if formula is None else f"$\\displaystyle {formula}$"
+
+    def _repr_html_(self) -> str | None:
+        from .printing import html
+
+        # What is short is a formula; of two representations a notebook would take this one.
+        return html(self) if self._repr_latex_() is None else None
 
     # -- numpy ---------------------------------------------------------------------------------------------
 
@@ -505,8 +556,12 @@ def as_expression(value: ExpressionLike) -> Expression:
             return _constant(float(value))
         except OverflowError:
             raise ValueRejectedError("The number is too large for a 64-bit float.") from None
-    if isinstance(value, (list, tuple)) or (isinstance(value, np.ndarray) and value.dtype == object):
+    if isinstance(value, (list, tuple)):
         return array(value)
+    if isinstance(value, np.ndarray) and value.dtype == object and not isinstance(value, np.ma.MaskedArray):
+        return array(value)
+    if isinstance(value, (np.ma.MaskedArray, np.matrix)):
+        _refuse(value)
     if isinstance(value, (str, bytes, Mapping)) or value is None:
         raise ExpressionError(
             f"{value!r} is not an expression or a number. Symbols are made by kv.position('path')."
@@ -525,6 +580,19 @@ def as_expression(value: ExpressionLike) -> Expression:
     return make(layout.from_array(numbers), numbers.shape, NO_NODES)
 
 
+def _refuse(value: object) -> NoReturn:
+    """Refuse arrays that mean more than their numbers say."""
+    if isinstance(value, np.ma.MaskedArray):
+        raise ExpressionError(
+            "A masked array has elements without a value, which an expression cannot have. Write "
+            "x.filled(number) to give them one, or x.compressed() to leave them out."
+        )
+    raise ExpressionError(
+        "An np.matrix multiplies by *, where expressions multiply elementwise. Write np.asarray(m), and @ "
+        "for the product of matrices."
+    )
+
+
 def _constant(number: float) -> Expression:
     expression = object.__new__(Expression)
     expression._set(ca.SX(number), (), NO_NODES)
@@ -537,6 +605,8 @@ def array(values: Any) -> Expression:
     if isinstance(values, Expression):
         return values
     if isinstance(values, np.ndarray) and values.dtype == object:
+        if isinstance(values, np.ma.MaskedArray):
+            _refuse(values)
         values = values.tolist()
     if not isinstance(values, (list, tuple)):
         return as_expression(values)
@@ -640,19 +710,18 @@ def broadcast_to(operand: Expression, shape: Shape) -> Expression:
         raise ShapeError(f"An expression of shape {operand.shape} does not fit shape {shape}.") from None
 
 
-def floor_divide(left: ExpressionLike, right: ExpressionLike) -> Expression:
-    """Return the largest integer not greater than the quotient, elementwise."""
-    return unary(ca.OP_FLOOR, binary(ca.OP_DIV, left, right))
-
-
 def matmul(left: ExpressionLike, right: ExpressionLike) -> Expression:
-    """Return the matrix product with numpy's rules for vectors; at most two dimensions each."""
+    """Return the matrix product with numpy's rules: vectors, matrices, and stacks of matrices."""
     a, b = as_expression(left), as_expression(right)
-    if not 1 <= a.ndim <= 2 or not 1 <= b.ndim <= 2 or a.shape[-1] != b.shape[0]:
+    if not a.ndim or not b.ndim or a.shape[-1] != b.shape[-2 if b.ndim > 1 else 0]:
         raise ShapeError(
             f"Shapes {a.shape} and {b.shape} cannot be multiplied as matrices"
             + ("; use * to scale by a number." if not a.ndim or not b.ndim else ".")
         )
+    if a.ndim > 2 or b.ndim > 2:
+        from .contractions import stacked_product
+
+        return stacked_product(a, b)
     product = ca.mtimes(a._sx.T if a.ndim == 1 else a._sx, b._sx)
     stored = product.T if a.ndim == 1 else product
     return make(stored, a.shape[:-1] + b.shape[1:], union((a, b)))

@@ -26,7 +26,9 @@ from .expression import (
 )
 from .kinks import Extremum as Extremum
 from .kinks import Norm as Norm
+from .kinks import Power as Power
 from .kinks import Select as Select
+from .kinks import power as power
 
 
 def sin(x: ExpressionLike) -> Expression:
@@ -119,6 +121,25 @@ def sqrt(x: ExpressionLike) -> Expression:
     return unary(ca.OP_SQRT, as_expression(x))
 
 
+def log10(x: ExpressionLike) -> Expression:
+    """Return the logarithm to base 10, elementwise; it may be off by a last digit."""
+    return log(x) / math.log(10)
+
+
+def log2(x: ExpressionLike) -> Expression:
+    """Return the logarithm to base 2, elementwise; it may be off by a last digit."""
+    return log(x) / math.log(2)
+
+
+def cbrt(x: ExpressionLike) -> Expression:
+    """Return the cube root, elementwise, of negative numbers too; its slope is infinite at 0."""
+    operand = as_expression(x)
+    root = binary(ca.OP_POW, operand, 1 / 3), -binary(ca.OP_POW, -operand, 1 / 3)
+    holds = binary(ca.OP_LE, 0.0, operand)
+    chosen = ca.if_else(holds._sx, root[0]._sx, root[1]._sx)
+    return make(chosen, operand._shape, operand._nodes)
+
+
 def square(x: ExpressionLike) -> Expression:
     """Return x², elementwise."""
     return unary(ca.OP_SQ, as_expression(x))
@@ -200,7 +221,10 @@ def clip(x: ExpressionLike, lower: ExpressionLike, upper: ExpressionLike) -> Exp
 
 
 def norm(x: ExpressionLike) -> Expression:
-    """Return the Euclidean norm over all elements, a scalar; its gradient at the origin is 0."""
+    """Return the Euclidean norm over all elements, a scalar; its gradient at the origin is 0.
+
+    The squares of elements neither overflow nor vanish: the norm of (3e200, 4e200) is 5e200.
+    """
     vector = as_expression(x).ravel()
     if vector.size == 0:
         raise ShapeError("The norm of an empty array is not defined here.")
@@ -208,25 +232,23 @@ def norm(x: ExpressionLike) -> Expression:
 
 
 def hypot(a: ExpressionLike, b: ExpressionLike) -> Expression:
-    """Return √(a² + b²), elementwise; its gradient at the origin is 0."""
+    """Return √(a² + b²), elementwise, for large and small numbers too; its gradient at the origin is 0."""
     x, y = broadcast(as_expression(a), as_expression(b))
     if not x.shape:
         return norm(array([x, y]))
-    squares = square(x) + square(y)
-    return where(
-        make(ca.SX.binary(ca.OP_LT, 0, squares._sx), squares.shape, squares._nodes), sqrt(squares), 0
-    )
+    pairs = zip(x.ravel(), y.ravel(), strict=True)
+    return array([norm(array([first, second])) for first, second in pairs]).reshape(x.shape)
 
 
 def sum_along(x: ExpressionLike, axis: int | tuple[int, ...] | None = None) -> Expression:
     """Return the sum over all elements, or along one axis or several."""
-    rows, rest = _axis_first(x, axis)
+    rows, rest = axis_first(x, axis)
     return make(ca.sum1(rows._sx).T, (rows.shape[1],), rows._nodes).reshape(rest)
 
 
 def product_along(x: ExpressionLike, axis: int | tuple[int, ...] | None = None) -> Expression:
     """Return the product of all elements, or along one axis or several; 1 of none."""
-    rows, rest = _axis_first(x, axis)
+    rows, rest = axis_first(x, axis)
     result = as_expression(np.ones(rows.shape[1]))
     for row in rows:
         result = result * row
@@ -250,14 +272,14 @@ def largest(x: ExpressionLike, axis: int | tuple[int, ...] | None = None) -> Exp
 
 
 def _among(x: ExpressionLike, axis: int | tuple[int, ...] | None, which: str) -> Expression:
-    rows, rest = _axis_first(x, axis)
+    rows, rest = axis_first(x, axis)
     if not rows.shape[0]:
         raise ShapeError("Nothing has no smallest or largest element.")
     columns = (tuple(column) for column in rows.T)
     return array([c[0] if len(c) == 1 else Extremum.of(c, (), (which,)) for c in columns]).reshape(rest)
 
 
-def _axis_first(x: ExpressionLike, axis: int | tuple[int, ...] | None) -> tuple[Expression, tuple[int, ...]]:
+def axis_first(x: ExpressionLike, axis: int | tuple[int, ...] | None) -> tuple[Expression, tuple[int, ...]]:
     """Return a matrix with the wanted axes as its rows and all others as its columns; the others' shape."""
     operand = as_expression(x)
     axes = tuple(range(operand.ndim)) if axis is None else axis if isinstance(axis, tuple) else (axis,)

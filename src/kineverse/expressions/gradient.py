@@ -8,9 +8,8 @@ partial derivatives, all keys at once.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
-from types import MappingProxyType
-from typing import TYPE_CHECKING
+from collections.abc import ItemsView, Iterator, KeysView, Mapping, Sequence, ValuesView
+from typing import TYPE_CHECKING, Any
 
 import casadi as ca
 import numpy as np
@@ -28,11 +27,63 @@ if TYPE_CHECKING:
     from .node import Node
 
 
+class Gradient(Mapping["Symbol", Expression]):
+    """D(e): an immutable mapping from derivative symbols to expressions, in the order of the symbols."""
+
+    __slots__ = ("_entries",)
+
+    def __init__(self, entries: Mapping[Symbol, Expression]) -> None:
+        self._entries = dict(entries)
+
+    def __getitem__(self, key: Symbol) -> Expression:
+        return self._entries[key]
+
+    def __contains__(self, key: object) -> bool:
+        return key in self._entries
+
+    def __iter__(self) -> Iterator[Symbol]:
+        return iter(self._entries)
+
+    def __len__(self) -> int:
+        return len(self._entries)
+
+    # A dictionary's own are a multiple faster than those of Mapping.
+
+    def get(self, key: Symbol, default: Any = None) -> Any:
+        """Return the entry of a speed, else what is given instead."""
+        return self._entries.get(key, default)
+
+    def keys(self) -> KeysView[Symbol]:
+        """Return the speeds, sorted."""
+        return self._entries.keys()
+
+    def values(self) -> ValuesView[Expression]:
+        """Return the entries, in the order of their speeds."""
+        return self._entries.values()
+
+    def items(self) -> ItemsView[Symbol, Expression]:
+        """Return speeds and entries."""
+        return self._entries.items()
+
+    def __reduce__(self) -> Any:
+        return Gradient, (self._entries,)
+
+    def __repr__(self) -> str:
+        from .printing import mapping_text
+
+        return mapping_text(self)
+
+    def _repr_html_(self) -> str:
+        from .printing import mapping_html
+
+        return mapping_html(self)
+
+
 def gradient(expression: Expression, heuristic: bool = True) -> Mapping[Symbol, Expression]:
     """Return D(e), see :meth:`Expression.gradient`."""
     known = expression._gradients.get(heuristic)
     if known is None:
-        known = MappingProxyType(_gradient(expression, heuristic))
+        known = Gradient(_gradient(expression, heuristic))
         expression._gradients[heuristic] = known
     result: Mapping[Symbol, Expression] = known
     return result
@@ -112,7 +163,21 @@ def jacobian(expression: Expression, symbols: Sequence[Symbol], heuristic: bool 
         anew: Expression = watcher.ask("jacobian" if heuristic else "facts", expression, array(list(wanted)))
         return anew
     entries = gradient(expression, heuristic)
-    return _side_by_side([entries.get(symbol.derivative()) for symbol in wanted], expression._shape)
+    columns = [entries.get(symbol.derivative()) for symbol in wanted]
+    if wanted and not any(column is not None for column in columns):
+        _refuse_speeds([symbol for symbol in wanted if symbol in entries])
+    return _side_by_side(columns, expression._shape)
+
+
+def _refuse_speeds(speeds: Sequence[Symbol]) -> None:
+    """Refuse columns of zeros for speeds by which the expression does move."""
+    if speeds:
+        raise ExpressionError(
+            f"'{speeds[0]}' is a speed, and the columns of a jacobian are named by positions: that of "
+            f"'{speeds[0].integral()}' is D(e)['{speeds[0]}']. Pass positions, as model.degrees_of_freedom, "
+            "or read e.gradient(), whose keys are speeds. For the derivative by a speed itself, which is 0 "
+            "here, there is partial([...])."
+        )
 
 
 def partial(expression: Expression, symbols: Sequence[Symbol]) -> Expression:

@@ -13,7 +13,18 @@ from typing import TYPE_CHECKING
 import casadi as ca
 import numpy as np
 
-from .expression import Expression, as_expression, binary, make, unary, union
+from .expression import (
+    Expression,
+    ExpressionLike,
+    array,
+    as_expression,
+    binary,
+    broadcast,
+    make,
+    unary,
+    union,
+)
+from .layout import SX
 from .node import Node
 
 if TYPE_CHECKING:
@@ -105,18 +116,88 @@ def _in_rounds(op: int, operands: Sequence[Expression]) -> Expression:
 
 
 class Norm(Node):
-    """The Euclidean norm of one vector."""
+    """The Euclidean norm of one vector; its first and second derivatives at the origin are 0."""
 
     __slots__ = ()
     kind = "norm"
     own_partials = True
 
+    @property
+    def unscaled(self) -> Expression:
+        """√Σ x²: what the norm is in real numbers, and in doubles unless a square leaves their range."""
+        return _root_of_squares(self.arguments[0])
+
     def _value(self) -> Expression:
+        # A power of two changes no digit, and 1 none at all. It brings huge and tiny vectors to where squares
+        # neither overflow nor vanish.
         (vector,) = self.arguments
-        return unary(ca.OP_SQRT, make(ca.sumsqr(vector._sx), (), vector._nodes))
+        squares = make(ca.sumsqr(vector._sx), (), vector._nodes)
+        huge, tiny = binary(ca.OP_LT, _LARGE, squares), binary(ca.OP_LT, squares, _SMALL)
+        scale = _selected(huge, 1 / _SCALE, _selected(tiny, _SCALE, as_expression(1.0)))
+        return _root_of_squares(vector * scale) / scale
 
     def _gradient(self, heuristic: bool) -> Mapping[Symbol, Expression]:
         (vector,) = self.arguments
-        away = binary(ca.OP_LT, 0, self.value)
-        length = Select.of((away, self.value, as_expression(1.0)), ())
-        return {key: vector @ entry / length for key, entry in vector.gradient(heuristic).items()}
+        # Divided first: a product of two large numbers may be too large.
+        zero = as_expression(np.zeros(vector.shape))
+        away = binary(ca.OP_LT, zero, self.value)
+        direction = Select.of((away, vector / self.value, zero), vector.shape)
+        return {key: direction @ entry for key, entry in vector.gradient(heuristic).items()}
+
+
+_LARGE, _SMALL = as_expression(1e300), as_expression(1e-280)
+_SCALE = as_expression(2.0**600)
+
+
+def _root_of_squares(vector: Expression) -> Expression:
+    return unary(ca.OP_SQRT, make(ca.sumsqr(vector._sx), (), vector._nodes))
+
+
+class Power(Node):
+    """One scalar to the power of another that is not constant.
+
+    CasADi's derivatives are NaN at 0, where log is infinite; these are right wherever there is one.
+    """
+
+    __slots__ = ()
+    kind = "power"
+    own_partials = True
+
+    @staticmethod
+    def is_needed(base: SX, exponent: SX) -> bool:
+        """Return whether a power may have derivatives that CasADi does not know: those of 0 to something."""
+        return not exponent.is_constant() and not (
+            base.is_constant() and all(float(element) for element in base.elements())
+        )
+
+    def _value(self) -> Expression:
+        return binary(ca.OP_POW, *self.arguments)
+
+    def _gradient(self, heuristic: bool) -> Mapping[Symbol, Expression]:
+        base, exponent = self.arguments
+        at_zero, zero = binary(ca.OP_EQ, base, 0.0), as_expression(0.0)
+        # 0⁰ is 1, as x⁰ is for every x; and 0ʸ is 0 for every positive y.
+        one = at_zero * binary(ca.OP_EQ, exponent, 0.0)
+        nothing = at_zero * binary(ca.OP_LT, 0.0, exponent)
+        of_base, of_exponent = base.gradient(heuristic), exponent.gradient(heuristic)
+        result: dict[Symbol, Expression] = {}
+        if of_base:
+            slope = Select.of((one, zero, exponent * power(base, exponent - 1)), ())
+            result = {key: slope * entry for key, entry in of_base.items()}
+        if of_exponent:
+            slope = Select.of((nothing, zero, self.value * unary(ca.OP_LOG, base)), ())
+            for key, entry in of_exponent.items():
+                result[key] = result[key] + slope * entry if key in result else slope * entry
+        return result
+
+
+def power(base: ExpressionLike, exponent: ExpressionLike) -> Expression:
+    """Return the power, elementwise, with derivatives wherever they exist: at 0 too."""
+    x, y = as_expression(base), as_expression(exponent)
+    if not Power.is_needed(x._sx, y._sx):
+        return binary(ca.OP_POW, x, y)
+    x, y = broadcast(x, y)
+    if not x.shape:
+        return Power.of((x, y), ())
+    pairs = zip(x.ravel(), y.ravel(), strict=True)
+    return array([power(a, b) for a, b in pairs]).reshape(x.shape)

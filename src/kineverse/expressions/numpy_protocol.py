@@ -7,6 +7,7 @@ mean.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from functools import reduce
 from inspect import signature
 from typing import Any
 
@@ -15,9 +16,11 @@ import numpy as np
 
 from kineverse.errors import ExpressionError, KineverseError, ShapeError
 
+from . import contractions as c
 from . import functions as f
-from . import layout
-from .expression import Expression, array, as_expression, binary, floor_divide, make, matmul, unary, union
+from . import layout, rounding
+from . import reductions as r
+from .expression import Expression, as_expression, binary, make, matmul, unary, union
 
 _UNARY_OPS = {
     np.negative: ca.OP_NEG, np.sin: ca.OP_SIN, np.cos: ca.OP_COS, np.tan: ca.OP_TAN, np.arcsin: ca.OP_ASIN,
@@ -30,14 +33,23 @@ _UNARY_OPS = {
 
 _BINARY_OPS = {
     np.add: ca.OP_ADD, np.subtract: ca.OP_SUB, np.multiply: ca.OP_MUL, np.true_divide: ca.OP_DIV,
-    np.power: ca.OP_POW, np.float_power: ca.OP_POW, np.arctan2: ca.OP_ATAN2,
+    np.arctan2: ca.OP_ATAN2, np.fmod: ca.OP_FMOD,
 }  # fmt: skip
 
 _UFUNCS: dict[Any, Callable[..., Any]] = {
     np.positive: as_expression,
     np.copysign: f.copysign,
-    np.floor_divide: floor_divide,
-    np.remainder: lambda a, b: as_expression(a) % b,
+    np.power: f.power,
+    np.float_power: f.power,
+    np.floor_divide: rounding.floor_divide,
+    np.remainder: rounding.remainder,
+    np.divmod: lambda a, b: (rounding.floor_divide(a, b), rounding.remainder(a, b)),
+    np.rint: rounding.rint,
+    np.trunc: rounding.trunc,
+    np.log10: f.log10,
+    np.log2: f.log2,
+    np.exp2: lambda a: f.power(2.0, a),
+    np.cbrt: f.cbrt,
     np.minimum: f.minimum,
     np.fmin: f.fmin,
     np.maximum: f.maximum,
@@ -64,9 +76,16 @@ _UFUNCS: dict[Any, Callable[..., Any]] = {
 }
 
 
-_REDUCTIONS = {
-    np.add: f.sum_along, np.multiply: f.product_along, np.minimum: f.smallest, np.maximum: f.largest,
-}  # fmt: skip
+# Those that came with version 2 of numpy.
+_LATER_UFUNCS: dict[str, Callable[..., Any]] = {
+    "vecdot": c.vecdot,
+    "matvec": lambda a, x: c.einsum("...ij,...j->...i", a, x),
+    "vecmat": lambda x, a: c.einsum("...i,...ij->...j", x, a),
+}
+_UFUNCS |= {getattr(np, name): function for name, function in _LATER_UFUNCS.items() if hasattr(np, name)}
+
+_REDUCTIONS = {np.add: r.total, np.multiply: r.product, np.minimum: r.smallest, np.maximum: r.largest}
+_AXIS_OF_ITS_OWN = {getattr(np, "vecdot", None)}
 
 
 def apply_ufunc(ufunc: Any, method: str, inputs: tuple[Any, ...], options: Mapping[str, Any]) -> Any:
@@ -77,8 +96,8 @@ def apply_ufunc(ufunc: Any, method: str, inputs: tuple[Any, ...], options: Mappi
     ExpressionError
         For ufuncs, methods or options that have no counterpart.
     """
-    if method == "reduce" and ufunc in _REDUCTIONS and not set(options) - {"axis"}:
-        return _REDUCTIONS[ufunc](inputs[0], options.get("axis", 0))
+    if method == "reduce" and ufunc in _REDUCTIONS and not set(options) - {"axis", "keepdims"}:
+        return _REDUCTIONS[ufunc](inputs[0], options.get("axis", 0), keepdims=options.get("keepdims", False))
     if options.get("out") is not None:
         raise ExpressionError(
             f"np.{ufunc.__name__} cannot write expressions into an existing array of numbers."
@@ -87,9 +106,9 @@ def apply_ufunc(ufunc: Any, method: str, inputs: tuple[Any, ...], options: Mappi
         reducing = ", ".join(f"np.{known.__name__}" for known in _REDUCTIONS)
         raise ExpressionError(
             f"np.{ufunc.__name__}.{method} with the options {sorted(options)} is not available for "
-            f"expressions; there is reduce, with axis=, of {reducing}."
+            f"expressions; there is reduce, with axis= and keepdims=, of {reducing}."
         )
-    if options:
+    if options and not (ufunc in _AXIS_OF_ITS_OWN and set(options) == {"axis"}):
         raise ExpressionError(
             f"np.{ufunc.__name__} of expressions takes no {'=, '.join(sorted(options))}=; leave it out. "
             "To select, there is np.where."
@@ -99,18 +118,23 @@ def apply_ufunc(ufunc: Any, method: str, inputs: tuple[Any, ...], options: Mappi
     if ufunc in _BINARY_OPS:
         return binary(_BINARY_OPS[ufunc], *inputs)
     if ufunc in _UFUNCS:
-        return _UFUNCS[ufunc](*inputs)
+        return _UFUNCS[ufunc](*inputs, **options)
     raise _unavailable(f"np.{ufunc.__name__}")
 
 
 _REARRANGING = {
     np.transpose, np.reshape, np.ravel, np.squeeze, np.expand_dims, np.moveaxis, np.swapaxes, np.flip,
     np.fliplr, np.flipud, np.roll, np.tile, np.repeat, np.broadcast_to, np.diagonal, np.take, np.rot90,
-    np.atleast_1d, np.atleast_2d, np.atleast_3d,
+    np.delete, np.atleast_1d, np.atleast_2d, np.atleast_3d, np.split, np.array_split, np.hsplit, np.vsplit,
+    np.dsplit,
 }  # fmt: skip
+# Those that put zeros between the elements.
+_SPREADING = {np.diag, np.diagflat, np.tril, np.triu}
+_LATER = [(np, "matrix_transpose"), (np, "unstack"), (np.linalg, "matrix_transpose"), (np.linalg, "diagonal")]
+_REARRANGING |= {getattr(home, name) for home, name in _LATER if hasattr(home, name)}
 
 _AT_LEAST = {np.atleast_1d, np.atleast_2d, np.atleast_3d}
-_JOINING = {np.concatenate, np.stack, np.vstack, np.hstack, np.dstack, np.column_stack}
+_JOINING = {np.concatenate, np.stack, np.vstack, np.hstack, np.dstack, np.column_stack, np.block, np.append}
 # How many arguments come before an array to write into.
 _BEFORE_OUT = {np.take: 3, np.concatenate: 2, np.stack: 2}
 
@@ -135,7 +159,11 @@ def apply_function(function: Any, args: Sequence[Any], options: Mapping[str, Any
                 f"{name} of expressions: {error}. Its parameters are {', '.join(parameters.parameters)}."
             ) from None
         return _FUNCTIONS[function](*bound.args, **bound.kwargs)
-    if function not in _REARRANGING and function not in _JOINING:
+    if function is np.append and len(args) > 1:
+        # The second part comes as an argument of its own, and both are flat without an axis.
+        axis = args[2] if len(args) > 2 else options.get("axis")
+        return apply_function(np.concatenate, (args[:2],), {"axis": axis})
+    if function not in _REARRANGING and function not in _SPREADING and function not in _JOINING:
         raise _unavailable(name)
     if (
         not args
@@ -148,11 +176,11 @@ def apply_function(function: Any, args: Sequence[Any], options: Mapping[str, Any
             f"{name} rearranges the elements of its first argument by plain numbers, not by expressions."
         )
     try:
-        return (_rearrange if function in _REARRANGING else _join)(function, args[0], args[1:], options)
+        return (_join if function in _JOINING else _rearrange)(function, args[0], args[1:], options)
     except KineverseError:
         raise
     except (ValueError, IndexError) as error:
-        parts = [args[0]] if function in _REARRANGING else args[0]
+        parts = _leaves(args[0]) if function in _JOINING else [args[0]]
         shapes = " and ".join(str(as_expression(part).shape) for part in parts)
         raise ShapeError(f"{name}: {error} (of shape {shapes}).") from None
     except TypeError as error:
@@ -160,10 +188,14 @@ def apply_function(function: Any, args: Sequence[Any], options: Mapping[str, Any
 
 
 _INSTEAD = {
-    "all": "logic, a & b", "any": "logic, a | b", "divmod": "a // b and a % b",
-    "solve": "np.linalg.inv(A) @ b", "append": "np.concatenate", "block": "np.concatenate",
-    "einsum": "@ and np.sum", "tensordot": "@ and np.sum", "log10": "np.log(x) / np.log(10)",
-    "log2": "np.log(x) / np.log(2)", "exp2": "2**x",
+    "all": "logic, a & b", "any": "logic, a | b", "sort": "np.min and np.max, or call it with values",
+    "argmin": "np.min, or kv.where", "argmax": "np.max, or kv.where", "interp": "kv.spline(x, knots, values)",
+    "std": "np.sqrt(np.mean((x - np.mean(x))**2))", "var": "np.mean((x - np.mean(x))**2)",
+    "average": "np.sum(w * x) / np.sum(w)", "logical_xor": "(a | b) & ~(a & b)",
+    "heaviside": "kv.where(x < 0, 0, 1)", "pinv": "np.linalg.inv(A.T @ A) @ A.T", "insert": "np.concatenate",
+    "pad": "np.concatenate", "full_like": "value * np.ones(shape)", "polyval": "c[0]*x**2 + c[1]*x + c[2]",
+    "linspace": "a + (b - a) * np.linspace(0, 1, n)", "isclose": "abs(a - b) < tolerance",
+    "allclose": "np.max(abs(a - b)) < tolerance",
 }  # fmt: skip
 
 
@@ -175,41 +207,47 @@ def _unavailable(name: str) -> ExpressionError:
     )
 
 
-def _rearrange(function: Any, operand: Any, args: Sequence[Any], options: Mapping[str, Any]) -> Expression:
+def _rearrange(function: Any, operand: Any, args: Sequence[Any], options: Mapping[str, Any]) -> Any:
     expression = as_expression(operand)
-    index = function(layout.indices(expression.shape), *args, **options)
+    spreading = function in _SPREADING
+    index = function(layout.indices(expression.shape) + spreading, *args, **options)
+    if spreading:
+        # Elements are counted from 1, so 0 is what the function filled in; it becomes a last one.
+        index = np.where(index == 0, expression.size, index - 1)
+        expression = _join(np.concatenate, [expression.ravel(), np.zeros(1)], (), {})
+    if isinstance(index, (list, tuple)):
+        return type(index)(expression._rearranged(np.asarray(part)) for part in index)
     return expression._rearranged(np.asarray(index))
 
 
 def _join(function: Any, parts: Sequence[Any], args: Sequence[Any], options: Mapping[str, Any]) -> Expression:
-    operands = [as_expression(p) for p in parts]
-    offset, numbered = 0, []
-    for operand in operands:
-        numbered.append(layout.indices(operand.shape) + offset)
+    operands: list[Expression] = []
+    offset = 0
+
+    def numbered(part: Any) -> Any:
+        nonlocal offset
+        if function is np.block and isinstance(part, (list, tuple)):
+            return [numbered(inner) for inner in part]
+        operand = as_expression(part)
+        operands.append(operand)
         offset += operand.size
-    index = function(numbered, *args, **options)
+        return layout.indices(operand.shape) + (offset - operand.size)
+
+    blocks = numbered(parts) if function is np.block else [numbered(part) for part in parts]
+    index = np.asarray(function(blocks, *args, **options))
     elements = ca.vertcat(*(layout.column(o._sx, o.shape) for o in operands))
-    return make(layout.gather(elements, (offset,), index), index.shape, union(operands))
+    return make(layout.gather(elements, (offset,), index.astype(int)), index.shape, union(operands))
 
 
-def _trace(a: Any) -> Expression:
-    return f.sum_along(np.diagonal(as_expression(a)), -1)
+def _leaves(parts: Any) -> list[Any]:
+    if isinstance(parts, (list, tuple)):
+        return [leaf for part in parts for leaf in _leaves(part)]
+    return [parts]
 
 
-def _cross(a: Any, b: Any) -> Expression:
-    x, y = as_expression(a), as_expression(b)
-    if x.shape != (3,) or y.shape != (3,):
-        raise ShapeError(f"The cross product is one of two 3-vectors, not of shapes {x.shape} and {y.shape}.")
-    return array([x[1] * y[2] - x[2] * y[1], x[2] * y[0] - x[0] * y[2], x[0] * y[1] - x[1] * y[0]])
-
-
-def _dot(a: Any, b: Any) -> Expression:
-    x, y = as_expression(a), as_expression(b)
-    return x * y if not x.ndim or not y.ndim else matmul(x, y)
-
-
-def _inner(a: Any, b: Any) -> Expression:
-    return _dot(a, as_expression(b).T if np.ndim(a) else b)
+def _trace(a: Any, offset: int = 0, axis1: int = 0, axis2: int = 1) -> Expression:
+    diagonal: Any = np.diagonal(as_expression(a), offset, axis1, axis2)
+    return f.sum_along(diagonal, -1)
 
 
 def _clip(
@@ -227,46 +265,60 @@ def _clip(
     return result if upper is None else f.minimum(result, upper)
 
 
-def _mean(a: Any, axis: int | tuple[int, ...] | None = None) -> Expression:
-    total = f.sum_along(a, axis)
-    if total.size and not as_expression(a).size:
-        raise ShapeError(f"Nothing has no mean (of shape {as_expression(a).shape}).")
-    if not total.size:
-        return total
-    return total * (total.size / as_expression(a).size)
-
-
-def _norm(x: Any, ord: Any = None, axis: int | None = None) -> Expression:  # noqa: A002 - numpy's name
-    dimensions = as_expression(x).ndim
-    known = ord is None or (ord == 2 and dimensions == 1) or (ord == "fro" and dimensions == 2)
-    if axis is not None or not known:
-        raise ExpressionError("Of norms, the Euclidean one over all elements is available.")
-    return f.norm(x)
-
-
 _FUNCTIONS: dict[Any, Callable[..., Any]] = {
     np.where: f.where,
     np.clip: _clip,
-    np.sum: lambda a, axis=None: f.sum_along(a, axis),
-    np.mean: _mean,
-    np.min: lambda a, axis=None: f.smallest(a, axis),
-    np.max: lambda a, axis=None: f.largest(a, axis),
-    np.amin: lambda a, axis=None: f.smallest(a, axis),
-    np.amax: lambda a, axis=None: f.largest(a, axis),
-    np.prod: lambda a, axis=None: f.product_along(a, axis),
+    np.sum: r.total,
+    np.mean: r.mean,
+    np.min: r.smallest,
+    np.max: r.largest,
+    np.amin: r.smallest,
+    np.amax: r.largest,
+    np.ptp: r.extent,
+    np.prod: r.product,
+    np.cumsum: r.cumsum,
+    np.cumprod: r.cumprod,
+    np.diff: r.diff,
+    np.round: rounding.around,
+    np.around: rounding.around,
+    np.fix: rounding.trunc,
+    np.copy: as_expression,
     np.trace: _trace,
-    np.dot: _dot,
-    np.inner: _inner,
-    np.vdot: lambda a, b: _dot(as_expression(a).ravel(), as_expression(b).ravel()),
-    np.outer: lambda a, b: as_expression(a).reshape(-1, 1) * as_expression(b).reshape(1, -1),
-    np.cross: _cross,
-    np.linalg.norm: _norm,
+    np.dot: c.dot,
+    np.inner: c.inner,
+    np.vdot: lambda a, b: c.dot(as_expression(a).ravel(), as_expression(b).ravel()),
+    np.outer: c.outer,
+    np.cross: c.cross,
+    np.kron: c.kron,
+    np.einsum: c.einsum,
+    np.tensordot: c.tensordot,
+    np.linalg.norm: r.norms,
     np.linalg.inv: f.inverse,
     np.linalg.det: f.determinant,
+    np.linalg.solve: c.solve,
+    np.linalg.matrix_power: c.matrix_power,
+    np.linalg.multi_dot: lambda arrays: reduce(c.dot, arrays),
     np.shape: lambda a: as_expression(a).shape,
     np.ndim: lambda a: as_expression(a).ndim,
-    np.size: lambda a: as_expression(a).size,
+    np.size: lambda a, axis=None: as_expression(a).size if axis is None else as_expression(a).shape[axis],
     np.zeros_like: lambda a: as_expression(np.zeros(as_expression(a).shape)),
     np.ones_like: lambda a: as_expression(np.ones(as_expression(a).shape)),
     np.array_equal: lambda a, b: as_expression(a) == as_expression(b),
 }
+_LATER_FUNCTIONS: dict[str, Callable[..., Any]] = {
+    "cross": lambda x1, x2, axis=-1: c.cross(x1, x2, axis=axis),
+    "outer": c.outer,
+    "trace": lambda x, offset=0: _trace(x, offset, -2, -1),
+    "matmul": matmul,
+    "vecdot": c.vecdot,
+    "tensordot": lambda x1, x2, axes=2: c.tensordot(x1, x2, axes),
+    "vector_norm": r.vector_norm,
+    "matrix_norm": r.matrix_norm,
+}
+_FUNCTIONS |= {
+    getattr(np.linalg, name): function
+    for name, function in _LATER_FUNCTIONS.items()
+    if hasattr(np.linalg, name)
+}
+if hasattr(np, "astype"):
+    _FUNCTIONS[np.astype] = lambda x, dtype: as_expression(x).astype(dtype)

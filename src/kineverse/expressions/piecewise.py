@@ -39,7 +39,8 @@ def spline(
     Surprise first: outside of its knots a spline goes on *straight*, with the slopes it has at the ends.
     These are 0 unless given, so it stays at its first and last value. The first derivative is continuous
     everywhere, the second between the first and the last knot. A periodic spline is twice continuously
-    differentiable everywhere.
+    differentiable everywhere. At ±infinity a spline has its limit: the last value, or ±infinity where it has
+    a slope there; a periodic one has none, and is NaN.
 
     Between the knots t_k and t_k+1, at a distance h and with s = x - t_k, it is
 
@@ -181,7 +182,12 @@ class Piecewise(Node):
         result = coefficients[-1]
         for coefficient in reversed(coefficients[:-1]):
             result = coefficient + s * result
-        return result
+        if self.periodic:
+            return result
+        # 0 times infinity is no number, but a line without slope goes on forever.
+        below, above = _limit(self.pieces[0], -1.0), _limit(self.pieces[-1], 1.0)
+        beyond_all = ca.SX.binary(ca.OP_EQ, ca.fabs(x), math.inf)
+        return ca.if_else(beyond_all, ca.if_else(x < 0, below, above), result)
 
     def _gradient(self, heuristic: bool) -> Mapping[Symbol, Expression]:
         (x,) = self.arguments
@@ -190,6 +196,12 @@ class Piecewise(Node):
             return {}
         slope = Piecewise.of(self.arguments, self.shape, (self.periodic, self.knots, steps))
         return {key: slope * entry for key, entry in x.gradient(heuristic).items()}
+
+
+def _limit(piece: tuple[float, ...], side: float) -> float:
+    """Return what a polynomial tends to at infinity, or at minus infinity."""
+    power, leading = next(((k, c) for k, c in reversed(list(enumerate(piece))) if c), (0, piece[0]))
+    return math.copysign(math.inf, leading * side**power) if power else leading
 
 
 def _numbers(given: Iterable[float], what: str) -> list[float]:

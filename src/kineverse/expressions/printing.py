@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import itertools
+from collections.abc import Mapping
+from html import escape
 from typing import TYPE_CHECKING, Any
 
 import casadi as ca
@@ -17,6 +20,9 @@ if TYPE_CHECKING:
 _LIMIT = 400
 _ELEMENTS = 16
 _DEPTH = 24
+_LONGEST_FORMULA = 3000
+_LONGEST_MAPPING = 4 * _LIMIT
+_ROWS = 40
 
 _INFIX = {ca.OP_ADD: ("+", 1), ca.OP_SUB: ("-", 1), ca.OP_MUL: ("*", 2), ca.OP_DIV: ("/", 2)}
 _COMPARISONS = {
@@ -35,7 +41,7 @@ _FUNCTIONS = {
     ca.OP_ATANH: "arctanh", ca.OP_EXP: "exp", ca.OP_LOG: "log", ca.OP_FABS: "abs", ca.OP_SIGN: "sign",
     ca.OP_FLOOR: "floor", ca.OP_CEIL: "ceil", ca.OP_FMIN: "minimum", ca.OP_FMAX: "maximum",
     ca.OP_IF_ELSE_ZERO: "if_else_zero", ca.OP_NOT: "not", ca.OP_EXPM1: "expm1", ca.OP_LOG1P: "log1p",
-    ca.OP_COPYSIGN: "copysign", ca.OP_HYPOT: "hypot",
+    ca.OP_COPYSIGN: "copysign", ca.OP_HYPOT: "hypot", ca.OP_FMOD: "fmod",
 }  # fmt: skip
 
 
@@ -52,18 +58,54 @@ def text(expression: Expression) -> str:
     return f"Expression{expression.shape}[{body}]"
 
 
-def latex(expression: Expression) -> str:
-    r"""Return LaTeX: ``\dot{a}`` for velocities, matrices up to 6×6 written out."""
+def latex(expression: Expression) -> str | None:
+    r"""Return LaTeX: ``\dot{a}`` for velocities, matrices up to 6×6; None for what is too long to read."""
     writer = _Latex()
     if not expression.shape:
-        return writer.bounded(expression._sx)
+        formula = writer.bounded(expression._sx)
+        return formula if len(formula) <= _LONGEST_FORMULA and formula != writer.ellipsis else None
     rows, columns = expression._sx.shape
-    if rows > 6 or columns > 6:
-        return rf"\text{{Expression of shape }} {expression.shape}".replace("(", r"\left(").replace(
-            ")", r"\right)"
-        )
-    lines = [" & ".join(writer.bounded(expression._sx[i, j]) for j in range(columns)) for i in range(rows)]
+    if expression.ndim > 2 or rows > 6 or columns > 6:
+        return None
+    lines = []
+    for i in range(rows):
+        entries = [writer.bounded(expression._sx[i, j]) for j in range(columns)]
+        lines.append(" & ".join(entries))
+        if sum(map(len, lines)) > _LONGEST_FORMULA or writer.ellipsis in entries:
+            return None
     return r"\begin{bmatrix}" + r" \\ ".join(lines) + r"\end{bmatrix}"
+
+
+def html(expression: Expression) -> str:
+    """Return the text as HTML, for what is too long for a formula."""
+    return f"<code>{escape(repr(expression))}</code>"
+
+
+def mapping_text(gradient: Mapping[Symbol, Expression]) -> str:
+    """Return a gradient in the form of a dictionary, its first entries if it has many."""
+    shown, length = [], 0
+    for key, entry in gradient.items():
+        shown.append(f"{key}: {_short(repr(entry))}")
+        length += len(shown[-1])
+        if length > _LONGEST_MAPPING:
+            break
+    more = len(gradient) - len(shown)
+    return f"{{{', '.join(shown)}{f', ... {more} more' if more else ''}}}"
+
+
+def mapping_html(gradient: Mapping[Symbol, Expression]) -> str:
+    """Return a gradient as a table of HTML, its first entries if it has many."""
+    rows = [
+        f"<tr><td>{escape(_short(str(key)))}</td><td><code>{escape(_short(repr(entry)))}</code></td></tr>"
+        for key, entry in itertools.islice(gradient.items(), _ROWS)
+    ]
+    if len(gradient) > _ROWS:
+        rows.append(f"<tr><td>… {len(gradient) - _ROWS} more</td><td></td></tr>")
+    return f"<table><tr><th>speed</th><th>entry of D</th></tr>{''.join(rows)}</table>"
+
+
+def _short(text: str) -> str:
+    return text if len(text) <= _LIMIT else f"{text[:_LIMIT]} ..."
 
 
 class _Writer:

@@ -342,6 +342,33 @@ class Structure:
                 free.update((key,) if row is None else row)
             return tuple(sorted(free, key=lambda s: s.sort_key))
 
+    def symbols_of(self, frame: str, relative_to: str = WORLD) -> tuple[Symbol, ...]:
+        """Return the symbols of a pose in the order of the chain, from ``relative_to`` to ``frame``.
+
+        They are those of :meth:`fk`, parameters included: joints come as one meets them on the way, the
+        coordinates of one joint in its own order, and instead of what follows others, as a mimic joint or a
+        closed loop does, what it follows. Give them to :func:`kineverse.compile` as inputs for vectors in
+        this order, rather than sorted by name.
+
+        Raises
+        ------
+        UnknownNameError
+            If a frame does not exist, with similar names.
+        """
+        with self._lock:
+            self._settle()
+            base, down = kinematics.branches(frame, relative_to, self._frame)
+            dependent = self.rates.dependent
+            records = self._head[ARTICULATIONS].values()
+            own = {s: place for record in records for place, s in enumerate(record.coordinates)}
+            found: dict[Symbol, None] = {}
+            for name in (*base[::-1], *down):
+                for factor in self._frame(name).factors:
+                    if isinstance(factor, Expression):
+                        for s in sorted(factor.symbols, key=lambda s: (own.get(s, len(own)), s.sort_key)):
+                            found |= dict.fromkeys(dependent[s].symbols if s in dependent else (s,))
+            return tuple(found)
+
     def _frame(self, name: str) -> Frame:
         try:
             frame: Frame = self._head[FRAMES][name]

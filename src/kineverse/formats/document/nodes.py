@@ -11,7 +11,7 @@ import casadi as ca
 
 from kineverse.errors import KineverseError
 from kineverse.expressions import layout
-from kineverse.expressions.functions import Extremum, Norm, Select
+from kineverse.expressions.functions import Extremum, Norm, Power, Select
 from kineverse.expressions.node import Augment
 from kineverse.expressions.piecewise import Piecewise, checked_pieces
 from kineverse.logic import And, Less, Not, Or
@@ -64,6 +64,9 @@ def _elementary(graph: Graph, node: list[Any]) -> None:
     function = node[1] if len(node) > 2 and type(node[1]) is str else ""
     if function in BINARY:
         a, b = map(graph.scalar_at, exactly(node, 4)[2:])
+        if function == "pow" and Power.is_needed(sx[a], sx[b]):
+            graph.add_alike(Power, node[2:])
+            return
         result, depth = ca.SX.binary(BINARY[function], sx[a], sx[b]), max(depths[a], depths[b])
     elif function in UNARY:
         a = graph.scalar_at(exactly(node, 3)[2])

@@ -47,7 +47,7 @@ import casadi as ca
 from kineverse.errors import FormatError
 from kineverse.expressions import layout
 from kineverse.expressions.expression import Expression
-from kineverse.expressions.functions import Extremum, Norm, Select
+from kineverse.expressions.functions import Extremum, Norm, Power, Select
 from kineverse.expressions.implicit import Implicit, ImplicitFunction
 from kineverse.expressions.leaves import bottom_up, leaves
 from kineverse.expressions.node import Augment, Node
@@ -188,6 +188,8 @@ class Table:
             within = ",".join(_numbers(ends) for ends in f.domain)
             domain = f",[{within}]" if within else ""
             return self._shared(f'["implicit",{self._function(f)},[{joined}]{domain}]')
+        if type(node) is Power:
+            return self._shared(f'["elementary","pow",{joined}]')
         if type(node) in _PLAIN:
             return self._shared(f'["{node.kind}",{joined}]')
         raise FormatError(

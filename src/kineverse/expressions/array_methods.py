@@ -1,0 +1,147 @@
+"""The methods that arrays of numpy have and expressions have too."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any, TypeAlias
+
+import numpy
+
+from kineverse.errors import ExpressionError
+
+if TYPE_CHECKING:
+    from .expression import Expression, ExpressionLike
+
+Axis: TypeAlias = int | tuple[int, ...] | None
+
+# To the type checker numpy's functions return arrays of numbers.
+np: Any = numpy
+
+
+class ArrayMethods:
+    """Base of :class:`Expression`: each method is numpy's function of the same name."""
+
+    __slots__ = ()
+
+    # -- rearranging ---------------------------------------------------------------------------------------
+
+    def swapaxes(self, axis1: int, axis2: int) -> Expression:
+        """Return the array with two axes exchanged."""
+        result: Expression = np.swapaxes(self, axis1, axis2)
+        return result
+
+    def squeeze(self, axis: Axis = None) -> Expression:
+        """Return the array without its axes of length 1, or without those that are given."""
+        result: Expression = np.squeeze(self, axis)
+        return result
+
+    def diagonal(self, offset: int = 0, axis1: int = 0, axis2: int = 1) -> Expression:
+        """Return the diagonal, or one beside it, along the last axis."""
+        result: Expression = np.diagonal(self, offset, axis1, axis2)
+        return result
+
+    def repeat(self, repeats: Any, axis: int | None = None) -> Expression:
+        """Return the array with its elements repeated."""
+        result: Expression = np.repeat(self, repeats, axis)
+        return result
+
+    def take(self, indices: Any, axis: int | None = None) -> Expression:
+        """Return the elements at some places along an axis, or of all elements."""
+        result: Expression = np.take(self, indices, axis)
+        return result
+
+    def copy(self) -> Expression:
+        """Return the expression itself, which never changes."""
+        result: Expression = np.copy(self)
+        return result
+
+    def astype(self, dtype: Any) -> Expression:
+        """Return the expression itself: its values are 64-bit floats.
+
+        Raises
+        ------
+        ExpressionError
+            For any other type.
+        """
+        if numpy.dtype(dtype) != numpy.float64:
+            raise ExpressionError(
+                f"The values of an expression are 64-bit floats, not {numpy.dtype(dtype)}. Call it with "
+                "values, e({name: number}), and convert what comes out."
+            )
+        return self.copy()
+
+    def item(self, *place: Any) -> Expression:
+        """Return one element as a scalar: the only one, or that at an index."""
+        flat: Expression = np.ravel(self)
+        if not place and flat.size != 1:
+            raise ExpressionError(
+                f"item() is the element of an array that has one, and this has shape {np.shape(self)}. "
+                "Write e[i, j], or e.tolist() for all of them."
+            )
+        index = place[0] if len(place) == 1 else place or 0
+        whole: Any = self
+        element: Expression = whole[index] if isinstance(index, tuple) else flat[index]
+        return element
+
+    def tolist(self) -> Any:
+        """Return nested lists of scalar expressions, and a scalar as itself."""
+        rows: Any = self
+        return [row.tolist() for row in rows] if np.ndim(self) else self
+
+    # -- sums and their kin --------------------------------------------------------------------------------
+
+    def sum(self, axis: Axis = None, *, keepdims: bool = False) -> Expression:
+        """Return the sum over all elements, or along one axis or several."""
+        result: Expression = np.sum(self, axis=axis, keepdims=keepdims)
+        return result
+
+    def prod(self, axis: Axis = None, *, keepdims: bool = False) -> Expression:
+        """Return the product of all elements, or along one axis or several."""
+        result: Expression = np.prod(self, axis=axis, keepdims=keepdims)
+        return result
+
+    def mean(self, axis: Axis = None, *, keepdims: bool = False) -> Expression:
+        """Return the mean of all elements, or along one axis or several."""
+        result: Expression = np.mean(self, axis=axis, keepdims=keepdims)
+        return result
+
+    def min(self, axis: Axis = None, *, keepdims: bool = False) -> Expression:
+        """Return the smallest of all elements, or along one axis or several."""
+        result: Expression = np.min(self, axis=axis, keepdims=keepdims)
+        return result
+
+    def max(self, axis: Axis = None, *, keepdims: bool = False) -> Expression:
+        """Return the largest of all elements, or along one axis or several."""
+        result: Expression = np.max(self, axis=axis, keepdims=keepdims)
+        return result
+
+    def cumsum(self, axis: int | None = None) -> Expression:
+        """Return the sums up to each element, along an axis or of all elements in C order."""
+        result: Expression = np.cumsum(self, axis=axis)
+        return result
+
+    def cumprod(self, axis: int | None = None) -> Expression:
+        """Return the products up to each element, along an axis or of all elements in C order."""
+        result: Expression = np.cumprod(self, axis=axis)
+        return result
+
+    def trace(self, offset: int = 0, axis1: int = 0, axis2: int = 1) -> Expression:
+        """Return the sum of a diagonal."""
+        result: Expression = np.trace(self, offset, axis1, axis2)
+        return result
+
+    # -- elementwise, and products -------------------------------------------------------------------------
+
+    def clip(self, min: Any = None, max: Any = None) -> Expression:  # noqa: A002 - numpy's names
+        """Return the elements limited to [min, max]."""
+        result: Expression = np.clip(self, min, max)
+        return result
+
+    def round(self, decimals: int = 0) -> Expression:
+        """Return the elements rounded to a number of decimals; of two equally near, the even one."""
+        result: Expression = np.round(self, decimals)
+        return result
+
+    def dot(self, other: ExpressionLike) -> Expression:
+        """Return the sum of products over the last axis of this and the last but one of the other."""
+        result: Expression = np.dot(self, other)
+        return result
