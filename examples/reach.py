@@ -1,7 +1,7 @@
 """Where a robot's gripper reaches: draws reach.png, seen from above and from the side.
 
-Run it as ``.venv/bin/python examples/reach.py``; ``--robot fetch`` or ``--frame pr2/l_gripper_tool_frame`` asks
-for another one.
+Run it as ``.venv/bin/python examples/reach.py``; ``--robot fetch`` or ``--frame pr2/l_gripper_tool_frame``
+asks for another one.
 """
 
 from __future__ import annotations
