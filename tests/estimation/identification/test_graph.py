@@ -101,8 +101,8 @@ def test_the_model_moves_as_what_was_seen(cart: kv.Model, poses: dict[str, Array
     for k in (0, 17):
         values = {f"seen/{edge.child}": float(edge.fit.joint_values[k, 0]) for edge in graph.edges}
         handle, sticker = truth(points[k])
-        assert np.allclose(model.fk("seen/handle", "seen/cart")(values), handle, atol=0.02)
-        assert np.allclose(model.fk("seen/sticker", "seen/cart")(values), sticker, atol=0.02)
+        assert np.allclose(model.fk("seen/handle", "seen/cart")(kv.State(values)), handle, atol=0.02)
+        assert np.allclose(model.fk("seen/sticker", "seen/cart")(kv.State(values)), sticker, atol=0.02)
 
 
 def linkage() -> kv.Model:
@@ -201,7 +201,7 @@ def test_parts_that_were_seen_as_points_hang_on_others(cart: kv.Model, poses: di
     for k in (0, 17):
         values = {e.child: float(e.fit.joint_values[np.searchsorted(e.times, k), 0]) for e in graph.edges}
         for part, position in zip(("drawer", "handle", "sticker"), truth(points[k]), strict=True):
-            assert np.allclose(model.fk(part, "cart")[:3, 3](values), position, atol=0.02)
+            assert np.allclose(model.fk(part, "cart")[:3, 3](kv.State(values)), position, atol=0.02)
 
 
 def test_points_that_nothing_holds_slide() -> None:
