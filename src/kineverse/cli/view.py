@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 from kineverse.cli.assignments import add_set_option, parse_assignments, parse_length
 from kineverse.cli.listing import asked_for, print_articulations
 from kineverse.cli.progress import progress
+from kineverse.cli.reading import add_reading_options, load
 
 if TYPE_CHECKING:
     import kineverse as kv
@@ -47,6 +48,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--decomposed", action="store_true", help="both with meshes as the hulls of kineverse decompose"
     )
     parser.add_argument("--picture", metavar="PATH", help="write a picture (.png) instead of opening a page")
+    add_reading_options(parser)
     add_page_options(parser)
 
 
@@ -63,12 +65,11 @@ def run(arguments: argparse.Namespace) -> int:
     if asked_for(arguments.model):
         return print_articulations()
 
-    import kineverse as kv
     from kineverse.view import meshes
     from kineverse.view.viewer import Viewer
 
     label = os.path.basename(arguments.model)
-    model = kv.load(arguments.model)
+    model = load(arguments, arguments.model)
     for mesh in progress(meshes.seen_in(model), "reading meshes", "file"):
         meshes.load(mesh)  # and remembered: whoever draws them finds them read
     if arguments.picture is not None:

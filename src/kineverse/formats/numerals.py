@@ -64,7 +64,9 @@ def _number(word: str, count: int) -> float:
     if "_" in word or not word.isascii():
         raise ValueError(f"has '{abbreviate(word)}', where {_expected(count)}")
     try:
-        value = float(word)
+        value = float.fromhex(word) if "0x" in word[:3].lower() else float(word)
+    except OverflowError:
+        value = math.inf
     except ValueError:
         raise ValueError(f"has '{abbreviate(word)}', where {_expected(count)}{_hint(word)}") from None
     if not math.isfinite(value):

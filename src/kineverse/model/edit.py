@@ -242,12 +242,15 @@ class Edit:
         """Store an immutable value under ``data``."""
         return self.apply(Write(name, value), tag)
 
-    def include(self, source: Any, prefix: str | None = None) -> list[str]:
+    def include(
+        self, source: Any, prefix: str | None = None, *, root: Any = None, strict: bool = False
+    ) -> list[str]:
         """Append the operations of a file or shipped model, see :func:`kineverse.load`; return their tags."""
         from kineverse.formats.loading import operations_of
 
+        found = operations_of(source, prefix, root=root, strict=strict)
         with no_collection():
-            return [self.apply(operation, tag) for tag, operation in operations_of(source, prefix)]
+            return [self.apply(operation, tag) for tag, operation in found]
 
     # -- inside --------------------------------------------------------------------------------------------
 

@@ -98,10 +98,12 @@ class Model(ModelView):
             runs,
         )
 
-    def include(self, source: Any, prefix: str | None = None) -> list[str]:
+    def include(
+        self, source: Any, prefix: str | None = None, *, root: Any = None, strict: bool = False
+    ) -> list[str]:
         """Add a file or a shipped model in one edit; returns the tags. See :func:`kineverse.load`."""
         with self.edit() as edit:
-            return edit.include(source, prefix)
+            return edit.include(source, prefix, root=root, strict=strict)
 
     def listen(
         self,

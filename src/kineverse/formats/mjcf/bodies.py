@@ -6,6 +6,7 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from kineverse.formats.poses import IDENTITY, is_identity
 from kineverse.model.body import Vector3
@@ -183,16 +184,22 @@ class Bodies:
         if kind in ("hinge", "slide"):
             return (float(given[address]),)
         if kind == "ball":
-            w, x, y, z = given[address : address + 4].tolist()
+            w, x, y, z = self._turn(given[address : address + 4]).tolist()
             return x, y, z, w
         # The joint's own coordinates begin where the body is in the file, MuJoCo's at the origin.
         rest, pose = m.qpos0[address : address + 7], given[address : address + 7]
         back, turn, offset = np.zeros(4), np.zeros(4), np.zeros(3)
         engine.mju_negQuat(back, rest[3:])
-        engine.mju_mulQuat(turn, back, pose[3:])
+        engine.mju_mulQuat(turn, back, self._turn(pose[3:]))
         engine.mju_rotVecQuat(offset, pose[:3] - rest[:3], back)
         w, x, y, z = turn.tolist()
         return *offset.tolist(), x, y, z, w
+
+    def _turn(self, wxyz: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+        """Return a quaternion of length one, as MuJoCo makes it: one without length turns nothing."""
+        unit = np.array(wxyz, dtype=float)
+        mujoco().mju_normalize4(unit)
+        return unit
 
     def _dynamics(self, number: int, kind: Kind) -> Dynamics:
         m = self._model

@@ -10,6 +10,7 @@ from pathlib import Path
 
 from kineverse.formats.files import read_file
 from kineverse.formats.remarks import tell
+from kineverse.formats.roots import text_root
 
 from .bodies import Bodies
 from .compiling import compile_document
@@ -20,8 +21,10 @@ from .shapes import Shapes
 from .tree import Node
 
 
-def read_mjcf(path: str | os.PathLike[str]) -> Scene:
-    """Read an MJCF file, with what it includes and attaches from its folder.
+def read_mjcf(
+    path: str | os.PathLike[str], root: str | os.PathLike[str] | None = None, strict: bool = False
+) -> Scene:
+    """Read an MJCF file, with what it includes and attaches; see :func:`parse_mjcf`.
 
     Raises
     ------
@@ -31,10 +34,16 @@ def read_mjcf(path: str | os.PathLike[str]) -> Scene:
         If MuJoCo is not installed.
     """
     path = Path(path)
-    return parse_mjcf(read_file(path), source=path.name, folder=str(path.absolute().parent))
+    return parse_mjcf(read_file(path), path.name, str(path.absolute().parent), root, strict)
 
 
-def parse_mjcf(text: str | bytes, source: str = "<mjcf>", folder: str = "") -> Scene:
+def parse_mjcf(
+    text: str | bytes,
+    source: str = "<mjcf>",
+    folder: str = "",
+    root: str | os.PathLike[str] | None = None,
+    strict: bool = False,
+) -> Scene:
     """Read an MJCF from text.
 
     Parameters
@@ -44,7 +53,11 @@ def parse_mjcf(text: str | bytes, source: str = "<mjcf>", folder: str = "") -> S
     source
         Its name in error messages.
     folder
-        The folder below which the files it includes are, and from which the meshes it names are found.
+        The folder from which the files it includes and the meshes it names are found.
+    root
+        The folder that they do not leave; None for that which :func:`kineverse.formats.roots.root_of` finds.
+    strict
+        Whether mistakes that others read past are refused, rather than remarked on.
 
     Raises
     ------
@@ -54,9 +67,10 @@ def parse_mjcf(text: str | bytes, source: str = "<mjcf>", folder: str = "") -> S
         If MuJoCo is not installed.
     """
     notes = _Notes(source)
-    prepared = Preparation(folder, notes.add).run(text, source)
-    compiled = compile_document(prepared, source, folder, notes.add)
-    bodies = Bodies(compiled, Shapes(compiled, folder, notes.add), source, notes.add)
+    below = text_root(folder, root)
+    prepared = Preparation(folder, below, notes.add, strict).run(text, source)
+    compiled = compile_document(prepared, source, folder, below, notes.add)
+    bodies = Bodies(compiled, Shapes(compiled, folder, below, notes.add), source, notes.add)
     found = Constraints(compiled, bodies, notes.add)
     return Scene(
         bodies.links,
