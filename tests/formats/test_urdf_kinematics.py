@@ -132,7 +132,7 @@ def test_robots_that_break_the_specification_are_read_with_a_remark(name: str) -
         read_urdf(with_name(name), strict=True)
     assert REFUSED[name] in str(info.value)
     if name.endswith("ur3.urdf"):
-        with pytest.raises(kv.FormatError, match="has no <link>.*Run xacro first"):
+        with pytest.raises(kv.FormatError, match=r"has no <link>.*Run xacro first"):
             read_urdf(with_name(name))
     else:
         assert REFUSED[name] in "".join(read_urdf(with_name(name)).remarks)

@@ -100,7 +100,26 @@ def test_a_circle_is_shown():
 def test_a_circle_beside_a_tree_is_shown():
     text = robot(joint("a", "l1", "l2"), joint("b", "l2", "l1"), joint("c", "l2", "l3"), links=4)
     with pytest.raises(FormatError, match='<joint name="a">: the joints "a" -> "b" lead in a circle'):
-        parse_urdf(text)
+        parse_urdf(text, strict=True)
+    read = parse_urdf(text)
+    assert ([link.name for link in read.links], read.joints) == (["l0"], ())
+    assert read.remarks[0].endswith("3 links that no root holds are left out.")
+
+
+def test_a_joint_that_mimics_one_of_a_circle_moves_by_itself():
+    circle = joint("a", "l1", "l1") + joint("b", "l0", "l2", "continuous", '<mimic joint="a"/>')
+    (only,) = parse_urdf(robot(circle, links=3)).joints
+    assert (only.name, only.mimic) == ("b", None)
+
+
+def test_links_and_joints_without_names_get_some():
+    text = robot('<link name=""/>', joint("j", "l0", "l1", "fixed").replace('name="j" ', ""), links=2)
+    model = kv.Model()
+    with model.edit() as edit:
+        for operation in robot_operations(parse_urdf(text)):
+            edit.apply(operation)
+    assert set(model.frames) == {"l0", "l1", "link"}
+    assert set(model.articulations) == {"l0_l1"}
 
 
 def test_a_link_that_is_its_own_parent():

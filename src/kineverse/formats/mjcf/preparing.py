@@ -51,9 +51,15 @@ class _Model:
 class Preparation:
     """Reads a file and those that it attaches, each of them once."""
 
-    def __init__(self, top: str, root: str, note: Callable[[Node | None, str], None], strict: bool) -> None:
+    def __init__(
+        self,
+        top: str,
+        root: str,
+        note: Callable[[Node | None, str], None],
+        mend: Callable[[str, int, str], None] | None,
+    ) -> None:
         self._top, self._root = top, root
-        self._note, self._strict = note, strict
+        self._note, self._mend = note, mend
         self._known: dict[Path, _Model] = {}
         self._open: list[Path] = []
         self.prepared = Prepared()
@@ -89,10 +95,7 @@ class Preparation:
         return text, _Model("", root.attributes.get("model", ""), size)
 
     def _read(self, data: str | bytes, source: str, folder: str) -> Node:
-        return read_tree(data, source, folder, self._root, None if self._strict else self._mended)
-
-    def _mended(self, source: str, line: int, text: str) -> None:
-        self._note(None, f"{source}, line {line}, {text}")
+        return read_tree(data, source, folder, self._root, self._mend)
 
     def _attached(self, node: Node, folder: str) -> _Model:
         path = find_below(node, node.attributes["file"], self._root, folder)

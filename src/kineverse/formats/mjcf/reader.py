@@ -8,8 +8,9 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
+from kineverse.errors import FormatError
 from kineverse.formats.files import read_file
-from kineverse.formats.remarks import tell
+from kineverse.formats.remarks import Fault, tell
 from kineverse.formats.roots import text_root
 
 from .bodies import Bodies
@@ -66,12 +67,12 @@ def parse_mjcf(
     MissingExtraError
         If MuJoCo is not installed.
     """
-    notes = _Notes(source)
+    notes = _Notes(source, strict)
     below = text_root(folder, root)
-    prepared = Preparation(folder, below, notes.add, strict).run(text, source)
+    prepared = Preparation(folder, below, notes.add, None if strict else notes.misspelt).run(text, source)
     compiled = compile_document(prepared, source, folder, below, notes.add)
-    bodies = Bodies(compiled, Shapes(compiled, folder, below, notes.add), source, notes.add)
-    found = Constraints(compiled, bodies, notes.add)
+    bodies = Bodies(compiled, Shapes(compiled, folder, below, notes.add), source, notes.add, notes.mend)
+    found = Constraints(compiled, bodies, notes.add, notes.mend)
     return Scene(
         bodies.links,
         bodies.sites,
@@ -87,8 +88,8 @@ def parse_mjcf(
 class _Notes:
     """What is remarked on a document, each remark once."""
 
-    def __init__(self, source: str) -> None:
-        self._source = source
+    def __init__(self, source: str, strict: bool) -> None:
+        self._source, self._strict = source, strict
         self.texts: dict[str, None] = {}
 
     def add(self, node: Node | None, text: str) -> None:
@@ -97,3 +98,23 @@ class _Notes:
         if text not in self.texts:
             self.texts[text] = None
             tell([f"{self._source}, {text}"])
+
+    def mend(self, where: str, problem: str, taken: str) -> None:
+        """Note a mistake at a place, and what is taken instead.
+
+        Raises
+        ------
+        FormatError
+            The mistake, where the file is read strictly.
+        """
+        if self._strict:
+            raise FormatError(f"{where}: {problem}.")
+        self._fault(f"{where.removeprefix(f'{self._source}, ')}: {problem}; {taken}.")
+
+    def misspelt(self, source: str, line: int, text: str) -> None:
+        """Note what is no XML, but can be read."""
+        self._fault(f"{'' if source == self._source else f'{source}, '}line {line}, {text}")
+
+    def _fault(self, text: str) -> None:
+        self.texts[Fault(text)] = None
+        tell([Fault(f"{self._source}, {text}")])

@@ -18,7 +18,7 @@ from .description import AXES, Axis, Joint, Kind
 from .nodes import MODEL, Node
 from .placing import relation
 from .resolving import end_of
-from .values import bound, direction, number, text, text_of, truth
+from .values import bound, direction, number, text_of, truth
 
 _SUFFIXES = {1: ("",), 2: ("/first", "/second")}
 _DYNAMICS = ("damping", "friction", "spring_reference", "spring_stiffness")
@@ -92,7 +92,7 @@ def _axis(node: Node, tag: str, suffix: str, kind: Kind) -> Axis:
             mistake = ElementError(
                 element, f"is {kind} but has no <{tag}>; by default both axes are z, which is no such joint."
             )
-            remarks.mend(mistake, "it turns about z twice")
+            remarks.mend(mistake, "it is z")
             return Axis(suffix=suffix)
         remarks.add(element, f"has no <{tag}>; it is z, the specification's default.")
         return Axis(suffix=suffix)
@@ -201,6 +201,5 @@ def _pitch(element: Element) -> float:
 def reference_body(node: Node, carriers: dict[Node, Node]) -> Node:
     """Return the link against which a gearbox measures its angles."""
     part = child(node.element, "gearbox_reference_body")
-    if part is None or not text(node.element, "gearbox_reference_body"):
-        node.refuse("has no <gearbox_reference_body>: nothing says what it turns against.")
+    assert part is not None
     return carriers[node.scope.find(text_of(part), part, node.element)]

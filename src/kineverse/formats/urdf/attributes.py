@@ -30,12 +30,14 @@ def number(element: Element, key: str, default: float | None = None) -> float:
         raise ElementError(element, f'{key}="{abbreviate(text)}" {error}.') from None
 
 
-def vector(element: Element, key: str, default: Vector3 | None = None) -> Vector3:
-    """Return three numbers; without a default, the attribute is required."""
+def vector(element: Element, key: str, default: Vector3 | None = None, turns: bool = False) -> Vector3:
+    """Return three numbers, coordinates or what only turns; without a default, the attribute is required."""
     text = element[1].get(key)
     if text is None:
         return _default(element, key, default)
     try:
+        if turns:
+            return numerals.directions(text, 3)  # type: ignore[return-value]  # as many as asked for
         return numerals.numbers(text, 3)  # type: ignore[return-value]  # as many as asked for
     except ValueError as error:
         raise ElementError(element, f'{key}="{abbreviate(text)}" {error}.') from None
@@ -87,9 +89,11 @@ def pose(origin: Element | None, owner: Element, version: tuple[int, int], remar
     if quaternion is None:
         return rpy.pose_of(xyz, _said(origin, "rpy", owner, remarks))
     try:
-        xyzw = numerals.numbers(quaternion, 4)
+        xyzw = numerals.unit(numerals.directions(quaternion, 4))
     except ValueError as error:
-        raise ElementError(origin, f'quat_xyzw="{abbreviate(quaternion)}" {error}.') from None
+        mistake = ElementError(origin, f'quat_xyzw="{abbreviate(quaternion)}" {error}.')
+        remarks.mend(mistake, "nothing is turned", owner)
+        return rpy.pose_of(xyz, _ZERO)
     if not rpy.is_rotation(xyzw):
         mistake = ElementError(
             origin, f'quat_xyzw="{abbreviate(quaternion)}" has length zero, and so is no rotation.'
@@ -102,4 +106,4 @@ def _said(origin: Element, key: str, owner: Element, remarks: Remarks) -> Vector
     """Return three numbers of an origin, zeros where they are left out, or empty."""
     if not origin[1].get(key, "0").strip():
         return mended(lambda: vector(origin, key), _ZERO, "zeros are taken", remarks, owner)
-    return vector(origin, key, _ZERO)
+    return vector(origin, key, _ZERO, turns=key == "rpy")

@@ -52,7 +52,7 @@ class LinkReader:
         ElementError
             If something is missing, malformed or without meaning.
         """
-        name = name_of(element)
+        name = mended(lambda: name_of(element), "", "it gets a name", self._remarks)
         visuals: list[Shape] = []
         collisions: list[Shape] = []
         inertia: Inertia | None = None

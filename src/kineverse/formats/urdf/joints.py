@@ -12,7 +12,7 @@ import sys
 
 from kineverse.errors import suggest
 from kineverse.formats.markup import Element, ElementError, abbreviate, name_of
-from kineverse.formats.numerals import LARGEST
+from kineverse.formats.numerals import LARGEST, unit
 from kineverse.formats.remarks import Remarks
 from kineverse.formats.rpy import snap
 from kineverse.formats.urdf.attributes import mended, number, pose, vector
@@ -46,11 +46,12 @@ def read_joint(element: Element, version: tuple[int, int], remarks: Remarks) -> 
     ElementError
         If something is missing, malformed or without meaning.
     """
-    name = name_of(element)
+    name = mended(lambda: name_of(element), "", "it is called by its links", remarks)
     kind = _kind(element, remarks)
     parts = _parts(element, remarks)
-    origin = pose(parts.get("origin"), element, version, remarks)
     parent, child = _link(element, parts, "parent"), _link(element, parts, "child")
+    name = name or f"{parent}_{child}"
+    origin = pose(parts.get("origin"), element, version, remarks)
     line = element[3]
     if kind in ("fixed", "floating", "planar", "spherical"):
         if "mimic" in parts and kind != "fixed":
@@ -127,7 +128,7 @@ def _axis(axis: Element | None, joint: Element, remarks: Remarks, taken: str) ->
     """Return the unit vector of an axis, None if it has no length; the specification's default is x."""
     if axis is None:
         return _X
-    x, y, z = vector(axis, "xyz", _X)
+    x, y, z = unit(vector(axis, "xyz", _X, turns=True))
     length = math.hypot(x, y, z)
     if length < _SHORTEST_AXIS:
         mistake = ElementError(

@@ -82,11 +82,19 @@ def parse_urdf(
     document = _Document(folder, text_root(folder, root), remarks)
     top = parse(text, source, _EXTENSIONS, document.begin, mend=None if strict else remarks.fault)
     hint = document.finish(top)
-    joints = resolve(one_parent_each(list(document.joints.values()), remarks), remarks)
+    joints = one_parent_each(list(document.joints.values()), remarks)
     links = tuple(document.links.values())
-    roots, ordered = root_outwards(links, joints, remarks, hint)
+    roots, ordered, reached = root_outwards(links, joints, remarks, hint)
     name = top[1].get("name", "")
-    return Robot(name, roots[0], links, ordered, source, tuple(remarks.texts), roots[1:])
+    return Robot(
+        name,
+        roots[0],
+        tuple(reached),
+        tuple(resolve(ordered, remarks)),
+        source,
+        tuple(remarks.texts),
+        roots[1:],
+    )
 
 
 class _Document:

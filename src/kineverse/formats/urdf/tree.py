@@ -45,8 +45,8 @@ def one_parent_each(joints: Sequence[Joint], remarks: Remarks) -> list[Joint]:
 
 def root_outwards(
     links: Sequence[Link], joints: Sequence[Joint], remarks: Remarks, hint: str = ""
-) -> tuple[tuple[str, ...], tuple[Joint, ...]]:
-    """Return the roots, and the joints from there outwards, children in the order of the file.
+) -> tuple[tuple[str, ...], tuple[Joint, ...], list[Link]]:
+    """Return the roots, the joints from there outwards, siblings as in the file, and all links reached.
 
     Parameters
     ----------
@@ -89,8 +89,8 @@ def root_outwards(
             raise FormatError(f"{source}, line {roots[1].line}, {text}")
         remarks.fault(roots[1].line, f"{text.rstrip('.')}; all of them stand where the first does.")
     ordered = [joint for root in roots for joint in _outwards(root.name, joints_below)]
+    reached = {root.name for root in roots} | {joint.child for joint in ordered}
     if len(ordered) != len(joints):
-        reached = {joint.child for joint in ordered}
         loop = _loop(next(joint for joint in joints if joint.child not in reached), joint_above)
         shown = " -> ".join(f"{quote(joint.name)}" for joint in loop[:_SHOWN])
         more = f" and {len(loop) - _SHOWN} more" if len(loop) > _SHOWN else ""
@@ -99,10 +99,15 @@ def root_outwards(
             if len(loop) > 1
             else "its child link is its own parent"
         )
-        raise FormatError(
-            f"{_place(source, loop[0])}: {circle}. URDF describes trees only: remove a joint.{hint}"
+        text = f"{circle}. URDF describes trees only: remove a joint.{hint}"
+        if remarks.strict or not roots:
+            raise FormatError(f"{_place(source, loop[0])}: {text}")
+        place = _place(source, loop[0]).removeprefix(f"{source}, line {loop[0].line}, ")
+        left = len(links) - len(reached)
+        remarks.fault(
+            loop[0].line, f"{place}: {text.rstrip('.')}; {left} links that no root holds are left out."
         )
-    return tuple(root.name for root in roots), tuple(ordered)
+    return tuple(root.name for root in roots), tuple(ordered), [k for k in links if k.name in reached]
 
 
 def _outwards(root: str, joints_below: dict[str, list[Joint]]) -> list[Joint]:
