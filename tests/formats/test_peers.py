@@ -14,10 +14,10 @@ pytest.importorskip("mujoco")
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "tools"))
 
-from fuzz.inputs import inputs  # noqa: E402  - it is no part of the package
-from fuzz.peers import quiet, reader_of, refusal  # noqa: E402
-from fuzz.targets import TARGETS  # noqa: E402
-from fuzz.worker import place  # noqa: E402
+from fuzz.inputs import inputs
+from fuzz.peers import quiet, reader_of, refusal
+from fuzz.targets import TARGETS
+from fuzz.worker import place
 
 
 @pytest.mark.parametrize(("name", "tried", "read"), [("urdf", 400, 100), ("mjcf", 60, 1)])

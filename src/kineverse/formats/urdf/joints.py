@@ -207,17 +207,15 @@ def _range(
     lower, upper = _end(limit, "lower", joint, remarks), _end(limit, "upper", joint, remarks)
     if math.isnan(lower) or math.isnan(upper):
         return None, None
-    mistake: ElementError | None = None
+    wrong: ElementError | None = None
     if lower > upper:
-        mistake = ElementError(
-            limit, f"has lower={lower!r} above upper={upper!r}: no position would be valid."
-        )
+        wrong = ElementError(limit, f"has lower={lower!r} above upper={upper!r}: no position would be valid.")
     elif lower > LARGEST or upper < -LARGEST:
-        mistake = ElementError(
+        wrong = ElementError(
             limit, f"has lower={lower!r} and upper={upper!r}: all positions would be beyond {LARGEST:g}."
         )
-    if mistake is not None:
-        remarks.mend(mistake, "the joint is not limited", joint)
+    if wrong is not None:
+        remarks.mend(wrong, "the joint is not limited", joint)
         return None, None
     return (lower if lower > -math.inf else None), (upper if upper < math.inf else None)
 
