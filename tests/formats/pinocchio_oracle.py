@@ -7,6 +7,7 @@ mimics what is read from the text once more, without Kineverse.
 
 from __future__ import annotations
 
+import re
 from xml.etree import ElementTree
 
 import numpy as np
@@ -36,7 +37,8 @@ class Reference:
     def __init__(self, text: str) -> None:
         self.model = pin.buildModelFromXML(text)
         self.data = self.model.createData()
-        elements = {e.get("name"): e for e in ElementTree.fromstring(text).findall("joint")}
+        plain = re.sub(r"<\?xml[^>]*\?>", "", text)  # which may be misspelt
+        elements = {e.get("name"): e for e in ElementTree.fromstring(plain).findall("joint")}
         self._kinds = {name: e.get("type") for name, e in elements.items()}
         self._mimics = {
             name: (mimic.get("joint"), float(mimic.get("multiplier", 1)), float(mimic.get("offset", 0)))

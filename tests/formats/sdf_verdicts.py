@@ -19,7 +19,7 @@ sdf_joint_types/drake/joint_parsing_test.sdf | 23 53
 sdf_joint_types/drake/negative_damping_joint.sdf | 1 1
 sdf_joint_types/drake/revolute_spring_parsing_test.sdf | 5 4
 sdf_joint_types/drake/universal_joint.sdf | 1 2
-sdf_joint_types/gazebo_models_ccby3/demo_joint_types/model.sdf | line 838, <joint name="universal_demo">: is
+sdf_joint_types/gazebo_models_ccby3/demo_joint_types/model.sdf | 24 12
 sdf_joint_types/gazebo_models_ccby3/double_pendulum_with_base/model.sdf | 3 2
 sdf_joint_types/gazebo_models_ccby3/fire_hose_long_curled/model.sdf | 62 43
 sdf_joint_types/gazebo_models_ccby3/follower_vehicle/model.sdf | 6 6
@@ -50,7 +50,7 @@ sdf_joint_types/sdformat_test/joint_axis_xyz_normalization.sdf | line 38, <joint
 sdf_joint_types/sdformat_test/joint_child_frame.sdf | 4 0
 sdf_joint_types/sdformat_test/joint_child_model_frame.sdf | 3 0
 sdf_joint_types/sdformat_test/joint_child_world.sdf | line 7, <joint name="joint">: has the world as its chil
-sdf_joint_types/sdformat_test/joint_complete.sdf | line 101, <joint name="revolute2_joint">: is revolute2 but
+sdf_joint_types/sdformat_test/joint_complete.sdf | 20 19
 sdf_joint_types/sdformat_test/joint_invalid_child.sdf | line 10, <joint name="joint">: <child> refers to "inv
 sdf_joint_types/sdformat_test/joint_invalid_parent.sdf | line 9, <joint name="joint">: <parent> refers to "in
 sdf_joint_types/sdformat_test/joint_invalid_parent_same_as_child.sdf | line 7, <joint name="joint">: its pare

@@ -33,6 +33,11 @@ def test_spellings(text):
     assert number(text) == float(text)
 
 
+@pytest.mark.parametrize(("text", "value"), [("0x10", 16.0), ("-0x1.8p1", -3.0), ("0XA", 10.0)])
+def test_hexadecimal_numbers_are_those_of_c(text, value):
+    assert number(text) == value
+
+
 @pytest.mark.parametrize(
     "text",
     [
@@ -43,7 +48,6 @@ def test_spellings(text):
         "Infinity",
         "1e999",
         "1_000",
-        "0x10",
         "1,5",
         "١",
         "1d5",

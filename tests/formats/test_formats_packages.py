@@ -152,7 +152,7 @@ def test_paths_do_not_leave_their_package(make, tmp_path, path):
 
 def test_an_absolute_path_inside_a_package_is_one_inside_the_package(make, tmp_path):
     make("arm/a.stl")
-    with pytest.raises(FormatError, match="which has no file"):
+    with pytest.raises(FormatError, match="has no file"):
         locate("package://arm//etc/passwd", tmp_path)
 
 
@@ -166,16 +166,27 @@ def test_a_miss_says_where_it_looked_and_what_to_set(tmp_path):
     with pytest.raises(FormatError) as info:
         locate("package://arm/a.stl", tmp_path / "urdf")
     message = str(info.value)
-    assert message.startswith(
-        '"package://arm/a.stl": there is no package "arm". Looked in: $KINEVERSE_PACKAGE_PATH (not set)'
+    first, *places = message.splitlines()
+    assert first == (
+        '"package://arm/a.stl": there is no package "arm". '
+        "Set KINEVERSE_PACKAGE_PATH or ROS_PACKAGE_PATH to the folder that holds it. Looked in:"
     )
-    assert f"{tmp_path / 'urdf'} and the folders above it" in message
-    assert message.endswith('Set KINEVERSE_PACKAGE_PATH or ROS_PACKAGE_PATH to the folder that holds "arm".')
+    assert places[0] == f"  {tmp_path / 'urdf'} and the folders above it"
+    assert len(places) <= 3
+
+
+def test_a_miss_names_three_places_at_most(tmp_path, monkeypatch):
+    monkeypatch.setenv("ROS_PACKAGE_PATH", os.pathsep.join(str(tmp_path / name) for name in "abcdef"))
+    with pytest.raises(FormatError) as info:
+        locate("package://arm/a.stl", tmp_path)
+    _, *places = str(info.value).splitlines()
+    assert len(places) == 3
+    assert places[-1].startswith("  and ")
 
 
 def test_a_package_without_the_file_is_named(make, tmp_path):
     make("arm/b.stl")
-    with pytest.raises(FormatError, match=r'package "arm" is at .*arm, which has no file "a.stl"'):
+    with pytest.raises(FormatError, match=r'package "arm" has no file "a.stl". It is at:\n  .*arm$'):
         locate("package://arm/a.stl", tmp_path)
 
 

@@ -17,9 +17,9 @@ def parses(monkeypatch):
     """Names of the descriptions that were parsed, in an empty memory."""
     names = []
 
-    def parse_urdf(content, source, folder):
+    def parse_urdf(content, source, *further):
         names.append(source)
-        return original(content, source=source, folder=folder)
+        return original(content, source, *further)
 
     original = loading.parse_urdf
     monkeypatch.setattr(loading, "parse_urdf", parse_urdf)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import sys
 
 import pytest
@@ -12,6 +13,7 @@ from test_mjcf_kinematics import GEOM, body, mjcf
 
 import kineverse as kv
 from kineverse.formats.mjcf import parse_mjcf, read_mjcf
+from kineverse.formats.remarks import Fault
 
 WORLD = f"<worldbody>{body('a', '<joint/>')}</worldbody>"
 
@@ -67,9 +69,6 @@ def outcome(text: str | bytes, folder: object = "") -> str:
         (mjcf('<worldbody><body name="m"><joint/></body></worldbody>'), 'line 2, <body name="m">', "mass and inertia of moving bodies"),
         (mjcf('<worldbody><body><joint name="j" axis="0 0 0"/><geom size="1"/></body></worldbody>'), 'line 2, <joint name="j">', "axis too small"),
         (mjcf('<worldbody><body name="a"/>\n<body name="a"/></worldbody>'), 'line 3, <body name="a">', "repeated name"),
-        (mjcf('<worldbody><body name="a"/>\n<body name="/a"/></worldbody>'), 'line 3, <body name="/a">', 'would be called "a" here'),
-        (mjcf('<worldbody><body name="//"/></worldbody>'), 'line 2, <body name="//">', "nothing but slashes"),
-        (mjcf("<worldbody>" + body("a", '<joint name="j" type="ball"/>') + body("b", '<joint name="j/qx"/>') + "</worldbody>"), "line 2", 'would be called "j/qx" here'),
         (mjcf(WORLD, '<equality><joint joint1="no"/></equality>'), "line 3, <joint>", "unknown element 'no'"),
         (mjcf('<worldbody><geom type="mesh" mesh="no"/></worldbody>'), "line 2, <geom>", "'no' not found"),
         (mjcf('<worldbody><replicate count="1000"><replicate count="1000"><body/></replicate></replicate></worldbody>'), "line 2, <", "larger than 30000 elements"),
@@ -118,8 +117,41 @@ def test_files_outside_of_the_folder_are_not_opened(tmp_path, name, element):
     message = outcome(mjcf(element.format(name)), top)
     opened = [path for path in _OPENED if "secret" in path or "passwd" in path]
     assert message.startswith("x.xml, line 2, <")
-    assert any(reason in message for reason in ("leads out of the folder", "no such file", "names no file"))
+    assert any(reason in message for reason in ("leads out of the root", "no such file", "names no file"))
     assert opened == []
+
+
+NAMES = [
+    (mjcf('<worldbody><body name="a"/>\n<body name="/a"/></worldbody>'), 'would be called "a" here', {"a", "a_2"}),
+    (mjcf('<worldbody><body name="//"/></worldbody>'), "nothing but slashes", {"nameless"}),
+    (mjcf('<worldbody><body name="a&#9;b"/></worldbody>'), "a control character", {"a_b"}),
+    (
+        mjcf("<worldbody>" + body("a", '<joint name="j" type="ball"/>') + body("b", '<joint name="j/qx"/>') + "</worldbody>"),
+        'would be called "j/qx" here',
+        {"a", "b"},
+    ),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("text", "problem", "names"), NAMES)
+def test_names_that_cannot_be_names_are_replaced(text, problem, names):
+    scene = parse_mjcf(text, "x.xml")
+    (remark,) = scene.remarks
+    assert isinstance(remark, Fault)
+    assert problem in remark
+    assert {link.name for link in scene.links} == {"world", *names}
+    assert names <= set(model_of(scene).frames)
+    with pytest.raises(kv.FormatError, match=re.escape(problem)):
+        parse_mjcf(text, "x.xml", strict=True)
+
+
+def test_comments_and_declarations_that_xml_forbids_are_read():
+    text = f'\n<?xml version="1.0"?><!-- a -- b -->{mjcf(WORLD)}'
+    scene = parse_mjcf(text, "x.xml")
+    assert len(scene.links) == 2
+    assert sum(isinstance(remark, Fault) for remark in scene.remarks) == 2
+    with pytest.raises(kv.FormatError, match="not well-formed"):
+        parse_mjcf(text, "x.xml", strict=True)
 
 
 def test_what_a_part_includes_is_found_from_both_folders(tmp_path):

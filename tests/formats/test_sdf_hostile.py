@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 
+import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -11,15 +12,17 @@ from test_sdf_frames import WORLD, link, model_of, pose, sdf
 from test_sdf_joints import Z, joint, mimic
 
 import kineverse as kv
+from kineverse.formats.remarks import Fault
 from kineverse.formats.sdf import Scene, parse_sdf
+from kineverse.formats.sdf.operations import scene_operations
 
 LINKS = link("a") + link("b") + link("c")
 
 
-def outcome(data: str | bytes) -> Scene | str:
+def outcome(data: str | bytes, strict: bool = False) -> Scene | str:
     """Return the description or the message; anything but a FormatError fails the test."""
     try:
-        return parse_sdf(data, source="x.sdf")
+        return parse_sdf(data, source="x.sdf", strict=strict)
     except kv.FormatError as error:
         return str(error)
 
@@ -30,6 +33,12 @@ def test_cut_off_anywhere():
         assert isinstance(message, str), length
         assert message.startswith("x.sdf, line "), message
     assert isinstance(outcome(WORLD), Scene)
+
+
+CROSSED = "<limit><lower>1</lower><upper>0</upper></limit>"
+LIMITED = "<limit><{0}>x</{0}></limit>"
+SEEN = "<visual><geometry><sphere><radius>1</radius></sphere></geometry><material>{}</material></visual>"
+MESH = "<visual><geometry><mesh><uri>a.stl</uri><scale>{}</scale></mesh></geometry></visual>"
 
 
 @given(st.integers(0, len(WORLD) - 1), st.binary(max_size=8))
@@ -50,7 +59,7 @@ def test_bytes_replaced_anywhere(position, replacement):
         ('<sdf version="1.7">' + "<model name='a'>" * 300, "nested more than 200 deep"),
         ("<sdf/>", "does not say its version"),
         ('<sdf version="2.0"/>', "is not one that is read"),
-        ('<sdf version="1.3"/>', "is not one that is read"),
+        ('<sdf version="1.1"/>', "is not one that is read"),
         ('<sdf version="nan"/>', "does not say its version"),
         ('<sdf version="1.7"/>', "neither a model nor a world"),
         ("<robot name='r'/>", "This is a URDF"),
@@ -136,10 +145,96 @@ def test_bytes_replaced_anywhere(position, replacement):
     ],
 )
 def test_refusals(text, reason):
-    message = outcome(text)
+    message = outcome(text, strict=True)
     assert isinstance(message, str)
     assert message.startswith("x.sdf, line ")
     assert reason in message
+
+
+AXIS = "<axis>{}</axis>"
+
+
+@pytest.mark.parametrize(
+    ("text", "reason"),
+    [
+        (sdf(link("a", pose("0 0 0 0 0 0 0", 'rotation_format="quat_xyzw"'))), "length zero"),
+        (sdf(LINKS + joint("j", "revolute", "a", "b", AXIS.format(CROSSED))), "no position would be valid"),
+        (sdf(LINKS + joint("j", "universal", "a", "b", Z)), "has no <axis2>"),
+        (
+            sdf(link("a", "<visual><geometry><sphere><radius>-1</radius></sphere></geometry></visual>")),
+            "negative",
+        ),
+        (sdf(link("a", "<visual><geometry><box/></geometry></visual>")), "has no <size>"),
+        (sdf(link("a", "<inertial><mass>heavy</mass></inertial>")), "a finite number"),
+        (sdf(link("a", SEEN.format("<diffuse>red</diffuse>"))), "4 finite numbers"),
+        (sdf(link("a", SEEN.format("<diffuse>1 0 0 1 1</diffuse>"))), "4 finite numbers"),
+        (sdf(link("a", MESH.format("1 1 1 1"))), "3 finite numbers"),
+        (
+            sdf(LINKS + joint("j", "revolute", "a", "b", AXIS.format(LIMITED.format("effort")))),
+            "a finite number",
+        ),
+        (
+            sdf(LINKS + joint("j", "revolute", "a", "b", AXIS.format(LIMITED.format("velocity")))),
+            "a finite number",
+        ),
+        (
+            sdf(
+                LINKS
+                + joint("j", "revolute", "a", "b", AXIS.format("<dynamics><damping>x</damping></dynamics>"))
+            ),
+            "a finite number",
+        ),
+        (f"\n<?xml version='1.0'?>{sdf(link('a'))}", "<?xml ...?>"),
+        (f"<!-- a -- b -->{sdf(link('a'))}", "<!--"),
+    ],
+)
+def test_what_moves_nothing_is_read_with_a_remark(text, reason):
+    assert isinstance(outcome(text, strict=True), str)
+    scene = outcome(text)
+    assert isinstance(scene, Scene)
+    assert any(isinstance(remark, Fault) and reason in remark for remark in scene.remarks)
+    model = kv.Model()
+    with model.edit() as edit:
+        for operation in scene_operations(scene):
+            edit.apply(operation)
+    state = model.default_state()
+    assert all(np.isfinite(model.fk(name)(state)).all() for name in model.frames)
+
+
+def test_crossed_limits_leave_a_joint_free():
+    scene = parse_sdf(sdf(LINKS + joint("j", "revolute", "a", "b", AXIS.format(CROSSED))))
+    assert [(axis.lower, axis.upper) for axis in scene.joints[0].axes] == [(None, None)]
+
+
+@pytest.mark.parametrize("root", ["sdf", "gazebo"])
+@pytest.mark.parametrize("version", ["1.2", "1.3"])
+def test_old_versions_are_read_as_1_4(version, root):
+    inside = (
+        link("a", MESH.format("1 1 1").replace("uri>", "filename>" if version == "1.2" else "uri>")),
+        link("b", pose("1 0 0 0 0 1.5")),
+        joint("j", "revolute", "a", "b", "<axis><xyz>1 0 0</xyz></axis>"),
+    )
+    new = parse_sdf(sdf(*inside, version="1.4").replace("filename>", "uri>"))
+    old = parse_sdf(sdf(*inside, version=version).replace("<sdf", f"<{root}").replace("</sdf", f"</{root}"))
+    assert old.joints == new.joints
+    assert old.links[0].body == new.links[0].body
+    assert len(new.links[0].body.visuals) == 1
+
+
+def test_a_world_takes_a_model_without_links_apart(tmp_path):
+    inner = '<sdf version="1.10"><model name="m">{}<model name="n"><link name="l"/></model></model></sdf>'
+    world = (
+        '<sdf version="1.10"><world name="w"><include merge="true"><uri>m.sdf</uri>'
+        "<pose>1 0 0 0 0 0</pose></include></world></sdf>"
+    )
+    (tmp_path / "m.sdf").write_text(inner.format('<frame name="f"/>'))
+    scene = parse_sdf(world, "x.sdf", str(tmp_path))
+    assert [link.name for link in scene.links] == ["n/l"]
+    assert scene.links[0].pose.matrix[:3, 3].tolist() == [1, 0, 0]
+    (tmp_path / "m.sdf").write_text(inner.format('<link name="k"/>'))
+    scene = parse_sdf(world, "x.sdf", str(tmp_path))
+    assert [link.name for link in scene.links] == ["m/k", "m/n/l"]
+    assert "it is a model of its own" in scene.remarks[0]
 
 
 def test_what_the_specification_does_not_know_is_left_out_with_a_remark():

@@ -32,5 +32,5 @@ def test_messages_are_the_ones_that_are_given():
     ]
     for text, message in zip(mistakes, messages.splitlines(), strict=True):
         with pytest.raises(kv.FormatError) as info:
-            parse_urdf(text, source="lamp.urdf")
+            parse_urdf(text, source="lamp.urdf", strict=True)
         assert str(info.value) == message

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import codecs
+import re
 
 import pytest
 from hypothesis import given
@@ -11,6 +12,7 @@ from robots import SMALL, pair
 
 from kineverse.errors import FormatError
 from kineverse.formats import markup
+from kineverse.formats.remarks import Fault
 from kineverse.formats.urdf import Robot, parse_urdf, read_urdf
 
 
@@ -148,8 +150,6 @@ def test_text_that_cannot_be_decoded(data):
     ("text", "expected"),
     [
         ("", "r.urdf, line 1, column 1, before any element: not well-formed XML: no element found"),
-        ("\n\n<?xml version='1.0'?><robot/>", "r.urdf, line 3, column 1, <?xml ...?>: "),
-        ("<?xml verison='1.0'?><robot/>", 'The first line must read <?xml version="1.0"?>, or be left out.'),
         ("<robot name='r'>\n<link name='a'>\n</robot>", 'line 3, column 3, in <link name="a"> of line 2'),
         ("<robot name='r' name='s'/>", "duplicate attribute. Keep one"),
         ("<robot name='r'/><robot/>", "Remove what comes after"),
@@ -159,3 +159,44 @@ def test_text_that_cannot_be_decoded(data):
 )
 def test_text_that_is_not_xml(text, expected):
     assert expected in outcome(text)
+
+
+@pytest.mark.parametrize(
+    ("text", "line", "expected"),
+    [
+        ("\n\n<?xml version='1.0'?>{}", 3, "line 3, column 1, <?xml ...?>: "),
+        ("<!-- c -->\n<?xml version='1.0'?>\n{}", 2, "line 2, column 1, <?xml ...?>: "),
+        ("<?xml verison='1.0'?>{}", 1, 'The first line must read <?xml version="1.0"?>, or be left out.'),
+        ("<?xml version='1.0'?>\n<?xml version='1.0'?>{}", 2, "Nothing, not even an empty line, may come"),
+        ("<!-- a\n -- b -->{}", 1, "not well-formed"),
+        ("<!-- <!-- -->{}", 1, "not well-formed"),
+        ("\n<!--- a --->{}", 2, "not well-formed"),
+    ],
+)
+@pytest.mark.parametrize("kind", [str, bytes])
+def test_what_xml_forbids_and_others_read(text, line, expected, kind):
+    whole = text.format(SMALL.removeprefix('<?xml version="1.0"?>\n'))
+    data = whole if kind is str else whole.encode()
+    read = parse_urdf(data)
+    assert (len(read.links), len(read.joints)) == (2, 1)
+    assert read.joints[0].line == whole[: whole.index("<joint")].count("\n") + 1
+    (remark,) = read.remarks
+    assert isinstance(remark, Fault)
+    assert remark.startswith(f"line {line}, <")
+    with pytest.raises(FormatError, match=re.escape(expected)):
+        parse_urdf(data, strict=True)
+
+
+def test_the_encoding_of_a_declaration_that_comes_late_counts():
+    text = "\n<?xml version='1.0' encoding='latin-1'?><robot name='r'><link name='\xe9'/></robot>"
+    assert parse_urdf(text.encode("latin-1")).links[0].name == "\xe9"
+    assert parse_urdf(text).links[0].name == "\xe9"
+
+
+def test_what_looks_like_a_comment_in_a_literal_section_is_none():
+    assert len(parse_urdf(SMALL.replace("<gazebo/>", "<a><![CDATA[ <!-- -- --> ]]></a>")).links) == 2
+
+
+def test_many_comments_take_time_in_proportion():
+    text = SMALL.replace("<gazebo/>", "<!-- -- -->" * 20_000 + "<!-- a -->" * 20_000)
+    assert len(parse_urdf(text).remarks) == 20_000

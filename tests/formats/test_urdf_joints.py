@@ -10,6 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from robots import LIMIT, joint, pair, robot
 
+from kineverse.errors import FormatError
 from kineverse.formats.urdf import Dynamics, Limits, Mimic, Safety, parse_urdf
 
 
@@ -183,7 +184,7 @@ def test_gazebo_transmissions_sensors_and_strangers_are_ignored():
     assert description.remarks == ()
 
 
-def test_macros_that_were_not_expanded_are_remarked():
+def test_macros_that_were_not_expanded_are_remarked_on_where_there_is_more():
     text = robot(
         "<m:arm/>",
         joint("j", "l0", "l1"),
@@ -191,4 +192,28 @@ def test_macros_that_were_not_expanded_are_remarked():
         attributes='name="r" xmlns:m="http://www.ros.org/wiki/xacro"',
     )
     (remark,) = parse_urdf(text).remarks
-    assert remark.startswith("line 4, <m:arm> is ignored: it is xacro")
+    assert remark == (
+        "line 4, <m:arm>: is xacro that was not expanded. Run xacro first: "
+        "xacro robot.urdf.xacro > robot.urdf; it is passed over, and what it would add is missing."
+    )
+    with pytest.raises(FormatError, match="Run xacro first"):
+        parse_urdf(text, strict=True)
+
+
+@pytest.mark.parametrize(
+    "left", ["<xacro:arm/>", '<xacro:include filename="arm.xacro"/>', "<xacro:macro name='a'/>"]
+)
+def test_a_file_of_which_only_macros_are_left_is_refused(left):
+    with pytest.raises(
+        FormatError, match=r"<xacro:.*Run xacro first: xacro robot\.urdf\.xacro > robot\.urdf"
+    ):
+        parse_urdf(robot('<link name="world"/>', left))
+
+
+def test_macros_inside_of_links_and_joints_are_remarked_on():
+    text = robot(joint("j", "l0", "l1", "fixed", "<xacro:origin/>"), '<link name="${a}"/>', links=2)
+    remarks = parse_urdf(text.replace("</robot>", joint("k", "l0", "${a}", "fixed", "") + "</robot>")).remarks
+    assert [remark.partition(":")[0] for remark in remarks] == [
+        'line 4, <joint name="j">',
+        'line 5, <link name="${a}">',
+    ]

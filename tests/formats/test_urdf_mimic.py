@@ -65,8 +65,17 @@ def test_circles_are_refused_and_shown():
     def follow(name: str, i: int) -> str:
         return joint(name, "l0", f"l{i}", "continuous", f'<mimic joint="{"abc"[i % 3]}"/>')
 
+    text = robot(*(follow(name, i + 1) for i, name in enumerate("abc")), links=4)
     with pytest.raises(FormatError, match='it mimics itself, by way of "a" -> "b" -> "c"'):
-        parse_urdf(robot(*(follow(name, i + 1) for i, name in enumerate("abc")), links=4))
+        parse_urdf(text, strict=True)
+    read = parse_urdf(text)
+    assert {joint.name: joint.mimic and joint.mimic.joint for joint in read.joints} == {
+        "a": "c",
+        "b": "c",
+        "c": None,
+    }
+    assert 'by way of "a" -> "b" -> "c"' in read.remarks[0]
+    assert read.remarks[0].endswith("; it moves by itself.")
 
 
 def test_a_chain_that_leads_nowhere_names_the_joint_that_breaks_it():
@@ -77,10 +86,23 @@ def test_a_chain_that_leads_nowhere_names_the_joint_that_breaks_it():
         links=4,
     )
     with pytest.raises(FormatError, match=r"<mimic> of <joint name=\"a\">: .*Did you mean 'finger_joint'\?"):
-        parse_urdf(text)
+        parse_urdf(text, strict=True)
+    mimics = {joint.name: joint.mimic for joint in parse_urdf(text).joints}
+    assert mimics == {"a": None, "b": Mimic("a"), "finger_joint": None}
 
 
 def test_factors_that_overflow_are_refused():
     text = followers([(1e200, 0.0), (1e200, 0.0)], range(3))
     with pytest.raises(FormatError, match="overflow"):
-        parse_urdf(text)
+        parse_urdf(text, strict=True)
+    read = parse_urdf(text)
+    assert [joint.mimic for joint in read.joints] == [None, None, None]
+    assert all("overflow" in remark for remark in read.remarks)
+
+
+def test_many_circles_take_time_in_proportion():
+    text = robot(
+        *(joint(f"j{i}", "l0", f"l{i + 1}", "continuous", f'<mimic joint="j{i}"/>') for i in range(3000)),
+        links=3001,
+    )
+    assert len(parse_urdf(text).remarks) == 3000

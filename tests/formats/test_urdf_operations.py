@@ -7,6 +7,7 @@ import pytest
 from robots import LIMIT, SMALL, chain, joint, pair, robot
 
 import kineverse as kv
+from kineverse.formats.remarks import listening
 from kineverse.formats.urdf import parse_urdf
 from kineverse.formats.urdf.operations import robot_operations
 
@@ -73,7 +74,10 @@ def test_a_root_can_be_attached_elsewhere():
 def test_a_link_called_world_that_is_not_the_root_needs_a_prefix():
     text = robot('<link name="world"/>', joint("j", "l0", "world"), links=1)
     with pytest.raises(kv.FormatError, match=r'line 3, <link name="world">: .* Give a prefix'):
-        model_of(text)
+        list(robot_operations(parse_urdf(text), strict=True))
+    with listening() as remarks:
+        assert set(model_of(text).frames) == {"l0", "world_link"}
+    assert remarks[0].endswith('Give a prefix; it is called "world_link".')
     assert "p/world" in model_of(text, "p").frames
 
 
@@ -85,26 +89,52 @@ def test_empty_parts_of_names_are_left_out():
 
 
 @pytest.mark.parametrize(
-    ("links", "message"),
+    ("links", "message", "frames"),
     [
-        (["/"], 'line 2, <link name="/">: the name has nothing but slashes'),
-        (["a", "/a"], 'line 3, <link name="/a">: only slashes tell it from the one on line 2'),
+        (["/"], 'line 2, <link name="/">: the name has nothing but slashes', {"link"}),
+        (
+            ["a", "/a"],
+            'line 3, <link name="/a">: only slashes tell it from the one on line 2',
+            {"a", "a_link"},
+        ),
+        (
+            ["a", "/a", "a_link", "a/"],
+            'line 3, <link name="/a">: only slashes tell it from the one on line 2',
+            {"a", "a_link", "a_link_2", "a_link_3"},
+        ),
         (
             ["a&#9;b"],
             r'line 2, <link name="a\\tb">: the name has nothing but slashes, or a control character',
+            {"a_b"},
         ),
     ],
 )
-def test_names_that_cannot_be_names_are_refused(links, message):
+def test_names_that_cannot_be_names_are_replaced(links, message, frames):
     joints = [joint(f"j{i}", links[0], name) for i, name in enumerate(links[1:])]
+    text = robot(*(f'<link name="{name}"/>' for name in links), *joints)
     with pytest.raises(kv.FormatError, match=message):
-        model_of(robot(*(f'<link name="{name}"/>' for name in links), *joints))
+        list(robot_operations(parse_urdf(text), strict=True))
+    with listening() as remarks:
+        assert set(model_of(text).frames) == frames
+    assert len(remarks) == len(frames) - (len(links) > 1) - ("a_link" in links)
+    assert all("; it is called " in remark for remark in remarks)
 
 
-def test_coordinates_that_would_share_a_name_are_refused():
+def test_coordinates_that_would_share_a_name_get_another():
     text = robot(joint("a", "l0", "l1", "planar", ""), joint("a/x", "l1", "l2"), links=3)
     with pytest.raises(kv.FormatError, match=r'line 5, <joint name="a">: its coordinate "a/x" has the name'):
-        model_of(text)
+        list(robot_operations(parse_urdf(text), strict=True))
+    assert [str(s) for s in model_of(text).degrees_of_freedom] == [
+        "a/x",
+        "a_joint/angle",
+        "a_joint/x",
+        "a_joint/y",
+    ]
+
+
+def test_a_ball_joint_in_a_urdf_is_that_of_mujoco():
+    model = model_of(pair("", "spherical"))
+    assert [str(s) for s in model.degrees_of_freedom] == ["j/qw", "j/qx", "j/qy", "j/qz"]
 
 
 @pytest.mark.parametrize(

@@ -1,12 +1,16 @@
-"""What is wrong is refused with source, line, element and reason."""
+"""What is wrong is refused with source, line, element and reason, or remarked on where others read past it."""
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
 from robots import LIMIT, joint, pair, robot
 
+import kineverse as kv
 from kineverse.errors import FormatError
+from kineverse.formats.remarks import Fault
 from kineverse.formats.urdf import parse_urdf, read_urdf
+from kineverse.formats.urdf.operations import robot_operations
 
 J = 'r.urdf, line 4, <joint name="j">: '
 MIMIC = 'r.urdf, line 4, <mimic> of <joint name="j">: '
@@ -14,7 +18,7 @@ MIMIC = 'r.urdf, line 4, <mimic> of <joint name="j">: '
 
 def refusal(text: str | bytes) -> str:
     with pytest.raises(FormatError) as info:
-        parse_urdf(text, source="r.urdf")
+        parse_urdf(text, source="r.urdf", strict=True)
     return str(info.value)
 
 
@@ -23,15 +27,21 @@ CASES = {
         "<sdf/>",
         "r.urdf, line 1, <sdf>: is not <robot>, the root element of a URDF. This is an SDF file.",
     ),
-    "no name": ("<robot/>", "r.urdf, line 1, <robot>: has no name"),
+    "no name": (robot(links=1, attributes=""), "r.urdf, line 1, <robot>: has no name"),
     "no links": (robot(), 'r.urdf, line 1, <robot name="r">: has no <link>'),
-    "only xacro": (robot("<xacro:arm/>"), "Expand xacro first"),
+    "only xacro": (robot("<xacro:arm/>"), "Run xacro first: xacro robot.urdf.xacro > robot.urdf"),
     "version 2": (
         robot(links=1, attributes='name="r" version="2.0"'),
         'version="2.0" is not one that is read',
     ),
     "version 1.3": (robot(links=1, attributes='name="r" version="1.3"'), "1.0, 1.1, 1.2 are"),
     "version 1": (robot(links=1, attributes='name="r" version="1"'), 'version="1" is not one that is read'),
+    "no version": (robot(links=1, attributes='name="r" version=""'), 'version="" is not one that is read'),
+    "capital robot": (
+        robot(links=1).replace("robot", "Robot"),
+        "is not <robot>, the root element of a URDF",
+    ),
+    "spherical": (pair(kind="spherical"), J + 'type="spherical" is no joint type of URDF'),
     "1.2 without lower": (
         pair('<limit upper="1"/>', attributes='name="r" version="1.2"'),
         J + "<limit> has no lower",
@@ -137,6 +147,7 @@ CASES = {
         robot(
             '<material name="m"><color rgba="1 0 0 1"/></material>',
             '<material name="m"><texture filename="a"/></material>',
+            '<link name="l"/>',
         ),
         'r.urdf, line 3, <material name="m">: is texture "a" here and rgba 1 0 0 1 before',
     ),
@@ -149,6 +160,99 @@ def test_refusals(case):
     message = refusal(text)
     assert message.startswith("r.urdf, line ")
     assert expected in message
+
+
+REFUSED = frozenset(
+    (
+        *("not a robot", "no links", "only xacro", "two links", "two joints"),
+        *("nameless joint", "no type", "unknown type", "no parent", "empty child", "mimics nothing"),
+        *("two numbers", "nan", "commas", "xacro number", "long number"),
+    )
+)
+"""What nobody reads, or nothing could be made of."""
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_what_others_read_is_read_with_a_remark(case):
+    text, expected = CASES[case]
+    if case in REFUSED:
+        with pytest.raises(FormatError):
+            parse_urdf(text, source="r.urdf")
+        return
+    read = parse_urdf(text, source="r.urdf")
+    (fault,) = (remark for remark in read.remarks if isinstance(remark, Fault))
+    start, _, end = fault.rpartition("; ")
+    assert expected.removeprefix("r.urdf, ").removesuffix(".").partition(";")[0] in start
+    assert end.endswith(".")
+    model = kv.Model()
+    with model.edit() as edit:
+        for operation in robot_operations(read):
+            edit.apply(operation)
+    state = model.default_state()
+    assert all(np.isfinite(model.fk(name)(state)).all() for name in model.frames)
+
+
+def test_magnitudes_that_are_none_bound_nothing():
+    (joint,) = parse_urdf(pair('<limit lower="-1" upper="2"/>')).joints
+    assert (joint.limits.lower, joint.limits.upper) == (-1.0, 2.0)
+    assert (joint.limits.velocity, joint.limits.effort) == (None, None)
+
+
+@pytest.mark.parametrize(
+    "limit",
+    [
+        "",
+        '<limit lower="2" upper="1"/>',
+        '<limit lower="nan" upper="1"/>',
+        '<limit lower="-inf" upper="inf"/>',
+    ],
+)
+def test_ranges_that_are_none_leave_a_joint_free(limit):
+    (joint,) = parse_urdf(pair(limit)).joints
+    assert (joint.limits.lower, joint.limits.upper) == (None, None)
+
+
+@pytest.mark.parametrize(
+    ("inside", "scale"),
+    [("0.001 0.001 0.002 1", (0.001, 0.001, 0.002)), ("2", (2.0, 2.0, 2.0)), ("a b c", (1.0, 1.0, 1.0))],
+)
+def test_scales_of_meshes(inside, scale):
+    text = f'<link name="l"><visual><geometry><mesh filename="a.stl" scale="{inside}"/></geometry></visual></link>'
+    (shape,) = parse_urdf(robot(text)).links[0].body.visuals
+    assert shape.geometry.scale == scale
+
+
+def test_colours_of_five_numbers():
+    look = '<material name="m"><color rgba="1 0.5 0 1 9"/></material>'
+    text = f'<link name="l"><visual>{look}<geometry><sphere radius="1"/></geometry></visual></link>'
+    (shape,) = parse_urdf(robot(text)).links[0].body.visuals
+    assert shape.color == (1.0, 0.5, 0.0, 1.0)
+
+
+def test_a_bad_inertia_is_left_out_and_the_rest_of_the_body_stays():
+    text = (
+        '<link name="l"><inertial><mass value="x"/></inertial>'
+        '<visual><geometry><sphere radius="1"/></geometry></visual></link>'
+    )
+    body = parse_urdf(robot(text)).links[0].body
+    assert body.inertia is None
+    assert len(body.visuals) == 1
+
+
+def test_a_joint_along_nothing_is_fixed_and_a_plane_without_normal_that_of_x_and_y():
+    (joint,) = parse_urdf(pair('<axis xyz="0 0 0"/>' + LIMIT)).joints
+    assert joint.kind == "fixed"
+    (joint,) = parse_urdf(pair('<axis xyz="0 0 0"/>', "planar")).joints
+    assert joint.axis == (0.0, 0.0, 1.0)
+
+
+def test_of_rpy_and_a_quaternion_rpy_counts_and_a_quaternion_of_zeros_turns_nothing():
+    attributes = 'name="r" version="1.1"'
+    both = pair('<origin rpy="0 0 1" quat_xyzw="0 0 0 1"/>', "fixed", attributes)
+    (joint,) = parse_urdf(both).joints
+    assert joint.origin == parse_urdf(pair('<origin rpy="0 0 1"/>', "fixed", attributes)).joints[0].origin
+    (joint,) = parse_urdf(pair('<origin xyz="1 2 3" quat_xyzw="0 0 0 0"/>', "fixed", attributes)).joints
+    np.testing.assert_array_equal(joint.origin.matrix[:3, :3], np.eye(3))
 
 
 @pytest.mark.parametrize("kind", ["fixed", "planar", "floating"])
@@ -180,4 +284,4 @@ def test_files_are_named_in_messages(tmp_path):
     path = tmp_path / "robot.urdf"
     path.write_text(pair(""))
     with pytest.raises(FormatError, match=r'^robot.urdf, line 4, <joint name="j">: '):
-        read_urdf(path)
+        read_urdf(path, strict=True)

@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import sys
 
+import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from robots import chain, joint, robot
 
+import kineverse as kv
 from kineverse.errors import FormatError
 from kineverse.formats.urdf import parse_urdf
+from kineverse.formats.urdf.operations import robot_operations
 
 
 @st.composite
@@ -44,13 +47,13 @@ def test_joints_come_from_the_root_outwards_in_the_order_of_the_file(tree):
 
 
 @given(trees(), st.data())
-def test_one_more_joint_is_one_too_many(tree, data):
+def test_one_more_joint_is_one_too_many_for_a_strict_reader(tree, data):
     parents, order = tree
     links = st.integers(0, len(parents))
     extra = joint("extra", f"l{data.draw(links)}", f"l{data.draw(links)}", "fixed", "")
     text = tree_text(parents, order).replace("</robot>", extra + "</robot>")
     with pytest.raises(FormatError, match="URDF describes trees only"):
-        parse_urdf(text, source="r.urdf")
+        parse_urdf(text, source="r.urdf", strict=True)
 
 
 @given(trees().filter(lambda tree: tree[0]), st.data())
@@ -58,7 +61,10 @@ def test_one_joint_less_leaves_two_roots(tree, data):
     parents, order = tree
     gone = data.draw(st.sampled_from(order))
     with pytest.raises(FormatError, match=f"where one root is expected: .*l{gone + 1}"):
-        parse_urdf(tree_text(parents, [i for i in order if i != gone]))
+        parse_urdf(tree_text(parents, [i for i in order if i != gone]), strict=True)
+    read = parse_urdf(tree_text(parents, [i for i in order if i != gone]))
+    assert (read.root, *read.more_roots) == ("l0", f"l{gone + 1}")
+    assert len(read.joints) == len(parents) - 1
 
 
 def test_links_that_do_not_exist():
@@ -72,10 +78,15 @@ def test_links_that_do_not_exist():
 
 def test_a_second_parent_names_the_first():
     text = robot(joint("a", "l0", "l2"), joint("b", "l1", "l2"), links=3)
-    with pytest.raises(
-        FormatError, match=r'<joint name="b">: its child link "l2" has a parent already, by the joint "a" on'
-    ):
-        parse_urdf(text)
+    message = '<joint name="b">: its child link "l2" has a parent already, by the joint "a" on'
+    with pytest.raises(FormatError, match=message):
+        parse_urdf(text, strict=True)
+    # As urdfdom keeps the one with the last name.
+    for first, second in (("a", "b"), ("b", "a")):
+        text = robot(joint(first, "l0", "l2"), joint(second, "l0", "l2"), joint("c", "l0", "l1"), links=3)
+        read = parse_urdf(text)
+        assert {j.name for j in read.joints} == {"b", "c"}
+        assert read.remarks[0].endswith('; "a" is left out.')
 
 
 def test_a_circle_is_shown():
@@ -89,7 +100,26 @@ def test_a_circle_is_shown():
 def test_a_circle_beside_a_tree_is_shown():
     text = robot(joint("a", "l1", "l2"), joint("b", "l2", "l1"), joint("c", "l2", "l3"), links=4)
     with pytest.raises(FormatError, match='<joint name="a">: the joints "a" -> "b" lead in a circle'):
-        parse_urdf(text)
+        parse_urdf(text, strict=True)
+    read = parse_urdf(text)
+    assert ([link.name for link in read.links], read.joints) == (["l0"], ())
+    assert read.remarks[0].endswith("3 links that no root holds are left out.")
+
+
+def test_a_joint_that_mimics_one_of_a_circle_moves_by_itself():
+    circle = joint("a", "l1", "l1") + joint("b", "l0", "l2", "continuous", '<mimic joint="a"/>')
+    (only,) = parse_urdf(robot(circle, links=3)).joints
+    assert (only.name, only.mimic) == ("b", None)
+
+
+def test_links_and_joints_without_names_get_some():
+    text = robot('<link name=""/>', joint("j", "l0", "l1", "fixed").replace('name="j" ', ""), links=2)
+    model = kv.Model()
+    with model.edit() as edit:
+        for operation in robot_operations(parse_urdf(text)):
+            edit.apply(operation)
+    assert set(model.frames) == {"l0", "l1", "link"}
+    assert set(model.articulations) == {"l0_l1"}
 
 
 def test_a_link_that_is_its_own_parent():
@@ -101,7 +131,27 @@ def test_joints_of_other_dialects_are_named_when_there_is_no_tree():
     with pytest.raises(
         FormatError, match=r'Ignored, since URDF does not know it: <drake:joint name="j"> \(line 4\)'
     ):
-        parse_urdf(robot('<drake:joint name="j" type="ball"/>', links=2))
+        parse_urdf(robot('<drake:joint name="j" type="ball"/>', links=2), strict=True)
+
+
+def test_further_roots_stand_where_the_first_does():
+    text = robot(joint("j", "l0", "l1"), joint("k", "l2", "l3"), links=4)
+    model = kv.Model()
+    with model.edit() as edit:
+        for operation in robot_operations(parse_urdf(text), "p"):
+            edit.apply(operation)
+    state = {"p/j": 0.0, "p/k": 0.5}
+    np.testing.assert_array_equal(model.fk("p/l2")(state), np.eye(4))
+    assert model.fk("p/l3", "p/l2").symbols == (kv.position("p/k"),)
+
+
+def test_of_joints_with_one_name_the_fixed_one_gets_another():
+    for kinds in (("fixed", "revolute"), ("revolute", "fixed")):
+        text = robot(*(joint("j", "l0", f"l{i + 1}", kind) for i, kind in enumerate(kinds)), links=3)
+        read = parse_urdf(text)
+        assert {j.name: j.kind for j in read.joints} == {"j": "revolute", "j_2": "fixed"}
+        with pytest.raises(FormatError, match="names are unique"):
+            parse_urdf(text, strict=True)
 
 
 def work(text: str) -> int:

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 
 from kineverse.cli.paint import bounded
 from kineverse.cli.progress import doing
+from kineverse.cli.reading import add_reading_options, load
 from kineverse.errors import FormatError, NameTakenError, ValueRejectedError
 
 if TYPE_CHECKING:
@@ -50,6 +51,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("source", metavar="IN", help="name of a shipped model, or path of a file")
     parser.add_argument("target", metavar="OUT", help="path of the file to write; - for standard output")
     parser.add_argument("--prefix", metavar="NAME", help="put in front of all names, with a slash")
+    add_reading_options(parser)
     parser.add_argument("--force", action="store_true", help="replace OUT if it is there")
     parser.add_argument(
         "--strict", action="store_true", help="refuse constraints that OUT cannot say, and write nothing"
@@ -90,12 +92,11 @@ def run(arguments: argparse.Namespace) -> int:
                 f"{option} and - exclude each other: the output is a document, which says all."
             )
 
-    import kineverse as kv
     from kineverse.formats.remarks import listening
     from kineverse.formats.saving import Saved
 
     with listening() as left_out, doing(f"reading {arguments.source}"):
-        model = kv.load(arguments.source, arguments.prefix)
+        model = load(arguments, arguments.source, arguments.prefix)
     with doing(f"writing {arguments.target}"):
         if to_stdout:
             saved, size = Saved(Path(STDOUT)), _print_document(model)

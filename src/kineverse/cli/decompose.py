@@ -6,7 +6,7 @@ import argparse
 import json
 import os
 import time
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 from kineverse.cli.assignments import parse_length
 from kineverse.cli.paint import paint
 from kineverse.cli.progress import doing, progress
+from kineverse.cli.reading import add_reading_options, load
 from kineverse.cli.table import figure, table
 from kineverse.errors import KineverseError, UnknownNameError, ValueRejectedError, suggest
 from kineverse.model.body import Mesh
@@ -66,6 +67,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "names", metavar="MODEL_OR_MESH", nargs="*", help="name or path of a model, or a mesh file"
     )
+    add_reading_options(parser)
     parser.add_argument("--links", metavar="LINK", nargs="+", help="only the meshes of these links")
     parser.add_argument("--max-hulls", metavar="N", type=int, help="at most so many hulls of each mesh (32)")
     parser.add_argument(
@@ -93,7 +95,7 @@ def run(arguments: argparse.Namespace) -> int:
     from kineverse.geometry.decomposition import decompose_all
 
     settings, limits, jobs = _settings(arguments)
-    tasks, unread = _tasks(arguments.names, arguments.links)
+    tasks, unread = _tasks(arguments)
     order = {task.mesh: k for k, task in enumerate(tasks)}
     outcomes = decompose_all([task.mesh for task in tasks], settings, limits, arguments.force, jobs)
     found = sorted(
@@ -132,18 +134,19 @@ def _positive(value: float, option: str) -> float:
     return value
 
 
-def _tasks(names: Iterable[str], links: Sequence[str] | None) -> tuple[list[Task], dict[str, str]]:
+def _tasks(arguments: argparse.Namespace) -> tuple[list[Task], dict[str, str]]:
     """Return each mesh once, and why models could not be read, by their names."""
     tasks: dict[Mesh, Task] = {}
     unread: dict[str, str] = {}
     with_meshes: set[str] = set()
-    for name in names:
+    links: Sequence[str] | None = arguments.links
+    for name in arguments.names:
         if name.lower().endswith(ENDINGS):
             mesh = Mesh(os.path.abspath(name))
             tasks.setdefault(mesh, Task(mesh))
             continue
         try:
-            meshes = _meshes_of(name)
+            meshes = _meshes_of(name, arguments)
         except (KineverseError, OSError) as error:
             unread[name] = " ".join(str(error).split())
             continue
@@ -162,11 +165,10 @@ def _tasks(names: Iterable[str], links: Sequence[str] | None) -> tuple[list[Task
     return list(tasks.values()), unread
 
 
-def _meshes_of(name: str) -> list[tuple[str, Mesh]]:
-    import kineverse as kv
+def _meshes_of(name: str, arguments: argparse.Namespace) -> list[tuple[str, Mesh]]:
 
     with doing(f"reading {name}"):
-        model = kv.load(name)
+        model = load(arguments, name)
     return [
         (link, shape.geometry)
         for link, body in model.bodies.items()

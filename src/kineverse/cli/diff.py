@@ -8,6 +8,7 @@ import math
 
 from kineverse.cli.paint import paint
 from kineverse.cli.progress import doing
+from kineverse.cli.reading import add_reading_options, load
 from kineverse.errors import ValueRejectedError
 
 HELP = """print what two models differ in: operations, frames, constraints, bodies
@@ -42,6 +43,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
             name.lower(), metavar=name, help=f"{what}: name of a shipped one, or path of a file"
         )
     parser.add_argument("--prefix", metavar="NAME", help="put in front of all names of both, with a slash")
+    add_reading_options(parser)
     parser.add_argument(
         "--tolerance",
         metavar="X",
@@ -65,7 +67,6 @@ def run(arguments: argparse.Namespace) -> int:
     if not (math.isfinite(arguments.tolerance) and arguments.tolerance >= 0.0):
         raise ValueRejectedError(f"--tolerance is a number from 0 on, not {arguments.tolerance}.")
 
-    import kineverse as kv
     from kineverse.cli.behaviour import Behaviour
     from kineverse.cli.behaviour_report import BehaviourReport
     from kineverse.cli.comparison import Comparison
@@ -75,7 +76,7 @@ def run(arguments: argparse.Namespace) -> int:
     models = []
     for source in (arguments.a, arguments.b):
         with doing(f"reading {source}"):
-            models.append(kv.load(source, arguments.prefix))
+            models.append(load(arguments, source, arguments.prefix))
     before, after = models
     report: BehaviourReport | ComparisonReport
     with doing("comparing"):

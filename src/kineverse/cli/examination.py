@@ -14,7 +14,7 @@ from kineverse.errors import KineverseError
 from kineverse.formats.document import Recorded
 from kineverse.formats.files import read_file
 from kineverse.formats.markup import root_tag
-from kineverse.formats.remarks import listening
+from kineverse.formats.remarks import Fault, listening
 from kineverse.formats.sources import Source, locate_model
 
 FORMATS = {".kv.json": "document", ".urdf": "URDF", ".sdf": "SDF", ".world": "SDF", ".mjcf": "MJCF"}
@@ -39,6 +39,8 @@ class Examination:
         What a document says about itself: its ``version``, and ``sha256``, the hash of its content.
     remarks
         What its reader left out, or took another way.
+    faults
+        What a strict reader refuses.
     problems
         What is wrong with the model.
     strict
@@ -51,13 +53,14 @@ class Examination:
     error: KineverseError | OSError | None = None
     facts: Mapping[str, int | str] = field(default_factory=dict)
     remarks: Sequence[str] = ()
+    faults: Sequence[str] = ()
     problems: Sequence[Finding] = ()
     strict: bool = False
 
     @property
     def status(self) -> int:
         """The exit status for this file."""
-        if self.model is None:
+        if self.model is None or self.faults:
             return UNREADABLE
         return BAD if self.problems or (self.strict and self.remarks) else GOOD
 
@@ -81,7 +84,9 @@ class Examination:
         return " ".join(str(self.error).split())
 
 
-def examine(name: str, meshes: bool = True, strict: bool = False, touch: bool = False) -> Examination:
+def examine(
+    name: str, meshes: bool = True, strict: bool = False, touch: bool = False, root: str | None = None
+) -> Examination:
     """Return what is found in a file; nothing is raised for what is wrong with it.
 
     Parameters
@@ -94,18 +99,24 @@ def examine(name: str, meshes: bool = True, strict: bool = False, touch: bool = 
         Whether remarks are problems, too.
     touch
         Whether to look for bodies that penetrate each other at the default state.
+    root
+        The folder below which the file may open others; by default its package or repository.
     """
     language = ""
     with listening() as remarks:
         try:
             source = locate_model(name)
             language = format_of(source)
-            model = kv.load(name)
+            model = kv.load(name, root=root)
             facts = _facts(source)
             problems = (*findings(model, meshes), *(penetrations(model) if touch else ()))
         except (KineverseError, OSError) as error:
             return Examination(name, language, error=error, remarks=remarks, strict=strict)
-    return Examination(name, language, model, None, facts, [*remarks, *_frozen(model)], problems, strict)
+    faults = [remark for remark in remarks if isinstance(remark, Fault)]
+    noted = [remark for remark in remarks if not isinstance(remark, Fault)]
+    return Examination(
+        name, language, model, None, facts, [*noted, *_frozen(model)], faults, problems, strict
+    )
 
 
 def _frozen(model: kv.Model) -> list[str]:

@@ -10,7 +10,7 @@ import numpy as np
 
 from kineverse.cli.table import figure
 from kineverse.errors import KineverseError
-from kineverse.formats.packages import locate
+from kineverse.formats.packages import locate_mesh
 from kineverse.loops.record import loops_of
 from kineverse.model.body import Inertia, Mesh
 from kineverse.model.samples import Samples
@@ -150,6 +150,11 @@ def impossible(inertia: Inertia) -> Iterator[str]:
         yield f"{shown} without any mass"
 
 
+def _reason(error: Exception) -> str:
+    first = (str(error).splitlines() or [type(error).__name__])[0]
+    return first.removesuffix(" Looked in:").removesuffix(" Looked for:").removesuffix(" It is at:")
+
+
 def _meshes(model: ModelView) -> Iterator[Finding]:
     missing: dict[Mesh, str] = {}
     found: set[Mesh] = set()
@@ -158,10 +163,10 @@ def _meshes(model: ModelView) -> Iterator[Finding]:
         for mesh in dict.fromkeys(g for g in shapes if isinstance(g, Mesh)):
             if mesh not in found and mesh not in missing:
                 try:
-                    locate(mesh.uri, mesh.folder)
+                    locate_mesh(mesh)
                     found.add(mesh)
                 except (KineverseError, OSError) as error:
                     # Where it was looked for is long, and for all meshes the same.
-                    missing[mesh] = " ".join(str(error).partition(" Looked ")[0].split())
+                    missing[mesh] = _reason(error)
             if mesh in missing:
                 yield Finding("mesh", name, missing[mesh])

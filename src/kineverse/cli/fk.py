@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 from kineverse.cli.assignments import add_set_option, parse_assignments
 from kineverse.cli.beyond_limits import note, remarks
+from kineverse.cli.reading import add_reading_options, load
 from kineverse.cli.table import figure
 from kineverse.errors import ValueRejectedError
 
@@ -30,6 +31,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("frame", metavar="FRAME", help="name of a frame, such as kitchen/fridge_door")
     parser.add_argument("--relative-to", metavar="FRAME", default="world", help="in whose axes (world)")
     add_set_option(parser)
+    add_reading_options(parser)
     parser.add_argument("--json", action="store_true", help="one JSON object on standard output")
 
 
@@ -44,7 +46,7 @@ def run(arguments: argparse.Namespace) -> int:
     from kineverse.view.poses import complete
     from kineverse.view.rotation import quaternions, roll_pitch_yaw
 
-    model = kv.load(arguments.model)
+    model = load(arguments, arguments.model)
     expression = model.fk(arguments.frame, arguments.relative_to)
     values = complete(model, assigned)
     pose = np.asarray(expression(kv.State(values)), dtype=float)

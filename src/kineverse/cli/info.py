@@ -8,6 +8,8 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 from kineverse.cli.listing import asked_for, print_articulations
+from kineverse.cli.paint import bounded
+from kineverse.cli.reading import add_reading_options, load
 from kineverse.cli.table import figure, table
 
 if TYPE_CHECKING:
@@ -23,12 +25,17 @@ examples:
   kineverse info articulations        the list of those in the gallery"""
 
 
+SHOWN = 10
+"""How many remarks of the reader are printed."""
+
+
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     parser.add_argument("model", metavar="MODEL", help="name of a shipped model, or path of a file")
     parser.add_argument("--frames", action="store_true", help="also print the tree of frames")
     parser.add_argument("--constraints", action="store_true", help="also print all constraints")
     parser.add_argument("--json", action="store_true", help="everything, as one JSON object")
+    add_reading_options(parser)
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -36,15 +43,19 @@ def run(arguments: argparse.Namespace) -> int:
     if asked_for(arguments.model):
         return print_articulations(arguments.json)
 
-    import kineverse as kv
     from kineverse.cli.summary import summarise
+    from kineverse.formats.remarks import listening
 
-    model = kv.load(arguments.model)
+    with listening() as remarks:
+        model = load(arguments, arguments.model)
     summary = summarise(arguments.model, model)
     if arguments.json:
-        print(json.dumps(as_json(summary), allow_nan=False))
+        print(json.dumps({**as_json(summary), "remarks": remarks}, allow_nan=False))
         return 0
-    print("\n\n".join(sections(summary, arguments.frames, arguments.constraints)))
+    found = sections(summary, arguments.frames, arguments.constraints)
+    if remarks:
+        found.append("\n".join(["remarks", *bounded([f"  {text}" for text in remarks], SHOWN, "  ")]))
+    print("\n\n".join(found))
     return 0
 
 

@@ -8,21 +8,24 @@ from typing import TYPE_CHECKING, Any
 
 from kineverse.cli.paint import bounded, paint
 from kineverse.cli.progress import progress
+from kineverse.cli.reading import add_root_option
 from kineverse.cli.table import table
+from kineverse.cli.wording import number
 
 if TYPE_CHECKING:
     from kineverse.cli.examination import Examination
 
 HELP = """read files strictly, and say what is wrong with them
 
-A file that can be read is looked at for limits that are broken at the default state, poses that are not
-finite and loops that do not close there or within the limits, bodies with an impossible inertia, and meshes
-whose files are missing. With --contacts bodies that are in each other at the default state are problems as
-well, unless they are joined; many a good model has some. Remarks are what the reader left out, or took in a
-way that may not have been meant.
+Mistakes that kv.load reads past with a remark are listed, all of them, and the file counts as one that cannot
+be read. A file that can be read is looked at for limits that are broken at the default state, poses that are
+not finite and loops that do not close there or within the limits, bodies with an impossible inertia, and
+meshes whose files are missing. With --contacts bodies that are in each other at the default state are
+problems as well, unless they are joined; many a good model has some. Remarks are what the reader left out, or
+took in a way that may not have been meant.
 
-The exit status is 0 if nothing is wrong, 1 if something is, and 2 if a file cannot be read; of several files,
-the worst.
+The exit status is 0 if nothing is wrong, 1 if something is, and 2 if a file cannot be read, or not strictly;
+of several files, the worst.
 
 examples:
   kineverse validate robot.urdf
@@ -52,6 +55,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--contacts", action="store_true", help="bodies that penetrate each other are problems (needs coal)"
     )
     parser.add_argument("--strict", action="store_true", help="remarks count as problems")
+    add_root_option(parser)
     parser.add_argument(
         "--all", action="store_true", help=f"print all remarks and problems, not {SHOWN} of a kind"
     )
@@ -67,7 +71,7 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.contacts:
         coal_engine()
     meshes, strict, touch = not arguments.no_meshes, arguments.strict, arguments.contacts
-    found = [examine(file, meshes, strict, touch) for file in files]
+    found = [examine(file, meshes, strict, touch, arguments.root) for file in files]
     status = max(examination.status for examination in found)
     most = None if arguments.all else SHOWN if len(found) == 1 else SHOWN_OF_SEVERAL
     if arguments.json:
@@ -94,7 +98,7 @@ def report(found: Examination, most: int | None) -> list[str]:
 
 def _by_kind(found: Examination) -> dict[str, list[str]]:
     """Return the problems under their kinds, and the remarks at the end."""
-    kinds: dict[str, list[str]] = {}
+    kinds: dict[str, list[str]] = {"mistakes": list(found.faults)} if found.faults else {}
     for problem in found.problems:
         kinds.setdefault(TITLES[problem.kind], []).append(f"{problem.where}: {problem.text}")
     return {**kinds, "remarks": list(found.remarks)} if found.remarks else kinds
@@ -103,6 +107,8 @@ def _by_kind(found: Examination) -> dict[str, list[str]]:
 def _verdict(found: Examination) -> str:
     problems, remarks = len(found.problems), len(found.remarks)
     text = f"{problems or 'no'} problem{'' if problems == 1 else 's'}"
+    if found.faults:
+        text = f"not read strictly: {number(len(found.faults), 'mistake')}, {text}"
     noted = f", {remarks} remark{'' if remarks == 1 else 's'}" if remarks else ""
     return f"{paint(text, '!' if found.status else '+')}{noted}"
 
@@ -118,7 +124,7 @@ def _table(found: list[Examination]) -> str:
             str(len(e.model.degrees_of_freedom)),
             str(len(e.model.constraints)),
             str(len(e.remarks)),
-            str(len(e.problems)),
+            str(len(e.problems) + len(e.faults)),
         )
         for e in found
     ]
@@ -141,7 +147,8 @@ def as_json(found: Examination) -> dict[str, Any]:
         "format": found.format or None,
         **found.facts,
         "status": found.status,
-        "error": found.reason if found.error is not None else None,
+        "error": found.reason if found.error is not None else found.faults[0] if found.faults else None,
+        **({"mistakes": list(found.faults)} if found.faults else {}),
         "counts": counts,
         "problems": [{"kind": p.kind, "where": p.where, "text": p.text} for p in found.problems],
         "remarks": list(found.remarks),

@@ -13,6 +13,7 @@ from kineverse.cli.assignments import add_set_option, parse_assignments, parse_l
 from kineverse.cli.beyond_limits import note, remarks
 from kineverse.cli.listing import asked_for, print_articulations, print_models
 from kineverse.cli.progress import progress
+from kineverse.cli.reading import add_reading_options, load
 from kineverse.errors import ValueRejectedError
 
 if TYPE_CHECKING:
@@ -55,6 +56,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--degrees", action="store_true", help="show angles in degrees")
     parser.add_argument("--picture", metavar="PATH", help="write a picture (.png) instead of opening a page")
+    add_reading_options(parser)
     add_page_options(parser)
 
 
@@ -85,14 +87,13 @@ def run(arguments: argparse.Namespace) -> int:
     if asked_for(arguments.model):
         return print_articulations()
 
-    import kineverse as kv
     from kineverse.view import meshes
     from kineverse.view.poses import complete
     from kineverse.view.title import title_of_file
     from kineverse.view.viewer import Viewer
 
     label = title_of_file(arguments.model)
-    model = kv.load(arguments.model)
+    model = load(arguments, arguments.model)
     if assigned:
         note(remarks(model, complete(model, assigned), arguments.assignments))
     for mesh in progress(meshes.seen_in(model), "reading meshes", "file"):

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Hashable, Mapping
 from dataclasses import dataclass
-from typing import Generic, NoReturn, TypeVar
+from typing import Generic, TypeVar
 
 from kineverse.formats.markup import quote
 from kineverse.formats.numerals import LARGEST, SMALLEST
@@ -27,9 +27,9 @@ class Following(Generic[K]):
 
 def resolve_chains(
     following: Mapping[K, Following[K]],
-    refuse: Callable[[K, str], NoReturn],
+    refuse: Callable[[K, str], None],
     shown: Callable[[K], str] = str,
-    check: Callable[[K, K], None] | None = None,
+    check: Callable[[K, K], bool] | None = None,
 ) -> dict[K, Following[K]]:
     """Return for each follower what it follows in the end, with the factors of its chain composed.
 
@@ -38,17 +38,19 @@ def resolve_chains(
     following
         What each follower follows; who is not in there moves by itself.
     refuse
-        Called with a follower and the reason why it cannot be resolved; raises.
+        Called with a follower and the reason why it cannot be resolved; raises, or else it moves by itself.
     shown
         The name of a follower in that reason.
     check
-        Called with each follower and its leader; may raise.
+        Called with each follower and its leader; returns whether the one follows the other, or it moves by
+        itself.
     """
     resolved: dict[K, Following[K]] = {}
+    free: set[K] = set()
     for start in following:
         chain: dict[K, Following[K]] = {}
         last = start
-        while last in following and last not in resolved:
+        while last in following and last not in resolved and last not in free:
             step = chain[last] = following[last]
             if step.leader in chain:
                 circle = " -> ".join(quote(shown(name)) for name in list(chain)[:8])
@@ -58,8 +60,10 @@ def resolve_chains(
                     + (f", by way of {circle}" if len(chain) > 1 else "")
                     + ". One of them has to move by itself: remove its <mimic>.",
                 )
-            if check is not None:
-                check(last, step.leader)
+            if step.leader in chain or (check is not None and not check(last, step.leader)):
+                del chain[last]
+                free.add(last)
+                break
             last = step.leader
         end = resolved.get(last, Following(last))
         for follower in reversed(chain):
@@ -71,6 +75,9 @@ def resolve_chains(
                     f"the factors of its chain of <mimic> come to {multiplier:g} and {offset:g}: positions "
                     f"or limits overflow. Multipliers are 0 or from {SMALLEST:g} to {LARGEST:g}.",
                 )
+                end = Following(follower)
+                free.add(follower)
+                continue
             end = resolved[follower] = Following(end.leader, multiplier, offset)
     return resolved
 

@@ -8,6 +8,7 @@ from collections import OrderedDict
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import TypeAlias
 
 from kineverse.collection import no_collection
 from kineverse.errors import FormatError, KineverseError, MissingExtraError
@@ -18,10 +19,12 @@ from kineverse.model.operation import Operation
 from kineverse.shipped.bases import base_of
 
 from .files import read_file
+from .foreign import not_read
 from .loops import Loops, check_loops
 from .markup import root_tag
 from .prefixes import check_prefix
 from .remarks import listening, tell
+from .roots import NOWHERE, root_of
 from .sources import Source, locate_model
 from .urdf.operations import robot_operations
 from .urdf.reader import parse_urdf
@@ -31,10 +34,18 @@ LARGEST_REMEMBERED = 1 << 22
 """Models whose files are larger than this [byte] are not remembered, they would take too much memory."""
 
 # Models loaded by this process and remarks on them, the latest last, by everything that they follow from.
-_REMEMBERED: OrderedDict[tuple[Source, str | None, str, bytes], tuple[Snapshot, list[str]]] = OrderedDict()
+_Key: TypeAlias = "tuple[Source, str | None, bytes, str, bool, str]"
+_REMEMBERED: OrderedDict[_Key, tuple[Snapshot, list[str]]] = OrderedDict()
 
 
-def load(source: str | os.PathLike[str], prefix: str | None = None, *, loops: Loops = "solve") -> Model:
+def load(
+    source: str | os.PathLike[str],
+    prefix: str | None = None,
+    *,
+    root: str | os.PathLike[str] | None = None,
+    strict: bool = False,
+    loops: Loops = "solve",
+) -> Model:
     """Load a model from a file or by name.
 
     Parameters
@@ -47,6 +58,14 @@ def load(source: str | os.PathLike[str], prefix: str | None = None, *, loops: Lo
         Put in front of the names of all frames and degrees of freedom, with a slash. A model that ships has
         its own name as prefix unless another is given (``screw`` for ``articulations/screw``); ``""`` means
         none.
+    root
+        The folder below which the files that it names may be opened, meshes and included ones. By default the
+        folder of ``KINEVERSE_ROOT`` that holds it, else the repository or package around it, else its own
+        folder.
+    strict
+        Whether mistakes that move nothing, or that others read past, are refused. Otherwise there is a remark
+        on each, which :func:`kineverse.formats.remarks.listening` hears and the logger ``kineverse.formats``
+        gets.
     loops
         What becomes of loops that an SDF or MJCF closes. ``"solve"``: coordinates follow others, see
         :class:`kineverse.CloseLoop`; where that cannot be done, the closure is kept as an equality
@@ -58,7 +77,8 @@ def load(source: str | os.PathLike[str], prefix: str | None = None, *, loops: Lo
     UnknownNameError
         If there is no such model.
     FormatError
-        If the file is not what it should be, with file, line, element and reason; or if the prefix is not.
+        If the file is not what it should be, with file, line, element and reason; or if the prefix or the
+        root is not.
     ValueRejectedError
         If ``loops`` is none of these.
     """
@@ -67,12 +87,13 @@ def load(source: str | os.PathLike[str], prefix: str | None = None, *, loops: Lo
     found = locate_model(source)
     content = _content(found)
     remembered = _stands_alone(found, content)
-    key = found, prefix, loops, hashlib.blake2b(content).digest()
+    below = _root(found, root)
+    key = found, prefix, hashlib.blake2b(content).digest(), below, strict, loops
     known = _REMEMBERED.pop(key, None)
     if known is None:
         model = Model()
         with listening() as remarks, _blaming(found.path), model.edit() as edit, no_collection():
-            for _ in _applied(edit, found, content, prefix, loops):
+            for _ in _applied(edit, found, content, prefix, below, strict, loops):
                 pass
         if len(content) > LARGEST_REMEMBERED or not remembered:
             return model
@@ -100,20 +121,28 @@ def _blaming(path: Path) -> Iterator[None]:
 
 
 def include(
-    edit: Edit, source: str | os.PathLike[str], prefix: str | None = None, loops: Loops = "solve"
+    edit: Edit,
+    source: str | os.PathLike[str],
+    prefix: str | None = None,
+    *,
+    root: str | os.PathLike[str] | None = None,
+    strict: bool = False,
+    loops: Loops = "solve",
 ) -> list[str]:
     """Append the operations of a file or shipped model to an edit, see :func:`load`; return their tags."""
     check_prefix(prefix)
     check_loops(loops)
     found = locate_model(source)
-    return list(_applied(edit, found, _content(found), prefix, loops))
+    return list(_applied(edit, found, _content(found), prefix, _root(found, root), strict, loops))
 
 
-def _applied(edit: Edit, source: Source, content: bytes, prefix: str | None, loops: Loops) -> Iterator[str]:
+def _applied(
+    edit: Edit, source: Source, content: bytes, prefix: str | None, root: str, strict: bool, loops: Loops
+) -> Iterator[str]:
     """Apply the operations of a source, and yield their tags."""
     name = source.path.name
     closing = "joint" if _is_sdf(name) else "equality" if _is_mjcf(name, content) else ""
-    operations = _operations(source, content, prefix)
+    operations = _operations(source, content, prefix, root, strict)
     if not closing or source.scene:
         for tag, operation in operations:
             yield edit.apply(operation, tag)
@@ -126,11 +155,20 @@ def _applied(edit: Edit, source: Source, content: bytes, prefix: str | None, loo
     yield from closures.finish()
 
 
+def _root(source: Source, root: str | os.PathLike[str] | None) -> str:
+    """Return the folder below which a model may open files."""
+    if source.scene:
+        return NOWHERE if root is None else root_of(NOWHERE, root)
+    return root_of(source.path.parent, root, source.folder)
+
+
 def _content(source: Source) -> bytes:
     return b"" if source.scene else read_file(source.path)
 
 
-def _operations(source: Source, content: bytes, prefix: str | None) -> Iterator[tuple[str, Operation]]:
+def _operations(
+    source: Source, content: bytes, prefix: str | None, root: str, strict: bool
+) -> Iterator[tuple[str, Operation]]:
     path, name = source.path, source.path.name
     if prefix is None:
         prefix = source.shipped
@@ -143,38 +181,36 @@ def _operations(source: Source, content: bytes, prefix: str | None) -> Iterator[
     elif name.endswith(".kv.json"):
         from .document import operations_from  # nor does every process read a document
 
-        yield from operations_from(content, str(path), prefix)
+        yield from operations_from(content, str(path), prefix, root)
     elif name.endswith(".kv.msgpack"):
         from .document import operations_unpacked
 
-        yield from operations_unpacked(content, str(path), prefix)
+        yield from operations_unpacked(content, str(path), prefix, root)
     elif _is_mjcf(name, content):
         from .mjcf.operations import scene_operations as mjcf_operations
         from .mjcf.reader import parse_mjcf
 
-        description = parse_mjcf(content, source=name, folder=str(path.absolute().parent))
+        description = parse_mjcf(content, name, str(path.absolute().parent), root, strict)
         for operation in mjcf_operations(description, prefix):
             yield operation.default_tag(), operation
     elif name.endswith((".urdf", ".xml")):
-        robot = parse_urdf(content, source=name, folder=str(path.absolute().parent))
+        robot = parse_urdf(content, name, str(path.absolute().parent), root, strict)
         base = base_of(source.shipped, prefix) if source.shipped else None
         if base is not None:
             yield base.default_tag(), base
-        for operation in robot_operations(robot, prefix, parent=WORLD if base is None else base.child):
+        parent = WORLD if base is None else base.child
+        for operation in robot_operations(robot, prefix, parent, strict):
             yield operation.default_tag(), operation
     elif _is_sdf(name):
         # Many modules, which most processes never need.
         from .sdf.operations import scene_operations
         from .sdf.reader import parse_sdf
 
-        scene = parse_sdf(content, source=name, folder=str(path.absolute().parent))
+        scene = parse_sdf(content, name, str(path.absolute().parent), root, strict)
         for operation in scene_operations(scene, prefix):
             yield operation.default_tag(), operation
     else:
-        raise FormatError(
-            f"{path}: this version reads URDF (.urdf, .xml), SDF (.sdf, .world), MJCF (.xml, .mjcf) and "
-            f"documents (.kv.json, .kv.msgpack), not '{''.join(path.suffixes) or name}'."
-        )
+        raise not_read(path)
 
 
 def _is_sdf(name: str) -> bool:

@@ -8,6 +8,7 @@ element, too, unless it is asked for.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from typing import NoReturn, TypeAlias
 from xml.parsers import expat
@@ -29,6 +30,8 @@ TEXT = ""
 
 Visit: TypeAlias = Callable[[Element], None]
 Begin: TypeAlias = Callable[[Element], Visit]
+Mend: TypeAlias = Callable[[int, str], None]
+"""Takes the line of what is no XML but can be read, and how it is."""
 
 
 class ElementError(Exception):
@@ -47,6 +50,7 @@ def parse(
     begin: Begin | None = None,
     texts: bool = False,
     depth: int = MAX_DEPTH,
+    mend: Mend | None = None,
 ) -> Element:
     """Parse a document and return its root element.
 
@@ -66,6 +70,10 @@ def parse(
         Whether to keep the text of elements that have any, as their attribute ``TEXT``.
     depth
         The deepest nesting of elements.
+    mend
+        Called with what is read although XML forbids it, since the parsers of robots do: what comes before
+        the declaration, a declaration that is misspelt, comments with two hyphens. Without it, that is
+        refused.
 
     Raises
     ------
@@ -75,7 +83,13 @@ def parse(
     """
     if len(data) > MAX_BYTES:
         raise FormatError(f"{source}: larger than {MAX_BYTES} bytes, the most that is read of one document.")
-    parser = expat.ParserCreate()
+    encoding = None
+    if mend is not None:
+        text, (data, encoding) = data, _declared(data, mend)
+        data = _commented(data, mend)
+        if isinstance(text, str) and not isinstance(data, str):
+            encoding = "utf-8"
+    parser = expat.ParserCreate(encoding)
     document: list[Element] = []
     open_lists = [document]
     skipped_depth = 0
@@ -162,7 +176,8 @@ def parse(
 
 def root_tag(data: bytes) -> str:
     """Return the tag of the root element; empty where no element is found."""
-    parser = expat.ParserCreate()
+    text, encoding = _declared(data, lambda *_: None)
+    parser = expat.ParserCreate(encoding)
     found: list[str] = []
 
     def start(tag: str, _: dict[str, str]) -> None:
@@ -172,13 +187,76 @@ def root_tag(data: bytes) -> str:
     parser.StartElementHandler = start
     parser.StartDoctypeDeclHandler = lambda *_: found.append("")
     try:
-        for begin in range(0, len(data), _PIECE):
-            parser.Parse(data[begin : begin + _PIECE])
+        for begin in range(0, len(text), _PIECE):
+            parser.Parse(text[begin : begin + _PIECE])
             if found:
                 break
     except (expat.ExpatError, ValueError, LookupError):
         pass  # whoever reads all of it says what is wrong
     return found[0] if found else ""
+
+
+_DECLARED = re.compile(rb"\s*(?:<!--(?:(?!-->).)*-->\s*)*<\?xml\s[^<>]*\?>", re.DOTALL)
+_GOOD = re.compile(rb"<\?xml\s+version\s*=\s*[\"']1\.\d[\"']")
+_ENCODING = re.compile(rb"encoding\s*=\s*[\"']([\w.-]{1,40})[\"']")
+_NOT_A_BREAK = re.compile(rb"[^\n]")
+_MARK = b"\xef\xbb\xbf"
+
+
+def _bytes(data: str | bytes) -> bytes:
+    try:
+        return data.encode() if isinstance(data, str) else data
+    except UnicodeEncodeError:  # which the parser says in its words
+        return b""
+
+
+def _declared(data: str | bytes, mend: Mend) -> tuple[str | bytes, str | None]:
+    """Return a document without a declaration that is not where, or what, it should be, and its encoding."""
+    content = _bytes(data[: 1 << 16]).removeprefix(_MARK)
+    good = _GOOD.match(content)
+    if good and not _DECLARED.match(content, content.find(b">", good.end()) + 1):
+        return data, None
+    found, end, encoding = _DECLARED.match(content), 0, None
+    while found is not None:
+        said = _ENCODING.search(content[end : found.end()])
+        encoding = encoding or (said[1].decode() if said else None)
+        end = found.end()
+        found = _DECLARED.match(content, end)
+    if not end:
+        return data, None
+    line = content[:end].count(b"\n") + 1
+    mend(
+        line, "<?xml ...?>: is not the first of the file, or misspelt, which XML forbids; it is passed over."
+    )
+    rest = _bytes(data).removeprefix(_MARK)
+    blank = _NOT_A_BREAK.sub(b" ", rest[:end]) + rest[end:]
+    return blank, encoding
+
+
+def _commented(data: str | bytes, mend: Mend) -> str | bytes:
+    """Return a document with blanks for comments that have two hyphens inside."""
+    content = _bytes(data)
+    pieces: list[bytes] = []
+    start, at, literal = 0, 0, content.find(b"<![CDATA[")
+    line, counted = 1, 0
+    while (at := content.find(b"<!--", at)) >= 0:
+        if 0 <= literal < at:
+            end = content.find(b"]]>", literal)
+            if end < 0:
+                break
+            at, literal = max(at, end), content.find(b"<![CDATA[", end)
+            continue
+        end = content.find(b"-->", at + 4)
+        if end < 0:
+            break
+        inside = content[at + 4 : end]
+        if b"--" in inside or inside.endswith(b"-"):
+            line, counted = line + content.count(b"\n", counted, at), at
+            mend(line, "<!-- ... -->: has '--' inside, which XML forbids; it is a comment all the same.")
+            pieces += [content[start:at], _NOT_A_BREAK.sub(b" ", content[at : end + 3])]
+            start = end + 3
+        at = end + 3
+    return b"".join([*pieces, content[start:]]) if pieces else data
 
 
 def name_of(element: Element) -> str:

@@ -35,6 +35,24 @@ def number(text: str) -> float:
 
 
 @lru_cache(maxsize=8192)
+def directions(text: str, count: int) -> tuple[float, ...]:
+    """Return ``count`` numbers of which no pose gets large: angles, or those of an axis or a quaternion.
+
+    Raises
+    ------
+    ValueError
+        With the reason, if the text is anything else.
+    """
+    return _read(text, count)
+
+
+def unit(values: tuple[float, ...]) -> tuple[float, ...]:
+    """Return a vector, made shorter where its length would overflow."""
+    largest = max(map(abs, values))
+    return values if largest <= LARGEST else tuple(value / largest for value in values)
+
+
+@lru_cache(maxsize=8192)
 def numbers(text: str, count: int) -> tuple[float, ...]:
     """Return the ``count`` coordinates that the text spells, separated by white space.
 
@@ -64,7 +82,9 @@ def _number(word: str, count: int) -> float:
     if "_" in word or not word.isascii():
         raise ValueError(f"has '{abbreviate(word)}', where {_expected(count)}")
     try:
-        value = float(word)
+        value = float.fromhex(word) if "0x" in word[:3].lower() else float(word)
+    except OverflowError:
+        value = math.inf
     except ValueError:
         raise ValueError(f"has '{abbreviate(word)}', where {_expected(count)}{_hint(word)}") from None
     if not math.isfinite(value):

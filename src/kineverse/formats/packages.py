@@ -2,7 +2,7 @@
 
 Nothing here opens a file it finds, and nothing searches the whole disk: the places are few, listed in
 :func:`locate`, and the two kinds of folders that are searched in depth are searched within ``MAX_DEPTH`` and
-``MAX_FOLDERS``.
+``MAX_FOLDERS``. Below which folder a description may open files is said in :mod:`.roots`.
 """
 
 from __future__ import annotations
@@ -15,11 +15,12 @@ from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache
 from pathlib import Path
-from typing import TypeAlias
 from urllib.parse import unquote, urlsplit
 
 from kineverse.errors import FormatError
 from kineverse.formats.markup import quote
+from kineverse.formats.roots import NOWHERE, Folder, is_below, is_common, refusal, root_variable
+from kineverse.model.body import Mesh
 
 MAX_DEPTH = 4
 """How deep below a folder of a workspace variable packages are looked for."""
@@ -31,13 +32,17 @@ _WORKSPACES = ("KINEVERSE_PACKAGE_PATH", "ROS_PACKAGE_PATH")
 _PREFIXES = ("AMENT_PREFIX_PATH", "COLCON_PREFIX_PATH", "CMAKE_PREFIX_PATH")
 _MODELS = ("GZ_SIM_RESOURCE_PATH", "IGN_GAZEBO_RESOURCE_PATH", "GAZEBO_MODEL_PATH", "SDF_PATH")
 _MANIFESTS = ("package.xml", "manifest.xml")
+_MARKS = (*_MANIFESTS, "model.config", "model.sdf")
 _IGNORED = ("CATKIN_IGNORE", "COLCON_IGNORE", "AMENT_IGNORE")
-_LISTED = 12
-
-Folder: TypeAlias = "str | os.PathLike[str]"
+_LISTED = 3
 
 
-def locate(uri: str, folder: Folder = "", search: Sequence[Folder] = ()) -> Path:
+def locate_mesh(mesh: Mesh) -> Path:
+    """Return the path of the file of a mesh, within the root of its description; see :func:`locate`."""
+    return locate(mesh.uri, mesh.folder, root=mesh.root)
+
+
+def locate(uri: str, folder: Folder = "", search: Sequence[Folder] = (), root: str | None = None) -> Path:
     """Return the path of the file that a description names.
 
     ``package://name/rest`` and ``model://name/rest`` are the file ``rest`` of the first folder for ``name``
@@ -55,6 +60,10 @@ def locate(uri: str, folder: Folder = "", search: Sequence[Folder] = ()) -> Path
     A folder is the package ``name`` if it is called so or has a ``package.xml`` with that name. Other paths
     are relative to ``folder``, then to the folders of ``search``.
 
+    With a root, paths have to lie below it, below ``search``, or below a folder that one of these variables
+    or ``KINEVERSE_ROOT`` names. Of the folders above, those outside of the root count if they have a
+    manifest, or if they are above a description in the root and neither the home folder nor above it.
+
     Parameters
     ----------
     uri
@@ -63,21 +72,23 @@ def locate(uri: str, folder: Folder = "", search: Sequence[Folder] = ()) -> Path
         The folder of the description.
     search
         Folders to try first.
+    root
+        The folder that the description must not leave, as :func:`.roots.root_of` returns it; None for none.
 
     Raises
     ------
     FormatError
         If there is no such file (the message lists where it was looked for and which variable to set), if the
-        path leaves its package, or if it is to be fetched from a network.
+        path leaves its package or the root, or if it is to be fetched from a network.
     """
     scheme, colon, rest = uri.partition("://")
     if not colon:
-        return _plain(uri, folder, search)
+        return _plain(uri, uri, folder, search, root)
     scheme = scheme.lower()
     if scheme in ("package", "model"):
-        return _packaged(uri, rest, folder, search)
+        return _packaged(uri, rest, folder, search, root)
     if scheme == "file":
-        return _file(uri, folder, search)
+        return _file(uri, folder, search, root)
     raise FormatError(
         f"{quote(uri)}: {scheme}:// is not fetched. Download the file and name it by package:// or a path."
     )
@@ -97,9 +108,11 @@ class _Trail:
 
     places: list[str] = field(default_factory=list)
     without_file: list[Path] = field(default_factory=list)
+    trusted: bool = True
+    """Whether the user has named the place that is looked at, rather than the description."""
 
 
-def _packaged(uri: str, rest: str, folder: Folder, search: Sequence[Folder]) -> Path:
+def _packaged(uri: str, rest: str, folder: Folder, search: Sequence[Folder], root: str | None) -> Path:
     name, _, inside = rest.partition("/")
     if not name or name in (".", "..") or "\\" in name:
         raise FormatError(f"{quote(uri)}: names no package; expected package://name/path/in/the/package.")
@@ -111,13 +124,47 @@ def _packaged(uri: str, rest: str, folder: Folder, search: Sequence[Folder]) -> 
             _packages_below.cache_clear()
             _manifest_name.cache_clear()
         trail = _Trail()
-        for package in _folders_of(name, Path(folder), search, trail):
+        for package in _folders_of(name, Path(folder), search, trail, root):
             for parts in insides:
                 path = package.joinpath(*parts)
-                if os.path.isfile(path):
+                if not os.path.isfile(path):
+                    continue
+                if trail.trusted or root is None or _stays(path, root, package):
                     return path
+                raise refusal(uri, root)
             trail.without_file.append(package)
     raise FormatError(_miss(uri, name, inside, trail))
+
+
+def _stays(path: Path, root: str, package: Path | None = None) -> bool:
+    """Return whether the real path of a file is in the root, in its package, or where a variable points."""
+    real = os.path.realpath(path)
+    places = (root, *root_variable(), *declared_folders(), *([os.path.realpath(package)] if package else ()))
+    return any(is_below(real, place) for place in places if place)
+
+
+def outside(uri: str, folder: Folder, root: str | None) -> FormatError | None:
+    """Return the error for a path that leaves the root; None for others, and for what lies in a package."""
+    scheme, colon, rest = uri.partition("://")
+    if root is None or (colon and scheme.lower() != "file"):
+        return None
+    if root == NOWHERE and not colon and not os.path.isabs(uri):
+        return None  # whoever gave the text knows that it lies nowhere
+    path = (
+        Path(folder).absolute() / unquote(rest.removeprefix("localhost"))
+        if colon
+        else Path(folder).absolute() / uri
+    )
+    return None if "\0" in uri or _stays(path, root) else refusal(uri, root)
+
+
+def declared_folders() -> Iterator[str]:
+    """Yield the real paths of the folders that hold packages and models, as environment variables say."""
+    for variables, inside in ((_WORKSPACES, ""), (_PREFIXES, "share"), (_MODELS, "")):
+        for variable in variables:
+            for place in os.environ.get(variable, "").split(os.pathsep):
+                if place:
+                    yield os.path.realpath(os.path.join(place, inside))
 
 
 def _inside(uri: str, text: str) -> list[str]:
@@ -134,19 +181,27 @@ def _inside(uri: str, text: str) -> list[str]:
 
 
 def _miss(uri: str, name: str, inside: str, trail: _Trail) -> str:
+    """Return what is missing on the first line, then where it was looked for, a place a line."""
     if trail.without_file:
-        found = ", ".join(str(path) for path in dict.fromkeys(trail.without_file))
-        return f"{quote(uri)}: package {quote(name)} is at {found}, which has no file {quote(inside)}."
-    places = list(dict.fromkeys(trail.places))
-    more = f" and {len(places) - _LISTED} more" if len(places) > _LISTED else ""
+        places = [str(path) for path in dict.fromkeys(trail.without_file)]
+        return f"{quote(uri)}: package {quote(name)} has no file {quote(inside)}. It is at:{_lines(places)}"
     return (
-        f"{quote(uri)}: there is no package {quote(name)}. Looked in: {', '.join(places[:_LISTED])}{more}. "
-        f"Set KINEVERSE_PACKAGE_PATH or ROS_PACKAGE_PATH to the folder that holds {quote(name)}."
+        f"{quote(uri)}: there is no package {quote(name)}. "
+        "Set KINEVERSE_PACKAGE_PATH or ROS_PACKAGE_PATH to the folder that holds it. "
+        f"Looked in:{_lines(list(dict.fromkeys(trail.places)))}"
     )
 
 
-def _folders_of(name: str, folder: Path, search: Sequence[Folder], trail: _Trail) -> Iterator[Path]:
+def _lines(places: Sequence[str]) -> str:
+    more = [f"and {len(places) - _LISTED + 1} more"] if len(places) > _LISTED else []
+    return "".join(f"\n  {place}" for place in [*places[: _LISTED - len(more)], *more])
+
+
+def _folders_of(
+    name: str, folder: Path, search: Sequence[Folder], trail: _Trail, root: str | None
+) -> Iterator[Path]:
     """Yield the folders that are the package, in the order in which they count."""
+    trail.places.append(f"{folder.absolute()} and the folders above it")
     for place in search:
         trail.places.append(str(place))
         yield from _at_or_in(Path(place), name)
@@ -160,19 +215,31 @@ def _folders_of(name: str, folder: Path, search: Sequence[Folder], trail: _Trail
         for place in _paths_in(variable, trail):
             yield from _at_or_in(place, name)
     here = folder.absolute()
-    trail.places.append(f"{here} and the folders above it")
+    trail.trusted = False
     for place in (here, *here.parents):
-        yield from _at_or_in(place, name)
+        for package in _at_or_in(place, name):
+            if root is None or counts_as_package(package, here, root):
+                yield package
+    trail.trusted = True
     for place in _installed():
         trail.places.append(str(place))
         yield from _at_or_in(place, name)
 
 
+def counts_as_package(package: Path, folder: Path, root: str) -> bool:
+    """Return whether a description may take a folder for a package; it has found it above its own folder.
+
+    Otherwise ``package://etc/passwd`` were a file of the package ``etc``.
+    """
+    real = os.path.realpath(package)
+    if is_below(real, root) or any(os.path.isfile(os.path.join(real, mark)) for mark in _MARKS):
+        return True
+    above = real if is_below(os.path.realpath(folder), real) else os.path.dirname(real)
+    return bool(root) and is_below(os.path.realpath(folder), root) and not is_common(above)
+
+
 def _paths_in(variable: str, trail: _Trail) -> Iterator[Path]:
-    value = os.environ.get(variable, "")
-    if not value:
-        trail.places.append(f"${variable} (not set)")
-    for place in value.split(os.pathsep):
+    for place in os.environ.get(variable, "").split(os.pathsep):
         if place:
             trail.places.append(f"{place} (${variable})")
             yield Path(place).absolute()
@@ -242,7 +309,7 @@ def _installed() -> Iterator[Path]:
     yield from map(Path, repositories)
 
 
-def _file(uri: str, folder: Folder, search: Sequence[Folder]) -> Path:
+def _file(uri: str, folder: Folder, search: Sequence[Folder], root: str | None) -> Path:
     parts = urlsplit(uri)
     if parts.netloc not in ("", "localhost"):
         raise FormatError(
@@ -250,16 +317,22 @@ def _file(uri: str, folder: Folder, search: Sequence[Folder]) -> Path:
             "For a path relative to the description, leave file:// out."
         )
     literal = uri.partition("://")[2].removeprefix("localhost")
-    path = Path(literal)
-    return path if os.path.isfile(path) else _plain(unquote(literal), folder, search)
+    path = literal if os.path.isfile(literal) else unquote(literal)
+    return _plain(uri, path, folder, search, root)
 
 
-def _plain(text: str, folder: Folder, search: Sequence[Folder]) -> Path:
+def _plain(uri: str, text: str, folder: Folder, search: Sequence[Folder], root: str | None) -> Path:
     path = Path(text)
     tried = [Path(folder).absolute() / path, *(Path(place).absolute() / path for place in search)]
+    left = False
     for candidate in tried:
-        if os.path.isfile(candidate):  # which is no for a name that is too long, and no error
+        # What is outside is not even looked at.
+        if root is not None and candidate is tried[0] and "\0" not in text and not _stays(candidate, root):
+            left = True
+        elif os.path.isfile(candidate):  # which is no for a name that is too long, and no error
             return candidate
-    where = ", ".join(str(candidate) for candidate in dict.fromkeys(tried))
+    if left and root is not None:
+        raise refusal(uri, root)
+    where = [str(candidate) for candidate in dict.fromkeys(tried)]
     hint = "" if path.is_absolute() else " Paths are relative to the folder of the description."
-    raise FormatError(f"{quote(text)}: there is no such file. Looked for: {where}.{hint}")
+    raise FormatError(f"{quote(text)}: there is no such file.{hint} Looked for:{_lines(where)}")

@@ -8,19 +8,26 @@ from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import dataclass, field
 
-from kineverse.formats.markup import Element, label
+from kineverse.formats.markup import Element, ElementError, label
 
 _log = logging.getLogger("kineverse.formats")
 
 _listeners: ContextVar[tuple[list[str], ...]] = ContextVar("listeners", default=())
 
 
+class Fault(str):
+    """A remark on a mistake that a strict reader refuses, and what was taken instead."""
+
+    __slots__ = ()
+
+
 @dataclass(slots=True)
 class Remarks:
-    """A growing list of remarks on one document."""
+    """A growing list of remarks on one document; where it is read strictly, mistakes are no remarks."""
 
     source: str
     texts: list[str] = field(default_factory=list)
+    strict: bool = False
 
     def add(self, element: Element, text: str, owner: Element | None = None) -> None:
         """Note something about an element, which is part of ``owner``."""
@@ -28,6 +35,27 @@ class Remarks:
         remark = f"line {element[3]}, {of}{label(element)} {text}"
         self.texts.append(remark)
         tell([f"{self.source}, {remark}"])
+
+    def mend(self, mistake: ElementError, taken: str, owner: Element | None = None) -> None:
+        """Note a mistake in a part of ``owner``, and what is taken instead.
+
+        Raises
+        ------
+        ElementError
+            The mistake, where the document is read strictly.
+        """
+        if self.strict:
+            raise mistake
+        element = mistake.element
+        owner = owner or element
+        of = "" if owner is element else f"{label(element)} "
+        self.fault(element[3], f"{label(owner)}: {of}{mistake.message.rstrip('. ')}; {taken}.")
+
+    def fault(self, line: int, text: str) -> None:
+        """Note a mistake in a line, which is not refused."""
+        fault = Fault(f"line {line}, {text}")
+        self.texts.append(fault)
+        tell([Fault(f"{self.source}, {fault}")])
 
 
 def tell(remarks: Iterable[str]) -> None:

@@ -47,17 +47,23 @@ def pose_of(xyz: tuple[float, ...], rpy: tuple[float, ...]) -> Pose:
     )
 
 
+SHORTEST = 1e-9
+"""The length below which a quaternion says nothing."""
+
+
+def is_rotation(xyzw: tuple[float, ...]) -> bool:
+    """Return whether a quaternion is long enough to say a rotation."""
+    return math.hypot(*xyzw) >= SHORTEST
+
+
 def pose_of_quaternion(xyz: tuple[float, ...], xyzw: tuple[float, ...]) -> Pose:
     """Return the pose with offset ``xyz`` [m] and the rotation of a quaternion (x, y, z, w), normalised.
 
-    Raises
-    ------
-    ValueError
-        If the quaternion has length zero.
+    One of length zero turns nothing, as for MuJoCo and libsdformat.
     """
+    if not is_rotation(xyzw):
+        xyzw = (0.0, 0.0, 0.0, 1.0)
     length = math.hypot(*xyzw)
-    if length < 1e-9:
-        raise ValueError("has length zero, and so is no rotation")
     a, b, c, w = (q / length for q in xyzw)
     x, y, z = xyz
     return Pose(

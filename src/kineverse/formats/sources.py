@@ -7,7 +7,7 @@ import os
 import sysconfig
 from collections import Counter
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from itertools import islice
 from pathlib import Path
 
@@ -32,6 +32,8 @@ class Source:
     path: Path
     shipped: str | None = None
     scene: bool = False
+    folder: Path | None = field(default=None, compare=False)
+    """The folder of models in which it was found by its name."""
 
 
 def shipped_models() -> tuple[str, ...]:
@@ -55,7 +57,11 @@ def locate_model(name: str | os.PathLike[str]) -> Source:
         If there is none, with similar names, what was searched and how to get more; or if there are several.
     """
     if not isinstance(name, (str, os.PathLike)):
-        raise FormatError(f"A model is loaded by its name or from the path of a file, not from {name!r}.")
+        hint = " Bytes are read by kv.from_bytes." if isinstance(name, (bytes, bytearray, memoryview)) else ""
+        raise FormatError(
+            "A model is loaded by its name or from the path of a file, "
+            f"not from {_shown(repr(name))[1:-1]}.{hint}"
+        )
     text = os.fspath(name)
     if text in shipped_models():
         return Source(shipped.FOLDER / f"{text}.urdf", text)
@@ -66,6 +72,11 @@ def locate_model(name: str | os.PathLike[str]) -> Source:
         raise UnknownNameError(
             "This looks like the text of a description, where the name or path of a model is expected. "
             "Write it to a file; 'kineverse.formats.urdf.parse_urdf' reads text."
+        )
+    if text.lstrip().startswith("{"):
+        raise UnknownNameError(
+            "This looks like the text of a document, where the name or path of a model is expected. "
+            "Write it to a file, model.kv.json."
         )
     path = _expanded(text)
     if _is(path, Path.is_file):
@@ -83,7 +94,7 @@ def locate_model(name: str | os.PathLike[str]) -> Source:
         files = [p.relative_to(folder).as_posix() for p in _files(folder)]
         found = [f for f in files if _is_called(f, text)]
         if found:
-            return Source((folder / _only(found, text, folder)).resolve())
+            return Source((folder / _only(found, text, folder)).resolve(), folder=folder)
         searched.append(f"{place} ({folder})")
         seen += files
     if gallery == GALLERY:

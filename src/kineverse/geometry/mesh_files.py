@@ -16,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from kineverse.errors import FormatError, MissingExtraError
-from kineverse.formats.packages import locate
+from kineverse.formats.packages import locate_mesh
 from kineverse.installation import install_command
 from kineverse.model.body import Mesh
 
@@ -58,11 +58,11 @@ def find(mesh: Mesh) -> MeshFile:
     Raises
     ------
     FormatError
-        If there is none.
+        If there is none, or it lies outside of the root of the description.
     OSError
         If it cannot be read, or is larger than :data:`LARGEST`.
     """
-    path = locate(mesh.uri, mesh.folder)
+    path = locate_mesh(mesh)
     size = path.stat().st_size
     if size > LARGEST:
         raise OSError(f"{path} has {size / 2**20:.0f} MiB, more than the {LARGEST / 2**20:.0f} MiB read here")

@@ -7,7 +7,7 @@ is opened before somebody asks for it.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -130,12 +130,16 @@ class Mesh:
     """A reference to a mesh file.
 
     ``uri`` is what the description says (``package://...``, ``file://...`` or a path), ``folder`` the folder
-    of the file that said so, from which it is resolved when somebody needs the triangles.
+    of the file that said so, from which it is resolved when somebody needs the triangles. ``root`` is the
+    folder that the path must not leave, a real path, empty for none that it may go to; None if the reference
+    is not that of a file but of a program, which may open what it likes. Documents do not carry it, and it
+    makes no difference.
     """
 
     uri: str
     scale: Vector3 = (1.0, 1.0, 1.0)
     folder: str = ""
+    root: str | None = field(default=None, compare=False)
 
 
 Geometry: TypeAlias = Box | Cylinder | Capsule | Sphere | Ellipsoid | Cone | Mesh

@@ -99,7 +99,7 @@ def _walk(what: str, a: Any, b: Any) -> Iterator[tuple[str, Any, Any]]:
     elif is_dataclass(a) and not isinstance(a, type):
         alike: tuple[str, ...] = ()
         if isinstance(a, Mesh):
-            alike = ("folder", "uri") if _file(a) == _file(b) else ("folder",)
+            alike = ("folder", "root", "uri") if _file(a) == _file(b) else ("folder", "root")
         for field in fields(a):
             if field.name not in alike:
                 name = f"{what}.{field.name}" if what else field.name

@@ -328,13 +328,21 @@ class Edit:
         """Store an immutable value under ``data``; the last one written under a name counts."""
         return self.apply(Write(name, value), tag)
 
-    def include(self, source: Any, prefix: str | None = None, *, loops: Loops = "solve") -> list[str]:
+    def include(
+        self,
+        source: Any,
+        prefix: str | None = None,
+        *,
+        root: Any = None,
+        strict: bool = False,
+        loops: Loops = "solve",
+    ) -> list[str]:
         """Append the operations of a file or shipped model, see :func:`kineverse.load`; return their tags."""
         from kineverse.formats.loading import include
 
         with no_collection():
             try:
-                return include(self, source, prefix, loops)
+                return include(self, source, prefix, root=root, strict=strict, loops=loops)
             except NameTakenError as error:
                 raise NameTakenError(
                     f"{error} include(source, prefix=...) puts a prefix in front of all names."

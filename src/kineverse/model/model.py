@@ -108,10 +108,18 @@ class Model(ModelView):
         self._version += 1
         return diff
 
-    def include(self, source: Any, prefix: str | None = None, *, loops: Loops = "solve") -> list[str]:
+    def include(
+        self,
+        source: Any,
+        prefix: str | None = None,
+        *,
+        root: Any = None,
+        strict: bool = False,
+        loops: Loops = "solve",
+    ) -> list[str]:
         """Add a file or a shipped model in one edit; returns the tags. See :func:`kineverse.load`."""
         with self.edit() as edit:
-            return edit.include(source, prefix, loops=loops)
+            return edit.include(source, prefix, root=root, strict=strict, loops=loops)
 
     def listen(
         self,

@@ -26,7 +26,7 @@ class Loaded:
     problem: str = ""
 
 
-_by_reference: dict[Mesh, Loaded] = {}
+_by_reference: dict[tuple[Mesh, str | None], Loaded] = {}
 _by_content: dict[tuple[object, ...], Triangles] = {}
 _reported: set[tuple[str, str]] = set()
 
@@ -42,14 +42,15 @@ def load(mesh: Mesh) -> Loaded:
     mesh
         The reference: uri, scale along x, y, z, and the folder from which a relative uri is resolved.
     """
-    if mesh not in _by_reference:
+    key = mesh, mesh.root
+    if key not in _by_reference:
         try:
-            _by_reference[mesh] = Loaded(_read(mesh))
+            _by_reference[key] = Loaded(_read(mesh))
         except (KineverseError, OSError) as error:
-            _by_reference[mesh] = _missing(mesh, str(error))
+            _by_reference[key] = _missing(mesh, str(error))
         except Exception as error:  # Parsers of other people's formats raise anything at all.
-            _by_reference[mesh] = _missing(mesh, f"{type(error).__name__}: {error}")
-    return _by_reference[mesh]
+            _by_reference[key] = _missing(mesh, f"{type(error).__name__}: {error}")
+    return _by_reference[key]
 
 
 def seen_in(model: ModelView) -> list[Mesh]:

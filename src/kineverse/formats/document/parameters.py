@@ -127,7 +127,9 @@ def written_parameter(value: Any, writes: Mapping[Cell, Any], ref: Ref, depth: i
     if isinstance(value, Record):
         return {"record": value.kind, "fields": {key: inner(item) for key, item in value.fields}}
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        parts = {f.name: inner(getattr(value, f.name)) for f in dataclasses.fields(value) if f.init}
+        parts = {
+            f.name: inner(getattr(value, f.name)) for f in dataclasses.fields(value) if f.init and f.compare
+        }
         return {"record": type(value).__name__, "fields": parts}
     return {"unwritten": type(value).__name__}
 

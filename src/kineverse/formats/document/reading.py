@@ -10,9 +10,11 @@ from kineverse.collection import no_collection
 from kineverse.errors import FormatError, KineverseError
 from kineverse.expressions.expression import Expression
 from kineverse.formats.files import MAX_BYTES
+from kineverse.formats.mesh_bounds import bounded
+from kineverse.formats.roots import NOWHERE
 from kineverse.model.contents import expressions_in
 from kineverse.model.frame import WORLD
-from kineverse.model.operation import FRAMES, KINDS, RATES
+from kineverse.model.operation import BODIES, FRAMES, KINDS, RATES
 from kineverse.model.reader import ABSENT, Cell, Read
 from kineverse.model.traces import Trace
 from kineverse.model.traces.answer import answers_in
@@ -36,7 +38,7 @@ LONGEST_REASON = 1000
 
 
 def operations_from(
-    content: str | bytes, source: str = "document", prefix: str | None = None
+    content: str | bytes, source: str = "document", prefix: str | None = None, root: str = NOWHERE
 ) -> list[tuple[str, Recorded]]:
     """Return the operations of a document, each with its tag.
 
@@ -48,6 +50,9 @@ def operations_from(
         What errors call it.
     prefix
         Put in front of all names, tags included, with a slash; the world stays the world.
+    root
+        The folder below which its meshes may be opened, see :mod:`kineverse.formats.roots`; by default no
+        path leads to one.
 
     Raises
     ------
@@ -60,11 +65,11 @@ def operations_from(
         content.decode()
     except UnicodeError as error:
         raise FormatError(f"{source}: a document is UTF-8 text, and this is not: {error}.") from None
-    return _Document(source, prefix).read(_parsed, content)
+    return _Document(source, prefix, root).read(_parsed, content)
 
 
 def operations_unpacked(
-    data: bytes, source: str = "document", prefix: str | None = None
+    data: bytes, source: str = "document", prefix: str | None = None, root: str = NOWHERE
 ) -> list[tuple[str, Recorded]]:
     """Return the operations of a packed document; as :func:`operations_from`.
 
@@ -76,12 +81,12 @@ def operations_unpacked(
         If the package for msgpack is not installed.
     """
     _check_size(data, source)
-    return _Document(source, prefix).read(unpacked, data)
+    return _Document(source, prefix, root).read(unpacked, data)
 
 
 class _Document:
-    def __init__(self, source: str, prefix: str | None) -> None:
-        self._source = source
+    def __init__(self, source: str, prefix: str | None, root: str) -> None:
+        self._source, self._root = source, root
         self._place = ""
         self._prefix = prefix
         self._graph = Graph(prefix)
@@ -217,6 +222,8 @@ class _Document:
                     raise RefusedError(str(error)) from None
                 if kind == RATES and str(read[0]) != cell[1]:
                     raise RefusedError(f"this is the rate of '{read[0]}'")
+                if kind == BODIES:
+                    read = bounded(read, self._root, f"{self._source}, body {cell[1]}")
                 writes.append((cell, read))
         return tuple(writes)
 

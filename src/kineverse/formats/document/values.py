@@ -163,12 +163,18 @@ def _read_articulation(value: Any, graph: Graph, rename: Rename) -> Articulation
     required = ("kind", "parent", "child", "coordinates", "home", "speeds", "dynamics")
     given = fields(value, required, ("follows",))
     dynamics = [exactly(listed(d, "name and value"), 2) for d in listed(given["dynamics"], "dynamics")]
+    coordinates = tuple(map(graph.symbol, listed(given["coordinates"], "coordinates")))
+    home = numbers(given["home"])
+    names = [symbol.path.rpartition("/")[2] for symbol in coordinates]
+    for k in range(len(names) - 3):
+        if names[k : k + 4] == ["qx", "qy", "qz", "qw"] and not any(home[k : k + 4]):
+            raise RefusedError("its home has a quaternion of length zero, at which nothing has a pose")
     return Articulation(
         string(given["kind"]),
         frame_name(given["parent"], rename),
         frame_name(given["child"], rename),
-        tuple(map(graph.symbol, listed(given["coordinates"], "coordinates"))),
-        numbers(given["home"]),
+        coordinates,
+        home,
         tuple(graph.symbol(ref, 1) for ref in listed(given["speeds"], "speeds")),
         tuple((string(item), read_datum(datum, graph, rename)) for item, datum in dynamics),
         graph.scalar(given["follows"]) if "follows" in given else None,

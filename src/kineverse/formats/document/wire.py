@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import os
+
 from kineverse.collection import no_collection
 from kineverse.errors import FormatError, KineverseError
 from kineverse.formats.prefixes import check_prefix
+from kineverse.formats.roots import NOWHERE, text_root
 from kineverse.model.model import Model
 from kineverse.model.view import ModelView
 
@@ -31,7 +34,9 @@ def to_bytes(model: ModelView) -> bytes:
     return packed(document_of(model))
 
 
-def from_bytes(data: bytes, prefix: str | None = None) -> Model:
+def from_bytes(
+    data: bytes, prefix: str | None = None, *, root: str | os.PathLike[str] | None = None
+) -> Model:
     """Return the model that :func:`to_bytes` made bytes of. No code is run and no name imported.
 
     Parameters
@@ -40,6 +45,9 @@ def from_bytes(data: bytes, prefix: str | None = None) -> Model:
         The bytes, from anywhere.
     prefix
         Put in front of all names, tags included, with a slash; the world stays the world.
+    root
+        The folder below which meshes that it names by path may be opened. By default none is: those of
+        packages are.
 
     Raises
     ------
@@ -51,7 +59,7 @@ def from_bytes(data: bytes, prefix: str | None = None) -> Model:
     if not isinstance(data, (bytes, bytearray, memoryview)):
         raise FormatError(f"A packed document is bytes, not a {type(data).__name__}.")
     check_prefix(prefix)
-    operations = operations_unpacked(bytes(data), "the document", prefix or None)
+    operations = operations_unpacked(bytes(data), "the document", prefix or None, text_root(NOWHERE, root))
     model = Model()
     try:
         with model.edit() as edit, no_collection():

@@ -6,14 +6,16 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
+from kineverse.formats.markup import quote
 from kineverse.formats.poses import IDENTITY, is_identity
 from kineverse.model.body import Vector3
 
 from .compiling import Compiled, Note
 from .description import SUFFIXES, WORLD, Dynamics, Joint, Kind, Link, Site
 from .engine import mujoco
-from .naming import Names, plain
+from .naming import Mend, Names, plain
 from .shapes import Shapes, pose_at
 from .tree import Node
 
@@ -32,7 +34,7 @@ class Bodies:
         By the numbers that they have in the model.
     """
 
-    def __init__(self, compiled: Compiled, shapes: Shapes, source: str, note: Note) -> None:
+    def __init__(self, compiled: Compiled, shapes: Shapes, source: str, note: Note, mend: Mend) -> None:
         self._model, self._source, self._shapes = compiled.model, source, shapes
         self._efforts, self._home = compiled.efforts, compiled.home
         self._custom, self._bound = compiled.prepared.custom, float(compiled.spec.compiler.boundmass)
@@ -47,8 +49,8 @@ class Bodies:
             for number, node in compiled.nodes(spec.joints).items()
         }
         self._site_nodes = compiled.nodes(spec.sites)
-        self._frames = Names(WORLD)
-        self._movers = Names()
+        self._frames = Names(mend, WORLD)
+        self._movers = Names(mend)
         self.body_names = self._named_bodies()
         self.joint_names = self._named_joints()
         joints: dict[int, list[Joint]] = {}
@@ -60,7 +62,6 @@ class Bodies:
         self.links = tuple(self._link(number, tuple(joints.get(number, ()))) for number in range(model.nbody))
         self.site_names = self._named_sites()
         self.sites = tuple(self._site(k) for k in range(model.nsite) if not self.is_end(k))
-        self._check_coordinates()
 
     def is_end(self, site: int) -> bool:
         """Whether a site is only there to say where its body is tied, which is at its origin."""
@@ -102,6 +103,14 @@ class Bodies:
             for count, number in enumerate(numbers):
                 name = self.body_names[body] + ("" if len(numbers) == 1 else f"/joint{count}")
                 names[number] = self._movers.invent(name, self._where(self._joint_nodes[number]))
+        kinds = {int(mujoco().mjtJoint.mjJNT_BALL): "ball", int(mujoco().mjtJoint.mjJNT_FREE): "free"}
+        for number in range(m.njnt):
+            kind: Kind = kinds.get(int(m.jnt_type[number]), "hinge")  # type: ignore[assignment]  # as above
+            name, where = names[number], self._where(self._joint_nodes[number])
+            clash = [f"{name}/{suffix}" for suffix in SUFFIXES[kind] if f"{name}/{suffix}" in self._movers]
+            if clash:
+                problem = f"its coordinate would be called {quote(clash[0])} here, as a joint is. Rename one"
+                names[number] = self._movers.replace(f"{name}_joint", where, problem)
         return names
 
     def _named_sites(self) -> list[str]:
@@ -183,16 +192,22 @@ class Bodies:
         if kind in ("hinge", "slide"):
             return (float(given[address]),)
         if kind == "ball":
-            w, x, y, z = given[address : address + 4].tolist()
+            w, x, y, z = self._turn(given[address : address + 4]).tolist()
             return x, y, z, w
         # The joint's own coordinates begin where the body is in the file, MuJoCo's at the origin.
         rest, pose = m.qpos0[address : address + 7], given[address : address + 7]
         back, turn, offset = np.zeros(4), np.zeros(4), np.zeros(3)
         engine.mju_negQuat(back, rest[3:])
-        engine.mju_mulQuat(turn, back, pose[3:])
+        engine.mju_mulQuat(turn, back, self._turn(pose[3:]))
         engine.mju_rotVecQuat(offset, pose[:3] - rest[:3], back)
         w, x, y, z = turn.tolist()
         return *offset.tolist(), x, y, z, w
+
+    def _turn(self, wxyz: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+        """Return a quaternion of length one, as MuJoCo makes it: one without length turns nothing."""
+        unit = np.array(wxyz, dtype=float)
+        mujoco().mju_normalize4(unit)
+        return unit
 
     def _dynamics(self, number: int, kind: Kind) -> Dynamics:
         m = self._model
@@ -212,14 +227,6 @@ class Bodies:
             "spring_reference": float(m.qpos_spring[int(m.jnt_qposadr[number])]) if springs else None,
         }
         return tuple((key, value) for key, value in values.items() if value is not None)
-
-    def _check_coordinates(self) -> None:
-        """Raise where a coordinate of a joint with several has the name of another joint."""
-        for link in self.links:
-            for joint in link.joints:
-                for suffix in SUFFIXES[joint.kind]:
-                    if f"{joint.name}/{suffix}" in self._movers:
-                        self._movers.take(f"{joint.name}/{suffix}", joint.where)
 
 
 def _vector(numbers: Any) -> Vector3:

@@ -70,7 +70,7 @@ class _MeshError(FormatError):
     """What MuJoCo says where it may be the fault of a mesh file."""
 
 
-def compile_document(prepared: Prepared, source: str, folder: str, note: Note) -> Compiled:
+def compile_document(prepared: Prepared, source: str, folder: str, root: str, note: Note) -> Compiled:
     """Have MuJoCo parse and compile a document.
 
     Parameters
@@ -80,7 +80,9 @@ def compile_document(prepared: Prepared, source: str, folder: str, note: Note) -
     source
         Its name in messages.
     folder
-        Below which mesh files are read, where they decide something.
+        From where mesh files are found, where they decide something.
+    root
+        The folder that they do not leave.
     note
         Called with what is left out.
 
@@ -91,10 +93,10 @@ def compile_document(prepared: Prepared, source: str, folder: str, note: Note) -
     """
     with engine.listening() as heard:
         try:
-            compiled = _attempt(prepared, source, folder, note)
+            compiled = _attempt(prepared, source, folder, root, note)
         except _MeshError as error:
             note(None, f"inertia and sizes that follow from meshes are left out: {error}")
-            compiled = _attempt(prepared, source, folder, note, with_files=False)
+            compiled = _attempt(prepared, source, folder, root, note, with_files=False)
     for remark in dict.fromkeys(heard):
         note(None, f"MuJoCo says: {remark.strip()}")
     for name in _NUMBERS:
@@ -103,10 +105,12 @@ def compile_document(prepared: Prepared, source: str, folder: str, note: Note) -
     return compiled
 
 
-def _attempt(prepared: Prepared, source: str, folder: str, note: Note, with_files: bool = True) -> Compiled:
+def _attempt(
+    prepared: Prepared, source: str, folder: str, root: str, note: Note, with_files: bool = True
+) -> Compiled:
     spec = engine.parse(prepared, source)
     shapeless = _without_shape(spec)
-    replacement = Replacement(spec, prepared, folder, note)
+    replacement = Replacement(spec, prepared, folder, root, note)
     files = replacement.read_files(with_files)
     strength, home = efforts(spec), _home(spec)
     # What has been read goes: muscles make compiling long, and keys of what is left out make it fail.

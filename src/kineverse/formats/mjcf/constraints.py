@@ -16,7 +16,7 @@ from .compiling import Compiled, Note
 from .custom import closed_as_said
 from .description import Closure, Coupling, Dynamics, Quartic, Tendon
 from .engine import mujoco
-from .naming import Names
+from .naming import Mend, Names
 from .shapes import pose_at
 from .tree import Node
 
@@ -29,15 +29,15 @@ _UNTURNED = (1.0, 0.0, 0.0, 0.0)
 class Constraints:
     """What couples joints, closes loops and ties lengths."""
 
-    def __init__(self, compiled: Compiled, bodies: Bodies, note: Note) -> None:
+    def __init__(self, compiled: Compiled, bodies: Bodies, note: Note, mend: Mend) -> None:
         self._model, self._bodies, self._note = compiled.model, bodies, note
         model = compiled.model
         self._nodes = compiled.nodes(compiled.spec.equalities)
         self._tendon_nodes = compiled.nodes(compiled.spec.tendons)
         self._rest = at_rest(bodies.links)
-        names = Names()
+        names = Names(mend)
         self._tendon_names = self._named(names, "tendon", model.ntendon, self._tendon_nodes)
-        self._names = self._named(Names(), "equality", model.neq, self._nodes)
+        self._names = self._named(Names(mend), "equality", model.neq, self._nodes)
         found = [self._tendon(number) for number in range(model.ntendon)]
         self.tendons = tuple(tendon for tendon in found if tendon is not None)
         self._known = {tendon.name for tendon in self.tendons}

@@ -56,8 +56,11 @@ class Meshes:
 class Replacement:
     """Puts boxes for files into a specification, and files where they decide something."""
 
-    def __init__(self, spec: Any, prepared: Prepared, top: str, note: Callable[[Node, str], None]) -> None:
-        self._spec, self._prepared, self._top, self._note = spec, prepared, top, note
+    def __init__(
+        self, spec: Any, prepared: Prepared, folder: str, root: str, note: Callable[[Node, str], None]
+    ) -> None:
+        self._spec, self._prepared, self._note = spec, prepared, note
+        self._folder, self._root = folder, root
         self.meshes = Meshes()
         self._nodes: dict[str, Node] = {}
         self._boxes: dict[str, tuple[Any, list[float], list[int]]] = {}
@@ -127,14 +130,14 @@ class Replacement:
         return bool(rule == kinds.mjINERTIAFROMGEOM_TRUE)
 
     def _content(self, name: str) -> bytes | None:
-        """Return the content of a file, None if it is not below the folder, or of no known format."""
+        """Return the content of a file, None if it is not below the root, or of no known format."""
         node, uri = self._nodes[name], self.meshes.assets[name].uri
         if not uri:
             return None
         try:
             if Path(uri).suffix.lower() not in _FORMATS:
                 node.refuse(f"names {quote(uri)}, which is in no format that MuJoCo reads.")
-            return read_file(find_below(node, uri, self._top, self._top))
+            return read_file(find_below(node, uri, self._root, self._folder))
         except FormatError as error:
             reason = str(error).removeprefix(f"{node.where}: ")
             self._note(node, f"is not read, where its triangles decide an inertia or a size: {reason}")
@@ -153,7 +156,7 @@ class Replacement:
         mesh.scale, mesh.refpos, mesh.refquat = asset.scale, asset.position, asset.quaternion
 
 
-def placed(asset: Asset, body_T_mesh: Pose, folder: str) -> tuple[Mesh, Pose] | None:
+def placed(asset: Asset, body_T_mesh: Pose, folder: str, root: str) -> tuple[Mesh, Pose] | None:
     """Return a mesh and where its file's frame is; None where no scale of the file says it.
 
     With v' = S Rᵀ (v - p), v' = Rᵀ (R S Rᵀ v) - S Rᵀ p, so R S Rᵀ has to be a scale, too.
@@ -168,4 +171,4 @@ def placed(asset: Asset, body_T_mesh: Pose, folder: str) -> tuple[Mesh, Pose] | 
     mesh_T_file[:3, :3] = turn.T
     mesh_T_file[:3, 3] = -scale @ turn.T @ asset.position
     a, b, c = np.diag(along).tolist()
-    return Mesh(asset.uri, (a, b, c), folder), product(body_T_mesh, Pose.of(mesh_T_file + 0.0))
+    return Mesh(asset.uri, (a, b, c), folder, root), product(body_T_mesh, Pose.of(mesh_T_file + 0.0))

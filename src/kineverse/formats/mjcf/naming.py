@@ -2,8 +2,13 @@
 
 from __future__ import annotations
 
-from kineverse.errors import FormatError
+from collections.abc import Callable
+from typing import TypeAlias
+
 from kineverse.formats.markup import quote
+
+Mend: TypeAlias = Callable[[str, str, str], None]
+"""Called with the place of a mistake, what it is and what is taken instead; raises in a strict reader."""
 
 
 def plain(name: str) -> str:
@@ -14,28 +19,37 @@ def plain(name: str) -> str:
 class Names:
     """Names that are taken, with what has each of them."""
 
-    def __init__(self, *taken: str) -> None:
+    def __init__(self, mend: Mend, *taken: str) -> None:
         self._taken: dict[str, str] = dict.fromkeys(taken, "the world")
+        self._mend = mend
+        self._numbers: dict[str, int] = {}
 
     def take(self, name: str, where: str) -> str:
-        """Return the name of the file as it is here.
+        """Return the name of the file as it is here, another one if it cannot be a name, or is taken.
 
         Raises
         ------
         FormatError
-            If it cannot be a name, or is taken.
+            If it is another one, and the file is read strictly.
         """
-        short = plain(name)
-        if not short or not (short.isprintable() or all(ord(character) >= 32 for character in short)):
-            raise FormatError(
-                f"{where}: the name has nothing but slashes, or a control character. Rename it."
+        short, problem = plain(name), ""
+        if not short or any(ord(character) < 32 for character in short):
+            problem = "the name has nothing but slashes, or a control character. Rename it"
+            short = "".join(c if ord(c) >= 32 else "_" for c in short) or "nameless"
+        elif self._taken.get(short, where) != where:
+            problem = (
+                f"it would be called {quote(short)} here, as {self._taken[short]} is. Rename one of them"
             )
-        other = self._taken.setdefault(short, where)
-        if other != where:
-            raise FormatError(
-                f"{where}: it would be called {quote(short)} here, as {other} is. Rename one of them."
-            )
-        return short
+        if not problem:
+            self._taken[short] = where
+            return short
+        return self.replace(short, where, problem)
+
+    def replace(self, name: str, where: str, problem: str) -> str:
+        """Return another name than the one that is wanted, which has a problem."""
+        found = self.invent(name, where)
+        self._mend(where, problem, f"it is called {quote(found)}")
+        return found
 
     def invent(self, name: str, where: str, *more: str) -> str:
         """Return the first name that is free: the one wanted, then others, then numbered ones."""
@@ -43,9 +57,10 @@ class Names:
             if candidate not in self._taken:
                 break
         else:
-            number = 2
+            number = self._numbers.get(name, 2)
             while f"{name}_{number}" in self._taken:
                 number += 1
+            self._numbers[name] = number + 1
             candidate = f"{name}_{number}"
         self._taken[candidate] = where
         return candidate

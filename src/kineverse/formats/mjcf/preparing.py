@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -50,9 +51,15 @@ class _Model:
 class Preparation:
     """Reads a file and those that it attaches, each of them once."""
 
-    def __init__(self, top: str, note: Callable[[Node | None, str], None]) -> None:
-        self._top = top
-        self._note = note
+    def __init__(
+        self,
+        top: str,
+        root: str,
+        note: Callable[[Node | None, str], None],
+        mend: Callable[[str, int, str], None] | None,
+    ) -> None:
+        self._top, self._root = top, root
+        self._note, self._mend = note, mend
         self._known: dict[Path, _Model] = {}
         self._open: list[Path] = []
         self.prepared = Prepared()
@@ -65,7 +72,7 @@ class Preparation:
         FormatError
             For what is no MJCF, leaves its folder, holds itself, or is too large.
         """
-        root = read_tree(data, source, self._top, self._top)
+        root = self._read(data, source, self._top)
         self.prepared.custom = custom_of(root, self._note)
         self.prepared.text = self._document(root, self._top)[0]
         return self.prepared
@@ -80,21 +87,24 @@ class Preparation:
                 models[node.attributes.get("name") or model.title] = model.size
         files = screen(root, self._note)
         for node, file in files.items():
-            below = Path(folder).relative_to(self._top) if folder != self._top else Path()
+            below = Path(os.path.relpath(folder, self._top)) if folder != self._top else Path()
             self.prepared.files[node] = MeshFile((below / file.uri).as_posix() if file.uri else "")
         size = check_size(root, models)
         text, nodes = written(root, len(self.prepared.nodes) + 1)
         self.prepared.nodes += nodes
         return text, _Model("", root.attributes.get("model", ""), size)
 
+    def _read(self, data: str | bytes, source: str, folder: str) -> Node:
+        return read_tree(data, source, folder, self._root, self._mend)
+
     def _attached(self, node: Node, folder: str) -> _Model:
-        path = find_below(node, node.attributes["file"], self._top, folder)
+        path = find_below(node, node.attributes["file"], self._root, folder)
         if path in self._open or len(self._open) >= DEEPEST:
             node.refuse("attaches itself, directly or through others.")
         if path not in self._known:
             self._open.append(path)
             folder = str(path.parent)
-            text, model = self._document(read_tree(read_file(path), path.name, folder, self._top), folder)
+            text, model = self._document(self._read(read_file(path), path.name, folder), folder)
             self._open.pop()
             model.name = f"{len(self._known)}.xml"
             self._known[path] = model

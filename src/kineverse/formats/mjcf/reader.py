@@ -8,8 +8,10 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
+from kineverse.errors import FormatError
 from kineverse.formats.files import read_file
-from kineverse.formats.remarks import tell
+from kineverse.formats.remarks import Fault, tell
+from kineverse.formats.roots import text_root
 
 from .bodies import Bodies
 from .compiling import compile_document
@@ -20,8 +22,10 @@ from .shapes import Shapes
 from .tree import Node
 
 
-def read_mjcf(path: str | os.PathLike[str]) -> Scene:
-    """Read an MJCF file, with what it includes and attaches from its folder.
+def read_mjcf(
+    path: str | os.PathLike[str], root: str | os.PathLike[str] | None = None, strict: bool = False
+) -> Scene:
+    """Read an MJCF file, with what it includes and attaches; see :func:`parse_mjcf`.
 
     Raises
     ------
@@ -31,10 +35,16 @@ def read_mjcf(path: str | os.PathLike[str]) -> Scene:
         If MuJoCo is not installed.
     """
     path = Path(path)
-    return parse_mjcf(read_file(path), source=path.name, folder=str(path.absolute().parent))
+    return parse_mjcf(read_file(path), path.name, str(path.absolute().parent), root, strict)
 
 
-def parse_mjcf(text: str | bytes, source: str = "<mjcf>", folder: str = "") -> Scene:
+def parse_mjcf(
+    text: str | bytes,
+    source: str = "<mjcf>",
+    folder: str = "",
+    root: str | os.PathLike[str] | None = None,
+    strict: bool = False,
+) -> Scene:
     """Read an MJCF from text.
 
     Parameters
@@ -44,7 +54,11 @@ def parse_mjcf(text: str | bytes, source: str = "<mjcf>", folder: str = "") -> S
     source
         Its name in error messages.
     folder
-        The folder below which the files it includes are, and from which the meshes it names are found.
+        The folder from which the files it includes and the meshes it names are found.
+    root
+        The folder that they do not leave; None for that which :func:`kineverse.formats.roots.root_of` finds.
+    strict
+        Whether mistakes that others read past are refused, rather than remarked on.
 
     Raises
     ------
@@ -53,11 +67,12 @@ def parse_mjcf(text: str | bytes, source: str = "<mjcf>", folder: str = "") -> S
     MissingExtraError
         If MuJoCo is not installed.
     """
-    notes = _Notes(source)
-    prepared = Preparation(folder, notes.add).run(text, source)
-    compiled = compile_document(prepared, source, folder, notes.add)
-    bodies = Bodies(compiled, Shapes(compiled, folder, notes.add), source, notes.add)
-    found = Constraints(compiled, bodies, notes.add)
+    notes = _Notes(source, strict)
+    below = text_root(folder, root)
+    prepared = Preparation(folder, below, notes.add, None if strict else notes.misspelt).run(text, source)
+    compiled = compile_document(prepared, source, folder, below, notes.add)
+    bodies = Bodies(compiled, Shapes(compiled, folder, below, notes.add), source, notes.add, notes.mend)
+    found = Constraints(compiled, bodies, notes.add, notes.mend)
     return Scene(
         bodies.links,
         bodies.sites,
@@ -74,8 +89,8 @@ def parse_mjcf(text: str | bytes, source: str = "<mjcf>", folder: str = "") -> S
 class _Notes:
     """What is remarked on a document, each remark once."""
 
-    def __init__(self, source: str) -> None:
-        self._source = source
+    def __init__(self, source: str, strict: bool) -> None:
+        self._source, self._strict = source, strict
         self.texts: dict[str, None] = {}
 
     def add(self, node: Node | None, text: str) -> None:
@@ -84,3 +99,23 @@ class _Notes:
         if text not in self.texts:
             self.texts[text] = None
             tell([f"{self._source}, {text}"])
+
+    def mend(self, where: str, problem: str, taken: str) -> None:
+        """Note a mistake at a place, and what is taken instead.
+
+        Raises
+        ------
+        FormatError
+            The mistake, where the file is read strictly.
+        """
+        if self._strict:
+            raise FormatError(f"{where}: {problem}.")
+        self._fault(f"{where.removeprefix(f'{self._source}, ')}: {problem}; {taken}.")
+
+    def misspelt(self, source: str, line: int, text: str) -> None:
+        """Note what is no XML, but can be read."""
+        self._fault(f"{'' if source == self._source else f'{source}, '}line {line}, {text}")
+
+    def _fault(self, text: str) -> None:
+        self.texts[Fault(text)] = None
+        tell([Fault(f"{self._source}, {text}")])

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from kineverse.formats import rpy
+from kineverse.formats.packages import outside
 from kineverse.formats.poses import inverse, product
 from kineverse.model.body import (
     Body,
@@ -44,8 +45,9 @@ class Shapes:
         Called with what is left out, and why.
     """
 
-    def __init__(self, compiled: Compiled, folder: str, note: Note) -> None:
-        self._model, self._compiled, self._folder = compiled.model, compiled, folder
+    def __init__(self, compiled: Compiled, folder: str, root: str, note: Note) -> None:
+        self._model, self._compiled = compiled.model, compiled
+        self._folder, self._root = folder, root
         self._nodes, self._say = compiled.nodes(compiled.spec.geoms), note
 
     def body(self, number: int) -> Body:
@@ -93,10 +95,13 @@ class Shapes:
             self._note(geom, "is left out: its triangles are in no file.")
             return None
         centred = pose_at(m.mesh_pos[mesh], m.mesh_quat[mesh])
-        found = placed(asset, product(pose, inverse(centred)), self._folder)
+        found = placed(asset, product(pose, inverse(centred)), self._folder, self._root)
         if found is None:
             self._note(geom, "is left out: its mesh is scaled along other axes than those of its file.")
             return None
+        wrong = outside(asset.uri, self._folder, self._root)
+        if wrong is not None:
+            self._note(geom, f"names {wrong}")
         form, origin = found
         return Shape(form, origin, name, color)
 

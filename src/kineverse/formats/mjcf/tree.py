@@ -1,20 +1,22 @@
 """An MJCF and the files it includes as one tree of elements, before MuJoCo sees any of them.
 
 MuJoCo is given no path: it would open whatever a file names. Includes are expanded here, from within the
-folder of the file and nowhere else.
+root of the file and nowhere else, see :mod:`kineverse.formats.roots`.
 """
 
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import NoReturn
 
 from kineverse.errors import FormatError
 from kineverse.formats.files import read_file
 from kineverse.formats.markup import Element, label, parse, quote
+from kineverse.formats.roots import is_below, refusal, root_variable
 
 DEEPEST = 450
 """The deepest nesting of elements: MuJoCo reads 500, and a body is inside of the body that carries it."""
@@ -59,7 +61,13 @@ class Node:
             ahead.extend(reversed(node.children))
 
 
-def read_tree(data: str | bytes, source: str, folder: str, top: str) -> Node:
+def read_tree(
+    data: str | bytes,
+    source: str,
+    folder: str,
+    root: str,
+    mend: Callable[[str, int, str], None] | None = None,
+) -> Node:
     """Return the root of a document, with the content of what it includes in place of the includes.
 
     Parameters
@@ -70,32 +78,38 @@ def read_tree(data: str | bytes, source: str, folder: str, top: str) -> Node:
         Its name in messages.
     folder
         Where it lies, from where the files it includes are named. Empty for text that lies nowhere.
-    top
+    root
         The folder that they do not leave.
+    mend
+        Called with the file, the line and a text for what is read although XML forbids it; None to refuse it.
 
     Raises
     ------
     FormatError
-        For what is no XML, or no MJCF; for includes that are not there, lead out of the folder, or come
+        For what is no XML, or no MJCF; for includes that are not there, lead out of the root, or come
         twice.
     """
-    root = parse(data, source, depth=DEEPEST)
-    _check_root(root, source)
+
+    def parsed(data: str | bytes, source: str) -> Element:
+        return parse(data, source, depth=DEEPEST, mend=None if mend is None else partial(mend, source))
+
+    top = parsed(data, source)
+    _check_root(top, source)
     whole = Node("", {})
     included: set[Path] = set()
-    ahead: list[tuple[Element, Node, str, str]] = [(root, whole, source, folder)]
+    ahead: list[tuple[Element, Node, str, str]] = [(top, whole, source, folder)]
     while ahead:
         element, parent, source, here = ahead.pop()
         tag, attributes, children, line = element
         node = Node(tag, attributes, source=source, line=line)
         if tag == "include":
-            path = find_below(node, attributes.get("file", ""), top, folder, here)
+            path = find_below(node, attributes.get("file", ""), root, folder, here)
             # A file in twice would have all its names twice, or include itself.
             if path in included:
                 node.refuse("is there a second time; a file is included once.")
             included.add(path)
             below = str(path.parent)
-            children = parse(read_file(path), path.name, depth=DEEPEST)[2]
+            children = parsed(read_file(path), path.name)[2]
             ahead.extend((child, parent, path.name, below) for child in reversed(children))
             continue
         parent.children.append(node)
@@ -103,8 +117,8 @@ def read_tree(data: str | bytes, source: str, folder: str, top: str) -> Node:
     return whole.children[0]
 
 
-def find_below(node: Node, name: str, top: str, *places: str) -> Path:
-    """Return the file that an element names, which is below a folder.
+def find_below(node: Node, name: str, root: str, *places: str) -> Path:
+    """Return the file that an element names, which is below the root, or below ``KINEVERSE_ROOT``.
 
     Parameters
     ----------
@@ -112,8 +126,8 @@ def find_below(node: Node, name: str, top: str, *places: str) -> Path:
         The element.
     name
         What it says: a path relative to one of the places.
-    top
-        The folder that it does not leave.
+    root
+        The folder that it does not leave, a real path.
     places
         Folders from which it is looked for, one after the other.
 
@@ -122,22 +136,21 @@ def find_below(node: Node, name: str, top: str, *places: str) -> Path:
     FormatError
         If it is somewhere else, or is not there.
     """
-    if not top:
+    if not any(places):
         node.refuse(f"names the file {quote(name)}, and the text has no folder. Load it from its file.")
     if not name or "\0" in name:
         node.refuse("names no file.")
+    allowed = [root, *root_variable()]
     outside = False
     for place in dict.fromkeys(places):
-        path = (Path(place) / name).resolve()
-        if not path.is_relative_to(Path(top).resolve()):
+        path = os.path.realpath(os.path.join(place, name))
+        if not any(is_below(path, folder) for folder in allowed if folder):
             outside = True
         elif os.path.isfile(path):  # which is no for a name that is too long, and no error
-            return path
-    return node.refuse(
-        f"names {quote(name)}, which leads out of the folder of the file. That is refused."
-        if outside
-        else f"names {quote(name)}, and there is no such file below {top}."
-    )
+            return Path(path)
+    if outside:
+        node.refuse(f"names {refusal(name, root)}")
+    return node.refuse(f"names {quote(name)}, and there is no such file below {root}.")
 
 
 def _check_root(root: Element, source: str) -> None:

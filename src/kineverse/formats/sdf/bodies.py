@@ -1,7 +1,7 @@
 """``<link>`` elements to what they carry: inertia, shapes to see, shapes to touch.
 
-Shapes and their colours decide nothing about where links are: a shape that cannot be said here is left out
-with a remark. A malformed number in one is still an error.
+Shapes and their colours decide nothing about where links are: a shape that cannot be said here, or is not
+said, is left out with a remark.
 """
 
 from __future__ import annotations
@@ -10,6 +10,7 @@ from collections.abc import Callable
 
 from kineverse.formats.markup import Element, ElementError, child, label
 from kineverse.formats.numerals import numbers as spelt
+from kineverse.formats.packages import outside
 from kineverse.formats.poses import IDENTITY, product
 from kineverse.model.body import (
     Body,
@@ -52,12 +53,15 @@ def body_of(link: Node) -> Body:
     document = link.document
     for part in link.element[2]:
         with document.about(link.element):
-            if part[0] in ("visual", "collision"):
-                shape = _shape(part, link)
-                if shape is not None:
-                    (visuals if part[0] == "visual" else collisions).append(shape)
-            elif part[0] == "inertial" and inertia is None:
-                inertia = _inertia(part, link)
+            try:
+                if part[0] in ("visual", "collision"):
+                    shape = _shape(part, link)
+                    if shape is not None:
+                        (visuals if part[0] == "visual" else collisions).append(shape)
+                elif part[0] == "inertial" and inertia is None:
+                    inertia = _inertia(part, link)
+            except ElementError as mistake:
+                document.remarks.mend(mistake, f"the {label(part)} is left out", link.element)
     return Body(tuple(visuals), tuple(collisions), inertia)
 
 
@@ -69,12 +73,12 @@ def _shape(element: Element, link: Node) -> Shape | None:
     place = IDENTITY
     pose = child(element, "pose")
     if pose is not None:
-        place = pose_of(pose)
+        place = pose_of(pose, link.document.remarks)
         old = "frame" if link.document.version < (1, 7) else "relative_to"
         reference = pose[1].get(old, "")
         if reference:
             place = product(relation(link, link.scope.find(reference, pose, element)), place)
-    color = _color(element) if element[0] == "visual" else None
+    color = _color(element, link) if element[0] == "visual" else None
     return Shape(form, place, element[1].get("name", ""), color)
 
 
@@ -95,12 +99,21 @@ def _geometry(geometry: Element, shape: Element, link: Node) -> Geometry | None:
     if tag != "mesh":
         remarks.add(form, f"cannot be said here; the {label(shape)} is left out.", link.element)
         return None
-    uri = text(form, "uri")
+    uri = text(form, "uri") or (text(form, "filename") if link.document.version < (1, 3) else "")
     if not uri:
         raise ElementError(form, "has no <uri>; the specification requires it.")
     if child(form, "submesh") is not None:
         remarks.add(form, "names a submesh; all of the mesh is taken.", link.element)
-    return Mesh(uri, vector(form, "scale", _UNSCALED), link.document.folder)
+    folder, root = link.document.folder, link.document.root
+    wrong = outside(uri, folder, root)
+    if wrong is not None:
+        remarks.add(form, f"names {wrong}", link.element)
+    try:
+        scale = vector(form, "scale", _UNSCALED)
+    except ElementError as mistake:
+        remarks.mend(mistake, "it is not scaled", link.element)
+        scale = _UNSCALED
+    return Mesh(uri, scale, folder, root)
 
 
 def _length(form: Element, tag: str) -> float:
@@ -117,7 +130,7 @@ def _lengths(form: Element, tag: str) -> tuple[float, float, float]:
     return x, y, z
 
 
-def _color(visual: Element) -> Rgba | None:
+def _color(visual: Element, link: Node) -> Rgba | None:
     material = child(visual, "material")
     if material is None:
         return None
@@ -126,10 +139,14 @@ def _color(visual: Element) -> Rgba | None:
         return None
     words = text_of(part).split()
     try:
-        red, green, blue, alpha = (*spelt(text_of(part), len(words)), 1.0)[:4]
-    except ValueError as error:
-        raise ElementError(part, f"{error}.") from None
-    opaque = 1.0 - number(visual, "transparency", 0.0)
+        red, green, blue, alpha = (*spelt(text_of(part), min(len(words), 4) if len(words) > 2 else 4), 1.0)[
+            :4
+        ]
+        opaque = 1.0 - number(visual, "transparency", 0.0)
+    except (ValueError, ElementError) as error:
+        mistake = error if isinstance(error, ElementError) else ElementError(part, f"{error}.")
+        link.document.remarks.mend(mistake, "it is no colour", link.element)
+        return None
     return red, green, blue, alpha * min(max(opaque, 0.0), 1.0)
 
 
@@ -139,7 +156,7 @@ def _inertia(inertial: Element, link: Node) -> Inertia | None:
         return None
     mass = number(inertial, "mass", 1.0)
     pose, tensor = child(inertial, "pose"), child(inertial, "inertia")
-    origin = IDENTITY if pose is None else pose_of(pose)
+    origin = IDENTITY if pose is None else pose_of(pose, link.document.remarks)
     if tensor is None:
         return Inertia(mass, (1.0, 0.0, 0.0, 1.0, 0.0, 1.0), origin)
     ixx, ixy, ixz, iyy, iyz, izz = (

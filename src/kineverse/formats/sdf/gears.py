@@ -12,7 +12,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 from kineverse.formats.chains import Following
-from kineverse.formats.markup import quote
+from kineverse.formats.markup import ElementError, quote
 from kineverse.formats.poses import rotated
 from kineverse.model.body import Vector3
 
@@ -20,7 +20,7 @@ from .description import Axis
 from .joints import Hinge, reference_body
 from .nodes import Node
 from .placing import relation
-from .values import number
+from .values import number, text
 
 _PARALLEL = 1e-4
 _TURNING = ("revolute", "continuous")
@@ -42,7 +42,16 @@ def couple(hinges: Sequence[Hinge], carriers: dict[Node, Node]) -> list[Hinge]:
     for at, hinge in enumerate(hinges):
         if hinge.joint.kind != "gearbox":
             continue
-        node, body = hinge.node, reference_body(hinge.node, carriers)
+        node = hinge.node
+        if not text(node.element, "gearbox_reference_body"):
+            with node.document.about(node.element):
+                mistake = ElementError(
+                    node.element, "has no <gearbox_reference_body>: nothing says what it turns against."
+                )
+                node.document.remarks.mend(mistake, "it is left out")
+            result[at] = None
+            continue
+        body = reference_body(node, carriers)
         with node.document.about(node.element):
             ratio = number(node.element, "gearbox_ratio", 1.0)
         if not ratio:

@@ -11,7 +11,8 @@ from urllib.parse import unquote
 from kineverse.errors import FormatError
 from kineverse.formats.files import read_file
 from kineverse.formats.markup import Element, parse, quote
-from kineverse.formats.packages import model_paths
+from kineverse.formats.packages import counts_as_package, model_paths
+from kineverse.formats.roots import is_below, refusal, root_variable
 
 from .nodes import Version
 from .values import text_of
@@ -20,12 +21,23 @@ _LATEST = (1, 12)
 _FILES = (".sdf", ".world", ".urdf")
 
 
-def find_included(uri: str, folder: str) -> Path:
+def find_included(uri: str, folder: str, root: str) -> Path:
     """Return the file that an include means: a file, or that which the manifest of a folder names.
 
     ``model://name/...`` and plain paths are looked for below the folder of the document, then below those of
     ``GZ_SIM_RESOURCE_PATH``, ``IGN_GAZEBO_RESOURCE_PATH``, ``GAZEBO_MODEL_PATH`` and ``SDF_PATH``, then below
-    the folders above the document. ``file://`` and absolute paths have to lie within the first two.
+    the folders above the document. A path has to lie within the root, or below a folder that one of these
+    variables or ``KINEVERSE_ROOT`` names; a model may also be in a folder above the document that holds
+    models.
+
+    Parameters
+    ----------
+    uri
+        What the document says.
+    folder
+        Where the document lies.
+    root
+        The folder that paths do not leave, as :func:`kineverse.formats.roots.root_of` returns it.
 
     Raises
     ------
@@ -46,28 +58,31 @@ def find_included(uri: str, folder: str) -> Path:
     rest = unquote(rest)
     if "\0" in rest or not rest.strip("/. \\"):
         raise FormatError(f"{quote(uri)} names no model.")
-    if scheme == "file" or os.path.isabs(rest):
-        places = [here, *given]
-        candidates = [(place, Path(rest)) for place in places]
-    else:
-        parts = re.split(r"[/\\]", rest)
-        if ".." in parts:
-            raise FormatError(f"{quote(uri)} leads out of the folder of models with '..', which is refused.")
-        places = [here, *given, *here.parents]
-        # A folder on the path may itself be the model.
-        candidates = [(place, place / rest) for place in places]
-        candidates += [(place, place.parent / rest) for place in given if place.name == parts[0]]
-    outside = False
-    for place, candidate in candidates:
-        if not _is_model(candidate):
-            continue
+    parts = re.split(r"[/\\]", rest)
+    named = scheme in ("model", "package")
+    if named and ".." in parts:
+        raise FormatError(f"{quote(uri)} leads out of the folder of models with '..', which is refused.")
+    # A folder on the path may itself be the model.
+    itself = [(str(place), place.parent / rest) for place in given if place.name == parts[0]]
+    candidates = [(root, here / rest)]
+    if ".." not in parts:
+        candidates += [*((str(place), place / rest) for place in given), *itself]
+    if not os.path.isabs(rest) and scheme != "file":
+        for above in here.parents:
+            model = above / parts[0]
+            bound = str(model) if named and counts_as_package(model, here, root) else root
+            candidates.append((bound, above / rest))
+    left = False
+    for bound, candidate in candidates:
+        real = os.path.realpath(candidate)
         # A place may be a link to somewhere else; what is below it may not.
-        if not candidate.resolve().is_relative_to(place.resolve()):
-            outside = True
+        if not any(is_below(real, os.path.realpath(place)) for place in (bound, *root_variable()) if place):
+            left = left or bound == root
             continue
-        return _model_file(candidate) if candidate.is_dir() else candidate
-    if outside:
-        raise FormatError(f"{quote(uri)} leads out of the folders where models are, which is refused.")
+        if _is_model(candidate):
+            return _model_file(candidate) if candidate.is_dir() else candidate
+    if left and not named and (os.path.isabs(rest) or _is_model(here / rest)):
+        raise refusal(uri, root)
     variables = ", ".join(dict.fromkeys(variable for variable, _ in model_paths())) or "none is set"
     raise FormatError(
         f"{quote(uri)} is not there. Looked below {here}, the folders of GZ_SIM_RESOURCE_PATH, "

@@ -18,7 +18,7 @@ from .description import AXES, Axis, Joint, Kind
 from .nodes import MODEL, Node
 from .placing import relation
 from .resolving import end_of
-from .values import bound, direction, number, text, text_of, truth
+from .values import bound, direction, number, text_of, truth
 
 _SUFFIXES = {1: ("",), 2: ("/first", "/second")}
 _DYNAMICS = ("damping", "friction", "spring_reference", "spring_stiffness")
@@ -89,24 +89,30 @@ def _axis(node: Node, tag: str, suffix: str, kind: Kind) -> Axis:
     axis = child(element, tag)
     if axis is None:
         if kind in ("universal", "revolute2"):
-            raise ElementError(
+            mistake = ElementError(
                 element, f"is {kind} but has no <{tag}>; by default both axes are z, which is no such joint."
             )
+            remarks.mend(mistake, "it is z")
+            return Axis(suffix=suffix)
         remarks.add(element, f"has no <{tag}>; it is z, the specification's default.")
         return Axis(suffix=suffix)
     limit, dynamics = child(axis, "limit"), child(axis, "dynamics")
     lower = upper = velocity = effort = None
     if limit is not None:
         lower, upper = bound(limit, "lower"), bound(limit, "upper")
-        velocity, effort = bound(limit, "velocity"), bound(limit, "effort")
+        velocity, effort = (_magnitude(limit, key, node) for key in ("velocity", "effort"))
     if kind == "continuous":
         lower = upper = None
     if lower is not None and upper is not None and lower > upper:
         assert limit is not None
-        raise ElementError(limit, f"has lower {lower!r} above upper {upper!r}: no position would be valid.")
+        mistake = ElementError(
+            limit, f"has lower {lower!r} above upper {upper!r}: no position would be valid."
+        )
+        remarks.mend(mistake, "the joint is not limited", element)
+        lower = upper = None
     values = [] if effort is None or effort < 0.0 else [("effort", effort)]
     if dynamics is not None:
-        found = [(key, number(dynamics, key, 0.0)) for key in _DYNAMICS]
+        found = [(key, _known(dynamics, key, node)) for key in _DYNAMICS]
         springs = any(value for key, value in found if key == "spring_stiffness")
         values += [(k, v) for k, v in found if v or (springs and k == "spring_reference")]
     if child(axis, "initial_position") is not None and number(axis, "initial_position"):
@@ -120,6 +126,24 @@ def _axis(node: Node, tag: str, suffix: str, kind: Kind) -> Axis:
         suffix,
         None if kind == "ball" else _following(node, axis),
     )
+
+
+def _magnitude(limit: Element, key: str, node: Node) -> float | None:
+    """Return a bound of a speed or an effort; what is none bounds nothing."""
+    try:
+        return bound(limit, key)
+    except ElementError as mistake:
+        node.document.remarks.mend(mistake, "it bounds nothing", node.element)
+        return None
+
+
+def _known(dynamics: Element, key: str, node: Node) -> float:
+    """Return a number of the dynamics, 0 where it is none."""
+    try:
+        return number(dynamics, key, 0.0)
+    except ElementError as mistake:
+        node.document.remarks.mend(mistake, "0 is taken", node.element)
+        return 0.0
 
 
 def _direction(node: Node, axis: Element) -> Vector3:
@@ -177,6 +201,5 @@ def _pitch(element: Element) -> float:
 def reference_body(node: Node, carriers: dict[Node, Node]) -> Node:
     """Return the link against which a gearbox measures its angles."""
     part = child(node.element, "gearbox_reference_body")
-    if part is None or not text(node.element, "gearbox_reference_body"):
-        node.refuse("has no <gearbox_reference_body>: nothing says what it turns against.")
+    assert part is not None
     return carriers[node.scope.find(text_of(part), part, node.element)]

@@ -11,6 +11,7 @@ from kineverse.errors import FormatError, suggest
 from kineverse.formats.markup import Element, ElementError, label, quote
 from kineverse.formats.poses import IDENTITY
 from kineverse.formats.remarks import Remarks
+from kineverse.formats.roots import NOWHERE
 from kineverse.model.body import Pose
 
 Sort: TypeAlias = Literal["world", "model", "link", "joint", "frame"]
@@ -26,6 +27,7 @@ class Document:
     folder: str
     version: Version
     remarks: Remarks
+    root: str = NOWHERE
 
     @contextmanager
     def about(self, owner: Element) -> Iterator[None]:

@@ -15,6 +15,7 @@ from typing import NoReturn
 from kineverse.formats.chains import Following, resolve_chains
 from kineverse.formats.files import read_file
 from kineverse.formats.markup import Element, quote
+from kineverse.formats.roots import text_root
 
 from .bodies import body_of
 from .description import WORLD, Frame, Joint, Link, Scene
@@ -27,8 +28,10 @@ from .resolving import resolve
 from .tree import span
 
 
-def read_sdf(path: str | os.PathLike[str]) -> Scene:
-    """Read an SDF file, and the files that it includes.
+def read_sdf(
+    path: str | os.PathLike[str], root: str | os.PathLike[str] | None = None, strict: bool = False
+) -> Scene:
+    """Read an SDF file, and the files that it includes; see :func:`parse_sdf`.
 
     Raises
     ------
@@ -36,10 +39,16 @@ def read_sdf(path: str | os.PathLike[str]) -> Scene:
         If a file cannot be read or is not a valid SDF; the message names file, line, element and reason.
     """
     path = Path(path)
-    return parse_sdf(read_file(path), source=path.name, folder=str(path.absolute().parent))
+    return parse_sdf(read_file(path), path.name, str(path.absolute().parent), root, strict)
 
 
-def parse_sdf(text: str | bytes, source: str = "<sdf>", folder: str = "") -> Scene:
+def parse_sdf(
+    text: str | bytes,
+    source: str = "<sdf>",
+    folder: str = "",
+    root: str | os.PathLike[str] | None = None,
+    strict: bool = False,
+) -> Scene:
     """Read an SDF from text.
 
     Parameters
@@ -50,6 +59,10 @@ def parse_sdf(text: str | bytes, source: str = "<sdf>", folder: str = "") -> Sce
         Its name in error messages.
     folder
         The folder from which meshes and included models are found.
+    root
+        The folder that they do not leave; None for that which :func:`kineverse.formats.roots.root_of` finds.
+    strict
+        Whether mistakes that others read past are refused, rather than remarked on.
 
     Raises
     ------
@@ -57,10 +70,11 @@ def parse_sdf(text: str | bytes, source: str = "<sdf>", folder: str = "") -> Sce
         If it is not a valid SDF; the message names source, line, element and reason.
     """
     remarks: list[str] = []
-    document, root = open_document(text, source, folder, remarks)
+    below = text_root(folder, root)
+    document, top = open_document(text, source, folder, remarks, below, strict)
     parts = Parts()
-    scope = root_scope(document, root)
-    standing = _read(document, root, Reader(parts, remarks), scope)
+    scope = root_scope(document, top)
+    standing = _read(document, top, Reader(parts, remarks, below, strict), scope)
     resolve(parts)
     over = carriers(parts.nodes, scope.model)
     return _scene(parts, over, standing, document, remarks)

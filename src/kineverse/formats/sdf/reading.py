@@ -17,7 +17,7 @@ from .nodes import Document, Node, Scope, check_name
 from .values import attribute_truth, text, text_of, truth
 
 _MOST_NESTED = 100
-_OLDEST, _LATEST = (1, 4), (1, 12)
+_OLDEST, _LATEST = (1, 2), (1, 12)
 _LEFT_OUT = ("actor", "population", "road", "plugin")
 
 
@@ -59,7 +59,7 @@ class Parts:
 
 
 def open_document(
-    data: str | bytes, source: str, folder: str, remarks: list[str]
+    data: str | bytes, source: str, folder: str, remarks: list[str], below: str, strict: bool
 ) -> tuple[Document, Element]:
     """Return a document and its root element.
 
@@ -68,13 +68,15 @@ def open_document(
     FormatError
         If it is no SDF, or of a version that is not read.
     """
+    notes = Remarks(source, remarks, strict)
     try:
-        root = parse(data, source, texts=True)
+        root = parse(data, source, texts=True, mend=None if strict else notes.fault)
     except FormatError as error:
         raise FormatError(f"{error}{_template(data)}") from None
-    document = Document(source, folder, _LATEST, Remarks(source, remarks))
-    if root[0] != "sdf":
-        known = {"robot": "a URDF", "mujoco": "an MJCF", "gazebo": "a file of Gazebo before SDF 1.0"}
+    document = Document(source, folder, _LATEST, notes, below)
+    # Up to 1.2, <gazebo> was what it was called.
+    if root[0] not in ("sdf", "gazebo"):
+        known = {"robot": "a URDF", "mujoco": "an MJCF"}
         guess = f" This is {known[root[0]]}." if root[0] in known else ""
         document.refuse(root, f"is not <sdf>, the root element of an SDF.{guess}")
     said = root[1].get("version")
@@ -83,7 +85,7 @@ def open_document(
         document.refuse(root, 'does not say its version, as <sdf version="1.10"> does.')
     document.version = int(match[1]), int(match[2])
     if not _OLDEST <= document.version <= _LATEST:
-        document.refuse(root, f"version={quote(said or '')} is not one that is read; 1.4 to 1.12 are.")
+        document.refuse(root, f"version={quote(said or '')} is not one that is read; 1.2 to 1.12 are.")
     return document, root
 
 
@@ -97,9 +99,10 @@ def _template(data: str | bytes) -> str:
 class Reader:
     """Reads models into nodes, and those that they include."""
 
-    def __init__(self, parts: Parts, remarks: list[str]):
+    def __init__(self, parts: Parts, remarks: list[str], below: str, strict: bool):
         self._parts = parts
         self._remarks = remarks
+        self._below, self._strict = below, strict
         self._open: list[Path] = []
 
     def world(self, element: Element, scope: Scope) -> None:
@@ -226,7 +229,7 @@ class Reader:
                 raise ElementError(include, "has no <uri>; the specification requires it.")
             merge = attribute_truth(include, "merge")
             try:
-                path = find_included(text_of(part), document.folder).resolve()
+                path = find_included(text_of(part), document.folder, self._below).resolve()
             except FormatError as error:
                 raise ElementError(part, str(error)) from None
             if path in self._open or len(self._open) >= _MOST_NESTED:
@@ -235,7 +238,8 @@ class Reader:
                 )
             if path.suffix == ".urdf":
                 raise ElementError(part, f"{quote(text_of(part))} is a URDF; load it by itself.")
-        inner, root = open_document(read_file(path), path.name, str(path.parent), self._remarks)
+        content, folder = read_file(path), str(path.parent)
+        inner, root = open_document(content, path.name, folder, self._remarks, self._below, self._strict)
         models = [element for element in root[2] if element[0] == "model"]
         if len(models) != 1 and not models:
             strangers = [element for element in root[2] if element[0] in ("light", "actor")]
@@ -250,9 +254,12 @@ class Reader:
         with document.about(include):
             check_name(name, include, document.version)
         self._open.append(path)
+        if merge and scope.model.sort == "world" and any(part[0] == "link" for part in models[0][2]):
+            with document.about(include):
+                mistake = ElementError(include, "has merge, and a world has no links as that model has.")
+                document.remarks.mend(mistake, "it is a model of its own")
+            merge = False
         if merge:
-            if scope.model.sort == "world":
-                document.refuse(include, "has merge, and is not in a model that it could be merged into.")
             proxy = self._add("frame", models[0], scope, f"_merged__{name}__model__")
             shared = Scope(scope.path, inner, scope.outer, scope.static, proxy)
             shared.names, shared.inner = scope.names, scope.inner

@@ -93,7 +93,7 @@ def _relate(node: Node) -> None:
     if said is None:
         return
     with scope.document.about(node.element):
-        node.pose = pose_of(said)
+        node.pose = pose_of(said, scope.document.remarks)
     key = "frame" if scope.document.version < (1, 7) else "relative_to"
     name = said[1].get(key, "")
     if name:

@@ -9,6 +9,7 @@ import math
 
 from kineverse.formats import numerals, rpy
 from kineverse.formats.markup import TEXT, Element, ElementError, abbreviate, child, quote
+from kineverse.formats.remarks import Remarks
 from kineverse.model.body import Pose, Vector3
 
 _TRUTH = {"true": True, "1": True, "false": False, "0": False}
@@ -97,7 +98,7 @@ def direction(axis: Element) -> Vector3:
     return (rpy.snap(x / length), rpy.snap(y / length), rpy.snap(z / length))
 
 
-def pose_of(element: Element) -> Pose:
+def pose_of(element: Element, remarks: Remarks) -> Pose:
     """Return what a ``<pose>`` says, in whichever of the formats of SDF 1.9."""
     layout = element[1].get("rotation_format", "euler_rpy")
     degrees = attribute_truth(element, "degrees")
@@ -111,9 +112,10 @@ def pose_of(element: Element) -> Pose:
         if degrees:
             raise ElementError(element, "is a quaternion in degrees; quaternions have no unit.")
         x, y, z, *xyzw = listed(element, 7)
-        try:
-            return rpy.pose_of_quaternion((x, y, z), tuple(xyzw))
-        except ValueError as error:
-            raise ElementError(element, f"says {abbreviate(text_of(element))}: it {error}.") from None
+        if not rpy.is_rotation(tuple(xyzw)):
+            said = abbreviate(text_of(element))
+            mistake = ElementError(element, f"says {said}: it has length zero, and so is no rotation.")
+            remarks.mend(mistake, "nothing is turned")
+        return rpy.pose_of_quaternion((x, y, z), tuple(xyzw))
     x, y, z, *angles = listed(element, 6)
     return rpy.pose_of((x, y, z), tuple(math.radians(a) if degrees else a for a in angles))

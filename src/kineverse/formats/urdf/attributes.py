@@ -5,6 +5,7 @@ Every function raises :class:`ElementError` for what is missing or malformed; th
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import TypeVar
 
 from kineverse.formats import numerals, rpy
@@ -29,15 +30,34 @@ def number(element: Element, key: str, default: float | None = None) -> float:
         raise ElementError(element, f'{key}="{abbreviate(text)}" {error}.') from None
 
 
-def vector(element: Element, key: str, default: Vector3 | None = None) -> Vector3:
-    """Return three numbers; without a default, the attribute is required."""
+def vector(element: Element, key: str, default: Vector3 | None = None, turns: bool = False) -> Vector3:
+    """Return three numbers, coordinates or what only turns; without a default, the attribute is required."""
     text = element[1].get(key)
     if text is None:
         return _default(element, key, default)
     try:
+        if turns:
+            return numerals.directions(text, 3)  # type: ignore[return-value]  # as many as asked for
         return numerals.numbers(text, 3)  # type: ignore[return-value]  # as many as asked for
     except ValueError as error:
         raise ElementError(element, f'{key}="{abbreviate(text)}" {error}.') from None
+
+
+def mended(
+    read: Callable[[], T], default: T, taken: str, remarks: Remarks, owner: Element | None = None
+) -> T:
+    """Return what is read, or a default with a remark: for what moves nothing if it is wrong.
+
+    Raises
+    ------
+    ElementError
+        Where the document is read strictly.
+    """
+    try:
+        return read()
+    except ElementError as mistake:
+        remarks.mend(mistake, taken, owner)
+        return default
 
 
 def _default(element: Element, key: str, default: T | None) -> T:
@@ -53,7 +73,7 @@ def pose(origin: Element | None, owner: Element, version: tuple[int, int], remar
     """
     if origin is None:
         return _IDENTITY
-    xyz = vector(origin, "xyz", _ZERO)
+    xyz = _said(origin, "xyz", owner, remarks)
     quaternion = origin[1].get("quat_xyzw")
     if quaternion is not None and version < (1, 1):
         remarks.add(
@@ -62,11 +82,28 @@ def pose(origin: Element | None, owner: Element, version: tuple[int, int], remar
             owner,
         )
         quaternion = None
+    if quaternion is not None and "rpy" in origin[1]:
+        mistake = ElementError(origin, "has both rpy and quat_xyzw; keep one of them.")
+        remarks.mend(mistake, "rpy is what counts", owner)
+        quaternion = None
     if quaternion is None:
-        return rpy.pose_of(xyz, vector(origin, "rpy", _ZERO))
-    if "rpy" in origin[1]:
-        raise ElementError(origin, "has both rpy and quat_xyzw; keep one of them.")
+        return rpy.pose_of(xyz, _said(origin, "rpy", owner, remarks))
     try:
-        return rpy.pose_of_quaternion(xyz, numerals.numbers(quaternion, 4))
+        xyzw = numerals.unit(numerals.directions(quaternion, 4))
     except ValueError as error:
-        raise ElementError(origin, f'quat_xyzw="{abbreviate(quaternion)}" {error}.') from None
+        mistake = ElementError(origin, f'quat_xyzw="{abbreviate(quaternion)}" {error}.')
+        remarks.mend(mistake, "nothing is turned", owner)
+        return rpy.pose_of(xyz, _ZERO)
+    if not rpy.is_rotation(xyzw):
+        mistake = ElementError(
+            origin, f'quat_xyzw="{abbreviate(quaternion)}" has length zero, and so is no rotation.'
+        )
+        remarks.mend(mistake, "nothing is turned", owner)
+    return rpy.pose_of_quaternion(xyz, xyzw)
+
+
+def _said(origin: Element, key: str, owner: Element, remarks: Remarks) -> Vector3:
+    """Return three numbers of an origin, zeros where they are left out, or empty."""
+    if not origin[1].get(key, "0").strip():
+        return mended(lambda: vector(origin, key), _ZERO, "zeros are taken", remarks, owner)
+    return vector(origin, key, _ZERO, turns=key == "rpy")

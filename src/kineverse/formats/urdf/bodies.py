@@ -1,20 +1,22 @@
 """``<link>`` elements to links: inertia, shapes to see, shapes to touch.
 
 Specification: http://wiki.ros.org/urdf/XML/link, and urdf.xsd of ros/urdfdom for defaults. Shapes and their
-colours decide nothing about where links are: a shape that cannot be said here is left out with a remark. A
-malformed number in one is still an error.
+colours decide nothing about where links are: a shape that cannot be said here, or is not said, is left out
+with a remark.
 """
 
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 
 from kineverse.formats.markup import Element, ElementError, child, label, name_of
+from kineverse.formats.packages import outside
 from kineverse.formats.remarks import Remarks
-from kineverse.formats.urdf.attributes import number, pose, vector
+from kineverse.formats.urdf.attributes import mended, number, pose, vector
 from kineverse.formats.urdf.description import Link
 from kineverse.formats.urdf.materials import Materials
-from kineverse.model.body import Body, Box, Capsule, Cylinder, Geometry, Inertia, Mesh, Shape, Sphere
+from kineverse.model.body import Body, Box, Capsule, Cylinder, Geometry, Inertia, Mesh, Shape, Sphere, Vector3
 
 _UNSCALED = (1.0, 1.0, 1.0)
 _NOTHING = Body()
@@ -31,11 +33,13 @@ class LinkReader:
         Of the specification that the document claims to follow.
     remarks
         What is noticed goes here.
+    root
+        The folder that meshes do not leave, see :mod:`kineverse.formats.roots`.
     """
 
-    def __init__(self, folder: str, version: tuple[int, int], remarks: Remarks):
+    def __init__(self, folder: str, version: tuple[int, int], remarks: Remarks, root: str | None = None):
         self.materials = Materials(remarks)
-        self._folder = folder
+        self._folder, self._root = folder, root
         self._version = version
         self._remarks = remarks
         self._uncoloured: list[tuple[str, int, Element, Element]] = []
@@ -48,7 +52,7 @@ class LinkReader:
         ElementError
             If something is missing, malformed or without meaning.
         """
-        name = name_of(element)
+        name = mended(lambda: name_of(element), "", "it gets a name", self._remarks)
         visuals: list[Shape] = []
         collisions: list[Shape] = []
         inertia: Inertia | None = None
@@ -64,7 +68,9 @@ class LinkReader:
                     collisions.append(shape)
             elif tag == "inertial":
                 if inertia is None:
-                    inertia = self._inertia(part, element)
+                    inertia = mended(
+                        partial(self._inertia, part, element), None, "it is left out", self._remarks, element
+                    )
                 else:
                     self._remarks.add(part, "is ignored: another one came first.", element)
         if not visuals and not collisions and inertia is None:
@@ -81,6 +87,10 @@ class LinkReader:
             links[name] = replace(link, body=replace(link.body, visuals=tuple(visuals)))
 
     def _shape(self, element: Element, link: Element, name: str = "", index: int = -1) -> Shape | None:
+        read = partial(self._read_shape, element, link, name, index)
+        return mended(read, None, f"the {label(element)} is left out", self._remarks, link)
+
+    def _read_shape(self, element: Element, link: Element, name: str, index: int) -> Shape | None:
         """Return a shape; the colour is looked at if an index among the visuals of the link is given."""
         origin = geometry = material = None
         for part in element[2]:
@@ -110,7 +120,7 @@ class LinkReader:
         form = geometry[2][0]
         tag = form[0]
         if tag == "mesh":
-            return self._mesh(form)
+            return self._mesh(form, link)
         if tag == "box":
             x, y, z = vector(form, "size")
             if min(x, y, z) < 0.0:
@@ -125,11 +135,30 @@ class LinkReader:
         self._remarks.add(form, f"is not a shape of URDF; the {label(shape)} is left out.", link)
         return None
 
-    def _mesh(self, mesh: Element) -> Mesh:
+    def _mesh(self, mesh: Element, link: Element) -> Mesh:
         uri = mesh[1].get("filename")
         if not uri:
             raise ElementError(mesh, "has no filename; the specification requires it.")
-        return Mesh(uri, vector(mesh, "scale", _UNSCALED), self._folder)
+        wrong = outside(uri, self._folder, self._root)
+        if wrong is not None:
+            self._remarks.add(mesh, f"names {wrong}", link)
+        return Mesh(uri, self._scale(mesh, link), self._folder, self._root)
+
+    def _scale(self, mesh: Element, link: Element) -> Vector3:
+        """Return the three factors of a mesh; where there is one only, or one too many, what others take."""
+        words = mesh[1].get("scale", "").split()
+        if len(words) in (1, 4):
+            x, y, z = words * 3 if len(words) == 1 else words[:3]
+            taken = (mesh[0], {"scale": f"{x} {y} {z}"}, mesh[2], mesh[3])
+            default = mended(
+                lambda: vector(taken, "scale"), _UNSCALED, "it is not scaled", self._remarks, link
+            )
+        else:
+            default = _UNSCALED
+        shown = " ".join(f"{factor:g}" for factor in default)
+        return mended(
+            lambda: vector(mesh, "scale", _UNSCALED), default, f"{shown} is taken", self._remarks, link
+        )
 
     def _inertia(self, inertial: Element, link: Element) -> Inertia:
         mass_element, tensor = child(inertial, "mass"), child(inertial, "inertia")

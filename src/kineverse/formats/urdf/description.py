@@ -11,7 +11,7 @@ from typing import Literal, TypeAlias
 
 from kineverse.model.body import Body, Pose, Vector3
 
-Kind: TypeAlias = Literal["fixed", "revolute", "continuous", "prismatic", "planar", "floating"]
+Kind: TypeAlias = Literal["fixed", "revolute", "continuous", "prismatic", "planar", "floating", "spherical"]
 
 FREEDOM: dict[Kind, int] = {
     "fixed": 0,
@@ -20,8 +20,15 @@ FREEDOM: dict[Kind, int] = {
     "prismatic": 1,
     "planar": 3,
     "floating": 6,
+    "spherical": 3,
 }
-"""How many independent speeds a joint of each kind has, unless it mimics another."""
+"""How many independent speeds a joint of each kind has, unless it mimics another.
+
+``spherical`` is no word of URDF; MuJoCo reads it.
+"""
+
+SPECIFIED = tuple(kind for kind in FREEDOM if kind != "spherical")
+"""The kinds that the specification has."""
 
 _IDENTITY = Pose()
 _NOTHING = Body()
@@ -129,8 +136,9 @@ class Robot:
     """A tree of links and joints.
 
     ``links`` are in the order of the file; ``joints`` lead from the ``root`` outwards, so that a joint comes
-    after the one that moves its parent. ``remarks`` say what was ignored, or read in a way its author may not
-    have meant; each names its line.
+    after the one that moves its parent. ``more_roots`` are further links that are nobody's child, of files
+    that are no tree: they stand where the root does. ``remarks`` say what was ignored, or read in a way its
+    author may not have meant; each names its line.
     """
 
     name: str
@@ -139,6 +147,7 @@ class Robot:
     joints: tuple[Joint, ...]
     source: str = ""
     remarks: tuple[str, ...] = ()
+    more_roots: tuple[str, ...] = ()
 
     @property
     def dof(self) -> int:

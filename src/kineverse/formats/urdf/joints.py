@@ -1,7 +1,8 @@
 """``<joint>`` elements to joints.
 
 Specification: http://wiki.ros.org/urdf/XML/joint, and urdf.xsd of ros/urdfdom for defaults. A joint is read
-for what its kind can have: the limits of a fixed joint mean nothing and are not looked at.
+for what its kind can have: the limits of a fixed joint mean nothing and are not looked at. What other parsers
+read although it is wrong is read as they do, with a remark, unless the document is read strictly.
 """
 
 from __future__ import annotations
@@ -11,13 +12,14 @@ import sys
 
 from kineverse.errors import suggest
 from kineverse.formats.markup import Element, ElementError, abbreviate, name_of
-from kineverse.formats.numerals import LARGEST
+from kineverse.formats.numerals import LARGEST, unit
 from kineverse.formats.remarks import Remarks
 from kineverse.formats.rpy import snap
-from kineverse.formats.urdf.attributes import number, pose, vector
+from kineverse.formats.urdf.attributes import mended, number, pose, vector
 from kineverse.formats.urdf.description import (
     FREEDOM,
     FRICTIONLESS,
+    SPECIFIED,
     UNLIMITED,
     Dynamics,
     Joint,
@@ -29,6 +31,7 @@ from kineverse.formats.urdf.description import (
 from kineverse.model.body import Vector3
 
 _X = (1.0, 0.0, 0.0)
+_Z = (0.0, 0.0, 1.0)
 _SHORTEST_AXIS = 1e-9
 _PARTS = frozenset(
     ("origin", "parent", "child", "axis", "limit", "safety_controller", "mimic", "dynamics", "calibration")
@@ -43,19 +46,26 @@ def read_joint(element: Element, version: tuple[int, int], remarks: Remarks) -> 
     ElementError
         If something is missing, malformed or without meaning.
     """
-    name = name_of(element)
-    kind = _kind(element)
+    name = mended(lambda: name_of(element), "", "it is called by its links", remarks)
+    kind = _kind(element, remarks)
     parts = _parts(element, remarks)
-    origin = pose(parts.get("origin"), element, version, remarks)
     parent, child = _link(element, parts, "parent"), _link(element, parts, "child")
+    name = name or f"{parent}_{child}"
+    origin = pose(parts.get("origin"), element, version, remarks)
     line = element[3]
-    if kind in ("fixed", "floating", "planar"):
+    if kind in ("fixed", "floating", "planar", "spherical"):
         if "mimic" in parts and kind != "fixed":
-            raise ElementError(
+            mistake = ElementError(
                 parts["mimic"], f"cannot drive a {kind} joint: only a joint of one DoF can mimic."
             )
-        axis = _axis(parts.get("axis"), element, remarks) if kind == "planar" else None
+            remarks.mend(mistake, "it moves by itself", element)
+        axis = None
+        if kind == "planar":
+            axis = _axis(parts.get("axis"), element, remarks, "the plane is that of x and y") or _Z
         return Joint(name, kind, parent, child, origin, axis, line=line)
+    axis = _axis(parts.get("axis"), element, remarks, "the joint does not move, it is fixed")
+    if axis is None:
+        return Joint(name, "fixed", parent, child, origin, line=line)
     limit, safety, mimic, dynamics = map(parts.get, ("limit", "safety_controller", "mimic", "dynamics"))
     limits = _limits(limit, kind, element, version, remarks)
     return Joint(
@@ -64,25 +74,32 @@ def read_joint(element: Element, version: tuple[int, int], remarks: Remarks) -> 
         parent,
         child,
         origin,
-        _axis(parts.get("axis"), element, remarks),
+        axis,
         limits,
-        _safety(safety, limits),
+        mended(lambda: _safety(safety, limits), None, "it is left out", remarks, element),
         None if mimic is None else _mimic(mimic),
-        FRICTIONLESS
-        if dynamics is None
-        else Dynamics(number(dynamics, "damping", 0.0), number(dynamics, "friction", 0.0)),
+        mended(lambda: _dynamics(dynamics), FRICTIONLESS, "it is left out", remarks, element),
         line,
     )
 
 
-def _kind(element: Element) -> Kind:
+def _dynamics(dynamics: Element | None) -> Dynamics:
+    if dynamics is None:
+        return FRICTIONLESS
+    return Dynamics(number(dynamics, "damping", 0.0), number(dynamics, "friction", 0.0))
+
+
+def _kind(element: Element, remarks: Remarks) -> Kind:
     kind = element[1].get("type")
     if kind is None:
-        raise ElementError(element, f"has no type; the specification requires one of {', '.join(FREEDOM)}.")
-    if kind not in FREEDOM:
-        raise ElementError(
-            element, f'type="{abbreviate(kind)}" is no joint type of URDF. {suggest(kind, FREEDOM, "type")}'
+        raise ElementError(element, f"has no type; the specification requires one of {', '.join(SPECIFIED)}.")
+    if kind not in SPECIFIED:
+        mistake = ElementError(
+            element, f'type="{abbreviate(kind)}" is no joint type of URDF. {suggest(kind, SPECIFIED, "type")}'
         )
+        if kind not in FREEDOM:
+            raise mistake
+        remarks.mend(mistake, "MuJoCo knows it as a ball joint, which it is here")
     return kind
 
 
@@ -107,16 +124,18 @@ def _link(element: Element, parts: dict[str, Element], role: str) -> str:
     return link
 
 
-def _axis(axis: Element | None, joint: Element, remarks: Remarks) -> Vector3:
-    """Return the unit vector of an axis; the specification's default is x."""
+def _axis(axis: Element | None, joint: Element, remarks: Remarks, taken: str) -> Vector3 | None:
+    """Return the unit vector of an axis, None if it has no length; the specification's default is x."""
     if axis is None:
         return _X
-    x, y, z = vector(axis, "xyz", _X)
+    x, y, z = unit(vector(axis, "xyz", _X, turns=True))
     length = math.hypot(x, y, z)
     if length < _SHORTEST_AXIS:
-        raise ElementError(
+        mistake = ElementError(
             axis, f'xyz="{abbreviate(axis[1]["xyz"])}" has length zero: nothing to move along or about.'
         )
+        remarks.mend(mistake, taken, joint)
+        return None
     if abs(length - 1.0) > 1e-3:
         remarks.add(axis, f"has length {length:g}; only its direction is used.", joint)
     return (snap(x / length), snap(y / length), snap(z / length))
@@ -126,47 +145,43 @@ def _limits(
     limit: Element | None, kind: Kind, joint: Element, version: tuple[int, int], remarks: Remarks
 ) -> Limits:
     if limit is None:
-        if kind == "continuous":
-            return UNLIMITED
-        raise ElementError(
-            joint,
-            f"is {kind} but has no <limit>; the specification requires "
-            '<limit lower="..." upper="..." effort="..." velocity="..."/>'
-            + (', or type="continuous" for a joint without bounds.' if kind == "revolute" else "."),
-        )
-    if version >= (1, 2):
-        return _limits_1_2(limit, kind)
-    effort, velocity = number(limit, "effort"), number(limit, "velocity")
-    if velocity <= 0.0:
-        remarks.add(limit, f"has velocity {velocity:g}, which is taken as no bound at all.", joint)
-    lower = upper = None
-    if kind != "continuous":
-        lower, upper = _range(limit, number(limit, "lower", 0.0), number(limit, "upper", 0.0))
-        if "lower" not in limit[1] and "upper" not in limit[1]:
-            remarks.add(
-                limit, "has neither lower nor upper; both are 0 by the specification: it cannot move.", joint
+        if kind != "continuous":
+            mistake = ElementError(
+                joint,
+                f"is {kind} but has no <limit>; the specification requires "
+                '<limit lower="..." upper="..." effort="..." velocity="..."/>'
+                + (', or type="continuous" for a joint without bounds.' if kind == "revolute" else "."),
             )
+            remarks.mend(mistake, "it has no limits")
+        return UNLIMITED
+    newer = version >= (1, 2)
+    lower, upper = (None, None) if kind == "continuous" else _range(limit, joint, newer, remarks)
+    values = {key: _magnitude(limit, key, joint, newer, remarks) for key in ("effort", "velocity")}
     for key in ("acceleration", "deceleration", "jerk"):
-        if key in limit[1]:
+        if newer:
+            values[key] = _magnitude(limit, key, joint, newer, remarks)
+        elif key in limit[1]:
             remarks.add(limit, f"has {key}, which is ignored: it came with URDF 1.2.", joint)
-    return Limits(
-        _bound(lower), _bound(upper), _bound(velocity) if velocity > 0.0 else None, _bound(abs(effort))
-    )
-
-
-def _limits_1_2(limit: Element, kind: Kind) -> Limits:
-    """Return limits as URDF 1.2 reads them: open where left out, but a range needs both ends."""
-    lower = upper = None
-    if kind != "continuous":
-        lower, upper = _range(limit, number(limit, "lower"), number(limit, "upper"))
-    keys = ("velocity", "effort", "acceleration", "deceleration", "jerk")
-    values = {key: number(limit, key) for key in keys if key in limit[1]}
-    for key, value in values.items():
-        if value < 0.0:
-            raise ElementError(limit, f"has {key}={value!r}; URDF 1.2 refuses negative magnitudes.")
-    if "acceleration" in values:
-        values.setdefault("deceleration", values["acceleration"])
+    if values.get("deceleration") is None and "deceleration" not in limit[1]:
+        values["deceleration"] = values.get("acceleration")
     return Limits(_bound(lower), _bound(upper), **{key: _bound(value) for key, value in values.items()})
+
+
+def _magnitude(limit: Element, key: str, joint: Element, newer: bool, remarks: Remarks) -> float | None:
+    """Return a bound of a magnitude; from URDF 1.2 on it may be left out, and must not be negative."""
+    if newer and key not in limit[1]:
+        return None
+    value = mended(lambda: number(limit, key), None, "it bounds nothing", remarks, joint)
+    if value is None:
+        return None
+    if newer and value < 0.0:
+        mistake = ElementError(limit, f"has {key}={value!r}; URDF 1.2 refuses negative magnitudes.")
+        remarks.mend(mistake, "it bounds nothing", joint)
+        return None
+    if key == "velocity" and not newer and value <= 0.0:
+        remarks.add(limit, f"has velocity {value:g}, which is taken as no bound at all.", joint)
+        return None
+    return abs(value)
 
 
 def _bound(value: float | None) -> float | None:
@@ -174,14 +189,49 @@ def _bound(value: float | None) -> float | None:
     return None if value is None or abs(value) == sys.float_info.max else value
 
 
-def _range(limit: Element, lower: float, upper: float) -> tuple[float, float]:
+def _range(
+    limit: Element, joint: Element, newer: bool, remarks: Remarks
+) -> tuple[float | None, float | None]:
+    """Return the ends of a range, None for one that is open: as Bullet and MuJoCo do, where there is none."""
+    said = limit[1]
+    if newer:
+        for key in ("lower", "upper"):
+            if key not in said:
+                mistake = ElementError(limit, f"has no {key}; the specification requires it.")
+                remarks.mend(mistake, "the joint is not limited", joint)
+                return None, None
+    elif "lower" not in said and "upper" not in said:
+        remarks.add(
+            limit, "has neither lower nor upper; both are 0 by the specification: it cannot move.", joint
+        )
+    lower, upper = _end(limit, "lower", joint, remarks), _end(limit, "upper", joint, remarks)
+    if math.isnan(lower) or math.isnan(upper):
+        return None, None
+    wrong: ElementError | None = None
     if lower > upper:
-        raise ElementError(limit, f"has lower={lower!r} above upper={upper!r}: no position would be valid.")
-    if lower > LARGEST or upper < -LARGEST:
-        raise ElementError(
+        wrong = ElementError(limit, f"has lower={lower!r} above upper={upper!r}: no position would be valid.")
+    elif lower > LARGEST or upper < -LARGEST:
+        wrong = ElementError(
             limit, f"has lower={lower!r} and upper={upper!r}: all positions would be beyond {LARGEST:g}."
         )
-    return lower, upper
+    if wrong is not None:
+        remarks.mend(wrong, "the joint is not limited", joint)
+        return None, None
+    return (lower if lower > -math.inf else None), (upper if upper < math.inf else None)
+
+
+def _end(limit: Element, key: str, joint: Element, remarks: Remarks) -> float:
+    """Return an end of a range: infinite where there is none, NaN where nobody knows."""
+    text = limit[1].get(key, "0").strip()
+    if not text:
+        return mended(lambda: number(limit, key), 0.0, "it is 0", remarks, joint)
+    try:
+        value = float(text) if text.isascii() and "_" not in text else None
+    except ValueError:
+        value = None
+    if value is None or math.isfinite(value):
+        return number(limit, key, 0.0)
+    return mended(lambda: number(limit, key), value, "it bounds nothing", remarks, joint)
 
 
 def _safety(safety: Element | None, limits: Limits) -> Safety | None:

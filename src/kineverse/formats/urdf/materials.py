@@ -40,10 +40,11 @@ class Materials:
             return
         earlier = self._shared.setdefault(material[1].get("name", ""), appearance)
         if earlier != appearance:
-            raise ElementError(
+            mistake = ElementError(
                 material,
                 f"is {_show(appearance)} here and {_show(earlier)} before; give the two different names.",
             )
+            self._remarks.mend(mistake, "the first is taken")
 
     def appearance(self, material: Element, link: Element) -> Appearance | None:
         """Return what the ``<material>`` of a visual looks like, None if that may be said further on."""
@@ -76,7 +77,15 @@ class Materials:
                 return ((red, green, blue, 1.0), file)
             red, green, blue, alpha = numbers(text, 4)
         except ValueError as error:
-            raise ElementError(color, f"rgba={quote(text)} {error}.") from None
+            mistake = ElementError(color, f"rgba={quote(text)} {error}.")
+        else:
+            return ((red, green, blue, alpha), file)
+        try:
+            red, green, blue, alpha = numbers(" ".join(text.split()[:4]), 4)
+        except ValueError:
+            self._remarks.mend(mistake, "it is no colour", owner)
+            return (None, file)
+        self._remarks.mend(mistake, "the first four are taken", owner)
         return ((red, green, blue, alpha), file)
 
 

@@ -4,32 +4,37 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import replace
-from typing import NoReturn
 
 from kineverse.errors import FormatError, suggest
 from kineverse.formats.chains import Following, resolve_chains
 from kineverse.formats.markup import quote
+from kineverse.formats.remarks import Remarks
 from kineverse.formats.urdf.description import FREEDOM, Joint, Mimic
 
 
-def resolve(joints: Iterable[Joint], source: str) -> list[Joint]:
+def resolve(joints: Iterable[Joint], remarks: Remarks) -> list[Joint]:
     """Return the joints, each ``mimic`` naming the joint at the end of its chain and the composed factors.
+
+    A joint that mimics one that does not exist, itself, in a circle, or one that has no single position,
+    moves by itself, as it does for others.
 
     Raises
     ------
     FormatError
-        If a joint mimics one that does not exist, itself, in a circle, or one that has no single position.
+        If there is such a joint, and the description is read strictly.
     """
     joints = list(joints)
     if all(joint.mimic is None for joint in joints):
         return joints
     by_name = {joint.name: joint for joint in joints}
 
-    def refuse(follower: str, reason: str) -> NoReturn:
-        line = by_name[follower].line
-        raise FormatError(f"{source}, line {line}, <mimic> of <joint name={quote(follower)}>: {reason}")
+    def refuse(follower: str, reason: str) -> None:
+        line, text = by_name[follower].line, f"<mimic> of <joint name={quote(follower)}>: {reason}"
+        if remarks.strict:
+            raise FormatError(f"{remarks.source}, line {line}, {text}")
+        remarks.fault(line, f"{text.rstrip('. ')}; it moves by itself.")
 
-    def check(follower: str, name: str) -> None:
+    def check(follower: str, name: str) -> bool:
         leader = by_name.get(name)
         if leader is None:
             movable = [joint.name for joint in joints if FREEDOM[joint.kind] == 1]
@@ -38,12 +43,15 @@ def resolve(joints: Iterable[Joint], source: str) -> list[Joint]:
                 f"it mimics {quote(name)}, and there is no joint of that name. "
                 f"{suggest(name, movable, 'joint to mimic')}",
             )
+            return False
         if FREEDOM[leader.kind] != 1:
             refuse(
                 follower,
                 f"it mimics {quote(leader.name)} (line {leader.line}), which is {leader.kind} and so has no "
                 "single position to follow. Mimic a revolute, continuous or prismatic joint.",
             )
+            return False
+        return True
 
     following = {
         joint.name: Following(joint.mimic.joint, joint.mimic.multiplier, joint.mimic.offset)
@@ -54,6 +62,6 @@ def resolve(joints: Iterable[Joint], source: str) -> list[Joint]:
     return [
         replace(joint, mimic=Mimic(end.leader, end.multiplier, end.offset))
         if (end := resolved.get(joint.name))
-        else joint
+        else replace(joint, mimic=None)
         for joint in joints
     ]

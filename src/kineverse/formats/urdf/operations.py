@@ -6,15 +6,16 @@ the things: ``joint pr2/l_elbow_flex_joint``, ``body pr2/l_elbow_flex_link``, ``
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Container, Iterable, Iterator
 from dataclasses import dataclass
 from typing import Any
 
-from kineverse.articulations import AxisJoint, Continuous, Fixed, Floating, Planar, Prismatic, Revolute
+from kineverse.articulations import AxisJoint, Ball, Continuous, Fixed, Floating, Planar, Prismatic, Revolute
 from kineverse.articulations import Joint as JointOperation
 from kineverse.errors import FormatError
 from kineverse.expressions.expression import Expression
 from kineverse.formats.markup import quote
+from kineverse.formats.remarks import Fault, tell
 from kineverse.formats.set_body import SetBody, is_empty
 from kineverse.formats.urdf.description import Joint, Link, Robot
 from kineverse.model.body import Pose
@@ -31,6 +32,7 @@ _AXIS_JOINTS: dict[str, type[AxisJoint]] = {
 }
 _SUFFIXES = {
     "planar": ("x", "y", "angle"),
+    "spherical": ("qx", "qy", "qz", "qw", "wx", "wy", "wz"),
     "floating": ("x", "y", "z", "qx", "qy", "qz", "qw", "wx", "wy", "wz"),
 }
 _ROOT = Pose()
@@ -68,7 +70,9 @@ class SoftLimits(Operation):
         return f"soft limits {self.name}"
 
 
-def robot_operations(robot: Robot, prefix: str | None = None, parent: str = WORLD) -> Iterator[Operation]:
+def robot_operations(
+    robot: Robot, prefix: str | None = None, parent: str = WORLD, strict: bool = False
+) -> Iterator[Operation]:
     """Yield the operations that build a robot, from its root outwards.
 
     Parameters
@@ -80,17 +84,23 @@ def robot_operations(robot: Robot, prefix: str | None = None, parent: str = WORL
     parent
         The frame to which the root link is attached. A root link ``world`` without prefix is the world.
 
+    strict
+        Whether names that cannot be names here are refused, rather than replaced with a remark.
+
     Empty parts of names are left out: ``/base_link`` becomes ``base_link``.
 
     Raises
     ------
     FormatError
-        If names of the description cannot be names here, or two things would have the same.
+        If the root is the world and is to be attached elsewhere; for names, where they are read strictly.
     """
-    _check_names(robot, prefix)
+    links, joints = _names(robot, prefix, strict)
 
     def named(name: str) -> str:
-        return f"{prefix}/{_plain(name)}" if prefix else _plain(name)
+        return f"{prefix}/{links[name]}" if prefix else links[name]
+
+    def moved(name: str) -> str:
+        return f"{prefix}/{joints[name]}" if prefix else joints[name]
 
     root = named(robot.root)
     bodies = {link.name: link.body for link in robot.links if not is_empty(link.body)}
@@ -103,14 +113,20 @@ def robot_operations(robot: Robot, prefix: str | None = None, parent: str = WORL
         )
     if robot.root in bodies:
         yield SetBody(root, bodies[robot.root])
+    for other in robot.more_roots:
+        yield AddFrame(named(other), Frame(parent, (_ROOT,)))
+        if other in bodies:
+            yield SetBody(named(other), bodies[other])
     for joint in robot.joints:
-        yield from _joint_operations(joint, named)
+        yield from _joint_operations(joint, named, moved)
         if joint.child in bodies:
             yield SetBody(named(joint.child), bodies[joint.child])
 
 
-def _joint_operations(joint: Joint, named: Callable[[str], str]) -> Iterator[Operation]:
-    name = named(joint.name)
+def _joint_operations(
+    joint: Joint, named: Callable[[str], str], moved: Callable[[str], str]
+) -> Iterator[Operation]:
+    name = moved(joint.name)
     common: dict[str, Any] = {
         "name": name,
         "parent": named(joint.parent),
@@ -121,11 +137,13 @@ def _joint_operations(joint: Joint, named: Callable[[str], str]) -> Iterator[Ope
         yield Fixed(**common)
     elif joint.kind == "floating":
         yield Floating(**common)
+    elif joint.kind == "spherical":
+        yield Ball(**common)
     elif joint.kind == "planar":
         assert joint.axis is not None
         yield Planar(**common, axis=joint.axis)
     else:
-        followed = _followed(joint, named)
+        followed = _followed(joint, moved)
         yield _axis_joint(joint, common, followed)
         safety = joint.safety
         if safety is not None and safety.bounds and joint.kind != "continuous":
@@ -146,11 +164,11 @@ def _axis_joint(joint: Joint, common: dict[str, Any], followed: Expression | Non
     )
 
 
-def _followed(joint: Joint, named: Callable[[str], str]) -> Expression | None:
+def _followed(joint: Joint, moved: Callable[[str], str]) -> Expression | None:
     """Return the expression that stands for the position of a joint that mimics another one."""
     if joint.mimic is None:
         return None
-    return joint.mimic.multiplier * position(named(joint.mimic.joint)) + joint.mimic.offset
+    return joint.mimic.multiplier * position(moved(joint.mimic.joint)) + joint.mimic.offset
 
 
 def _dynamics(joint: Joint) -> tuple[tuple[str, float], ...]:
@@ -167,37 +185,78 @@ def _dynamics(joint: Joint) -> tuple[tuple[str, float], ...]:
     return tuple((name, value) for name, value in values.items() if value is not None)
 
 
-def _check_names(robot: Robot, prefix: str | None) -> None:
-    """Raise where names of the description cannot be names of the model."""
+def _names(robot: Robot, prefix: str | None, strict: bool) -> tuple[dict[str, str], dict[str, str]]:
+    """Return what links and joints are called here, those that cannot have their names with another one.
+
+    Raises
+    ------
+    FormatError
+        If there are such names, and the description is read strictly.
+    """
+    again: dict[str, int] = {}
+
+    def rename(what: str, thing: Link | Joint, problem: str, wanted: str, taken: Container[str]) -> str:
+        place = f"<{what} name={quote(thing.name)}>"
+        if strict:
+            raise FormatError(f"{robot.source}, line {thing.line}, {place}: {problem}. Rename it.")
+        k, name = again.get(wanted, 1), wanted
+        while name in taken:
+            k += 1
+            name = f"{wanted}_{k}"
+        again[wanted] = k
+        tell([Fault(f"{robot.source}, line {thing.line}, {place}: {problem}; it is called {quote(name)}.")])
+        return name
+
     parts: tuple[tuple[str, Iterable[Link | Joint]], ...] = (("link", robot.links), ("joint", robot.joints))
+    found: list[dict[str, str]] = []
     for what, things in parts:
+        plain = {thing.name: _plain(thing.name) for thing in things}
         known: dict[str, Link | Joint] = {}
+        every = set(plain.values())
         for thing in things:
-            name = _plain(thing.name)
-            if not name or not (name.isprintable() or all(ord(character) >= 32 for character in name)):
+            name = plain[thing.name]
+            if not name or any(ord(character) < 32 for character in name):
                 problem = "the name has nothing but slashes, or a control character"
-            elif known.setdefault(name, thing) is not thing:
+                name = "".join(c if ord(c) >= 32 else "_" for c in name) or what
+                name = rename(what, thing, problem, name, every)
+            elif name in known:
                 problem = f"only slashes tell it from the one on line {known[name].line}"
+                name = rename(what, thing, problem, f"{name}_{what}", every)
             elif what == "link" and name == WORLD and not prefix and thing.name != robot.root:
                 problem = "it is not the root, but has the name of the root of all frames. Give a prefix"
-            else:
-                continue
-            raise FormatError(f"{_place(robot, thing, what)}: {problem}. Rename it.")
-    taken = {_plain(joint.name) for joint in robot.joints}
+                name = rename(what, thing, problem, f"{name}_{what}", every)
+            known[name] = thing
+            every.add(name)
+            plain[thing.name] = name
+        found.append(plain)
+    links, joints = found
+    taken = set(joints.values())
     for joint in robot.joints:
-        for suffix in _SUFFIXES.get(joint.kind, ()):
-            if f"{_plain(joint.name)}/{suffix}" in taken:
-                coordinate = quote(f"{joint.name}/{suffix}")
-                raise FormatError(
-                    f"{_place(robot, joint, 'joint')}: its coordinate {coordinate} has the name of another "
-                    "joint. Rename one of them."
-                )
+        name = joints[joint.name]
+        clash = [f"{name}/{s}" for s in _SUFFIXES.get(joint.kind, ()) if f"{name}/{s}" in taken]
+        if clash:
+            problem = f"its coordinate {quote(clash[0])} has the name of another joint"
+            everywhere = _Prefixes(taken)
+            joints[joint.name] = rename("joint", joint, problem, f"{name}_joint", everywhere)
+            taken.add(joints[joint.name])
+    return links, joints
+
+
+class _Prefixes:
+    """Whether a name is taken, or those of coordinates below it are."""
+
+    def __init__(self, taken: set[str]) -> None:
+        self._taken = {
+            "/".join(parts[:k])
+            for name in taken
+            for parts in [name.split("/")]
+            for k in range(1, len(parts) + 1)
+        }
+
+    def __contains__(self, name: object) -> bool:
+        return name in self._taken
 
 
 def _plain(name: str) -> str:
     """Return a name without empty parts: descriptions older than tf2 call links ``/base_link``."""
     return "/".join(filter(None, name.split("/"))) if "/" in name else name
-
-
-def _place(robot: Robot, thing: Link | Joint, what: str) -> str:
-    return f"{robot.source}, line {thing.line}, <{what} name={quote(thing.name)}>"

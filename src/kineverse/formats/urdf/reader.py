@@ -6,7 +6,9 @@ disagree and how it is decided here.
 
 from __future__ import annotations
 
+import math
 import os
+from dataclasses import replace
 from pathlib import Path
 from typing import TypeVar
 
@@ -14,14 +16,17 @@ from kineverse.errors import FormatError
 from kineverse.formats.files import read_file
 from kineverse.formats.markup import Element, ElementError, Visit, label, parse, quote
 from kineverse.formats.remarks import Remarks
+from kineverse.formats.roots import text_root
 from kineverse.formats.urdf.bodies import LinkReader
 from kineverse.formats.urdf.description import Joint, Link, Robot
 from kineverse.formats.urdf.joints import read_joint
 from kineverse.formats.urdf.mimicry import resolve
-from kineverse.formats.urdf.tree import root_outwards
+from kineverse.formats.urdf.tree import one_parent_each, root_outwards
 
 _VERSIONS = {"1.0": (1, 0), "1.1": (1, 1), "1.2": (1, 2)}
 _EXTENSIONS = frozenset(("gazebo", "transmission"))
+EXPAND = "Run xacro first: xacro robot.urdf.xacro > robot.urdf"
+
 _OTHER_FORMATS = {
     "sdf": "an SDF",
     "mujoco": "an MJCF",
@@ -32,8 +37,10 @@ _OTHER_FORMATS = {
 T = TypeVar("T", Link, Joint)
 
 
-def read_urdf(path: str | os.PathLike[str]) -> Robot:
-    """Read a URDF file.
+def read_urdf(
+    path: str | os.PathLike[str], root: str | os.PathLike[str] | None = None, strict: bool = False
+) -> Robot:
+    """Read a URDF file; see :func:`parse_urdf`.
 
     Raises
     ------
@@ -41,10 +48,16 @@ def read_urdf(path: str | os.PathLike[str]) -> Robot:
         If the file cannot be read or is not a valid URDF; the message names file, line, element and reason.
     """
     path = Path(path)
-    return parse_urdf(read_file(path), source=path.name, folder=str(path.absolute().parent))
+    return parse_urdf(read_file(path), path.name, str(path.absolute().parent), root, strict)
 
 
-def parse_urdf(text: str | bytes, source: str = "<urdf>", folder: str = "") -> Robot:
+def parse_urdf(
+    text: str | bytes,
+    source: str = "<urdf>",
+    folder: str = "",
+    root: str | os.PathLike[str] | None = None,
+    strict: bool = False,
+) -> Robot:
     """Read a URDF from text.
 
     Parameters
@@ -55,63 +68,103 @@ def parse_urdf(text: str | bytes, source: str = "<urdf>", folder: str = "") -> R
         Its name in error messages.
     folder
         The folder from which the meshes it names are found, when somebody asks for them.
+    root
+        The folder that they do not leave; None for that which :func:`kineverse.formats.roots.root_of` finds.
+    strict
+        Whether mistakes that others read past are refused, rather than remarked on.
 
     Raises
     ------
     FormatError
         If it is not a valid URDF; the message names source, line, element and reason.
     """
-    document = _Document(source, folder)
-    root = parse(text, source, _EXTENSIONS, document.begin)
-    hint = document.finish(root)
-    joints = resolve(document.joints.values(), source)
+    remarks = Remarks(source, strict=strict)
+    document = _Document(folder, text_root(folder, root), remarks)
+    top = parse(text, source, _EXTENSIONS, document.begin, mend=None if strict else remarks.fault)
+    hint = document.finish(top)
+    joints = one_parent_each(list(document.joints.values()), remarks)
     links = tuple(document.links.values())
-    top, ordered = root_outwards(links, joints, source, hint)
-    return Robot(root[1]["name"], top, links, ordered, source, tuple(document.remarks.texts))
+    roots, ordered, reached = root_outwards(links, joints, remarks, hint)
+    name = top[1].get("name", "")
+    return Robot(
+        name,
+        roots[0],
+        tuple(reached),
+        tuple(resolve(ordered, remarks)),
+        source,
+        tuple(remarks.texts),
+        roots[1:],
+    )
 
 
 class _Document:
     """The links and joints of a document, which are taken up as they come."""
 
-    def __init__(self, source: str, folder: str):
+    def __init__(self, folder: str, root: str, remarks: Remarks):
         self.links: dict[str, Link] = {}
         self.joints: dict[str, Joint] = {}
-        self.remarks = Remarks(source)
-        self._folder = folder
+        self.remarks = remarks
+        self._folder, self._root = folder, root
         self._strangers: list[Element] = []
+        self._again: dict[str, int] = {}
 
     def begin(self, root: Element) -> Visit:
         """Look at the root element, which has no children yet."""
         try:
-            self._version = _version(root)
+            self._version = _version(root, self.remarks)
         except ElementError as mistake:
             raise self._error(mistake, root) from None
-        self._reader = LinkReader(self._folder, self._version, self.remarks)
+        self._xacro = _xacro_prefix(root)
+        self._reader = LinkReader(self._folder, self._version, self.remarks, self._root)
         return self._take
 
     def finish(self, root: Element) -> str:
         """Do what needs all of the document; return a hint for the case that it is no tree."""
         self._reader.colour(self.links)
-        hint = _note_strangers(root, self._strangers, self.remarks)
+        try:
+            hint = _note_strangers(root, self._strangers, bool(self.joints), self.remarks)
+        except ElementError as mistake:
+            raise self._error(mistake, mistake.element) from None
         if not self.links:
+            declared = any(key.startswith("xmlns:") and "xacro" in value for key, value in root[1].items())
+            hint += f" {EXPAND}" if declared else ""
             raise self._error(ElementError(root, f"has no <link>; a robot has at least one.{hint}"), root)
         return hint
 
     def _take(self, element: Element) -> None:
         tag = element[0]
         try:
+            if tag in ("link", "joint"):
+                _check_expanded(element, self._xacro, self.remarks)
             if tag == "link":
                 link = self._reader.read(element)
                 _add(self.links, link.name, link, element)
             elif tag == "joint":
-                joint = read_joint(element, self._version, self.remarks)
-                _add(self.joints, joint.name, joint, element)
+                self._add_joint(read_joint(element, self._version, self.remarks), element)
             elif tag == "material":
                 self._reader.materials.share(element)
             elif tag != "sensor":
                 self._strangers.append(element)
         except ElementError as mistake:
             raise self._error(mistake, element) from None
+
+    def _add_joint(self, joint: Joint, element: Element) -> None:
+        """Take up a joint; a name that a fixed one has, too, goes to the other, which has a coordinate."""
+        other = self.joints.get(joint.name)
+        if other is None or "fixed" not in (joint.kind, other.kind):
+            _add(self.joints, joint.name, joint, element)
+            return
+        name, k = joint.name, self._again.get(joint.name, 2)
+        while f"{name}_{k}" in self.joints:
+            k += 1
+        self._again[name] = k + 1
+        mistake = ElementError(
+            element, f"has the name of the joint on line {other.line} again; names are unique."
+        )
+        self.remarks.mend(mistake, f'the fixed one is called "{name}_{k}"')
+        if other.kind == "fixed" and joint.kind != "fixed":
+            self.joints[name], joint = joint, other
+        self.joints[f"{name}_{k}"] = replace(joint, name=f"{name}_{k}")
 
     def _error(self, mistake: ElementError, owner: Element) -> FormatError:
         """Return the error that people see; a mistake is often deep inside the element they know by name."""
@@ -128,40 +181,69 @@ def _add(named: dict[str, T], name: str, part: T, element: Element) -> None:
         )
 
 
-def _version(root: Element) -> tuple[int, int]:
+def _version(root: Element, remarks: Remarks) -> tuple[int, int]:
     """Return the version of the specification that the root element claims, 1.0 if it claims none."""
     if root[0] != "robot":
         guess = f" This is {_OTHER_FORMATS[root[0]]} file." if root[0] in _OTHER_FORMATS else ""
-        raise ElementError(root, f"is not <robot>, the root element of a URDF.{guess}")
+        mistake = ElementError(root, f"is not <robot>, the root element of a URDF.{guess}")
+        if root[0].lower() != "robot":
+            raise mistake
+        remarks.mend(mistake, "it is taken for that")
     if "name" not in root[1]:
-        raise ElementError(root, 'has no name; the specification requires <robot name="...">.')
+        mistake = ElementError(root, 'has no name; the specification requires <robot name="...">.')
+        remarks.mend(mistake, "it is called nothing")
     text = root[1].get("version", "1.0")
-    if text not in _VERSIONS:
-        raise ElementError(
-            root, f"version={quote(text)} is not one that is read; {', '.join(_VERSIONS)} are."
-        )
-    return _VERSIONS[text]
+    if text in _VERSIONS:
+        return _VERSIONS[text]
+    mistake = ElementError(
+        root, f"version={quote(text)} is not one that is read; {', '.join(_VERSIONS)} are."
+    )
+    try:
+        latest = math.inf > float(text) > 1.2
+    except ValueError:
+        latest = False
+    taken = "1.2" if latest else "1.0"
+    remarks.mend(mistake, f"{taken} is taken")
+    return _VERSIONS[taken]
 
 
-def _note_strangers(root: Element, strangers: list[Element], remarks: Remarks) -> str:
+def _note_strangers(root: Element, strangers: list[Element], has_joints: bool, remarks: Remarks) -> str:
     """Remark on elements that may have been meant to be part of the robot, and return them as a hint.
 
-    Elements that URDF does not know are allowed, and are ignored; but macros that were never expanded and
-    joints of other dialects are how links come to be without a parent.
+    Elements that URDF does not know are allowed, and are ignored; but joints of other dialects are how links
+    come to be without a parent.
+
+    Raises
+    ------
+    ElementError
+        For macros that were never expanded, where they are all that there is.
     """
     xacro = _xacro_prefix(root)
-    suspects = [e for e in strangers if e[0].startswith(xacro) or e[0].lower().endswith(("link", "joint"))]
+    for element in strangers:
+        if element[0].startswith(xacro):
+            mistake = ElementError(element, f"is xacro that was not expanded. {EXPAND}")
+            if not has_joints:
+                raise mistake
+            remarks.mend(mistake, "it is passed over, and what it would add is missing")
+    suspects = [
+        e for e in strangers if e[0].lower().endswith(("link", "joint")) and not e[0].startswith(xacro)
+    ]
+    for element in suspects:
+        remarks.add(element, "is ignored: URDF does not know it.")
     if not suspects:
         return ""
-    remedy = ""
-    for element in suspects:
-        if element[0].startswith(xacro):
-            remedy = " Expand xacro first: xacro robot.urdf.xacro > robot.urdf"
-            remarks.add(element, "is ignored: it is xacro that was not expanded.")
-        else:
-            remarks.add(element, "is ignored: URDF does not know it.")
     shown = ", ".join(f"{label(element)} (line {element[3]})" for element in suspects[:4])
-    return f" Ignored, since URDF does not know it: {shown}{', ...' if len(suspects) > 4 else ''}.{remedy}"
+    return f" Ignored, since URDF does not know it: {shown}{', ...' if len(suspects) > 4 else ''}."
+
+
+def _check_expanded(element: Element, xacro: str, remarks: Remarks) -> None:
+    if "${" in element[1].get("name", ""):
+        mistake = ElementError(element, f"has a name that xacro was to expand. {EXPAND}")
+        remarks.mend(mistake, "it is taken as it is")
+    for part in element[2]:
+        if part[0].startswith(xacro):
+            mistake = ElementError(part, f"is xacro that was not expanded. {EXPAND}")
+            remarks.mend(mistake, "it is passed over, and what it would add is missing", element)
 
 
 def _xacro_prefix(root: Element) -> str:

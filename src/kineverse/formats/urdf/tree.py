@@ -9,30 +9,61 @@ from collections.abc import Sequence
 
 from kineverse.errors import FormatError, suggest
 from kineverse.formats.markup import quote
+from kineverse.formats.remarks import Remarks
 from kineverse.formats.urdf.description import Joint, Link
 
 _SHOWN = 8
 
 
+def one_parent_each(joints: Sequence[Joint], remarks: Remarks) -> list[Joint]:
+    """Return the joints, of several that lead to one link that with the last name, as urdfdom takes it.
+
+    Raises
+    ------
+    FormatError
+        If there are such joints, and the description is read strictly.
+    """
+    above: dict[str, Joint] = {}
+    for joint in joints:
+        other = above.setdefault(joint.child, joint)
+        if other is joint:
+            continue
+        text = (
+            f"its child link {quote(joint.child)} has a parent already, by the joint {quote(other.name)} on "
+            f"line {other.line}. URDF describes trees only: a link has one parent."
+        )
+        if remarks.strict:
+            raise FormatError(f"{_place(remarks.source, joint)}: {text}")
+        kept, dropped = (joint, other) if joint.name.encode() > other.name.encode() else (other, joint)
+        above[joint.child] = kept
+        remarks.fault(
+            joint.line,
+            f"<joint name={quote(joint.name)}>: {text.rstrip('.')}; {quote(dropped.name)} is left out.",
+        )
+    return [joint for joint in joints if above[joint.child] is joint]
+
+
 def root_outwards(
-    links: Sequence[Link], joints: Sequence[Joint], source: str, hint: str = ""
-) -> tuple[str, tuple[Joint, ...]]:
-    """Return the root link, and the joints from there outwards, children in the order of the file.
+    links: Sequence[Link], joints: Sequence[Joint], remarks: Remarks, hint: str = ""
+) -> tuple[tuple[str, ...], tuple[Joint, ...], list[Link]]:
+    """Return the roots, the joints from there outwards, siblings as in the file, and all links reached.
 
     Parameters
     ----------
     links, joints
-        In the order of the file, with unique names.
-    source
-        The name of the file in error messages.
+        In the order of the file, with unique names; each link has one parent, or none.
+    remarks
+        If there is more than one root, as MuJoCo reads, that is said here.
     hint
         What else the reader noticed that may explain why there is no tree.
 
     Raises
     ------
     FormatError
-        If a joint names a link that does not exist, a link has two parents, or there is not exactly one root.
+        If a joint names a link that does not exist, or joints lead in a circle; if there is more than one
+        root, and the description is read strictly.
     """
+    source = remarks.source
     lines = {link.name: link.line for link in links}
     joints_below: dict[str, list[Joint]] = {}
     joint_above: dict[str, Joint] = {}
@@ -43,27 +74,23 @@ def root_outwards(
                     f"{_place(source, joint)}: its {role} link {quote(name)} does not exist; every link "
                     f"needs a <link> element of its own. {suggest(name, lines, 'link')}"
                 )
-        other = joint_above.setdefault(joint.child, joint)
-        if other is not joint:
-            raise FormatError(
-                f"{_place(source, joint)}: its child link {quote(joint.child)} has a parent already, by "
-                f"the joint {quote(other.name)} on line {other.line}. URDF describes trees only: a link "
-                "has one parent."
-            )
+        joint_above[joint.child] = joint
         joints_below.setdefault(joint.parent, []).append(joint)
 
     roots = [link for link in links if link.name not in joint_above]
     if len(roots) > 1:
         shown = ", ".join(f"{quote(link.name)} (line {link.line})" for link in roots[:_SHOWN])
         more = f" and {len(roots) - _SHOWN} more" if len(roots) > _SHOWN else ""
-        raise FormatError(
-            f"{source}, line {roots[1].line}, <link name={quote(roots[1].name)}>: there are {len(roots)} "
-            "links that are nobody's child, where one root is expected: "
-            f"{shown}{more}. Connect them by joints.{hint}"
+        text = (
+            f"<link name={quote(roots[1].name)}>: there are {len(roots)} links that are nobody's child, "
+            f"where one root is expected: {shown}{more}. Connect them by joints.{hint}"
         )
-    ordered = _outwards(roots[0].name, joints_below) if roots else []
+        if remarks.strict:
+            raise FormatError(f"{source}, line {roots[1].line}, {text}")
+        remarks.fault(roots[1].line, f"{text.rstrip('.')}; all of them stand where the first does.")
+    ordered = [joint for root in roots for joint in _outwards(root.name, joints_below)]
+    reached = {root.name for root in roots} | {joint.child for joint in ordered}
     if len(ordered) != len(joints):
-        reached = {joint.child for joint in ordered}
         loop = _loop(next(joint for joint in joints if joint.child not in reached), joint_above)
         shown = " -> ".join(f"{quote(joint.name)}" for joint in loop[:_SHOWN])
         more = f" and {len(loop) - _SHOWN} more" if len(loop) > _SHOWN else ""
@@ -72,10 +99,15 @@ def root_outwards(
             if len(loop) > 1
             else "its child link is its own parent"
         )
-        raise FormatError(
-            f"{_place(source, loop[0])}: {circle}. URDF describes trees only: remove a joint.{hint}"
+        text = f"{circle}. URDF describes trees only: remove a joint.{hint}"
+        if remarks.strict or not roots:
+            raise FormatError(f"{_place(source, loop[0])}: {text}")
+        place = _place(source, loop[0]).removeprefix(f"{source}, line {loop[0].line}, ")
+        left = len(links) - len(reached)
+        remarks.fault(
+            loop[0].line, f"{place}: {text.rstrip('.')}; {left} links that no root holds are left out."
         )
-    return roots[0].name, tuple(ordered)
+    return tuple(root.name for root in roots), tuple(ordered), [k for k in links if k.name in reached]
 
 
 def _outwards(root: str, joints_below: dict[str, list[Joint]]) -> list[Joint]:

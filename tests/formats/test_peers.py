@@ -1,0 +1,57 @@
+"""What pinocchio and MuJoCo read is read: a short pass of ``tools/fuzz/peers.py``."""
+
+from __future__ import annotations
+
+import sys
+from itertools import islice
+from pathlib import Path
+from random import Random
+
+import pytest
+
+pytest.importorskip("pinocchio")
+pytest.importorskip("mujoco")
+
+sys.path.insert(0, str(Path(__file__).parents[2] / "tools"))
+
+from fuzz.inputs import inputs
+from fuzz.peers import quiet, reader_of, refusal
+from fuzz.targets import TARGETS
+from fuzz.worker import place
+
+
+@pytest.mark.parametrize(("name", "tried", "read"), [("urdf", 400, 100), ("mjcf", 60, 1)])
+def test_what_others_read_is_refused_for_six_reasons_only(tmp_path, name, tried, read):
+    target, folder = TARGETS[name], place(tmp_path)
+    with quiet():
+        given = [
+            data
+            for data in islice(inputs(target, target.own_seeds(), Random(7)), tried)
+            if reader_of(name, data)
+        ]
+    assert len(given) >= read
+    refused = [(text, data) for data in given if (text := refusal(target, data, folder))]
+    assert refused == []
+
+
+@pytest.mark.parametrize(
+    ("text", "by"),
+    [
+        ('<robot name="r"><link name="l"/></robot>', "pinocchio"),
+        ("<robot><link name='l'/></robot>", "MuJoCo"),
+        ("<robot name='r'><link name='l'/><link/></robot>", ""),
+        ('<robot name="r"><link name="l"><visual><origin xyz="nan 0 0"/></visual></link>', ""),
+    ],
+)
+def test_who_reads_what_is_known(text, by):
+    with quiet():
+        assert reader_of("urdf", text.encode()) == by
+
+
+def test_a_refusal_without_a_reason_is_seen(tmp_path):
+    target = TARGETS["urdf"]
+    assert "has the name of the link" in refusal(
+        target, b'<robot name="r"><link name="l"/><link name="l"/></robot>', tmp_path
+    )
+    for excused in (b"<robot name='r'/>", b"<robot", b"<!DOCTYPE robot><robot/>"):
+        assert refusal(target, excused, tmp_path) == ""

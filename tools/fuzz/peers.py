@@ -1,0 +1,154 @@
+"""Files that others read and Kineverse refuses: ``PYTHONPATH=tools python -m fuzz.peers --minutes 5``.
+
+A refusal is excused by one of six reasons, see ``EXCUSES``. A peer reads a file if it gives a model whose
+poses are finite, and not beyond 1e50, of all that the file says: joints that it drops may have any.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import re
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from random import Random
+from typing import Any
+
+import mujoco
+import numpy as np
+import pinocchio
+
+import kineverse as kv
+from kineverse.formats.numerals import LARGEST
+
+from .inputs import inputs
+from .targets import TARGETS, Target
+from .worker import place
+
+EXCUSES = {
+    "entities": re.compile("document types and entities|undefined entity"),
+    "size": re.compile("larger than|nested more than|characters long"),
+    "root": re.compile("leads out of|names no file|the text has no folder|is no folder"),
+    "xacro": re.compile("xacro"),
+    "XML": re.compile("not well-formed XML|cannot be decoded"),
+    "no link": re.compile("has no <link>"),
+}
+"""Why a file may be refused though others read it, by what the error says."""
+
+_MESH = re.compile(rb"<mesh\b[^<>]*/>")
+"""MuJoCo opens the files of meshes; without them it would refuse."""
+
+
+_PARTICULARS = re.compile(r'line [0-9]+|"[^"]*"|[-+.0-9e]{3,}')
+
+
+def reader_of(target: str, data: bytes) -> str:
+    """Return who of the others reads a file; empty if nobody does."""
+    if target == "urdf" and _read_by_pinocchio(data):
+        return "pinocchio"
+    if target in ("urdf", "mjcf") and _read_by_mujoco(data):
+        return "MuJoCo"
+    return ""
+
+
+def refusal(target: Target, data: bytes, folder: Path) -> str:
+    """Return what an error says that is not excused; empty if the file is read."""
+    try:
+        model = kv.Model()
+        with model.edit() as edit:
+            for tag, operation in target.operations(data, folder, None):
+                edit.apply(operation, tag)
+    except kv.KineverseError as error:
+        text = str(error)
+        excused = any(excuse.search(text) for excuse in EXCUSES.values())
+        return "" if excused or "has a number beyond" in text else text
+    return ""
+
+
+def _read_by_pinocchio(data: bytes) -> bool:
+    try:
+        model = pinocchio.buildModelFromXML(data.decode())
+        at = model.createData()
+        pinocchio.forwardKinematics(model, at, pinocchio.neutral(model))
+    except (ValueError, RuntimeError, IndexError):
+        return False
+    placed = [*model.jointPlacements, *at.oMi, *(frame.placement for frame in model.frames)]
+    return all(_is_sound(pose.homogeneous) for pose in placed)
+
+
+def _read_by_mujoco(data: bytes) -> bool:
+    try:
+        model = mujoco.MjModel.from_xml_string(_MESH.sub(b'<sphere radius="1"/>', data).decode())
+        at = mujoco.MjData(model)
+        mujoco.mj_kinematics(model, at)
+    except (ValueError, RuntimeError, mujoco.FatalError):
+        return False
+    names = ("body_pos", "body_quat", "jnt_pos", "jnt_axis", "qpos0", "site_pos", "site_quat")
+    return all(map(_is_sound, (at.xpos, at.xmat, *(getattr(model, name) for name in names))))
+
+
+def _is_sound(values: Any) -> bool:
+    return bool((np.abs(values) <= LARGEST).all())
+
+
+@contextmanager
+def quiet() -> Iterator[None]:
+    """Send what the others print nowhere."""
+    sys.stdout.flush()
+    kept = os.dup(2)
+    nowhere = os.open(os.devnull, os.O_WRONLY)
+    os.dup2(nowhere, 2)
+    try:
+        yield
+    finally:
+        os.dup2(kept, 2)
+        os.close(kept)
+        os.close(nowhere)
+
+
+def compare(target: Target, random: Random, folder: Path, end: float) -> tuple[int, int, dict[str, bytes]]:
+    """Return how many inputs were tried, how many of them others read, and refusals with an input."""
+    tried, read, found = 0, 0, {}
+    for data in inputs(target, target.seeds(), random):
+        if time.monotonic() > end:
+            break
+        tried += 1
+        with quiet():
+            by = reader_of(target.name, data)
+        if not by:
+            continue
+        read += 1
+        text = refusal(target, data, folder)
+        if text:
+            kind = f"{by}: {_PARTICULARS.sub('…', text)[:110]}"
+            found[kind] = min(found.get(kind, data), data, key=len)
+    return tried, read, found
+
+
+def main() -> int:
+    """Compare, print, and return how many kinds of refusals were found."""
+    parser = argparse.ArgumentParser(prog="python -m fuzz.peers", description=__doc__)
+    parser.add_argument("--target", choices=("urdf", "mjcf"), action="append", help="a format (both)")
+    parser.add_argument("--minutes", type=float, default=5.0, help="how long, for all together (5)")
+    parser.add_argument("--seed", type=int, default=1, help="of the search (1)")
+    given = parser.parse_args()
+    names = given.target or ["urdf", "mjcf"]
+    mujoco.set_mju_user_warning(lambda _: None)
+    total = 0
+    for name in names:
+        with tempfile.TemporaryDirectory() as top:
+            end = time.monotonic() + 60 * given.minutes / len(names)
+            tried, read, found = compare(TARGETS[name], Random(given.seed), place(Path(top)), end)
+        print(f"{name}: {tried} inputs, {read} read by others, {len(found)} kinds of refusals")
+        for kind, data in found.items():
+            print(f"  {kind}\n    {data[:600]!r}")
+        total += len(found)
+    return min(total, 99)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
