@@ -42,7 +42,7 @@ def measure(settings: Settings) -> Result:
     field.admit("pinocchio", lambda: _pinocchio(robot, configurations))
     field.admit("mujoco", lambda: [_mujoco(robot, configurations)])
     measured = race("call", field.contenders, settings.rounds, settings.progress)
-    tables = list(_table_compiled())
+    tables = list(_table_compiled(settings.processes))
     return Result(
         name="call",
         work=(
@@ -70,7 +70,7 @@ def pose_and_jacobian(robot: Robot) -> CompiledFunction:
     return compile([model.fk(robot.frame), model.jacobian(robot.frame)], robot.chain, wait=True)
 
 
-def _table_compiled() -> Iterator[Measurement]:
+def _table_compiled(times: int) -> Iterator[Measurement]:
     """Yield how long C for a matrix of constants takes to be generated and compiled; nothing is kept."""
     compiler = toolchain()
     if compiler is None:
@@ -78,7 +78,7 @@ def _table_compiled() -> Iterator[Measurement]:
     numbers = np.random.default_rng(0).normal(size=_TABLE)
     samples = []
     with tempfile.TemporaryDirectory(prefix="kineverse-bench-") as folder:
-        for _ in range(3):
+        for _ in range(times):
             start = perf_counter()
             program = Program([array(numbers)], ())
             flags = (optimisation(program.instructions) or "", *CLOSED)
