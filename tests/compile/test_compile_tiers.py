@@ -18,6 +18,7 @@ from kineverse.compile import compiler_information, worker
 from kineverse.compile.batch_source import batch_source
 from kineverse.compile.native import native
 from kineverse.compile.program import Program
+from kineverse.expressions.implicit import ImplicitFunction
 
 a, b = kv.position("door/a"), kv.position("door/b")
 
@@ -234,3 +235,49 @@ def test_the_queue_is_bounded(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -
     assert [f([1.0, 2.0]) for f in functions] == [2 * (50.5 + i) for i in range(6)]
     gate.touch()
     assert not functions[-1].wait(60)
+
+
+def table(rows: int, columns: int) -> np.ndarray:
+    """A matrix of any numbers, with those that are special."""
+    numbers = np.random.default_rng(0).normal(size=(rows, columns)) * 10.0 ** np.arange(columns)
+    numbers.flat[:5] = [0.0, -0.0, np.inf, -np.inf, 5e-324]
+    return numbers
+
+
+@pytest.mark.compiler
+def test_tiers_agree_to_the_bit_on_dense_constants() -> None:
+    """Constants among what is computed, alone, shared by results and operands, and a matrix times a vector."""
+    numbers = table(12, 9)
+    x = kv.array([kv.position(f"dense/x{k}") for k in range(9)])
+    mixed = kv.array([[*row[:4], a * row[4], row[4] + b, *row[6:]] for row in numbers.tolist()])
+    outputs = [kv.array(numbers), mixed, kv.array(numbers[1:]) @ x, kv.array(numbers[:3]), a * b]
+    slow, fast = kv.compile(outputs, tier="interpreter"), kv.compile(outputs, tier="c", wait=True)
+    rows = np.random.default_rng(1).uniform(-3, 3, (40, len(slow.inputs)))
+    agree(slow, fast, rows)
+    for one, other in zip(slow.batch(rows), fast.batch(rows), strict=True):
+        assert same_bits(one, other)
+    np.testing.assert_array_equal(fast(rows[0])[0], numbers)
+    np.testing.assert_array_equal(fast(rows[0])[1][:, :4], numbers[:, :4])
+
+
+@pytest.mark.compiler
+def test_tiers_agree_to_the_bit_on_constants_beside_a_loop() -> None:
+    u, x = kv.position("loop/u"), kv.position("loop/x")
+    cubic = ImplicitFunction(
+        "cubic", (x,), (u,), kv.array([x**3 + x - u]), (0,), kv.array([np.arcsinh(u)]), 12
+    )
+    outputs = [cubic.of([a]), kv.array(table(20, 20))]
+    slow, fast = kv.compile(outputs, tier="interpreter"), kv.compile(outputs, tier="c", wait=True)
+    agree(slow, fast, np.random.default_rng(0).uniform(-0.5, 0.5, (20, len(slow.inputs))))
+
+
+def test_constants_are_data_and_no_statements() -> None:
+    """A compiler's time goes by statements and branches; of these a table of constants has none."""
+    numbers = table(147, 62)
+    inputs = tuple(sorted({kv.position(f"dense/x{k}") for k in range(62)}, key=lambda s: s.sort_key))
+    alone = Program([kv.array(numbers)], ())
+    assert alone.source().count("\n") < 200
+    assert batch_source(alone).count("\n") - batch_source(Program([kv.array(1.0)], ())).count("\n") < 5
+    product = Program([kv.array(numbers) @ kv.array(list(inputs))], inputs).source()
+    assert "if (res" not in product
+    assert "?" not in product.partition("casadi_f0(")[2].partition("\n}")[0]

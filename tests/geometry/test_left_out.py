@@ -113,3 +113,21 @@ def test_hulls_are_closed_surfaces_seen_from_outside(seed, count):
     volume = np.einsum("ij,ij->", a, np.cross(b, c)) / 6.0
     assert volume == pytest.approx(spatial.ConvexHull(points).volume, rel=1e-9)
     np.testing.assert_allclose(np.cross(b - a, c - a).sum(axis=0), 0.0, atol=1e-9)
+
+
+def test_of_many_missing_meshes_a_few_are_listed_each_in_one_short_line(tmp_path):
+    model = kv.Model()
+    with model.edit() as edit:
+        for k in range(20):
+            mesh = Mesh(f"package://nowhere_{k}/mesh.stl", folder=str(tmp_path))
+            turned = kv.rotation_z(kv.position(f"q{k}"))
+            edit.add_frame(f"part_{k}", "world", turned, Body(collisions=(Shape(mesh),)))
+    scene = Scene(model)
+    scene.update(model.default_state())
+    with pytest.raises(kv.KineverseError) as caught:
+        scene.within(0.1)
+    first, *lines = str(caught.value).splitlines()
+    assert first.startswith("20 shapes cannot be used. Mend the model, or leave such bodies out")
+    assert len(lines) == 13
+    assert lines[-1] == "  and 8 more"
+    assert all("Looked" not in line and len(line) < 200 for line in lines)

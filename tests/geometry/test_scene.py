@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import threading
 
 import numpy as np
@@ -11,6 +12,7 @@ from scenes import arm_among_boxes, body, brute_force, by_names, random_state
 import kineverse as kv
 from kineverse.geometry import Rule, Scene, mirror, pieces, sweep, sweep_native
 from kineverse.model.body import Body, Box, Shape, Sphere
+from kineverse.model.kinematics import ancestors
 
 
 @pytest.fixture(scope="module")
@@ -430,3 +432,30 @@ def test_bodies_without_collision_shapes_are_what_is_seen_of_them():
     scene.update({"x": 2.0})
     assert scene.distance("seen", "both").distance == pytest.approx(1.0)
     assert pieces.touched_by_what_is_seen(model) == ["seen"]
+
+
+def test_what_is_chosen_follows_the_model():
+    """The pairs between two frames are kept until the model changes, and are those of all that are near."""
+    scene = Scene(arm := arm_among_boxes())
+    scene.update(random_state(arm, np.random.default_rng(2)))
+    top = arm.frames[scene.bodies[-1]].parent
+
+    def below(frame):
+        return {
+            b for b in scene.bodies if frame in ("world", b) or frame in ancestors(b, arm.frames.__getitem__)
+        }
+
+    for number in range(2):
+        for one, other in itertools.product(("world", scene.bodies[0], top), repeat=2):
+            want = {
+                frozenset((near.a, near.b))
+                for near in scene.within(0.5)
+                if {near.a in below(one), near.b in below(other)} == {True}
+                or {near.b in below(one), near.a in below(other)} == {True}
+            }
+            for _ in range(2):
+                assert by_names(scene.between(one, other, 0.5)).keys() == want
+        with arm.edit() as edit:
+            edit.add_frame(
+                f"another_{number}", scene.bodies[0], np.eye(4), Body(collisions=(Shape(Sphere(0.3)),))
+            )

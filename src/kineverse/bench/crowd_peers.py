@@ -33,8 +33,8 @@ class Finder(Protocol):
 class OurScene:
     """Kineverse."""
 
-    def __init__(self, scene: Scene) -> None:
-        self.scene = scene
+    def __init__(self, scene: Scene, radius: float = RADIUS) -> None:
+        self.scene, self._radius = scene, radius
         self.found: Any = ()
 
     def put(self, angles: Array) -> None:
@@ -43,7 +43,7 @@ class OurScene:
 
     def find(self) -> object:
         """Find what is near."""
-        self.found = self.scene.within(RADIUS)
+        self.found = self.scene.within(self._radius)
         return self.found
 
     def distances(self) -> Found:
@@ -57,14 +57,15 @@ class PlainCoal:
     Poses come from our compiled function, in place.
     """
 
-    def __init__(self, scene: Scene) -> None:
+    def __init__(self, scene: Scene, radius: float = RADIUS) -> None:
         coal = coal_engine()
+        self._radius = radius
         self._scene, mirror = scene, scene._mirror
         scene.update(np.zeros(len(scene.inputs)))
         mirror.ready()
         self._table = table = mirror.table
         self._looked_at = np.triu(table.allowed[table.body[: table.moving, None], table.body] == 1)
-        self._reach = (table.radius[: table.moving, None] + table.radius + RADIUS) ** 2
+        self._reach = (table.radius[: table.moving, None] + table.radius + radius) ** 2
         self._solids = [mirror.solid(k) for k in range(table.count)]
         self._names = [piece.body for piece in mirror.pieces]
         self._transforms = [coal.Transform3s(pose[:, :3], pose[:, 3]) for pose in table.poses]
@@ -88,7 +89,7 @@ class PlainCoal:
                 functor = functors[i, j] = self._make(self._solids[i].engine, self._solids[j].engine)
             result.clear()
             distance = functor(transforms[i], transforms[j], request, result)
-            if distance <= RADIUS:
+            if distance <= self._radius:
                 points = result.getNearestPoint1(), result.getNearestPoint2()
                 found.append((i, j, distance, *points, np.array(result.normal)))
         self.found = found
@@ -106,7 +107,7 @@ class PlainCoal:
         gaps = np.einsum("ijk,ijk->ij", apart, apart)
         between = table.place[moving, None] - table.place
         centres = np.einsum("ijk,ijk->ij", between, between)
-        near = (gaps <= RADIUS * RADIUS) & (centres <= self._reach) & self._looked_at
+        near = (gaps <= self._radius**2) & (centres <= self._reach) & self._looked_at
         first, second = np.nonzero(near)
         return zip(first.tolist(), second.tolist(), strict=True)
 

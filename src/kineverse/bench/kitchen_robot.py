@@ -45,6 +45,10 @@ class KitchenRobot:
         """Return a scene in which robot and kitchen are looked at, but neither with itself."""
         return _scene(self.model)
 
+    def whole_scene(self) -> Scene:
+        """Return a scene without rules, so that what overlaps in the robot itself is looked at as well."""
+        return Scene(self.model)
+
 
 def kitchen_robot(steps: int) -> KitchenRobot:
     """Return the first PR2 and the first kitchen that are found here, with their meshes as hulls."""

@@ -2,17 +2,24 @@
 
 from __future__ import annotations
 
+import subprocess
+import tempfile
 from collections.abc import Iterable, Iterator
 from functools import partial
+from pathlib import Path
 from time import perf_counter
 
 import numpy as np
 
 from kineverse.compile import CompiledFunction, Evaluator, compile  # noqa: A004
+from kineverse.compile.library import optimisation
+from kineverse.compile.program import Program
+from kineverse.compile.toolchain import CLOSED, toolchain
+from kineverse.expressions import array
 
 from .agreement import Array
 from .peers import Field
-from .result import Result, faster
+from .result import Measurement, Result, at_most, faster
 from .robot import Robot, find_robot
 from .settings import Settings
 from .timing import Contender, race, timed
@@ -24,6 +31,7 @@ MUJOCO = "mujoco, all joints"
 
 _CHECKED = 50
 _BOUND_AT_ONCE = 40
+_TABLE = 147, 62
 
 
 def measure(settings: Settings) -> Result:
@@ -34,13 +42,14 @@ def measure(settings: Settings) -> Result:
     field.admit("pinocchio", lambda: _pinocchio(robot, configurations))
     field.admit("mujoco", lambda: [_mujoco(robot, configurations)])
     measured = race("call", field.contenders, settings.rounds, settings.progress)
+    tables = list(_table_compiled(settings.processes))
     return Result(
         name="call",
         work=(
             f"pose 4x4 and Jacobian 6x{len(robot.chain)} of {robot.frame}, one configuration, from Python; "
             f"inputs go through {len(configurations)} configurations"
         ),
-        measurements=tuple(measured.values()),
+        measurements=(*measured.values(), *tables),
         comparisons=(
             faster(measured, BOUND, REDUCED, 8.0),
             faster(measured, BOUND, HELD),
@@ -49,6 +58,7 @@ def measure(settings: Settings) -> Result:
             faster(measured, PLAIN, PATH),
             faster(measured, PLAIN, WHOLE, 3.0),
             faster(measured, PLAIN, MUJOCO),
+            *(at_most(table, 2.0) for table in tables),
         ),
         missing=tuple(field.missing),
     )
@@ -58,6 +68,24 @@ def pose_and_jacobian(robot: Robot) -> CompiledFunction:
     """Return the function that is measured, compiled as far as it goes here."""
     model = robot.model
     return compile([model.fk(robot.frame), model.jacobian(robot.frame)], robot.chain, wait=True)
+
+
+def _table_compiled(times: int) -> Iterator[Measurement]:
+    """Yield how long C for a matrix of constants takes to be generated and compiled; nothing is kept."""
+    compiler = toolchain()
+    if compiler is None:
+        return
+    numbers = np.random.default_rng(0).normal(size=_TABLE)
+    samples = []
+    with tempfile.TemporaryDirectory(prefix="kineverse-bench-") as folder:
+        for _ in range(times):
+            start = perf_counter()
+            program = Program([array(numbers)], ())
+            flags = (optimisation(program.instructions) or "", *CLOSED)
+            command = compiler.arguments(flags, str(Path(folder, "library.so")))
+            subprocess.run(command, input=program.source().encode(), check=True)
+            samples.append(perf_counter() - start)
+    yield Measurement("kineverse, {}x{} constants compiled".format(*_TABLE), "s", tuple(samples))
 
 
 def _ours(robot: Robot, configurations: Array) -> Iterator[Contender]:

@@ -31,6 +31,9 @@ _EXACT, _CURVED, _MARGINS = 1e-6, 1e-4, 3e-3
 """How far distances may be apart [m]: of polytopes and capsules; of whatever a robot has; of Bullet with
 its margins."""
 
+_NEAR, _WHOLE = 0.06, " without rules, within .06 m"
+"""A radius [m] at which the robot's own links, many of which always overlap, are most of what is found."""
+
 _CHECKED = 20
 
 
@@ -56,14 +59,20 @@ def measure(settings: Settings) -> Result:
         angles = crowd(steps=steps).angles
         check(arm, angles)
         check(rooms, robot.values)
+        everything = [
+            Entry(f"{robot.name}: {OURS}{_WHOLE}", OurScene(robot.whole_scene(), _NEAR), _CURVED),
+            Entry(f"{robot.name}: {COAL}{_WHOLE}", PlainCoal(robot.whole_scene(), _NEAR), _CURVED),
+        ]
         many = [
             Entry(f"{OURS} among {boxes} boxes", OurScene(_scene(Path(folder), boxes, steps)), _EXACT)
             for boxes in sizes
         ]
         field.contenders += [*_timed(arm, angles), *_timed(many, angles), *_timed(rooms, robot.values)]
+        field.contenders += _timed(everything, robot.values)
         measured = race("geometry", field.contenders, settings.rounds, settings.progress)
     peers = (SEARCH, PAIRS, BULLET, COAL)
     room = {name: f"{robot.name}: {name}, {QUERY}" for name in (OURS, SEARCH, BULLET, COAL)}
+    whole = f"{robot.name}: {OURS}{_WHOLE}, {QUERY}"
     return Result(
         name="geometry",
         work=(
@@ -78,6 +87,9 @@ def measure(settings: Settings) -> Result:
             *(faster(measured, f"{OURS}, {UPDATE}", f"{peer}, {UPDATE}") for peer in peers),
             faster(measured, room[OURS], room[SEARCH]),
             *(faster(measured, room[OURS], room[peer], 1.0) for peer in (BULLET, COAL)),
+            at_most(measured[whole], 150e-6),
+            faster(measured, whole, room[OURS]),
+            faster(measured, whole, f"{robot.name}: {COAL}{_WHOLE}, {QUERY}", 1.0),
             _growth(measured, sizes),
         ),
         missing=tuple(field.missing),

@@ -6,7 +6,7 @@ import hashlib
 
 import casadi as ca
 
-from .program import Program
+from .program import Program, literal
 from .schedule import Part, Schedule, Step, schedule
 from .vector_functions import ARITHMETIC, EXPONENTIAL, TRIGONOMETRIC, by_lane
 from .vector_types import ROWS, TYPES
@@ -86,7 +86,8 @@ int kineverse_batch(const double *in, double *const *out, long long rows, int st
     output_begin(outputs + k, out[k], sizes[k], pending, streaming);
     pending += W * (sizes[k] + 1);
   }
-  constants(o);
+  /* The first entries are there because no table is empty. */
+  for (int k = 1; k <= CONSTANTS; k++) o[constant_place[k]] = splat(constant[k]);
   const long long full = rows / W * W;
   const int left = (int)(rows - full);
   for (long long row = 0; row < rows; row += W) {
@@ -124,7 +125,7 @@ int kineverse_batch(const double *in, double *const *out, long long rows, int st
 _TEXTS = "\n".join([TYPES, ROWS, ARITHMETIC, TRIGONOMETRIC, EXPONENTIAL, by_lane()])
 
 # Raise the number when other source is generated from the same program and texts.
-KIND = "batch 1 " + hashlib.sha256((_TEXTS + _LOOP + repr((_PLAIN, _TRUTH))).encode()).hexdigest()
+KIND = "batch 2 " + hashlib.sha256((_TEXTS + _LOOP + repr((_PLAIN, _TRUTH))).encode()).hexdigest()
 
 
 def vectorisable(program: Program) -> bool:
@@ -155,17 +156,20 @@ def batch_source(program: Program) -> str:
         "OUTPUTS": len(program.sizes),
         "RESULTS": sum(program.sizes),
         "STORED": plan.stored,
+        "CONSTANTS": len(plan.constants),
         "SIZES": ", ".join(map(str, program.sizes)),
     }
     calls = "\n".join(f"  part{i}(x, store, o);" for i in range(len(plan.parts)))
-    constants = "\n".join(f"  o[{place}] = splat({_number(c)});" for place, c in plan.constants)
+    numbers = ", ".join(["0", *(literal(c) for _, c in plan.constants)])
+    places = ", ".join(["0", *(str(place) for place, _ in plan.constants)])
     return "\n".join(
         [
             _TEXTS,
             *(f"#define {name} {value}" for name, value in definitions.items()),
             *(_part(plan, part, i) for i, part in enumerate(plan.parts)),
             f"static void compute(const V *x, V *store, V *o) {{\n{calls}\n}}",
-            f"static void constants(V *o) {{\n{constants}\n}}",
+            f"static const double constant[] = {{{numbers}}};",
+            f"static const int constant_place[] = {{{places}}};",
             _LOOP,
         ]
     )
@@ -217,13 +221,5 @@ def _operand(steps: list[Step], value: int) -> str:
     if step.op == ca.OP_INPUT:
         return f"x[{step.arguments[0]}]"
     if step.op == ca.OP_CONST:
-        return f"splat({_number(step.constant)})"
+        return f"splat({literal(step.constant)})"
     return f"v{value}"
-
-
-def _number(x: float) -> str:
-    if x != x:
-        return "NAN"
-    if x in (float("inf"), float("-inf")):
-        return "INFINITY" if x > 0 else "-INFINITY"
-    return x.hex()

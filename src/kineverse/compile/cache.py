@@ -1,9 +1,10 @@
 """Compiled libraries on disk, by the digest of what they are made from.
 
-Code from this folder is loaded into the process, so nobody else may be able to write there: it is made with
-mode 0700, and refused if it belongs to someone else or others may write to it. Every library ends in a digest
-of itself that is checked before it is loaded; a broken one counts as absent. Libraries arrive by renaming, so
-any number of processes can share the folder.
+Code from this folder is loaded into the process, so nobody else may be able to write there, see
+:mod:`.private_folder`. Every library ends in a digest of itself that is checked before it is loaded, and it
+is loaded through the descriptor that was checked. One that is broken, that is not this user's alone, or that
+does not hold what was looked for counts as absent and is made anew. Libraries arrive by renaming, so any
+number of processes can share the folder.
 """
 
 from __future__ import annotations
@@ -11,12 +12,17 @@ from __future__ import annotations
 import contextlib
 import functools
 import hashlib
+import itertools
 import logging
 import os
 import shutil
 import tempfile
 import time
+from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import TypeVar
+
+from .private_folder import NotPrivateError, PrivateFolder
 
 logger = logging.getLogger("kineverse.compile")
 
@@ -29,6 +35,11 @@ _TRAILER = len(_MARK) + 32
 _STALE_SECONDS = 3600.0
 _LAST_USE_RESOLUTION = 3600.0
 
+_DESCRIPTORS = "/proc/self/fd/"
+_loaded = itertools.count(1)
+
+Code = TypeVar("Code")
+
 
 class LibraryCache:
     """One folder of compiled libraries.
@@ -36,31 +47,82 @@ class LibraryCache:
     Parameters
     ----------
     folder
-        An existing folder that only this user can write to.
+        A folder that only this user can write to; it is made if it is not there.
+    made
+        Whether it was just made by this process.
+
+    Raises
+    ------
+    NotPrivateError
+        If others can write to it.
+    OSError
+        If it cannot be made.
     """
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: Path, made: bool = False) -> None:
         self.folder = folder
-        self._text = str(folder)
+        self._inside = PrivateFolder(folder, made)
+
+    @property
+    def is_still_private(self) -> bool:
+        """Whether the folder is still there, and still nobody else's."""
+        return self._inside.is_still_private
 
     def find(self, key: str) -> str | None:
         """Return the path of a library that is there and whole, else None."""
-        path = f"{self._text}/{key}.so"
+        found = self._opened(key)
+        if found is None:
+            return None
+        os.close(found[0])
+        return str(self.folder / _name(key))
+
+    def load(self, key: str, load: Callable[[str], Code]) -> Code | None:
+        """Return what is made of a library; None if there is none, or if it is not what it should be.
+
+        Parameters
+        ----------
+        key
+            What it is found by.
+        load
+            Makes of a path what can be called. The path is good only now, and no other library ever has it:
+            what has the name of a library that is loaded already would be taken for that one.
+        """
+        found = self._opened(key)
+        if found is None:
+            return None
         try:
-            with open(path, "rb") as file:
-                content = file.read()
-                last_use = os.fstat(file.fileno()).st_mtime
+            with _path_of(*found) as path:
+                return load(path)
+        except (OSError, RuntimeError, AttributeError, ImportError) as error:
+            self._discard(key, f"cannot be used ({error})")
+            return None
+        finally:
+            os.close(found[0])
+
+    def _opened(self, key: str) -> tuple[int, bytes] | None:
+        """Open and read a library that is there and whole; whoever asks closes the descriptor."""
+        try:
+            descriptor = self._inside.open(_name(key))
+        except NotPrivateError as error:
+            self._discard(key, str(error))
+            return None
         except OSError:
             return None
-        digest = hashlib.sha256(memoryview(content)[:-_TRAILER]).digest()
-        if len(content) <= _TRAILER or content[-_TRAILER:] != _MARK + digest:
-            logger.warning("The compiled library %s is damaged and will be made anew.", path)
-            self.discard(key)
+        with open(descriptor, "rb", closefd=False) as file:
+            content = file.read()
+        if not _is_whole(content):
+            os.close(descriptor)
+            self._discard(key, "is damaged")
             return None
-        if time.time() - last_use > _LAST_USE_RESOLUTION:
+        if time.time() - os.fstat(descriptor).st_mtime > _LAST_USE_RESOLUTION:
             with contextlib.suppress(OSError):
-                os.utime(path)
-        return path
+                os.utime(descriptor)
+        return descriptor, content
+
+    def _discard(self, key: str, reason: str) -> None:
+        path = self.folder / _name(key)
+        logger.warning("The compiled library %s %s and will be made anew.", path, reason)
+        self._inside.remove(_name(key))
 
     def store(self, key: str, library: str) -> str:
         """Move a library that was just compiled in here; return its path.
@@ -72,41 +134,31 @@ class LibraryCache:
         library
             A file on the same file system (see :meth:`workplace`).
         """
-        with open(library, "r+b") as file:
+        with open(library, "rb") as file:
             digest = hashlib.sha256(file.read()).digest()
-            file.write(_MARK + digest)
-        path = f"{self._text}/{key}.so"
-        os.replace(library, path)
+        self._inside.adopt(library, _name(key), _MARK + digest)
         self._make_room()
-        return path
-
-    def discard(self, key: str) -> None:
-        """Remove a library."""
-        with contextlib.suppress(OSError):
-            os.unlink(f"{self._text}/{key}.so")
+        return str(self.folder / _name(key))
 
     def workplace(self) -> str:
         """Return a new folder to compile in; the caller removes it."""
-        return tempfile.mkdtemp(prefix=".build-", dir=self._text)
+        return tempfile.mkdtemp(prefix=".build-", dir=self.folder)
 
     def _make_room(self) -> None:
         """Remove what was used longest ago, and what processes left behind that were killed."""
         files: list[tuple[float, int, str]] = []
         now = time.time()
-        for entry in os.scandir(self._text):
-            with contextlib.suppress(OSError):
-                status = entry.stat(follow_symlinks=False)
-                if entry.name.startswith(".build-"):
-                    if now - status.st_mtime > _STALE_SECONDS:
-                        shutil.rmtree(entry.path, ignore_errors=True)
-                elif entry.name.endswith(".so"):
-                    files.append((status.st_mtime, status.st_size, entry.path))
+        for name, status in self._inside.entries():
+            if name.startswith(".build-"):
+                if now - status.st_mtime > _STALE_SECONDS:
+                    shutil.rmtree(self.folder / name, ignore_errors=True)
+            elif name.endswith(".so"):
+                files.append((status.st_mtime, status.st_size, name))
         excess = sum(size for _, size, _ in files) - MAXIMUM_BYTES
-        for _, size, path in sorted(files):
+        for _, size, name in sorted(files):
             if excess <= 0:
                 break
-            with contextlib.suppress(OSError):
-                os.unlink(path)
+            self._inside.remove(name)
             excess -= size
 
 
@@ -118,7 +170,26 @@ def library_cache() -> LibraryCache:
     takes its place, and the log says why.
     """
     get = os.environ.get
-    return _open(get("KINEVERSE_CACHE_DIR"), get("XDG_CACHE_HOME"), get("HOME"))
+    where = get("KINEVERSE_CACHE_DIR"), get("XDG_CACHE_HOME"), get("HOME")
+    cache = _open(*where)
+    if not cache.is_still_private:  # removed, or opened to others since
+        _open.cache_clear()
+        cache = _open(*where)
+    return cache
+
+
+def private_subfolder(name: str) -> PrivateFolder:
+    """Return a folder in the cache of this user, or in a private one that ends with the process."""
+    path = library_cache().folder / name
+    try:
+        return PrivateFolder(path)
+    except (NotPrivateError, OSError) as error:
+        logger.warning(
+            "What is computed is not kept for other processes: the cache folder %s", _said(path, error)
+        )
+    path = Path(_private_folder().name) / name
+    path.mkdir(mode=0o700, exist_ok=True)
+    return PrivateFolder(path, made=True)
 
 
 @functools.lru_cache(maxsize=16)
@@ -128,37 +199,64 @@ def _open(folder: str | None, caches: str | None, home: str | None) -> LibraryCa
     elif caches and os.path.isabs(caches):
         wanted = Path(caches) / "kineverse"
     else:
-        wanted = Path(home or os.path.expanduser("~")) / ".cache" / "kineverse"
-    reason = _why_not(wanted)
-    if reason is None:
-        return LibraryCache(wanted)
-    logger.warning(
-        "Compiled functions are not kept for other processes: the cache folder %s %s.", wanted, reason
-    )
-    return LibraryCache(Path(_private_folder().name))
-
-
-def _why_not(folder: Path) -> str | None:
-    """Return why libraries cannot or must not be kept in the folder; None if all is well."""
+        wanted = Path(home or os.path.expanduser("~")).absolute() / ".cache" / "kineverse"
     try:
-        folder.parent.mkdir(parents=True, exist_ok=True)
-        with contextlib.suppress(FileExistsError):
-            folder.mkdir(mode=0o700)
-        status = folder.stat()
-    except OSError as error:
-        return f"cannot be made ({error.strerror})"
-    if hasattr(os, "geteuid") and status.st_uid != os.geteuid():
-        return "belongs to another user"
-    if status.st_mode & 0o022:
-        return f"can be written by others (its mode is {status.st_mode & 0o777:o}; make it 700)"
-    if not os.access(folder, os.R_OK | os.W_OK | os.X_OK):
-        return "cannot be written"
-    return None
+        return LibraryCache(wanted)
+    except (NotPrivateError, OSError) as error:
+        logger.warning(
+            "Compiled functions are not kept for other processes: the cache folder %s", _said(wanted, error)
+        )
+    if not _private_folder_is_there():
+        _private_folder.cache_clear()
+    return LibraryCache(Path(_private_folder().name), made=True)
+
+
+def _said(folder: Path, error: Exception) -> str:
+    if isinstance(error, OSError):
+        return f"{folder} cannot be made or opened ({error.strerror})."
+    return (
+        f"{folder} {error}. Others may have left code in it: remove it with all it holds, or set "
+        "KINEVERSE_CACHE_DIR to a folder of your own."
+    )
+
+
+def _name(key: str) -> str:
+    return f"{key}.so"
+
+
+def _is_whole(content: bytes) -> bool:
+    digest = hashlib.sha256(memoryview(content)[:-_TRAILER]).digest()
+    return len(content) > _TRAILER and content[-_TRAILER:] == _MARK + digest
+
+
+@contextlib.contextmanager
+def _path_of(descriptor: int, content: bytes) -> Iterator[str]:
+    """Give a file that is open a path for the loader, one that no other had before.
+
+    On Linux it is that of the descriptor, with the number of the library in its slashes and dots. Elsewhere
+    what was read is written to a private folder.
+    """
+    number = next(_loaded)
+    path = f"{_DESCRIPTORS}{''.join('./' if bit == '1' else '/' for bit in f'{number:b}')}{descriptor}"
+    if os.path.exists(path):
+        yield path
+        return
+    path = os.path.join(_private_folder().name, f"{number}.so")
+    Path(path).write_bytes(content)
+    try:
+        yield path
+    finally:
+        with contextlib.suppress(OSError):
+            os.unlink(path)
 
 
 @functools.lru_cache(maxsize=1)
 def _private_folder() -> tempfile.TemporaryDirectory[str]:
     return tempfile.TemporaryDirectory(prefix="kineverse-", ignore_cleanup_errors=True)
+
+
+def _private_folder_is_there() -> bool:
+    return not _private_folder.cache_info().currsize or os.path.isdir(_private_folder().name)
 
 
 def _forked() -> None:

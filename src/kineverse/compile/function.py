@@ -23,7 +23,7 @@ from .binding import Array, Shape, bind, pooled
 from .evaluator import Evaluator
 from .library import Library
 from .native import MOST_OUTPUTS, native
-from .program import NAME, CasadiFunction, Program, Vector
+from .program import NAME, SINGLE, CasadiFunction, Program, Vector
 from .signature import signature
 
 if TYPE_CHECKING:
@@ -177,7 +177,7 @@ class CompiledFunction(Generic[Results]):
         self._batch: Batch | None = None
         self._library: Library[_Code] | None = None
         if tier == "c" or (tier == "auto" and program.instructions >= _WORTH_COMPILING):
-            self._library = Library(program, "single", program.source, _load, self._ready)
+            self._library = Library(program, SINGLE, program.source, _load, self._ready)
             if tier == "c" and self._library.error:
                 raise CompileError(f"The function cannot be compiled: {self._library.error}.")
         if self._library is not None:

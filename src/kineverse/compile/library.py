@@ -69,9 +69,7 @@ class Library(Generic[Code]):
     def find(self) -> bool:
         """Take it from the cache; return whether it is there now."""
         if self.code is None and self.error is None:
-            path = library_cache().find(self._key)
-            if path is not None:
-                self._take(path)
+            self.code = library_cache().load(self._key, self._load)
         return self.code is not None
 
     def request(self, urgent: bool = False) -> None:
@@ -98,20 +96,13 @@ class Library(Generic[Code]):
         return self.code is not None
 
     def _built(self, build: Build) -> None:
-        if build.path is not None:
-            self._take(build.path)
+        if build.path is not None and self.code is None:
+            self.code = build.cache.load(self._key, self._load)
         if self.code is None and not build.forgotten:
             self.error = build.error or "its library cannot be loaded"
         notify = self._ready() if self._ready is not None else None
         if notify is not None:
             notify()
-
-    def _take(self, path: str) -> None:
-        try:
-            self.code = self._load(path)
-        except (OSError, RuntimeError):
-            # Removed by another process since it was found, or by a full disk.
-            library_cache().discard(self._key)
 
 
 def optimisation(instructions: int) -> str | None:

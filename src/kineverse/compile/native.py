@@ -9,7 +9,6 @@ from __future__ import annotations
 import hashlib
 import importlib.machinery
 import importlib.util
-import logging
 import os
 import sys
 import sysconfig
@@ -20,13 +19,11 @@ from weakref import WeakMethod
 
 import numpy as np
 
-from .cache import library_cache
+from .cache import LibraryCache, library_cache
 from .evaluator import Evaluator
 from .native_source import NATIVE
 from .toolchain import toolchain
 from .worker import Build, request
-
-logger = logging.getLogger("kineverse.compile")
 
 # The extension has room for so many results.
 MOST_OUTPUTS = 256
@@ -73,9 +70,7 @@ class Native:
             return False
         version = (NATIVE, compiler.identity, sys.version, sys.base_prefix, np.__version__)
         key = hashlib.sha256(repr(version).encode()).hexdigest()[:40]
-        path = library_cache().find(key)
-        if path is not None:
-            self._load(path)
+        if self._take(library_cache(), key):
             return False
         headers = sysconfig.get_path("include")
         if not os.path.exists(os.path.join(headers, "Python.h")):
@@ -85,7 +80,7 @@ class Native:
 
     def _built(self, build: Build) -> None:
         if build.path is not None:
-            self._load(build.path)
+            self._take(build.cache, build.key)
         with self._lock:
             self._state = "settled"
             watchers, self._watchers = self._watchers, []
@@ -94,19 +89,25 @@ class Native:
             if notify is not None:
                 notify()
 
-    def _load(self, path: str) -> None:
-        loader = importlib.machinery.ExtensionFileLoader(_NAME, path)
-        specification = importlib.util.spec_from_file_location(_NAME, path, loader=loader)
-        if specification is None:
-            return
-        try:
-            module = importlib.util.module_from_spec(specification)
-            loader.exec_module(module)
-        except (ImportError, OSError) as error:
-            logger.info("Calls go through CasADi: their extension cannot be loaded (%s).", error)
-            return
+    def _take(self, cache: LibraryCache, key: str) -> bool:
+        module = cache.load(key, _module)
+        if module is None:
+            return False
         Evaluator.register(module.Evaluator)
         self.module = module
+        return True
+
+
+def _module(path: str) -> Any:
+    loader = importlib.machinery.ExtensionFileLoader(_NAME, path)
+    specification = importlib.util.spec_from_file_location(_NAME, path, loader=loader)
+    if specification is None:
+        raise ImportError("it is no extension")
+    module = importlib.util.module_from_spec(specification)
+    loader.exec_module(module)
+    if not (hasattr(module, "Call") and hasattr(module, "Evaluator")):
+        raise ImportError("it has no Call and Evaluator")
+    return module
 
 
 native = Native()

@@ -36,6 +36,12 @@ static inline double first_larger(double x, double y) { return x >= y || y != y 
 #define fmax(x, y) first_larger(x, y)
 """
 
+# Raise the number when other source is generated from the same program.
+SINGLE = "single 2"
+
+# From so many constants on an output begins as a copy of a table: the time of a compiler goes by statements.
+_TABLE = 64
+
 
 class Program:
     """What is computed: n numbers in, and one column of numbers, in C order, per output.
@@ -107,25 +113,81 @@ class Program:
     def function(self) -> CasadiFunction:
         """CasADi's function of one input vector, common parts shared."""
         if self._function is None:
-            shared = ca.vertsplit(ca.cse(ca.vertcat(*self._columns)), _offsets(self.sizes))
-            self._function = ca.Function(NAME, [self._vector], [ca.densify(c) for c in shared])
+            self._function = ca.Function(NAME, [self._vector], self._shared())
         return self._function
 
+    def _shared(self) -> list[ca.SX]:
+        """Return the columns with common parts shared."""
+        shared = ca.vertsplit(ca.cse(ca.vertcat(*self._columns)), _offsets(self.sizes))
+        return [ca.densify(c) for c in shared]
+
     def source(self) -> str:
-        """Return the C source of the function, as CasADi generates it, comments removed.
+        """Return the C source of the function, as CasADi generates it, but for inputs and outputs.
+
+        All inputs and outputs have to be given when it is called: CasADi asks for each number whether it is,
+        and hundreds of such branches keep a compiler busy for minutes. Constants of which there are many are
+        copied from a table.
 
         Raises
         ------
         CompileError
             If an operation has no definition in C.
         """
+        columns: list[Any] = []
+        tables: dict[int, dict[int, float]] = {}
+        for k, column in enumerate(self._shared()):
+            elements: list[Any] = column.elements()
+            table = {n: float(e) for n, e in enumerate(elements) if e.is_constant()}
+            if len(table) >= _TABLE:
+                tables[k] = table
+                elements = [0.0 if n in table else e for n, e in enumerate(elements)]
+            columns.append(ca.densify(ca.vertcat(*elements)) if elements else column)
         generator = ca.CodeGenerator("kineverse.c")
-        generator.add(self.function)
+        generator.add(ca.Function(NAME, [self._vector], columns))
         # Comments hold the names of functions that are called inside, such as those of loops.
         code = re.sub(r"/\*.*?\*/", "", generator.dump(), flags=re.DOTALL)
         if re.search(r"\berfinv\(", code):
             raise CompileError("CasADi has no C for the inverse error function.")
-        return _PRELUDE + code
+        main = _MAIN.search(code)
+        if main is None:
+            raise CompileError("CasADi's C is not what it was: its function is not found in it.")
+        return _PRELUDE + code[: main.start()] + _straight(main, self.sizes, tables) + code[main.end() :]
+
+
+# The function itself; those that it calls come after it and may be asked for a part of their results.
+_MAIN = re.compile(
+    r"(static int casadi_f0\(.*?\) \{\n(?:  casadi_(?:real|int)[^=;]*;\n)*)(.*?\n\}\n)", re.DOTALL
+)
+_INPUT = re.compile(r"arg\[0\]\? arg\[0\]\[(\d+)\] : 0")
+_OUTPUT = re.compile(r"  if \(res\[(\d+)\]!=0\) res\[\d+\]\[(\d+)\]=(\w+);\n")
+
+
+def _straight(main: re.Match[str], sizes: Sequence[int], tables: dict[int, dict[int, float]]) -> str:
+    """Return a function without a branch for each number, and with constants that come from tables."""
+    declared, body = main.groups()
+
+    def written(output: re.Match[str]) -> str:
+        k, place, value = int(output[1]), int(output[2]), output[3]
+        return "" if place in tables.get(k, ()) else f"  res[{k}][{place}]={value};\n"
+
+    body = _OUTPUT.sub(written, _INPUT.sub(r"arg[0][\1]", body))
+    if body.count("res[") != sum(sizes) - sum(map(len, tables.values())):
+        raise CompileError("CasADi's C is not what it was: its results are not found in it.")
+    data, copies = "", ""
+    for k, table in tables.items():
+        numbers = ", ".join(literal(table.get(place, 0.0)) for place in range(sizes[k]))
+        data += f"static const casadi_real constants{k}[] = {{{numbers}}};\n"
+        copies += f"  __builtin_memcpy(res[{k}], constants{k}, sizeof constants{k});\n"
+    return data + declared + copies + body
+
+
+def literal(x: float) -> str:
+    """Return a number as C has it, exactly."""
+    if x != x:
+        return "NAN"
+    if x in (float("inf"), float("-inf")):
+        return "INFINITY" if x > 0 else "-INFINITY"
+    return x.hex()
 
 
 def _offsets(sizes: Sequence[int]) -> list[int]:

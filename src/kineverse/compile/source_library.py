@@ -67,23 +67,18 @@ class SourceLibrary:
             return None
         version = (self._source, self._flags, compiler.identity)
         key = hashlib.sha256(repr(version).encode()).hexdigest()[:40]
-        path = library_cache().find(key)
-        if path is not None:
-            self._load(path)
+        self._code = library_cache().load(key, self._loaded)
+        if self._code is not None:
             return None
         return request(key, compiler, lambda: self._source, self._flags, self._built)
 
     def _built(self, build: Build) -> None:
         if build.path is not None and self._code is None:
-            self._load(build.path)
+            self._code = build.cache.load(build.key, self._loaded)
         self._hopeless = self._code is None and not build.forgotten
         self._build = None
 
-    def _load(self, path: str) -> None:
-        try:
-            code = ctypes.CDLL(path)
-        except OSError:
-            self._hopeless = True
-            return
+    def _loaded(self, path: str) -> Any:
+        code = ctypes.CDLL(path)
         self._declare(code)
-        self._code = code
+        return code

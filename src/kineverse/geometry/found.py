@@ -5,8 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import overload
 
-import numpy as np
-
 from .mesh_files import Floats
 from .mirror import Mirror
 from .results import Closest
@@ -20,8 +18,9 @@ class Found(Sequence[Closest]):
     ----------
     mirror
         Where the pieces are from.
-    pairs, distances, witnesses
-        (K, 2) pieces, (K,) their distances [m], (K, 9) the nearest points of both and the normals.
+    pieces, bodies, distances, witnesses
+        (K, 2) pieces, (K, 2) their bodies, that first which is before the other in the model, (K,) their
+        distances [m], (K, 9) the nearest points of both and the normals.
 
     Attributes
     ----------
@@ -31,16 +30,11 @@ class Found(Sequence[Closest]):
         (K, 3) each, as in :class:`Closest`.
     """
 
-    def __init__(self, mirror: Mirror, pairs: Indices, distances: Floats, witnesses: Floats) -> None:
+    def __init__(
+        self, mirror: Mirror, pieces: Indices, bodies: Indices, distances: Floats, witnesses: Floats
+    ) -> None:
         self._bodies, self._pieces = mirror.bodies, mirror.pieces
-        owners = mirror.table.body[pairs]
-        turned = owners[:, 0] > owners[:, 1]
-        if turned.any():
-            pairs, owners, witnesses = pairs.copy(), owners.copy(), witnesses.copy()
-            pairs[turned], owners[turned] = pairs[turned, ::-1], owners[turned, ::-1]
-            backwards = witnesses[turned]
-            witnesses[turned] = np.hstack([backwards[:, 3:6], backwards[:, :3], -backwards[:, 6:]])
-        self._numbers, self._owners = pairs, owners
+        self._numbers, self._owners = pieces, bodies
         self.distances = distances
         self.points_a, self.points_b, self.normals = witnesses[:, :3], witnesses[:, 3:6], witnesses[:, 6:]
 

@@ -10,7 +10,7 @@ from kineverse.errors import FormatError, MissingExtraError, ValueRejectedError
 from kineverse.model.body import Geometry, Mesh
 from kineverse.model.view import ModelView
 
-from .pieces import matches, touchable
+from .pieces import in_short, matches, touchable
 from .rules import Rule, adjacent, allowed, rules_in
 from .solids import solid_of
 from .table import Flags
@@ -62,8 +62,7 @@ def _problem(geometry: Geometry) -> str:
     except MissingExtraError:
         raise
     except (FormatError, ValueRejectedError, OSError) as error:
-        # Where a file was looked for is long, and the same for all of them.
-        reason = " ".join(str(error).partition(" Looked ")[0].split())
+        reason = in_short(error)
         return f"mesh {geometry.uri}: {reason}" if isinstance(geometry, Mesh) else reason
     return ""
 

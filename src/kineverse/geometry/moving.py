@@ -39,13 +39,14 @@ class Motion:
 
     def moves(self, frame: str) -> bool:
         """Whether a frame moves in the world."""
-        return bool(self._way(frame))
+        return bool(self.way(frame))
 
     def moves_between(self, one: str, other: str) -> bool:
         """Whether two frames move with respect to each other."""
-        return self._way(one) != self._way(other)
+        return self.way(one) != self.way(other)
 
-    def _way(self, name: str) -> tuple[str, ...]:
+    def way(self, name: str) -> tuple[str, ...]:
+        """Return the frames from the world to a frame that move in their parent."""
         above = []
         while name not in self._ways:
             above.append(name)

@@ -18,7 +18,8 @@ import numpy as np
 
 from kineverse.model.body import Sphere
 
-from .mesh_files import Floats
+from .gjk import separation, separation_of_faces
+from .mesh_files import Faces, Floats
 from .reach import Placed, furthest, gaps, widest_gap
 from .solids import Solid, coal_engine, enlarged, solid_of
 
@@ -73,6 +74,7 @@ class Narrow:
         self._surfaces: set[tuple[int, int]] = set()
         self._small: dict[tuple[int, int], tuple[float, Floats, Narrow]] = {}
         self._request, *self._rougher = (_request(coal, factor) for factor in (1.0, 10.0, 100.0))
+        self._roughest = _request(coal, 1e5)
         self._result = coal.DistanceResult()
         self._mended: Witness | None = None
         self.calls = 0
@@ -99,10 +101,14 @@ class Narrow:
         if _TOUCH < distance < 1e300:
             if (i, j) in self._surfaces:
                 self._mended = self._between_points(distance)
-            return distance
+                return distance
+            a, b = self._pair(i, j)
+            if not (a.is_convex and b.is_convex):
+                return self._from_triangles(i, j, distance, functor)
+            return distance if self._shows(i, j, distance) else self._solved(i, j)
         a, b = self._pair(i, j)
         if not (a.is_convex and b.is_convex):
-            return self._with_triangles(a, b, at_a, at_b)
+            return self._touching_triangles(i, j, functor)
         for request in (*self._rougher, None):
             if -1e300 < distance < -_TOUCH and self._normal_is_right() and self._shows(i, j, distance):
                 return distance
@@ -110,6 +116,8 @@ class Narrow:
                 break
             result.clear()
             distance = functor(at_a, at_b, request, result)
+            if distance > _TOUCH and self._shows(i, j, distance):
+                return distance
         return self._mend(i, j, functor)
 
     def witness(self) -> Witness:
@@ -163,10 +171,65 @@ class Narrow:
         return bool(abs(x * x + y * y + z * z - 1.0) < 1e-6)
 
     def _shows(self, i: int, j: int, distance: float) -> bool:
-        """Whether moving so far along the normal separates two convex solids that are in each other."""
-        normal = self.witness()[2]
-        shown = float(gaps(*self._placed_solids(i, j), normal[None])[0])
-        return distance - shown <= _SHOWN * max(1.0, *(solid.radius for solid in self._pair(i, j)))
+        """Whether the normal shows the distance of two convex solids.
+
+        Apart, that is the gap of the planes that hold them; in each other, so far they have to be moved.
+        """
+        a, b = self._pair(i, j)
+        shown = float(gaps(*self._placed_solids(i, j), self.witness()[2][None])[0])
+        return abs(distance - shown) <= _SHOWN * max(1.0, distance, a.radius, b.radius)
+
+    def _solved(self, i: int, j: int) -> float:
+        """Measure two convex solids without coal."""
+        found = separation(*self._placed_solids(i, j))
+        if found is None:
+            return self._searched(i, j)
+        distance, point, normal = found
+        self._mended = point, point + distance * normal, normal
+        return distance
+
+    def _from_triangles(self, i: int, j: int, distance: float, functor: Any) -> float:
+        """Check the distance of a convex solid from triangles, between which there is no plane.
+
+        coal goes wrong where its iterations cannot end, so they are given another end; where that gives
+        another distance, all triangles that may be nearest are measured without coal.
+        """
+        witness = self.witness()
+        a, b = self._pair(i, j)
+        again = self._asked_again(i, j, functor)
+        self._mended = witness
+        if abs(again - distance) <= _SHOWN * max(1.0, distance, a.radius, b.radius):
+            return distance
+        solved = self._solved_triangles(i, j)
+        return self._with_triangles(i, j) if solved is None else solved
+
+    def _touching_triangles(self, i: int, j: int, functor: Any) -> float:
+        """Measure in touch where triangles take part, if that is so."""
+        a, b = self._pair(i, j)
+        if (a.is_convex or b.is_convex) and self._asked_again(i, j, functor) > _TOUCH:
+            solved = self._solved_triangles(i, j)
+            if solved is not None:
+                return solved
+        return self._with_triangles(i, j)
+
+    def _asked_again(self, i: int, j: int, functor: Any) -> float:
+        self._result.clear()
+        distance: float = functor(self._transforms[i], self._transforms[j], self._roughest, self._result)
+        return distance
+
+    def _solved_triangles(self, i: int, j: int) -> float | None:
+        """Measure a convex solid and triangles without coal; None if they touch."""
+        turned = not self._pair(i, j)[0].is_convex
+        solid, mesh = (j, i) if turned else (i, j)
+        surface = self._pair(mesh, mesh)[0].surface
+        assert isinstance(surface, Faces)
+        found = separation_of_faces(self._placed_solids(solid, solid)[0], surface, *self._parts[mesh])
+        if found is None:
+            return None
+        distance, point, normal = found
+        other = point + distance * normal
+        self._mended = (other, point, -normal) if turned else (point, other, normal)
+        return distance
 
     def _mend(self, i: int, j: int, functor: Any) -> float:
         """Measure two convex solids in touch, or that coal failed on, when they are a little apart.
@@ -213,8 +276,9 @@ class Narrow:
         (rotation_a, at_a), (rotation_b, at_b) = self._parts[i], self._parts[j]
         return rotation_a @ a.centre + at_a, rotation_b @ b.centre + at_b
 
-    def _with_triangles(self, a: Solid, b: Solid, at_a: Any, at_b: Any) -> float:
+    def _with_triangles(self, i: int, j: int) -> float:
         """Measure in touch where triangles take part: how deep in the triangle that is entered the most."""
+        (a, b), at_a, at_b = self._pair(i, j), self._transforms[i], self._transforms[j]
         coal = self._coal
         request = coal.CollisionRequest(coal.CollisionRequestFlag.CONTACT, _CONTACTS)
         found = coal.CollisionResult()
@@ -226,6 +290,8 @@ class Narrow:
             if depth < -contact.penetration_depth < 1e300 and abs(np.linalg.norm(contact.normal) - 1) < 1e-6:
                 deepest, depth = contact, -contact.penetration_depth
         if deepest is None:
+            if (a.is_convex or b.is_convex) and (solved := self._solved_triangles(i, j)) is not None:
+                return solved
             point = np.array(self._result.getNearestPoint1())
             if not np.isfinite(point).all():
                 point = np.array(at_a.getTranslation())

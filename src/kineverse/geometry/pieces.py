@@ -18,6 +18,8 @@ from . import decomposition
 from .mesh_files import Floats
 from .solids import Solid, solid_of, solid_of_hull
 
+_LISTED = 12
+
 logger = logging.getLogger("kineverse.geometry")
 
 Left: TypeAlias = str | tuple[str, int]
@@ -189,6 +191,12 @@ class _Same:
         return answer
 
 
+def in_short(error: Exception) -> str:
+    """Return what an error says in one line, without all the places where a file was looked for."""
+    first = (str(error).partition(" Looked ")[0].splitlines() or [type(error).__name__])[0]
+    return " ".join(first.split())
+
+
 def load(pieces: Iterable[Piece]) -> list[Solid]:
     """Make the solids of pieces.
 
@@ -208,5 +216,7 @@ def load(pieces: Iterable[Piece]) -> list[Solid]:
     advice = "Mend the model, or leave such bodies out: Scene(model, leave_out=[...])."
     if len(errors) == 1:
         raise type(errors[0])(f"{errors[0]} {advice}") from errors[0]
-    lines = "\n".join(f"  {error}" for error in errors)
+    lines = "\n".join(f"  {in_short(error)}" for error in errors[:_LISTED])
+    if len(errors) > _LISTED:
+        lines += f"\n  and {len(errors) - _LISTED} more"
     raise FormatError(f"{len(errors)} shapes cannot be used. {advice}\n{lines}") from errors[0]

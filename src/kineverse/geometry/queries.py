@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 
 import numpy as np
+import numpy.typing as npt
 
 from kineverse.errors import ValueRejectedError
 
@@ -15,9 +15,7 @@ from .mirror import Mirror
 from .narrow import ACCURACY
 from .results import Closest
 from .sweep_native import sweep_library
-from .table import Indices
-
-Choice = Callable[[str, str], bool]
+from .table import Flags, Indices
 
 
 def pair(mirror: Mirror, a: str, b: str) -> Closest:
@@ -39,24 +37,27 @@ def pair(mirror: Mirror, a: str, b: str) -> Closest:
     return found if found.a == a else found.swapped()
 
 
-def within(mirror: Mirror, radius: float, choice: Choice | None = None) -> Found:
-    """Return the pairs of bodies within a radius [m], nearest first; only those of ``choice`` if given."""
+def within(mirror: Mirror, radius: float, wanted: Flags | None = None) -> Found:
+    """Return the pairs of bodies within a radius [m], nearest first.
+
+    Those that are looked at; or of these only some, (B, B) flags.
+    """
     _check_radius(radius)
     mirror.ready()
-    if choice is not None:
-        return _nearest(mirror, *_candidates(mirror, radius, choice), radius)
-    pairs, lows, distances, witnesses, order = sweep_library.search(mirror.table, radius + ACCURACY, radius)
+    table = mirror.table
+    reach = radius + ACCURACY
+    pairs, lows, distances, witnesses, order = sweep_library.search(table, reach, radius, wanted)
     if order is None:
         mirror.measure_rest(pairs, lows, radius, distances, witnesses)
-        order = sweep_library.rank(mirror.table, pairs, distances, radius)
-    return Found(mirror, pairs[order], distances[order], witnesses[order])
+        order = sweep_library.rank(table, pairs, distances, radius)
+    return _found(mirror, pairs, distances, witnesses, order)
 
 
 def first(mirror: Mirror, margin: float) -> Closest | None:
     """Return the first pair found within a margin [m], in the order of the pieces; None if there is none."""
     _check_radius(margin)
     mirror.ready()
-    pairs, _ = _candidates(mirror, margin, None)
+    pairs, _ = sweep_library.near(mirror.table, margin + ACCURACY)
     pairs = pairs[np.lexsort((pairs[:, 1], pairs[:, 0]))]
     distances, witnesses = sweep_library.measure(mirror.table, pairs, margin)
     for k in np.flatnonzero(~(distances > margin)).tolist():
@@ -64,7 +65,9 @@ def first(mirror: Mirror, margin: float) -> Closest | None:
         if math.isnan(distances[k]):
             mirror.measure_rest(pairs[only], np.zeros(1), margin, distances[only], witnesses[only])
         if distances[k] <= margin:
-            return Found(mirror, pairs[only], distances[only], witnesses[only])[0]
+            return _found(mirror, pairs[only], distances[only], witnesses[only], np.zeros(1, dtype=np.int64))[
+                0
+            ]
     return None
 
 
@@ -87,15 +90,6 @@ def _product(members: list[int], others: list[int]) -> Indices:
     return np.stack([np.minimum(left, right), np.maximum(left, right)], axis=1).astype(np.int32)
 
 
-def _candidates(mirror: Mirror, radius: float, choice: Choice | None) -> tuple[Indices, Floats]:
-    pairs, lows = sweep_library.near(mirror.table, radius + ACCURACY)
-    if choice is not None:
-        body, names = mirror.table.body[pairs].tolist(), mirror.bodies
-        wanted = np.array([choice(names[a], names[b]) for a, b in body], dtype=bool)
-        pairs, lows = pairs[wanted], lows[wanted]
-    return pairs, lows
-
-
 def _least(mirror: Mirror, pairs: Indices) -> float:
     return float(mirror.measure(pairs, np.zeros(len(pairs)), math.inf)[0].min())
 
@@ -104,7 +98,13 @@ def _nearest(mirror: Mirror, pairs: Indices, lows: Floats, radius: float) -> Fou
     """Measure pairs of pieces, and return the nearest ones of each pair of bodies within a radius [m]."""
     distances, witnesses = mirror.measure(pairs, lows, radius)
     order = sweep_library.rank(mirror.table, pairs, distances, radius)
-    return Found(mirror, pairs[order], distances[order], witnesses[order])
+    return _found(mirror, pairs, distances, witnesses, order)
+
+
+def _found(
+    mirror: Mirror, pairs: Indices, distances: Floats, witnesses: Floats, order: npt.NDArray[np.int64]
+) -> Found:
+    return Found(mirror, *sweep_library.gather(mirror.table, pairs, distances, witnesses, order))
 
 
 def _check_radius(radius: float) -> None:

@@ -9,8 +9,6 @@ from typing import TypeAlias
 
 import numpy as np
 
-from kineverse.model.body import Cone
-
 from .mesh_files import Floats
 from .solids import Solid
 
@@ -61,6 +59,22 @@ def furthest(placed: Placed, way: Floats) -> Floats:
     return np.asarray(position + point + short * way)
 
 
+def support(placed: Placed, way: Floats) -> Floats:
+    """Return a point (3,) of a solid, in the world, that is furthest in a unit direction."""
+    solid, rotation, position = placed
+    core, own = solid.core, way @ rotation
+    assert core is not None
+    if core.tip and 2 * core.tip * own[2] >= core.radii[0] * np.hypot(own[0], own[1]):
+        return np.asarray(position + rotation @ np.array([0.0, 0.0, core.tip]))
+    point = np.where(own > 0.0, core.half, -core.half) + core.radius * own - [0.0, 0.0, core.tip]
+    if core.corners.size:
+        point += core.corners[:, np.argmax(own @ core.corners)]
+    across = np.linalg.norm(core.radii * own)
+    if across > 0.0:
+        point += core.radii**2 * own / across
+    return np.asarray(position + rotation @ point)
+
+
 def _uphill(a: Placed, b: Placed, way: Floats, gap: float) -> tuple[float, Floats]:
     width = 0.3
     for turn in range(_ROUNDS):
@@ -79,11 +93,11 @@ def _uphill(a: Placed, b: Placed, way: Floats, gap: float) -> tuple[float, Float
 
 def _reach(solid: Solid, ways: Floats) -> Floats:
     """Return the largest ``way @ x`` over the points x of a solid in its own frame, for (n, 3) directions."""
-    core, surface = solid.core, solid.surface
-    if core is None:
-        assert isinstance(surface, Cone)
-        half, side = surface.length / 2, np.hypot(ways[:, 0], ways[:, 1])
-        return np.maximum(half * ways[:, 2], surface.radius * side - half * ways[:, 2])
+    core = solid.core
+    assert core is not None
+    if core.tip:
+        side = core.radii[0] * np.hypot(ways[:, 0], ways[:, 1])
+        return np.asarray(np.maximum(core.tip * ways[:, 2], side - core.tip * ways[:, 2]))
     reach: Floats = np.abs(ways) @ core.half
     if core.radius:
         reach += core.radius * np.sqrt((ways * ways).sum(axis=1))

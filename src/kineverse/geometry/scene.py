@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -24,6 +24,9 @@ from .moving import Motion
 from .pieces import Left
 from .results import Closest, Hit, Nearby
 from .rules import Rule
+from .table import Flags
+
+_MOST_CHOSEN = 32
 
 
 class Scene:
@@ -69,6 +72,8 @@ class Scene:
         self.model = model
         self._mirror = Mirror(model, rules, triangles, decomposed, leave_out)
         self._parameters: dict[tuple[str, str], Parameters] = {}
+        self._chosen: dict[tuple[Any, ...], Flags] = {}
+        self._version: int | None = None
 
     @property
     def bodies(self) -> tuple[str, ...]:
@@ -142,10 +147,7 @@ class Scene:
 
     def between(self, one: str, other: str, radius: float) -> Found:
         """Return the pairs within a radius [m] of which one body is at or below each of two frames."""
-        first, second = self._below(one), self._below(other)
-        return queries.within(
-            self._mirror, radius, lambda a, b: (a in first and b in second) or (b in first and a in second)
-        )
+        return queries.within(self._mirror, radius, self._wanted(("between", one, other), self._both_below))
 
     def inside(self, frame: str, radius: float) -> Found:
         """Return the pairs within a radius [m] that are both at or below a frame: self-collision."""
@@ -254,16 +256,38 @@ class Scene:
 
     def near_what_moves(self, symbols: Symbol | str | Iterable[Symbol | str], radius: float) -> Found:
         """Return the pairs within a radius [m] whose distance depends on some symbols, nearest first."""
-        motion = Motion(self.model, _several(symbols))
-        return queries.within(self._mirror, radius, motion.moves_between)
+        return queries.within(
+            self._mirror, radius, self._wanted(("moved by", *_several(symbols)), self._moving_apart)
+        )
 
-    def _below(self, frame: str) -> frozenset[str]:
+    def _wanted(self, key: tuple[Any, ...], choose: Callable[..., npt.NDArray[np.bool_]]) -> Flags:
+        """Return the pairs that are looked at and chosen, (B, B); kept for this version of the model."""
+        self._mirror.follow()
+        if self._version != self.model.version or len(self._chosen) > _MOST_CHOSEN:
+            self._chosen.clear()
+            self._version = self.model.version
+        if key not in self._chosen:
+            self._chosen[key] = np.ascontiguousarray(self._mirror.table.allowed * choose(*key[1:]))
+        return self._chosen[key]
+
+    def _both_below(self, one: str, other: str) -> npt.NDArray[np.bool_]:
+        there = np.logical_and.outer(self._below(one), self._below(other))
+        return np.asarray(there | there.T)
+
+    def _moving_apart(self, *symbols: Symbol | str) -> npt.NDArray[np.bool_]:
+        motion = Motion(self.model, symbols)
+        ways = [motion.way(body) for body in self.bodies]
+        numbers = {way: k for k, way in enumerate(dict.fromkeys(ways))}
+        number = np.array([numbers[way] for way in ways], dtype=int)
+        return np.asarray(np.not_equal.outer(number, number))
+
+    def _below(self, frame: str) -> npt.NDArray[np.bool_]:
         frames = self.model.frames
         if frame != WORLD and frame not in frames:
             raise UnknownNameError(f"There is no frame '{frame}'. {suggest(frame, frames, 'frame')}")
         lookup = frames.__getitem__
-        return frozenset(
-            body for body in self.bodies if frame in (WORLD, body) or frame in ancestors(body, lookup)
+        return np.array(
+            [frame in (WORLD, body) or frame in ancestors(body, lookup) for body in self.bodies], dtype=bool
         )
 
     def __repr__(self) -> str:

@@ -30,9 +30,9 @@ class Hull:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Core:
-    """What a solid is made of for our own measuring, see :mod:`.narrow_source`.
+    """What a solid is made of for our own measuring, see :mod:`.support_source`.
 
-    It is the sum of a hull of corners, and about the origin of a box, an ellipsoid, and a ball.
+    It is the sum of a hull of corners, and about the origin of a box, an ellipsoid, and a ball; or a cone.
 
     Attributes
     ----------
@@ -45,12 +45,16 @@ class Core:
     corners
         (3, n) in the frame of the solid [m], n a multiple of 8, for which the first one is repeated; n = 0
         stands for the origin alone.
+    tip
+        Of a cone, which is the hull of the tip at (0, 0, tip) and the ellipsoid, a disc, at (0, 0, -tip); 0
+        for everything else [m].
     """
 
     half: Floats
     radius: float = 0.0
     radii: Floats = field(default_factory=lambda: np.zeros(3))
     corners: Floats = field(default_factory=lambda: np.empty((3, 0)))
+    tip: float = 0.0
 
     @staticmethod
     def hull(points: Floats) -> Core:
@@ -260,6 +264,7 @@ def _of_primitive(geometry: Primitive) -> Solid:
         core = Core(np.array([0.0, 0.0, y / 2]), radii=np.array([x, x, 0.0]))
     else:
         engine, half, radius = coal.Cone(x, y), (x, x, y / 2), math.hypot(x, y / 2)
+        core = Core(np.zeros(3), radii=np.array([x, x, 0.0]), tip=y / 2)
     engine.computeLocalAABB()
     return Solid(engine, geometry, np.zeros(3), np.array(half), radius, stand_in, core)
 

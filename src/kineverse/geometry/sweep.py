@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from .mesh_files import Floats
-from .table import Indices, Table
+from .table import Flags, Indices, Table
 
 FURTHEST = 1e12
 """Nothing is put further than this from the origin, where numbers are 0.1 mm apart [m]."""
@@ -45,11 +45,11 @@ def place(table: Table, fresh: Floats) -> int:
     return GONE_TOO_FAR if (table.travel[moving] > LONGEST_TRAVEL).any() else PLACED
 
 
-def near(table: Table, reach: float) -> tuple[Indices, Floats]:
+def near(table: Table, reach: float, allowed: Flags | None = None) -> tuple[Indices, Floats]:
     """Return the pairs that may be within ``reach`` [m] of each other.
 
-    Only active pieces of pairs of bodies that are looked at, of which at least one moves; no pair is missing
-    whose distance, when it was or would be measured, is at most ``reach``.
+    Only active pieces of pairs of bodies that are looked at, or ``allowed``, (B, B), of which one moves; no
+    pair is missing whose distance, when it was or would be measured, is at most ``reach``.
 
     Returns
     -------
@@ -65,7 +65,8 @@ def near(table: Table, reach: float) -> tuple[Indices, Floats]:
     step = np.arange(len(first)) - np.repeat(np.cumsum(counts) - counts, counts) + 1
     ones, others = order[first], order[first + step]
     ones, others = np.minimum(ones, others), np.maximum(ones, others)
-    keep = (table.allowed[table.body[ones], table.body[others]] == 1) & (ones < table.moving)
+    looked_at = table.allowed if allowed is None else allowed
+    keep = (looked_at[table.body[ones], table.body[others]] == 1) & (ones < table.moving)
     ones, others = ones[keep], others[keep]
     gaps = np.maximum(table.low[ones] - table.high[others], table.low[others] - table.high[ones])
     keep = (np.maximum(gaps, 0.0) ** 2).sum(axis=1) <= reach * reach
@@ -92,3 +93,19 @@ def rank(table: Table, pairs: Indices, distances: Floats, radius: float) -> npt.
     bodies = low[order].astype(np.int64) * len(table.allowed) + high[order]
     leading = np.unique(bodies, return_index=True)[1]
     return np.asarray(order[np.sort(leading)])
+
+
+def gather(
+    table: Table, pairs: Indices, distances: Floats, witnesses: Floats, order: npt.NDArray[np.int64]
+) -> tuple[Indices, Indices, Floats, Floats]:
+    """Return pieces (K, 2), their bodies (K, 2), distances and witnesses in an order.
+
+    The first body of each pair is before the other in the model.
+    """
+    pairs, distances, witnesses = pairs[order], distances[order], witnesses[order]
+    owners = table.body[pairs]
+    turned = owners[:, 0] > owners[:, 1]
+    pairs[turned], owners[turned] = pairs[turned, ::-1], owners[turned, ::-1]
+    backwards = witnesses[turned]
+    witnesses[turned] = np.hstack([backwards[:, 3:6], backwards[:, :3], -backwards[:, 6:]])
+    return pairs, owners, distances, witnesses

@@ -15,15 +15,18 @@ from kineverse.compile.source_library import SourceLibrary
 
 from . import sweep
 from .mesh_files import Floats
-from .narrow_source import NARROW
+from .narrow_source import NARROW, SIMPLEX
+from .penetration_source import PENETRATION
+from .search_source import SEARCH
 from .standing import tree_of
+from .support_source import SUPPORT
 from .sweep_source import SWEEP
-from .table import Indices, Table
+from .table import Flags, Indices, Table
 
 _ARRAYS = (
     "body", "allowed", "active", "centre", "half", "radius",
     "poses", "travel", "place", "low", "high", "bounds", "order",
-    "corners", "corner_count", "edges", "radii", "round",
+    "corners", "corner_count", "edges", "radii", "round", "tip", "memory",
 )  # fmt: skip
 
 
@@ -43,7 +46,7 @@ class SweepLibrary(SourceLibrary):
     """The compiled sweep, once there is one; for all scenes of the process."""
 
     def __init__(self) -> None:
-        super().__init__(SWEEP + NARROW, _declare)
+        super().__init__(SWEEP + SUPPORT + SIMPLEX + PENETRATION + NARROW + SEARCH, _declare)
 
     def place(self, table: Table, fresh: Floats) -> int:
         """Do what :func:`.sweep.place` does; ``fresh`` is contiguous."""
@@ -52,7 +55,7 @@ class SweepLibrary(SourceLibrary):
         return int(self._code.place(_native(table).address, fresh.ctypes.data))
 
     def near(self, table: Table, reach: float) -> tuple[Indices, Floats]:
-        """Do what :func:`.sweep.near` does."""
+        """Do what :func:`.sweep.near` does, for all pairs that are looked at."""
         if self._code is None:
             return sweep.near(table, reach)
         native = _native(table)
@@ -89,16 +92,39 @@ class SweepLibrary(SourceLibrary):
                 return order[:found]
         return sweep.rank(table, pairs, distances, radius)
 
-    def search(self, table: Table, reach: float, radius: float) -> Search:
-        """Do :meth:`near`, :meth:`measure` and, if that leaves nothing to coal, :meth:`rank`."""
+    def gather(
+        self, table: Table, pairs: Indices, distances: Floats, witnesses: Floats, order: npt.NDArray[np.int64]
+    ) -> tuple[Indices, Indices, Floats, Floats]:
+        """Do what :func:`.sweep.gather` does; all arrays are contiguous."""
         if self._code is None:
-            pairs, lows = sweep.near(table, reach)
+            return sweep.gather(table, pairs, distances, witnesses, order)
+        count = len(order)
+        pieces, bodies = np.empty((2, count, 2), dtype=np.int32)
+        near, points = np.empty(count), np.empty((count, 9))
+        given = (array.ctypes.data for array in (pairs, distances, witnesses, order))
+        made = (array.ctypes.data for array in (pieces, bodies, near, points))
+        self._code.gather(_native(table).address, *given, count, *made)
+        return pieces, bodies, near, points
+
+    def search(self, table: Table, reach: float, radius: float, wanted: Flags | None = None) -> Search:
+        """Do :meth:`near`, :meth:`measure` and, if that leaves nothing to coal, :meth:`rank`.
+
+        For the pairs of bodies that are wanted, (B, B); for all that are looked at if None.
+        """
+        if self._code is None:
+            pairs, lows = sweep.near(table, reach, wanted)
             return pairs, lows, *self.measure(table, pairs, radius), None
         native = _native(table)
-        while (found := self._code.search(native.address, reach, radius, *native.everything)) > len(
-            native.lows
-        ):
-            native.room(2 * found)
+        looked_at = native.struct.allowed
+        if wanted is not None:
+            native.struct.allowed = wanted.ctypes.data
+        try:
+            while (found := self._code.search(native.address, reach, radius, *native.everything)) > len(
+                native.lows
+            ):
+                native.room(2 * found)
+        finally:
+            native.struct.allowed = looked_at
         kept = native.kept.value
         order = None if kept < 0 else native.order[:kept]
         pairs, lows, distances, witnesses = native.pairs, native.lows, native.distances, native.witnesses
@@ -156,6 +182,8 @@ def _declare(code: Any) -> None:
     code.measure.restype = None
     code.rank.argtypes = (pointer, pointer, ctypes.c_int64, pointer, ctypes.c_double, pointer)
     code.rank.restype = ctypes.c_int64
+    code.gather.argtypes = (*(pointer,) * 5, ctypes.c_int64, *(pointer,) * 4)
+    code.gather.restype = None
     code.search.argtypes = (pointer, *(ctypes.c_double,) * 2, ctypes.c_int64, *(pointer,) * 6)
     code.search.restype = ctypes.c_int64
 

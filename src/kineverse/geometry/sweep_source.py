@@ -1,9 +1,17 @@
 """C text: what :mod:`.sweep` does, on the same table."""
 
+from .table import REMEMBERED
+
 SWEEP = r"""
 #include <math.h>
 #include <stdint.h>
 #include <stdlib.h>
+
+/* A pair that was measured: the travel of both at that time, and what came out. */
+typedef struct {
+  int64_t pair; /* 0 for none */
+  double travel_i, travel_j, distance, witness[9];
+} Memory;
 
 typedef struct {
   int64_t count, moving, bodies, axis;
@@ -14,11 +22,14 @@ typedef struct {
   int32_t *order;
   const double *const *corners;
   const int64_t *corner_count;
-  const double *edges, *radii, *round, *boxes;
+  const double *edges, *radii, *round, *tip;
+  Memory *memory;
+  const double *boxes;
   const int32_t *leaves;
   int64_t leaf_count;
 } Table;
 
+#define MEMORY_BITS @BITS@
 #define EXPORT __attribute__((visibility("default")))
 
 static inline double square(double x) { return x * x; }
@@ -159,4 +170,4 @@ EXPORT int64_t near(Table *t, double reach, int32_t *pairs, double *lows, int64_
   }
   return answer.found;
 }
-"""
+""".replace("@BITS@", str(REMEMBERED.bit_length() - 1))

@@ -17,9 +17,14 @@ Flags: TypeAlias = npt.NDArray[np.uint8]
 MOST_CARRIED = 6000
 """Bounds are carried for so many pieces at most; memory is touched only for pairs that were measured."""
 
+REMEMBERED = 2**13
+"""So many pairs are not measured again where nothing has moved; a power of two."""
+
+_MEMORY = np.dtype([("pair", np.int64), ("numbers", np.float64, 12)])
+
 _TAKEN_OVER = (
     "active", "centre", "half", "radius", "poses", "travel",
-    "corners", "corner_count", "edges", "radii", "round",
+    "corners", "corner_count", "edges", "radii", "round", "tip",
 )  # fmt: skip
 
 
@@ -45,10 +50,12 @@ class Table:
         (M,) by how much any point of a piece can have moved since the beginning, at most [m].
     place, low, high
         (M, 3) each: the centre in the world, and the corners of the box around the piece there [m].
-    corners, corner_count, edges, radii, round
+    corners, corner_count, edges, radii, round, tip
         (M,) the address of a piece's corners, how many these are, -1 for a piece without a core; the (M, 3)
-        box, (M, 3) ellipsoid and (M,) ball of its core [m]. See :class:`.solids.Core`, which has to outlive
-        this.
+        box, (M, 3) ellipsoid, (M,) ball and (M,) tip of its core [m]. See :class:`.solids.Core`, which has to
+        outlive this.
+    memory
+        What C measured last, of each pair that has not given way to another one.
     order
         (M,) the moving pieces sorted along ``axis`` when that was last done, and then the others.
     standing_changed
@@ -75,6 +82,8 @@ class Table:
     edges: Floats = field(init=False)
     radii: Floats = field(init=False)
     round: Floats = field(init=False)
+    tip: Floats = field(init=False)
+    memory: npt.NDArray[np.void] = field(init=False)
     order: Indices = field(init=False)
     bounds: Floats | None = field(init=False)
     axis: int = 0
@@ -90,6 +99,7 @@ class Table:
         self.place, self.low, self.high = (np.zeros((count, 3)) for _ in range(3))
         self.corners, self.corner_count = np.zeros(count, dtype=np.uintp), np.full(count, -1, dtype=np.int64)
         self.edges, self.radii, self.round = np.zeros((count, 3)), np.zeros((count, 3)), np.zeros(count)
+        self.tip, self.memory = np.zeros(count), np.zeros(REMEMBERED, dtype=_MEMORY)
         self.order = np.arange(count, dtype=np.int32)
         self.bounds = np.zeros((count, count)) if count <= MOST_CARRIED else None
 
@@ -106,6 +116,7 @@ class Table:
         if core is not None:
             self.corners[piece], self.corner_count[piece] = core.corners.ctypes.data, core.corners.shape[1]
             self.edges[piece], self.radii[piece], self.round[piece] = core.half, core.radii, core.radius
+            self.tip[piece] = core.tip
         self.active[piece] = 1
         self.put(np.array([piece]))
 
@@ -137,6 +148,7 @@ class Table:
     def forget_travel(self) -> None:
         """Begin to count again, with nothing known of any pair."""
         self.travel[:] = 0.0
+        self.memory[:] = 0
         if self.bounds is not None:
             self.bounds[self.bounds != 0.0] = 0.0
 

@@ -1,8 +1,9 @@
 """Decompositions on disk, by the content of the mesh and the settings.
 
-They lie in a folder of the cache that compiled functions are kept in, which only this user can write to. A
-file ends in the SHA-256 of what is before it; a broken one counts as absent. Files arrive by renaming, so any
-number of processes can share the folder, and what was done before an interruption is there.
+They lie in a folder of the cache that compiled functions are kept in, which only this user can write to, as
+to every file in it. A file ends in the SHA-256 of what is before it; a broken one counts as absent. Files
+arrive by renaming, so any number of processes can share the folder, and what was done before an interruption
+is there.
 """
 
 from __future__ import annotations
@@ -17,7 +18,8 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-from kineverse.compile.cache import library_cache
+from kineverse.compile.cache import private_subfolder
+from kineverse.compile.private_folder import NotPrivateError, PrivateFolder
 from kineverse.errors import FormatError
 
 from .result import Decomposition
@@ -52,94 +54,92 @@ def find(mesh: str, settings: str | None = None) -> Decomposition | None:
     settings
         The key of the settings; those with which it was decomposed last if None.
     """
+    folder = _folder()
     if settings is not None:
-        return _read(folder() / _name(mesh, settings))
-    found = [_read(path) for path in folder().glob(_name(mesh, "*"))]
+        return _read(folder, _name(mesh, settings))
+    beginning = _name(mesh, "").removesuffix(_ENDING)
+    found = [_read(folder, name) for _, _, name in _files(folder) if name.startswith(beginning)]
     return max((some for some in found if some), key=lambda some: some.made, default=None)
 
 
 def keep(mesh: str, settings: str, decomposition: Decomposition) -> None:
     """Write a decomposition, whole or not at all; see :func:`find`."""
+    folder = _folder()
     content = decomposition.to_bytes()
-    handle, name = tempfile.mkstemp(prefix=_UNFINISHED, dir=folder())
+    handle, name = tempfile.mkstemp(prefix=_UNFINISHED, dir=folder.path)
     try:
         with open(handle, "wb") as file:
-            file.write(content + hashlib.sha256(content).digest())
-        os.replace(name, folder() / _name(mesh, settings))
+            file.write(content)
+        folder.adopt(name, _name(mesh, settings), hashlib.sha256(content).digest())
     except BaseException:
         with contextlib.suppress(OSError):
             os.unlink(name)
         raise
-    _make_room()
+    _make_room(folder)
 
 
 def listing() -> list[Kept]:
     """Return what is in the cache, by name of the file it was made from."""
-    found = [(_read(path, used=False), size) for _, size, path in _files()]
+    folder = _folder()
+    found = [(_read(folder, name, used=False), size) for _, size, name in _files(folder)]
     kept = [Kept(decomposition, size) for decomposition, size in found if decomposition]
     return sorted(kept, key=lambda one: (one.decomposition.name, one.decomposition.made))
 
 
 def clear() -> int:
     """Remove everything, and return how many decompositions there were."""
-    count = 0
-    for _, _, path in _files():
-        with contextlib.suppress(OSError):
-            path.unlink()
-            count += 1
-    return count
+    folder = _folder()
+    return sum(folder.remove(name) for _, _, name in list(_files(folder)))
 
 
 def folder() -> Path:
     """Return where decompositions are kept."""
-    path = library_cache().folder / "decompositions"
-    with contextlib.suppress(FileExistsError):
-        path.mkdir(mode=0o700)
-    return path
+    return _folder().path
+
+
+def _folder() -> PrivateFolder:
+    return private_subfolder("decompositions")
 
 
 def _name(mesh: str, settings: str) -> str:
     return f"{mesh[:40]}-{settings}{_ENDING}"
 
 
-def _read(path: Path, used: bool = True) -> Decomposition | None:
+def _read(folder: PrivateFolder, name: str, used: bool = True) -> Decomposition | None:
     try:
-        content = path.read_bytes()
-        last_use = path.stat().st_mtime
-    except OSError:
-        return None
-    try:
+        with open(folder.open(name), "rb") as file:
+            content, last_use = file.read(), os.fstat(file.fileno()).st_mtime
+            if used and time.time() - last_use > _LAST_USE_RESOLUTION:
+                with contextlib.suppress(OSError):
+                    os.utime(file.fileno())
         if hashlib.sha256(content[:-_DIGEST]).digest() != content[-_DIGEST:]:
             raise FormatError("It does not end in its digest.")
-        decomposition = Decomposition.from_bytes(content[:-_DIGEST])
-    except FormatError:
-        logger.warning("The decomposition %s is damaged and counts as absent.", path)
-        with contextlib.suppress(OSError):
-            path.unlink()
+        return Decomposition.from_bytes(content[:-_DIGEST])
+    except OSError:
         return None
-    if used and time.time() - last_use > _LAST_USE_RESOLUTION:
-        with contextlib.suppress(OSError):
-            os.utime(path)
-    return decomposition
+    except NotPrivateError as error:
+        reason = str(error)
+    except FormatError:
+        reason = "is damaged"
+    logger.warning("The decomposition %s %s and counts as absent.", folder.path / name, reason)
+    folder.remove(name)
+    return None
 
 
-def _files() -> Iterator[tuple[float, int, Path]]:
-    """Yield the time of the last use, the size and the path of every decomposition."""
-    for entry in list(os.scandir(folder())):
-        with contextlib.suppress(OSError):
-            status = entry.stat(follow_symlinks=False)
-            if entry.name.endswith(_ENDING):
-                yield status.st_mtime, status.st_size, Path(entry.path)
-            elif entry.name.startswith(_UNFINISHED) and time.time() - status.st_mtime > _STALE_SECONDS:
-                os.unlink(entry.path)
+def _files(folder: PrivateFolder) -> Iterator[tuple[float, int, str]]:
+    """Yield the time of the last use, the size and the name of every decomposition."""
+    for name, status in folder.entries():
+        if name.endswith(_ENDING):
+            yield status.st_mtime, status.st_size, name
+        elif name.startswith(_UNFINISHED) and time.time() - status.st_mtime > _STALE_SECONDS:
+            folder.remove(name)
 
 
-def _make_room() -> None:
-    files = sorted(_files())
+def _make_room(folder: PrivateFolder) -> None:
+    files = sorted(_files(folder))
     excess = sum(size for _, size, _ in files) - MAXIMUM_BYTES
-    for _, size, path in files:
+    for _, size, name in files:
         if excess <= 0:
             break
-        with contextlib.suppress(OSError):
-            path.unlink()
+        folder.remove(name)
         excess -= size

@@ -1,0 +1,176 @@
+"""C text: how deep two cores are in each other, after the simplex of :mod:`.narrow_source`.
+
+The depth is the distance of the origin from the surface of {b - a}. As van den Bergen found it (Proximity
+queries and penetration depth computation on 3D game objects, 2001), a polytope inside of {b - a} grows at the
+face that is nearest to the origin until that face is on the surface. Its distance is never more than the
+depth, and how far {b - a} reaches along its normal never less: an answer is given only once the two meet.
+"""
+
+PENETRATION = r"""
+/* Both bounds of a depth have to meet to the first [m], or when there is no more room, to the second. */
+#define DEEP_MET 1e-9
+#define DEEP_STUCK 1e-7
+#define MOST_CORNERS 160
+#define MOST_FACES (6 * MOST_CORNERS)
+/* What is nearer to a plane than this part of the size of both is in it. */
+#define FLAT 1e-13
+
+typedef struct {
+  int corner[3], seen;
+  Vector normal;
+  double height; /* of the plane over the origin; infinite for a face that is gone */
+} Facet;
+
+typedef struct {
+  int corners, faces;
+  Vector w[MOST_CORNERS], a[MOST_CORNERS];
+  Facet face[MOST_FACES];
+  int16_t beside[MOST_CORNERS][MOST_CORNERS]; /* the face to the left of each edge */
+} Polytope;
+
+static int add_corner(Polytope *p, Vector w, Vector a) {
+  p->w[p->corners] = w;
+  p->a[p->corners] = a;
+  return p->corners++;
+}
+
+/* Adds a face, its corners counter-clockwise seen from outside; returns 0 if it is a line. */
+static int add_face(Polytope *p, int i, int j, int k) {
+  const Vector n = cross(plus(p->w[j], -1.0, p->w[i]), plus(p->w[k], -1.0, p->w[i]));
+  const double size = sqrt(dot(n, n));
+  if (!(size > 1e-30) || p->faces == MOST_FACES) return 0;
+  const Vector normal = {{n.x[0] / size, n.x[1] / size, n.x[2] / size}};
+  p->face[p->faces] = (Facet){{i, j, k}, 0, normal, dot(normal, p->w[i])};
+  p->beside[i][j] = p->beside[j][k] = p->beside[k][i] = (int16_t)p->faces;
+  p->faces++;
+  return 1;
+}
+
+static double above(const Polytope *p, int i, int j, int k, Vector w) {
+  const Vector n = cross(plus(p->w[j], -1.0, p->w[i]), plus(p->w[k], -1.0, p->w[i]));
+  const double size = sqrt(dot(n, n));
+  return size > 0.0 ? dot(n, plus(w, -1.0, p->w[i])) / size : 0.0;
+}
+
+/* Four corners far from each other, whether or not the origin is between them. */
+static int spread(Polytope *p, const Pair *pair, double size) {
+  Vector w[8], a[8];
+  int first = 0, second = 0, third = -1;
+  double most = 0.0;
+  for (int k = 0; k < 6; k++) {
+    Vector way = {{0.0, 0.0, 0.0}};
+    way.x[k / 2] = k % 2 ? 1.0 : -1.0;
+    w[k] = against(pair, way, a + k);
+    for (int m = 0; m < k; m++) {
+      const Vector between = plus(w[k], -1.0, w[m]);
+      const double square = dot(between, between);
+      if (square > most) most = square, first = m, second = k;
+    }
+  }
+  const double enough = 1e-7 * size;
+  if (!(sqrt(most) > enough)) return 0;
+  const Vector line = plus(w[second], -1.0, w[first]);
+  most = square(enough) * dot(line, line);
+  for (int k = 0; k < 6; k++) {
+    const Vector n = cross(line, plus(w[k], -1.0, w[first]));
+    if (dot(n, n) > most) most = dot(n, n), third = k;
+  }
+  if (third < 0) return 0;
+  add_corner(p, w[first], a[first]);
+  add_corner(p, w[second], a[second]);
+  add_corner(p, w[third], a[third]);
+  const Vector n = cross(line, plus(w[third], -1.0, w[first]));
+  w[6] = against(pair, n, a + 6);
+  w[7] = against(pair, (Vector){{-n.x[0], -n.x[1], -n.x[2]}}, a + 7);
+  const int last = fabs(above(p, 0, 1, 2, w[6])) > fabs(above(p, 0, 1, 2, w[7])) ? 6 : 7;
+  add_corner(p, w[last], a[last]);
+  return fabs(above(p, 0, 1, 2, w[last])) > enough;
+}
+
+static int begin(Polytope *p, const Pair *pair, const Simplex *s, double size) {
+  p->corners = p->faces = 0;
+  if (s)
+    for (int k = 0; k < 4; k++) add_corner(p, s->w[k], s->a[k]);
+  if (!s || !(fabs(above(p, 0, 1, 2, p->w[3])) > 1e-7 * size)) {
+    p->corners = 0;
+    if (!spread(p, pair, size)) return 0;
+  }
+  const int turn = above(p, 0, 1, 2, p->w[3]) > 0.0, i = turn, j = !turn;
+  return add_face(p, i, j, 2) && add_face(p, j, i, 3) && add_face(p, 2, j, 3) && add_face(p, i, 2, 3);
+}
+
+/* Puts a corner above a face, in place of all faces that it sees or is in the plane of; returns 0 where these
+   are not in one piece. */
+static int grow(Polytope *p, int from, Vector w, Vector a, double flat) {
+  int16_t waiting[MOST_FACES], gone[MOST_FACES], next[MOST_CORNERS];
+  int depth = 0, count = 0, edges = 0, start = 0;
+  const int tip = add_corner(p, w, a);
+  for (int k = 0; k < tip; k++) next[k] = -1;
+  waiting[depth++] = (int16_t)from;
+  p->face[from].seen = 1;
+  while (depth) {
+    const int f = waiting[--depth];
+    gone[count++] = (int16_t)f;
+    for (int k = 0; k < 3; k++) {
+      const int i = p->face[f].corner[k], j = p->face[f].corner[(k + 1) % 3], other = p->beside[j][i];
+      Facet *facet = p->face + other;
+      if (facet->seen) continue;
+      if (dot(facet->normal, w) - facet->height > -flat) {
+        facet->seen = 1;
+        waiting[depth++] = (int16_t)other;
+      } else {
+        if (next[i] >= 0) return 0;
+        next[i] = (int16_t)j;
+        start = i;
+        edges++;
+      }
+    }
+  }
+  /* Only now the edges are as they were when all were looked at. */
+  int round = 0;
+  for (int i = start; round < edges; round++) {
+    const int j = next[i];
+    if (j < 0 || !add_face(p, i, j, tip)) return 0;
+    i = j;
+    if (i == start && round + 1 < edges) return 0;
+  }
+  for (int k = 0; k < count; k++) p->face[gone[k]].height = INFINITY;
+  return edges >= 3;
+}
+
+/* Returns how deep two cores are in each other, the deepest point a of the first and the normal from it to
+   the second, in the frame of the first; NaN where that is not certain, or where they are not in each other.
+   A simplex of four points is where to begin, if there is one. */
+static double depth_of(const Pair *pair, const Simplex *s, double size, Vector *a, Vector *normal) {
+  Polytope p;
+  if (!begin(&p, pair, s, size)) return NAN;
+  double high = INFINITY, low = -INFINITY;
+  Facet best;
+  for (;;) {
+    int nearest = 0;
+    for (int f = 1; f < p.faces; f++)
+      if (p.face[f].height < p.face[nearest].height) nearest = f;
+    const Facet facet = p.face[nearest];
+    low = facet.height;
+    if (p.corners == MOST_CORNERS) break;
+    Vector from;
+    const Vector m = facet.normal, w = against(pair, (Vector){{-m.x[0], -m.x[1], -m.x[2]}}, &from);
+    const double reach = dot(m, w);
+    if (reach - low <= DEEP_STUCK && reach < high) {
+      high = reach;
+      best = facet;
+    }
+    if (reach - low <= DEEP_MET || !grow(&p, nearest, w, from, FLAT * size)) break;
+  }
+  if (!(high - low <= DEEP_STUCK && best.height >= -DEEP_MET)) return NAN;
+  const int *c = best.corner;
+  const Vector n = best.normal, x = p.w[c[0]], y = p.w[c[1]], z = p.w[c[2]];
+  double weight[3] = {dot(n, cross(y, z)), dot(n, cross(z, x)), dot(n, cross(x, y))}, sum = 0.0;
+  for (int k = 0; k < 3; k++) sum += weight[k] = larger(weight[k], 0.0);
+  if (!(sum > 0.0)) return NAN;
+  *a = (Vector){{0.0, 0.0, 0.0}};
+  for (int k = 0; k < 3; k++) *a = plus(*a, weight[k] / sum, p.a[c[k]]);
+  *normal = (Vector){{-n.x[0], -n.x[1], -n.x[2]}};
+  return best.height;
+}
+"""
