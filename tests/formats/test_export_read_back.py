@@ -154,7 +154,7 @@ def test_constraints_that_cannot_be_said_are_left_out_and_motions_are_not(
     assert any(r.startswith("that 'drive' moves by speeds that are not its own") for r in saved.remarks)
     again = kv.load(tmp_path / f"m.{ending}")
     assert again.degrees_of_freedom == model.degrees_of_freedom
-    at = {str(s): 0.3 for s in model.degrees_of_freedom}
+    at = kv.State({str(s): 0.3 for s in model.degrees_of_freedom})
     for frame in model.frames:
         np.testing.assert_allclose(again.fk(frame)(at), model.fk(frame)(at), atol=1e-12)
     with pytest.raises(kv.FormatError, match=r"'lock' .* all of them without strict=True"):

@@ -241,9 +241,9 @@ def test_rate_tables_are_the_same_once_they_are_written(rows):
             [12, None, None, 11, None, 12, None, None, None, None, 12, None, 10, None, None, 10],
         ],
     ]
-    tree = json.loads(document(nodes, {}))
-    trace = {"questions": [], "writes": {"frames": {"h": {"parent": "world", "factors": [13]}}}}
-    tree["operations"][0]["trace"] = trace
+    writes = {"frames": {"h": {"parent": "world", "factors": [13]}}}
+    tree = json.loads(document(nodes, writes))
+    tree["operations"][0]["trace"] = {"questions": [], "writes": writes}
     text = document_of(built(json.dumps(tree)))
     assert document_of(built(text)) == text
 

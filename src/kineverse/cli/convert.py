@@ -51,10 +51,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("source", metavar="IN", help="name of a shipped model, or path of a file")
     parser.add_argument("target", metavar="OUT", help="path of the file to write; - for standard output")
     parser.add_argument("--prefix", metavar="NAME", help="put in front of all names, with a slash")
-    add_reading_options(parser)
     parser.add_argument("--force", action="store_true", help="replace OUT if it is there")
-    parser.add_argument(
-        "--strict", action="store_true", help="refuse constraints that OUT cannot say, and write nothing"
+    add_reading_options(
+        parser, "refuse what is otherwise read or left out with a remark, such as constraints OUT cannot say"
     )
     parser.add_argument(
         "--leave-out",

@@ -13,6 +13,7 @@ from kineverse.cli.wording import contents, number
 from kineverse.errors import KineverseError
 from kineverse.formats.document import Recorded
 from kineverse.formats.files import read_file
+from kineverse.formats.loops import Loops
 from kineverse.formats.markup import root_tag
 from kineverse.formats.remarks import Fault, listening
 from kineverse.formats.sources import Source, locate_model
@@ -85,7 +86,12 @@ class Examination:
 
 
 def examine(
-    name: str, meshes: bool = True, strict: bool = False, touch: bool = False, root: str | None = None
+    name: str,
+    meshes: bool = True,
+    strict: bool = False,
+    touch: bool = False,
+    root: str | None = None,
+    loops: Loops = "solve",
 ) -> Examination:
     """Return what is found in a file; nothing is raised for what is wrong with it.
 
@@ -101,13 +107,15 @@ def examine(
         Whether to look for bodies that penetrate each other at the default state.
     root
         The folder below which the file may open others; by default its package or repository.
+    loops
+        What becomes of closed loops, see :func:`kineverse.load`.
     """
     language = ""
     with listening() as remarks:
         try:
             source = locate_model(name)
             language = format_of(source)
-            model = kv.load(name, root=root)
+            model = kv.load(name, root=root, loops=loops)
             facts = _facts(source)
             problems = (*findings(model, meshes), *(penetrations(model) if touch else ()))
         except (KineverseError, OSError) as error:

@@ -9,17 +9,15 @@ if TYPE_CHECKING:
     import kineverse as kv
 
 
-def add_root_option(parser: argparse.ArgumentParser) -> None:
-    """Declare ``--root``."""
+def add_reading_options(
+    parser: argparse.ArgumentParser, strict: str = "refuse what is otherwise read with a remark"
+) -> None:
+    """Declare ``--root``, ``--loops`` and ``--strict``, which means ``strict``."""
     parser.add_argument(
         "--root",
         metavar="FOLDER",
         help="the folder below which it may open files, meshes and included ones (its package or repository)",
     )
-
-
-def add_loops_option(parser: argparse.ArgumentParser) -> None:
-    """Declare ``--loops``."""
     parser.add_argument(
         "--loops",
         choices=("solve", "constraint", "refuse"),
@@ -27,13 +25,7 @@ def add_loops_option(parser: argparse.ArgumentParser) -> None:
         help="what becomes of closed loops: solved where that can be done (the default), all kept as equality "
         "constraints, or refused where one cannot be solved",
     )
-
-
-def add_reading_options(parser: argparse.ArgumentParser) -> None:
-    """Declare ``--root``, ``--loops`` and ``--strict``."""
-    add_root_option(parser)
-    add_loops_option(parser)
-    parser.add_argument("--strict", action="store_true", help="refuse what is otherwise read with a remark")
+    parser.add_argument("--strict", action="store_true", help=strict)
 
 
 def load(arguments: argparse.Namespace, source: str, prefix: str | None = None) -> kv.Model:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from kineverse.cli.paint import bounded, paint
 from kineverse.cli.progress import progress
-from kineverse.cli.reading import add_root_option
+from kineverse.cli.reading import add_reading_options
 from kineverse.cli.table import table
 from kineverse.cli.wording import number
 
@@ -54,8 +54,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--contacts", action="store_true", help="bodies that penetrate each other are problems (needs coal)"
     )
-    parser.add_argument("--strict", action="store_true", help="remarks count as problems")
-    add_root_option(parser)
+    add_reading_options(parser, "remarks count as problems")
     parser.add_argument(
         "--all", action="store_true", help=f"print all remarks and problems, not {SHOWN} of a kind"
     )
@@ -71,7 +70,7 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.contacts:
         coal_engine()
     meshes, strict, touch = not arguments.no_meshes, arguments.strict, arguments.contacts
-    found = [examine(file, meshes, strict, touch, arguments.root) for file in files]
+    found = [examine(file, meshes, strict, touch, arguments.root, arguments.loops) for file in files]
     status = max(examination.status for examination in found)
     most = None if arguments.all else SHOWN if len(found) == 1 else SHOWN_OF_SEVERAL
     if arguments.json:
