@@ -127,7 +127,7 @@ def test_equation_6_of_2022_drives_a_base():
         )
     pose = model.fk("base")
     left, right = kv.velocity("left"), kv.velocity("right")
-    at = {"base/x": 0.3, "base/y": -1.0, "base/angle": 0.7}
+    at = kv.State({"base/x": 0.3, "base/y": -1.0, "base/angle": 0.7})
 
     assert {left, right} <= pose.gradient().keys()
     assert kv.position("left") not in pose.symbols
@@ -254,7 +254,7 @@ class Hinge(kv.Operation):
 def test_equation_10_of_2022():
     """Eq. 10: a model is what operations make, one after the other, of the empty model."""
     operations = [Body("A", "world", 1.0), Hinge("A", 2.0), Body("B", "A", 0.5), Hinge("B", 3.0)]
-    at = {"A/hinge": 0.4, "B/hinge": -0.3}
+    at = kv.State({"A/hinge": 0.4, "B/hinge": -0.3})
 
     model = kv.Model()
     assert set(model.frames) <= {"world"}

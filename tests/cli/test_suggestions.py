@@ -38,8 +38,8 @@ def test_the_module_is_the_same_command():
         ),
         (("info", "kitchen", "--jsno"), "kineverse info has no option '--jsno'. Did you mean '--json'?"),
         (
-            ("fk", "kitchen", "world", "--sett=a"),
-            "kineverse fk has no option '--sett'. Did you mean '--set'?",
+            ("fk", "kitchen", "world", "--sset=a"),
+            "kineverse fk has no option '--sset'. Did you mean '--set'?",
         ),
         (
             ("info", "kitchen", "pr2"),

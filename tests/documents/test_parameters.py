@@ -43,6 +43,8 @@ def hand_made() -> kv.Model:
         edit.write("colour", ("red", 1.5, (q, None, -np.inf)))
         limits = kv.articulations.Limits(-q, q + 2, 1.5)
         edit.apply(kv.articulations.Cylindrical(name="rod", parent="a", child="rod", slide=limits))
+        edit.apply(kv.LoopConstraint(name="tie", frame="rod", to="b", mask=("x",)))
+        edit.add_frame("b", "world", kv.translation(0, 0, q), override=True)
     # What carries a rate is written plainly, so these are not among the writes as they were given.
     carried = model.fk("a")[:3, 3]
     with model.edit() as edit:

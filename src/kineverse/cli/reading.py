@@ -22,8 +22,8 @@ def add_reading_options(
         "--loops",
         choices=("solve", "constraint", "refuse"),
         default="solve",
-        help="what becomes of closed loops: solved where that can be done (the default), all kept as equality "
-        "constraints, or refused where one cannot be solved",
+        help="what becomes of closed loops: solved where that can be done (the default), all kept as "
+        "equality constraints, or refused where one cannot be solved",
     )
     parser.add_argument("--strict", action="store_true", help=strict)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import re
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
@@ -192,8 +193,9 @@ class _Same:
 
 
 def in_short(error: Exception) -> str:
-    """Return what an error says in one line, without all the places where a file was looked for."""
-    first = (str(error).partition(" Looked ")[0].splitlines() or [type(error).__name__])[0]
+    """Return what an error says in one line, without where a file was looked for and what makes it found."""
+    text = re.split(r" (?:Looked|Set) ", str(error), maxsplit=1)[0]
+    first = (text.splitlines() or [type(error).__name__])[0]
     return " ".join(first.split())
 
 

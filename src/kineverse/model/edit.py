@@ -151,8 +151,8 @@ class Override(Operation):
         return self.operation.apply(model)
 
     def default_tag(self) -> str:
-        """Return the tag of the operation."""
-        return self.operation.default_tag()
+        """Return ``override`` and the tag of the operation, which what it writes over may have."""
+        return f"override {self.operation.default_tag()}"
 
 
 class Edit:
@@ -197,9 +197,9 @@ class Edit:
         EditError
             If the operation raises something that is not an error of this package; those pass as they are.
         """
-        chosen = self._tag(operation, tag)
         if override and isinstance(operation, Operation):
             operation = Override(operation)
+        chosen = self._tag(operation, tag)
         self._changing().append(chosen, operation)
         return self._note_added(chosen)
 
