@@ -14,9 +14,11 @@ from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Any
 
+from kineverse import articulations
 from kineverse.articulations.limits import Limits
 from kineverse.errors import FormatError, KineverseError
 from kineverse.expressions.expression import Expression
+from kineverse.loops import CloseLoop, LoopConstraint
 from kineverse.model.articulation import Articulation
 from kineverse.model.body import (
     Body,
@@ -32,6 +34,7 @@ from kineverse.model.body import (
     Sphere,
 )
 from kineverse.model.constraint import Constraint
+from kineverse.model.edit import AddFrame, Attach, Constrain, SetRate, Write
 from kineverse.model.frame import Frame
 from kineverse.model.operation import Operation
 from kineverse.model.reader import Cell
@@ -67,16 +70,25 @@ class Unwritten:
     kind: str
 
 
+def _is_operation(kind: object) -> bool:
+    return isinstance(kind, type) and issubclass(kind, Operation)
+
+
 RECORDS: Mapping[str, type] = MappingProxyType(
     {
         kind.__name__: kind
         for kind in (
             *(Limits, Frame, Constraint, Articulation),
             *(Body, Shape, Inertia, Box, Capsule, Cone, Cylinder, Ellipsoid, Mesh, Sphere),
+            *(AddFrame, Attach, Constrain, SetRate, Write, CloseLoop, LoopConstraint),
+            *(kind for kind in vars(articulations).values() if _is_operation(kind)),
         )
     }
 )
-"""What operations that ship are made with, by the name under which a document has it; a closed set."""
+"""What operations that ship are made with, by the name under which a document has it; a closed set.
+
+Operations are among it, since :class:`kineverse.Override` is made with one.
+"""
 
 
 def parameters_of(operation: Operation) -> dict[str, Any]:
