@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 from pathlib import Path
 
@@ -10,7 +11,8 @@ import pytest
 import kineverse as kv
 from kineverse.formats.packages import locate, locate_mesh
 from kineverse.formats.remarks import listening
-from kineverse.formats.roots import root_of
+from kineverse.formats.roots import NOWHERE, is_below, root_of
+from kineverse.formats.sdf.inclusion import find_included
 from kineverse.geometry.mesh_files import find
 
 MESH = '<link name="l"><visual><geometry><mesh filename="{}"/></geometry></visual></link>'
@@ -166,6 +168,38 @@ def test_documents_are_bounded_by_where_they_lie_whatever_they_say(inside, put, 
             locate_mesh(mesh_of(unbounded))
     assert locate_mesh(mesh_of(kv.load(elsewhere, root=inside))) == inside / "a.stl"
     assert locate_mesh(mesh_of(kv.from_bytes(kv.to_bytes(model), root=inside))) == inside / "a.stl"
+
+
+@pytest.mark.parametrize("folder", ["robot/secret", "robot", "elsewhere"])
+def test_documents_cannot_say_that_a_folder_is_a_package_of_theirs(put, tmp_path, folder):
+    """A document says in which folder its meshes lie; that of somebody else stays closed, manifest or not."""
+    secret = put("robot/secret/a.stl", "solid")
+    put("robot/secret/package.xml", "<package><name>secret</name></package>")
+    document = put("downloads/x").parent / "r.kv.json"
+    urdf = put("robot/secret/r.urdf", robot("package://secret/a.stl"))
+    kv.load(urdf).save(document)
+    said = json.loads(document.read_text().replace(str(urdf.parent), str(tmp_path / folder)))
+    document.write_text(json.dumps({key: value for key, value in said.items() if key != "sha256"}))
+    model = kv.load(document)
+    for bounded in (model, kv.from_bytes(kv.to_bytes(model))):
+        with pytest.raises(kv.FormatError, match="leads out of|there is no package"):
+            locate_mesh(mesh_of(bounded))
+    if folder != "elsewhere":
+        for wide in (kv.load(document, root=tmp_path), kv.from_bytes(kv.to_bytes(model), root=secret.parent)):
+            assert locate_mesh(mesh_of(wide)) == secret
+
+
+def test_text_that_lies_nowhere_takes_no_folder_for_a_package(put, tmp_path, monkeypatch):
+    secret = put("secret/a.stl", "solid")
+    put("secret/model.sdf", MODEL)
+    monkeypatch.chdir(secret.parent)
+    for folder in ("", str(secret.parent), str(tmp_path), "/etc"):
+        for uri in ("package://secret/a.stl", "package://etc/passwd", f"package://{tmp_path.parts[1]}/x"):
+            with pytest.raises(kv.FormatError):
+                locate(uri, folder, root=NOWHERE)
+        with pytest.raises(kv.FormatError):
+            find_included("model://secret", folder, NOWHERE)
+    assert not is_below("/etc", NOWHERE)
 
 
 @pytest.mark.parametrize(("kind", "text", "part"), [("xml", MJCF, PART), ("sdf", SDF, MODEL)])

@@ -70,7 +70,9 @@ def root_variable() -> Iterator[str]:
 
 
 def is_below(path: str, folder: str) -> bool:
-    """Return whether a path is a folder, or in it; both are real paths."""
+    """Return whether a path is a folder, or in it; both are real paths. Nothing is below ``NOWHERE``."""
+    if not folder:
+        return False
     return path == folder or path.startswith(folder if folder.endswith(os.sep) else folder + os.sep)
 
 
