@@ -61,8 +61,8 @@ def locate(uri: str, folder: Folder = "", search: Sequence[Folder] = (), root: s
     are relative to ``folder``, then to the folders of ``search``.
 
     With a root, paths have to lie below it, below ``search``, or below a folder that one of these variables
-    or ``KINEVERSE_ROOT`` names. Of the folders above a description in the root, those outside of the root count
-    if they have a manifest, or if they are neither the home folder nor above it.
+    or ``KINEVERSE_ROOT`` names. Of the folders above a description in the root, those outside of the root
+    count if they have a manifest, or if they are neither the home folder nor above it.
 
     Parameters
     ----------
@@ -148,10 +148,12 @@ def _stays(path: Path, root: str, package: Path | None = None) -> bool:
 
 
 def outside(uri: str, folder: Folder, root: str | None) -> FormatError | None:
-    """Return the error for a path that leaves the root; None for others, and for what lies in a package."""
+    """Return the error for a path or a package that leads out of the root; None for others."""
     scheme, colon, rest = uri.partition("://")
-    if root is None or (colon and scheme.lower() != "file"):
+    if root is None:
         return None
+    if colon and scheme.lower() != "file":
+        return _outside_package(uri, folder, root) if scheme.lower() in ("package", "model") else None
     if root == NOWHERE and not colon and not os.path.isabs(uri):
         return None  # whoever gave the text knows that it lies nowhere
     path = (
@@ -160,6 +162,26 @@ def outside(uri: str, folder: Folder, root: str | None) -> FormatError | None:
         else Path(folder).absolute() / uri
     )
     return None if "\0" in uri or _stays(path, root) else refusal(uri, root)
+
+
+def _outside_package(uri: str, folder: Folder, root: str) -> FormatError | None:
+    """Return the error for a package that is only found from a folder outside of the root."""
+    if root == NOWHERE or _may_lie_in(os.path.realpath(folder), root):
+        return None
+    for bound in (root, None):
+        try:
+            locate(uri, folder, root=bound)
+        except FormatError:
+            if bound is None:
+                return None  # it is nowhere
+        else:
+            break
+    return None if bound is not None else refusal(uri, root)
+
+
+def _may_lie_in(real: str, root: str) -> bool:
+    """Return whether a folder is in the root, or in one that a variable declares."""
+    return any(is_below(real, place) for place in (root, *root_variable(), *declared_folders()))
 
 
 def declared_folders() -> Iterator[str]:
@@ -241,7 +263,7 @@ def counts_as_package(package: Path, folder: Path, root: str) -> bool:
     real, here = os.path.realpath(package), os.path.realpath(folder)
     if is_below(real, root):
         return True
-    if not any(is_below(here, place) for place in (root, *root_variable(), *declared_folders())):
+    if not _may_lie_in(here, root):
         return False
     if any(os.path.isfile(os.path.join(real, mark)) for mark in _MARKS):
         return True

@@ -141,9 +141,8 @@ def _check_packing(file: MeshFile) -> None:
         with zipfile.ZipFile(file.path) as packed:
             size = sum(part.file_size for part in packed.infolist())
         if size > LARGEST:
-            raise OSError(
-                f"{file.path} unpacks to {size / 2**20:.0f} MiB, more than the {LARGEST / 2**20:.0f} MiB read here"
-            )
+            most = f"the {LARGEST / 2**20:.0f} MiB read here"
+            raise OSError(f"{file.path} unpacks to {size / 2**20:.0f} MiB, more than {most}")
 
 
 class _Beside(Mapping[str, bytes]):
