@@ -318,3 +318,22 @@ def test_a_folder_says_what_is_in_it(put, tmp_path):
     put("robots/arm.urdf", robot("a.stl"))
     with pytest.raises(kv.UnknownNameError, match=r"It is a folder; models in it: arm.urdf"):
         kv.load(tmp_path / "robots")
+
+
+@pytest.mark.parametrize("root", ["", "nope", "a\0b", 5, b"nope", ["/"], Path("nope")])
+def test_what_is_no_root_is_said(put, root):
+    shown = str(root) if isinstance(root, Path) else root
+    with pytest.raises(kv.FormatError) as info:
+        kv.load(put("r.urdf", robot("a.stl")), root=root)
+    assert str(info.value) == f"root={shown!r} is no folder; give one below which files may be opened."
+
+
+@pytest.mark.parametrize(
+    "uri", ["package://{}/a.stl", "model://{}/a.stl", "package://a/{}", "{}.stl", "file:///{}"]
+)
+@pytest.mark.parametrize("name", ["x" * 5000, "a\0b"])
+def test_names_that_no_file_has_are_not_there(put, uri, name):
+    folder = put("robot/r.urdf").parent
+    for root in (None, NOWHERE, str(folder)):
+        with pytest.raises(kv.FormatError):
+            locate(uri.format(name), folder, root=root)

@@ -287,7 +287,7 @@ def _at_or_in(place: Path, name: str) -> Iterator[Path]:
 
 def _existing(places: Iterable[Path]) -> Iterator[Path]:
     for place in places:
-        if place.is_dir():
+        if os.path.isdir(place):  # which is no for a name that is too long, and no error
             yield place
 
 
