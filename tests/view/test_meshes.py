@@ -9,6 +9,7 @@ from small_models import with_mesh
 
 from kineverse.geometry import mesh_files
 from kineverse.model.body import Body, Box, Mesh, Shape
+from kineverse.view.hulls import load_hull
 from kineverse.view.meshes import load
 from kineverse.view.parts import MISSING, parts
 
@@ -140,3 +141,13 @@ def test_what_is_packed_is_bounded_by_what_it_unpacks_to(tetrahedron, monkeypatc
     assert "is an archive" in load(Mesh("two.zip", folder=str(tetrahedron))).problem
     monkeypatch.setattr(mesh_files, "LARGEST", (tetrahedron / "two.stl").stat().st_size - 1)
     assert "unpacks to" in load(Mesh("two.zae", folder=str(tetrahedron))).problem
+
+
+def test_what_one_description_may_open_another_does_not_get(tetrahedron, tmp_path):
+    (tmp_path / "in").mkdir()
+    own = Mesh("two.stl", folder=str(tetrahedron))
+    other = Mesh("two.stl", folder=str(tetrahedron), root=str(tmp_path / "in"))
+    assert own == other
+    for opened in (load, load_hull):
+        assert not opened(own).problem
+        assert "leads out of the root" in opened(other).problem
