@@ -14,7 +14,7 @@ import written_meshes as made
 
 import kineverse as kv
 from kineverse.formats.packages import locate, locate_mesh
-from kineverse.model.body import Body, Mesh, Shape
+from kineverse.model.body import Body, Box, Mesh, Shape
 
 REFERENCES = [
     "package://cups/meshes/{}",
@@ -214,6 +214,24 @@ def test_who_writes_elsewhere_is_told_the_root_to_read_it_with(
     again = kv.load(there / f"r.{ending}", root=tmp_path).bodies["b"].visuals
     assert {locate_mesh(s.geometry).resolve().parent for s in again} == {package / "meshes"}  # type: ignore[arg-type]
     assert not any("outside" in r for r in model.save(package / f"r.{ending}").remarks)
+
+
+def test_a_texture_is_not_taken_from_wherever_the_program_runs(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pytest.importorskip("mujoco")
+    from PIL import Image
+
+    Image.new("RGB", (2, 2)).save(tmp_path / "wood.png")
+    monkeypatch.chdir(tmp_path)
+    shapes = [Shape(Box((1, 1, 1)), texture=name) for name in ("wood.png", str(tmp_path / "wood.png"))]
+    model = kv.Model()
+    with model.edit() as edit:
+        edit.add_frame("box", "world", kv.rotation_z(kv.position("q")), body=Body(tuple(shapes)))
+    saved = model.save(tmp_path / "m.xml")
+    expected = "the texture wood.png is left out: it is relative to a folder that is not known"
+    assert [r for r in saved.remarks if r.startswith("the texture")] == [expected]
+    assert re.findall('<texture .*file="([^"]*)"', (tmp_path / "m.xml").read_text()) == ["wood.png"]
 
 
 def test_what_a_description_may_not_open_is_not_opened_to_be_written(

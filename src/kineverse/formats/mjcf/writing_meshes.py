@@ -60,7 +60,11 @@ class MeshFiles:
         texture
             What it is called, its folder and its root, as those of a mesh.
         """
-        there, uri = found(texture), texture.uri
+        uri = texture.uri
+        if not texture.folder and "://" not in uri and not os.path.isabs(uri):
+            self._note(f"the texture {uri} is left out: it is relative to a folder that is not known")
+            return None
+        there = found(texture)
         if there is None or there.suffix.lower() != ".png":
             why = "it is not there" if there is None else "MuJoCo reads PNG"
             self._note(f"the texture {uri} is left out: {why}")
