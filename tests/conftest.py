@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import atexit
 import gc
+import importlib.util
 import os
 import shutil
 import tempfile
@@ -54,6 +55,14 @@ def pytest_collection() -> Generator[None, object, object]:
         return (yield)
     finally:
         gc.enable()
+
+
+def pytest_collection_finish(session: pytest.Session) -> None:
+    """Keep MuJoCo from leaving its warnings in a file in the current folder."""
+    if session.items and importlib.util.find_spec("mujoco"):
+        import mujoco
+
+        mujoco.set_mju_user_warning(lambda warning: None)
 
 
 def pytest_runtest_setup(item: pytest.Item) -> None:

@@ -10,6 +10,7 @@ import pytest
 import kineverse as kv
 from kineverse.bench import BENCHMARKS, DisagreementError, chosen, measure
 from kineverse.bench.large_model import READERS, large_model, runs_of_replacing
+from kineverse.bench.peers import installed
 from kineverse.bench.processes import ProgramError, run_program
 
 HAS_PEERS = all(importlib.util.find_spec(name) for name in ("pinocchio", "mujoco"))
@@ -125,3 +126,19 @@ def test_the_frame_is_a_gripper_unless_one_is_given(tiny):
     from kineverse.bench.robot import find_robot
 
     assert find_robot(replace(tiny, frame=None)).frame == "left"  # the longest way
+
+
+def test_mujoco_leaves_no_file_of_warnings(tmp_path, monkeypatch):
+    mujoco = pytest.importorskip("mujoco")
+    before = mujoco.get_mju_user_warning()
+    mujoco.set_mju_user_warning(None)
+    monkeypatch.chdir(tmp_path)
+    assert installed("mujoco")
+    model = mujoco.MjModel.from_xml_string(
+        '<mujoco><worldbody><body><freejoint/><geom size="1"/></body></worldbody></mujoco>'
+    )
+    data = mujoco.MjData(model)
+    data.qvel[0] = np.nan
+    mujoco.mj_step(model, data)
+    mujoco.set_mju_user_warning(before)
+    assert not list(tmp_path.iterdir())

@@ -18,9 +18,6 @@ from kineverse.formats.mjcf.operations import scene_operations
 
 mujoco = pytest.importorskip("mujoco")
 
-# It would log warnings to a file in the current folder, such as those about random trees without much inertia.
-mujoco.set_mju_user_warning(lambda warning: None)
-
 Array = npt.NDArray[np.float64]
 
 

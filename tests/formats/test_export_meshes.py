@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 import os
+import re
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import written_meshes as made
 
 import kineverse as kv
-from kineverse.formats.packages import locate
-from kineverse.model.body import Body, Mesh, Shape
+from kineverse.formats.packages import locate, locate_mesh
+from kineverse.model.body import Body, Box, Mesh, Shape
 
 REFERENCES = [
     "package://cups/meshes/{}",
@@ -187,11 +190,80 @@ def test_textures_that_are_not_there_cost_their_colour_only(tmp_path: Path) -> N
         )
     (tmp_path / "out").mkdir()
     saved = model.save(tmp_path / "out" / "m.xml")
-    assert [r for r in saved.remarks if "texture" in r] == [
+    assert [r for r in saved.remarks if r.startswith("the texture")] == [
         "the texture no.png is left out: it is not there",
         "the texture wood.jpg is left out: it is not there",
     ]
     assert len(kv.load(tmp_path / "out" / "m.xml").bodies["cup"].visuals) == 3
+
+
+@pytest.mark.parametrize("ending", ["urdf", "xml"])
+def test_who_writes_elsewhere_is_told_the_root_to_read_it_with(
+    ending: str, package: Path, tmp_path: Path
+) -> None:
+    if ending == "xml":
+        pytest.importorskip("mujoco")
+    there = tmp_path / "some" / "where"
+    there.mkdir(parents=True)
+    model = robot(
+        package, "../meshes/cup.stl", "package://cups/meshes/cup.STL", "package://cups/meshes/cup.stl"
+    )
+    saved = model.save(there / f"r.{ending}")
+    (said,) = [r for r in saved.remarks if "outside" in r]
+    assert said.endswith(f"are outside of {there}: give root='{tmp_path}' to open them from there")
+    again = kv.load(there / f"r.{ending}", root=tmp_path).bodies["b"].visuals
+    assert {locate_mesh(s.geometry).resolve().parent for s in again} == {package / "meshes"}  # type: ignore[arg-type]
+    assert not any("outside" in r for r in model.save(package / f"r.{ending}").remarks)
+
+
+def test_a_texture_is_not_taken_from_wherever_the_program_runs(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pytest.importorskip("mujoco")
+    from PIL import Image
+
+    Image.new("RGB", (2, 2)).save(tmp_path / "wood.png")
+    monkeypatch.chdir(tmp_path)
+    shapes = [Shape(Box((1, 1, 1)), texture=name) for name in ("wood.png", str(tmp_path / "wood.png"))]
+    model = kv.Model()
+    with model.edit() as edit:
+        edit.add_frame("box", "world", kv.rotation_z(kv.position("q")), body=Body(tuple(shapes)))
+    saved = model.save(tmp_path / "m.xml")
+    expected = "the texture wood.png is left out: it is relative to a folder that is not known"
+    assert [r for r in saved.remarks if r.startswith("the texture")] == [expected]
+    assert re.findall('<texture .*file="([^"]*)"', (tmp_path / "m.xml").read_text()) == ["wood.png"]
+
+
+def test_what_a_description_may_not_open_is_not_opened_to_be_written(
+    package: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pytest.importorskip("mujoco")
+    from PIL import Image
+
+    for name in ("secret.stl", "secret.dae"):
+        (tmp_path / name).write_bytes(FILES["cup" + Path(name).suffix])
+    Image.new("RGB", (2, 2)).save(tmp_path / "secret.png")
+    model = robot(package, "../../../secret.stl", f"{tmp_path}/secret.dae", "../meshes/cup.stl")
+    (*_, cup) = model.bodies["b"].visuals
+    with model.edit() as edit:
+        edit.add_frame(
+            "c", "b", kv.translation(0, 0, 1), Body((replace(cup, texture=f"{tmp_path}/secret.png"),))
+        )
+    opened: list[str] = []
+    monkeypatch.setattr(Path, "open", _recording(Path.open, opened))
+    monkeypatch.setattr(Path, "read_bytes", _recording(Path.read_bytes, opened))
+    saved = model.save(tmp_path / "r.xml")
+    assert not [path for path in opened if "secret" in path]
+    assert "secret." not in "".join(re.findall('file="[^"]*"', (tmp_path / "r.xml").read_text()))
+    assert sum("leads out of the root" in r or "secret.png is left out" in r for r in saved.remarks) == 3
+
+
+def _recording(function: Any, opened: list[str]) -> Any:
+    def recording(path: Path, *arguments: Any, **options: Any) -> Any:
+        opened.append(str(path))
+        return function(path, *arguments, **options)
+
+    return recording
 
 
 @pytest.mark.parametrize("ending", ["urdf", "kv.json"])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 from pathlib import Path
 
@@ -10,7 +11,8 @@ import pytest
 import kineverse as kv
 from kineverse.formats.packages import locate, locate_mesh
 from kineverse.formats.remarks import listening
-from kineverse.formats.roots import root_of
+from kineverse.formats.roots import NOWHERE, is_below, root_of
+from kineverse.formats.sdf.inclusion import find_included
 from kineverse.geometry.mesh_files import find
 
 MESH = '<link name="l"><visual><geometry><mesh filename="{}"/></geometry></visual></link>'
@@ -168,6 +170,41 @@ def test_documents_are_bounded_by_where_they_lie_whatever_they_say(inside, put, 
     assert locate_mesh(mesh_of(kv.from_bytes(kv.to_bytes(model), root=inside))) == inside / "a.stl"
 
 
+@pytest.mark.parametrize("folder", ["robot/secret", "robot", "elsewhere"])
+def test_documents_cannot_say_that_a_folder_is_a_package_of_theirs(put, tmp_path, folder):
+    """A document says in which folder its meshes lie; that of somebody else stays closed, manifest or not."""
+    secret = put("robot/secret/a.stl", "solid")
+    put("robot/secret/package.xml", "<package><name>secret</name></package>")
+    document = put("downloads/x").parent / "r.kv.json"
+    urdf = put("robot/secret/r.urdf", robot("package://secret/a.stl"))
+    kv.load(urdf).save(document)
+    said = json.loads(document.read_text().replace(str(urdf.parent), str(tmp_path / folder)))
+    document.write_text(json.dumps({key: value for key, value in said.items() if key != "sha256"}))
+    with listening() as remarks:
+        model = kv.load(document)
+    found_there = folder != "elsewhere"
+    assert any("leads out of the root" in remark for remark in remarks) is found_there
+    for bounded in (model, kv.from_bytes(kv.to_bytes(model))):
+        with pytest.raises(kv.FormatError, match=r"leads out of|there is no package"):
+            locate_mesh(mesh_of(bounded))
+    if found_there:
+        for wide in (kv.load(document, root=tmp_path), kv.from_bytes(kv.to_bytes(model), root=secret.parent)):
+            assert locate_mesh(mesh_of(wide)) == secret
+
+
+def test_text_that_lies_nowhere_takes_no_folder_for_a_package(put, tmp_path, monkeypatch):
+    secret = put("secret/a.stl", "solid")
+    put("secret/model.sdf", MODEL)
+    monkeypatch.chdir(secret.parent)
+    for folder in ("", str(secret.parent), str(tmp_path), "/etc"):
+        for uri in ("package://secret/a.stl", "package://etc/passwd", f"package://{tmp_path.parts[1]}/x"):
+            with pytest.raises(kv.FormatError):
+                locate(uri, folder, root=NOWHERE)
+        with pytest.raises(kv.FormatError):
+            find_included("model://secret", folder, NOWHERE)
+    assert not is_below("/etc", NOWHERE)
+
+
 @pytest.mark.parametrize(("kind", "text", "part"), [("xml", MJCF, PART), ("sdf", SDF, MODEL)])
 def test_includes_stay_in_the_root(put, tmp_path, kind, text, part, monkeypatch):
     outside = put(f"part.{kind}", part)
@@ -281,3 +318,22 @@ def test_a_folder_says_what_is_in_it(put, tmp_path):
     put("robots/arm.urdf", robot("a.stl"))
     with pytest.raises(kv.UnknownNameError, match=r"It is a folder; models in it: arm.urdf"):
         kv.load(tmp_path / "robots")
+
+
+@pytest.mark.parametrize("root", ["", "nope", "a\0b", 5, b"nope", ["/"], Path("nope")])
+def test_what_is_no_root_is_said(put, root):
+    shown = str(root) if isinstance(root, Path) else root
+    with pytest.raises(kv.FormatError) as info:
+        kv.load(put("r.urdf", robot("a.stl")), root=root)
+    assert str(info.value) == f"root={shown!r} is no folder; give one below which files may be opened."
+
+
+@pytest.mark.parametrize(
+    "uri", ["package://{}/a.stl", "model://{}/a.stl", "package://a/{}", "{}.stl", "file:///{}"]
+)
+@pytest.mark.parametrize("name", ["x" * 5000, "a\0b"])
+def test_names_that_no_file_has_are_not_there(put, uri, name):
+    folder = put("robot/r.urdf").parent
+    for root in (None, NOWHERE, str(folder)):
+        with pytest.raises(kv.FormatError):
+            locate(uri.format(name), folder, root=root)

@@ -113,7 +113,9 @@ def test_an_empty_dynamics_is_the_default():
 
 def test_an_axis_without_xyz_is_the_default():
     # urdfdom makes it zero; by the specification the attribute's default is x.
-    assert parse_urdf(pair("<axis/>" + LIMIT)).joints[0].axis == (1.0, 0.0, 0.0)
+    robot = parse_urdf(pair("<axis/>" + LIMIT))
+    assert robot.joints[0].axis == (1.0, 0.0, 0.0)
+    assert any("<axis> has no xyz; it is 1 0 0, the default" in remark for remark in robot.remarks)
 
 
 @given(st.tuples(*[st.floats(-1e3, 1e3)] * 3).filter(lambda v: math.hypot(*v) > 1e-3))

@@ -1,12 +1,15 @@
 from __future__ import annotations
 
 import logging
+import zipfile
 
 import numpy as np
 import pytest
 from small_models import with_mesh
 
+from kineverse.geometry import mesh_files
 from kineverse.model.body import Body, Box, Mesh, Shape
+from kineverse.view.hulls import load_hull
 from kineverse.view.meshes import load
 from kineverse.view.parts import MISSING, parts
 
@@ -108,3 +111,43 @@ def test_a_model_that_is_only_there_to_be_touched_is_shown_by_that():
         edit.add_frame("stone", parent="world", transform=np.eye(4), body=body)
     assert [part.kind for part in parts(model)] == ["visual"]
     assert [part.kind for part in parts(model, "collision")] == ["collision"]
+
+
+def test_a_mesh_opens_what_lies_beside_it_and_nothing_outside(tetrahedron, tmp_path):
+    inside = tmp_path / "in"
+    (inside / "materials").mkdir(parents=True)
+    (inside / "two.obj").write_text(OBJ.replace("two.mtl", "materials/two.mtl"))
+    (inside / "materials" / "two.mtl").write_text(MTL)
+    assert load(Mesh("two.obj", folder=str(inside))).surface.colors is not None
+    (inside / "link.mtl").symlink_to(tetrahedron / "two.mtl")
+    for k, name in enumerate(("../two.mtl", str(tetrahedron / "two.mtl"), "link.mtl")):
+        (inside / f"{k}.obj").write_text(OBJ.replace("two.mtl", name))
+        colors = load(Mesh(f"{k}.obj", folder=str(inside))).surface.colors
+        assert colors is None or len({tuple(color) for color in colors.tolist()}) == 1
+    files = trimesh.creation.box().export(file_type="gltf")
+    for name, content in files.items():
+        (tmp_path / name).write_bytes(content)
+        if name.endswith(".gltf"):
+            (inside / name).write_bytes(content.replace(b'"uri":"', b'"uri":"../'))
+            named = name
+    assert not load(Mesh(named, folder=str(tmp_path))).problem
+    assert load(Mesh(named, folder=str(inside))).problem
+
+
+def test_what_is_packed_is_bounded_by_what_it_unpacks_to(tetrahedron, monkeypatch):
+    with zipfile.ZipFile(tetrahedron / "two.zip", "w", zipfile.ZIP_DEFLATED) as packed:
+        packed.write(tetrahedron / "two.stl", "two.stl")
+    (tetrahedron / "two.zae").write_bytes((tetrahedron / "two.zip").read_bytes())
+    assert "is an archive" in load(Mesh("two.zip", folder=str(tetrahedron))).problem
+    monkeypatch.setattr(mesh_files, "LARGEST", (tetrahedron / "two.stl").stat().st_size - 1)
+    assert "unpacks to" in load(Mesh("two.zae", folder=str(tetrahedron))).problem
+
+
+def test_what_one_description_may_open_another_does_not_get(tetrahedron, tmp_path):
+    (tmp_path / "in").mkdir()
+    own = Mesh("two.stl", folder=str(tetrahedron))
+    other = Mesh("two.stl", folder=str(tetrahedron), root=str(tmp_path / "in"))
+    assert own == other
+    for opened in (load, load_hull):
+        assert not opened(own).problem
+        assert "leads out of the root" in opened(other).problem

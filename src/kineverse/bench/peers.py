@@ -50,10 +50,16 @@ def installed(module: str) -> bool:
     """Whether a peer can be imported."""
     try:
         with _ungreeted() if module == "pybullet" else contextlib.nullcontext():
-            importlib.import_module(module)
+            peer = importlib.import_module(module)
     except ImportError:
         return False
+    if module == "mujoco" and peer.get_mju_user_warning() is None:
+        peer.set_mju_user_warning(_unheard)
     return True
+
+
+def _unheard(warning: str) -> None:
+    """Take a warning of MuJoCo, which would leave it in a file in the current folder."""
 
 
 def advice(module: str) -> str:

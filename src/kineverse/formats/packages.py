@@ -61,8 +61,8 @@ def locate(uri: str, folder: Folder = "", search: Sequence[Folder] = (), root: s
     are relative to ``folder``, then to the folders of ``search``.
 
     With a root, paths have to lie below it, below ``search``, or below a folder that one of these variables
-    or ``KINEVERSE_ROOT`` names. Of the folders above, those outside of the root count if they have a
-    manifest, or if they are above a description in the root and neither the home folder nor above it.
+    or ``KINEVERSE_ROOT`` names. Of the folders above a description in the root, those outside of the root
+    count if they have a manifest, or if they are neither the home folder nor above it.
 
     Parameters
     ----------
@@ -108,6 +108,8 @@ class _Trail:
 
     places: list[str] = field(default_factory=list)
     without_file: list[Path] = field(default_factory=list)
+    outside: bool = False
+    """Whether there is such a folder, and the description may not take it for a package."""
     trusted: bool = True
     """Whether the user has named the place that is looked at, rather than the description."""
 
@@ -133,6 +135,8 @@ def _packaged(uri: str, rest: str, folder: Folder, search: Sequence[Folder], roo
                     return path
                 raise refusal(uri, root)
             trail.without_file.append(package)
+    if trail.outside and root is not None and not trail.without_file:
+        raise refusal(uri, root)
     raise FormatError(_miss(uri, name, inside, trail))
 
 
@@ -144,10 +148,12 @@ def _stays(path: Path, root: str, package: Path | None = None) -> bool:
 
 
 def outside(uri: str, folder: Folder, root: str | None) -> FormatError | None:
-    """Return the error for a path that leaves the root; None for others, and for what lies in a package."""
+    """Return the error for a path or a package that leads out of the root; None for others."""
     scheme, colon, rest = uri.partition("://")
-    if root is None or (colon and scheme.lower() != "file"):
+    if root is None:
         return None
+    if colon and scheme.lower() != "file":
+        return _outside_package(uri, folder, root) if scheme.lower() in ("package", "model") else None
     if root == NOWHERE and not colon and not os.path.isabs(uri):
         return None  # whoever gave the text knows that it lies nowhere
     path = (
@@ -156,6 +162,26 @@ def outside(uri: str, folder: Folder, root: str | None) -> FormatError | None:
         else Path(folder).absolute() / uri
     )
     return None if "\0" in uri or _stays(path, root) else refusal(uri, root)
+
+
+def _outside_package(uri: str, folder: Folder, root: str) -> FormatError | None:
+    """Return the error for a package that is only found from a folder outside of the root."""
+    if root == NOWHERE or _may_lie_in(os.path.realpath(folder), root):
+        return None
+    for bound in (root, None):
+        try:
+            locate(uri, folder, root=bound)
+        except FormatError:
+            if bound is None:
+                return None  # it is nowhere
+        else:
+            break
+    return None if bound is not None else refusal(uri, root)
+
+
+def _may_lie_in(real: str, root: str) -> bool:
+    """Return whether a folder is in the root, or in one that a variable declares."""
+    return any(is_below(real, place) for place in (root, *root_variable(), *declared_folders()))
 
 
 def declared_folders() -> Iterator[str]:
@@ -220,6 +246,8 @@ def _folders_of(
         for package in _at_or_in(place, name):
             if root is None or counts_as_package(package, here, root):
                 yield package
+            else:
+                trail.outside = True
     trail.trusted = True
     for place in _installed():
         trail.places.append(str(place))
@@ -229,13 +257,18 @@ def _folders_of(
 def counts_as_package(package: Path, folder: Path, root: str) -> bool:
     """Return whether a description may take a folder for a package; it has found it above its own folder.
 
-    Otherwise ``package://etc/passwd`` were a file of the package ``etc``.
+    Otherwise ``package://etc/passwd`` were a file of the package ``etc``. A document says itself in which
+    folder its meshes lie, so a folder counts for what is above it only where files may be opened anyway.
     """
-    real = os.path.realpath(package)
-    if is_below(real, root) or any(os.path.isfile(os.path.join(real, mark)) for mark in _MARKS):
+    real, here = os.path.realpath(package), os.path.realpath(folder)
+    if is_below(real, root):
         return True
-    above = real if is_below(os.path.realpath(folder), real) else os.path.dirname(real)
-    return bool(root) and is_below(os.path.realpath(folder), root) and not is_common(above)
+    if not _may_lie_in(here, root):
+        return False
+    if any(os.path.isfile(os.path.join(real, mark)) for mark in _MARKS):
+        return True
+    above = real if is_below(here, real) else os.path.dirname(real)
+    return is_below(here, root) and not is_common(above)
 
 
 def _paths_in(variable: str, trail: _Trail) -> Iterator[Path]:
@@ -254,7 +287,7 @@ def _at_or_in(place: Path, name: str) -> Iterator[Path]:
 
 def _existing(places: Iterable[Path]) -> Iterator[Path]:
     for place in places:
-        if place.is_dir():
+        if os.path.isdir(place):  # which is no for a name that is too long, and no error
             yield place
 
 

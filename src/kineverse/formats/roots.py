@@ -46,10 +46,15 @@ def root_of(folder: Folder, root: Folder | None = None, models: Folder | None = 
         If the root that is asked for is no folder.
     """
     if root is not None:
-        path = os.path.realpath(os.path.expanduser(os.fspath(root)))
-        if not os.path.isdir(path):
-            raise FormatError(f"root={str(root)!r} is no folder; give one below which files may be opened.")
-        return path
+        try:
+            given = os.fsdecode(root)
+        except TypeError:
+            given = ""
+        # An empty one is a variable that is not set, rather than the current folder.
+        if not given or not os.path.isdir(os.path.expanduser(given)):
+            shown = given if isinstance(root, os.PathLike) else root
+            raise FormatError(f"root={shown!r} is no folder; give one below which files may be opened.")
+        return os.path.realpath(os.path.expanduser(given))
     here = os.path.realpath(folder)
     declared = [place for place in root_variable() if is_below(here, place)]
     if declared:
@@ -70,7 +75,9 @@ def root_variable() -> Iterator[str]:
 
 
 def is_below(path: str, folder: str) -> bool:
-    """Return whether a path is a folder, or in it; both are real paths."""
+    """Return whether a path is a folder, or in it; both are real paths. Nothing is below ``NOWHERE``."""
+    if not folder:
+        return False
     return path == folder or path.startswith(folder if folder.endswith(os.sep) else folder + os.sep)
 
 

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import hashlib
 import logging
+import os
 import re
 import threading
-from collections.abc import Iterator
+import zipfile
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,6 +19,7 @@ import numpy.typing as npt
 
 from kineverse.errors import FormatError, MissingExtraError
 from kineverse.formats.packages import locate_mesh
+from kineverse.formats.roots import is_below
 from kineverse.installation import install_command
 from kineverse.model.body import Mesh
 
@@ -25,6 +28,8 @@ Integers: TypeAlias = npt.NDArray[np.int64]
 
 LARGEST = 256 * 2**20
 """No mesh file above this size is read [bytes]: a description is not trusted with memory."""
+
+_ARCHIVES = (".zip", ".gz", ".bz2", ".tgz", ".xz")
 
 
 @dataclass(frozen=True, slots=True)
@@ -119,12 +124,48 @@ def parts(file: MeshFile) -> list[Any]:
         import trimesh
     except ImportError as error:
         raise MissingExtraError(f"reading meshes needs trimesh: {install_command('geometry')}") from error
+    _check_packing(file)
     with _quiet("trimesh"):
-        scene = trimesh.load_scene(file.path, process=False)
+        scene = trimesh.load_scene(file.path, process=False, resolver=_Beside(file.path.parent))
         found = [g for g in scene.dump() if isinstance(g, trimesh.Trimesh) and len(g.faces)]
     if not found:
         raise OSError(f"{file.path} holds no triangles")
     return found
+
+
+def _check_packing(file: MeshFile) -> None:
+    """Refuse what is small and becomes large: archives, and meshes whose parts are packed together."""
+    if file.kind in _ARCHIVES:
+        raise OSError(f"{file.path} is an archive, and no mesh. Unpack it, and name the mesh in it")
+    if zipfile.is_zipfile(file.path):
+        with zipfile.ZipFile(file.path) as packed:
+            size = sum(part.file_size for part in packed.infolist())
+        if size > LARGEST:
+            most = f"the {LARGEST / 2**20:.0f} MiB read here"
+            raise OSError(f"{file.path} unpacks to {size / 2**20:.0f} MiB, more than {most}")
+
+
+class _Beside(Mapping[str, bytes]):
+    """The files in and below the folder of a mesh: its materials, pictures and buffers, and no others."""
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = os.path.realpath(folder)
+
+    def __getitem__(self, name: str) -> bytes:
+        name = name.strip()
+        for candidate in (name, name.lstrip("/"), os.path.basename(name)):
+            path = os.path.realpath(os.path.join(self._folder, candidate))
+            if "\0" not in name and is_below(path, self._folder) and os.path.isfile(path):
+                if os.path.getsize(path) > LARGEST:
+                    raise OSError(f"{path} is larger than what is read here")
+                return Path(path).read_bytes()
+        raise FileNotFoundError(name)
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(())
+
+    def __len__(self) -> int:
+        return 0
 
 
 def metres(path: Path) -> float:

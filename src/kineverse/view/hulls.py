@@ -16,12 +16,17 @@ from kineverse.view.meshes import Loaded, load
 from kineverse.view.triangles import Triangles, creased
 
 
-@lru_cache(maxsize=4096)
 def load_hull(mesh: Mesh) -> Loaded:
     """Return the hull of a mesh that distances are computed to, and what is wrong if there is none [m].
 
     Without the extra ``geometry``, or where a mesh has no hull, that is the mesh itself, or its placeholder.
     """
+    return _load_hull(mesh, mesh.root)
+
+
+@lru_cache(maxsize=4096)
+def _load_hull(mesh: Mesh, root: str | None) -> Loaded:
+    """Return the hull of a mesh; what may be opened is no part of what makes two meshes equal."""
     as_seen = load(mesh)
     if as_seen.problem or not is_installed():
         return as_seen

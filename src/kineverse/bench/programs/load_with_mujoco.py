@@ -13,6 +13,8 @@ import numpy as np
 
 def main(file: str, frame: str) -> None:
     """Load, and print how long it took [s], and what came out at zero."""
+    # It would leave warnings in a file in the current folder.
+    mujoco.set_mju_user_warning(lambda warning: None)
     start = perf_counter()
     model = mujoco.MjModel.from_xml_path(file)
     data = mujoco.MjData(model)

@@ -45,6 +45,8 @@ def _pinocchio(module: Any, file: str) -> tuple[Any, ...]:
 
 
 def _mujoco(module: Any, file: str) -> tuple[Any, ...]:
+    # It would leave warnings in a file in the current folder.
+    module.set_mju_user_warning(lambda warning: None)
     model = module.MjModel.from_xml_path(file)
     return model, module.MjData(model)
 

@@ -7,7 +7,8 @@ from collections.abc import Callable
 from pathlib import Path
 
 from kineverse.errors import FormatError
-from kineverse.formats.packages import locate
+from kineverse.formats.packages import locate_mesh, outside
+from kineverse.formats.roots import is_common, root_of
 from kineverse.model.body import Mesh
 
 Note = Callable[[str], None]
@@ -32,19 +33,30 @@ def reference(mesh: Mesh, folder: Path, note: Note) -> str:
     """
     if not mesh.folder or Path(mesh.folder) == folder or os.path.isabs(mesh.uri):
         return mesh.uri
+    there = found(mesh)
     if "://" not in mesh.uri:
-        return path_from(Path(mesh.folder, mesh.uri), folder)
-    there = found(mesh.uri, mesh.folder)
-    if there is None or there == found(mesh.uri, str(folder)):
+        return path_to(there, folder, note) if there else path_from(Path(mesh.folder, mesh.uri), folder)
+    if there is None or there == found(Mesh(mesh.uri, folder=str(folder), root=root_of(folder))):
         return mesh.uri
     note(f"{mesh.uri} is written as a path, since that package is not found from {folder}")
-    return path_from(there, folder)
+    return path_to(there, folder, note)
 
 
-def found(uri: str, folder: str) -> Path | None:
-    """Return the file that a description in ``folder`` means; None if there is none."""
+def path_to(path: Path, folder: Path, note: Note) -> str:
+    """Return a path as :func:`path_from`, with a remark if whoever reads it here has to give a root."""
+    there, root = path_from(path, folder), root_of(folder)
+    if outside(there, folder, root) is not None:
+        real = os.path.dirname(os.path.realpath(path))
+        common = os.path.commonpath((real, os.path.realpath(folder)))
+        wide = real if is_common(common) else common
+        note(f"the files in {path.parent} are outside of {root}: give root={wide!r} to open them from there")
+    return there
+
+
+def found(file: Mesh) -> Path | None:
+    """Return the file of a mesh, or of a texture; None if there is none that its description may open."""
     try:
-        return Path(os.path.abspath(locate(uri, folder)))
+        return Path(os.path.abspath(locate_mesh(file)))
     except FormatError:
         return None
 

@@ -204,10 +204,10 @@ class BodyWriter:
         return self._meshes[key]
 
     def _material(self, shape: Shape) -> str | None:
-        folder = shape.geometry.folder if isinstance(shape.geometry, Mesh) else ""
-        key = shape.color, shape.texture, folder
+        beside = shape.geometry if isinstance(shape.geometry, Mesh) else Mesh("")
+        key = shape.color, shape.texture, beside.folder, beside.root
         if key not in self._materials:
-            file = self.files.texture(shape.texture, folder)
+            file = self.files.texture(Mesh(shape.texture, folder=beside.folder, root=beside.root))
             self._materials[key] = None
             if file is not None:
                 name = self._materials[key] = f"material_{len(self._materials)}"

@@ -10,8 +10,8 @@ from pathlib import Path
 import numpy as np
 
 from kineverse.errors import FormatError, MissingExtraError
-from kineverse.formats.export.meshes import Note, found, path_from
-from kineverse.formats.packages import locate
+from kineverse.formats.export.meshes import Note, found, path_to
+from kineverse.formats.packages import locate_mesh
 from kineverse.model.body import Mesh
 
 _HEADER, _TRIANGLE = 84, 50
@@ -41,34 +41,44 @@ class MeshFiles:
         self._folder = path.absolute().parent
         self._beside = self._folder / f"{path.name.removesuffix(path.suffix)}_meshes"
         self._note, self._without = note, without
-        self._known: dict[tuple[str, str], str | None] = {}
+        self._known: dict[tuple[str, str, str | None], str | None] = {}
         self.converted: dict[Path, bytes] = {}
 
     def file(self, mesh: Mesh) -> str | None:
         """Return what the description calls the file of a mesh; None if it is left out, with a remark."""
-        key = mesh.uri, mesh.folder
+        key = mesh.uri, mesh.folder, mesh.root
         if key not in self._known:
             self._known[key] = self._file(mesh)
         named = self._known[key]
         return None if named in self._without else named
 
-    def texture(self, uri: str, folder: str) -> str | None:
-        """Return what the description calls the file of a texture; None if it is left out, with a remark."""
-        there = found(uri, folder)
+    def texture(self, texture: Mesh) -> str | None:
+        """Return what the description calls the file of a texture; None if it is left out, with a remark.
+
+        Parameters
+        ----------
+        texture
+            What it is called, its folder and its root, as those of a mesh.
+        """
+        uri = texture.uri
+        if not texture.folder and "://" not in uri and not os.path.isabs(uri):
+            self._note(f"the texture {uri} is left out: it is relative to a folder that is not known")
+            return None
+        there = found(texture)
         if there is None or there.suffix.lower() != ".png":
             why = "it is not there" if there is None else "MuJoCo reads PNG"
             self._note(f"the texture {uri} is left out: {why}")
             return None
-        return path_from(there, self._folder)
+        return path_to(there, self._folder, self._note)
 
     def _file(self, mesh: Mesh) -> str | None:
         try:
-            there = Path(os.path.abspath(locate(mesh.uri, mesh.folder)))
+            there = Path(os.path.abspath(locate_mesh(mesh)))
         except FormatError as error:
-            self._note(f"the mesh {mesh.uri} is left out: it is not there. {error}")
+            self._note(f"the mesh {mesh.uri} is left out. {error}")
             return None
         if there.suffix.lower() in (".obj", ".msh") or _is_binary_stl(there):
-            return path_from(there, self._folder)
+            return path_to(there, self._folder, self._note)
         return self._convert(mesh, there)
 
     def _convert(self, mesh: Mesh, there: Path) -> str | None:
@@ -103,9 +113,12 @@ def _is_binary_stl(path: Path) -> bool:
     """Whether a file is an STL as MuJoCo reads them: binary, with as many faces as there is room for."""
     if path.suffix.lower() != ".stl":
         return False
-    with path.open("rb") as file:
-        start = file.read(_HEADER)
-        size = os.fstat(file.fileno()).st_size
+    try:
+        with path.open("rb") as file:
+            start = file.read(_HEADER)
+            size = os.fstat(file.fileno()).st_size
+    except OSError:  # whoever reads it says why
+        return False
     if len(start) < _HEADER:
         return False
     count: int = struct.unpack("<I", start[-4:])[0]

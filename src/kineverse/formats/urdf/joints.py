@@ -128,6 +128,8 @@ def _axis(axis: Element | None, joint: Element, remarks: Remarks, taken: str) ->
     """Return the unit vector of an axis, None if it has no length; the specification's default is x."""
     if axis is None:
         return _X
+    if "xyz" not in axis[1]:
+        remarks.add(axis, "has no xyz; it is 1 0 0, the default, where others move about nothing.", joint)
     x, y, z = unit(vector(axis, "xyz", _X, turns=True))
     length = math.hypot(x, y, z)
     if length < _SHORTEST_AXIS:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from dataclasses import replace
 from pathlib import Path
 
 from kineverse.formats.export.markup import Tag
@@ -96,7 +97,8 @@ class BodyWriter:
     def _texture(self, shape: Shape) -> str:
         """Return what the file calls a texture; where a relative one is, only a mesh beside it knows."""
         if isinstance(shape.geometry, Mesh) and shape.geometry.folder:
-            return reference(Mesh(shape.texture, folder=shape.geometry.folder), self._folder, self._remark)
+            texture = replace(shape.geometry, uri=shape.texture)
+            return reference(texture, self._folder, self._remark)
         if "://" not in shape.texture and not os.path.isabs(shape.texture):
             self._remark(f"the texture {shape.texture} is written as it is, relative to some other folder")
         return shape.texture
