@@ -124,7 +124,7 @@ def test_on_purpose() -> None:
     ):
         assert copied.snapshot() == model.snapshot()
         with copied.edit() as edit:
-            edit.remove("frame door")
+            edit.remove("override frame door")
         assert copied.fk("door")({"door": 0})[2, 3] == 0
         with pytest.raises(kv.NameTakenError), copied.edit() as edit:
             edit.add_frame("door", "world", UP)

@@ -13,11 +13,12 @@ from kineverse.expressions.expression import ExpressionLike
 from kineverse.symbols import Symbol
 from kineverse.vocabulary import EDIT, unknown_attribute
 
-from .body import Body
+from .body import Body, Pose
 from .constraint import Constraint
 from .diff import Change, Diff, moved_tags
 from .frame import WORLD, Frame, TransformLike
 from .history import Entry, History
+from .keywords import check_flag
 from .operation import Effects, Operation
 from .rates import Row, as_row
 from .reader import Reader
@@ -197,6 +198,7 @@ class Edit:
         EditError
             If the operation raises something that is not an error of this package; those pass as they are.
         """
+        check_flag("override", override)
         if override and isinstance(operation, Operation):
             operation = Override(operation)
         chosen = self._tag(operation, tag)
@@ -262,13 +264,15 @@ class Edit:
         self,
         name: str,
         parent: str,
-        transform: TransformLike | Sequence[TransformLike],
+        transform: TransformLike | Sequence[TransformLike] = Pose(),
         body: Body | None = None,
         tag: str | None = None,
         *,
         override: bool = False,
     ) -> str:
         """Place a frame in its parent by a 4×4 transform parent_T_frame, or by several (their product).
+
+        Without a transform it is where its parent is.
 
         A frame that is there already is refused unless ``override`` is given; :meth:`attach` moves it.
         """
