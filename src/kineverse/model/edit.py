@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
@@ -30,13 +30,16 @@ if TYPE_CHECKING:
 
 
 class Opening(AbstractContextManager["Edit"]):
-    """What :meth:`Model.edit` returns: it opens the edit when its ``with`` block begins."""
+    """What :meth:`Model.edit` returns: a new edit is opened whenever a ``with`` block of it begins."""
 
-    def __init__(self, transaction: AbstractContextManager[Edit]) -> None:
-        self._transaction = transaction
+    def __init__(self, begin: Callable[[], AbstractContextManager[Edit]]) -> None:
+        self._begin = begin
 
     def __enter__(self) -> Edit:
-        return self._transaction.__enter__()
+        transaction = self._begin()
+        edit = transaction.__enter__()
+        self._transaction = transaction  # once it is open: an edit inside of this one is refused
+        return edit
 
     def __exit__(self, *raised: Any) -> bool | None:
         return self._transaction.__exit__(*raised)

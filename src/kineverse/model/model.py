@@ -67,7 +67,7 @@ class Model(ModelView):
             At the end of the block, if operations cannot be run after the edit: the first ones are listed,
             and all of them are in its ``failures``.
         """
-        return Opening(self._transaction())
+        return Opening(self._transaction)
 
     @contextmanager
     def _transaction(self) -> Iterator[Edit]:
