@@ -110,6 +110,14 @@ MESSAGES: dict[str, tuple[Callable[[kv.Model], Any], str]] = {
         lambda m: m.violations(kv.State()),
         "The state has no value for anything in this model. model.default_state() has one for everything.",
     ),
+    "a name of a package": (
+        lambda _: kv.estimation.Trackr,
+        "The package kineverse.estimation has no 'Trackr'. Did you mean 'Tracker'?",
+    ),
+    "a name of another package": (
+        lambda _: kv.reasoning.interlock_,
+        "The package kineverse.reasoning has no 'interlock_'. Did you mean 'Interlock' or 'interlocks' or 'Interval'?",
+    ),
     "values without keywords": (
         lambda _: kv.Revolute("d", "world", "d"),
         f"Revolute is made with keywords, and 'd' has none. {REVOLUTE}",
