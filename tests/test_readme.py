@@ -35,3 +35,13 @@ def test_the_names_agree() -> None:
     assert project["name"] in text
     for extra in project["optional-dependencies"]:
         assert f"`{extra}`" in text
+
+
+def test_every_page_of_the_docs_is_listed() -> None:
+    pages = {page.name for page in (ROOT / "docs").glob("*.md")} - {"README.md"}
+    text, index = (
+        README.read_text(encoding="utf-8"),
+        (ROOT / "docs" / "README.md").read_text(encoding="utf-8"),
+    )
+    assert {name for name in pages if f"(docs/{name})" not in text} == set()
+    assert {name for name in pages if f"]({name})" not in index} == set()

@@ -69,7 +69,7 @@ class AxisMotion(Expression):
     def __getattr__(self, name: str) -> Any:
         # Called for what is not there: the graph, before it is looked at for the first time.
         if name != "_sx":
-            raise AttributeError(f"'{type(self).__name__}' object has no attribute '{name}'")
+            return super().__getattr__(name)  # type: ignore[misc]
         if self.turns:
             graph = ca.SX(_TRANSFORMS[self.direction], ca.vertcat(*self._entries(), _ONE))
         else:

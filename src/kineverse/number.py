@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 
@@ -25,3 +26,12 @@ def real_number(value: Any) -> float:
     ):
         raise TypeError(f"{value!r} is not a real number")
     return float(value)
+
+
+def finite_number(value: Any) -> float | None:
+    """Return a finite number as a float; None for infinities, NaN and whatever is no number."""
+    try:
+        number = real_number(value)
+    except (TypeError, ValueError, OverflowError):
+        return None
+    return number if math.isfinite(number) else None

@@ -11,6 +11,7 @@ from .errors import (
     ExpressionError,
     KineverseError,
     NameTakenError,
+    UnknownAttributeError,
     UnknownNameError,
     ValueRejectedError,
     given_twice,
@@ -78,6 +79,10 @@ class State(Mapping[Symbol, float]):
     if not TYPE_CHECKING:  # a type checker says so on its own
 
         def __getattr__(self, name):
+            if name in State.__slots__:  # not set yet, which __setattr__ asks about for every state
+                raise AttributeError(name)
+            if name in self._by_name:
+                raise UnknownAttributeError(f"A state has no {name!r}. Its value is state[{name!r}].")
             raise unknown_attribute("A state", name, dir(type(self)), STATE)
 
         def __setitem__(self, key: object, value: object) -> None:

@@ -151,6 +151,23 @@ def test_a_posture_beyond_limits_is_evaluated_and_said(run):
 
 
 @pytest.mark.parametrize(
+    ("assigned", "remark"),
+    [
+        ("fridge_door=5mm", "kitchen/fridge_door is an angle, and 5mm is none: it is taken for 0.005 rad"),
+        (
+            "sink_left_upper_drawer=10deg",
+            "kitchen/sink_left_upper_drawer is a length, and 10deg is none: it is taken for 0.174533 m",
+        ),
+        ("fridge_door=pi/4", ""),
+        ("sink_left_upper_drawer=10cm", ""),
+    ],
+)
+def test_a_unit_of_something_else_is_said(run, assigned, remark):
+    status, _, err = run("fk", "kitchen", "kitchen/fridge_door", "--set", f"kitchen/{assigned}")
+    assert (status, err) == (0, f"kineverse: note: {remark}\n" if remark else "")
+
+
+@pytest.mark.parametrize(
     ("words", "hint"),
     [
         (("info", "kitchn"), "kitchen"),

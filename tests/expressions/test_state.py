@@ -210,6 +210,21 @@ def test_attributes_that_a_state_lacks(name, message):
     assert not hasattr(State(), name)
 
 
+def test_a_value_is_no_attribute():
+    with pytest.raises(kv.UnknownAttributeError) as error:
+        State({"door": 1}).door  # noqa: B018
+    assert str(error.value) == "A state has no 'door'. Its value is state['door']."
+
+
+def test_no_similar_names_are_looked_for_while_a_state_is_made(monkeypatch):
+    def looked(*_):
+        raise AssertionError("names were compared")
+
+    monkeypatch.setattr("kineverse.vocabulary.difflib.get_close_matches", looked)
+    assert State({a: 1.0}, stamp=2.0).updated({a: 3.0})[a] == 3.0
+    assert kv.position("never before").path == "never before"
+
+
 # -- equality, hashes, copies ------------------------------------------------------------------------------
 
 

@@ -80,7 +80,7 @@ def test_several_pairs():
     [
         ({"mask": ("x", "q")}, ValueRejectedError, r"mask of loop 'tie'.*'q'"),
         ({"mask": ()}, ValueRejectedError, r"mask of loop 'tie'.*\(\)"),
-        ({"mask": "x"}, ValueRejectedError, "mask of loop 'tie'"),
+        ({"mask": "rx"}, ValueRejectedError, "mask of loop 'tie'.*not 'rx'"),
         ({"mask": ("z",)}, ModelError, "'tie' cannot move: nothing changes what its mask names"),
         ({"to": "coupler"}, ModelError, "'tie' cannot move: nothing changes .* 'coupler_tip' and 'coupler'"),
         ({"frame": "lid"}, UnknownNameError, "no frame 'lid'"),
@@ -178,3 +178,21 @@ def test_velocity_rows_keep_it_closed():
                 value = constraint(state)
                 assert least <= most
                 assert (least >= 0 and most > 0) if value < 0 else (most <= 0 and least < 0)
+
+
+@pytest.mark.parametrize("kind", [kv.CloseLoop, kv.LoopConstraint])
+def test_masks_and_ends_are_given_alike(kind):
+    one = kind(name="l", frame="a", mask="xz", more=[["b", "c"]])
+    other = kind(name="l", frame="a", mask=["x", "z"], more=(("b", "c"),))
+    assert one == other
+    assert (one.mask, one.more) == (("x", "z"), (("b", "c"),))
+    for wrong in (5, "bc", ("b", "c"), [("b",)], [("b", "c", "d")], [(1, 2)], None):
+        with pytest.raises(
+            kv.ValueRejectedError, match=r"^Loop 'l' takes more=\(\(frame, to\), \.\.\.\), pairs of"
+        ):
+            kind(name="l", frame="a", more=wrong)
+    for wrong in (5, "q", "xx", (), [["x"]], None):
+        with pytest.raises(
+            kv.ValueRejectedError, match=r"^The mask of loop 'l' has names out of x, y, z, rx"
+        ):
+            kind(name="l", frame="a", mask=wrong)

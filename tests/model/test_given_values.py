@@ -213,3 +213,27 @@ def test_homes_without_a_pose(home: tuple[float, ...], message: str) -> None:
     with pytest.raises(kv.ValueRejectedError) as error, model.edit() as edit:
         edit.apply(SetHome("float", home))
     assert str(error.value).startswith(message)
+
+
+def test_rows_of_coordinates_by_name() -> None:
+    fetch = kv.load("fetch")
+    assert fetch.rates.row("fetch/base/x") == fetch.rates["fetch/base/x"]
+    assert fetch.rates.row("fetch/torso_lift_joint") is None
+
+
+def test_a_listener_that_could_never_hear() -> None:
+    model = kitchen()
+    with pytest.raises(
+        kv.UnknownNameError, match=r"^'kitchen/door' is not a path into a model; it begins with"
+    ):
+        model.listen(print, paths=["kitchen/door"])
+    with pytest.raises(kv.UnknownNameError, match=r"^5 is not a path into a model"):
+        model.history.readers(5)  # type: ignore[arg-type]
+    with pytest.raises(
+        kv.ExpressionError, match=r"^A listener is called with a diff, and 5 cannot be called"
+    ):
+        model.listen(5)  # type: ignore[arg-type]
+    heard: list[kv.Diff] = []
+    with model.listen(heard.append, paths="frames"), model.edit() as edit:
+        edit.add_frame("lamp", "world")
+    assert len(heard) == 1

@@ -57,6 +57,67 @@ MESSAGES: dict[str, tuple[Callable[[kv.Model], Any], str]] = {
         lambda _: kv.Model("kitchen"),
         "A model begins empty, with kv.Model(). To load one: kv.load('kitchen').",
     ),
+    "a model of nothing that it is made of": (
+        lambda _: kv.Model([1, 2]),  # type: ignore[list-item]
+        "A model begins empty, with kv.Model(), and is not made from a list. To load one: kv.load(path).",
+    ),
+    "a flag that is a text": (
+        edited(lambda e: e.add_frame("door", "world", np.eye(4), override="no")),  # type: ignore[arg-type]
+        "override= is True or False, not 'no'.",
+    ),
+    "another flag": (
+        lambda m: m.integrate(m.default_state(), {}, 1.0, clip=None),  # type: ignore[arg-type]
+        "clip= is True or False, not None.",
+    ),
+    "no speeds": (
+        lambda m: m.integrate(m.default_state(), None, 1.0),  # type: ignore[arg-type]
+        "Speeds are given as a mapping {name: number}, not as None.",
+    ),
+    "a speed that is a text": (
+        lambda m: m.integrate(m.default_state(), {"door:velocity": "fast"}, 1.0),  # type: ignore[dict-item]
+        "The speed 'door:velocity' is 'fast'; it must be finite.",
+    ),
+    "a time that is a text": (
+        lambda m: m.integrate(m.default_state(), {}, "soon"),  # type: ignore[arg-type]
+        "The time step is a finite number of seconds, not 'soon'.",
+    ),
+    "a speed that leads to infinity": (
+        lambda m: m.integrate(m.default_state(), {"door:velocity": 1e300}, 1e300),
+        "'door' runs to inf in 1e+300 s. Take a shorter time.",
+    ),
+    "a tolerance that is a text": (
+        lambda m: m.violations(m.default_state(), "small"),  # type: ignore[arg-type]
+        "A tolerance is a finite number from 0, not 'small'.",
+    ),
+    "a projection with a tolerance of NaN": (
+        lambda m: m.project(m.default_state(), tolerance=float("nan")),
+        "A tolerance is a finite number from 0, not nan.",
+    ),
+    "a projection of no state": (
+        lambda m: m.project("door"),  # type: ignore[arg-type]
+        "Values are given as a mapping {name: number} or a state, not as str.",
+    ),
+    "a number that stays fixed": (
+        lambda m: m.project(m.default_state(), fixed=5),  # type: ignore[arg-type]
+        "What stays fixed is given as names of coordinates, not as 5.",
+    ),
+    "a state of another model": (
+        lambda m: m.violations(kv.State({"dor": 9.0})),
+        "The state has no value for anything in this model. It knows 'dor'. Did you mean 'door'? "
+        "model.default_state() has one for everything.",
+    ),
+    "a state of nothing": (
+        lambda m: m.violations(kv.State()),
+        "The state has no value for anything in this model. model.default_state() has one for everything.",
+    ),
+    "a name of a package": (
+        lambda _: kv.estimation.Trackr,
+        "The package kineverse.estimation has no 'Trackr'. Did you mean 'Tracker'?",
+    ),
+    "a name of another package": (
+        lambda _: kv.reasoning.interlock_,
+        "The package kineverse.reasoning has no 'interlock_'. Did you mean 'Interlock' or 'interlocks' or 'Interval'?",
+    ),
     "values without keywords": (
         lambda _: kv.Revolute("d", "world", "d"),
         f"Revolute is made with keywords, and 'd' has none. {REVOLUTE}",

@@ -243,7 +243,9 @@ def test_unknown_names_are_errors_in_mappings_and_not_in_states() -> None:
         model.violations({})
     state = kv.State({"a": 3, "nobody": 1})
     assert [v.excess for v in model.violations(state)] == [2]
-    assert model.violations(kv.State({"nobody": 1})).unchecked == ("a",)
+    assert model.violations(kv.State({"a:velocity": 1})).unchecked == ("a",)
+    with pytest.raises(kv.UnknownNameError, match=r"no value for anything in this model\. It knows 'nobody'"):
+        model.violations(kv.State({"nobody": 1}))
     with pytest.raises(kv.ValueRejectedError, match="NaN"):
         model.violations({"a": float("nan")})
     with pytest.raises(kv.ValueRejectedError, match="not a number"):

@@ -297,3 +297,12 @@ def test_what_hangs_nowhere_is_refused(parents: tuple[tuple[str, str], ...], wor
     with pytest.raises(kv.KineverseError, match=words), model.edit() as edit:
         edit.apply(Chain(parents))
     assert not model.frames
+
+
+def test_a_frame_without_a_transform_is_where_its_parent_is() -> None:
+    model = kv.Model()
+    with model.edit() as edit:
+        edit.add_frame("door", "world", kv.translation(1, 2, 3))
+        edit.add_frame("handle", parent="door")
+    assert np.array_equal(model.fk("handle")(), model.fk("door")())
+    assert kv.from_bytes(kv.to_bytes(model)).snapshot() == model.snapshot()

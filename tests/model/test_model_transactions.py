@@ -428,3 +428,18 @@ def test_edits_in_many_threads_are_all_made_and_heard_of_in_order() -> None:
         thread.join()
     assert model.version == len(model.data) == 160
     assert heard == list(range(1, 161))
+
+
+def test_what_edit_returned_may_be_used_again() -> None:
+    model = kv.Model()
+    again = model.edit()
+    for name in ("a", "b"):
+        with again as edit:
+            edit.write(name, 1)
+    assert (list(model.data), model.version) == (["a", "b"], 2)
+    with again as edit:
+        edit.write("c", 1)
+        with pytest.raises(kv.EditError, match="being edited already"), again:
+            pass
+        edit.write("d", 1)
+    assert (list(model.data), model.version) == (["a", "b", "c", "d"], 3)

@@ -253,3 +253,14 @@ def test_equalities_whose_bounds_are_expressions():
 def test_it_follows_from_the_state_alone(one, other):
     start = MODEL.default_state().updated({one: 0.3, other: 0.6})
     assert MODEL.project(start) == four_bar(lower=-1.0, upper=1.0).project(start)
+
+
+def test_a_parameter_by_its_name():
+    model = kv.Model()
+    length, x = kv.parameter("length", 1.0), kv.position("x")
+    with model.edit() as edit:
+        edit.add_frame("tip", parent="world", transform=kv.translation(x, 0, 0))
+        edit.constrain("as long as that", 0, x - length, 0)
+    assert model.project(kv.State({"x": 0.0, "length": 3.0}))["x"] == pytest.approx(3.0)
+    assert model.project({"x": 0.0, "length": 3.0})["x"] == pytest.approx(3.0)
+    assert model.project({"x": 0.0})["x"] == pytest.approx(1.0)

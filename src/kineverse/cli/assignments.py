@@ -63,8 +63,15 @@ def parse_assignments(texts: Iterable[str]) -> dict[str, float]:
 
 def has_unit(text: str) -> bool:
     """Whether a value says what it is measured in; parts of pi are angles."""
+    return unit_kind(text) is not None
+
+
+def unit_kind(text: str) -> str | None:
+    """Return ``rad`` or ``m``, whichever a value is measured in; None if it does not say."""
     match = _VALUE.fullmatch(text.rpartition("=")[2].strip())
-    return match is not None and bool(match["unit"] or match["pi"])
+    if match is None or not (match["unit"] or match["pi"]):
+        return None
+    return "m" if match["unit"] in LENGTHS[1:] else "rad"
 
 
 def parse_length(text: str) -> float:

@@ -7,7 +7,7 @@ import sys
 from collections.abc import Iterable, Mapping
 from typing import TYPE_CHECKING
 
-from kineverse.cli.assignments import UNITS, has_unit
+from kineverse.cli.assignments import UNITS, has_unit, unit_kind
 from kineverse.cli.table import figure
 
 if TYPE_CHECKING:
@@ -38,6 +38,9 @@ def remarks(model: kv.Model, values: Mapping[str, float], texts: Iterable[str]) 
     for name, text in given.items():
         lower, upper = map(float, model.limits(model.symbol(name)))
         kind, value = kinds[name], values[name]
+        if unit_kind(text) not in (None, kind) and kind:
+            sort, wrong = "an angle" if kind == "rad" else "a length", text.rpartition("=")[2].strip()
+            lines.append(f"{name} is {sort}, and {wrong} is none: it is taken for {figure(value, 6)} {kind}")
         turns = kind == "rad" and abs(value) > math.tau and not has_unit(text)
         if lower <= value <= upper and not turns:
             continue

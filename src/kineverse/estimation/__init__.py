@@ -5,6 +5,8 @@
 :mod:`kineverse.estimation.rating` says whether a model explains what is seen.
 """
 
+from kineverse.vocabulary import MODULE, unknown_attribute
+
 from .identification import Family, Fit, Found, Identifier, Unknown, identify
 from .identification.bodies import RigidBody
 from .identification.graph import Edge, Graph, identify_graph
@@ -45,3 +47,7 @@ __all__ = [
     "plausibility",
     "pose_covariance",
 ]
+
+
+def __getattr__(name: str) -> object:
+    raise unknown_attribute("The package kineverse.estimation", name, __all__, MODULE)

@@ -18,6 +18,7 @@ import numpy as np
 import numpy.typing as npt
 
 from kineverse.errors import ExpressionError, ShapeError, ValueRejectedError
+from kineverse.vocabulary import EXPRESSION, unknown_attribute
 
 from . import layout
 from .array_methods import ArrayMethods
@@ -418,6 +419,24 @@ class Expression(ArrayMethods):
 
     def __int__(self) -> int:
         return int(float(self))
+
+    def __format__(self, spec: str) -> str:
+        if not spec or not self.is_constant or self._shape:
+            try:
+                return format(str(self), spec)
+            except ValueError:
+                raise ExpressionError(
+                    f"The format {spec!r} is one of numbers, and this is an expression. "
+                    "For a number call it with values: e({name: number})."
+                ) from None
+        return format(float(self), spec)
+
+    if not TYPE_CHECKING:  # a type checker says so on its own
+
+        def __getattr__(self, name):
+            if hasattr(type(self), name):  # a slot that is not filled yet, which some classes ask about
+                raise AttributeError(name)
+            raise unknown_attribute("An expression", name, dir(type(self)), EXPRESSION)
 
     # -- identity ------------------------------------------------------------------------------------------
 

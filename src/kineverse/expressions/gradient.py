@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import casadi as ca
 import numpy as np
 
-from kineverse.errors import ExpressionError
+from kineverse.errors import ExpressionError, UnknownNameError, suggest
 
 from . import layout
 from .expression import NO_NODES, Expression, array, as_expression, make, union, watcher_of
@@ -28,18 +28,28 @@ if TYPE_CHECKING:
 
 
 class Gradient(Mapping["Symbol", Expression]):
-    """D(e): an immutable mapping from derivative symbols to expressions, in the order of the symbols."""
+    """D(e): an immutable mapping from derivative symbols to expressions, in the order of the symbols.
+
+    Entries are asked for by symbol or by its name, ``door:velocity``.
+    """
 
     __slots__ = ("_entries",)
 
     def __init__(self, entries: Mapping[Symbol, Expression]) -> None:
         self._entries = dict(entries)
 
-    def __getitem__(self, key: Symbol) -> Expression:
-        return self._entries[key]
+    def __getitem__(self, key: Symbol | str) -> Expression:
+        entry: Expression | None = self.get(key)
+        if entry is not None:
+            return entry
+        name = str(key)
+        raise UnknownNameError(
+            f"The gradient has no entry for '{name}'; its keys are speeds. "
+            f"{suggest(name, map(str, self._entries), 'speed')}"
+        )
 
     def __contains__(self, key: object) -> bool:
-        return key in self._entries
+        return self.get(key) is not None
 
     def __iter__(self) -> Iterator[Symbol]:
         return iter(self._entries)
@@ -49,9 +59,11 @@ class Gradient(Mapping["Symbol", Expression]):
 
     # A dictionary's own are a multiple faster than those of Mapping.
 
-    def get(self, key: Symbol, default: Any = None) -> Any:
-        """Return the entry of a speed, else what is given instead."""
-        return self._entries.get(key, default)
+    def get(self, key: object, default: Any = None) -> Any:
+        """Return the entry of a speed, by symbol or name, else what is given instead."""
+        if isinstance(key, str):
+            return next((entry for speed, entry in self._entries.items() if str(speed) == key), default)
+        return self._entries.get(key, default)  # type: ignore[call-overload]
 
     def keys(self) -> KeysView[Symbol]:
         """Return the speeds, sorted."""

@@ -14,7 +14,7 @@ from kineverse.model.operation import Effects, Operation
 from kineverse.model.reader import Reader
 
 from .record import constrained_record
-from .residual import check_mask, residual_rows, upright
+from .residual import as_ends, as_mask, residual_rows, upright
 
 APART = 1e-9
 """What a row may be that nothing changes [m], [rad]."""
@@ -60,10 +60,8 @@ class LoopConstraint(Operation):
     more: tuple[tuple[str, str], ...] = ()
 
     def __post_init__(self) -> None:
-        for field in ("mask", "more"):
-            if isinstance(getattr(self, field), list):
-                object.__setattr__(self, field, tuple(map(_as_given, getattr(self, field))))
-        check_mask(self.mask, self.name)
+        object.__setattr__(self, "mask", as_mask(self.mask, self.name))
+        object.__setattr__(self, "more", as_ends(self.more, self.name))
 
     def default_tag(self) -> str:
         """Return ``loop`` and the name, as of a loop that is solved."""
@@ -102,7 +100,3 @@ class LoopConstraint(Operation):
             if model.resolve(sign).symbols:
                 found[f"{name}/upright{k or ''}"] = Constraint.of(0.0, sign, math.inf)
         return found
-
-
-def _as_given(item: object) -> object:
-    return tuple(item) if isinstance(item, list) else item

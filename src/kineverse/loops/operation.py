@@ -17,7 +17,7 @@ from kineverse.symbols import Symbol
 
 from .closing import Closed, close
 from .record import loop_record
-from .residual import AXES, check_mask, residual_rows, upright
+from .residual import AXES, as_ends, as_mask, residual_rows, upright
 
 __all__ = ["AXES", "CloseLoop"]
 
@@ -84,11 +84,10 @@ class CloseLoop(Operation):
     within: tuple[tuple[str, float, float], ...] = ()
 
     def __post_init__(self) -> None:
-        for field in ("mask", "dependent", "more"):
-            given = getattr(self, field)
-            if isinstance(given, list) or (field == "mask" and isinstance(given, str)):
-                object.__setattr__(self, field, tuple(given))
-        check_mask(self.mask, self.name)
+        object.__setattr__(self, "mask", as_mask(self.mask, self.name))
+        object.__setattr__(self, "more", as_ends(self.more, self.name))
+        if isinstance(self.dependent, list):
+            object.__setattr__(self, "dependent", tuple(self.dependent))
         if isinstance(self.branch, bool) or not isinstance(self.branch, int):
             raise ValueRejectedError(
                 f"The branch of loop '{self.name}' is a number from 0, not {self.branch!r}."

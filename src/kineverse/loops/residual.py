@@ -11,13 +11,25 @@ from kineverse.expressions.expression import Expression, array
 AXES = ("x", "y", "z", "rx", "ry", "rz")
 
 
-def check_mask(mask: Any, name: str) -> None:
-    """Raise unless a mask has different names out of :data:`AXES`."""
-    known = isinstance(mask, tuple) and all(axis in AXES for axis in mask)
-    if not known or not mask or len(set(mask)) < len(mask):
+def as_mask(given: Any, name: str) -> tuple[str, ...]:
+    """Return a mask, a sequence or text of different names out of :data:`AXES`, as a tuple."""
+    mask = tuple(given) if isinstance(given, list | tuple | str) else ()
+    if not mask or not all(axis in AXES for axis in mask) or len(set(mask)) < len(mask):
         raise ValueRejectedError(
-            f"The mask of loop '{name}' has names out of {', '.join(AXES)}, not {mask!r}."
+            f"The mask of loop '{name}' has names out of {', '.join(AXES)}, not {given!r}."
         )
+    return mask
+
+
+def as_ends(given: Any, name: str) -> tuple[tuple[str, str], ...]:
+    """Return further pairs of frames that coincide as tuples."""
+    pairs = tuple(given) if isinstance(given, list | tuple) else (given,)
+    for pair in pairs:
+        if not isinstance(pair, list | tuple) or [type(end) for end in pair] != [str, str]:
+            raise ValueRejectedError(
+                f"Loop '{name}' takes more=((frame, to), ...), pairs of names of frames, not {given!r}."
+            )
+    return tuple((frame, to) for frame, to in pairs)
 
 
 def residual_rows(pose: Expression, mask: Sequence[str]) -> dict[str, Expression]:

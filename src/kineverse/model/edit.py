@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
@@ -13,11 +13,12 @@ from kineverse.expressions.expression import ExpressionLike
 from kineverse.symbols import Symbol
 from kineverse.vocabulary import EDIT, unknown_attribute
 
-from .body import Body
+from .body import Body, Pose
 from .constraint import Constraint
 from .diff import Change, Diff, moved_tags
 from .frame import WORLD, Frame, TransformLike
 from .history import Entry, History
+from .keywords import check_flag
 from .operation import Effects, Operation
 from .rates import Row, as_row
 from .reader import Reader
@@ -29,13 +30,16 @@ if TYPE_CHECKING:
 
 
 class Opening(AbstractContextManager["Edit"]):
-    """What :meth:`Model.edit` returns: it opens the edit when its ``with`` block begins."""
+    """What :meth:`Model.edit` returns: a new edit is opened whenever a ``with`` block of it begins."""
 
-    def __init__(self, transaction: AbstractContextManager[Edit]) -> None:
-        self._transaction = transaction
+    def __init__(self, begin: Callable[[], AbstractContextManager[Edit]]) -> None:
+        self._begin = begin
 
     def __enter__(self) -> Edit:
-        return self._transaction.__enter__()
+        transaction = self._begin()
+        edit = transaction.__enter__()
+        self._transaction = transaction  # once it is open: an edit inside of this one is refused
+        return edit
 
     def __exit__(self, *raised: Any) -> bool | None:
         return self._transaction.__exit__(*raised)
@@ -197,6 +201,7 @@ class Edit:
         EditError
             If the operation raises something that is not an error of this package; those pass as they are.
         """
+        check_flag("override", override)
         if override and isinstance(operation, Operation):
             operation = Override(operation)
         chosen = self._tag(operation, tag)
@@ -262,13 +267,15 @@ class Edit:
         self,
         name: str,
         parent: str,
-        transform: TransformLike | Sequence[TransformLike],
+        transform: TransformLike | Sequence[TransformLike] = Pose(),
         body: Body | None = None,
         tag: str | None = None,
         *,
         override: bool = False,
     ) -> str:
         """Place a frame in its parent by a 4×4 transform parent_T_frame, or by several (their product).
+
+        Without a transform it is where its parent is.
 
         A frame that is there already is refused unless ``override`` is given; :meth:`attach` moves it.
         """

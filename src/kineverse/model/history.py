@@ -20,7 +20,7 @@ from kineverse.errors import EditError, KineverseError, ModelError, NameTakenErr
 from .frame import WORLD, Frame
 from .operation import DATA, FRAMES, KINDS, Effects, Operation
 from .ownership import may_override, taken
-from .reader import ABSENT, Cell, Read, Reader, Reads, missing
+from .reader import ABSENT, Cell, Read, Reader, Reads, missing, no_path
 
 _GAP = 1 << 32
 _BEFORE_ALL = -1 << 200
@@ -587,11 +587,9 @@ def as_cell(path: str) -> Cell:
     UnknownNameError
         If it does not begin with a kind.
     """
-    kind, _, name = path.partition("/")
+    kind, _, name = str(path).partition("/")
     if kind not in KINDS or not name:
-        raise UnknownNameError(
-            f"{path!r} is not a path into a model; it begins with one of {', '.join(KINDS)}, then '/'."
-        )
+        raise no_path(path)
     return kind, name
 
 

@@ -14,9 +14,10 @@ import numpy as np
 import numpy.typing as npt
 
 from kineverse.compile import compile  # noqa: A004
-from kineverse.errors import UnknownNameError, ValueRejectedError, given_twice, suggest
+from kineverse.errors import ExpressionError, UnknownNameError, ValueRejectedError, given_twice, suggest
 from kineverse.expressions.evaluation import assign
 from kineverse.expressions.expression import Expression, array
+from kineverse.number import finite_number
 from kineverse.state import State
 from kineverse.symbols import Symbol
 
@@ -63,8 +64,12 @@ def integrate(
     ValueRejectedError
         For NaN or an infinite step, or if coordinates run to infinity on the way.
     """
-    if not math.isfinite(dt):
+    step = finite_number(dt)
+    if step is None:
         raise ValueRejectedError(f"The time step is a finite number of seconds, not {dt!r}.")
+    dt = step
+    if not isinstance(speeds, Mapping):
+        raise ExpressionError(f"Speeds are given as a mapping {{name: number}}, not as {speeds!r}.")
     free = {c.derivative(): c for c in coordinates if c not in rates}
     flow = flow_of(rates) if rates else None
     wheels = flow.speeds if flow else ()
@@ -78,10 +83,14 @@ def integrate(
             raise UnknownNameError(f"Nothing moves with '{key}'. {suggest(str(key), by_name, 'speed')}")
         if speed in given:
             raise given_twice(speed)
-        given[speed] = float(value)
-        if not math.isfinite(given[speed]):
+        finite = finite_number(value)
+        if finite is None:
             raise ValueRejectedError(f"The speed '{key}' is {value!r}; it must be finite.")
+        given[speed] = finite
     result = {free[v]: state[free[v]] + dt * value for v, value in given.items() if v in free}
+    for coordinate, reached in result.items():
+        if not math.isfinite(reached):
+            raise ValueRejectedError(f"'{coordinate}' runs to {reached} in {dt:g} s. Take a shorter time.")
     if flow and any(given.get(v) for v in wheels):
         try:
             after = flow.follow(state, given, dt)

@@ -6,7 +6,9 @@ from dataclasses import MISSING, fields
 from functools import cache
 from typing import Any, NamedTuple
 
-from kineverse.errors import ExpressionError, suggest
+import numpy as np
+
+from kineverse.errors import ExpressionError, ValueRejectedError, suggest
 
 
 class Keywords(NamedTuple):
@@ -43,6 +45,18 @@ def check_keywords(made: type, arguments: tuple[Any, ...], given: dict[str, Any]
             )
     missing = [key for key in required if key[:-1] not in given]
     raise ExpressionError(f"{name} is made without {', '.join(missing)}. {takes}")
+
+
+def check_flag(name: str, given: object) -> None:
+    """Look whether a keyword that switches something is True or False: the text 'no' would be taken for yes.
+
+    Raises
+    ------
+    ValueRejectedError
+        If it is neither.
+    """
+    if not isinstance(given, bool | np.bool_):
+        raise ValueRejectedError(f"{name}= is True or False, not {given!r}.")
 
 
 @cache

@@ -8,10 +8,12 @@ from collections import deque
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 
+from kineverse.errors import ExpressionError
 from kineverse.symbols import Symbol, check_symbols
 
 from .diff import Change, Diff
-from .operation import CONSTRAINTS
+from .operation import CONSTRAINTS, KINDS
+from .reader import no_path
 
 _LOG = logging.getLogger(__name__)
 
@@ -74,6 +76,11 @@ class Listeners:
         tags: Iterable[str] | None,
     ) -> Listener:
         """Register a callback; with no filter at all it hears of everything."""
+        if not callable(callback):
+            raise ExpressionError(f"A listener is called with a diff, and {callback!r} cannot be called.")
+        for path in () if paths is None else _names(paths):
+            if path and str(path).partition("/")[0] not in KINDS:  # the empty path is that of everything
+                raise no_path(path)
         listener = Listener(
             callback,
             None if paths is None else _names(paths),

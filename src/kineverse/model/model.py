@@ -39,7 +39,14 @@ class Model(ModelView):
             raise ExpressionError(
                 f"A model begins empty, with kv.Model(). To load one: kv.load({os.fspath(_entries)!r})."
             )
-        self._history = _entries if isinstance(_entries, History) else History(_entries)
+        if not isinstance(_entries, History):
+            if not isinstance(_entries, list | tuple) or not all(isinstance(one, Entry) for one in _entries):
+                raise ExpressionError(
+                    "A model begins empty, with kv.Model(), and is not made from a "
+                    f"{type(_entries).__name__}. To load one: kv.load(path)."
+                )
+            _entries = History(_entries)
+        self._history = _entries
         self._edit: Edit | None = None
         self._listeners = Listeners()
         super().__init__(self._history.head, _version)
@@ -60,7 +67,7 @@ class Model(ModelView):
             At the end of the block, if operations cannot be run after the edit: the first ones are listed,
             and all of them are in its ``failures``.
         """
-        return Opening(self._transaction())
+        return Opening(self._transaction)
 
     @contextmanager
     def _transaction(self) -> Iterator[Edit]:

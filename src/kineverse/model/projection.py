@@ -22,6 +22,7 @@ from kineverse.state import State
 from kineverse.symbols import Symbol
 
 from .equalities import Array, Equalities
+from .values import as_tolerance
 
 TOLERANCE = 1e-9
 """How far from holding a constraint may be, as in :meth:`kineverse.Model.violations`."""
@@ -37,15 +38,17 @@ def project(
     equalities: Equalities, state: State, fixed: Iterable[Symbol | str] = (), tolerance: float = TOLERANCE
 ) -> State:
     """Move coordinates so that equalities hold, and return the state, see :meth:`ModelView.project`."""
+    tolerance = as_tolerance(tolerance)
     held = _held(equalities, fixed)
     symbols = equalities.symbols
-    missing = [s for s in symbols if s not in state and s.value is None]
+    given = [state.given(s) for s in symbols]
+    missing = [s for s, value in zip(symbols, given, strict=True) if value is None and s.value is None]
     if missing:
         raise UnknownNameError(
             f"No value for '{missing[0]}', which a projection has to know. Start from "
             "model.default_state().updated({...}) to have a value for everything."
         )
-    at = np.array([state[s] if s in state else s.value or 0.0 for s in symbols], dtype=np.float64)  # noqa: SIM401
+    at = np.array([s.value or 0.0 if v is None else v for s, v in zip(symbols, given, strict=True)])
     search = _search(equalities, at, held, tolerance)
     if search is None:
         return state
@@ -61,6 +64,8 @@ def _held(equalities: Equalities, fixed: Iterable[Symbol | str]) -> frozenset[Sy
     by_name = {str(s): s for s in equalities.symbols}
     by_name |= {str(s): s for record in records.values() for s in record.coordinates}
     found: set[Symbol] = set()
+    if not isinstance(fixed, Iterable):
+        raise UnknownNameError(f"What stays fixed is given as names of coordinates, not as {fixed!r}.")
     for item in [fixed] if isinstance(fixed, (str, Symbol)) else fixed:
         name = str(item)
         if name in dependent:

@@ -150,8 +150,13 @@ class Rates(Mapping[Symbol, Mapping[Symbol, Expression]]):
         wanted = {s: self.dependent[s] for s in all_symbols(expression) if s in self.dependent}
         return apply(expression, wanted)
 
-    def row(self, coordinate: Symbol) -> Mapping[Symbol, Expression] | None:
+    def row(self, coordinate: Symbol | str) -> Mapping[Symbol, Expression] | None:
         """Return how a coordinate moves with free speeds, in plain coordinates; None if it is free itself."""
+        if isinstance(coordinate, str):
+            named = {str(symbol): symbol for symbol in (*self._rows, *self.dependent)}
+            if coordinate not in named:
+                return None
+            coordinate = named[coordinate]
         itself = self.dependent.get(coordinate)
         if itself is not None:
             return self._combined(itself.gradient(False).items())

@@ -15,7 +15,7 @@ from .body import Body
 from .constraint import Constraint
 from .frame import WORLD, Frame
 from .kinematics import branches, relative
-from .operation import ARTICULATIONS, BODIES, CONSTRAINTS, DATA, FRAMES, RATES
+from .operation import ARTICULATIONS, BODIES, CONSTRAINTS, DATA, FRAMES, KINDS, RATES
 from .rates import Entry, Rates, all_symbols, plain
 
 Cell = tuple[str, str]
@@ -196,6 +196,13 @@ class _View(Mapping[str, V], Generic[V]):
     def __len__(self) -> int:
         self._reads.listings.add(self._kind)
         return len(self._names_at(self._kind))
+
+
+def no_path(path: object) -> UnknownNameError:
+    """Return the error for what is no path into a model."""
+    return UnknownNameError(
+        f"{path!r} is not a path into a model; it begins with one of {', '.join(KINDS)}, then '/'."
+    )
 
 
 def missing(kind: str, name: str, available: Any) -> UnknownNameError:

@@ -5,7 +5,15 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from typing import Any
 
-from kineverse.errors import ExpressionError, NameTakenError, UnknownNameError, given_twice, suggest
+from kineverse.errors import (
+    ExpressionError,
+    NameTakenError,
+    UnknownNameError,
+    ValueRejectedError,
+    given_twice,
+    suggest,
+)
+from kineverse.number import finite_number
 from kineverse.state import State
 from kineverse.symbols import Symbol
 
@@ -53,3 +61,17 @@ def as_state(values: Mapping[Any, float], known: Iterable[Symbol]) -> State:
             raise given_twice(symbol)
         result[symbol] = value
     return State(result)
+
+
+def as_tolerance(given: float) -> float:
+    """Return by how much something may be off.
+
+    Raises
+    ------
+    ValueRejectedError
+        If that is no finite number from 0.
+    """
+    tolerance = finite_number(given)
+    if tolerance is None or tolerance < 0:
+        raise ValueRejectedError(f"A tolerance is a finite number from 0, not {given!r}.")
+    return tolerance

@@ -18,6 +18,7 @@ from kineverse.symbols import Symbol, parse_symbol_name
 from .constraint import Constraint
 from .equalities import Equalities
 from .integration import integrate
+from .keywords import check_flag
 from .operation import ARTICULATIONS, CONSTRAINTS
 from .projection import TOLERANCE, project
 from .structure import Structure
@@ -101,7 +102,8 @@ class ModelView(Structure):
         Raises
         ------
         UnknownNameError
-            If a constraint is about a given symbol and a position that is missing, or a name is unknown.
+            If a constraint is about a given symbol and a position that is missing, a name is unknown, or a
+            state has no value for anything in the model.
         NameTakenError
             If a symbol has two values, by name and as such, or a name is that of several symbols.
         """
@@ -110,7 +112,23 @@ class ModelView(Structure):
             if self._checks is None:
                 followed = {name: self._followed(c) for name, c in self._head[CONSTRAINTS].items()}
                 self._checks = Checks(followed, self.rates.dependent.values())
-            return find_violations(self._checks, values, self._known(values), tolerance)
+            found = find_violations(self._checks, values, self._known(values), tolerance)
+            if isinstance(values, State) and 0 < len(found.unchecked) == len(self._checks.names):
+                self._check_that_it_is_meant(values)
+            return found
+
+    def _check_that_it_is_meant(self, state: State) -> None:
+        """Refuse a state that has no value for anything in this model: it is one of another model."""
+        known = self._known({})
+        if any(state.given(symbol) is not None for symbol in known):
+            return
+        names = list(map(str, state))
+        about = f"It knows {', '.join(map(repr, names[:3]))}{', ...' if names[3:] else ''}. " if names else ""
+        hint = suggest(names[0], map(str, known), "symbol") if names else ""
+        raise UnknownNameError(
+            f"The state has no value for anything in this model. {about}{hint}".rstrip()
+            + " model.default_state() has one for everything."
+        )
 
     def _known(self, values: object) -> tuple[Symbol, ...]:
         """Return the symbols that plain values may be about; a state may be about anything."""
@@ -285,6 +303,7 @@ class ModelView(Structure):
         """
         with self._lock:
             coordinates, rates = self.degrees_of_freedom, self.rates
+            check_flag("clip", clip)
             given = as_state(state, self._known(state))
             after = integrate(coordinates, rates, given, speeds, dt)
             if not clip:
@@ -323,9 +342,7 @@ class ModelView(Structure):
             self._catch_up()
             if self._equalities is None:
                 self._equalities = self._equalities_of(None)
-            if not isinstance(state, State):
-                state = State({self.symbol(k) if isinstance(k, str) else k: v for k, v in state.items()})
-            return project(self._equalities, state, fixed, tolerance)
+            return project(self._equalities, as_state(state, self._known(state)), fixed, tolerance)
 
     def _equalities_of(self, names: Collection[str] | None) -> Equalities:
         """Return the equalities of these names, or all."""

@@ -18,7 +18,7 @@ from kineverse.state import State
 from kineverse.symbols import Symbol
 
 from .constraint import Constraint
-from .values import as_state
+from .values import as_state, as_tolerance
 
 
 class Violation(NamedTuple):
@@ -98,6 +98,7 @@ def find_violations(
     checks: Checks, values: Mapping[Any, float], known: Iterable[Symbol], tolerance: float
 ) -> Violations:
     """Return the violations at ``values``, see :meth:`ModelView.violations`."""
+    tolerance = as_tolerance(tolerance)
     known = (*known, *checks.symbols)
     state = as_state(values, known)
     if known and not len(state) and not isinstance(values, State):

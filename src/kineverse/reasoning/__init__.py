@@ -1,5 +1,7 @@
 """Reasoning about models (layer 5): what locks what, and when."""
 
+from kineverse.vocabulary import MODULE, unknown_attribute
+
 from .boxes import Box, Interval
 from .check import contradictions
 from .finding import interlocks
@@ -17,3 +19,7 @@ __all__ = [
     "interlocks",
     "opening_order",
 ]
+
+
+def __getattr__(name: str) -> object:
+    raise unknown_attribute("The package kineverse.reasoning", name, __all__, MODULE)

@@ -150,7 +150,8 @@ class Recording:
         if child is None:
             if len(others) != 1:
                 raise UnknownNameError(
-                    f"{self.source}: which part moves? There are {_listed(others)}; name one as the child."
+                    f"{self.source}: which part moves? There are {_listed(others)}; name one as the child "
+                    "(--child on the command line)."
                 )
             child = others[0]
         track = self._track(child)
