@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from contextlib import AbstractContextManager
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from kineverse.collection import no_collection
-from kineverse.errors import EditError, NameTakenError, UnknownAttributeError
+from kineverse.errors import EditError, NameTakenError
 from kineverse.expressions.expression import ExpressionLike
 from kineverse.symbols import Symbol
 from kineverse.vocabulary import EDIT, unknown_attribute
@@ -27,30 +26,6 @@ if TYPE_CHECKING:
     from kineverse.formats.loops import Loops
 
     from .view import ModelView
-
-
-class Opening(AbstractContextManager["Edit"]):
-    """What :meth:`Model.edit` returns: a new edit is opened whenever a ``with`` block of it begins."""
-
-    def __init__(self, begin: Callable[[], AbstractContextManager[Edit]]) -> None:
-        self._begin = begin
-
-    def __enter__(self) -> Edit:
-        transaction = self._begin()
-        edit = transaction.__enter__()
-        self._transaction = transaction  # once it is open: an edit inside of this one is refused
-        return edit
-
-    def __exit__(self, *raised: Any) -> bool | None:
-        return self._transaction.__exit__(*raised)
-
-    if not TYPE_CHECKING:  # a type checker says so on its own
-
-        def __getattr__(self, name: str) -> Any:
-            raise UnknownAttributeError(
-                f"model.edit() has to be opened before .{name}: write `with model.edit() as edit:`, and in "
-                f"the block edit.{name if hasattr(Edit, name) else 'add_frame'}(...)."
-            )
 
 
 @dataclass(frozen=True)

@@ -8,11 +8,11 @@ from contextlib import AbstractContextManager, contextmanager
 from typing import TYPE_CHECKING, Any
 
 from kineverse.collection import no_collection
-from kineverse.errors import EditError, ExpressionError
+from kineverse.errors import EditError, ExpressionError, UnknownAttributeError
 from kineverse.symbols import Symbol
 
 from .diff import Change, Diff
-from .edit import Edit, Opening
+from .edit import Edit
 from .history import Entry, History
 from .listeners import Listener, Listeners
 from .reader import ABSENT
@@ -20,6 +20,30 @@ from .view import ModelView
 
 if TYPE_CHECKING:
     from kineverse.formats.loops import Loops
+
+
+class Opening(AbstractContextManager["Edit"]):
+    """What :meth:`Model.edit` returns: a new edit is opened whenever a ``with`` block of it begins."""
+
+    def __init__(self, begin: Callable[[], AbstractContextManager[Edit]]) -> None:
+        self._begin = begin
+
+    def __enter__(self) -> Edit:
+        transaction = self._begin()
+        edit = transaction.__enter__()
+        self._transaction = transaction  # once it is open: an edit inside of this one is refused
+        return edit
+
+    def __exit__(self, *raised: Any) -> bool | None:
+        return self._transaction.__exit__(*raised)
+
+    if not TYPE_CHECKING:  # a type checker says so on its own
+
+        def __getattr__(self, name: str) -> Any:
+            raise UnknownAttributeError(
+                f"model.edit() has to be opened before .{name}: write `with model.edit() as edit:`, and in "
+                f"the block edit.{name if hasattr(Edit, name) else 'add_frame'}(...)."
+            )
 
 
 class Model(ModelView):

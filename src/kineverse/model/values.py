@@ -63,6 +63,26 @@ def as_state(values: Mapping[Any, float], known: Iterable[Symbol]) -> State:
     return State(result)
 
 
+def check_meant(state: State, known: Iterable[Symbol]) -> None:
+    """Refuse a state that has no value for anything in a model: it is one of another model.
+
+    Raises
+    ------
+    UnknownNameError
+        With a name like its first one.
+    """
+    symbols = list(known)
+    if any(state.given(symbol) is not None for symbol in symbols):
+        return
+    names = list(map(str, state))
+    about = f"It knows {', '.join(map(repr, names[:3]))}{', ...' if names[3:] else ''}. " if names else ""
+    hint = f"{suggest(names[0], map(str, symbols), 'symbol')} " if names else ""
+    raise UnknownNameError(
+        f"The state has no value for anything in this model. {about}{hint}"
+        "model.default_state() has one for everything."
+    )
+
+
 def as_tolerance(given: float) -> float:
     """Return by how much something may be off.
 

@@ -22,7 +22,7 @@ from .keywords import check_flag
 from .operation import ARTICULATIONS, CONSTRAINTS
 from .projection import TOLERANCE, project
 from .structure import Structure
-from .values import as_state
+from .values import as_state, check_meant
 from .velocity import VelocityRows, velocity_rows
 from .violations import Checks, Violations, find_violations
 
@@ -114,21 +114,8 @@ class ModelView(Structure):
                 self._checks = Checks(followed, self.rates.dependent.values())
             found = find_violations(self._checks, values, self._known(values), tolerance)
             if isinstance(values, State) and 0 < len(found.unchecked) == len(self._checks.names):
-                self._check_that_it_is_meant(values)
+                check_meant(values, self._known({}))
             return found
-
-    def _check_that_it_is_meant(self, state: State) -> None:
-        """Refuse a state that has no value for anything in this model: it is one of another model."""
-        known = self._known({})
-        if any(state.given(symbol) is not None for symbol in known):
-            return
-        names = list(map(str, state))
-        about = f"It knows {', '.join(map(repr, names[:3]))}{', ...' if names[3:] else ''}. " if names else ""
-        hint = suggest(names[0], map(str, known), "symbol") if names else ""
-        raise UnknownNameError(
-            f"The state has no value for anything in this model. {about}{hint}".rstrip()
-            + " model.default_state() has one for everything."
-        )
 
     def _known(self, values: object) -> tuple[Symbol, ...]:
         """Return the symbols that plain values may be about; a state may be about anything."""
