@@ -242,3 +242,36 @@ def test_without_a_compiler_coal_measures_everything():
     table = placed([random_shape("box", rng)] * 2, [random_pose(rng, 1.0) for _ in range(2)])
     distances, _ = library.measure(table, np.array([[0, 1]], dtype=np.int32), 1.0)
     assert np.isnan(distances).all()
+
+
+@pytest.fixture(scope="module")
+def narrower():
+    """Return the same C for a processor that takes two corners at a time."""
+    library = SweepLibrary()
+    library._flags = (*library._flags, "-U__AVX512F__", "-U__AVX2__")
+    assert library.prepare(wait=True)
+    return library
+
+
+@settings(max_examples=attempts(30))
+@given(counts=st.tuples(*[st.integers(8, 90)] * 2), seed=seeds, spread=st.sampled_from([0.0, 0.3, 2.0]))
+def test_many_corners_are_found_whatever_the_processor_takes_at_a_time(narrower, counts, seed, spread):
+    """Each corner is the furthest one in its direction: a ball of them leaves none out of what is measured."""
+    rng = np.random.default_rng(seed)
+    solids = []
+    for count in counts:
+        points = rng.normal(size=(count, 3))
+        solids.append(_hull(np.round(points / np.linalg.norm(points, axis=1)[:, None], 1 + seed % 8)))
+    poses = np.stack([random_pose(rng, spread) for _ in solids])
+    pair, found = np.array([[0, 1]], dtype=np.int32), []
+    for library in (sweep_library, narrower):
+        table = Table(2, np.arange(2, dtype=np.int32), 1 - np.eye(2, dtype=np.uint8))
+        for k, solid in enumerate(solids):
+            table.give_solid(k, solid.centre, solid.half, solid.radius, solid.core)
+        sweep.place(table, poses)
+        found.append(library.measure(table, pair, np.inf))
+    (distance, witness), (same, same_witness) = found
+    slow = Narrow(solids, poses).distance(0, 1)
+    assert distance == pytest.approx(slow, abs=1e-8) or (np.isnan(distance) and abs(slow) < 1e-4)
+    np.testing.assert_array_equal(distance, same)
+    np.testing.assert_array_equal(witness, same_witness)

@@ -162,9 +162,9 @@ static double measured(const Table *t, int64_t i, int64_t j, double limit, doubl
 EXPORT void measure(
     Table *t, const int32_t *pairs, int64_t n, double limit, double *distances, double *witnesses) {
   for (int64_t k = 0; k < n; k++) {
-    const int64_t i = pairs[2 * k], j = pairs[2 * k + 1], bodies = t->count * i + j + 1;
-    Memory *known = t->memory + ((uint64_t)bodies * 0x9E3779B97F4A7C15u >> (64 - MEMORY_BITS));
-    if (known->pair == bodies && known->travel_i == t->travel[i] && known->travel_j == t->travel[j]) {
+    const int64_t i = pairs[2 * k], j = pairs[2 * k + 1];
+    Memory *known = memory_of(t, i, j);
+    if (is_known(known, t, i, j)) {
       distances[k] = known->distance;
       for (int r = 0; r < 9; r++) witnesses[9 * k + r] = known->witness[r];
       continue;
@@ -174,7 +174,7 @@ EXPORT void measure(
     if (t->bounds && !isnan(distances[k]))
       t->bounds[t->count * i + j] = low + t->travel[i] + t->travel[j];
     if (distances[k] < INFINITY) {
-      *known = (Memory){bodies, t->travel[i], t->travel[j], distances[k]};
+      *known = (Memory){t->count * i + j + 1, t->travel[i], t->travel[j], distances[k]};
       for (int r = 0; r < 9; r++) known->witness[r] = witnesses[9 * k + r];
     }
   }

@@ -11,7 +11,7 @@ PENETRATION = r"""
 #define DEEP_MET 1e-9
 #define DEEP_STUCK 1e-7
 #define MOST_CORNERS 160
-#define MOST_FACES (6 * MOST_CORNERS)
+#define MOST_FACES (2 * MOST_CORNERS)
 /* What is nearer to a plane than this part of the size of both is in it. */
 #define FLAT 1e-13
 
@@ -34,15 +34,14 @@ static int add_corner(Polytope *p, Vector w, Vector a) {
   return p->corners++;
 }
 
-/* Adds a face, its corners counter-clockwise seen from outside; returns 0 if it is a line. */
-static int add_face(Polytope *p, int i, int j, int k) {
+/* Puts a face in a place, its corners counter-clockwise seen from outside; returns 0 if it is a line. */
+static inline int put_face(Polytope *p, int place, int i, int j, int k) {
   const Vector n = cross(plus(p->w[j], -1.0, p->w[i]), plus(p->w[k], -1.0, p->w[i]));
   const double size = sqrt(dot(n, n));
-  if (!(size > 1e-30) || p->faces == MOST_FACES) return 0;
-  const Vector normal = {{n.x[0] / size, n.x[1] / size, n.x[2] / size}};
-  p->face[p->faces] = (Facet){{i, j, k}, 0, normal, dot(normal, p->w[i])};
-  p->beside[i][j] = p->beside[j][k] = p->beside[k][i] = (int16_t)p->faces;
-  p->faces++;
+  if (!(size > 1e-30)) return 0;
+  const Vector normal = plus((Vector){{0.0, 0.0, 0.0}}, 1.0 / size, n);
+  p->face[place] = (Facet){{i, j, k}, 0, normal, dot(normal, p->w[i])};
+  p->beside[i][j] = p->beside[j][k] = p->beside[k][i] = (int16_t)place;
   return 1;
 }
 
@@ -96,11 +95,13 @@ static int begin(Polytope *p, const Pair *pair, const Simplex *s, double size) {
     if (!spread(p, pair, size)) return 0;
   }
   const int turn = above(p, 0, 1, 2, p->w[3]) > 0.0, i = turn, j = !turn;
-  return add_face(p, i, j, 2) && add_face(p, j, i, 3) && add_face(p, 2, j, 3) && add_face(p, i, 2, 3);
+  p->faces = 4;
+  return put_face(p, 0, i, j, 2) && put_face(p, 1, j, i, 3) && put_face(p, 2, 2, j, 3) &&
+         put_face(p, 3, i, 2, 3);
 }
 
 /* Puts a corner above a face, in place of all faces that it sees or is in the plane of; returns 0 where these
-   are not in one piece. */
+   are not in one piece. New faces come where those were, so that there are few to be looked through. */
 static int grow(Polytope *p, int from, Vector w, Vector a, double flat) {
   int16_t waiting[MOST_FACES], gone[MOST_FACES], next[MOST_CORNERS];
   int depth = 0, count = 0, edges = 0, start = 0;
@@ -130,11 +131,13 @@ static int grow(Polytope *p, int from, Vector w, Vector a, double flat) {
   int round = 0;
   for (int i = start; round < edges; round++) {
     const int j = next[i];
-    if (j < 0 || !add_face(p, i, j, tip)) return 0;
+    if (round == count && p->faces == MOST_FACES) return 0;
+    if (round == count) gone[count++] = (int16_t)p->faces++;
+    if (j < 0 || !put_face(p, gone[round], i, j, tip)) return 0;
     i = j;
     if (i == start && round + 1 < edges) return 0;
   }
-  for (int k = 0; k < count; k++) p->face[gone[k]].height = INFINITY;
+  for (; round < count; round++) p->face[gone[round]].height = INFINITY;
   return edges >= 3;
 }
 

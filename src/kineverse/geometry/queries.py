@@ -46,10 +46,11 @@ def within(mirror: Mirror, radius: float, wanted: Flags | None = None) -> Found:
     mirror.ready()
     table = mirror.table
     reach = radius + ACCURACY
-    pairs, lows, distances, witnesses, order = sweep_library.search(table, reach, radius, wanted)
-    if order is None:
-        mirror.measure_rest(pairs, lows, radius, distances, witnesses)
-        order = sweep_library.rank(table, pairs, distances, radius)
+    pairs, lows, distances, witnesses, nearest = sweep_library.search(table, reach, radius, wanted)
+    if nearest is not None:
+        return Found(mirror, *nearest)
+    mirror.measure_rest(pairs, lows, radius, distances, witnesses)
+    order = sweep_library.rank(table, pairs, distances, radius)
     return _found(mirror, pairs, distances, witnesses, order)
 
 

@@ -13,15 +13,26 @@ static inline int comes_before(const Found *a, const Found *b) {
   return a->i != b->i ? a->i < b->i : a->j < b->j;
 }
 
+/* So many are sorted by insertion, before runs of them are merged. */
+#define RUN 8
+
 /* Sorts by merging runs of growing length; `spare` has as much room. Returns where the result is. */
 static Found *sorted(Found *found, Found *spare, int64_t n) {
-  for (int64_t width = 1; width < n; width *= 2) {
+  for (int64_t k = 1; k < n; k++) {
+    const Found one = found[k];
+    int64_t at = k;
+    for (; at % RUN && comes_before(&one, found + at - 1); at--) found[at] = found[at - 1];
+    found[at] = one;
+  }
+  for (int64_t width = RUN; width < n; width *= 2) {
     for (int64_t start = 0; start < n; start += 2 * width) {
       const int64_t middle = start + width < n ? start + width : n;
       const int64_t end = middle + width < n ? middle + width : n;
-      int64_t a = start, b = middle;
-      for (int64_t k = start; k < end; k++)
-        spare[k] = a < middle && (b == end || !comes_before(found + b, found + a)) ? found[a++] : found[b++];
+      int64_t a = start, b = middle, k = start;
+      while (a < middle && b < end)
+        spare[k++] = comes_before(found + b, found + a) ? found[b++] : found[a++];
+      while (a < middle) spare[k++] = found[a++];
+      while (b < end) spare[k++] = found[b++];
     }
     Found *other = found;
     found = spare;
@@ -83,11 +94,13 @@ EXPORT void gather(
   }
 }
 
-/* All of it: what may be within `reach`, measured, and ranked. Returns how many pairs that are, of which the
-   nearest `kept` come in `order`; that is -1 if some are left to coal, or if there is no room. */
+/* All of it: what may be within `reach`, measured, ranked, and the nearest pairs of their bodies in order.
+   Returns how many pairs were measured, and writes how many are `kept`: -1 if some are left to coal, or if
+   there is no room. */
 EXPORT int64_t search(
     Table *t, double reach, double radius, int64_t room, int32_t *pairs, double *lows, double *distances,
-    double *witnesses, int64_t *order, int64_t *kept) {
+    double *witnesses, int64_t *order, int64_t *kept, int32_t *pieces, int32_t *bodies, double *distance,
+    double *witness) {
   const int64_t found = near(t, reach, pairs, lows, room);
   *kept = -1;
   if (found > room) return found;
@@ -95,6 +108,7 @@ EXPORT int64_t search(
   for (int64_t k = 0; k < found; k++)
     if (isnan(distances[k])) return found;
   *kept = rank(t, pairs, found, distances, radius, order);
+  if (*kept > 0) gather(t, pairs, distances, witnesses, order, *kept, pieces, bodies, distance, witness);
   return found;
 }
 """

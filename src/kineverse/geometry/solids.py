@@ -32,7 +32,7 @@ class Hull:
 class Core:
     """What a solid is made of for our own measuring, see :mod:`.support_source`.
 
-    It is the sum of a hull of corners, and about the origin of a box, an ellipsoid, and a ball; or a cone.
+    It is the hull of corners; or the sum of a box, an ellipsoid, and a ball, about the origin; or a cone.
 
     Attributes
     ----------
@@ -44,7 +44,7 @@ class Core:
         (3,) of the ellipsoid, which is a disc if the last is 0 [m].
     corners
         (3, n) in the frame of the solid [m], n a multiple of 8, for which the first one is repeated; n = 0
-        stands for the origin alone.
+        for what is no hull.
     tip
         Of a cone, which is the hull of the tip at (0, 0, tip) and the ellipsoid, a disc, at (0, 0, -tip); 0
         for everything else [m].

@@ -1,12 +1,22 @@
 """C text: how far the cores of convex solids reach in a direction, after the table of :mod:`.sweep_source`.
 
-A *core* is a hull plus a box plus an ellipsoid, all within a radius: a capsule is a line within one, a
+A *core* is a hull, or a box plus an ellipsoid, all within a radius: a capsule is a line within one, a
 cylinder a line plus a disc. A cone is the hull of a disc and its tip. What is asked of two is how far
 {b - a}, all differences of their points, reaches.
 """
 
 SUPPORT = r"""
+/* Corners come in eights, of which the processor takes W at a time; what is found is the same. */
 #define LANES 8
+#if defined(__AVX512F__)
+#define W 8
+#elif defined(__AVX2__)
+#define W 4
+#else
+#define W 2
+#endif
+#define PARTS (LANES / W)
+#define INLINE static inline __attribute__((always_inline))
 
 typedef struct { double x[3]; } Vector;
 
@@ -23,34 +33,84 @@ static inline Vector cross(Vector a, Vector b) {
                    a.x[0] * b.x[1] - a.x[1] * b.x[0]}};
 }
 
-/* The corner that is furthest in a direction; their number is a multiple of LANES, all x before all y. */
-static Vector corner(const double *corners, int64_t n, Vector way) {
-  const double *x = corners, *y = corners + n, *z = corners + 2 * n;
-  const double a = way.x[0], b = way.x[1], c = way.x[2];
-  double best[LANES], at[LANES];
-  for (int l = 0; l < LANES; l++) {
-    best[l] = a * x[l] + b * y[l] + c * z[l];
-    at[l] = l;
+typedef double Lanes __attribute__((vector_size(8 * W)));
+typedef int64_t Numbers __attribute__((vector_size(8 * W)));
+
+/* The largest value of each lane, and where it is. */
+typedef struct {
+  Lanes value;
+  Numbers at;
+} Largest;
+
+static inline Largest larger_of(Largest a, Largest b) {
+  const Numbers more = b.value > a.value;
+  const Numbers value = (more & (Numbers)b.value) | (~more & (Numbers)a.value);
+  return (Largest){(Lanes)value, (more & b.at) | (~more & a.at)};
+}
+
+#ifdef __clang__
+#define PICK(a, ...) __builtin_shufflevector(a, a, __VA_ARGS__)
+#else
+#define PICK(a, ...) __builtin_shuffle(a, (Numbers){__VA_ARGS__})
+#endif
+#define ACROSS(found, ...) \
+  larger_of(found, (Largest){PICK((found).value, __VA_ARGS__), PICK((found).at, __VA_ARGS__)})
+
+/* How far W corners from one on are in a direction. */
+static inline Largest reaches(const double *corners, int64_t n, Vector way, int64_t from) {
+  Lanes x, y, z;
+  memcpy(&x, corners + from, sizeof x);
+  memcpy(&y, corners + n + from, sizeof y);
+  memcpy(&z, corners + 2 * n + from, sizeof z);
+#if W == 8
+  const Numbers lane = {0, 1, 2, 3, 4, 5, 6, 7};
+#elif W == 4
+  const Numbers lane = {0, 1, 2, 3};
+#else
+  const Numbers lane = {0, 1};
+#endif
+  return (Largest){way.x[0] * x + way.x[1] * y + way.x[2] * z, lane + from};
+}
+
+/* The corner that is furthest in a direction; their number is a multiple of LANES, all x before all y. No
+   branch depends on where it is, as nobody could guess which way that goes; and there are two searches, as
+   each step waits for the one before. */
+INLINE Vector corner(const double *corners, int64_t n, Vector way) {
+  Largest found[PARTS], other[PARTS];
+  for (int p = 0; p < PARTS; p++) {
+    found[p] = reaches(corners, n, way, p * W);
+    other[p] = reaches(corners, n, way, n - LANES + p * W);
   }
-  for (int64_t k = LANES; k < n; k += LANES)
-    for (int l = 0; l < LANES; l++) {
-      const double value = a * x[k + l] + b * y[k + l] + c * z[k + l];
-      at[l] = value > best[l] ? (double)(k + l) : at[l];
-      best[l] = value > best[l] ? value : best[l];
+  for (int64_t k = LANES; k < n - LANES; k += 2 * LANES)
+    for (int p = 0; p < PARTS; p++) {
+      found[p] = larger_of(found[p], reaches(corners, n, way, k + p * W));
+      other[p] = larger_of(other[p], reaches(corners, n, way, k + LANES + p * W));
     }
-  int first = 0;
-  for (int l = 1; l < LANES; l++)
-    if (best[l] > best[first] || (best[l] == best[first] && at[l] < at[first])) first = l;
-  const int64_t k = (int64_t)at[first];
-  return (Vector){{x[k], y[k], z[k]}};
+  for (int p = 0; p < PARTS; p++) found[p] = larger_of(found[p], other[p]);
+  for (int half = PARTS / 2; half; half /= 2)
+    for (int p = 0; p < half; p++) found[p] = larger_of(found[p], found[p + half]);
+  Largest best = found[0];
+#if W == 8
+  best = ACROSS(best, 4, 5, 6, 7, 0, 1, 2, 3);
+  best = ACROSS(best, 2, 3, 0, 1, 6, 7, 4, 5);
+  best = ACROSS(best, 1, 0, 3, 2, 5, 4, 7, 6);
+#elif W == 4
+  best = ACROSS(best, 2, 3, 0, 1);
+  best = ACROSS(best, 1, 0, 3, 2);
+#else
+  best = ACROSS(best, 1, 0);
+#endif
+  const int64_t k = best.at[0];
+  return (Vector){{corners[k], corners[n + k], corners[2 * n + k]}};
 }
 
 /* The point of a core that is furthest in a direction. */
 static inline Vector furthest(const Table *t, int64_t piece, Vector way) {
-  const double *edges = t->edges + 3 * piece;
   const int64_t n = t->corner_count[piece];
-  Vector out = n ? corner(t->corners[piece], n, way) : (Vector){{0.0, 0.0, 0.0}};
-  for (int r = 0; r < 3; r++) out.x[r] += way.x[r] > 0.0 ? edges[r] : -edges[r];
+  if (n) return corner(t->corners[piece], n, way);
+  const double *edges = t->edges + 3 * piece;
+  Vector out;
+  for (int r = 0; r < 3; r++) out.x[r] = way.x[r] > 0.0 ? edges[r] : -edges[r];
   const double *radii = t->radii + 3 * piece, tip = t->tip[piece];
   if (tip > 0.0) {
     /* A cone: its tip or the rim. */

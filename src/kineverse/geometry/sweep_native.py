@@ -25,13 +25,16 @@ from .table import Flags, Indices, Table
 
 _ARRAYS = (
     "body", "allowed", "active", "centre", "half", "radius",
-    "poses", "travel", "place", "low", "high", "bounds", "order",
+    "poses", "travel", "place", "low", "high", "bounds", "order", "sorted_boxes",
     "corners", "corner_count", "edges", "radii", "round", "tip", "memory",
 )  # fmt: skip
 
 
-Search: TypeAlias = tuple[Indices, Floats, Floats, Floats, npt.NDArray[np.int64] | None]
-"""Pairs, lower bounds, distances, witnesses, and the order of the nearest ones; until the next question."""
+Gathered: TypeAlias = tuple[Indices, Indices, Floats, Floats]
+"""Pieces (K, 2), their bodies (K, 2), distances (K,) and witnesses (K, 9), in an order."""
+
+Search: TypeAlias = tuple[Indices, Floats, Floats, Floats, Gathered | None]
+"""Pairs, lower bounds, distances, witnesses, until the next question; and the nearest ones, to be kept."""
 
 
 class _Struct(ctypes.Structure):
@@ -94,7 +97,7 @@ class SweepLibrary(SourceLibrary):
 
     def gather(
         self, table: Table, pairs: Indices, distances: Floats, witnesses: Floats, order: npt.NDArray[np.int64]
-    ) -> tuple[Indices, Indices, Floats, Floats]:
+    ) -> Gathered:
         """Do what :func:`.sweep.gather` does; all arrays are contiguous."""
         if self._code is None:
             return sweep.gather(table, pairs, distances, witnesses, order)
@@ -107,7 +110,7 @@ class SweepLibrary(SourceLibrary):
         return pieces, bodies, near, points
 
     def search(self, table: Table, reach: float, radius: float, wanted: Flags | None = None) -> Search:
-        """Do :meth:`near`, :meth:`measure` and, if that leaves nothing to coal, :meth:`rank`.
+        """Do :meth:`near` and :meth:`measure`; if that leaves nothing to coal, :meth:`rank`, :meth:`gather`.
 
         For the pairs of bodies that are wanted, (B, B); for all that are looked at if None.
         """
@@ -126,9 +129,12 @@ class SweepLibrary(SourceLibrary):
         finally:
             native.struct.allowed = looked_at
         kept = native.kept.value
-        order = None if kept < 0 else native.order[:kept]
         pairs, lows, distances, witnesses = native.pairs, native.lows, native.distances, native.witnesses
-        return pairs[:found], lows[:found], distances[:found], witnesses[:found], order
+        if kept < 0:
+            return pairs[:found], lows[:found], distances[:found], witnesses[:found], None
+        pieces, bodies, near, points = native.nearest
+        nearest = pieces[:kept].copy(), bodies[:kept].copy(), near[:kept].copy(), points[:kept].copy()
+        return pairs[:found], lows[:found], distances[:found], witnesses[:found], nearest
 
 
 class _Native:
@@ -159,8 +165,11 @@ class _Native:
         self.distances, self.witnesses = np.empty(count), np.empty((count, 9))
         self.order, self.kept = np.empty(count, dtype=np.int64), ctypes.c_int64()
         self.results = self.pairs.ctypes.data, self.lows.ctypes.data, count
+        pieces, bodies = np.empty((2, count, 2), dtype=np.int32)
+        self.nearest = pieces, bodies, np.empty(count), np.empty((count, 9))
         measured = (array.ctypes.data for array in (self.distances, self.witnesses, self.order))
-        self.everything = count, *self.results[:2], *measured, ctypes.addressof(self.kept)
+        gathered = (array.ctypes.data for array in self.nearest)
+        self.everything = count, *self.results[:2], *measured, ctypes.addressof(self.kept), *gathered
 
 
 def _native(table: Table) -> _Native:
@@ -184,7 +193,7 @@ def _declare(code: Any) -> None:
     code.rank.restype = ctypes.c_int64
     code.gather.argtypes = (*(pointer,) * 5, ctypes.c_int64, *(pointer,) * 4)
     code.gather.restype = None
-    code.search.argtypes = (pointer, *(ctypes.c_double,) * 2, ctypes.c_int64, *(pointer,) * 6)
+    code.search.argtypes = (pointer, *(ctypes.c_double,) * 2, ctypes.c_int64, *(pointer,) * 10)
     code.search.restype = ctypes.c_int64
 
 

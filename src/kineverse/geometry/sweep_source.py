@@ -6,6 +6,7 @@ SWEEP = r"""
 #include <math.h>
 #include <stdint.h>
 #include <stdlib.h>
+#include <string.h>
 
 /* A pair that was measured: the travel of both at that time, and what came out. */
 typedef struct {
@@ -20,6 +21,7 @@ typedef struct {
   const double *centre, *half, *radius;
   double *poses, *travel, *place, *low, *high, *bounds;
   int32_t *order;
+  double *sorted_boxes;
   const double *const *corners;
   const int64_t *corner_count;
   const double *edges, *radii, *round, *tip;
@@ -31,6 +33,16 @@ typedef struct {
 
 #define MEMORY_BITS @BITS@
 #define EXPORT __attribute__((visibility("default")))
+
+/* Where a pair is remembered, unless another one has taken its place. */
+static inline Memory *memory_of(const Table *t, int64_t i, int64_t j) {
+  return t->memory + ((uint64_t)(t->count * i + j + 1) * 0x9E3779B97F4A7C15u >> (64 - MEMORY_BITS));
+}
+
+/* Whether a pair is remembered, and neither has moved since. */
+static inline int is_known(const Memory *m, const Table *t, int64_t i, int64_t j) {
+  return m->pair == t->count * i + j + 1 && m->travel_i == t->travel[i] && m->travel_j == t->travel[j];
+}
 
 static inline double square(double x) { return x * x; }
 
@@ -107,23 +119,24 @@ typedef struct {
   int64_t room, found;
 } Answer;
 
+static inline double square_gap(const double *low, const double *high, const double *from, const double *to) {
+  double gap = 0.0;
+  for (int r = 0; r < 3; r++) gap += square(larger(larger(low[r] - to[r], from[r] - high[r]), 0.0));
+  return gap;
+}
+
+/* Two pieces whose boxes are near each other. */
 static void consider(const Table *t, int64_t one, int64_t other, Answer *answer) {
   if (!t->allowed[t->bodies * t->body[one] + t->body[other]] || !t->active[other]) return;
   const double reach = answer->reach;
-  double gap = 0.0;
-  for (int r = 0; r < 3; r++) {
-    const double here = t->low[3 * one + r] - t->high[3 * other + r];
-    const double there = t->low[3 * other + r] - t->high[3 * one + r];
-    gap += square(larger(larger(here, there), 0.0));
-  }
-  if (gap > reach * reach) return;
   const int64_t i = one < other ? one : other, j = one < other ? other : one;
   double known = -INFINITY;
   if (t->bounds && t->bounds[t->count * i + j] != 0.0) {
     known = t->bounds[t->count * i + j] - (t->travel[i] + t->travel[j]);
     if (known > reach) return;
   }
-  const double low = larger(lower_bound(t, i, j), known);
+  const Memory *memory = memory_of(t, i, j);
+  const double low = is_known(memory, t, i, j) ? memory->distance : larger(lower_bound(t, i, j), known);
   if (low > reach) return;
   if (answer->found < answer->room) {
     answer->pairs[2 * answer->found] = (int32_t)i;
@@ -141,18 +154,30 @@ static void considered_standing(const Table *t, int64_t one, Answer *answer) {
   while (depth) {
     const int64_t node = waiting[--depth];
     const double *box = t->boxes + 6 * node;
-    double gap = 0.0;
-    for (int r = 0; r < 3; r++)
-      gap += square(larger(larger(low[r] - box[3 + r], box[r] - high[r]), 0.0));
-    if (gap > reach * reach) continue;
+    if (square_gap(low, high, box, box + 3) > reach * reach) continue;
     if (node < t->leaf_count - 1) {
       waiting[depth++] = 2 * node + 1;
       waiting[depth++] = 2 * node + 2;
       continue;
     }
     const int32_t *leaf = t->leaves + 4 * (node - t->leaf_count + 1);
-    for (int k = 0; k < 4 && leaf[k] >= 0; k++) consider(t, one, leaf[k], answer);
+    for (int k = 0; k < 4 && leaf[k] >= 0; k++)
+      if (square_gap(low, high, t->low + 3 * leaf[k], t->high + 3 * leaf[k]) <= reach * reach)
+        consider(t, one, leaf[k], answer);
   }
+}
+
+/* Writes the square gaps between the box of one of the moving pieces, in their order, and those of others. */
+static void square_gaps(const Table *t, int64_t one, int64_t first, int64_t end) {
+  const int64_t n = t->moving;
+  const double *low = t->sorted_boxes, *high = low + 3 * n;
+  double *gap = t->sorted_boxes + 6 * n;
+  const double a[3] = {low[one], low[n + one], low[2 * n + one]};
+  const double b[3] = {high[one], high[n + one], high[2 * n + one]};
+  for (int64_t k = first; k < end; k++)
+    gap[k] = square(larger(larger(a[0] - high[k], low[k] - b[0]), 0.0)) +
+             square(larger(larger(a[1] - high[n + k], low[n + k] - b[1]), 0.0)) +
+             square(larger(larger(a[2] - high[2 * n + k], low[2 * n + k] - b[2]), 0.0));
 }
 
 /* Returns how many pairs there are; only the first `room` of them are written. Of two moving pieces, the one
@@ -160,13 +185,22 @@ static void considered_standing(const Table *t, int64_t one, Answer *answer) {
 EXPORT int64_t near(Table *t, double reach, int32_t *pairs, double *lows, int64_t room) {
   sort(t, t->order, t->moving);
   Answer answer = {reach, pairs, lows, room, 0};
-  for (int64_t k = 0; k < t->moving; k++) {
+  const int64_t n = t->moving;
+  double *low = t->sorted_boxes, *high = low + 3 * n, *gap = low + 6 * n;
+  for (int64_t k = 0; k < n; k++)
+    for (int r = 0; r < 3; r++) {
+      low[r * n + k] = t->low[3 * t->order[k] + r];
+      high[r * n + k] = t->high[3 * t->order[k] + r];
+    }
+  for (int64_t k = 0; k < n; k++) {
     const int32_t one = t->order[k];
     if (!t->active[one]) continue;
-    const double end = t->high[3 * one + t->axis] + reach;
-    for (int64_t m = k + 1; m < t->moving && t->low[3 * t->order[m] + t->axis] <= end; m++)
-      consider(t, one, t->order[m], &answer);
-    if (t->moving < t->count) considered_standing(t, one, &answer);
+    int64_t end = k + 1;
+    while (end < n && low[t->axis * n + end] <= high[t->axis * n + k] + reach) end++;
+    square_gaps(t, k, k + 1, end);
+    for (int64_t m = k + 1; m < end; m++)
+      if (gap[m] <= reach * reach) consider(t, one, t->order[m], &answer);
+    if (n < t->count) considered_standing(t, one, &answer);
   }
   return answer.found;
 }

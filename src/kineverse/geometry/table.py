@@ -58,6 +58,8 @@ class Table:
         What C measured last, of each pair that has not given way to another one.
     order
         (M,) the moving pieces sorted along ``axis`` when that was last done, and then the others.
+    sorted_boxes
+        Room for C: the corners of the boxes of the moving pieces in that order, and a row of gaps.
     standing_changed
         Whether any of the others was put somewhere since somebody took notice.
     bounds
@@ -85,6 +87,7 @@ class Table:
     tip: Floats = field(init=False)
     memory: npt.NDArray[np.void] = field(init=False)
     order: Indices = field(init=False)
+    sorted_boxes: Floats = field(init=False)
     bounds: Floats | None = field(init=False)
     axis: int = 0
     native: Any = None
@@ -101,6 +104,7 @@ class Table:
         self.edges, self.radii, self.round = np.zeros((count, 3)), np.zeros((count, 3)), np.zeros(count)
         self.tip, self.memory = np.zeros(count), np.zeros(REMEMBERED, dtype=_MEMORY)
         self.order = np.arange(count, dtype=np.int32)
+        self.sorted_boxes = np.empty((7, self.moving))
         self.bounds = np.zeros((count, count)) if count <= MOST_CARRIED else None
 
     @property
