@@ -118,6 +118,10 @@ MESSAGES: dict[str, tuple[Callable[[kv.Model], Any], str]] = {
         lambda _: kv.reasoning.interlock_,
         "The package kineverse.reasoning has no 'interlock_'. Did you mean 'Interlock' or 'interlocks' or 'Interval'?",
     ),
+    "a name of a package that is an extra": (
+        lambda _: kv.geometry.Scen,
+        "The package kineverse.geometry has no 'Scen'. Did you mean 'Scene'?",
+    ),
     "values without keywords": (
         lambda _: kv.Revolute("d", "world", "d"),
         f"Revolute is made with keywords, and 'd' has none. {REVOLUTE}",
