@@ -13,7 +13,7 @@ import kineverse as kv
 a = kv.position("a")
 MODEL = kv.Model()
 with MODEL.edit() as _edit:
-    _edit.constrain("c", 0, a, 1)
+    _edit.constrain("c", 5, a, 6)
 COMPILED = kv.compile(2 * a, tier="interpreter")
 
 TAKERS = {
@@ -23,7 +23,7 @@ TAKERS = {
     "updated": lambda x: kv.State({a: 0}).updated({a: x})[a],
     "extended": lambda x: kv.State().extended({a: x})[a],
     "parameter": lambda x: kv.parameter("p", x).value,
-    "violations": lambda x: MODEL.violations({"a": x}, tolerance=-2)[0].value,
+    "violations": lambda x: MODEL.violations({"a": x})[0].value,
 }
 
 NO_NUMBERS = [
