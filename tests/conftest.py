@@ -13,6 +13,7 @@ import gc
 import importlib.util
 import os
 import shutil
+import sys
 import tempfile
 from collections import Counter
 from collections.abc import Generator
@@ -21,9 +22,10 @@ from pathlib import Path
 import pytest
 from hypothesis import settings
 
-from attempts import USUAL
+from hypothesis_profiles import USUAL
 
 ROOT = Path(__file__).parents[1]
+sys.path.append(str(ROOT / "examples"))  # living_kitchen
 SHARED = ROOT.parent / "shared" / "data"
 BROWSERS = ("chromium", "chromium-browser", "google-chrome")
 
@@ -101,11 +103,11 @@ def _cause(report: pytest.TestReport) -> str:
 @pytest.fixture(scope="session", autouse=True)
 def _models_are_remembered() -> Generator[None]:
     """What one test has loaded is there for the next one: linkages take seconds to be closed."""
-    from kineverse.formats import loading
+    from kineverse.formats import loader
 
-    before, loading.MOST_REMEMBERED = loading.MOST_REMEMBERED, 100
+    before, loader.MOST_REMEMBERED = loader.MOST_REMEMBERED, 100
     yield
-    loading.MOST_REMEMBERED = before
+    loader.MOST_REMEMBERED = before
 
 
 @pytest.fixture(scope="session")

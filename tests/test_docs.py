@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from examples import ROOT, agree, examples, run
+from markdown_examples import ROOT, agree, examples, run
 
 PAGES = [ROOT / name for name in ("README.md", "CONTRIBUTING.md", "CHANGELOG.md")]
 PAGES += sorted((ROOT / "docs").glob("*.md"))

@@ -18,9 +18,9 @@ from pathlib import Path
 
 import pytest
 
-from examples import ROOT, agree, examples
 from kineverse.cli import main
-from kineverse.cli.main import COMMANDS, parser
+from kineverse.cli.main import COMMANDS, make_parser
+from markdown_examples import ROOT, agree, examples
 
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]
 IN_CONSOLES = [page for page in PAGES if any(examples(page, "console"))]
@@ -64,7 +64,7 @@ def at_the_root(tmp_path, monkeypatch):
 def pages(monkeypatch):
     """Fetch each page that is opened, instead of waiting until somebody has seen enough."""
     viewer = pytest.importorskip("kineverse.view.viewer")
-    living = pytest.importorskip("kineverse.view.living.page")
+    living = pytest.importorskip("living_kitchen.page")
     answers = []
 
     def fetch(page):
@@ -116,7 +116,7 @@ def test_the_demo_is_opened_and_answers(at_the_root, pages, capsys):
 
 def test_the_helps_show_commands_that_can_be_said(capsys):
     """Each line that begins with ``kineverse`` below a heading "examples"."""
-    shown = [parser().format_help()]
+    shown = [make_parser().format_help()]
     for name in COMMANDS:
         assert main([name, "--help"]) == 0
         shown.append(capsys.readouterr().out)
@@ -157,4 +157,4 @@ def test_targets_extras_and_tests_that_pages_name_exist(page):
 def _parsed(command: str) -> None:
     words = shlex.split(re.split(r"\s{3,}| [|>]", command)[0])[1:]
     with suppress(SystemExit) if "--help" in words else nullcontext():
-        parser().parse_args(words)
+        make_parser().parse_args(words)

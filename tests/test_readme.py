@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import tomllib
 
-from examples import ROOT, examples
+from markdown_examples import ROOT, examples
 
 README = ROOT / "README.md"
 

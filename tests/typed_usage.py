@@ -37,14 +37,14 @@ kv.Prismatic(
     name="d", parent="world", child="d", axis=np.array([0.0, 0.0, 1.0]), origin=kv.translation(1, 0, 0)
 )
 kv.Planar(name="d", parent="world", child="d", axis=(0, 0, 1), origin=np.eye(4).tolist())
-kv.Universal(name="d", parent="world", child="d", first=[0, 0, 1], second=[0, 1, 0])
+kv.articulations.Universal(name="d", parent="world", child="d", first=[0, 0, 1], second=[0, 1, 0])
 kv.quaternion([0, 0, 0, 1])
 kv.quaternion(np.array([0, 0, 0, 1.0]))
 kv.rpy((0.1, 0.2, 0.3))
-kv.point([1, 2, 3])
+kv.spatial.point([1, 2, 3])
 kv.axis_angle([0, 0, 1], a)
 kv.axis_angle(np.array([0, 0, 1.0]), 0.3)
 kv.translation([1, 2, 3])
 kv.transform(np.eye(3), [1, 2, 3])
-with contextlib.suppress(kv.ValueRejectedError):
+with contextlib.suppress(kv.errors.InvalidValueError):
     kv.Revolute(name="d", parent="world", child="d", axis=3.0)  # type: ignore[arg-type]

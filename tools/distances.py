@@ -20,12 +20,12 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from kineverse.geometry import sweep
-from kineverse.geometry.narrow import Narrow
-from kineverse.geometry.reach import gaps
-from kineverse.geometry.solids import Solid, solid_of, solid_of_hull
-from kineverse.geometry.sweep_native import sweep_library
-from kineverse.geometry.table import Table
+from kineverse.geometry import broadphase
+from kineverse.geometry.bindings import collision_library
+from kineverse.geometry.broadphase import ObjectTable
+from kineverse.geometry.narrowphase import Narrowphase
+from kineverse.geometry.shapes import Solid, solid_from_geometry, solid_from_points
+from kineverse.geometry.support import directional_gaps
 from kineverse.model.body import Box, Capsule, Cone, Cylinder, Ellipsoid, Sphere
 
 Floats = npt.NDArray[np.float64]
@@ -59,8 +59,8 @@ def random_solid(kind: str, case: str, rng: np.random.Generator) -> Solid:
     size = 1e-3 if case == "small" else 1.0
     x, y, z = (size * rng.uniform(0.1, 1.2, 3)).tolist()
     if kind == "hull":
-        return solid_of_hull(size * rng.normal(size=(9, 3)) * HULLS.get(case, HULLS["any"])(rng))
-    return solid_of(
+        return solid_from_points(size * rng.normal(size=(9, 3)) * HULLS.get(case, HULLS["any"])(rng))
+    return solid_from_geometry(
         {
             "box": Box((x, y, z)),
             "sphere": Sphere(x),
@@ -85,18 +85,18 @@ def random_poses(case: str, rng: np.random.Generator) -> Floats:
 
 def by_coal(solids: list[Solid], poses: Floats) -> tuple[float, Floats]:
     """Return the distance and the normal by coal, and what mends it."""
-    narrow = Narrow(solids, poses)
+    narrow = Narrowphase(solids, poses)
     distance = narrow.distance(0, 1)
     return distance, narrow.witness()[2]
 
 
 def by_c(solids: list[Solid], poses: Floats) -> tuple[float, Floats]:
     """Return the distance and the normal by C; NaN for what is left to coal."""
-    table = Table(2, np.arange(2, dtype=np.int32), 1 - np.eye(2, dtype=np.uint8))
+    table = ObjectTable(2, np.arange(2, dtype=np.int32), 1 - np.eye(2, dtype=np.uint8))
     for k, solid in enumerate(solids):
         table.give_solid(k, solid.centre, solid.half, solid.radius, solid.core)
-    sweep.place(table, poses)
-    distances, witnesses = sweep_library.measure(table, np.array([[0, 1]], dtype=np.int32), np.inf)
+    broadphase.place_objects(table, poses)
+    distances, witnesses = collision_library.measure(table, np.array([[0, 1]], dtype=np.int32), np.inf)
     return float(distances[0]), witnesses[0, 6:]
 
 
@@ -122,7 +122,7 @@ def check(kinds: tuple[str, str], case: str, pairs: int, seed: int) -> dict[str,
             count.apart += distance > 0.0
             count.inside += distance <= 0.0
             placed = [(s, pose[:, :3], pose[:, 3]) for s, pose in zip(solids, poses, strict=True)]
-            shown[name] = float(gaps(placed[0], placed[1], normal[None])[0])
+            shown[name] = float(directional_gaps(placed[0], placed[1], normal[None])[0])
         widest = max(shown.values())
         for name, gap in shown.items():
             error = max(abs(gap - answers[name][0]), widest - gap)
@@ -141,7 +141,7 @@ def main() -> int:
     given = parser.parse_args()
     if len(given.kinds) not in (0, 2):
         parser.error("two kinds make a pair")
-    if not sweep_library.prepare(wait=True):
+    if not collision_library.prepare(wait=True):
         parser.error("this needs a C compiler")
     chosen = [tuple(given.kinds)] if given.kinds else list(itertools.combinations_with_replacement(KINDS, 2))
     off = 0

@@ -1,4 +1,4 @@
-"""Every error the library raises on purpose.
+"""Exceptions of the library and the parts of their messages.
 
 All of them derive from :class:`KineverseError`, so one ``except`` catches whatever Kineverse has to say; each
 also derives from the built-in error a Python programmer would expect (``KeyError``, ``ValueError`` ...).
@@ -23,7 +23,7 @@ class UnknownNameError(KineverseError, KeyError):
     """A frame, symbol, constraint, tag or model of that name does not exist."""
 
 
-class NameTakenError(KineverseError, ValueError):
+class DuplicateNameError(KineverseError, ValueError):
     """The name is in use already; names, tags and constraints are unique."""
 
 
@@ -31,7 +31,7 @@ class ShapeError(KineverseError, ValueError):
     """Operands, arrays or matrices have shapes that do not fit."""
 
 
-class ValueRejectedError(KineverseError, ValueError):
+class InvalidValueError(KineverseError, ValueError):
     """A number is not acceptable here: NaN, an empty range, a zero axis ..."""
 
 
@@ -43,7 +43,7 @@ class CompileError(KineverseError, RuntimeError):
     """Expressions could not be turned into a function."""
 
 
-class UnsolvedError(KineverseError, ValueError):
+class NoSolutionError(KineverseError, ValueError):
     """A closed loop, or another implicit function, has no solution at the values given."""
 
 
@@ -73,13 +73,13 @@ class FormatError(KineverseError, ValueError):
     """A file or document cannot be read as what it claims to be."""
 
 
-class MissingExtraError(KineverseError, ImportError):
+class MissingDependencyError(KineverseError, ImportError):
     """An optional dependency is not installed; the message names the extra that brings it."""
 
 
-def given_twice(symbol: object) -> NameTakenError:
+def duplicate_value_error(symbol: object) -> DuplicateNameError:
     """Return the error for a symbol with one value by symbol and another by name."""
-    return NameTakenError(
+    return DuplicateNameError(
         f"There are two values for '{symbol}', by symbol and by name. "
         f"Instead of {{**state, '{symbol}': ...}} write state.updated({{'{symbol}': ...}})."
     )
@@ -110,10 +110,10 @@ def suggest(name: str, available: Iterable[str], what: str = "name", limit: int 
     parts = (n for n in names if n.endswith(f"/{name}") or n.startswith((f"{name}/", f"{name}:")))
     close += [n for n in parts if n not in close][: max(0, 4 - len(close))]
     if close:
-        return f"Did you mean {' or '.join(_shown(repr(n)) for n in close)}?"
+        return f"Did you mean {' or '.join(_shorten(repr(n)) for n in close)}?"
     more = f" and {len(names) - limit} more" if len(names) > limit else ""
-    return f"Available: {', '.join(map(_shown, names[:limit]))}{more}."
+    return f"Available: {', '.join(map(_shorten, names[:limit]))}{more}."
 
 
-def _shown(name: str) -> str:
+def _shorten(name: str) -> str:
     return name if len(name) <= _LONGEST else f"{name[: _LONGEST - 1]}…"

@@ -31,7 +31,7 @@ from typing import ClassVar
 
 import casadi as ca
 
-from .errors import ExpressionError, ValueRejectedError
+from .errors import ExpressionError, InvalidValueError
 from .expressions.expression import Expression, ExpressionLike, as_expression, binary, broadcast
 from .expressions.functions import absolute, tanh
 from .expressions.node import Node
@@ -51,7 +51,7 @@ def less(a: ExpressionLike, b: ExpressionLike, contrast: float = CONTRAST) -> Ex
         R, per unit: the value changes within about 1/R around equality.
     """
     if not isinstance(contrast, Real) or not 0 < contrast < math.inf:
-        raise ValueRejectedError(f"The contrast is a positive number, not {contrast!r}.")
+        raise InvalidValueError(f"The contrast is a positive number, not {contrast!r}.")
     x, y = broadcast(as_expression(a), as_expression(b))
     return Less.of((x, y), x.shape, (float(contrast),))
 
@@ -64,15 +64,15 @@ def logic_not(a: ExpressionLike) -> Expression:
 
 def logic_and(*operands: ExpressionLike) -> Expression:
     """Return the truth of "all of them"; also ``a & b``."""
-    return _joined(And, operands)
+    return _join(And, operands)
 
 
 def logic_or(*operands: ExpressionLike) -> Expression:
     """Return the truth of "at least one of them"; also ``a | b``."""
-    return _joined(Or, operands)
+    return _join(Or, operands)
 
 
-def _joined(kind: type[_Joined], operands: tuple[ExpressionLike, ...]) -> Expression:
+def _join(kind: type[_Joined], operands: tuple[ExpressionLike, ...]) -> Expression:
     if not operands:
         raise ExpressionError(f"'{kind.kind}' needs at least one operand.")
     flat: list[Expression] = []

@@ -1,4 +1,8 @@
-"""Positions, rotations and rigid motions as expressions.
+"""Rotations, rigid transforms and twists (SO(3), SE(3)) as expressions.
+
+An :class:`OneAxisTransform` is a 4×4 expression like any other. But it remembers direction and amount, which is all
+that kinematics wants of it, and builds its matrix when somebody looks at it. A robot has dozens of them and
+most questions are about a few.
 
 ``a_T_b`` is the 4×4 homogeneous transform that maps coordinates in frame b to coordinates in frame a, so
 ``a_T_c = a_T_b @ b_T_c``. Rotations are right-handed, angles in [rad], lengths in [m], quaternions in the
@@ -10,18 +14,202 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
 import casadi as ca
 import numpy as np
 import numpy.typing as npt
 
-from .errors import ShapeError, ValueRejectedError
-from .expressions.expression import Expression, ExpressionLike, array, as_expression, make, union, watcher_of
+from .errors import InvalidValueError, ShapeError
+from .expressions.expression import (
+    Expression,
+    ExpressionLike,
+    access_listener,
+    array,
+    as_expression,
+    from_casadi,
+    union_nodes,
+)
 from .expressions.functions import arctan2, cos, norm, sin, sqrt, where
-from .motions import X, Y, Z, turn
+from .expressions.layout import SX
 
-Vector: TypeAlias = ExpressionLike
+Direction = tuple[float, float, float]
+
+X, Y, Z = (1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)
+
+# Which entries a rotation about an axis has, column by column, and what they are: cos, sin, -sin or 1. Built
+# sparse, because element by element each would cost ten times as much.
+_ROTATION_ENTRIES = {
+    X: ([0, 1, 2, 1, 2], [0, 1, 1, 2, 2], (3, 0, 1, 2, 0)),
+    Y: ([0, 2, 1, 0, 2], [0, 0, 1, 2, 2], (0, 2, 3, 1, 0)),
+    Z: ([0, 1, 0, 1, 2], [0, 0, 1, 1, 2], (0, 1, 2, 0, 3)),
+}
+_ROTATION_SPARSITIES = {
+    axis: ca.Sparsity.triplet(3, 3, rows, columns) for axis, (rows, columns, _) in _ROTATION_ENTRIES.items()
+}
+_TRANSFORM_SPARSITIES = {
+    axis: ca.Sparsity.triplet(4, 4, [*rows, 3], [*columns, 3])
+    for axis, (rows, columns, _) in _ROTATION_ENTRIES.items()
+}
+_TRANSLATION_SPARSITY = ca.Sparsity.triplet(4, 4, [0, 1, 2, 0, 1, 2, 3], [0, 1, 2, 3, 3, 3, 3])
+_UNIT_ENTRY = ca.SX(1)
+_UNIT_TOLERANCE = 1e-9
+"""How far the length of a direction may be from 1."""
+
+
+class OneAxisTransform(Expression):
+    """A 4×4 transform: a rotation about a coordinate axis or a translation along any direction.
+
+    Attributes
+    ----------
+    direction
+        A constant unit vector; of a rotation, one of the three coordinate axes.
+    amount
+        A scalar, [rad] or [m].
+    turns
+        Whether it is a rotation.
+    """
+
+    __slots__ = ("amount", "direction", "turns")
+
+    direction: Direction
+    amount: Expression
+    turns: bool
+
+    def __new__(cls, direction: Direction, amount: ExpressionLike, turns: bool) -> OneAxisTransform:
+        """Return the motion; :func:`rotation_about` and :func:`translation_along` are the ways to get one."""
+        self = object.__new__(cls)
+        self.direction, self.amount, self.turns = direction, as_expression(amount), turns
+        if self.amount.shape:
+            what = "An angle" if turns else "A distance"
+            raise ShapeError(f"{what} is a scalar, not of shape {self.amount.shape}.")
+        self._describe((4, 4), self.amount._nodes)
+        return self
+
+    def __getattr__(self, name: str) -> Any:
+        # Called for what is not there: the graph, before it is looked at for the first time.
+        if name != "_sx":
+            return super().__getattr__(name)  # type: ignore[misc]
+        if self.turns:
+            graph = ca.SX(_TRANSFORM_SPARSITIES[self.direction], ca.vertcat(*self._entries(), _UNIT_ENTRY))
+        else:
+            graph = ca.SX(
+                _TRANSLATION_SPARSITY,
+                ca.vertcat(_UNIT_ENTRY, _UNIT_ENTRY, _UNIT_ENTRY, self.offset, _UNIT_ENTRY),
+            )
+        self._sx = graph
+        return graph
+
+    @property
+    def rotation(self) -> SX:
+        """The 3×3 rotation of a motion that turns."""
+        return ca.SX(_ROTATION_SPARSITIES[self.direction], ca.vertcat(*self._entries()))
+
+    @property
+    def offset(self) -> SX:
+        """The translation of a motion that does not turn, 3×1."""
+        sx = self.amount._sx
+        return ca.vertcat(*(sx if d == 1 else ca.SX(d) if d == 0 else d * sx for d in self.direction))
+
+    def _entries(self) -> list[SX]:
+        angle = self.amount._sx
+        sine = ca.SX.unary(ca.OP_SIN, angle)
+        entries = (ca.SX.unary(ca.OP_COS, angle), sine, ca.SX.unary(ca.OP_NEG, sine), _UNIT_ENTRY)
+        return [entries[i] for i in _ROTATION_ENTRIES[self.direction][2]]
+
+    @property
+    def is_constant(self) -> bool:
+        """Whether the amount is constant."""
+        return self.amount.is_constant
+
+    def __reduce__(self) -> Any:
+        return OneAxisTransform, (self.direction, self.amount, self.turns)
+
+
+def rotation_about(axis: Direction, angle: ExpressionLike) -> OneAxisTransform:
+    """Return the 4×4 rotation about the coordinate axis X, Y or Z by ``angle`` [rad]."""
+    return OneAxisTransform(axis, angle, True)
+
+
+def translation_along(direction: Direction, distance: ExpressionLike) -> OneAxisTransform:
+    """Return the 4×4 translation along a constant unit vector by ``distance`` [m]."""
+    return OneAxisTransform(direction, distance, False)
+
+
+def as_one_axis_transform(transform: Expression) -> Expression:
+    """Return a 4×4 transform as the motion that its matrix is, if it is one; else as it is.
+
+    So a motion is the same to kinematics however it was written down, and after it was sent as a matrix.
+    """
+    if isinstance(transform, OneAxisTransform):
+        # Along a skew line, factors of the amount and those of the direction are one in the matrix.
+        is_skew = not transform.turns and sum(d != 0 for d in transform.direction) > 1
+        return transform if not is_skew else _as_translation(transform)
+    sparsity = transform._sx.sparsity()
+    if sparsity == _TRANSLATION_SPARSITY:
+        return _as_translation(transform)
+    for axis, pattern in _TRANSFORM_SPARSITIES.items():
+        if sparsity == pattern:
+            return _as_rotation(transform, axis)
+    return transform
+
+
+def _as_rotation(transform: Expression, axis: Direction) -> Expression:
+    *entries, one = transform._sx.nonzeros()
+    sine = entries[_ROTATION_ENTRIES[axis][2].index(1)]
+    if sine.op() != ca.OP_SIN or not one.is_one():
+        return transform
+    motion = rotation_about(axis, from_casadi(sine.dep(0), (), transform._nodes))
+    same = zip(entries, motion._entries(), strict=True)
+    return motion if all(ca.is_equal(a, b, 2) for a, b in same) else transform
+
+
+def _as_translation(transform: Expression) -> Expression:
+    nonzeros = transform._sx.nonzeros()
+    parts = nonzeros[3:6]
+    moving = [k for k, part in enumerate(parts) if not part.is_constant()]
+    if not moving or not all(e.is_one() for e in (*nonzeros[:3], nonzeros[6])):
+        return transform
+    if any(not part.is_zero() for k, part in enumerate(parts) if k not in moving):
+        return transform
+    if len(moving) == 1:
+        axis = (X, Y, Z)[moving[0]]
+        return translation_along(axis, from_casadi(parts[moving[0]], (), transform._nodes))
+    direction, amount = [0.0, 0.0, 0.0], None
+    for k in moving:
+        factor, rest = _split_factor(parts[k])
+        if amount is not None and not ca.is_equal(amount, rest, 1):
+            return _without_axis(transform)
+        direction[k], amount = factor, rest
+    motion = translation_along(
+        (direction[0], direction[1], direction[2]), from_casadi(amount, (), transform._nodes)
+    )
+    is_same = all(ca.is_equal(a, b, 2) for a, b in zip(parts, motion.offset.nonzeros(), strict=True))
+    return (
+        motion if is_same and abs(math.hypot(*direction) - 1) <= _UNIT_TOLERANCE else _without_axis(transform)
+    )
+
+
+def _split_factor(part: SX) -> tuple[float, SX]:
+    """Return a scalar as a number and what it is a multiple of."""
+    if part.op() == ca.OP_NEG:
+        factor, rest = _split_factor(part.dep(0))
+        return -factor, rest
+    if part.op() == ca.OP_MUL:
+        for k in (0, 1):
+            if part.dep(k).is_constant():
+                return float(part.dep(k)), part.dep(1 - k)
+    return 1.0, part
+
+
+def _without_axis(transform: Expression) -> Expression:
+    """Return a transform without what it knows beside its matrix."""
+    if not isinstance(transform, OneAxisTransform):
+        return transform
+    return from_casadi(transform._sx, transform.shape, transform._nodes)
+
+
+VectorLike: TypeAlias = ExpressionLike
 
 
 def translation(
@@ -33,15 +221,15 @@ def translation(
     """
     first = as_expression(x)
     if first.shape and y is None and z is None:
-        parts = _taken_apart("A translation", ("x", "y", "z"), (first,))
+        parts = _components("A translation", ("x", "y", "z"), (first,))
     else:
         others = (0.0 if y is None else y, 0.0 if z is None else z)
-        parts = _taken_apart("A translation", ("x", "y", "z"), (first, *others))
+        parts = _components("A translation", ("x", "y", "z"), (first, *others))
     column = ca.vertcat(_ONE, _ONE, _ONE, *(p._sx for p in parts), _ONE)
-    return make(ca.SX(_TRANSLATION, column), (4, 4), union(parts))
+    return from_casadi(ca.SX(_TRANSLATION, column), (4, 4), union_nodes(parts))
 
 
-def _taken_apart(
+def _components(
     what: str, names: tuple[str, ...], given: tuple[ExpressionLike | None, ...]
 ) -> tuple[Expression, ...]:
     """Return the numbers that are given one by one, or as one vector alone.
@@ -75,28 +263,28 @@ _TRANSLATION = ca.Sparsity.triplet(4, 4, [0, 1, 2, 0, 1, 2, 3], [0, 1, 2, 3, 3, 
 
 def rotation_x(angle: ExpressionLike) -> Expression:
     """Return the 4×4 rotation by ``angle`` [rad] about x."""
-    return turn(X, angle)
+    return rotation_about(X, angle)
 
 
 def rotation_y(angle: ExpressionLike) -> Expression:
     """Return the 4×4 rotation by ``angle`` [rad] about y."""
-    return turn(Y, angle)
+    return rotation_about(Y, angle)
 
 
 def rotation_z(angle: ExpressionLike) -> Expression:
     """Return the 4×4 rotation by ``angle`` [rad] about z."""
-    return turn(Z, angle)
+    return rotation_about(Z, angle)
 
 
-def axis_angle(axis: Vector, angle: ExpressionLike) -> Expression:
+def axis_angle(axis: VectorLike, angle: ExpressionLike) -> Expression:
     """Return the 4×4 rotation by ``angle`` [rad] about ``axis`` (Rodrigues).
 
     Raises
     ------
-    ValueRejectedError
+    InvalidValueError
         For a constant axis of length zero.
     """
-    x, y, z = unit(axis, "The axis of a rotation")
+    x, y, z = unit_vector(axis, "The axis of a rotation")
     c, s = cos(angle), sin(angle)
     t = 1 - c
     return array(
@@ -117,11 +305,11 @@ def rpy(
     The three are given one by one, or as one vector of shape (3,) alone.
     """
     names = ("roll", "pitch", "yaw")
-    about_x, about_y, about_z = _taken_apart("A rotation by roll, pitch and yaw", names, (roll, pitch, yaw))
+    about_x, about_y, about_z = _components("A rotation by roll, pitch and yaw", names, (roll, pitch, yaw))
     return rotation_z(about_z) @ rotation_y(about_y) @ rotation_x(about_x)
 
 
-def rpy_of(a_R_b: ExpressionLike) -> Expression:
+def to_rpy(a_R_b: ExpressionLike) -> Expression:
     """Return roll, pitch and yaw [rad], shape (3,), of a rotation or transform; pitch in [-π/2, π/2].
 
     At pitch ±π/2 roll and yaw are not defined apart: any yaw is given, and the roll that goes with it. The
@@ -154,18 +342,18 @@ def quaternion(
     ------
     ShapeError
         For more or fewer than four.
-    ValueRejectedError
+    InvalidValueError
         For a constant quaternion of length zero, or infinite.
     """
-    q = array(list(_taken_apart("A quaternion", ("x", "y", "z", "w"), (x, y, z, w))))
-    watcher = watcher_of(q)
+    q = array(list(_components("A quaternion", ("x", "y", "z", "w"), (x, y, z, w))))
+    watcher = access_listener(q)
     if watcher is not None:
         anew: Expression = watcher.ask("quaternion", q)
         return anew
     if not q.symbols:
         largest = float(np.abs(q()).max())
         if not 0 < largest < math.inf:
-            raise ValueRejectedError(
+            raise InvalidValueError(
                 f"A quaternion of length {'zero' if not largest else 'infinity'} has no direction."
             )
         # By a power of two, which changes no digit, or the square of something tiny is nothing.
@@ -182,7 +370,7 @@ def quaternion(
     )
 
 
-def quaternion_of(a_R_b: ExpressionLike) -> Expression:
+def to_quaternion(a_R_b: ExpressionLike) -> Expression:
     """Return the unit quaternion (x, y, z, w) with w >= 0, shape (4,), of a rotation or transform.
 
     Of the four formulas the one with the largest divisor is selected, so value and derivative are finite for
@@ -208,12 +396,12 @@ def quaternion_of(a_R_b: ExpressionLike) -> Expression:
     return where(_greater(0, q[3]), -q, q)
 
 
-def rotation_vector(a_R_b: ExpressionLike) -> Expression:
+def log_so3(a_R_b: ExpressionLike) -> Expression:
     """Return the logarithm of a rotation or transform: axis times angle in [0, π] [rad], shape (3,).
 
     Value and derivative are finite for every rotation, at 0 and at π as well.
     """
-    q = quaternion_of(a_R_b)
+    q = to_quaternion(a_R_b)
     v, w = q[:3], q[3]
     squared = v @ v
     # 2·atan2(√s, w)/√s, by its series in s/w² where s is small; the series is in no danger as w is near 1
@@ -227,19 +415,19 @@ def rotation_vector(a_R_b: ExpressionLike) -> Expression:
 
 def rotation_angle(a_R_b: ExpressionLike) -> Expression:
     """Return the angle of a rotation or transform, in [0, π] [rad]; its gradient at 0 is 0."""
-    return norm(rotation_vector(a_R_b))
+    return norm(log_so3(a_R_b))
 
 
-def exponential(rotation_vector: Vector) -> Expression:
+def exp_so3(rotation_vector: VectorLike) -> Expression:
     """Return the 4×4 rotation by the vector's length [rad] about its direction; smooth at zero."""
-    v = _three(rotation_vector, "A rotation vector")
+    v = _as_vector3(rotation_vector, "A rotation vector")
     s, c, _ = _sine_series(v @ v)
     k = skew(v)
     rotation = as_expression(np.eye(3)) + s * k + c * (k @ k)
     return transform(rotation, np.zeros(3))
 
 
-def twist_exponential(twist: Vector) -> Expression:
+def exp_se3(twist: VectorLike) -> Expression:
     """Return the 4×4 transform exp(ξ) of a twist (v, ω), shape (6,) [m], [rad]; smooth at zero."""
     xi = as_expression(twist)
     if xi.shape != (6,):
@@ -251,10 +439,10 @@ def twist_exponential(twist: Vector) -> Expression:
     return transform(as_expression(np.eye(3)) + s * k + c * kk, v + c * (k @ v) + d * (kk @ v))
 
 
-def twist_logarithm(a_T_b: ExpressionLike) -> Expression:
+def log_se3(a_T_b: ExpressionLike) -> Expression:
     """Return the twist (v, ω), shape (6,) [m], [rad], whose exponential is the transform; angles below π."""
-    t = transform_like(a_T_b)
-    omega = rotation_vector(t)
+    t = as_transform(a_T_b)
+    omega = log_so3(t)
     s, c, _ = _sine_series(omega @ omega)
     k = skew(omega)
     angle2 = omega @ omega
@@ -268,15 +456,15 @@ def twist_logarithm(a_T_b: ExpressionLike) -> Expression:
 
 def inverse(a_T_b: ExpressionLike) -> Expression:
     """Return b_T_a: (Rᵀ, -Rᵀ p), 4×4."""
-    t = transform_like(a_T_b)
+    t = as_transform(a_T_b)
     r = t[:3, :3].T
     return transform(r, -(r @ t[:3, 3]))
 
 
-def transform(a_R_b: ExpressionLike, a_p: Vector) -> Expression:
+def transform(a_R_b: ExpressionLike, a_p: VectorLike) -> Expression:
     """Return the 4×4 transform of a 3×3 (or 4×4) rotation and a position of shape (3,) [m]."""
     r = rotation_of(a_R_b)
-    p = _three(a_p, "A position")
+    p = _as_vector3(a_p, "A position")
     upper = np.concatenate([r, p.reshape(3, 1)], axis=1)
     return np.concatenate([upper, [[0.0, 0.0, 0.0, 1.0]]])  # type: ignore[return-value]
 
@@ -286,12 +474,12 @@ def rotation_of(a_T_b: ExpressionLike) -> Expression:
     t = as_expression(a_T_b)
     if t.shape == (3, 3):
         return t
-    return transform_like(t)[:3, :3]
+    return as_transform(t)[:3, :3]
 
 
 def position_of(a_T_b: ExpressionLike) -> Expression:
     """Return the position of frame b in a, shape (3,) [m]."""
-    return transform_like(a_T_b)[:3, 3]
+    return as_transform(a_T_b)[:3, 3]
 
 
 def point(x: ExpressionLike, y: ExpressionLike | None = None, z: ExpressionLike | None = None) -> Expression:
@@ -299,7 +487,7 @@ def point(x: ExpressionLike, y: ExpressionLike | None = None, z: ExpressionLike 
 
     The three are given one by one, or as one vector of shape (3,) alone.
     """
-    return array([*_taken_apart("A point", ("x", "y", "z"), (x, y, z)), 1])
+    return array([*_components("A point", ("x", "y", "z"), (x, y, z)), 1])
 
 
 def vector(x: ExpressionLike, y: ExpressionLike | None = None, z: ExpressionLike | None = None) -> Expression:
@@ -307,25 +495,25 @@ def vector(x: ExpressionLike, y: ExpressionLike | None = None, z: ExpressionLike
 
     The three are given one by one, or as one vector of shape (3,) alone.
     """
-    return array([*_taken_apart("A direction", ("x", "y", "z"), (x, y, z)), 0])
+    return array([*_components("A direction", ("x", "y", "z"), (x, y, z)), 0])
 
 
-def skew(v: Vector) -> Expression:
+def skew(v: VectorLike) -> Expression:
     """Return the 3×3 matrix [v]× with ``skew(v) @ w = v × w``."""
-    x, y, z = _three(v, "A vector")
+    x, y, z = _as_vector3(v, "A vector")
     return array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
 
 
 def adjoint(a_T_b: ExpressionLike) -> Expression:
     """Return the 6×6 matrix that maps twists (v, ω) in frame b to twists in frame a."""
-    t = transform_like(a_T_b)
+    t = as_transform(a_T_b)
     r = t[:3, :3]
     upper = np.concatenate([r, skew(t[:3, 3]) @ r], axis=1)
     lower = np.concatenate([np.zeros((3, 3)), r], axis=1)
     return np.concatenate([upper, lower])  # type: ignore[return-value]
 
 
-def transform_like(a_T_b: ExpressionLike) -> Expression:
+def as_transform(a_T_b: ExpressionLike) -> Expression:
     """Return the argument as an expression of shape (4, 4).
 
     Raises
@@ -339,29 +527,29 @@ def transform_like(a_T_b: ExpressionLike) -> Expression:
     return t
 
 
-def unit(v: Vector, what: str = "The vector") -> Expression:
+def unit_vector(v: VectorLike, what: str = "The vector") -> Expression:
     """Return the vector divided by its length, shape (3,).
 
     Raises
     ------
-    ValueRejectedError
+    InvalidValueError
         For a constant vector of length zero.
     """
-    expression = _three(v, what)
-    watcher = watcher_of(expression)
+    expression = _as_vector3(v, what)
+    watcher = access_listener(expression)
     if watcher is not None:
         anew: Expression = watcher.ask("unit", expression)
         return anew
     if not expression.symbols:
-        number = normalised(expression())
+        number = normalize(expression())
         if number is None:
-            raise ValueRejectedError(f"{what} has length zero.")
+            raise InvalidValueError(f"{what} has length zero.")
         if expression.is_constant:
             return as_expression(number)
     return expression / norm(expression)
 
 
-def normalised(v: Iterable[float]) -> tuple[float, ...] | None:
+def normalize(v: Iterable[float]) -> tuple[float, ...] | None:
     """Return numbers divided by their length, entries within 1e-15 of 0 and ±1 exact; None if it is zero."""
     numbers = [float(c) for c in v]
     largest = max(map(abs, numbers))
@@ -369,25 +557,25 @@ def normalised(v: Iterable[float]) -> tuple[float, ...] | None:
         return None
     scaled = [c / largest for c in numbers]  # or the square of something tiny is nothing
     length = math.sqrt(sum(c * c for c in scaled))
-    result = tuple(_snapped(c / length) for c in scaled)
+    result = tuple(_round_exact(c / length) for c in scaled)
     return None if any(math.isnan(c) for c in result) else result
 
 
-def _snapped(number: float) -> float:
+def _round_exact(number: float) -> float:
     nearest = float(round(number)) if math.isfinite(number) else number
     # Adding 0.0 turns -0.0 into 0.0.
     return (nearest if abs(number - nearest) < 1e-15 else number) + 0.0
 
 
-def snapped(numbers: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+def round_exact(numbers: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
     """Return rotation entries with those within 1e-15 of 0 and ±1 made exact.
 
     cos(π/2) is 6e-17 in floating point; what was meant is 0, and zeros make expressions small.
     """
-    return np.reshape([_snapped(n) for n in numbers.ravel().tolist()], numbers.shape)
+    return np.reshape([_round_exact(n) for n in numbers.ravel().tolist()], numbers.shape)
 
 
-def _three(v: Vector, what: str) -> Expression:
+def _as_vector3(v: VectorLike, what: str) -> Expression:
     expression = as_expression(v)
     if expression.shape != (3,):
         raise ShapeError(f"{what} has shape (3,), not {expression.shape}.")

@@ -1,26 +1,29 @@
-"""States: what is known about the values of symbols at one moment."""
+"""Values of symbols at one moment, and their conversion from what users give."""
 
 from __future__ import annotations
 
 import math
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeAlias
 
+from ._checks import real_number
+from ._synonyms import STATE_SYNONYMS, unknown_attribute_error
 from .errors import (
+    DuplicateNameError,
     ExpressionError,
+    InvalidValueError,
     KineverseError,
-    NameTakenError,
     UnknownAttributeError,
     UnknownNameError,
-    ValueRejectedError,
-    given_twice,
+    duplicate_value_error,
     suggest,
 )
-from .html_table import html_table
-from .number import real_number
+from .expressions.printing import html_table
 from .symbols import Symbol, parse_symbol_name
-from .vocabulary import STATE, unknown_attribute
+
+StateLike: TypeAlias = "State | Mapping[Symbol, float] | Mapping[str, float] | Mapping[Symbol | str, float]"
+"""A state, or a plain mapping from symbols or their names to numbers."""
 
 
 class State(Mapping[Symbol, float]):
@@ -42,9 +45,9 @@ class State(Mapping[Symbol, float]):
 
     Raises
     ------
-    ValueRejectedError
+    InvalidValueError
         For NaN or values that are not numbers.
-    NameTakenError
+    DuplicateNameError
         If a symbol is given a value and its name another one; likewise, later, if a value is asked for by a
         name that several of the symbols have.
     """
@@ -52,13 +55,13 @@ class State(Mapping[Symbol, float]):
     __slots__ = ("_by_name", "_values", "source", "stamp")
 
     def __init__(
-        self, values: Mapping[Any, float] | None = None, *, stamp: float | None = None, source: str = ""
+        self, values: StateLike | None = None, *, stamp: float | None = None, source: str = ""
     ) -> None:
         known: dict[Symbol, float] = {}
         for key, value in _items({} if values is None else values):
             symbol = _symbol(key)
             if symbol in known:
-                raise given_twice(symbol)
+                raise duplicate_value_error(symbol)
             known[symbol] = _number(symbol, value)
         self._values = known
         self._by_name: dict[str, Symbol | None] = {str(s): s for s in known}
@@ -67,7 +70,7 @@ class State(Mapping[Symbol, float]):
             counts = Counter(map(str, known))
             self._by_name = {name: s if counts[name] == 1 else None for name, s in self._by_name.items()}
         if stamp is not None and not _is_number(stamp):
-            raise ValueRejectedError(f"The stamp of a state is a time in seconds, not {stamp!r}.")
+            raise InvalidValueError(f"The stamp of a state is a time in seconds, not {stamp!r}.")
         self.stamp = stamp
         self.source = source  # from here on immutable
 
@@ -83,7 +86,7 @@ class State(Mapping[Symbol, float]):
                 raise AttributeError(name)
             if name in self._by_name:
                 raise UnknownAttributeError(f"A state has no {name!r}. Its value is state[{name!r}].")
-            raise unknown_attribute("A state", name, dir(type(self)), STATE)
+            raise unknown_attribute_error("A state", name, dir(type(self)), STATE_SYNONYMS)
 
         def __setitem__(self, key: object, value: object) -> None:
             raise ExpressionError(
@@ -112,7 +115,7 @@ class State(Mapping[Symbol, float]):
             raise KeyError(key)
         symbol = self._by_name[key]
         if symbol is None:
-            raise NameTakenError(
+            raise DuplicateNameError(
                 f"Several symbols have the name '{key}'; ask for one by symbol, not by name."
             )
         return symbol
@@ -136,9 +139,7 @@ class State(Mapping[Symbol, float]):
     def __len__(self) -> int:
         return len(self._values)
 
-    def updated(
-        self, values: Mapping[Any, float], *, stamp: float | None = None, source: str | None = None
-    ) -> State:
+    def updated(self, values: StateLike, *, stamp: float | None = None, source: str | None = None) -> State:
         """Return a state with other values for some of its symbols; stamp and source are kept unless given.
 
         Raises
@@ -153,29 +154,27 @@ class State(Mapping[Symbol, float]):
             except (KeyError, TypeError):  # of a name, and of what cannot be a key at all
                 raise self._unknown(key) from None
             if symbol in changed:
-                raise given_twice(symbol)
+                raise duplicate_value_error(symbol)
             changed[symbol] = _number(symbol, value)
         return self._with(changed, stamp, source)
 
-    def extended(
-        self, values: Mapping[Any, float], *, stamp: float | None = None, source: str | None = None
-    ) -> State:
+    def extended(self, values: StateLike, *, stamp: float | None = None, source: str | None = None) -> State:
         """Return a state that knows more symbols, too; stamp and source are kept unless given.
 
         Raises
         ------
-        NameTakenError
+        DuplicateNameError
             For a symbol that the state has a value for, which :meth:`updated` changes.
         """
         added = State(values)._values
         for symbol in added:
             if symbol in self._values:
-                raise NameTakenError(
+                raise DuplicateNameError(
                     f"The state has a value for '{symbol}' already; updated({{'{symbol}': ...}}) changes it."
                 )
         return self._with(added, stamp, source)
 
-    def __or__(self, other: Mapping[Any, float]) -> State:
+    def __or__(self, other: StateLike) -> State:
         if isinstance(other, State):
             return self._with(other._values, None, None)
         return self.updated(other) if isinstance(other, Mapping) else NotImplemented
@@ -250,9 +249,9 @@ def _number(symbol: Symbol, value: Any) -> float:
     try:
         number = real_number(value)
     except (TypeError, ValueError, OverflowError):
-        raise ValueRejectedError(f"The value of '{symbol}' is not a number: {value!r}.") from None
+        raise InvalidValueError(f"The value of '{symbol}' is not a number: {value!r}.") from None
     if number != number:
-        raise ValueRejectedError(f"The value of '{symbol}' is NaN.")
+        raise InvalidValueError(f"The value of '{symbol}' is NaN.")
     return number
 
 
@@ -265,3 +264,68 @@ def _is_number(value: object) -> bool:
 
 def _restore(values: dict[Symbol, float], stamp: float | None, source: str) -> State:
     return State(values, stamp=stamp, source=source)
+
+
+def as_state(values: StateLike, known: Iterable[Symbol]) -> State:
+    """Return values as a state, refusing what a plain mapping says about symbols that are not known.
+
+    Parameters
+    ----------
+    values
+        A state, which may know more, or a mapping from symbols or names to numbers, which may not.
+    known
+        The symbols that there are.
+
+    Raises
+    ------
+    UnknownNameError
+        For other symbols and names.
+    DuplicateNameError
+        If a symbol has two values, by name and as such, or a name is that of several symbols.
+    """
+    if isinstance(values, State):
+        return values
+    if not isinstance(values, Mapping):
+        raise ExpressionError(
+            f"Values are given as a mapping {{name: number}} or a state, not as {type(values).__name__}."
+        )
+    by_name: dict[str, set[Symbol]] = {}
+    for symbol in known:
+        by_name.setdefault(str(symbol), set()).add(symbol)
+    result: dict[Symbol, float] = {}
+    for key, value in values.items():
+        name = str(key)
+        meant = by_name.get(name, set())
+        if isinstance(key, Symbol):
+            meant = meant & {key}
+        if not meant:
+            raise UnknownNameError(f"Unknown symbol {name!r}. {suggest(name, by_name, 'symbol')}")
+        if len(meant) > 1:
+            raise DuplicateNameError(
+                f"Several symbols have the name {name!r}; give their values by symbol, not by name."
+            )
+        (symbol,) = meant
+        if symbol in result:
+            raise duplicate_value_error(symbol)
+        result[symbol] = value
+    return State(result)
+
+
+def check_meant(state: State, known: Iterable[Symbol]) -> None:
+    """Refuse a state that has no value for anything in a model: it is one of another model.
+
+    Raises
+    ------
+    UnknownNameError
+        With a name like its first one.
+    """
+    symbols = list(known)
+    if any(state.given(symbol) is not None for symbol in symbols):
+        return
+    names = list(map(str, state))
+    about = f"It knows {', '.join(map(repr, names[:3]))}{', ...' if names[3:] else ''}. " if names else ""
+    hint = f"{suggest(names[0], map(str, symbols), 'symbol')} " if names else ""
+    raise UnknownNameError(
+        f"The state has no value for anything in this model. {about}{hint}"
+        "model.default_state() has one for everything."
+    )

@@ -14,9 +14,9 @@ from typing import TYPE_CHECKING, Any, Literal, TypeAlias, get_args
 
 import casadi as ca
 
-from .errors import ExpressionError, ValueRejectedError
+from ._checks import real_number
+from .errors import ExpressionError, InvalidValueError
 from .expressions.expression import NO_NODES, SYMBOLS, Expression
-from .number import real_number
 
 Role: TypeAlias = Literal["dof", "parameter", "contact", "location"]
 
@@ -174,7 +174,7 @@ def _check(path: str, order: int, role: str, value: float | None) -> None:
         if order:
             raise ExpressionError("A parameter has no derivatives.")
         if value is None or not isinstance(value, float) or value != value:
-            raise ValueRejectedError(f"Parameter '{path}' needs a number as its value, not {value!r}.")
+            raise InvalidValueError(f"Parameter '{path}' needs a number as its value, not {value!r}.")
     elif value is not None:
         raise ExpressionError("Only parameters have a value of their own.")
 
@@ -200,11 +200,11 @@ def parameter(path: str, value: float) -> Symbol:
     ``D`` of a parameter is empty. Two parameters of one path and different values are different symbols.
     """
     if isinstance(value, bool):
-        raise ValueRejectedError(f"Parameter '{path}' needs a number as its value, not {value!r}.")
+        raise InvalidValueError(f"Parameter '{path}' needs a number as its value, not {value!r}.")
     try:
         number = real_number(value)
     except (TypeError, ValueError, OverflowError):
-        raise ValueRejectedError(f"Parameter '{path}' needs a number as its value, not {value!r}.") from None
+        raise InvalidValueError(f"Parameter '{path}' needs a number as its value, not {value!r}.") from None
     return Symbol(path, 0, "parameter", number)
 
 

@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 import kineverse as kv
 import motion_law
-from kineverse.formats.document import document_of
+from kineverse.formats.document import to_json
 
 Matrix = np.ndarray[Any, np.dtype[np.float64]]
 State = Mapping[kv.Symbol, float]
@@ -22,7 +22,7 @@ State = Mapping[kv.Symbol, float]
 ORIGIN = np.eye(4)
 ORIGIN[:3, :3] = Rotation.from_euler("xyz", [0.3, -0.8, 1.9]).as_matrix()
 ORIGIN[:3, 3] = [0.5, -0.25, 2.0]
-WHERE: dict[str, Any] = {"name": "j", "parent": "world", "child": "c", "origin": kv.Pose.of(ORIGIN)}
+WHERE: dict[str, Any] = {"name": "j", "parent": "world", "child": "c", "origin": kv.model.Pose.of(ORIGIN)}
 
 
 def model_of(*operations: kv.Operation) -> kv.Model:
@@ -119,4 +119,4 @@ def assert_is_a_value(operation: Any, model: kv.Model, folder: Path) -> None:
     model.save(path)
     read = kv.load(path)
     assert read.snapshot() == model.snapshot()
-    assert document_of(read) == document_of(model)
+    assert to_json(read) == to_json(model)

@@ -25,10 +25,14 @@ from kineverse.articulations import Base
 
 nan = float("nan")
 FLAT: dict[str, Any] = {"name": "j", "parent": "world", "child": "c"}
-CAR = kv.Ackermann(**FLAT, wheelbase=2.5, steering=0.5, steering_speed=0.4, speed=3)
-WHEELED = kv.Mecanum(**FLAT, radius=0.1, track=0.5, wheelbase=0.7, wheel_speed=30, speed=2, turn=1)
-TWO_WHEELED = kv.DifferentialDrive(**FLAT, radius=0.1, track=0.5, wheel_speed=30, speed=1, turn=2)
-EVERY: list[Base] = [CAR, WHEELED, TWO_WHEELED, kv.OmniBase(**FLAT)]
+CAR = kv.articulations.Ackermann(**FLAT, wheelbase=2.5, steering=0.5, steering_speed=0.4, speed=3)
+WHEELED = kv.articulations.Mecanum(
+    **FLAT, radius=0.1, track=0.5, wheelbase=0.7, wheel_speed=30, speed=2, turn=1
+)
+TWO_WHEELED = kv.articulations.DifferentialDrive(
+    **FLAT, radius=0.1, track=0.5, wheel_speed=30, speed=1, turn=2
+)
+EVERY: list[Base] = [CAR, WHEELED, TWO_WHEELED, kv.articulations.OmniBase(**FLAT)]
 CORNERS = ("front_left", "front_right", "rear_left", "rear_right")
 
 
@@ -104,7 +108,7 @@ def test_the_limits_of_a_car() -> None:
     wish = {"j/drive:velocity": 1, "j/steering:velocity": 1}
     end = assert_rows_keep_limits(model, model.default_state(), wish, 20, 0.1)
     assert end[kv.position("j/steering")] == pytest.approx(0.5)
-    free = model_of(kv.Ackermann(**FLAT, wheelbase=1))
+    free = model_of(kv.articulations.Ackermann(**FLAT, wheelbase=1))
     assert set(free.constraints) == {"j/steering/position"}
 
 
@@ -146,7 +150,7 @@ def test_wheels_that_roll_as_the_inverse_kinematics_says_do_what_was_wanted() ->
 
 def test_wheels_may_have_names_of_their_own() -> None:
     names = ("a", "b", "c/d", "e")
-    model = model_of(kv.Mecanum(**FLAT, radius=0.1, track=1, wheelbase=1, wheels=names))
+    model = model_of(kv.articulations.Mecanum(**FLAT, radius=0.1, track=1, wheelbase=1, wheels=names))
     assert [s.path for s in model.articulations["j"].speeds] == list(names)
     assert not model.constraints
 
@@ -197,27 +201,27 @@ def test_rows_keep_the_speeds(base: Base, seed: int) -> None:
 
 SIZES = {"radius": 0.1, "track": 0.5, "wheelbase": 0.7}
 BROKEN: list[tuple[type[Any], dict[str, Any], str]] = [
-    (kv.Ackermann, {"wheelbase": 0}, "wheelbase of the ackermann 'j' is a positive, finite number, not 0"),
-    (kv.Ackermann, {"wheelbase": nan}, "not nan"),
-    (kv.Ackermann, {"wheelbase": 1, "steering": 1.6}, r"'j' is limited to something in \(0, π/2\) rad, not 1.6"),
-    (kv.Ackermann, {"wheelbase": 1, "steering": 0}, "not 0"),
-    (kv.Ackermann, {"wheelbase": 1, "steering": None}, "steering angle of the ackermann 'j' is a number, not None"),
-    (kv.Ackermann, {"wheelbase": 1, "steering_speed": -1}, "'steering_speed' of the ackermann 'j' is -1"),
-    (kv.Ackermann, {"wheelbase": 1, "speed": nan}, "'speed' of the ackermann 'j' is nan; it cannot be negative"),
-    (kv.Ackermann, {"wheelbase": 1, "speed": "fast"}, "'speed' of the ackermann 'j' is a number or None, not 'fast'"),
-    (kv.Ackermann, {"wheelbase": 1, "name": "old"}, "There is an articulation 'old' already"),
-    (kv.Ackermann, {"wheelbase": 1, "child": "old"}, "There is a frame 'old' already, so the ackermann 'j'"),
-    *((kv.Mecanum, {**SIZES, what: -1}, f"{what} of the mecanum 'j' is a positive") for what in SIZES),
-    (kv.Mecanum, {**SIZES, "wheels": ("a", "b")}, r"wheels of the mecanum 'j' are 4 different paths, not \('a', 'b'\)"),
-    (kv.Mecanum, {**SIZES, "wheels": ("a", "b", "c", "a")}, "4 different paths"),
-    (kv.Mecanum, {**SIZES, "wheel_speed": -3}, "'wheel_speed' of the mecanum 'j' is -3"),
-    (kv.Mecanum, {**SIZES, "speed": -3}, "'speed' of the mecanum 'j' is -3"),
-    (kv.Mecanum, {**SIZES, "child": "old"}, "There is a frame 'old' already"),
-    (kv.Mecanum, {**SIZES, "wheels": 4}, "not 4"),
-    (kv.DifferentialDrive, {"radius": 1, "track": 1, "left": "a", "right": "a"}, r"'j' are 2 different paths, not \('a', 'a'\)"),
-    (kv.DifferentialDrive, {"radius": 1, "track": 1, "left": "j/right_wheel"}, "2 different paths"),
-    (kv.DifferentialDrive, {"radius": 1, "track": 1, "speed": -1}, "'speed' of the differential drive 'j' is -1"),
-    (kv.DifferentialDrive, {"radius": 1, "track": 1, "turn": nan}, "'turn' of the differential drive 'j' is nan"),
+    (kv.articulations.Ackermann, {"wheelbase": 0}, "wheelbase of the ackermann 'j' is a positive, finite number, not 0"),
+    (kv.articulations.Ackermann, {"wheelbase": nan}, "not nan"),
+    (kv.articulations.Ackermann, {"wheelbase": 1, "steering": 1.6}, r"'j' is limited to something in \(0, π/2\) rad, not 1.6"),
+    (kv.articulations.Ackermann, {"wheelbase": 1, "steering": 0}, "not 0"),
+    (kv.articulations.Ackermann, {"wheelbase": 1, "steering": None}, "steering angle of the ackermann 'j' is a number, not None"),
+    (kv.articulations.Ackermann, {"wheelbase": 1, "steering_speed": -1}, "'steering_speed' of the ackermann 'j' is -1"),
+    (kv.articulations.Ackermann, {"wheelbase": 1, "speed": nan}, "'speed' of the ackermann 'j' is nan; it cannot be negative"),
+    (kv.articulations.Ackermann, {"wheelbase": 1, "speed": "fast"}, "'speed' of the ackermann 'j' is a number or None, not 'fast'"),
+    (kv.articulations.Ackermann, {"wheelbase": 1, "name": "old"}, "There is an articulation 'old' already"),
+    (kv.articulations.Ackermann, {"wheelbase": 1, "child": "old"}, "There is a frame 'old' already, so the ackermann 'j'"),
+    *((kv.articulations.Mecanum, {**SIZES, what: -1}, f"{what} of the mecanum 'j' is a positive") for what in SIZES),
+    (kv.articulations.Mecanum, {**SIZES, "wheels": ("a", "b")}, r"wheels of the mecanum 'j' are 4 different paths, not \('a', 'b'\)"),
+    (kv.articulations.Mecanum, {**SIZES, "wheels": ("a", "b", "c", "a")}, "4 different paths"),
+    (kv.articulations.Mecanum, {**SIZES, "wheel_speed": -3}, "'wheel_speed' of the mecanum 'j' is -3"),
+    (kv.articulations.Mecanum, {**SIZES, "speed": -3}, "'speed' of the mecanum 'j' is -3"),
+    (kv.articulations.Mecanum, {**SIZES, "child": "old"}, "There is a frame 'old' already"),
+    (kv.articulations.Mecanum, {**SIZES, "wheels": 4}, "not 4"),
+    (kv.articulations.DifferentialDrive, {"radius": 1, "track": 1, "left": "a", "right": "a"}, r"'j' are 2 different paths, not \('a', 'a'\)"),
+    (kv.articulations.DifferentialDrive, {"radius": 1, "track": 1, "left": "j/right_wheel"}, "2 different paths"),
+    (kv.articulations.DifferentialDrive, {"radius": 1, "track": 1, "speed": -1}, "'speed' of the differential drive 'j' is -1"),
+    (kv.articulations.DifferentialDrive, {"radius": 1, "track": 1, "turn": nan}, "'turn' of the differential drive 'j' is nan"),
 ]  # fmt: skip
 
 

@@ -7,12 +7,12 @@ import math
 import numpy as np
 import pytest
 from articulation_checks import assert_rows_keep_limits, model_of
-from every_mechanism import WHERE, pose, refused
+from mechanism_cases import WHERE, pose, refused
 
 import kineverse as kv
 
 nan = float("nan")
-DOOR = kv.FoldingDoor(**WHERE)
+DOOR = kv.articulations.FoldingDoor(**WHERE)
 q = kv.position("m")
 
 # (x, z) of upper panel, lower panel and handle; 180° less the angle between the panels.
@@ -25,7 +25,7 @@ TABLE = [
 ]
 
 
-def planar(part: str, angle: float, door: kv.FoldingDoor = DOOR) -> np.ndarray:
+def planar(part: str, angle: float, door: kv.articulations.FoldingDoor = DOOR) -> np.ndarray:
     return pose(door, part, {"m": angle})[[0, 2], 3]
 
 
@@ -78,7 +78,7 @@ def test_another_size_is_the_same_door() -> None:
     fields = ("size", "panel", "top_hinge", "arm_pivot", "upper_middle", "panel_hinge", "lower_middle")
     fields += ("arm_end", "handle", "handle_size")
     double = {name: tuple(2 * v for v in getattr(DOOR, name)) for name in fields}
-    large = kv.FoldingDoor(**WHERE, **double, arm=2 * DOOR.arm, wall=2 * DOOR.wall)
+    large = kv.articulations.FoldingDoor(**WHERE, **double, arm=2 * DOOR.arm, wall=2 * DOOR.wall)
     for angle in (0.0, 0.7, 1.84):
         for part in ("upper_panel", "lower_panel", "handle", "arm_end"):
             np.testing.assert_allclose(planar(part, angle, large), 2 * planar(part, angle), atol=1e-14)
@@ -110,7 +110,7 @@ def test_another_size_is_the_same_door() -> None:
     ],
 )
 def test_what_cannot_close_is_refused(given: dict[str, object], words: str) -> None:
-    assert words in refused(kv.FoldingDoor, given)
+    assert words in refused(kv.articulations.FoldingDoor, given)
 
 
 def test_the_angle_at_which_it_does_not_reach_may_lie_within_the_range() -> None:
@@ -130,8 +130,8 @@ def test_the_angle_at_which_it_does_not_reach_may_lie_within_the_range() -> None
         for arm in np.linspace(0.05, 0.8, 31):
             closes = bool(abs(c - arm) < least and most < c + arm)
             try:
-                kv.FoldingDoor(**WHERE, arm=float(arm), opening=kv.Limits(*opening))
-            except kv.ValueRejectedError:
+                kv.articulations.FoldingDoor(**WHERE, arm=float(arm), opening=kv.Limits(*opening))
+            except kv.errors.InvalidValueError:
                 assert not closes
             else:
                 assert closes
@@ -148,4 +148,4 @@ def test_its_spring_opens_it_beyond_a_point_and_shuts_it_before() -> None:
         ({"stiffness": 0}, "The stiffness of the folding door 'm' is a positive, finite number, not 0"),
         ({"tipping": math.nan}, "The tipping of the folding door 'm' is a finite number, not nan"),
     ):
-        assert words in refused(kv.FoldingDoor, given)
+        assert words in refused(kv.articulations.FoldingDoor, given)

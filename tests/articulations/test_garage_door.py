@@ -7,13 +7,13 @@ import math
 import numpy as np
 import pytest
 from articulation_checks import Matrix, assert_rows_keep_limits, model_of
-from every_mechanism import WHERE, about_y, at, pose, refused
+from mechanism_cases import WHERE, about_y, at, pose, refused
 
 import kineverse as kv
 
 nan = float("nan")
-REGULAR = kv.GarageDoor(name="m", parent="world")
-PUBLISHED = kv.GarageDoor(name="m", parent="world", form="published")
+REGULAR = kv.articulations.GarageDoor(name="m", parent="world")
+PUBLISHED = kv.articulations.GarageDoor(name="m", parent="world", form="published")
 BOTH = pytest.mark.parametrize("door", [REGULAR, PUBLISHED], ids=["regular", "published"])
 
 
@@ -25,8 +25,8 @@ def printed(a: float, length: float) -> Matrix:
 
 @pytest.mark.parametrize("length", [2.0, 2.4])
 def test_both_forms_are_the_same_door(length: float) -> None:
-    regular = kv.GarageDoor(**WHERE, length=length)
-    published = kv.GarageDoor(**WHERE, length=length, form="published")
+    regular = kv.articulations.GarageDoor(**WHERE, length=length)
+    published = kv.articulations.GarageDoor(**WHERE, length=length, form="published")
     for angle in np.linspace(0, math.pi / 2, 20):
         a = length * math.cos(angle)
         expected = printed(a, length)
@@ -77,7 +77,9 @@ def test_its_constraints_are_those_of_the_papers() -> None:
 
 
 @BOTH
-def test_the_lock_forces_the_speed_to_zero_and_says_what_would_open_it(door: kv.GarageDoor) -> None:
+def test_the_lock_forces_the_speed_to_zero_and_says_what_would_open_it(
+    door: kv.articulations.GarageDoor,
+) -> None:
     model = model_of(door)
     closed, opening = (2.0, -1.0) if door is PUBLISHED else (0.0, 1.0)
     rows = model.velocity_rows(0.1)
@@ -94,7 +96,7 @@ def test_the_lock_forces_the_speed_to_zero_and_says_what_would_open_it(door: kv.
 
 
 @BOTH
-def test_it_opens_once_the_bolt_is_back(door: kv.GarageDoor) -> None:
+def test_it_opens_once_the_bolt_is_back(door: kv.articulations.GarageDoor) -> None:
     model = model_of(door)
     closed, opened, speed = (2.0, 0.0, -1.0) if door is PUBLISHED else (0.0, math.pi / 2, 1.0)
     q, b = kv.position("m/door"), kv.position("m/bolt")
@@ -105,7 +107,7 @@ def test_it_opens_once_the_bolt_is_back(door: kv.GarageDoor) -> None:
 
 
 @BOTH
-def test_both_catch_within_the_same_play(door: kv.GarageDoor) -> None:
+def test_both_catch_within_the_same_play(door: kv.articulations.GarageDoor) -> None:
     for a, shut in ((1.991, 1.0), (1.989, 0.0)):
         q = a if door is PUBLISHED else math.acos(a / 2)
         assert door.closed({"m/door": q}) == shut
@@ -124,4 +126,4 @@ def test_both_catch_within_the_same_play(door: kv.GarageDoor) -> None:
     ],
 )
 def test_what_cannot_be_is_refused(given: dict[str, object], words: str) -> None:
-    assert words in refused(kv.GarageDoor, given)
+    assert words in refused(kv.articulations.GarageDoor, given)

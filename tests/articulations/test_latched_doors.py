@@ -7,13 +7,17 @@ from typing import Any
 import numpy as np
 import pytest
 from articulation_checks import assert_rows_keep_limits, model_of, slid, turned
-from every_mechanism import WHERE, at, pose, refused
+from mechanism_cases import WHERE, at, pose, refused
 
 import kineverse as kv
 from kineverse.articulations import Mechanism
 
 inf = float("inf")
-HANDLE, LATCH, MICROWAVE = kv.DoorWithHandle(**WHERE), kv.Latch(**WHERE), kv.Microwave(**WHERE)
+HANDLE, LATCH, MICROWAVE = (
+    kv.articulations.DoorWithHandle(**WHERE),
+    kv.articulations.Latch(**WHERE),
+    kv.articulations.Microwave(**WHERE),
+)
 LOCKED = [
     (HANDLE, "handle", "lock", 0.7),
     (LATCH, "bolt", "latch", 0.01),
@@ -110,18 +114,18 @@ def test_springs_are_on_record() -> None:
 
 
 BROKEN: list[tuple[type[Mechanism], dict[str, Any], str]] = [
-    (kv.DoorWithHandle, {"threshold": 0.9}, "The threshold of the door with handle 'm' lies between 0.0 and 0.9, and is not 0.9"),
-    (kv.DoorWithHandle, {"handle_height": 2.0}, "The handle height of the door with handle 'm' is below its height 2, and not 2"),
-    (kv.DoorWithHandle, {"door": kv.Limits(0.1, 1)}, "The door of the door with handle 'm' is shut at 0, and not at 0.1"),
-    (kv.Latch, {"door": kv.Limits(None, 1)}, "The door of the latch 'm' is shut at 0, and not at None"),
-    (kv.Latch, {"catch": 0.012}, "The catch of the latch 'm' lies between 0.0 and 0.012, and is not 0.012"),
-    (kv.Latch, {"catch": -0.1}, "is not -0.1"),
-    (kv.Latch, {"stiffness": 0}, "The stiffness of the latch 'm' is a positive, finite number, not 0"),
-    (kv.Latch, {"rest": 0.001}, "The rest of the latch 'm' is at 0 or before it, where the spring pushes to, and not at 0.001"),
-    (kv.Latch, {"play": 0}, "The play of the latch 'm' is a positive, finite number, not 0"),
-    (kv.Microwave, {"catch": 0.5}, "The catch of the microwave 'm' lies between 0.0 and 0.006, and is not 0.5"),
-    (kv.Microwave, {"depth": 0}, "The depth of the microwave 'm' is a positive, finite number, not 0"),
-    (kv.Microwave, {"button": kv.Limits(1, 0)}, "The limits of 'm/button' are no range"),
+    (kv.articulations.DoorWithHandle, {"threshold": 0.9}, "The threshold of the door with handle 'm' lies between 0.0 and 0.9, and is not 0.9"),
+    (kv.articulations.DoorWithHandle, {"handle_height": 2.0}, "The handle height of the door with handle 'm' is below its height 2, and not 2"),
+    (kv.articulations.DoorWithHandle, {"door": kv.Limits(0.1, 1)}, "The door of the door with handle 'm' is shut at 0, and not at 0.1"),
+    (kv.articulations.Latch, {"door": kv.Limits(None, 1)}, "The door of the latch 'm' is shut at 0, and not at None"),
+    (kv.articulations.Latch, {"catch": 0.012}, "The catch of the latch 'm' lies between 0.0 and 0.012, and is not 0.012"),
+    (kv.articulations.Latch, {"catch": -0.1}, "is not -0.1"),
+    (kv.articulations.Latch, {"stiffness": 0}, "The stiffness of the latch 'm' is a positive, finite number, not 0"),
+    (kv.articulations.Latch, {"rest": 0.001}, "The rest of the latch 'm' is at 0 or before it, where the spring pushes to, and not at 0.001"),
+    (kv.articulations.Latch, {"play": 0}, "The play of the latch 'm' is a positive, finite number, not 0"),
+    (kv.articulations.Microwave, {"catch": 0.5}, "The catch of the microwave 'm' lies between 0.0 and 0.006, and is not 0.5"),
+    (kv.articulations.Microwave, {"depth": 0}, "The depth of the microwave 'm' is a positive, finite number, not 0"),
+    (kv.articulations.Microwave, {"button": kv.Limits(1, 0)}, "The limits of 'm/button' are no range"),
 ]  # fmt: skip
 
 
@@ -132,7 +136,7 @@ def test_what_cannot_be_is_refused(kind: type[Mechanism], given: dict[str, Any],
 
 def test_limits_may_follow_something() -> None:
     wall = kv.position("wall")
-    model = model_of(kv.Latch(**WHERE, door=kv.Limits(0.0, wall), bolt=kv.Limits(0.0)))
+    model = model_of(kv.articulations.Latch(**WHERE, door=kv.Limits(0.0, wall), bolt=kv.Limits(0.0)))
     assert not model.violations({"m/door": 0.3, "wall": 0.5, "m/bolt": 9.0})
     assert [v.name for v in model.violations({"m/door": 0.6, "wall": 0.5, "m/bolt": 0.0})] == [
         "m/door/position"

@@ -7,7 +7,7 @@ import sys
 import pytest
 from small_robot import SMALL_ROBOT
 
-from kineverse.bench import Settings
+from kineverse.bench import BenchmarkSettings
 
 
 @pytest.fixture
@@ -21,7 +21,7 @@ def robot_file(tmp_path):
 @pytest.fixture
 def tiny(robot_file):
     """Settings for everything on the small robot, once."""
-    return Settings(
+    return BenchmarkSettings(
         robot=str(robot_file),
         frame="tip",
         rounds=2,

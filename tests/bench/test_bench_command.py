@@ -7,9 +7,9 @@ import sys
 import pytest
 
 from kineverse import bench
-from kineverse.bench import BENCHMARKS, Bar, Comparison, Measurement, Result
+from kineverse.bench import BENCHMARKS, Bar, BenchmarkResult, Comparison, Measurement
 from kineverse.cli import main
-from kineverse.cli.bench import as_text, quantity
+from kineverse.cli.bench import format_benchmark, format_quantity
 
 
 @pytest.fixture
@@ -33,8 +33,8 @@ def asked(monkeypatch, tiny):
         heard.append((names, settings))
         return measure(names, tiny)
 
-    measure = bench.measure
-    monkeypatch.setattr(bench, "measure", few)
+    measure = bench.run_benchmarks
+    monkeypatch.setattr(bench, "run_benchmarks", few)
     return heard
 
 
@@ -101,7 +101,7 @@ def test_a_robot_that_does_not_exist_is_one_line(run):
     assert len(err.splitlines()) == 1
 
 
-RESULT = Result(
+RESULT = BenchmarkResult(
     "game",
     "playing",
     (Measurement("ours", "s", (1e-6,)), Measurement("packages", "packages", (4.0,))),
@@ -117,7 +117,7 @@ RESULT = Result(
 
 
 def test_tables_say_how_fast_who_is():
-    assert as_text(RESULT) == (
+    assert format_benchmark(RESULT) == (
         "game: playing\n"
         "              median        best\n"
         "--------  ----------  ----------\n"
@@ -136,7 +136,7 @@ def test_tables_say_how_fast_who_is():
 
 
 def test_tables_of_targets_say_whether_they_are_met():
-    lines = as_text(RESULT, targets=True).partition("target ")[2].splitlines()
+    lines = format_benchmark(RESULT, targets=True).partition("target ")[2].splitlines()
     by_name = {line.partition("  ")[0]: line.partition("  ")[2].split() for line in lines[2:]}
     assert by_name == {
         "good, beside peer": ["4", "x", ">=", "2", "x", "met"],
@@ -155,7 +155,7 @@ def test_targets_are_said_on_request(run, asked):
 
 def test_bullet_does_not_greet():
     pytest.importorskip("pybullet")
-    program = "from kineverse.bench.peers import installed; assert installed('pybullet')"
+    program = "from kineverse.bench.harness import has_peer; assert has_peer('pybullet')"
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
     assert done.stdout == done.stderr == ""
 
@@ -165,4 +165,4 @@ def test_bullet_does_not_greet():
     [(2.5, "2.5 s"), (1e-3, "1 ms"), (2.5e-6, "2.5 µs"), (45.6e-9, "45.6 ns"), (0.0, "0 ns")],
 )
 def test_times_are_in_the_unit_that_suits_them(value, text):
-    assert quantity(value, "s") == text
+    assert format_quantity(value, "s") == text

@@ -8,10 +8,9 @@ import numpy as np
 import pytest
 
 import kineverse as kv
-from kineverse.bench import BENCHMARKS, DisagreementError, chosen, measure
-from kineverse.bench.large_model import READERS, large_model, runs_of_replacing
-from kineverse.bench.peers import installed
-from kineverse.bench.processes import ProgramError, run_program
+from kineverse.bench import BENCHMARKS, DisagreementError, run_benchmarks, select_benchmarks
+from kineverse.bench.harness import ProgramError, has_peer, run_program
+from kineverse.bench.large_models import READERS, count_reruns, make_large_model
 
 HAS_PEERS = all(importlib.util.find_spec(name) for name in ("pinocchio", "mujoco"))
 # One of those it compares is casadi's map in C.
@@ -20,7 +19,7 @@ BATCH = pytest.param("batch", marks=pytest.mark.compiler)
 
 @pytest.mark.parametrize("name", [BATCH if name == "batch" else name for name in BENCHMARKS])
 def test_a_benchmark_measures_everybody_who_is_there(name, tiny):
-    (result,) = measure([name], tiny)
+    (result,) = run_benchmarks([name], tiny)
     assert result.name == name
     assert result.work
     names = [m.name for m in result.measurements]
@@ -42,7 +41,7 @@ def test_a_benchmark_measures_everybody_who_is_there(name, tiny):
 @pytest.mark.parametrize("name", ["call", "frames", BATCH, "edit"])
 def test_peers_that_are_not_installed_are_reported(name, tiny, without):
     without("pinocchio", "mujoco")
-    (result,) = measure([name], tiny)
+    (result,) = run_benchmarks([name], tiny)
     missing = [c for c in result.comparisons if c.status == "missing"]
     assert missing
     assert all("pinocchio" in c.name or "mujoco" in c.name for c in missing)
@@ -53,7 +52,7 @@ def test_peers_that_are_not_installed_are_reported(name, tiny, without):
 
 def test_a_benchmark_without_its_extra_is_left_out(tiny, without):
     without("coal")
-    (result,) = measure(["geometry"], tiny)
+    (result,) = run_benchmarks(["geometry"], tiny)
     assert (result.measurements, result.comparisons) == ((), ())
     (line,) = result.missing
     assert line.startswith("geometry is left out: distances need coal: ")
@@ -63,7 +62,7 @@ def test_a_benchmark_without_its_extra_is_left_out(tiny, without):
 def test_a_missing_compiler_is_reported(tiny, monkeypatch, tmp_path):
     monkeypatch.delenv("CC", raising=False)
     monkeypatch.setenv("PATH", str(tmp_path))
-    (result,) = measure(["batch"], tiny)
+    (result,) = run_benchmarks(["batch"], tiny)
     assert any("no C compiler" in line for line in result.missing)
     assert not any("casadi" in m.name for m in result.measurements)
     assert any("casadi" in c.name for c in result.comparisons if c.status == "missing")
@@ -72,7 +71,7 @@ def test_a_missing_compiler_is_reported(tiny, monkeypatch, tmp_path):
 
 def test_a_peer_that_computes_something_else_ends_the_benchmark(tiny, monkeypatch):
     pytest.importorskip("pinocchio")
-    from kineverse.bench.pinocchio_robot import PinocchioRobot
+    from kineverse.bench.peers.pinocchio import PinocchioRobot
 
     right = PinocchioRobot.pose_and_jacobian
 
@@ -82,17 +81,17 @@ def test_a_peer_that_computes_something_else_ends_the_benchmark(tiny, monkeypatc
 
     monkeypatch.setattr(PinocchioRobot, "pose_and_jacobian", wrong)
     with pytest.raises(DisagreementError, match="pinocchio, reduced to the chain"):
-        list(measure(["call"], tiny))
+        list(run_benchmarks(["call"], tiny))
 
 
 def test_benchmarks_run_in_their_order_and_once():
-    assert chosen([]) == list(BENCHMARKS)
-    assert chosen(["batch", "load", "batch"]) == ["load", "batch"]
+    assert select_benchmarks([]) == list(BENCHMARKS)
+    assert select_benchmarks(["batch", "load", "batch"]) == ["load", "batch"]
 
 
 def test_an_unknown_name_is_refused_before_anything_is_run(tiny):
-    with pytest.raises(kv.UnknownNameError, match=r"'bacth'\. Did you mean 'batch'\?"):
-        next(measure(["call", "bacth"], tiny))
+    with pytest.raises(kv.errors.UnknownNameError, match=r"'bacth'\. Did you mean 'batch'\?"):
+        next(run_benchmarks(["call", "bacth"], tiny))
 
 
 def test_a_program_that_fails_is_an_error_that_says_what_it_said(tmp_path):
@@ -101,21 +100,21 @@ def test_a_program_that_fails_is_an_error_that_says_what_it_said(tmp_path):
 
 
 def test_large_models_are_as_large_as_asked_for():
-    model = large_model(100)
+    model = make_large_model(100)
     assert len(model.constraints) == 100
     assert len(model.history.tags) >= 100
-    assert runs_of_replacing(model) == 1 + READERS
+    assert count_reruns(model) == 1 + READERS
     assert model.constraints_for(model.fk("link 15")).keys() >= {f"joint {k}/position" for k in range(8, 16)}
 
 
 def test_a_joint_is_replaced_in_a_copy(tiny):
-    from kineverse.bench.edited_robot import joint_replaced
-    from kineverse.bench.robot import find_robot
+    from kineverse.bench.measure_edit import replace_joint
+    from kineverse.bench.workloads import find_robot
 
     robot = find_robot(tiny)
     before = robot.model.snapshot()
     values = dict.fromkeys(robot.chain, 0.3)
-    contender = joint_replaced(robot)
+    contender = replace_joint(robot)
     (moved,) = contender.results()
     assert contender.sample() > 0.0
     assert robot.model.snapshot() == before
@@ -123,7 +122,7 @@ def test_a_joint_is_replaced_in_a_copy(tiny):
 
 
 def test_the_frame_is_a_gripper_unless_one_is_given(tiny):
-    from kineverse.bench.robot import find_robot
+    from kineverse.bench.workloads import find_robot
 
     assert find_robot(replace(tiny, frame=None)).frame == "left"  # the longest way
 
@@ -133,7 +132,7 @@ def test_mujoco_leaves_no_file_of_warnings(tmp_path, monkeypatch):
     before = mujoco.get_mju_user_warning()
     mujoco.set_mju_user_warning(None)
     monkeypatch.chdir(tmp_path)
-    assert installed("mujoco")
+    assert has_peer("mujoco")
     model = mujoco.MjModel.from_xml_string(
         '<mujoco><worldbody><body><freejoint/><geom size="1"/></body></worldbody></mujoco>'
     )

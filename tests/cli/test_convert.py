@@ -45,7 +45,7 @@ def test_a_document_is_the_model_to_the_bit(run, robot, tmp_path):
         "  remarks on reading",
         "    robot.urdf, line 1, <my_joint> is ignored: URDF does not know it.",
     ]
-    assert kv.difference(kv.load("robot.urdf"), kv.load("robot.kv.json")).is_empty
+    assert kv.model.compare_models(kv.load("robot.urdf"), kv.load("robot.kv.json")).is_empty
 
 
 @pytest.mark.parametrize("ending", [".kv.json", ".urdf"])

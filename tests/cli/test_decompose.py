@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from decomposed_meshes import cube, ell, fake_coacd
+from fake_coacd import cube, ell, fake_coacd
 from kineverse.cli import main
 
 ROBOT = """<robot name="r">

@@ -8,12 +8,12 @@ import sys
 
 import numpy as np
 import pytest
+from living_kitchen.unknown_mechanisms import STRANGERS
 
 import kineverse as kv
 from kineverse.cli import main
 from kineverse.cli.demo import MODELS, STATE, add_arguments
-from kineverse.cli.drive import SAMPLES, drive
-from kineverse.view.living.strangers import STRANGERS
+from kineverse.cli.exercise import SAMPLES_PER_RANGE, exercise_model
 
 
 @pytest.fixture(scope="module")
@@ -87,7 +87,7 @@ def test_who_interrupts_finds_no_empty_picture(tmp_path, monkeypatch):
         if dt > 0.0:
             raise KeyboardInterrupt
 
-    monkeypatch.setattr("kineverse.view.living.Life.step", interrupted)
+    monkeypatch.setattr("living_kitchen.Life.step", interrupted)
     with contextlib.suppress(KeyboardInterrupt):
         assert main(["demo", "--headless", "--picture", str(tmp_path / "x.png")]) != 0
     assert not list(tmp_path.iterdir())
@@ -119,14 +119,14 @@ def test_driving_finds_what_is_wrong_with_a_model():
         edit.constrain("a/range", 0, a, 1)
         edit.constrain("a/really", -1, 2 * a, 1)
         edit.constrain("b/range", -1, b, 1)
-    result = drive(model)
+    result = exercise_model(model)
     assert result.freedoms == 2
-    assert result.poses == 2 * 2 * SAMPLES
+    assert result.poses == 2 * 2 * SAMPLES_PER_RANGE
     assert result.violations == 1
     assert any("a/really" in line for line in result.problems)
     assert any(line.startswith("b: 1 frames have no rigid pose, such as rod") for line in result.problems)
 
 
 def test_driving_nothing_is_no_trouble():
-    result = drive(kv.Model())
+    result = exercise_model(kv.Model())
     assert (result.freedoms, result.poses, result.problems) == (0, 0, [])

@@ -186,7 +186,7 @@ def test_a_frame_in_another_parent_is_compared_in_the_world(run, files):
 def test_a_fixed_joint_is_no_difference_if_its_frames_are_there(run, tmp_path):
     for name in ("one", "two"):
         model = kv.Model()
-        origin = kv.Pose.of(kv.translation(1, 0, 0)())
+        origin = kv.model.Pose.of(kv.translation(1, 0, 0)())
         with model.edit() as edit:
             if name == "one":
                 edit.add_frame("f", parent="world", transform=origin)
@@ -241,7 +241,9 @@ class Crowd(kv.Operation):
 
     def apply(self, model):
         symbols = [kv.position(f"q{i}") for i in range(100)]
-        return kv.Effects(constraints={f"c{i}": (0, symbols[i % 100], self.upper + i) for i in range(1_000)})
+        return kv.model.Writes(
+            constraints={f"c{i}": (0, symbols[i % 100], self.upper + i) for i in range(1_000)}
+        )
 
 
 @pytest.fixture

@@ -7,7 +7,7 @@ import pytest
 
 import kineverse as kv
 from kineverse.cli import main
-from kineverse.view.geometry import triangles_of
+from kineverse.view.meshes import mesh_geometry
 
 DOOR = """<mujoco>
 <asset><mesh name="knob" file="knob.obj" refpos="0 0 1"/></asset>
@@ -52,5 +52,5 @@ def test_meshes_are_found_and_drawn(door):
     """The mesh is drawn where its file's frame is: lowered by its reference, raised by its geom."""
     shapes = kv.load(door).bodies["door"].visuals
     assert [shape.origin.matrix[2, 3] for shape in shapes] == [0.0, 1.0]
-    surface = triangles_of(shapes[1].geometry)
+    surface = mesh_geometry(shapes[1].geometry)
     assert np.diff(surface.bounds, axis=0)[0].tolist() == [1.0, 1.0, 1.0]

@@ -7,7 +7,7 @@ import pytest
 
 import kineverse as kv
 from kineverse.cli import main
-from kineverse.view.geometry import triangles_of
+from kineverse.view.meshes import mesh_geometry
 
 LAMP = """<sdf version="1.12"><world name="w"><model name="lamp"><static>true</static><link name="foot"/></model>
 <model name="arm"><link name="base"><visual name="v"><geometry><cone><radius>1</radius><length>2</length></cone>
@@ -43,6 +43,6 @@ def test_a_refusal_is_one_line(lamp, capsys):
 
 def test_shapes_become_surfaces(lamp):
     model = kv.load(lamp)
-    surfaces = {name: triangles_of(body.visuals[0].geometry) for name, body in model.bodies.items()}
+    surfaces = {name: mesh_geometry(body.visuals[0].geometry) for name, body in model.bodies.items()}
     sizes = {name: np.diff(surface.bounds, axis=0)[0].round(6).tolist() for name, surface in surfaces.items()}
     assert sizes == {"arm/base": [2, 2, 2], "arm/tip": [2, 4, 6]}

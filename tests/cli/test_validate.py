@@ -14,8 +14,8 @@ from hypothesis import strategies as st
 
 import kineverse as kv
 from kineverse.cli import main
-from kineverse.cli.findings import findings, impossible
-from kineverse.formats.document import document_of
+from kineverse.formats.document import to_json
+from kineverse.formats.validate import find_inertia_errors, find_problems
 
 LIMIT = '<limit lower="-1" upper="2" effort="1" velocity="1"/>'
 
@@ -51,8 +51,8 @@ def body(mass=1.0, moments=(1.0, 1.0, 1.0)):
     model = kv.Model()
     xx, yy, zz = moments
     with model.edit() as edit:
-        inertia = kv.Inertia(mass, (xx, 0.0, 0.0, yy, 0.0, zz))
-        edit.add_frame("a", parent="world", transform=np.eye(4), body=kv.Body(inertia=inertia))
+        inertia = kv.model.Inertia(mass, (xx, 0.0, 0.0, yy, 0.0, zz))
+        edit.add_frame("a", parent="world", transform=np.eye(4), body=kv.model.Body(inertia=inertia))
     return model
 
 
@@ -176,7 +176,7 @@ def test_poses_that_are_not_finite(bend, text):
         edit.add_frame("a", parent="world", transform=kv.translation(bend(q), 0, 0))
         edit.add_frame("b", parent="world", transform=kv.translation(q, 0, 0))
         edit.constrain("range", 0, q, 2)
-    (found,) = findings(model)
+    (found,) = find_problems(model)
     assert (found.kind, found.where) == ("pose", "a")
     assert text in found.text
 
@@ -189,7 +189,7 @@ def test_states_that_other_constraints_forbid_are_not_looked_at():
         for s in (q, r):
             edit.constrain(f"{s}/range", 0, s, 1)
         edit.constrain("sum", 0, q + r, 1)
-    assert list(findings(model)) == []
+    assert list(find_problems(model)) == []
 
 
 def four_bar(crank=0.3, within=()):
@@ -198,10 +198,10 @@ def four_bar(crank=0.3, within=()):
     z = {"axis": (0, 0, 1), "velocity": 1, "lower": -3, "upper": 3}
     with model.edit() as edit:
         edit.apply(kv.Revolute(name="crank", parent="world", child="crank", **z))
-        origin = kv.Pose.of(kv.translation(crank, 0, 0)())
+        origin = kv.model.Pose.of(kv.translation(crank, 0, 0)())
         edit.apply(kv.Revolute(name="coupler", parent="crank", child="coupler", origin=origin, **z))
         edit.add_frame("end", parent="coupler", transform=kv.translation(0.9, 0, 0))
-        origin = kv.Pose.of(kv.translation(1, 0, 0)())
+        origin = kv.model.Pose.of(kv.translation(1, 0, 0)())
         edit.apply(kv.Revolute(name="rocker", parent="world", child="rocker", origin=origin, **z))
         edit.add_frame("pin", parent="rocker", transform=kv.translation(0.5, 0, 0))
         edit.apply(kv.CloseLoop(name="four_bar", frame="end", to="pin", mask=("x", "y"), within=within))
@@ -209,16 +209,16 @@ def four_bar(crank=0.3, within=()):
 
 
 def test_loops_that_do_not_close_everywhere(tmp_path):
-    assert [f for f in findings(four_bar()) if f.kind == "loop"] == []
+    assert [f for f in find_problems(four_bar()) if f.kind == "loop"] == []
     # A crank as long as this passes points where the rocker is out of reach; it is closed in a part only.
     limited = four_bar(crank=0.9, within=(("crank", 0.5, 0.8),))
-    assert [f for f in findings(limited) if f.kind == "loop"] == []
+    assert [f for f in find_problems(limited) if f.kind == "loop"] == []
     # Somebody takes the limit out of the document by hand.
-    given = json.loads(document_of(limited))
+    given = json.loads(to_json(limited))
     del given["sha256"], given["operations"][-1]["writes"]["constraints"]
     path = tmp_path / "edited.kv.json"
     path.write_text(json.dumps(given))
-    found = [f for f in findings(kv.load(path)) if f.kind == "loop"]
+    found = [f for f in find_problems(kv.load(path)) if f.kind == "loop"]
     assert [(f.where, f.text.split()[:3]) for f in found] == [("four_bar", ["does", "not", "close"])]
 
 
@@ -235,7 +235,7 @@ def test_loops_that_do_not_close_everywhere(tmp_path):
     ],
 )
 def test_inertia_that_no_body_has(mass, moments, text):
-    (found,) = findings(body(mass, moments))
+    (found,) = find_problems(body(mass, moments))
     assert (found.kind, found.where) == ("inertia", "a")
     assert text in found.text
 
@@ -247,7 +247,7 @@ def test_the_inertia_of_any_points_is_possible(points):
         tensor += m * (np.dot(p, p) * np.eye(3) - np.outer(p, p))
         mass += m
     xx, xy, xz, _, yy, yz, _, _, zz = tensor.ravel().tolist()
-    assert list(impossible(kv.Inertia(mass, (xx, xy, xz, yy, yz, zz)))) == []
+    assert list(find_inertia_errors(kv.model.Inertia(mass, (xx, xy, xz, yy, yz, zz)))) == []
 
 
 def test_meshes_that_are_missing(run, good):

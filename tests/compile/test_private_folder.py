@@ -16,11 +16,11 @@ import pytest
 
 import kineverse as kv
 from kineverse.compile import cache
+from kineverse.compile.c_library import SourceLibrary
 from kineverse.compile.cache import LibraryCache, library_cache, private_subfolder
 from kineverse.compile.private_folder import NotPrivateError, PrivateFolder
-from kineverse.compile.source_library import SourceLibrary
 from kineverse.compile.toolchain import toolchain
-from kineverse.geometry.decomposition import store
+from kineverse.geometry.decomposition import hull_cache
 
 NOBODY = 65534
 KEY = "key"
@@ -336,8 +336,8 @@ def test_a_folder_of_decompositions_that_leads_elsewhere_is_not_used(
     library_cache()
     (folder / "decompositions").symlink_to(elsewhere)
     with caplog.at_level(logging.WARNING, "kineverse.compile"):
-        assert store.folder() != folder / "decompositions"
-        assert store.find("0" * 40) is None
+        assert hull_cache.folder() != folder / "decompositions"
+        assert hull_cache.find_entry("0" * 40) is None
     assert "can be written by others" in caplog.text
     assert list(elsewhere.iterdir()) == []
 
@@ -350,6 +350,6 @@ def test_a_decomposition_that_is_a_link_counts_as_absent(
     target.write_bytes(b"content")
     (inside.path / "abc-def.hulls").symlink_to(target)
     with caplog.at_level(logging.WARNING, "kineverse.geometry"):
-        assert store.find("abc", "def") is None
+        assert hull_cache.find_entry("abc", "def") is None
     assert "abc-def.hulls is a link and counts as absent." in caplog.text
     assert target.read_bytes() == b"content"

@@ -8,7 +8,7 @@ import numpy as np
 
 import kineverse as kv
 from kineverse.model.body import Box, Capsule, Cone, Cylinder, Ellipsoid, Mesh, Sphere
-from kineverse.model.reader import Reader
+from kineverse.model.read_recorder import ReadRecorder
 
 
 @dataclass(frozen=True)
@@ -18,9 +18,11 @@ class Doubled(kv.Operation):
     source: str
     target: str
 
-    def apply(self, model: Reader) -> kv.Effects:
+    def apply(self, model: ReadRecorder) -> kv.model.Writes:
         value = model.data[self.source]
-        return kv.Effects(data={self.target: 2 * value, f"{self.target}/bodies": len(list(model.bodies))})
+        return kv.model.Writes(
+            data={self.target: 2 * value, f"{self.target}/bodies": len(list(model.bodies))}
+        )
 
 
 @dataclass(frozen=True)
@@ -29,19 +31,19 @@ class Dressed(kv.Operation):
 
     frame: str
 
-    def apply(self, model: Reader) -> kv.Effects:
-        origin = kv.Pose.of(kv.translation(1, 0.1, 0) @ kv.rotation_z(0.3))
+    def apply(self, model: ReadRecorder) -> kv.model.Writes:
+        origin = kv.model.Pose.of(kv.translation(1, 0.1, 0) @ kv.rotation_z(0.3))
         shapes = (
-            kv.Shape(Box((1, 2, 0.3)), origin, "a box", (1, 0, 0.5, 1)),
-            kv.Shape(Cylinder(0.1, 1 / 3)),
-            kv.Shape(Capsule(0.1, 0.2)),
-            kv.Shape(Ellipsoid((0.1, 0.2, 0.3))),
-            kv.Shape(Cone(0.1, 0.2)),
-            kv.Shape(Sphere(1e-3), texture="wood.png"),
-            kv.Shape(Mesh("package://cups/cup.stl", (0.001, 0.001, 0.001), "/models")),
+            kv.model.Shape(Box((1, 2, 0.3)), origin, "a box", (1, 0, 0.5, 1)),
+            kv.model.Shape(Cylinder(0.1, 1 / 3)),
+            kv.model.Shape(Capsule(0.1, 0.2)),
+            kv.model.Shape(Ellipsoid((0.1, 0.2, 0.3))),
+            kv.model.Shape(Cone(0.1, 0.2)),
+            kv.model.Shape(Sphere(1e-3), texture="wood.png"),
+            kv.model.Shape(Mesh("package://cups/cup.stl", (0.001, 0.001, 0.001), "/models")),
         )
-        inertia = kv.Inertia(0.3, (1, 0, 0, 2, 0.1, 3), origin)
-        return kv.Effects(bodies={self.frame: kv.Body(shapes, shapes[:1], inertia)})
+        inertia = kv.model.Inertia(0.3, (1, 0, 0, 2, 0.1, 3), origin)
+        return kv.model.Writes(bodies={self.frame: kv.model.Body(shapes, shapes[:1], inertia)})
 
 
 def rich_model() -> kv.Model:
@@ -52,7 +54,11 @@ def rich_model() -> kv.Model:
     bent = (np.sin(a) * b).augment({kv.velocity("wheel"): p * c, a.derivative(): b})
     model = kv.load("shelf_door")
     with model.edit() as edit:
-        edit.apply(kv.DifferentialDrive(name="drive", parent="world", child="base", radius=0.1, track=0.5))
+        edit.apply(
+            kv.articulations.DifferentialDrive(
+                name="drive", parent="world", child="base", radius=0.1, track=0.5
+            )
+        )
         edit.apply(kv.Floating(name="cup", parent="base", child="cup"))
         hinge = kv.Revolute(
             name="arm", parent="base", child="arm", axis=(1, 2, 3), lower=-1, upper=p, velocity=3

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 import kineverse as kv
-from kineverse.formats.document import document_of, operations_from
-from kineverse.motions import AxisMotion
+from kineverse.formats.document import read_operations, to_json
+from kineverse.spatial import OneAxisTransform
 
 Q, P = kv.position("q"), kv.position("p")
 AXES = ((1, 2, 3), (-0.6, 0, 0.8), (0, -1, 0), (1, 0, 0), (0.6, 0.8, 0), (0, 0, 2))
@@ -27,13 +27,13 @@ TRANSFORMS = (
 
 
 def read_again(model: kv.Model) -> kv.Model:
-    text = document_of(model)
+    text = to_json(model)
     result = kv.Model()
     with result.edit() as edit:
-        for tag, operation in operations_from(text):
+        for tag, operation in read_operations(text):
             edit.apply(operation, tag)
     assert result.snapshot() == model.snapshot()
-    assert document_of(result) == text
+    assert to_json(result) == text
     return result
 
 
@@ -72,11 +72,11 @@ def test_transforms_that_are_motions_and_that_are_none() -> None:
     assert_same_bits(model, read)
     kinds = [[type(f) for f in m.frames[n].factors] for m in (model, read) for n in model.frames]
     assert kinds[: len(TRANSFORMS)] == kinds[len(TRANSFORMS) :]
-    is_motion = [AxisMotion in kind for kind in kinds[: len(TRANSFORMS)]]
+    is_motion = [OneAxisTransform in kind for kind in kinds[: len(TRANSFORMS)]]
     assert is_motion == [True, False, True, True, False, False, True, False, False, True]
 
 
 def test_a_motion_is_the_matrix_that_it_was() -> None:
     for transform in TRANSFORMS:
-        (factor,) = kv.Frame.of("world", transform).factors
+        (factor,) = kv.model.Frame.of("world", transform).factors
         assert factor == transform

@@ -9,10 +9,9 @@ import pytest
 
 import kineverse as kv
 from kineverse import gallery
-from kineverse.formats.document import document_of, operations_from
-from kineverse.formats.set_body import SetBody
+from kineverse.formats.document import read_operations, to_json
 from kineverse.model.body import Box, Cylinder, Mesh, Sphere
-from kineverse.model.edit import SetRate
+from kineverse.model.operations import SetBody, SetRate
 
 KINDS: dict[str, type[kv.Operation]] = {
     name: kind
@@ -25,13 +24,13 @@ KINDS: dict[str, type[kv.Operation]] = {
 def hand_made() -> kv.Model:
     """Return a model of the operations that no scene has, and of values that they seldom are given."""
     q, v = kv.position("q"), kv.velocity("v")
-    body = kv.Body(
+    body = kv.model.Body(
         (
-            kv.Shape(Box((1, 2, 3)), kv.Pose.of(kv.rotation_x(0.3)), "box", (1, 0, 0, 1)),
-            kv.Shape(Mesh("package://a/b.stl", (1, 1, 2), "/somewhere")),
+            kv.model.Shape(Box((1, 2, 3)), kv.model.Pose.of(kv.rotation_x(0.3)), "box", (1, 0, 0, 1)),
+            kv.model.Shape(Mesh("package://a/b.stl", (1, 1, 2), "/somewhere")),
         ),
-        (kv.Shape(Cylinder(0.1, 0.2)), kv.Shape(Sphere(0.5), texture="wood.png")),
-        kv.Inertia(1.5, (1, 0, 0, 1, 0, 1)),
+        (kv.model.Shape(Cylinder(0.1, 0.2)), kv.model.Shape(Sphere(0.5), texture="wood.png")),
+        kv.model.Inertia(1.5, (1, 0, 0, 1, 0, 1)),
     )
     model = kv.Model()
     with model.edit() as edit:
@@ -43,13 +42,13 @@ def hand_made() -> kv.Model:
         edit.write("colour", ("red", 1.5, (q, None, -np.inf)))
         limits = kv.articulations.Limits(-q, q + 2, 1.5)
         edit.apply(kv.articulations.Cylindrical(name="rod", parent="a", child="rod", slide=limits))
-        edit.apply(kv.LoopConstraint(name="tie", frame="rod", to="b", mask=("x",)))
+        edit.apply(kv.loops.LoopConstraint(name="tie", frame="rod", to="b", mask=("x",)))
         edit.add_frame("b", "world", kv.translation(0, 0, q), override=True)
     # What carries a rate is written plainly, so these are not among the writes as they were given.
     carried = model.fk("a")[:3, 3]
     with model.edit() as edit:
         edit.constrain("carried", 0, carried[0], 3)
-        edit.add_frame("c", parent="world", transform=kv.translation(*carried), body=kv.Body())
+        edit.add_frame("c", parent="world", transform=kv.translation(*carried), body=kv.model.Body())
     return model
 
 
@@ -61,7 +60,7 @@ def made_anew() -> dict[str, int]:
     count: dict[str, int] = {}
     for make in MODELS:
         model = make()
-        read = dict(operations_from(document_of(model)))
+        read = dict(read_operations(to_json(model)))
         for tag in model.history.tags:
             operation = model.history.operation(tag)
             kind = type(operation)
@@ -80,7 +79,7 @@ def test_every_kind_is_made_anew() -> None:
 
 def test_limits_follow_a_prefix_only_where_they_are_expressions() -> None:
     model = hand_made()
-    rod = dict(operations_from(document_of(model), prefix="left"))["left/joint rod"]
+    rod = dict(read_operations(to_json(model), prefix="left"))["left/joint rod"]
     q = kv.position("left/q")
     assert rod.parameters["slide"] == kv.articulations.Limits(-q, q + 2, 1.5)
     assert rod.parameters["name"] == "rod"
@@ -98,21 +97,21 @@ def test_a_record_of_somebody_elses_class_stays_one() -> None:
         limits: Limits
         more: tuple[kv.articulations.Limits, ...]
 
-        def apply(self, model: kv.Reader) -> kv.Effects:
-            return kv.Effects(data={"paint": self.limits.colour})
+        def apply(self, model: kv.model.ReadRecorder) -> kv.model.Writes:
+            return kv.model.Writes(data={"paint": self.limits.colour})
 
     model = kv.Model()
     with model.edit() as edit:
         edit.apply(Paint(Limits("red"), (kv.articulations.Limits(0, 1),)), "paint")
-    text = document_of(model)
-    ((_, paint),) = operations_from(text)
+    text = to_json(model)
+    ((_, paint),) = read_operations(text)
     assert paint.parameters["limits"].kind == "Limits"
     assert paint.parameters["limits"].fields == (("colour", "red"),)
     assert paint.parameters["more"] == (kv.articulations.Limits(0, 1),)
     again = kv.Model()
     with again.edit() as edit:
         edit.apply(paint, "paint")
-    assert document_of(again) == text
+    assert to_json(again) == text
 
 
 def test_a_joint_from_a_document_is_exchanged_for_one_made_anew() -> None:
@@ -120,7 +119,7 @@ def test_a_joint_from_a_document_is_exchanged_for_one_made_anew() -> None:
     tag = next(t for t in model.history.tags if "lift" in t and t != "frame scissor_lift/base")
     read = kv.Model()
     with read.edit() as edit:
-        for name, operation in operations_from(document_of(model)):
+        for name, operation in read_operations(to_json(model)):
             edit.apply(operation, name)
     recorded = read.history.operation(tag)
     kind = KINDS.get(recorded.kind)  # type: ignore[attr-defined]

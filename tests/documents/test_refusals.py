@@ -13,10 +13,10 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 import kineverse as kv
-from attempts import attempts
-from kineverse.formats.document import document_of, operations_from
+from hypothesis_profiles import attempts
+from kineverse.formats.document import read_operations, to_json
 
-TEXT = document_of(rich_model())
+TEXT = to_json(rich_model())
 WITHOUT_HASH = TEXT[: TEXT.rindex(",\n")] + "}\n"
 NODE = '{"format": "kineverse", "version": 1, "nodes": [%s], "operations": []}'
 WRITES = '{"format": "kineverse", "version": 1, "nodes": [["symbol", "a", 0, "dof"]], "operations": [%s]}'
@@ -25,8 +25,8 @@ WRITES = '{"format": "kineverse", "version": 1, "nodes": [["symbol", "a", 0, "do
 def outcome(text):
     """Return what was read, or the message; anything but a FormatError fails the test."""
     try:
-        return operations_from(text, "d.kv.json")
-    except kv.FormatError as error:
+        return read_operations(text, "d.kv.json")
+    except kv.errors.FormatError as error:
         return str(error)
 
 
@@ -42,7 +42,7 @@ def operation(kind="data", name="x", value="1", **others):
 
 
 def test_cut_off_anywhere():
-    text = document_of(kv.load("shelf_door"))
+    text = to_json(kv.load("shelf_door"))
     end = len(text.rstrip())
     for length in range(end):
         assert isinstance(outcome(text[:length]), str), length
@@ -157,14 +157,14 @@ def test_any_character_changed_is_read_or_refused(place, what):
 
 def test_files_that_are_none(tmp_path):
     path = tmp_path / "m.kv.json"
-    with pytest.raises(kv.UnknownNameError, match=r"m\.kv\.json"):
+    with pytest.raises(kv.errors.UnknownNameError, match=r"m\.kv\.json"):
         kv.load(path)
     path.write_bytes(b"\xff\xfe{}")
-    with pytest.raises(kv.FormatError, match="UTF-8"):
+    with pytest.raises(kv.errors.FormatError, match="UTF-8"):
         kv.load(path)
     path.unlink()
     path.mkdir()
-    with pytest.raises(kv.UnknownNameError, match=r"m\.kv\.json"):
+    with pytest.raises(kv.errors.UnknownNameError, match=r"m\.kv\.json"):
         kv.load(path)
 
 
@@ -180,7 +180,7 @@ def test_nothing_is_included_from_a_document_that_fails(tmp_path):
     before = model.snapshot()
     with pytest.raises(kv.KineverseError):
         model.include(path)
-    with pytest.raises(kv.FormatError, match="its operations cannot be applied"):
+    with pytest.raises(kv.errors.FormatError, match="its operations cannot be applied"):
         kv.load(path)
     assert model.snapshot() == before
 
@@ -195,7 +195,7 @@ def test_what_cannot_be_saved_is_named_and_the_file_stays(tmp_path):
     model = kv.load("shelf_door")
     with model.edit() as edit:
         edit.write("odd", (1, Odd()), tag="the odd one")
-    with pytest.raises(kv.FormatError, match=r"data/odd.*the odd one.*Odd cannot be saved"):
+    with pytest.raises(kv.errors.FormatError, match=r"data/odd.*the odd one.*Odd cannot be saved"):
         model.save(path)
     assert path.read_text() == "precious"
     assert os.listdir(tmp_path) == ["m.kv.json"]
@@ -203,9 +203,9 @@ def test_what_cannot_be_saved_is_named_and_the_file_stays(tmp_path):
 
 def test_the_ending_and_the_folder(tmp_path):
     model = kv.load("shelf_door")
-    with pytest.raises(kv.FormatError, match=r"m\.kv\.json"):
+    with pytest.raises(kv.errors.FormatError, match=r"m\.kv\.json"):
         model.save(tmp_path / "m.json")
-    with pytest.raises(kv.FormatError, match=r"the folder .*nowhere does not exist"):
+    with pytest.raises(kv.errors.FormatError, match=r"the folder .*nowhere does not exist"):
         model.save(tmp_path / "nowhere" / "m.kv.json")
     assert os.listdir(tmp_path) == []
 

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 import kineverse as kv
-from kineverse.formats.document.writing import VERSION
+from kineverse.formats.document.writer import VERSION
 
 FOLDER = Path(__file__).parent / "released"
 VERSIONS = range(1, VERSION + 1)
@@ -65,7 +65,7 @@ def test_its_operations_are_known(version: int) -> None:
     model = kv.load(FOLDER / f"version_{version}.kv.json")
     assert model.data["heavy"] == 3.0
     with model.edit() as edit:
-        edit.replace(model.history.writers("data/weight")[0], kv.Write("weight", 4.0))
+        edit.replace(model.history.writers("data/weight")[0], kv.model.SetData("weight", 4.0))
     assert model.data["heavy"] == 8.0
     assert model.history.operation("the arm").parameters["axis"] == (1.0, 2.0, 3.0)
 

@@ -12,13 +12,12 @@ from document_models import rich_model
 from jsonschema import Draft202012Validator
 
 import kineverse as kv
-from kineverse.formats.document import document_of, operations_from, schema
-from kineverse.formats.document.elementary import BINARY, UNARY
-from kineverse.formats.document.nodes import NODE_TYPES
+from kineverse.formats.document import read_operations, schema, to_json
+from kineverse.formats.document.bodies import GEOMETRIES
+from kineverse.formats.document.node_types import BINARY, NODE_TYPES, UNARY
 from kineverse.formats.document.parameters import TAGS
-from kineverse.formats.document.shapes import GEOMETRIES
 from kineverse.model.operation import KINDS
-from kineverse.model.traces import question
+from kineverse.model.traces import trace_queries
 from kineverse.symbols import ROLES
 
 SCHEMA = schema()
@@ -46,7 +45,7 @@ def test_it_is_a_schema() -> None:
 
 @pytest.mark.parametrize("name", MODELS)
 def test_what_is_written_follows_it(name: str) -> None:
-    error = next(VALID.iter_errors(json.loads(document_of(MODELS[name]()))), None)
+    error = next(VALID.iter_errors(json.loads(to_json(MODELS[name]()))), None)
     assert error is None, f"{error.json_path}: {error.message[:300]}"
 
 
@@ -72,8 +71,8 @@ def test_it_knows_what_the_reader_knows() -> None:
     assert (set(one), set(two)) == (set(UNARY), set(BINARY))
     plain, parameter = (shape["prefixItems"][3] for shape in DEFINITIONS["node_symbol"]["oneOf"])
     assert {*plain["enum"], parameter["const"]} == set(ROLES)
-    assert set(branches("question")) == set(question.KINDS)
-    for kind, asked in question.KINDS.items():
+    assert set(branches("question")) == set(trace_queries.QUERY_KINDS)
+    for kind, asked in trace_queries.QUERY_KINDS.items():
         assert len(DEFINITIONS[f"question_{kind}"]["prefixItems"]) == 2 + asked.arguments
     assert DEFINITIONS["kind"]["enum"] == list(KINDS) == list(DEFINITIONS["writes"]["properties"])
     assert all(f"kind_{kind}" in DEFINITIONS for kind in KINDS)
@@ -152,8 +151,8 @@ WRITES = OPERATION.replace('"writes": {}%s', '"writes": %s')
 )
 def test_both_refuse(text: str) -> None:
     assert not VALID.is_valid(json.loads(text))
-    with pytest.raises(kv.FormatError):
-        operations_from(text)
+    with pytest.raises(kv.errors.FormatError):
+        read_operations(text)
 
 
 def test_a_parameter_is_no_schema_of_its_own() -> None:
@@ -165,7 +164,7 @@ def test_a_parameter_is_no_schema_of_its_own() -> None:
         WRITES % "{}",
     ):
         assert VALID.is_valid(json.loads(text))
-        operations_from(text)
+        read_operations(text)
 
 
 def test_it_lies_in_the_package() -> None:

@@ -15,11 +15,11 @@ from hypothesis import strategies as st
 from trace_models import KNOB, LIFT, WHEEL, Custom, agree, build, changed, reloaded
 
 import kineverse as kv
-from attempts import attempts
-from kineverse.formats.document import Recorded, document_of, operations_from
+from hypothesis_profiles import attempts
+from kineverse.formats.document import OpaqueOperation, read_operations, to_json
 
 
-def follower(model: kv.Reader) -> kv.Effects:
+def follower(model: kv.model.ReadRecorder) -> kv.model.Writes:
     """Read one of everything, compute with it, augment it and differentiate it."""
     pose = model.fk("car")
     place = model.frames["car"].transform
@@ -29,7 +29,7 @@ def follower(model: kv.Reader) -> kv.Effects:
     flap = model.articulations["hinge"].position
     assert flap is not None
     open_ = (flap < 0.5) & (upper > LIFT)
-    return kv.Effects(
+    return kv.model.Writes(
         frames={"knob": ("car", kv.translation(rolling, slope, 0) @ place)},
         constraints={"near": (-open_, KNOB + slope * LIFT, 2 * upper)},
         data={"twice": 2 * model.data["number"]},
@@ -61,7 +61,7 @@ def test_what_it_follows_is_saved_and_follows_again() -> None:
     read = reloaded(build(follower))
     changed(read, build(follower, upper=4.5))
     again = reloaded(read)
-    assert document_of(again) == document_of(read)
+    assert to_json(again) == to_json(read)
     live = build(follower, number=7.0, car=kv.translation(0, 0, LIFT))
     changed(again, live)
     agree(again, live)
@@ -74,15 +74,15 @@ def test_a_change_and_back_is_the_first_to_the_last_bit() -> None:
     assert read.snapshot() != model.snapshot()
     changed(read, model)
     assert read.snapshot() == model.snapshot()
-    assert document_of(read) == document_of(model)
+    assert to_json(read) == to_json(model)
 
 
 @st.composite
-def programs(draw: st.DrawFn) -> Callable[[kv.Reader], kv.Effects]:
+def programs(draw: st.DrawFn) -> Callable[[kv.model.ReadRecorder], kv.model.Writes]:
     """Return code that makes something at random of what it reads."""
     steps = draw(st.lists(st.tuples(st.integers(0, 9), st.integers(0, 99), st.integers(0, 99)), max_size=8))
 
-    def code(model: kv.Reader) -> kv.Effects:
+    def code(model: kv.model.ReadRecorder) -> kv.model.Writes:
         pose = model.fk("car")
         values: list[Any] = [
             KNOB,
@@ -109,7 +109,7 @@ def programs(draw: st.DrawFn) -> Callable[[kv.Reader], kv.Effects]:
                 )[kind](a, b)
             )
         last = values[-1] + KNOB
-        return kv.Effects(
+        return kv.model.Writes(
             frames={"knob": ("car", kv.translation(last, 0, 0))},
             constraints={"near": (-1, last + LIFT, values[-1] * values[-1])},
         )
@@ -125,33 +125,35 @@ def test_any_code_is_followed_rightly_or_the_change_refused(code: Any, change: d
     live = build(code, **change)
     try:
         changed(read, live)
-    except kv.EditError:
+    except kv.errors.EditError:
         assert read.snapshot() == before
     else:
         agree(read, live)
 
 
 def test_most_code_needs_no_value() -> None:
-    (operation,) = (o for t, o in operations_from(document_of(build(follower))) if t == "custom")
-    assert isinstance(operation, Recorded)
+    (operation,) = (o for t, o in read_operations(to_json(build(follower))) if t == "custom")
+    assert isinstance(operation, OpaqueOperation)
     assert not operation.frozen
     assert operation.trace is not None
 
 
-def branching(model: kv.Reader) -> kv.Effects:
+def branching(model: kv.model.ReadRecorder) -> kv.model.Writes:
     """Decide by a number."""
     far = float(model.data["number"]) > 1
-    return kv.Effects(frames={"knob": ("car", kv.translation(KNOB if far else 0, model.fk("car")[2, 3], 0))})
+    return kv.model.Writes(
+        frames={"knob": ("car", kv.translation(KNOB if far else 0, model.fk("car")[2, 3], 0))}
+    )
 
 
-def listing(model: kv.Reader) -> kv.Effects:
+def listing(model: kv.model.ReadRecorder) -> kv.model.Writes:
     """Decide by what there is."""
-    return kv.Effects(data={"count": len(list(model.frames)), "at": model.data["number"]})
+    return kv.model.Writes(data={"count": len(list(model.frames)), "at": model.data["number"]})
 
 
-def gambling(model: kv.Reader) -> kv.Effects:
+def gambling(model: kv.model.ReadRecorder) -> kv.model.Writes:
     """Decide by the text of an expression, which nobody notices."""
-    return kv.Effects(data={"length": len(repr(model.fk("car")))})
+    return kv.model.Writes(data={"length": len(repr(model.fk("car")))})
 
 
 @pytest.mark.parametrize(
@@ -161,7 +163,9 @@ def gambling(model: kv.Reader) -> kv.Effects:
 def test_what_it_decides_by_must_stay(code: Any, change: dict[str, Any]) -> None:
     read = reloaded(build(code))
     before = read.snapshot()
-    with pytest.raises(kv.EditError, match=r"'custom': .* has changed, and this Custom was made from it"):
+    with pytest.raises(
+        kv.errors.EditError, match=r"'custom': .* has changed, and this Custom was made from it"
+    ):
         changed(read, build(code, **change))
     assert read.snapshot() == before
 
@@ -177,15 +181,17 @@ def test_names_that_it_listed_must_stay() -> None:
     read = reloaded(build(listing))
     changed(read, build(listing, number=3.0))
     assert (read.data["count"], read.data["at"]) == (2, 3.0)
-    with pytest.raises(kv.EditError, match="list of all frames"), read.edit() as edit:
-        edit.insert(kv.AddFrame("new", kv.Frame.of("world", kv.translation(1, 0, 0))), before="custom")
+    with pytest.raises(kv.errors.EditError, match="list of all frames"), read.edit() as edit:
+        edit.insert(
+            kv.model.AddFrame("new", kv.model.Frame.of("world", kv.translation(1, 0, 0))), before="custom"
+        )
 
 
 def test_a_frozen_one_is_replaced_in_the_same_edit() -> None:
     read = reloaded(build(branching))
     live = build(branching, number=0.5)
     with read.edit() as edit:
-        edit.replace("data number", kv.Write("number", 0.5))
+        edit.replace("data number", kv.model.SetData("number", 0.5))
         edit.replace("custom", Custom(branching))
     assert read.snapshot() == live.snapshot()
 
@@ -195,7 +201,7 @@ def test_a_loop_from_a_document_is_made_anew_from_its_parameters() -> None:
     read = reloaded(model)
     (tag,) = (t for t in read.history.tags if t.startswith("loop"))
     loop = read.history.operation(tag)
-    assert isinstance(loop, Recorded)
+    assert isinstance(loop, OpaqueOperation)
     assert loop.frozen
     assert kv.CloseLoop(**loop.parameters) == model.history.operation(tag)
 
@@ -207,7 +213,7 @@ read = kv.load(sys.argv[1])
 assert not any(c.__name__ == "Custom" for c in kv.Operation.__subclasses__())
 with read.edit() as edit:
     car = kv.translation(0.3, 0, 5 * kv.position("lift")) @ kv.rotation_z(kv.position("lift"))
-    edit.replace("frame car", kv.AddFrame("car", kv.Frame.of("world", car)))
+    edit.replace("frame car", kv.model.AddFrame("car", kv.model.Frame.of("world", car)))
 read.save(sys.argv[2])
 """
 

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 import kineverse as kv
-from kineverse.formats.document import document_of, operations_from
+from kineverse.formats.document import read_operations, to_json
 
 LIFT, KNOB, WHEEL = kv.position("lift"), kv.position("knob"), kv.velocity("wheel")
 
@@ -18,14 +18,14 @@ LIFT, KNOB, WHEEL = kv.position("lift"), kv.position("knob"), kv.velocity("wheel
 class Custom(kv.Operation):
     """An operation of anybody's code."""
 
-    code: Callable[[kv.Reader], kv.Effects]
+    code: Callable[[kv.model.ReadRecorder], kv.model.Writes]
     name: str = "custom"
 
-    def apply(self, model: kv.Reader) -> kv.Effects:
+    def apply(self, model: kv.model.ReadRecorder) -> kv.model.Writes:
         return self.code(model)
 
 
-def build(code: Callable[[kv.Reader], kv.Effects], **changes: Any) -> kv.Model:
+def build(code: Callable[[kv.model.ReadRecorder], kv.model.Writes], **changes: Any) -> kv.Model:
     """Return a model with something upstream to read and an operation that reads it."""
     given = {
         "car": kv.translation(0.1, 0, 2 * LIFT) @ kv.rotation_x(LIFT),
@@ -55,7 +55,7 @@ def reloaded(model: kv.Model) -> kv.Model:
     """Return what a process without the code makes of a model."""
     result = kv.Model()
     with result.edit() as edit:
-        for tag, operation in operations_from(document_of(model)):
+        for tag, operation in read_operations(to_json(model)):
             edit.apply(operation, tag)
     return result
 

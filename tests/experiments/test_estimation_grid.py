@@ -9,11 +9,15 @@ import pytest
 from scipy.spatial.transform import Rotation
 from scipy.stats import norm
 
-from kineverse.experiments.estimation_grid.bound import across, attainable, bound
-from kineverse.experiments.estimation_grid.fits import SAMPLES, fit_all, fit_cell, grid, quick_grid
-from kineverse.experiments.estimation_grid.report import report
-from kineverse.experiments.estimation_grid.results import Result, summarise
-from kineverse.experiments.estimation_grid.samples import LEVER, TO_AXIS, Cell, draw
+from kineverse.experiments.estimation_grid.cramer_rao import (
+    compute_attainable_bound,
+    compute_bound,
+    orthonormal_complement,
+)
+from kineverse.experiments.estimation_grid.fits import SAMPLES, fit_all, fit_cell, make_grid, make_quick_grid
+from kineverse.experiments.estimation_grid.report import report_grid
+from kineverse.experiments.estimation_grid.results import CellResult, summarize_cells
+from kineverse.experiments.estimation_grid.samples import LEVER, TO_AXIS, Cell, draw_samples
 
 DEG = np.pi / 180
 CELLS = [
@@ -32,7 +36,7 @@ def relative(parents, children):
 @by_cell
 def test_the_noise_is_what_it_is_said_to_be(cell):
     many = Cell(cell.joint, cell.position, cell.orientation, 400, cell.range)
-    samples = draw(many, 5, np.random.default_rng(0))
+    samples = draw_samples(many, 5, np.random.default_rng(0))
     seen, true = samples.seen_parents.reshape(-1, 4, 4), samples.parents.reshape(-1, 4, 4)
     offset = seen[:, :3, 3] - true[:, :3, 3]
     turned = Rotation.from_matrix(seen[:, :3, :3] @ true[:, :3, :3].swapaxes(1, 2)).as_rotvec()
@@ -43,7 +47,7 @@ def test_the_noise_is_what_it_is_said_to_be(cell):
 @by_cell
 def test_without_noise_the_child_moves_about_the_axis(cell):
     exact = Cell(cell.joint, 0.0, 0.0, 7, cell.range)
-    samples = draw(exact, 4, np.random.default_rng(1))
+    samples = draw_samples(exact, 4, np.random.default_rng(1))
     poses = relative(samples.seen_parents, samples.seen_children)
     np.testing.assert_allclose(poses[:, 0], samples.zero, atol=1e-12)
     since = poses @ np.linalg.inv(poses[:, :1])
@@ -102,7 +106,7 @@ def errors(seen, true):
 @by_cell
 def test_the_bound_is_that_of_all_unknowns_at_once(cell):
     """The dense information matrix, in redundant unknowns: its pseudo-inverse takes no account of the gauge."""
-    samples = draw(cell, 1, np.random.default_rng(2))
+    samples = draw_samples(cell, 1, np.random.default_rng(2))
     truth = np.concatenate(
         [
             samples.axis[0],
@@ -121,8 +125,8 @@ def test_the_bound_is_that_of_all_unknowns_at_once(cell):
         there, back = (errors(everything_seen(cell, truth + s * step), true) for s in (1, -1))
         columns.append((there - back).ravel() / 2e-6 * weights)
     covariance = np.linalg.pinv(np.array(columns) @ np.array(columns).T, rcond=1e-12, hermitian=True)
-    sides = across(samples.axis)[0]
-    found = bound(samples)
+    sides = orthonormal_complement(samples.axis)[0]
+    found = compute_bound(samples)
     np.testing.assert_allclose(found.direction[0], sides.T @ covariance[:3, :3] @ sides, rtol=1e-3)
     if cell.joint == "revolute":
         # The true point is in the plane across the axis in which the places of the axes are compared.
@@ -133,30 +137,32 @@ def test_short_motions_tell_as_much_as_joint_values_drawn_from_a_gaussian_would(
     """The direction of a Gaussian cloud of variance s² along, with noise σ² all around, is known to σ²(s² + σ²)/(N s⁴)."""
     # Only positions matter where orientations are exact; the errors of both poses add up.
     cell = Cell("prismatic", 0.05, 1e-7, 50, 0.1)
-    samples = draw(cell, 2, np.random.default_rng(4))
+    samples = draw_samples(cell, 2, np.random.default_rng(4))
     spread, noise = samples.joint_values[0].var(), 2 * 0.05**2
     expected = noise * (spread + noise) / (50 * spread**2)
     np.testing.assert_allclose(
-        attainable(samples).direction, [expected * np.eye(2)] * 2, rtol=1e-3, atol=1e-6
+        compute_attainable_bound(samples).direction, [expected * np.eye(2)] * 2, rtol=1e-3, atol=1e-6
     )
     np.testing.assert_allclose(
-        bound(samples).direction, [noise / spread / 50 * np.eye(2)] * 2, rtol=1e-3, atol=1e-6
+        compute_bound(samples).direction, [noise / spread / 50 * np.eye(2)] * 2, rtol=1e-3, atol=1e-6
     )
 
 
 @by_cell
 def test_what_can_be_attained_is_the_bound_where_noise_is_small(cell):
     exact = Cell(cell.joint, 1e-5, 1e-5, cell.count, cell.range)
-    samples = draw(exact, 3, np.random.default_rng(5))
-    np.testing.assert_allclose(attainable(samples).degrees, bound(samples).degrees, rtol=1e-4)
-    noisy = draw(cell, 3, np.random.default_rng(5))
-    assert (attainable(noisy).degrees > bound(noisy).degrees).all()
+    samples = draw_samples(exact, 3, np.random.default_rng(5))
+    np.testing.assert_allclose(
+        compute_attainable_bound(samples).degrees, compute_bound(samples).degrees, rtol=1e-4
+    )
+    noisy = draw_samples(cell, 3, np.random.default_rng(5))
+    assert (compute_attainable_bound(noisy).degrees > compute_bound(noisy).degrees).all()
 
 
 def test_more_observations_and_longer_ways_tell_more():
     def degrees(count, reach):
         cell = Cell("revolute", 0.01, 3 * DEG, count, reach * DEG)
-        return bound(draw(cell, 3, np.random.default_rng(3))).degrees.mean()
+        return compute_bound(draw_samples(cell, 3, np.random.default_rng(3))).degrees.mean()
 
     assert degrees(40, 45) < degrees(20, 45) < degrees(20, 15)
     assert degrees(160, 45) == pytest.approx(degrees(40, 45) / 2, rel=0.05)
@@ -173,8 +179,8 @@ def test_a_cell_is_fitted_the_same_way_each_time():
 
 
 def test_the_grid_has_18900_fits():
-    assert len(grid()) * SAMPLES == 18_900
-    assert set(quick_grid()) <= set(grid())
+    assert len(make_grid()) * SAMPLES == 18_900
+    assert set(make_quick_grid()) <= set(make_grid())
 
 
 def made_up(cell, ratio, right=True, count=40):
@@ -182,7 +188,7 @@ def made_up(cell, ratio, right=True, count=40):
     bounds = np.full(count, 2.0)
     errors = ratio * 1.2 * bounds
     turns = cell.joint == "revolute"
-    return Result(
+    return CellResult(
         cell=cell,
         degrees=errors,
         metres=errors / 100 if turns else np.full(count, np.nan),
@@ -199,14 +205,14 @@ def made_up(cell, ratio, right=True, count=40):
 
 def test_ratios_are_told_apart_from_chance():
     hinge, slider = CELLS[0], CELLS[2]
-    good = summarise([made_up(hinge, 1.0), made_up(slider, 1.0)])
+    good = summarize_cells([made_up(hinge, 1.0), made_up(slider, 1.0)])
     assert good.attainable.direction == pytest.approx(1.0)
     assert good.attainable.place == pytest.approx(1.0)
     assert good.bound.direction == pytest.approx(1.2)
     assert (good.attainable.over, good.bound.over, good.right, good.told_wrong) == (0, 2, 1.0, 0)
     # A Gaussian of 40 samples, two components each, exceeds 1.21 times its mean square so often.
     assert good.over_by_chance == pytest.approx(2 * norm.sf(0.21 * np.sqrt(40)))
-    bad = summarise([made_up(hinge, 1.3, right=False), made_up(slider, 1.0)])
+    bad = summarize_cells([made_up(hinge, 1.3, right=False), made_up(slider, 1.0)])
     assert (bad.attainable.over, bad.right, bad.told_wrong) == (1, 0.5, 40)
 
 
@@ -219,7 +225,7 @@ def test_divergences_are_what_is_far_off_and_what_is_not_there():
 
 
 def test_the_report_says_which_bars_hold(tmp_path):
-    made = report([made_up(CELLS[0], 1.0), made_up(CELLS[2], 1.0)])
+    made = report_grid([made_up(CELLS[0], 1.0), made_up(CELLS[2], 1.0)])
     holds = {row[0]: row[3] for row in made.tables[0].rows}
     assert holds["RMS of the direction over what can be attained, that below 10 deg"] == "yes"
     assert holds["RMS of the direction over the Cramér-Rao bound, that below 10 deg"] == "no"

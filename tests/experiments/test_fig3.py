@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from kineverse.cli import main
-from kineverse.errors import MissingExtraError, UnknownNameError
+from kineverse.errors import MissingDependencyError, UnknownNameError
 from kineverse.experiments import EXPERIMENTS, reproduce
 
 
@@ -65,7 +65,7 @@ def test_the_figure_is_drawn(fig3, tmp_path, suffix):
 
 def test_without_matplotlib_the_extra_is_named(fig3, tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
-    with pytest.raises(MissingExtraError, match=r"pip install -e '.*\[figures\]'"):
+    with pytest.raises(MissingDependencyError, match=r"pip install -e '.*\[figures\]'"):
         fig3.figure.save(tmp_path / "door.png")
 
 

@@ -13,24 +13,25 @@ import kineverse as kv
 from kineverse.cli import main
 from kineverse.errors import ModelError
 from kineverse.experiments import Options, fig4, reproduce
-from kineverse.experiments.fig4.accuracy import REPORTED_MEAN, observed
-from kineverse.experiments.fig4.consistency import _judged, cramer_rao
-from kineverse.experiments.fig4.mechanisms import _outcome
+from kineverse.experiments.fig4.accuracy import REPORTED_MEAN, simulate_observations
+from kineverse.experiments.fig4.consistency import _evaluate_consistency, cramer_rao
+from kineverse.experiments.fig4.mechanisms import _coordinate_errors
 from kineverse.experiments.fig4.protocol import (
     LEVELS,
-    Noise,
-    gaussian_noise,
-    published_noise,
-    scene_of,
+    FilterRun,
+    PoseNoise,
+    add_gaussian_noise,
+    add_published_noise,
+    make_observed_model,
+    run_published,
 )
-from kineverse.experiments.fig4.runs import Run, run_published
 
-NOISE = Noise(0.1, 0.05)
+NOISE = PoseNoise(0.1, 0.05)
 
 
 @pytest.fixture(scope="module")
 def kitchen():
-    return scene_of(kv.load("kitchen"))
+    return make_observed_model(kv.load("kitchen"))
 
 
 def errors_in(frame, noisy, true):
@@ -51,7 +52,7 @@ def pose():
 
 def test_published_noise_is_along_and_about_the_frames_own_axes(pose):
     """Directions over a quarter of the sphere correlate y and z, as 2/π says."""
-    noisy = published_noise(np.broadcast_to(pose, (40_000, 4, 4)), NOISE, np.random.default_rng(1))
+    noisy = add_published_noise(np.broadcast_to(pose, (40_000, 4, 4)), NOISE, np.random.default_rng(1))
     per_axis = np.eye(3) / 3
     per_axis[1, 2] = per_axis[2, 1] = 2 / (3 * math.pi)
     for errors, sigma in zip(errors_in("own", noisy, pose), (NOISE.position, NOISE.orientation), strict=True):
@@ -61,7 +62,7 @@ def test_published_noise_is_along_and_about_the_frames_own_axes(pose):
 
 def test_directions_over_all_of_the_sphere_correlate_nothing(pose):
     many = np.broadcast_to(pose, (40_000, 4, 4))
-    noisy = published_noise(many, NOISE, np.random.default_rng(2), "uniform")
+    noisy = add_published_noise(many, NOISE, np.random.default_rng(2), "uniform")
     for errors, sigma in zip(errors_in("own", noisy, pose), (NOISE.position, NOISE.orientation), strict=True):
         np.testing.assert_allclose(np.cov(errors, rowvar=False) / sigma**2, np.eye(3) / 3, atol=0.012)
         # Amplitudes are Gaussian, so lengths have the mean of a folded normal distribution.
@@ -71,7 +72,7 @@ def test_directions_over_all_of_the_sphere_correlate_nothing(pose):
 
 
 def test_gaussian_noise_is_in_the_observers_axes(pose):
-    noisy = gaussian_noise(np.broadcast_to(pose, (40_000, 4, 4)), NOISE, np.random.default_rng(3))
+    noisy = add_gaussian_noise(np.broadcast_to(pose, (40_000, 4, 4)), NOISE, np.random.default_rng(3))
     for errors, sigma in zip(
         errors_in("world", noisy, pose), (NOISE.position, NOISE.orientation), strict=True
     ):
@@ -96,11 +97,11 @@ def test_the_first_groups_are_a_scene_of_their_own(kitchen):
 
 def test_a_model_in_which_nothing_moves_cannot_be_tracked():
     with pytest.raises(ModelError, match="Nothing moves"):
-        scene_of(kv.Model())
+        make_observed_model(kv.Model())
 
 
 def test_the_bound_is_that_of_the_models_own_jacobians(kitchen):
-    noise = Noise(0.05, 0.1)
+    noise = PoseNoise(0.05, 0.1)
     q = kitchen.configurations(np.random.default_rng(6), 2)
     expected = np.zeros_like(q)
     weight = np.diag([noise.position**-2.0] * 3 + [noise.orientation**-2.0] * 3)
@@ -118,11 +119,11 @@ def test_the_published_filter_is_within_5_percent_of_the_authors_code():
     """On their kitchen, by their noise, mean of four seeds."""
     from formats.robots import shared
 
-    scene = scene_of(kv.load(shared("iai_kitchen", "iai_kitchen", "urdf_obj", "IAI_kitchen.urdf")))
+    scene = make_observed_model(kv.load(shared("iai_kitchen", "iai_kitchen", "urdf_obj", "IAI_kitchen.urdf")))
     for noise, reported in zip(LEVELS, REPORTED_MEAN, strict=True):
         means = []
         for seed in range(4):
-            truth, seen, training = observed(scene, noise, seed, 150)
+            truth, seen, training = simulate_observations(scene, noise, seed, 150)
             means.append(np.abs(run_published(scene, seen, training).q - truth).mean())
         assert np.mean(means) == pytest.approx(reported, rel=0.05)
 
@@ -131,9 +132,9 @@ def test_consistency_is_judged_right(kitchen):
     """Errors as large as a filter says give 1; of one that thinks it is three times better, 9."""
     rng = np.random.default_rng(7)
     truth = kitchen.configurations(rng, 400)
-    bound = cramer_rao(kitchen, truth, Noise(0.01, 0.02))
+    bound = cramer_rao(kitchen, truth, PoseNoise(0.01, 0.02))
     q = truth + rng.normal(0, np.sqrt(bound))
-    honest = _judged(kitchen, truth, bound, [Run(q, bound, nis=1010.0, dof=1000)])
+    honest = _evaluate_consistency(kitchen, truth, bound, [FilterRun(q, bound, nis=1010.0, dof=1000)])
     assert honest.nees_inside == pytest.approx(1, abs=0.05)
     assert honest.over_bound == pytest.approx(1, abs=0.03)
     assert honest.rms == pytest.approx(honest.bound, rel=0.04)
@@ -142,16 +143,16 @@ def test_consistency_is_judged_right(kitchen):
     lower, upper = kitchen.limits.T
     near = np.minimum(truth - lower, upper - truth) < 3 * np.sqrt(bound)
     assert honest.states == (~near).sum() < truth.size
-    proud = _judged(kitchen, truth, bound, [Run(q, bound / 9)])
+    proud = _evaluate_consistency(kitchen, truth, bound, [FilterRun(q, bound / 9)])
     assert proud.nees == pytest.approx(9 * honest.nees)
     assert "nis" not in proud.plain()
 
 
 def test_who_is_lost_is_counted_and_left_out():
     q = np.array([[0.5], [math.nan], [0.7], [math.nan]])
-    found = _outcome(Run(q, np.full((4, 1), 0.01)), np.full((4, 1), 0.6), 0)
+    found = _coordinate_errors(FilterRun(q, np.full((4, 1), 0.01)), np.full((4, 1), 0.6), 0)
     assert (found.mean, found.max, found.nees, found.lost_percent) == pytest.approx((0.1, 0.1, 1.0, 50.0))
-    nowhere = _outcome(Run(q * math.nan, q), q, 0)
+    nowhere = _coordinate_errors(FilterRun(q * math.nan, q), q, 0)
     assert nowhere.lost_percent == 100
     assert math.isnan(nowhere.mean)
 

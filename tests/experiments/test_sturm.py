@@ -11,10 +11,18 @@ import pytest
 from kineverse.cli import main
 from kineverse.errors import FormatError
 from kineverse.experiments import Options, reproduce
-from kineverse.experiments.sturm.figure import draw_recordings, size_of
-from kineverse.experiments.sturm.judging import judge
-from kineverse.experiments.sturm.recordings import POSITION, THINNED, Labelled, labelled_recordings
-from kineverse.experiments.sturm.report import report
+from kineverse.experiments.sturm.classify import (
+    classify_recording,
+    draw_recordings,
+    figure_size,
+    report_recordings,
+)
+from kineverse.experiments.sturm.recordings import (
+    POSITION,
+    THINNED,
+    LabelledRecording,
+    read_labelled_recordings,
+)
 
 TRACKS = Path(__file__).parents[3] / "shared" / "data" / "sturm_tracks"
 RNG = np.random.default_rng(0)
@@ -44,7 +52,7 @@ def folder(tmp_path):
 
 
 def test_recordings_are_known_by_their_names(folder):
-    found = list(labelled_recordings(folder))
+    found = list(read_labelled_recordings(folder))
     assert [(r.name, r.label, r.poses.shape) for r in found] == [
         ("cabinet_one/001", "revolute", (THINNED, 3)),
         ("drawer_one/001", "prismatic", (THINNED, 3)),
@@ -55,35 +63,37 @@ def test_recordings_are_known_by_their_names(folder):
 
 
 def test_what_is_written_beside_poses_is_left_out(folder):
-    door = list(labelled_recordings(folder))[-1]
+    door = list(read_labelled_recordings(folder))[-1]
     np.testing.assert_allclose(door.poses[-1, :2, 0], [np.cos(59 / 40), np.sin(59 / 40)])
 
 
 def test_arcs_are_hinges_and_lines_are_drawers():
-    assert judge(Labelled("an arc", "revolute", arc(0.4, 1.5, 20))).right
-    assert judge(Labelled("a line", "prismatic", line(0.45, 20))).right
+    assert classify_recording(LabelledRecording("an arc", "revolute", arc(0.4, 1.5, 20))).right
+    assert classify_recording(LabelledRecording("a line", "prismatic", line(0.45, 20))).right
 
 
 def test_what_is_missed_is_named_and_drawn(tmp_path):
     pytest.importorskip("matplotlib")
     judged = [
-        judge(Labelled("kitchen/door", "revolute", arc(0.4, 1.5, 20))),
-        judge(Labelled("kitchen/no drawer", "prismatic", arc(0.4, 1.5, 20))),
+        classify_recording(LabelledRecording("kitchen/door", "revolute", arc(0.4, 1.5, 20))),
+        classify_recording(LabelledRecording("kitchen/no drawer", "prismatic", arc(0.4, 1.5, 20))),
     ]
-    found = report(judged)
+    found = report_recordings(judged)
     assert found.numbers["missed"] == ["kitchen/no drawer"]
     assert found.numbers["right"] == 0.5
     assert json.loads(json.dumps(found.numbers, allow_nan=False)) == found.numbers
     assert found.tables[2].rows[0][0] == "kitchen/no drawer"
-    all_right = size_of(judged[:1])
-    assert size_of(judged)[1] > all_right[1] + 3
+    all_right = figure_size(judged[:1])
+    assert figure_size(judged)[1] > all_right[1] + 3
     found.figure.save(tmp_path / "missed.png")
     assert (tmp_path / "missed.png").stat().st_size > 20_000
 
 
 def test_the_missed_one_is_shown_with_both_explanations():
     figure = pytest.importorskip("matplotlib.figure").Figure(layout="constrained")
-    draw_recordings(figure, [judge(Labelled("no drawer", "prismatic", arc(0.4, 1.5, 20)))])
+    draw_recordings(
+        figure, [classify_recording(LabelledRecording("no drawer", "prismatic", arc(0.4, 1.5, 20)))]
+    )
     below = figure.subfigs[1]
     titles = " ".join(axes.get_title() for axes in below.axes)
     assert "missed: no drawer" in below.get_suptitle()
@@ -93,9 +103,9 @@ def test_the_missed_one_is_shown_with_both_explanations():
 
 def test_without_recordings_it_says_what_and_where(tmp_path, monkeypatch):
     with pytest.raises(FormatError, match=r"nowhere: there is no such folder.*cabinet_one/001\.log.*--data"):
-        labelled_recordings(tmp_path / "nowhere")
+        read_labelled_recordings(tmp_path / "nowhere")
     with pytest.raises(FormatError, match="none of them is there"):
-        labelled_recordings(tmp_path)
+        read_labelled_recordings(tmp_path)
     monkeypatch.chdir(tmp_path)
     with pytest.raises(FormatError, match="sturm_tracks: there is no such folder"):
         reproduce("sturm")

@@ -10,7 +10,7 @@ import numpy as np
 from hypothesis import HealthCheck, Phase, assume, given, settings
 from hypothesis import strategies as st
 
-from attempts import attempts
+from hypothesis_profiles import attempts
 from kineverse.expressions import array
 from kineverse.symbols import Symbol
 

@@ -21,7 +21,7 @@ def test_entries_by_symbol_and_by_name():
 @pytest.mark.parametrize("key", ["door", DOOR, "dor:velocity", kv.velocity("dor")], ids=str)
 def test_other_keys(key):
     assert key not in GRADIENT
-    with pytest.raises(kv.UnknownNameError) as error:
+    with pytest.raises(kv.errors.UnknownNameError) as error:
         GRADIENT[key]
     assert str(error.value).startswith(
         f"The gradient has no entry for '{key}'; its keys are speeds. Did you mean 'door:velocity'"
@@ -30,5 +30,5 @@ def test_other_keys(key):
 
 
 def test_constants_have_none():
-    with pytest.raises(kv.UnknownNameError, match=r"no entry for 'door:velocity'.*no speed at all"):
+    with pytest.raises(kv.errors.UnknownNameError, match=r"no entry for 'door:velocity'.*no speed at all"):
         kv.array(1.0).gradient()["door:velocity"]

@@ -13,7 +13,7 @@ from implicit_functions import u, v, x, y
 from numpy.testing import assert_allclose
 
 import kineverse as kv
-from kineverse.errors import ShapeError, ValueRejectedError
+from kineverse.errors import InvalidValueError, ShapeError
 from kineverse.expressions import array
 from kineverse.expressions.implicit import Implicit, ImplicitFunction, implicit_nodes
 
@@ -88,14 +88,14 @@ def test_it_prints():
         ({"residual": x * y}, ShapeError, "the residual is a vector"),
         (
             {"residual": array([x - a, y - u])},
-            ValueRejectedError,
+            InvalidValueError,
             "'polar': the residual is about implicit/a, too",
         ),
-        ({"seed": array([x, v])}, ValueRejectedError, "'polar': the seed is about unknown/x, too"),
-        ({"inputs": (u, v, u)}, ValueRejectedError, "'polar': a symbol is given twice"),
-        ({"inputs": (u, v, x)}, ValueRejectedError, "'polar': a symbol is given twice"),
-        ({"unknowns": (x, x)}, ValueRejectedError, "'polar': a symbol is given twice"),
-        ({"steps": -1}, ValueRejectedError, "'polar'.*steps"),
+        ({"seed": array([x, v])}, InvalidValueError, "'polar': the seed is about unknown/x, too"),
+        ({"inputs": (u, v, u)}, InvalidValueError, "'polar': a symbol is given twice"),
+        ({"inputs": (u, v, x)}, InvalidValueError, "'polar': a symbol is given twice"),
+        ({"unknowns": (x, x)}, InvalidValueError, "'polar': a symbol is given twice"),
+        ({"steps": -1}, InvalidValueError, "'polar'.*steps"),
     ],
 )
 def test_bad_definitions_are_refused(parts, error, text):

@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 import kineverse as kv
-from attempts import attempts
+from hypothesis_profiles import attempts
 from kineverse.errors import ShapeError
 from kineverse.expressions import numpy_protocol as protocol
 
@@ -438,7 +438,7 @@ def test_methods_that_give_scalars():
         (lambda: e.astype(int), "64-bit floats, not int64. Call it with values"),
         (lambda: int(a), r"float\(\) needs a constant scalar"),
     ):
-        with pytest.raises(kv.ExpressionError, match=message):
+        with pytest.raises(kv.errors.ExpressionError, match=message):
             call()
 
 

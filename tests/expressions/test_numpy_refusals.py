@@ -181,7 +181,7 @@ def test_masks_of_values():
         lambda: (a + b)({a: 1, b: masked[1]}),
         lambda: kv.State({"a": masked[1]}),
     ):
-        refused(call, "is not a number: masked", kv.ValueRejectedError)
+        refused(call, "is not a number: masked", kv.errors.InvalidValueError)
     assert f(masked.filled(0)) == 1
 
 
@@ -196,14 +196,14 @@ def test_masks_of_values():
 )
 def test_attributes_of_other_libraries(name, instead):
     for e in (kv.position("x"), kv.rotation_z(kv.position("x")), kv.array([1.0, 2.0])):
-        with pytest.raises(kv.UnknownAttributeError) as error:
+        with pytest.raises(kv.errors.UnknownAttributeError) as error:
             getattr(e, name)
         assert str(error.value) == f"An expression has no {name!r}. Here that is {instead}."
 
 
 def test_attributes_that_nothing_has():
     e = kv.rotation_z(kv.position("x"))
-    with pytest.raises(kv.UnknownAttributeError, match=r"no 'gradiant'\. Did you mean 'gradient' or"):
+    with pytest.raises(kv.errors.UnknownAttributeError, match=r"no 'gradiant'\. Did you mean 'gradient' or"):
         e.gradiant  # noqa: B018
     assert not hasattr(e, "__array_interface__")
 
@@ -211,5 +211,7 @@ def test_attributes_that_nothing_has():
 def test_formats_of_numbers():
     x = kv.position("x")
     assert (f"{x:>3}", f"{x}", f"{kv.array(1.25):.1f}") == ("  x", "x", "1.2")
-    with pytest.raises(kv.ExpressionError, match=r"The format '\.2f' is one of numbers.*call it with values"):
+    with pytest.raises(
+        kv.errors.ExpressionError, match=r"The format '\.2f' is one of numbers.*call it with values"
+    ):
         f"{x:.2f}"

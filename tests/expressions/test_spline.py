@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from scipy.interpolate import CubicSpline
 
 import kineverse as kv
-from attempts import attempts
+from hypothesis_profiles import attempts
 
 x, y = kv.position("x"), kv.position("y")
 
@@ -143,5 +143,5 @@ WRONG: list[tuple[dict[str, Any], str]] = [
 
 @pytest.mark.parametrize(("given", "words"), WRONG)
 def test_bad_points_are_one_clear_error(given: dict[str, Any], words: str) -> None:
-    with pytest.raises(kv.ValueRejectedError, match=words):
+    with pytest.raises(kv.errors.InvalidValueError, match=words):
         kv.spline(x, **given)

@@ -13,18 +13,18 @@ import numpy.typing as npt
 import pytest
 
 import kineverse as kv
-from kineverse.formats.mjcf import Scene, parse_mjcf
-from kineverse.formats.mjcf.operations import scene_operations
+from kineverse.formats.mjcf import MjcfScene, parse_mjcf
+from kineverse.formats.mjcf.operations import mjcf_operations
 
 mujoco = pytest.importorskip("mujoco")
 
 Array = npt.NDArray[np.float64]
 
 
-def model_of(scene: Scene, prefix: str | None = None) -> kv.Model:
+def model_of(scene: MjcfScene, prefix: str | None = None) -> kv.Model:
     model = kv.Model()
     with model.edit() as edit:
-        for operation in scene_operations(scene, prefix):
+        for operation in mjcf_operations(scene, prefix):
             edit.apply(operation)
     return model
 

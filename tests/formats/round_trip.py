@@ -7,12 +7,12 @@ from functools import cache
 from pathlib import Path
 
 import numpy as np
-from robots import SHARED
+from urdf_texts import SHARED
 
 import kineverse as kv
 from kineverse import gallery
-from kineverse.formats.packages import locate
-from kineverse.formats.sources import shipped_models
+from kineverse.formats.locate import shipped_models
+from kineverse.formats.resource_paths import locate_resource
 
 EXACT = 1e-12
 SCENES = [f"articulations/{name}" for name in gallery.names()]
@@ -26,7 +26,7 @@ def described() -> list[Path | None]:
     for file in sorted(SHARED.rglob("*.urdf")):
         try:
             kv.load(file)
-        except kv.FormatError:
+        except kv.errors.FormatError:
             continue
         found.append(file)
     return found or [None]
@@ -104,7 +104,7 @@ def _form(shape: object) -> object:
     if not hasattr(geometry, "uri"):
         return geometry
     try:
-        file = Path(locate(geometry.uri, geometry.folder)).resolve()
-    except kv.FormatError:  # it is not there, and is called what it was called
+        file = Path(locate_resource(geometry.uri, geometry.folder)).resolve()
+    except kv.errors.FormatError:  # it is not there, and is called what it was called
         return Path(geometry.uri).name, geometry.scale
     return file, geometry.scale

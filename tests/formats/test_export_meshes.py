@@ -13,7 +13,7 @@ import pytest
 import written_meshes as made
 
 import kineverse as kv
-from kineverse.formats.packages import locate, locate_mesh
+from kineverse.formats.resource_paths import locate_mesh, locate_resource
 from kineverse.model.body import Body, Box, Mesh, Shape
 
 REFERENCES = [
@@ -88,7 +88,7 @@ def test_mujoco_opens_what_is_written(reference: str, name: str, package: Path, 
     assert any(remark in r for r in saved.remarks) is is_converted
     (shape,) = kv.load(target).bodies["b"].visuals
     assert isinstance(shape.geometry, Mesh)
-    assert locate(shape.geometry.uri, shape.geometry.folder).is_file()
+    assert locate_resource(shape.geometry.uri, shape.geometry.folder).is_file()
 
 
 def test_what_is_not_there_or_no_mesh_is_left_out_and_the_rest_is_written(
@@ -153,7 +153,7 @@ def test_what_fails_leaves_no_meshes_behind(
         replace(source, target)  # type: ignore[call-overload]
 
     monkeypatch.setattr(os, "replace", refuse)
-    with pytest.raises(kv.FormatError, match="Permission denied"):
+    with pytest.raises(kv.errors.FormatError, match="Permission denied"):
         robot(package, "../meshes/cup.dae").save(tmp_path / "out" / "r.xml")
     assert not list((tmp_path / "out").iterdir())
 
@@ -164,7 +164,7 @@ def test_without_the_extra_what_needs_it_is_left_out_by_name(
     from kineverse.geometry import mesh_files
 
     def missing(file: object) -> None:
-        raise kv.MissingExtraError("reading meshes needs trimesh: install it")
+        raise kv.errors.MissingDependencyError("reading meshes needs trimesh: install it")
 
     monkeypatch.setattr(mesh_files, "read_faces", missing)
     saved = robot(package, "../meshes/cup.dae", "../meshes/cup.stl").save(tmp_path / "r.xml")
@@ -275,7 +275,7 @@ def test_meshes_are_found_from_elsewhere(reference: str, ending: str, package: P
     model.save(there / f"r.{ending}")
     (shape,) = kv.load(there / f"r.{ending}").bodies["b"].visuals
     assert isinstance(shape.geometry, Mesh)
-    found = locate(shape.geometry.uri, shape.geometry.folder)
+    found = locate_resource(shape.geometry.uri, shape.geometry.folder)
     assert found.resolve() == package / "meshes" / "cup.stl"
 
 

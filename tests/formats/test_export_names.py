@@ -42,7 +42,7 @@ def named(name: str, formats: str) -> kv.Model:
         edit.apply(kv.Floating(name=f"{name}/free", parent="world", child=f"{name}/free"))
         edit.apply(kv.Planar(name=f"{name}/flat", parent=name, child=f"{name}/flat"))
         if formats == "mjcf":
-            edit.apply(kv.Ball(name=f"{name}/ball", parent=name, child=f"{name}/ball"))
+            edit.apply(kv.articulations.Ball(name=f"{name}/ball", parent=name, child=f"{name}/ball"))
             edit.apply(kv.Floating(name=f"{name}/held", parent=f"{name}/ball", child=f"{name}/held"))
             edit.constrain(f"{name}/sum", -1, q + kv.position(name), 1.5)
             edit.constrain(f"{name}/speed", -2, q.derivative(), 3)
@@ -110,7 +110,9 @@ def test_text_that_xml_cannot_carry_is_refused_by_what_it_is_part_of(tmp_path: P
     with model.edit() as edit:
         edit.add_frame("bell\a", parent="world", transform=kv.rotation_z(kv.position("q")))
     for ending in ("urdf", "xml"):
-        with pytest.raises(kv.FormatError, match=r"XML cannot carry '\\x07', which is part of 'bell\\x07'"):
+        with pytest.raises(
+            kv.errors.FormatError, match=r"XML cannot carry '\\x07', which is part of 'bell\\x07'"
+        ):
             model.save(tmp_path / f"m.{ending}")
     assert not list(tmp_path.iterdir())
 

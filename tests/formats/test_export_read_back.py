@@ -11,10 +11,10 @@ from hypothesis import strategies as st
 from round_trip import assert_same_motion, loaded
 
 import kineverse as kv
-from attempts import attempts
-from kineverse.formats.mjcf import verification
-from kineverse.formats.mjcf import writing as mjcf_writing
-from kineverse.formats.urdf import writing as urdf_writing
+from hypothesis_profiles import attempts
+from kineverse.formats.mjcf import mujoco_api
+from kineverse.formats.mjcf import writer as mjcf_writing
+from kineverse.formats.urdf import writer as urdf_writing
 from kineverse.model.body import Body, Inertia
 
 
@@ -104,7 +104,8 @@ def test_what_mujoco_does_not_open_is_not_written(tmp_path: Path, monkeypatch: p
     monkeypatch.setattr(mjcf_writing, "_unless_zero", lambda point: (float(point[0]), 1.0))
     (tmp_path / "m.xml").write_text("precious")
     with pytest.raises(
-        kv.FormatError, match=r"^m\.xml is not written\. MuJoCo does not open what would be written: .*'pos'"
+        kv.errors.FormatError,
+        match=r"^m\.xml is not written\. MuJoCo does not open what would be written: .*'pos'",
     ):
         moving(1.0, (1, 1, 1)).save(tmp_path / "m.xml")
     assert (tmp_path / "m.xml").read_text() == "precious"
@@ -113,9 +114,9 @@ def test_what_mujoco_does_not_open_is_not_written(tmp_path: Path, monkeypatch: p
 
 def test_without_mujoco_it_is_written_all_the_same(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def missing() -> None:
-        raise kv.MissingExtraError("no MuJoCo")
+        raise kv.errors.MissingDependencyError("no MuJoCo")
 
-    monkeypatch.setattr(verification, "mujoco", missing)
+    monkeypatch.setattr(mujoco_api, "mujoco", missing)
     moving(1.0, (1, 1, 1)).save(tmp_path / "m.xml")
     assert (tmp_path / "m.xml").is_file()
 
@@ -125,9 +126,9 @@ def test_what_cannot_be_read_again_is_not_written(tmp_path: Path, monkeypatch: p
     model = moving(1.0, (1, 1, 1))
     with model.edit() as edit:
         edit.apply(kv.Planar(name="p", parent="f", child="p", lower=-1, upper=1))
-    monkeypatch.setattr(urdf_writing.Names, "take", lambda self, *wishes: "f")
+    monkeypatch.setattr(urdf_writing.TakenNames, "take", lambda self, *wishes: "f")
     with pytest.raises(
-        kv.FormatError,
+        kv.errors.FormatError,
         match=r"^m\.urdf is not written\. What would be written cannot be read again: .*has the name",
     ):
         model.save(tmp_path / "m.urdf")
@@ -146,7 +147,11 @@ def test_constraints_that_cannot_be_said_are_left_out_and_motions_are_not(
         edit.constrain("lock", -(bolt > 0.5), q.derivative(), bolt > 0.5)
         edit.constrain("jerky", -1, q.derivative().derivative(), 1)
         edit.constrain("curved", -1, q * bolt, 1)
-        edit.apply(kv.DifferentialDrive(name="drive", parent="world", child="base", radius=0.1, track=0.5))
+        edit.apply(
+            kv.articulations.DifferentialDrive(
+                name="drive", parent="world", child="base", radius=0.1, track=0.5
+            )
+        )
     saved = model.save(tmp_path / f"m.{ending}")
     assert set(saved.left_out) >= {"lock", "jerky", "curved", "drive"}
     name = ending.replace("xml", "mjcf").upper()
@@ -157,12 +162,14 @@ def test_constraints_that_cannot_be_said_are_left_out_and_motions_are_not(
     at = kv.State({str(s): 0.3 for s in model.degrees_of_freedom})
     for frame in model.frames:
         np.testing.assert_allclose(again.fk(frame)(at), model.fk(frame)(at), atol=1e-12)
-    with pytest.raises(kv.FormatError, match=r"'lock' .* all of them without strict=True"):
+    with pytest.raises(kv.errors.FormatError, match=r"'lock' .* all of them without strict=True"):
         model.save(tmp_path / f"strict.{ending}", strict=True)
     assert not (tmp_path / f"strict.{ending}").exists()
     with model.edit() as edit:
         edit.apply(kv.Revolute(name="odd", parent="door", child="odd", position=np.sin(3 * q)))
-    with pytest.raises(kv.FormatError, match=r"cannot say one thing of this model\. 'odd' turns by no"):
+    with pytest.raises(
+        kv.errors.FormatError, match=r"cannot say one thing of this model\. 'odd' turns by no"
+    ):
         model.save(tmp_path / f"motion.{ending}")
     assert not (tmp_path / f"motion.{ending}").exists()
 
@@ -178,7 +185,7 @@ def test_scenes_with_locks_and_wheels_are_written_and_move_alike(
 ) -> None:
     model = loaded(f"articulations/{name}")
     if (name, ending) == ("ball", "urdf"):
-        with pytest.raises(kv.FormatError, match="turns by a quaternion"):
+        with pytest.raises(kv.errors.FormatError, match="turns by a quaternion"):
             model.save(tmp_path / "m.urdf")
         return
     saved = model.save(tmp_path / f"m.{ending}")
@@ -190,11 +197,11 @@ def test_scenes_with_locks_and_wheels_are_written_and_move_alike(
 
 @pytest.mark.parametrize("name", ["m.sdf", "m", "m.xml.txt"])
 def test_unknown_endings_are_told_before_anything_is_made(name: str, tmp_path: Path) -> None:
-    with pytest.raises(kv.FormatError, match=r"a model is saved to a name that ends in \.kv\.json"):
+    with pytest.raises(kv.errors.FormatError, match=r"a model is saved to a name that ends in \.kv\.json"):
         kv.load("shelf_door").save(tmp_path / name)
 
 
 def test_a_folder_is_no_file(tmp_path: Path) -> None:
     (tmp_path / "m.urdf").mkdir()
-    with pytest.raises(kv.FormatError, match=r"m\.urdf is a folder; name a file in it"):
+    with pytest.raises(kv.errors.FormatError, match=r"m\.urdf is a folder; name a file in it"):
         kv.load("shelf_door").save(tmp_path / "m.urdf")

@@ -9,12 +9,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from pinocchio_oracle import Reference
-from robots import SHARED
+from random_trees import trees
 from round_trip import SCENES, SHIPPED, assert_same_bodies, assert_same_motion, described, loaded, poses
-from trees import trees
+from urdf_texts import SHARED
 
 import kineverse as kv
-from attempts import attempts
+from hypothesis_profiles import attempts
 from kineverse.formats.urdf import read_urdf
 
 FILES = described()
@@ -75,7 +75,7 @@ def test_every_urdf_survives(file: Path | None, tmp_path: Path) -> None:
 def test_what_ships_is_said_or_refused_by_name(name: str, tmp_path: Path) -> None:
     model = loaded(name)
     if name in REFUSED:
-        with pytest.raises(kv.FormatError) as info:
+        with pytest.raises(kv.errors.FormatError) as info:
             model.save(tmp_path / "m.urdf", strict=True)
         message = str(info.value)
         names = [f"'{n}'" for n in (*model.frames, *model.constraints, *model.articulations)]
@@ -166,7 +166,7 @@ def test_products_in_one_matrix_are_taken_apart(tmp_path: Path) -> None:
     # Moved by one coordinate at two places, with something else between them, it is no such product.
     with model.edit() as edit:
         edit.add_frame("h", parent="g", transform=motion @ kv.translation(a, 0, 0))
-    with pytest.raises(kv.FormatError, match="'h' is moved by more than multiples and waves"):
+    with pytest.raises(kv.errors.FormatError, match="'h' is moved by more than multiples and waves"):
         model.save(tmp_path / "m.urdf")
 
 
@@ -208,7 +208,7 @@ def test_one_error_names_everything_that_cannot_be_said(tmp_path: Path) -> None:
         edit.constrain("jerky", -1, b.derivative().derivative(), 1)
         edit.constrain("one way", 0, b.derivative(), 1)
         edit.constrain("mixture", 0, b.derivative() - a.derivative(), 1)
-    with pytest.raises(kv.FormatError) as info:
+    with pytest.raises(kv.errors.FormatError) as info:
         model.save(tmp_path / "m.urdf", strict=True)
     message = str(info.value)
     assert "URDF cannot say 7 things" in message
@@ -217,7 +217,7 @@ def test_one_error_names_everything_that_cannot_be_said(tmp_path: Path) -> None:
         assert part in message
     assert ".kv.json" in message
     assert "leave_out" in message
-    with pytest.raises(kv.UnknownNameError, match=r"'lok' cannot be left out.*Did you mean 'lock'"):
+    with pytest.raises(kv.errors.UnknownNameError, match=r"'lok' cannot be left out.*Did you mean 'lock'"):
         model.save(tmp_path / "m.urdf", leave_out=["lok"])
     assert not list(tmp_path.iterdir())
 
@@ -226,13 +226,13 @@ def test_what_loops_hold_is_refused_for_that(tmp_path: Path) -> None:
     model = kv.Model()
     with model.edit() as edit:
         for name, x in (("a", 0.0), ("b", 1.0)):
-            origin = kv.Pose.of(kv.translation(x, 0, 0))
+            origin = kv.model.Pose.of(kv.translation(x, 0, 0))
             edit.apply(kv.Revolute(name=name, parent="world", child=name, axis=(0, 0, 1), origin=origin))
             edit.add_frame(f"{name}_end", parent=name, transform=kv.translation(0.8, 0, 0))
         edit.close_loop("a_end", "b_end", home={"a": 1.0, "b": 2.0})
     assert not model.degrees_of_freedom
     with pytest.raises(
-        kv.FormatError, match="'a' turns by no multiple of a coordinate; loops hold it where it is"
+        kv.errors.FormatError, match="'a' turns by no multiple of a coordinate; loops hold it where it is"
     ):
         model.save(tmp_path / "m.urdf")
 
@@ -244,7 +244,7 @@ def test_contradicting_limits_are_refused(tmp_path: Path) -> None:
         edit.add_frame("f", parent="world", transform=kv.rotation_z(q))
         edit.constrain("one", 0, q, 1)
         edit.constrain("other", 2, q, 3)
-    with pytest.raises(kv.FormatError, match="'q' cannot be anywhere"):
+    with pytest.raises(kv.errors.FormatError, match="'q' cannot be anywhere"):
         model.save(tmp_path / "m.urdf")
 
 
@@ -260,7 +260,7 @@ def test_names_that_xml_has_to_escape(tmp_path: Path) -> None:
 def test_names_in_between_take_nobodys(tmp_path: Path) -> None:
     model = kv.Model()
     with model.edit() as edit:
-        edit.apply(kv.Screw(name="s", parent="world", child="s", axis=(0, 1, 1), pitch=0.1))
+        edit.apply(kv.articulations.Screw(name="s", parent="world", child="s", axis=(0, 1, 1), pitch=0.1))
         edit.apply(kv.Revolute(name="s/slide", parent="s", child="s/slide", lower=0, upper=1))
         edit.apply(kv.Fixed(name="t", parent="s", child="s/turn"))
     assert_same_motion(model, saved(model, tmp_path))
@@ -279,7 +279,7 @@ def test_bodies_and_meshes_from_another_folder(tmp_path: Path) -> None:
     body = Body(
         (Shape(Mesh("a.stl", (1, 1, -1), str(tmp_path / "meshes")), name="m"), Shape(Cone(0.1, 0.2))),
         (Shape(Box((1, 2, 3))),),
-        Inertia(1.5, (1, 0.1, 0, 1, 0, 1), kv.Pose.of(kv.translation(0, 1, 0))),
+        Inertia(1.5, (1, 0.1, 0, 1, 0, 1), kv.model.Pose.of(kv.translation(0, 1, 0))),
     )
     model = kv.Model()
     with model.edit() as edit:
@@ -296,5 +296,5 @@ def test_numbers_that_are_none_are_refused(tmp_path: Path) -> None:
     model = kv.Model()
     with model.edit() as edit:
         edit.add_frame("f", parent="world", transform=np.eye(4), body=Body((Shape(Sphere(np.nan)),)))
-    with pytest.raises(kv.FormatError, match=r"m\.urdf is not written.*finite numbers only"):
+    with pytest.raises(kv.errors.FormatError, match=r"m\.urdf is not written.*finite numbers only"):
         model.save(tmp_path / "m.urdf")

@@ -13,9 +13,9 @@ from random import Random
 import pytest
 
 import kineverse as kv
-from kineverse.formats.document import document_of, operations_from
-from kineverse.formats.document.nodes import NODE_TYPES
-from kineverse.model.traces.question import KINDS as QUESTIONS
+from kineverse.formats.document import read_operations, to_json
+from kineverse.formats.document.node_types import NODE_TYPES
+from kineverse.model.traces.trace_queries import QUERY_KINDS as QUESTIONS
 
 TOOLS = Path(__file__).parents[2] / "tools"
 sys.path.insert(0, str(TOOLS))
@@ -82,23 +82,23 @@ def warning(text, folder):
 
 
 def long_message(text, folder):
-    raise kv.FormatError("input.urdf: " + "x" * 2000)
+    raise kv.errors.FormatError("input.urdf: " + "x" * 2000)
 
 
 def half_a_pair(text, folder):
-    raise kv.FormatError("input.urdf: \ud800")
+    raise kv.errors.FormatError("input.urdf: \ud800")
 
 
 def no_message(text, folder):
-    raise kv.FormatError("")
+    raise kv.errors.FormatError("")
 
 
 def another_kind(text, folder):
-    raise kv.UnknownNameError("x")
+    raise kv.errors.UnknownNameError("x")
 
 
 def nowhere(text, folder):
-    raise kv.FormatError("something is wrong")
+    raise kv.errors.FormatError("something is wrong")
 
 
 def opens_files(text, folder):
@@ -186,16 +186,16 @@ def test_edits_are_taken_and_taken_back():
     for seed in range(12):
         model = kv.Model()
         with model.edit() as edit:
-            for tag, operation in operations_from(programs.document(Random(seed))):
+            for tag, operation in read_operations(programs.document(Random(seed))):
                 edit.apply(operation, tag)
-        before = document_of(model)
+        before = to_json(model)
 
         def changed(model: kv.Model = model, before: str = before) -> None:
             nonlocal taken
-            taken += document_of(model) != before
+            taken += to_json(model) != before
 
         edits(model, seed, changed)
-        assert document_of(model) == before
+        assert to_json(model) == before
     assert 3 < taken < 12 * ATTEMPTS
 
 

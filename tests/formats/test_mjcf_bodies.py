@@ -85,7 +85,7 @@ def test_inertia_from_a_mesh_needs_the_file(tmp_path):
 
 def test_meshes_are_not_blamed_for_other_mistakes(caplog):
     caplog.set_level("INFO", "kineverse")
-    with pytest.raises(kv.FormatError, match="mass and inertia of moving bodies"):
+    with pytest.raises(kv.errors.FormatError, match="mass and inertia of moving bodies"):
         parse_mjcf(mjcf("<worldbody><body><joint/></body></worldbody>"))
     assert caplog.messages == []
 

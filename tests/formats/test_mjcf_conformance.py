@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 from mujoco_oracle import Pair, mujoco
-from robots import SHARED, shared
+from urdf_texts import SHARED, shared
 
 import kineverse as kv
 
@@ -47,7 +47,7 @@ def test_verdicts(file: str):
         model = kv.load(path, prefix="p")
         assert f"{len(model.frames)} {len(model.degrees_of_freedom)}" == expected
         return
-    with pytest.raises(kv.FormatError) as info:
+    with pytest.raises(kv.errors.FormatError) as info:
         kv.load(path, prefix="p")
     assert str(info.value).startswith(f"{path.name}, {expected}")
 

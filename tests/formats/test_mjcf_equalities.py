@@ -7,7 +7,7 @@ from test_mjcf_kinematics import body, mjcf
 
 import kineverse as kv
 from kineverse.formats.mjcf import parse_mjcf
-from kineverse.formats.remarks import listening
+from kineverse.formats.reader_warnings import collect_warnings
 
 TWO = body(
     "a", '<joint name="x" ref="10" range="-60 60"/>' + body("b", '<joint name="y" ref="-20"/>', 'pos="1 0 0"')
@@ -114,7 +114,7 @@ def test_circles_that_agree_are_one():
 
 def test_joints_held_in_two_places_are_told():
     text = scene(TWO, '<joint joint1="y" polycoef=".1"/>\n<joint name="no" joint1="y" polycoef=".3"/>')
-    with listening() as remarks:
+    with collect_warnings() as remarks:
         model = model_of(parse_mjcf(text, "x.xml"))
     (remark,) = remarks
     assert 'line 3, <joint name="no"> is left out, and never holds: it holds its joint 0.2 away' in remark
@@ -250,7 +250,7 @@ def test_what_is_held_twice_is_closed_or_refused():
     )
     chain = '<weld body1="box" body2="crate"/><weld body1="box" relpose="0 0 1 1 0 0 0"/>'
     check_closed(Pair.of_text(scene(boxes, chain)), rows=12, samples=1)
-    with pytest.raises(kv.ModelError, match="rigidly connected"):
+    with pytest.raises(kv.errors.ModelError, match="rigidly connected"):
         model_of(parse_mjcf(scene(boxes, chain + '<weld body1="crate" relpose="0 0 2 1 0 0 0"/>')))
 
 
@@ -260,7 +260,7 @@ def test_loops_that_cannot_be_followed_are_refused_by_name(tmp_path):
     )
     (tmp_path / "x.xml").write_text(scene(hung, '<connect name="end" body1="b" anchor="1 0 0"/>'))
     with pytest.raises(
-        kv.FormatError, match=r"^x\.xml: the equality 'end' closes a loop, which cannot be followed"
+        kv.errors.FormatError, match=r"^x\.xml: the equality 'end' closes a loop, which cannot be followed"
     ):
         kv.load(tmp_path / "x.xml", loops="refuse")
 
@@ -272,7 +272,7 @@ def test_what_is_rigid_is_left_out_or_closes_nothing():
     )
     apart = parse_mjcf(scene(fixed, '<weld name="w" body1="a" body2="b" relpose=".5 0 0 1 0 0 0"/>'))
     assert [closure.name for closure in apart.closures] == ["w"]
-    with pytest.raises(kv.ModelError, match="rigidly connected"):
+    with pytest.raises(kv.errors.ModelError, match="rigidly connected"):
         model_of(apart)
 
 

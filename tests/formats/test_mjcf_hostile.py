@@ -8,12 +8,12 @@ import sys
 
 import pytest
 from mujoco_oracle import model_of, mujoco
-from robots import shared
 from test_mjcf_kinematics import GEOM, body, mjcf
+from urdf_texts import shared
 
 import kineverse as kv
 from kineverse.formats.mjcf import parse_mjcf, read_mjcf
-from kineverse.formats.remarks import Fault
+from kineverse.formats.reader_warnings import Fault
 
 WORLD = f"<worldbody>{body('a', '<joint/>')}</worldbody>"
 
@@ -47,7 +47,7 @@ def _watched():
 
 
 def outcome(text: str | bytes, folder: object = "") -> str:
-    with pytest.raises(kv.FormatError) as info:
+    with pytest.raises(kv.errors.FormatError) as info:
         model_of(parse_mjcf(text, "x.xml", str(folder)))
     return str(info.value)
 
@@ -141,7 +141,7 @@ def test_names_that_cannot_be_names_are_replaced(text, problem, names):
     assert problem in remark
     assert {link.name for link in scene.links} == {"world", *names}
     assert names <= set(model_of(scene).frames)
-    with pytest.raises(kv.FormatError, match=re.escape(problem)):
+    with pytest.raises(kv.errors.FormatError, match=re.escape(problem)):
         parse_mjcf(text, "x.xml", strict=True)
 
 
@@ -150,7 +150,7 @@ def test_comments_and_declarations_that_xml_forbids_are_read():
     scene = parse_mjcf(text, "x.xml")
     assert len(scene.links) == 2
     assert sum(isinstance(remark, Fault) for remark in scene.remarks) == 2
-    with pytest.raises(kv.FormatError, match="not well-formed"):
+    with pytest.raises(kv.errors.FormatError, match="not well-formed"):
         parse_mjcf(text, "x.xml", strict=True)
 
 
@@ -262,14 +262,14 @@ def test_every_prefix_of_a_file_is_one_error():
 
 
 def test_a_file_that_is_not_there(tmp_path):
-    with pytest.raises(kv.FormatError, match="there is no such file"):
+    with pytest.raises(kv.errors.FormatError, match="there is no such file"):
         read_mjcf(tmp_path / "no.xml")
 
 
 def test_without_mujoco_the_error_names_the_extra(monkeypatch, tmp_path):
     monkeypatch.setitem(sys.modules, "mujoco", None)
     write(tmp_path, "x.xml", mjcf(WORLD))
-    with pytest.raises(kv.MissingExtraError, match=r"pip install -e '.*\[mjcf\]'"):
+    with pytest.raises(kv.errors.MissingDependencyError, match=r"pip install -e '.*\[mjcf\]'"):
         kv.load(tmp_path / "x.xml")
 
 

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from mujoco_oracle import Pair
 
-from attempts import attempts
+from hypothesis_profiles import attempts
 
 SHORT = st.floats(-2, 2).map(lambda x: round(x, 6))
 POINT = st.tuples(SHORT, SHORT, SHORT)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import pytest
-from test_sdf_frames import link, model_of, pose, sdf
+from test_sdf_pose_graph import link, model_of, pose, sdf
 
 import kineverse as kv
 from kineverse.formats.sdf import parse_sdf
@@ -62,4 +62,4 @@ def test_places_colours_and_inertia():
     (seen,) = body.visuals
     assert seen.origin.matrix[:3, 3].tolist() == [4, 1, 0]
     assert seen.color == (1, 0.5, 0, 0.5)
-    assert body.inertia == Inertia(2, (1, 0, 0, 1, 0.5, 1), kv.Pose.of(kv.translation(0, 0, 3)))
+    assert body.inertia == Inertia(2, (1, 0, 0, 1, 0.5, 1), kv.model.Pose.of(kv.translation(0, 0, 3)))

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from robots import SHARED, shared
-from sdf_verdicts import VERDICTS
+from sdf_outcomes import VERDICTS
+from urdf_texts import SHARED, shared
 
 import kineverse as kv
 
@@ -25,7 +25,7 @@ def test_verdicts(file: str):
         model = kv.load(path, prefix="p")
         assert f"{len(model.frames)} {len(model.degrees_of_freedom)}" == expected
     else:
-        with pytest.raises(kv.FormatError) as info:
+        with pytest.raises(kv.errors.FormatError) as info:
             kv.load(path, prefix="p")
         assert expected in str(info.value)
         assert str(info.value).startswith(path.name)

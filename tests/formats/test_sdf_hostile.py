@@ -8,22 +8,22 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from test_sdf_frames import WORLD, link, model_of, pose, sdf
 from test_sdf_joints import Z, joint, mimic
+from test_sdf_pose_graph import WORLD, link, model_of, pose, sdf
 
 import kineverse as kv
-from kineverse.formats.remarks import Fault
-from kineverse.formats.sdf import Scene, parse_sdf
-from kineverse.formats.sdf.operations import scene_operations
+from kineverse.formats.reader_warnings import Fault
+from kineverse.formats.sdf import SdfScene, parse_sdf
+from kineverse.formats.sdf.operations import sdf_operations
 
 LINKS = link("a") + link("b") + link("c")
 
 
-def outcome(data: str | bytes, strict: bool = False) -> Scene | str:
+def outcome(data: str | bytes, strict: bool = False) -> SdfScene | str:
     """Return the description or the message; anything but a FormatError fails the test."""
     try:
         return parse_sdf(data, source="x.sdf", strict=strict)
-    except kv.FormatError as error:
+    except kv.errors.FormatError as error:
         return str(error)
 
 
@@ -32,7 +32,7 @@ def test_cut_off_anywhere():
         message = outcome(WORLD[:length])
         assert isinstance(message, str), length
         assert message.startswith("x.sdf, line "), message
-    assert isinstance(outcome(WORLD), Scene)
+    assert isinstance(outcome(WORLD), SdfScene)
 
 
 CROSSED = "<limit><lower>1</lower><upper>0</upper></limit>"
@@ -45,7 +45,7 @@ MESH = "<visual><geometry><mesh><uri>a.stl</uri><scale>{}</scale></mesh></geomet
 def test_bytes_replaced_anywhere(position, replacement):
     data = WORLD.encode()
     result = outcome(data[:position] + replacement + data[position + len(replacement) :])
-    assert isinstance(result, Scene) or result.startswith("x.sdf")
+    assert isinstance(result, SdfScene) or result.startswith("x.sdf")
 
 
 @pytest.mark.parametrize(
@@ -191,11 +191,11 @@ AXIS = "<axis>{}</axis>"
 def test_what_moves_nothing_is_read_with_a_remark(text, reason):
     assert isinstance(outcome(text, strict=True), str)
     scene = outcome(text)
-    assert isinstance(scene, Scene)
+    assert isinstance(scene, SdfScene)
     assert any(isinstance(remark, Fault) and reason in remark for remark in scene.remarks)
     model = kv.Model()
     with model.edit() as edit:
-        for operation in scene_operations(scene):
+        for operation in sdf_operations(scene):
             edit.apply(operation)
     state = model.default_state()
     assert all(np.isfinite(model.fk(name)(state)).all() for name in model.frames)
@@ -255,7 +255,7 @@ def test_names_that_clash_in_the_model():
         joint("j", "universal", "b", "c", Z + "<axis2><xyz>0 1 0</xyz></axis2>"),
         link("c"),
     )
-    with pytest.raises(kv.FormatError, match=r"would be called \"j/first\" here"):
+    with pytest.raises(kv.errors.FormatError, match=r"would be called \"j/first\" here"):
         model_of(text)
 
 

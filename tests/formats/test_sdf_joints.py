@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 import pytest
-from test_sdf_frames import at, link, model_of, pose, sdf
+from test_sdf_pose_graph import at, link, model_of, pose, sdf
 
 import kineverse as kv
 from kineverse.formats.sdf import parse_sdf
@@ -31,9 +31,9 @@ def one(kind: str, inside: str = Z) -> kv.Model:
         ("revolute", Z, kv.Revolute, 1),
         ("Continuous", Z, kv.Continuous, 1),
         ("prismatic", Z, kv.Prismatic, 1),
-        ("screw", Z, kv.Screw, 1),
-        ("ball", "", kv.Ball, 4),
-        ("universal", Z + "<axis2><xyz>0 1 0</xyz></axis2>", kv.Universal, 2),
+        ("screw", Z, kv.articulations.Screw, 1),
+        ("ball", "", kv.articulations.Ball, 4),
+        ("universal", Z + "<axis2><xyz>0 1 0</xyz></axis2>", kv.articulations.Universal, 2),
     ],
 )
 def test_kinds(kind, inside, operation, coordinates):
@@ -141,7 +141,7 @@ def test_nothing_follows_what_cannot_move():
     text = sdf(
         link("a"), link("b"), static, joint("f", "revolute", "a", "b", Z.replace("</axis>", mimic("s::q", 2)))
     )
-    with pytest.raises(kv.FormatError, match='it follows "s/q", which cannot move'):
+    with pytest.raises(kv.errors.FormatError, match='it follows "s/q", which cannot move'):
         parse_sdf(text)
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from robots import SMALL, robot
+from urdf_texts import SMALL, robot
 
 from kineverse.formats.urdf import parse_urdf
 from kineverse.model.body import Body, Box, Capsule, Cylinder, Mesh, Sphere

@@ -6,11 +6,11 @@ import csv
 from pathlib import Path
 
 import pytest
-from robots import SHARED, shared
-from verdicts import COUNT, verdict
+from urdf_outcomes import COUNT, verdict
+from urdf_texts import SHARED, shared
 
 import kineverse as kv
-from kineverse.formats.remarks import Fault, listening
+from kineverse.formats.reader_warnings import Fault, collect_warnings
 from kineverse.formats.urdf import read_urdf
 
 FOLDER = SHARED / "urdf_conformance"
@@ -25,11 +25,11 @@ def test_verdicts(file: Path | None, strict: bool):
         pytest.skip(f"no {FOLDER}")
     expected = verdict(file, strict)
     if isinstance(expected, str):
-        with pytest.raises(kv.FormatError) as info:
+        with pytest.raises(kv.errors.FormatError) as info:
             kv.load(FOLDER / file, strict=strict)
         assert str(info.value).startswith(f"{file.name}, {expected}")
     else:
-        with listening() as remarks:
+        with collect_warnings() as remarks:
             model = kv.load(FOLDER / file, prefix="p", strict=strict)
         refused = isinstance(verdict(file, strict=True), str)
         assert any(isinstance(remark, Fault) for remark in remarks) == refused

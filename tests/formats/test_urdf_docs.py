@@ -31,6 +31,6 @@ def test_messages_are_the_ones_that_are_given():
         lamp.replace('<mimic joint="shoulder"', '<mimic joint="sholder"'),
     ]
     for text, message in zip(mistakes, messages.splitlines(), strict=True):
-        with pytest.raises(kv.FormatError) as info:
+        with pytest.raises(kv.errors.FormatError) as info:
             parse_urdf(text, source="lamp.urdf", strict=True)
         assert str(info.value) == message

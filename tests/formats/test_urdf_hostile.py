@@ -8,15 +8,15 @@ import re
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from robots import SMALL, pair
+from urdf_texts import SMALL, pair
 
 from kineverse.errors import FormatError
-from kineverse.formats import markup
-from kineverse.formats.remarks import Fault
-from kineverse.formats.urdf import Robot, parse_urdf, read_urdf
+from kineverse.formats import xml_reader
+from kineverse.formats.reader_warnings import Fault
+from kineverse.formats.urdf import UrdfRobot, parse_urdf, read_urdf
 
 
-def outcome(data: str | bytes) -> Robot | str:
+def outcome(data: str | bytes) -> UrdfRobot | str:
     """Return the robot or the message; anything but a FormatError fails the test."""
     try:
         return parse_urdf(data, source="r.urdf")
@@ -32,7 +32,7 @@ def test_cut_off_anywhere(kind):
         message = outcome(text[:length])
         assert isinstance(message, str), length
         assert message.startswith("r.urdf, line "), message
-    assert isinstance(outcome(text[:end]), Robot)
+    assert isinstance(outcome(text[:end]), UrdfRobot)
 
 
 def test_cut_off_names_what_is_open():
@@ -47,7 +47,7 @@ def test_cut_off_names_what_is_open():
 def test_bytes_replaced_anywhere(position, replacement):
     data = SMALL.encode()
     result = outcome(data[:position] + replacement + data[position + len(replacement) :])
-    assert isinstance(result, Robot) or result.startswith("r.urdf")
+    assert isinstance(result, UrdfRobot) or result.startswith("r.urdf")
 
 
 @given(st.binary(max_size=200) | st.text(max_size=200))
@@ -105,7 +105,7 @@ def test_extensions_may_nest_as_deep_as_others():
 
 
 def test_size_is_bounded(tmp_path, monkeypatch):
-    monkeypatch.setattr(markup, "MAX_BYTES", 100)
+    monkeypatch.setattr(xml_reader, "MAX_BYTES", 100)
     path = tmp_path / "big.urdf"
     path.write_text(SMALL)
     with pytest.raises(FormatError, match="larger than 100 bytes"):

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from robots import LIMIT, joint, pair, robot
+from urdf_texts import LIMIT, joint, pair, robot
 
 from kineverse.errors import FormatError
-from kineverse.formats.urdf import Dynamics, Limits, Mimic, Safety, parse_urdf
+from kineverse.formats.urdf import UrdfDynamics, UrdfLimits, UrdfMimic, UrdfSafetyController, parse_urdf
 
 
 def test_defaults_are_those_of_the_specification():
@@ -19,8 +19,8 @@ def test_defaults_are_those_of_the_specification():
     assert (j.name, j.kind, j.parent, j.child, j.line) == ("j", "revolute", "l0", "l1", 4)
     assert np.array_equal(j.origin.matrix, np.eye(4))
     assert j.axis == (1.0, 0.0, 0.0)
-    assert j.limits == Limits(-1.0, 2.0, 3.0, 10.0)
-    assert (j.safety, j.mimic, j.dynamics) == (None, None, Dynamics(0.0, 0.0))
+    assert j.limits == UrdfLimits(-1.0, 2.0, 3.0, 10.0)
+    assert (j.safety, j.mimic, j.dynamics) == (None, None, UrdfDynamics(0.0, 0.0))
 
 
 @pytest.mark.parametrize(
@@ -42,18 +42,18 @@ def test_every_type(kind, dof, axis):
 
 @pytest.mark.parametrize("kind", ["continuous", "fixed", "planar", "floating"])
 def test_types_without_limits_need_none(kind):
-    assert parse_urdf(pair("", kind)).joints[0].limits == Limits()
+    assert parse_urdf(pair("", kind)).joints[0].limits == UrdfLimits()
 
 
 def test_a_continuous_joint_keeps_speed_and_effort_but_has_no_range():
-    assert parse_urdf(pair(LIMIT, "continuous")).joints[0].limits == Limits(None, None, 3.0, 10.0)
+    assert parse_urdf(pair(LIMIT, "continuous")).joints[0].limits == UrdfLimits(None, None, 3.0, 10.0)
 
 
 def test_a_missing_bound_is_zero():
     text = pair('<limit lower="-1" effort="1" velocity="1"/>')
-    assert parse_urdf(text).joints[0].limits == Limits(-1.0, 0.0, 1.0, 1.0)
+    assert parse_urdf(text).joints[0].limits == UrdfLimits(-1.0, 0.0, 1.0, 1.0)
     robot = parse_urdf(pair('<limit effort="1" velocity="1"/>'))
-    assert robot.joints[0].limits == Limits(0.0, 0.0, 1.0, 1.0)
+    assert robot.joints[0].limits == UrdfLimits(0.0, 0.0, 1.0, 1.0)
     assert "neither lower nor upper" in robot.remarks[0]
 
 
@@ -75,14 +75,14 @@ V1_2 = 'name="r" version="1.2"'
 
 def test_limits_of_version_1_2_are_open_where_left_out():
     text = pair('<limit lower="-1" upper="1" velocity="0" acceleration="3" jerk="9"/>', attributes=V1_2)
-    assert parse_urdf(text).joints[0].limits == Limits(-1.0, 1.0, 0.0, None, 3.0, 3.0, 9.0)
+    assert parse_urdf(text).joints[0].limits == UrdfLimits(-1.0, 1.0, 0.0, None, 3.0, 3.0, 9.0)
     text = pair('<limit deceleration="4"/>', "continuous", attributes=V1_2)
-    assert parse_urdf(text).joints[0].limits == Limits(deceleration=4.0)
+    assert parse_urdf(text).joints[0].limits == UrdfLimits(deceleration=4.0)
 
 
 def test_limits_of_version_1_2_are_ignored_before_with_a_remark():
     robot = parse_urdf(pair('<limit upper="1" effort="1" velocity="1" acceleration="x" jerk="1"/>'))
-    assert robot.joints[0].limits == Limits(0.0, 1.0, 1.0, 1.0)
+    assert robot.joints[0].limits == UrdfLimits(0.0, 1.0, 1.0, 1.0)
     assert ["acceleration" in robot.remarks[0], "jerk" in robot.remarks[1]] == [True, True]
 
 
@@ -101,14 +101,14 @@ def test_safety_mimic_and_dynamics():
         links=3,
     )
     b = parse_urdf(text).joints[1]
-    assert b.safety == Safety(-0.5, 0.5, 7.0, 5.0)
-    assert b.mimic == Mimic("a", -2.0, 0.1)
-    assert b.dynamics == Dynamics(3.0, 0.0)
+    assert b.safety == UrdfSafetyController(-0.5, 0.5, 7.0, 5.0)
+    assert b.mimic == UrdfMimic("a", -2.0, 0.1)
+    assert b.dynamics == UrdfDynamics(3.0, 0.0)
 
 
 def test_an_empty_dynamics_is_the_default():
     # urdfdom refuses it; by the specification both attributes are optional.
-    assert parse_urdf(pair(LIMIT + "<dynamics/>")).joints[0].dynamics == Dynamics(0.0, 0.0)
+    assert parse_urdf(pair(LIMIT + "<dynamics/>")).joints[0].dynamics == UrdfDynamics(0.0, 0.0)
 
 
 def test_an_axis_without_xyz_is_the_default():

@@ -9,14 +9,14 @@ import numpy as np
 import pytest
 from _pytest.mark import ParameterSet
 from pinocchio_oracle import FORMS, Reference, pin
-from robots import LIMIT, SHARED, robot
-from robots import joint as joint_text
 from scipy.spatial.transform import Rotation
-from verdicts import verdict
+from urdf_outcomes import verdict
+from urdf_texts import LIMIT, SHARED, robot
+from urdf_texts import joint as joint_text
 
 import kineverse as kv
-from kineverse.formats.urdf import Robot, parse_urdf, read_urdf
-from kineverse.formats.urdf.operations import robot_operations
+from kineverse.formats.urdf import UrdfRobot, parse_urdf, read_urdf
+from kineverse.formats.urdf.operations import urdf_operations
 
 DOCS = Path(__file__).parents[2] / "docs" / "urdf.md"
 INSTALLED = Path(sysconfig.get_path("purelib"), "cmeel.prefix/share/example-robot-data/robots")
@@ -81,11 +81,11 @@ def assert_close(result: np.ndarray, expected: np.ndarray, what: str) -> None:
     np.testing.assert_allclose(result, expected, rtol=0, atol=TOLERANCE * size, err_msg=what)
 
 
-def assert_equal_to_pinocchio(reference: Reference, description: Robot, seed: int) -> None:
+def assert_equal_to_pinocchio(reference: Reference, description: UrdfRobot, seed: int) -> None:
     """Compare poses of all links, and Jacobians of some that carry nothing, at random configurations."""
     model = kv.Model()
     with model.edit() as edit:
-        for operation in robot_operations(description, "robot"):
+        for operation in urdf_operations(description, "robot"):
             edit.apply(operation)
     # Two robots call their links "/base_link"; the empty part is left out.
     frames = {link.name: "robot/" + link.name.removeprefix("/") for link in description.links}
@@ -128,11 +128,11 @@ def test_what_pinocchio_cannot_read_is_known_by_name(name: str) -> None:
 
 @pytest.mark.parametrize("name", REFUSED)
 def test_robots_that_break_the_specification_are_read_with_a_remark(name: str) -> None:
-    with pytest.raises(kv.FormatError) as info:
+    with pytest.raises(kv.errors.FormatError) as info:
         read_urdf(with_name(name), strict=True)
     assert REFUSED[name] in str(info.value)
     if name.endswith("ur3.urdf"):
-        with pytest.raises(kv.FormatError, match=r"has no <link>.*Run xacro first"):
+        with pytest.raises(kv.errors.FormatError, match=r"has no <link>.*Run xacro first"):
             read_urdf(with_name(name))
     else:
         assert REFUSED[name] in "".join(read_urdf(with_name(name)).remarks)

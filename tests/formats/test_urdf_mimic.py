@@ -7,10 +7,10 @@ import math
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from robots import joint, robot
+from urdf_texts import joint, robot
 
 from kineverse.errors import FormatError
-from kineverse.formats.urdf import Mimic, parse_urdf
+from kineverse.formats.urdf import UrdfMimic, parse_urdf
 
 FACTOR = st.integers(-3000, 3000).map(lambda thousandths: thousandths / 1000)
 
@@ -46,7 +46,7 @@ def test_defaults():
         links=3,
     )
     description = parse_urdf(text)
-    assert description.joints[1].mimic == Mimic("a", 1.0, 0.0)
+    assert description.joints[1].mimic == UrdfMimic("a", 1.0, 0.0)
     assert description.dof == 1
 
 
@@ -88,7 +88,7 @@ def test_a_chain_that_leads_nowhere_names_the_joint_that_breaks_it():
     with pytest.raises(FormatError, match=r"<mimic> of <joint name=\"a\">: .*Did you mean 'finger_joint'\?"):
         parse_urdf(text, strict=True)
     mimics = {joint.name: joint.mimic for joint in parse_urdf(text).joints}
-    assert mimics == {"a": None, "b": Mimic("a"), "finger_joint": None}
+    assert mimics == {"a": None, "b": UrdfMimic("a"), "finger_joint": None}
 
 
 def test_factors_that_overflow_are_refused():

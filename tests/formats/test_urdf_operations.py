@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from robots import LIMIT, SMALL, chain, joint, pair, robot
+from urdf_texts import LIMIT, SMALL, chain, joint, pair, robot
 
 import kineverse as kv
-from kineverse.formats.remarks import listening
+from kineverse.formats.reader_warnings import collect_warnings
 from kineverse.formats.urdf import parse_urdf
-from kineverse.formats.urdf.operations import robot_operations
+from kineverse.formats.urdf.operations import urdf_operations
 
 
 def model_of(text: str, prefix: str | None = None, parent: str = "world") -> kv.Model:
@@ -17,7 +17,7 @@ def model_of(text: str, prefix: str | None = None, parent: str = "world") -> kv.
     with model.edit() as edit:
         if parent != "world":
             edit.add_frame(parent, "world", kv.translation(0, 0, 1))
-        for operation in robot_operations(parse_urdf(text), prefix, parent):
+        for operation in urdf_operations(parse_urdf(text), prefix, parent):
             edit.apply(operation)
     return model
 
@@ -67,15 +67,15 @@ def test_a_root_called_world_is_a_frame_with_prefix():
 def test_a_root_can_be_attached_elsewhere():
     model = model_of(SMALL, "p", parent="table")
     assert model.fk("p/arm")({"p/elbow": 0.0})[:3, 3].tolist() == [1, 0, 1]
-    with pytest.raises(kv.FormatError, match="its root link is the world"):
+    with pytest.raises(kv.errors.FormatError, match="its root link is the world"):
         model_of(WORLD, parent="table")
 
 
 def test_a_link_called_world_that_is_not_the_root_needs_a_prefix():
     text = robot('<link name="world"/>', joint("j", "l0", "world"), links=1)
-    with pytest.raises(kv.FormatError, match=r'line 3, <link name="world">: .* Give a prefix'):
-        list(robot_operations(parse_urdf(text), strict=True))
-    with listening() as remarks:
+    with pytest.raises(kv.errors.FormatError, match=r'line 3, <link name="world">: .* Give a prefix'):
+        list(urdf_operations(parse_urdf(text), strict=True))
+    with collect_warnings() as remarks:
         assert set(model_of(text).frames) == {"l0", "world_link"}
     assert remarks[0].endswith('Give a prefix; it is called "world_link".')
     assert "p/world" in model_of(text, "p").frames
@@ -112,9 +112,9 @@ def test_empty_parts_of_names_are_left_out():
 def test_names_that_cannot_be_names_are_replaced(links, message, frames):
     joints = [joint(f"j{i}", links[0], name) for i, name in enumerate(links[1:])]
     text = robot(*(f'<link name="{name}"/>' for name in links), *joints)
-    with pytest.raises(kv.FormatError, match=message):
-        list(robot_operations(parse_urdf(text), strict=True))
-    with listening() as remarks:
+    with pytest.raises(kv.errors.FormatError, match=message):
+        list(urdf_operations(parse_urdf(text), strict=True))
+    with collect_warnings() as remarks:
         assert set(model_of(text).frames) == frames
     assert len(remarks) == len(frames) - (len(links) > 1) - ("a_link" in links)
     assert all("; it is called " in remark for remark in remarks)
@@ -122,8 +122,10 @@ def test_names_that_cannot_be_names_are_replaced(links, message, frames):
 
 def test_coordinates_that_would_share_a_name_get_another():
     text = robot(joint("a", "l0", "l1", "planar", ""), joint("a/x", "l1", "l2"), links=3)
-    with pytest.raises(kv.FormatError, match=r'line 5, <joint name="a">: its coordinate "a/x" has the name'):
-        list(robot_operations(parse_urdf(text), strict=True))
+    with pytest.raises(
+        kv.errors.FormatError, match=r'line 5, <joint name="a">: its coordinate "a/x" has the name'
+    ):
+        list(urdf_operations(parse_urdf(text), strict=True))
     assert [str(s) for s in model_of(text).degrees_of_freedom] == [
         "a/x",
         "a_joint/angle",
@@ -242,7 +244,7 @@ def test_a_multiplier_of_zero_makes_a_joint_that_stands_still():
 
 def test_bodies_go_with_their_frames():
     model = model_of(SMALL)
-    with pytest.raises(kv.EditError, match="base"), model.edit() as edit:
+    with pytest.raises(kv.errors.EditError, match="base"), model.edit() as edit:
         edit.remove("frame base")
     assert "base" in model.bodies
 

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from robots import chain, joint, robot
+from urdf_texts import chain, joint, robot
 
 import kineverse as kv
 from kineverse.errors import FormatError
 from kineverse.formats.urdf import parse_urdf
-from kineverse.formats.urdf.operations import robot_operations
+from kineverse.formats.urdf.operations import urdf_operations
 
 
 @st.composite
@@ -116,7 +116,7 @@ def test_links_and_joints_without_names_get_some():
     text = robot('<link name=""/>', joint("j", "l0", "l1", "fixed").replace('name="j" ', ""), links=2)
     model = kv.Model()
     with model.edit() as edit:
-        for operation in robot_operations(parse_urdf(text)):
+        for operation in urdf_operations(parse_urdf(text)):
             edit.apply(operation)
     assert set(model.frames) == {"l0", "l1", "link"}
     assert set(model.articulations) == {"l0_l1"}
@@ -138,7 +138,7 @@ def test_further_roots_stand_where_the_first_does():
     text = robot(joint("j", "l0", "l1"), joint("k", "l2", "l3"), links=4)
     model = kv.Model()
     with model.edit() as edit:
-        for operation in robot_operations(parse_urdf(text), "p"):
+        for operation in urdf_operations(parse_urdf(text), "p"):
             edit.apply(operation)
     state = {"p/j": 0.0, "p/k": 0.5}
     np.testing.assert_array_equal(model.fk("p/l2")(state), np.eye(4))

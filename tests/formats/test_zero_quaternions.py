@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 import kineverse as kv
-from kineverse.formats.document import document_of, operations_from
+from kineverse.formats.document import read_operations, to_json
 from kineverse.formats.mjcf import parse_mjcf
-from kineverse.formats.mjcf.operations import scene_operations
+from kineverse.formats.mjcf.operations import mjcf_operations
 
 GEOM = '<geom size=".1"/>'
 FREE = f'<body name="b" pos="1 2 3" quat="{{}}"><freejoint/>{GEOM}</body>'
@@ -26,7 +26,7 @@ def test_homes_are_where_mujoco_has_them(turn, rest, body, before):
     text = f"<mujoco><worldbody>{body.format(rest)}</worldbody>{key}</mujoco>"
     model = kv.Model()
     with model.edit() as edit:
-        for operation in scene_operations(parse_mjcf(text)):
+        for operation in mjcf_operations(parse_mjcf(text)):
             edit.apply(operation)
     state = model.default_state()
     quaternion = [state[s] for s in state if str(s).rpartition("/")[2] in ("qx", "qy", "qz", "qw")]
@@ -43,11 +43,11 @@ def test_homes_are_where_mujoco_has_them(turn, rest, body, before):
 def test_a_document_with_such_a_home_is_refused():
     model = kv.Model()
     with model.edit() as edit:
-        edit.apply(kv.Ball(name="j", parent="world", child="b"))
-    tree = json.loads(document_of(model))
+        edit.apply(kv.articulations.Ball(name="j", parent="world", child="b"))
+    tree = json.loads(to_json(model))
     tree.pop("sha256", None)
     for operation in tree["operations"]:
         for record in operation["writes"].get("articulations", {}).values():
             record["home"] = [0.0] * 4
-    with pytest.raises(kv.FormatError, match="a quaternion of length zero"):
-        operations_from(json.dumps(tree))
+    with pytest.raises(kv.errors.FormatError, match="a quaternion of length zero"):
+        read_operations(json.dumps(tree))

@@ -13,8 +13,8 @@ import kineverse as kv
 from kineverse import gallery
 from kineverse.cli import main
 from kineverse.errors import UnknownNameError
-from kineverse.view.poses import Poses, complete
-from kineverse.view.ranges import Ranges, offered
+from kineverse.view.poses import FramePoses, complete
+from kineverse.view.sliders import Ranges, choose_slider_range
 
 NAMES = gallery.names()
 SAMPLES = 41
@@ -29,7 +29,7 @@ def opened(name):
 
 def shown(model):
     """The poses of what has a body."""
-    return Poses(model, [frame for frame in model.frames if frame in model.bodies])
+    return FramePoses(model, [frame for frame in model.frames if frame in model.bodies])
 
 
 def paths(model):
@@ -41,7 +41,7 @@ def paths(model):
     opened = {name: high for name, (_, high) in ranges.at(first).items() if np.isfinite(high)}
     for values in (first, {**first, **opened}):
         for name, limits in ranges.at(values).items():
-            path = np.clip(np.linspace(*offered(limits, values[name], "rad"), SAMPLES), *limits)
+            path = np.clip(np.linspace(*choose_slider_range(limits, values[name], "rad"), SAMPLES), *limits)
             # A quaternion that turns over by one of its elements would be none half-way.
             yield name, path if not name.endswith("qw") else np.linspace(0.1, 1.0, SAMPLES), values
 

@@ -8,7 +8,7 @@ import mujoco
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from kineverse.geometry.solids import Solid, _hull, solid_of
+from kineverse.geometry.shapes import Solid, _hull_solid, solid_from_geometry
 from kineverse.model.body import Box, Capsule, Cone, Cylinder, Ellipsoid, Sphere
 
 KINDS = ("box", "sphere", "capsule", "hull", "cylinder", "ellipsoid", "cone")
@@ -76,7 +76,7 @@ def random_shape(kind: str, rng: np.random.Generator) -> Convex:
     if kind == "hull":
         points = rng.normal(size=(20, 3)) * sizes / 2
         points = points.astype(np.float32).astype(float)  # as MuJoCo keeps them
-        return Convex(kind, _hull(points), sizes, points)
+        return Convex(kind, _hull_solid(points), sizes, points)
     geometry = {
         "box": Box((2 * x, 2 * y, 2 * z)),
         "sphere": Sphere(x),
@@ -85,7 +85,7 @@ def random_shape(kind: str, rng: np.random.Generator) -> Convex:
         "ellipsoid": Ellipsoid((x, y, z)),
         "cone": Cone(x, 2 * y),
     }[kind]
-    return Convex(kind, solid_of(geometry), sizes)
+    return Convex(kind, solid_from_geometry(geometry), sizes)
 
 
 def random_pose(rng: np.random.Generator, spread: float) -> np.ndarray:

@@ -12,25 +12,25 @@ import sys
 import numpy as np
 import pytest
 
-from decomposed_meshes import cube, ell, fake_coacd, finger, overlapping, tray
-from kineverse.errors import FormatError, ValueRejectedError
+from fake_coacd import cube, ell, fake_coacd, finger, overlapping, tray
+from kineverse.errors import FormatError, InvalidValueError
 from kineverse.geometry.decomposition import (
     DecompositionError,
-    Limits,
-    Settings,
+    DecompositionSettings,
+    ResourceLimits,
     clear,
+    convex_decomposition,
     decompose,
     decompose_all,
+    find_hulls,
+    hull_cache,
     listing,
-    making,
-    pieces,
-    store,
     worker,
 )
-from kineverse.geometry.decomposition.accuracy import Polytope, is_closed, measure
-from kineverse.geometry.decomposition.merging import at_most, polytopes
+from kineverse.geometry.decomposition.accuracy import Polytope, is_closed, measure_accuracy
+from kineverse.geometry.decomposition.convex_decomposition import clean_hulls, reduce_hulls
+from kineverse.geometry.decomposition.mesh_cleanup import clean_mesh
 from kineverse.geometry.decomposition.result import Decomposition
-from kineverse.geometry.decomposition.surface import surface_of
 from kineverse.geometry.mesh_files import Faces
 from kineverse.model.body import Mesh
 
@@ -73,7 +73,7 @@ def made(name):
     mesh = shape()
     with tempfile.TemporaryDirectory() as folder:
         mesh.export(f"{folder}/{name}.stl")
-        return mesh, decompose(Mesh(f"{name}.stl", folder=folder), Settings(error)).decomposition
+        return mesh, decompose(Mesh(f"{name}.stl", folder=folder), DecompositionSettings(error)).decomposition
 
 
 # Laws of what CoACD makes.
@@ -131,7 +131,9 @@ def test_parts_that_are_convex_are_found_exactly():
 
 def test_the_same_mesh_gives_the_same_hulls(file):
     mesh = file(finger())
-    first, second = (decompose(mesh, Settings(0.0014), force=True).decomposition for _ in range(2))
+    first, second = (
+        decompose(mesh, DecompositionSettings(0.0014), force=True).decomposition for _ in range(2)
+    )
     assert len(first.hulls) == len(second.hulls) > 1
     for one, other in zip(first.hulls, second.hulls, strict=True):
         np.testing.assert_array_equal(one, other)
@@ -139,7 +141,7 @@ def test_the_same_mesh_gives_the_same_hulls(file):
 
 def test_a_surface_that_is_not_closed_is_wrapped_and_said_so(file):
     half = trimesh.Trimesh(cube().vertices, cube().faces[:11])
-    result = decompose(file(half), Settings(0.1)).decomposition
+    result = decompose(file(half), DecompositionSettings(0.1)).decomposition
     assert result.accuracy.mesh_volume is None
     assert "not closed" in result.remarks[0]
     assert result.accuracy.uncovered < 1e-3
@@ -155,7 +157,7 @@ def _surface(mesh):
 
 def test_measures_of_an_ell_and_its_hull():
     mesh = _surface(ell())
-    measured = measure(mesh, [Polytope.of(mesh.vertices)])
+    measured = measure_accuracy(mesh, [Polytope.of(mesh.vertices)])
     # The middle of the slanted face of the hull is 75 mm from the sides of both legs.
     assert 0.073 < measured.excess <= 0.075 + 1e-5
     assert measured.uncovered == 0.0
@@ -165,7 +167,7 @@ def test_measures_of_an_ell_and_its_hull():
 
 def test_measures_of_an_ell_and_one_leg():
     leg = cube((0.2, 0.05, 0.05), (0.1, 0.025, 0.025)).vertices
-    measured = measure(_surface(ell()), [Polytope.of(np.array(leg))])
+    measured = measure_accuracy(_surface(ell()), [Polytope.of(np.array(leg))])
     assert measured.uncovered == pytest.approx(0.15, abs=1e-5)
     assert measured.excess == 0.0
     assert measured.volume == pytest.approx(0.2 * 0.05 * 0.05)
@@ -174,7 +176,7 @@ def test_measures_of_an_ell_and_one_leg():
 @pytest.mark.parametrize("overlap", [0.0, 0.3, 1.0])
 def test_the_volume_of_a_union_counts_what_overlaps_once(overlap):
     cubes = [Polytope.of(np.array(cube((1, 1, 1), (k * (1 - overlap), 0, 0)).vertices)) for k in range(2)]
-    measured = measure(_surface(cube((1, 1, 1))), cubes)
+    measured = measure_accuracy(_surface(cube((1, 1, 1))), cubes)
     assert measured.volume == pytest.approx(2 - overlap, rel=1e-2)
 
 
@@ -189,34 +191,34 @@ def test_a_surface_is_closed_if_every_edge_is_passed_both_ways():
 
 def test_hulls_are_joined_where_that_adds_least():
     row = [Polytope.of(np.array(cube((1, 1, 1), (x, 0, 0)).vertices)) for x in (0, 1, 2, 10)]
-    joined = at_most(row, 2)
+    joined = reduce_hulls(row, 2)
     assert sorted(round(one.volume, 9) for one in joined) == [1.0, 3.0]
-    assert len(at_most(row, 1)) == 1
-    assert at_most(row, 4) == row
+    assert len(reduce_hulls(row, 1)) == 1
+    assert reduce_hulls(row, 4) == row
 
 
 def test_hulls_inside_of_others_and_splinters_are_left_out():
     large, small = (np.array(cube((e, e, e)).vertices) for e in (1.0, 0.5))
     line = np.outer(np.arange(4.0), [1, 0, 0])
-    (one,) = polytopes([small, line, large], Polytope.of(2 * large))
+    (one,) = clean_hulls([small, line, large], Polytope.of(2 * large))
     assert one.volume == pytest.approx(1.0)
-    (one,) = polytopes([small, line, 1.1 * large], Polytope.of(large))
+    (one,) = clean_hulls([small, line, 1.1 * large], Polytope.of(large))
     np.testing.assert_allclose(np.abs(one.points), 0.5, atol=1e-6)
 
 
 def test_a_part_inside_out_is_a_hole_and_stays_with_what_is_around_it(file):
     hole = cube((0.05, 0.05, 0.05))
     hole.invert()
-    hollow = surface_of(file(trimesh.util.concatenate([cube(), hole]), "hollow.stl"))
+    hollow = clean_mesh(file(trimesh.util.concatenate([cube(), hole]), "hollow.stl"))
     assert hollow.parts.max() == 0
-    assert measure(hollow.faces, [Polytope.of(hollow.faces.vertices)]).mesh_volume == pytest.approx(
+    assert measure_accuracy(hollow.faces, [Polytope.of(hollow.faces.vertices)]).mesh_volume == pytest.approx(
         0.1**3 - 0.05**3
     )
-    assert surface_of(file(overlapping(), "two.stl")).parts.max() == 1
+    assert clean_mesh(file(overlapping(), "two.stl")).parts.max() == 1
     inverted = overlapping()
     inverted.invert()
     assert (
-        surface_of(file(inverted, "inverted.stl")).digest == surface_of(file(overlapping(), "two.stl")).digest
+        clean_mesh(file(inverted, "inverted.stl")).digest == clean_mesh(file(overlapping(), "two.stl")).digest
     )
 
 
@@ -234,27 +236,27 @@ def plain(tmp_path, monkeypatch):
 
 def test_what_is_in_the_cache_is_not_made_again(file, plain, monkeypatch):
     mesh = file(cube())
-    assert pieces(mesh) is None
+    assert find_hulls(mesh) is None
     first = decompose(mesh)
     assert not first.cached
-    monkeypatch.setattr(making, "run", None)
+    monkeypatch.setattr(convex_decomposition, "run_coacd", None)
     again = decompose(mesh)
     assert again.cached
     assert again.decomposition.accuracy == first.decomposition.accuracy
-    for hulls in (again.decomposition.hulls, pieces(mesh), pieces(mesh, Settings())):
+    for hulls in (again.decomposition.hulls, find_hulls(mesh), find_hulls(mesh, DecompositionSettings())):
         np.testing.assert_array_equal(hulls[0], first.decomposition.hulls[0])
         assert not hulls[0].flags.writeable
     # Another file of the same content, in another format, with the corners in another order.
-    assert pieces(file(cube(), "other.stl")) is not None
-    assert pieces(mesh, Settings(max_hulls=3)) is None
-    assert pieces(file(cube(), scale=(1.0, 2.0, 1.0))) is None
+    assert find_hulls(file(cube(), "other.stl")) is not None
+    assert find_hulls(mesh, DecompositionSettings(max_hulls=3)) is None
+    assert find_hulls(file(cube(), scale=(1.0, 2.0, 1.0))) is None
 
 
 def test_without_settings_the_latest_counts(file, plain):
     mesh = file(cube())
-    decompose(mesh, Settings(max_hulls=5))
-    latest = decompose(mesh, Settings(error=0.01))
-    assert store.find(surface_of(mesh).digest).error == latest.decomposition.error == 0.01
+    decompose(mesh, DecompositionSettings(max_hulls=5))
+    latest = decompose(mesh, DecompositionSettings(error=0.01))
+    assert hull_cache.find_entry(clean_mesh(mesh).digest).error == latest.decomposition.error == 0.01
 
 
 def test_a_scale_is_applied_and_may_mirror(file, plain):
@@ -275,7 +277,7 @@ def test_the_folder_is_this_users_and_files_are_whole(file, plain, cache, caplog
     assert Decomposition.from_bytes(content[:-32]).to_bytes() == content[:-32]
     for broken in (content[:-1], content[1:], b"", content[:50] + b"x" + content[51:]):
         path.write_bytes(broken)
-        assert pieces(mesh) is None
+        assert find_hulls(mesh) is None
         assert "damaged" in caplog.text
         assert not path.exists()
     with pytest.raises(FormatError):
@@ -287,7 +289,7 @@ def test_the_cache_is_bounded_listed_and_cleared(file, plain, monkeypatch):
     decompose(small)
     decompose(large)
     assert [os.path.basename(kept.decomposition.name) for kept in listing()] == ["large.stl", "small.stl"]
-    monkeypatch.setattr(store, "MAXIMUM_BYTES", max(kept.bytes for kept in listing()) + 100)
+    monkeypatch.setattr(hull_cache, "MAXIMUM_BYTES", max(kept.bytes for kept in listing()) + 100)
     decompose(file(finger(), "finger.stl"))
     assert [os.path.basename(kept.decomposition.name) for kept in listing()] == ["finger.stl"]
     assert clear() == 1
@@ -327,7 +329,7 @@ WRONG = {
 def test_a_failure_of_coacd_is_an_error_that_names_the_file(file, tmp_path, monkeypatch, capfd, name):
     body, message = WRONG[name]
     fake_coacd(tmp_path / "fake", monkeypatch, body)
-    limits = Limits(seconds=1.0 if name == "hangs" else 100.0)
+    limits = ResourceLimits(seconds=1.0 if name == "hangs" else 100.0)
     with pytest.raises(DecompositionError, match=message) as caught:
         decompose(file(cube(), "bad one.stl"), limits=limits)
     assert "bad one.stl" in str(caught.value)
@@ -339,7 +341,7 @@ def test_a_failure_of_coacd_is_an_error_that_names_the_file(file, tmp_path, monk
 def test_memory_is_bounded(file, tmp_path, monkeypatch):
     fake_coacd(tmp_path / "fake", monkeypatch, "bytearray(3 * 2**30)\n" + ONE_HULL)
     with pytest.raises(DecompositionError, match="more memory"):
-        decompose(file(cube()), limits=Limits(memory=2 * 2**30))
+        decompose(file(cube()), limits=ResourceLimits(memory=2 * 2**30))
 
 
 def test_what_is_done_before_an_interruption_is_kept(file, tmp_path, monkeypatch):
@@ -348,8 +350,8 @@ def test_what_is_done_before_an_interruption_is_kept(file, tmp_path, monkeypatch
     outcomes = decompose_all([good, endless], jobs=2)
     assert next(outcomes).mesh is good
     outcomes.close()  # as Ctrl-C does; returns only when CoACD has been ended
-    assert pieces(good) is not None
-    assert pieces(endless) is None
+    assert find_hulls(good) is not None
+    assert find_hulls(endless) is None
 
 
 def test_a_process_does_not_outlive_whoever_started_it(tmp_path, monkeypatch):
@@ -385,19 +387,19 @@ def _soup():
 
 BAD = {
     "nan.stl": (_with_nan, FormatError, "not finite"),
-    "huge.stl": (lambda: cube((1e9, 1, 1)), ValueRejectedError, "extent"),
-    "tiny.stl": (lambda: cube((1e-9, 1e-9, 1e-9)), ValueRejectedError, "extent"),
-    "flat.stl": (lambda: cube((1, 1, 0)), ValueRejectedError, "flat"),
-    "point.stl": (_soup, ValueRejectedError, "extent"),
+    "huge.stl": (lambda: cube((1e9, 1, 1)), InvalidValueError, "extent"),
+    "tiny.stl": (lambda: cube((1e-9, 1e-9, 1e-9)), InvalidValueError, "extent"),
+    "flat.stl": (lambda: cube((1, 1, 0)), InvalidValueError, "flat"),
+    "point.stl": (_soup, InvalidValueError, "extent"),
 }
 
 
 @pytest.mark.parametrize("name", BAD)
 def test_meshes_that_cannot_be_decomposed_are_refused_by_file(file, monkeypatch, name):
     mesh, kind, message = BAD[name]
-    monkeypatch.setattr(making, "run", None)
+    monkeypatch.setattr(convex_decomposition, "run_coacd", None)
     bad = file(mesh(), name)
-    for call in (decompose, pieces):
+    for call in (decompose, find_hulls):
         with pytest.raises(kind, match=message) as caught:
             call(bad)
         assert name in str(caught.value)
@@ -414,20 +416,20 @@ def test_files_that_are_no_meshes_are_refused(tmp_path, content):
 
 @pytest.mark.parametrize("scale", [(0.0, 1.0, 1.0), (np.nan, 1.0, 1.0), (np.inf, 1.0, 1.0)])
 def test_a_scale_that_is_none_is_refused(file, scale):
-    with pytest.raises(ValueRejectedError, match="scale"):
+    with pytest.raises(InvalidValueError, match="scale"):
         decompose(file(cube(), scale=scale))
 
 
 def test_meshes_of_too_many_triangles_are_refused(file, monkeypatch):
-    monkeypatch.setattr("kineverse.geometry.decomposition.surface.MOST_FACES", 10)
-    with pytest.raises(ValueRejectedError, match="12 triangles"):
+    monkeypatch.setattr("kineverse.geometry.decomposition.mesh_cleanup.MOST_FACES", 10)
+    with pytest.raises(InvalidValueError, match="12 triangles"):
         decompose(file(cube()))
 
 
 @pytest.mark.parametrize("asked", [{"error": 0.0}, {"error": np.nan}, {"error": -1.0}, {"max_hulls": 0}])
 def test_settings_that_make_no_sense_are_refused(asked):
-    with pytest.raises(ValueRejectedError):
-        Settings(**asked)
+    with pytest.raises(InvalidValueError):
+        DecompositionSettings(**asked)
 
 
 def test_one_bad_mesh_does_not_stop_the_others(file, plain, tmp_path):

@@ -7,10 +7,10 @@ import threading
 
 import numpy as np
 import pytest
-from scenes import arm_among_boxes, body, brute_force, by_names, random_state
+from scene_models import arm_among_boxes, body, brute_force, by_names, random_state
 
 import kineverse as kv
-from kineverse.geometry import Rule, Scene, mirror, pieces, sweep, sweep_native
+from kineverse.geometry import Rule, Scene, bindings, broadphase, collision_world, objects
 from kineverse.model.body import Body, Box, Shape, Sphere
 from kineverse.model.kinematics import ancestors
 
@@ -23,11 +23,11 @@ def model():
 @pytest.fixture(params=["numpy", pytest.param("c", marks=pytest.mark.compiler)])
 def either_sweep(request, monkeypatch):
     """Both ways to find what is near."""
-    library = sweep_native.SweepLibrary()
+    library = bindings.CollisionLibrary()
     if request.param == "c":
         assert library.prepare(wait=True)
     else:
-        library.place, library.near = sweep.place, sweep.near
+        library.place, library.near = broadphase.place_objects, broadphase.find_near_pairs
         library.prepare = lambda wait=False: False
     for module in ("mirror", "queries"):
         monkeypatch.setattr(f"kineverse.geometry.{module}.sweep_library", library)
@@ -72,13 +72,13 @@ def test_what_is_beyond_all_measure_is_refused_with_its_name(model, either_sweep
     scene.update(state)
     near = by_names(scene.within(0.3))
     for rail in (1e13, 1e200):
-        with pytest.raises(kv.ValueRejectedError, match=r"'base', .*1e\+12 m away; nothing was moved"):
+        with pytest.raises(kv.errors.InvalidValueError, match=r"'base', .*1e\+12 m away; nothing was moved"):
             scene.update(state.updated({"rail": rail}))
     assert by_names(scene.within(0.3)) == near
     far = kv.Model()
     with far.edit() as edit:
         edit.add_frame("post", "world", kv.translation(1e50, 0, 0), body(Sphere(0.1)))
-    with pytest.raises(kv.ValueRejectedError, match="'post' stands further"):
+    with pytest.raises(kv.errors.InvalidValueError, match="'post' stands further"):
         Scene(far)
     assert Scene(far, leave_out=["post"]).bodies == ()
 
@@ -88,11 +88,11 @@ def test_most_pairs_are_settled_without_measuring(model):
     state = model.default_state()
     scene.update(state)
     scene.within(0.3)
-    before = scene._mirror.narrow.calls
+    before = scene._world.narrow.calls
     for k in range(20):
         scene.update(state.updated({"j0": 0.002 * k}))
         scene.within(0.3)
-    measured = (scene._mirror.narrow.calls - before) / 20
+    measured = (scene._world.narrow.calls - before) / 20
     assert measured < 0.3 * len(brute_force(scene, state))
 
 
@@ -196,9 +196,9 @@ def counted(monkeypatch):
 
         return wrapped
 
-    monkeypatch.setattr(pieces, "Piece", counting("pieces", pieces.Piece))
-    monkeypatch.setattr(pieces, "solid_of", counting("solids", pieces.solid_of))
-    monkeypatch.setattr(mirror, "compile_expressions", counting("compiled", mirror.compile_expressions))
+    monkeypatch.setattr(objects, "CollisionObject", counting("pieces", objects.CollisionObject))
+    monkeypatch.setattr(objects, "solid_from_geometry", counting("solids", objects.solid_from_geometry))
+    monkeypatch.setattr(collision_world, "compile", counting("compiled", collision_world.compile_expressions))
     return counts
 
 
@@ -218,7 +218,7 @@ def test_an_edit_changes_what_it_touches(counted):
         work = dict(counted)
         fresh.update({**state, **{s: model.default_state()[s] for s in model.symbols if s not in state}})
         assert by_names(near) == by_names(fresh.within(0.3))
-        made = len(fresh._mirror.pieces)
+        made = len(fresh._world.pieces)
         return {**work, "pieces": work["pieces"] - made, "compiled": work["compiled"] - 1}
 
     def constrain(edit):
@@ -249,11 +249,11 @@ def test_what_is_picked_up_goes_with_the_hand():
     state = random_state(model, np.random.default_rng(5))
     scene = Scene(model)
     scene.update(state)
-    assert scene.looks_at("hand", "box0")
+    assert scene.checks_pair("hand", "box0")
     with model.edit() as edit:
         edit.attach("box0", "hand", kv.translation(0, 0, 0.3))
-    assert not scene.looks_at("hand", "box0")  # held, so they may touch
-    assert scene.looks_at("link1", "box0")
+    assert not scene.checks_pair("hand", "box0")  # held, so they may touch
+    assert scene.checks_pair("link1", "box0")
     np.testing.assert_allclose(scene.pose("box0"), model.fk("box0")(state), atol=1e-12)
     other = state.updated({"j0": 0.9})
     scene.update(other)
@@ -278,7 +278,7 @@ def test_after_an_edit_a_new_symbol_needs_a_value():
     scene.update(model.default_state())
     with model.edit() as edit:
         edit.add_frame("flap", "world", kv.rotation_z(kv.position("flap")), body(Box((1, 0.1, 0.1))))
-    with pytest.raises(kv.UnknownNameError, match=r"flap.*update"):
+    with pytest.raises(kv.errors.UnknownNameError, match=r"flap.*update"):
         scene.within(0.1)
     scene.update(model.default_state())
     assert scene.distance("flap", "box0").distance > 0
@@ -307,7 +307,7 @@ def test_an_edit_that_a_scene_cannot_follow_is_said_until_it_is_mended():
             post = kv.translation(kv.parameter("width", width), 0, 0)
             edit.add_frame(f"post{k}", "world", post, body(Box((0.1, 0.1, 0.1))))
     for _ in range(2):
-        with pytest.raises(kv.NameTakenError, match="width"):
+        with pytest.raises(kv.errors.DuplicateNameError, match="width"):
             scene.within(0.3)
     with model.edit() as edit:
         edit.remove("frame post0")
@@ -320,20 +320,20 @@ def test_an_edit_that_a_scene_cannot_follow_is_said_until_it_is_mended():
 
 def test_neighbours_are_not_looked_at(model):
     scene = Scene(model)
-    assert not scene.looks_at("link0", "link1")
-    assert not scene.looks_at("link4", "hand")  # rigidly connected
-    assert not scene.looks_at("link3", "hand")  # joined by one articulation, through link4
-    assert not scene.looks_at("box0", "box1")  # neither ever moves
-    assert scene.looks_at("link0", "link2")
-    assert scene.looks_at("base", "box0")  # the rail does not join the base to everything that stands
-    assert scene.looks_at("ball/body", "box0")
+    assert not scene.checks_pair("link0", "link1")
+    assert not scene.checks_pair("link4", "hand")  # rigidly connected
+    assert not scene.checks_pair("link3", "hand")  # joined by one articulation, through link4
+    assert not scene.checks_pair("box0", "box1")  # neither ever moves
+    assert scene.checks_pair("link0", "link2")
+    assert scene.checks_pair("base", "box0")  # the rail does not join the base to everything that stands
+    assert scene.checks_pair("ball/body", "box0")
 
 
 def test_a_door_is_joined_to_what_it_hangs_on_and_not_to_the_wall():
     model = kv.load("kitchen")
     scene = Scene(model)
-    assert not scene.looks_at("kitchen/fridge_door", "kitchen/fridge")
-    assert scene.looks_at("kitchen/fridge_door", "kitchen/wall")
+    assert not scene.checks_pair("kitchen/fridge_door", "kitchen/fridge")
+    assert scene.checks_pair("kitchen/fridge_door", "kitchen/wall")
 
 
 def test_where_a_loop_is_closed_its_ends_are_joined(tmp_path):
@@ -344,8 +344,8 @@ def test_where_a_loop_is_closed_its_ends_are_joined(tmp_path):
         edit.include(tmp_path / "four_bar.kv.json", "here")
     for each, prefix in ((model, "four_bar/"), (parts, "here/four_bar/")):
         scene = Scene(each)
-        assert not scene.looks_at(f"{prefix}coupler", f"{prefix}rocker")
-        assert scene.looks_at(f"{prefix}crank", f"{prefix}rocker")
+        assert not scene.checks_pair(f"{prefix}coupler", f"{prefix}rocker")
+        assert scene.checks_pair(f"{prefix}crank", f"{prefix}rocker")
         scene.update(each.default_state())
         assert not scene.in_collision
 
@@ -353,17 +353,17 @@ def test_where_a_loop_is_closed_its_ends_are_joined(tmp_path):
 def test_rules_are_data_and_the_last_one_decides(tmp_path):
     model = arm_among_boxes()
     scene = Scene(model)
-    assert scene.looks_at("hand", "box0")
+    assert scene.checks_pair("hand", "box0")
     stored = (Rule("hand", "box*", why="it pushes them"), Rule("hand", "box1", check=True))
     with model.edit() as edit:
         edit.write(kv.geometry.RULES, kv.geometry.rules_as_data(stored))
-    assert not scene.looks_at("hand", "box0")
-    assert scene.looks_at("hand", "box1")
+    assert not scene.checks_pair("hand", "box0")
+    assert scene.checks_pair("hand", "box1")
     model.save(tmp_path / "m.kv.json")
     again = Scene(kv.load(tmp_path / "m.kv.json"), rules=[Rule("link0", "link1", check=True)])
-    assert not again.looks_at("box0", "hand")
-    assert again.looks_at("box1", "hand")
-    assert again.looks_at("link1", "link0")
+    assert not again.checks_pair("box0", "hand")
+    assert again.checks_pair("box1", "hand")
+    assert again.checks_pair("link1", "link0")
 
 
 def test_rules_come_along_where_a_model_is_included(tmp_path):
@@ -378,17 +378,17 @@ def test_rules_come_along_where_a_model_is_included(tmp_path):
         edit.include(tmp_path / "part.kv.json", "two")
         edit.write(kv.geometry.RULES, kv.geometry.rules_as_data([Rule("two/hand", "two/box0", check=True)]))
     scene = Scene(model)
-    assert not scene.looks_at("one/hand", "one/box0")
-    assert scene.looks_at("one/hand", "one/box1")
-    assert scene.looks_at("two/hand", "two/box0")  # what the whole says comes last
-    assert scene.looks_at("one/hand", "two/box0")  # the part knows nothing of the other
+    assert not scene.checks_pair("one/hand", "one/box0")
+    assert scene.checks_pair("one/hand", "one/box1")
+    assert scene.checks_pair("two/hand", "two/box0")  # what the whole says comes last
+    assert scene.checks_pair("one/hand", "two/box0")  # the part knows nothing of the other
 
 
 @pytest.mark.parametrize(
     "entry", [("hand", "box0", "no"), ("hand", "box0", 1), ("hand", 3), (), 7, ("", "*")]
 )
 def test_what_is_no_rule_is_refused(model, entry):
-    with pytest.raises(kv.ValueRejectedError, match="A rule is"):
+    with pytest.raises(kv.errors.InvalidValueError, match="A rule is"):
         Scene(model, rules=[entry])
 
 
@@ -399,16 +399,16 @@ def test_rules_mean_what_their_patterns_match(model):
     named.append(Rule("box0", "link0", check=True))
     one = Scene(model, rules=named)
     other = Scene(model, rules=[Rule("link?", "box*"), Rule("link0", "box0", check=True)])
-    np.testing.assert_array_equal(one._mirror.table.allowed, other._mirror.table.allowed)
-    assert one.looks_at("link0", "box0")
-    assert not one.looks_at("box1", "link0")
+    np.testing.assert_array_equal(one._world.table.allowed, other._world.table.allowed)
+    assert one.checks_pair("link0", "box0")
+    assert not one.checks_pair("box1", "link0")
 
 
 def test_pairs_that_never_touched_are_a_rule(model):
     rng = np.random.default_rng(0)
     states = [random_state(model, rng) for _ in range(30)]
     scene = Scene(model)
-    rules = scene.never_touching(states)
+    rules = scene.find_never_colliding(states)
     assert rules
     quiet = Scene(model, rules=rules)
     for state in states:
@@ -416,8 +416,8 @@ def test_pairs_that_never_touched_are_a_rule(model):
             s.update(state)
         assert by_names(scene.within(0.0)) == by_names(quiet.within(0.0))
         assert len(quiet.within(0.5)) <= len(scene.within(0.5))
-    with pytest.raises(kv.ValueRejectedError, match="none is given"):
-        scene.never_touching([])
+    with pytest.raises(kv.errors.InvalidValueError, match="none is given"):
+        scene.find_never_colliding([])
 
 
 def test_bodies_without_collision_shapes_are_what_is_seen_of_them():
@@ -431,7 +431,7 @@ def test_bodies_without_collision_shapes_are_what_is_seen_of_them():
     assert scene.bodies == ("seen", "both")
     scene.update({"x": 2.0})
     assert scene.distance("seen", "both").distance == pytest.approx(1.0)
-    assert pieces.touched_by_what_is_seen(model) == ["seen"]
+    assert objects.bodies_with_visual_collision(model) == ["seen"]
 
 
 def test_what_is_chosen_follows_the_model():

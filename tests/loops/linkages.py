@@ -14,11 +14,13 @@ from kineverse import gallery
 Z, Y, X = (0, 0, 1), (0, 1, 0), (1, 0, 0)
 
 
-def at(x: float, y: float = 0.0, z: float = 0.0) -> kv.Pose:
-    return kv.Pose.of(kv.translation(x, y, z))
+def at(x: float, y: float = 0.0, z: float = 0.0) -> kv.model.Pose:
+    return kv.model.Pose.of(kv.translation(x, y, z))
 
 
-def bar(edit: kv.Edit, name: str, parent: str, origin: kv.Pose, axis: Any = Z, **limits: Any) -> None:
+def bar(
+    edit: kv.model.Edit, name: str, parent: str, origin: kv.model.Pose, axis: Any = Z, **limits: Any
+) -> None:
     edit.apply(kv.Revolute(name=name, parent=parent, child=name, origin=origin, axis=axis, **limits))
 
 

@@ -6,7 +6,7 @@ import numpy as np
 
 import kineverse as kv
 from kineverse.loops import CloseLoop
-from kineverse.loops.operation import AXES
+from kineverse.loops.equations import AXES
 
 
 def loops_of(model: kv.Model) -> list[CloseLoop]:

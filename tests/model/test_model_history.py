@@ -5,9 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
-from model_steps import (
+from history_operations import (
     Capped,
     Count,
     Exists,
@@ -29,9 +27,11 @@ from model_steps import (
     fold,
     state_of,
 )
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 import kineverse as kv
-from attempts import attempts
+from hypothesis_profiles import attempts
 
 MANY = attempts(50)
 NAMES = ("a", "b", "c", "d")
@@ -78,7 +78,9 @@ START: tuple[kv.Operation, ...] = (
 )
 
 
-def take(edit: kv.Edit, sequence: list[Sequenced], kind: str, operation: Any, at: int, tag: str) -> None:
+def take(
+    edit: kv.model.Edit, sequence: list[Sequenced], kind: str, operation: Any, at: int, tag: str
+) -> None:
     """Take a step, on the model and on the list."""
     if kind == "append" or not sequence:
         edit.apply(operation, tag)
@@ -250,8 +252,8 @@ def test_a_pose_is_run_again_when_a_frame_up_its_chain_changes_and_not_otherwise
 
 def test_rates_are_read_through_fk() -> None:
     class Columns(kv.Operation):
-        def apply(self, model: kv.Reader) -> kv.Effects:
-            return kv.Effects(data={"columns": tuple(map(str, model.fk("f").gradient()))})
+        def apply(self, model: kv.model.ReadRecorder) -> kv.model.Writes:
+            return kv.model.Writes(data={"columns": tuple(map(str, model.fk("f").gradient()))})
 
     model = build(Place("f", "world"), Row("other", "wheel", "k"), Columns())
     assert model.data["columns"] == ("f:velocity",)
@@ -342,14 +344,14 @@ def test_to_affect_takes_a_frame() -> None:
 def test_a_failed_operation_does_not_burn_its_tag_and_leaves_no_trace_inside_the_edit() -> None:
     model = build(Put("a", 5))
     with model.edit() as edit:
-        with pytest.raises(kv.UnknownNameError):
+        with pytest.raises(kv.errors.UnknownNameError):
             edit.apply(Next("b", "nothing"), "t")
-        with pytest.raises(kv.EditError, match="5 is too much"):
+        with pytest.raises(kv.errors.EditError, match="5 is too much"):
             edit.apply(Fragile("b", "a"), "t")
         with pytest.raises(kv.KineverseError):
             edit.insert(Next("b", "a"), "t", before="0")
         edit.apply(Next("b", "a"), "t")
-        with pytest.raises(kv.EditError):
+        with pytest.raises(kv.errors.EditError):
             edit.replace("t", Fragile("b", "a"))
     check(model, [("0", Put("a", 5)), ("t", Next("b", "a"))])
 
@@ -359,7 +361,7 @@ def test_a_refused_edit_lists_every_operation_with_what_it_misses() -> None:
         Put("a", 1), Next("b", "a"), Next("c", "a"), Fragile("d", "e"), Place("f", "world"), Place("g", "f")
     )
     before = state_of(model)
-    with pytest.raises(kv.EditError) as info, model.edit() as edit:
+    with pytest.raises(kv.errors.EditError) as info, model.edit() as edit:
         edit.remove("0")
         edit.insert(Put("e", 9), before="3")
         edit.remove("4")
@@ -375,14 +377,14 @@ def test_a_refused_edit_lists_every_operation_with_what_it_misses() -> None:
 def test_what_was_found_missing_inside_an_edit_can_be_mended_there_and_is_not_forgotten() -> None:
     model = build(Put("a", 1), Next("b", "a"))
     before = state_of(model)
-    with pytest.raises(kv.EditError, match="no datum 'a'"), model.edit() as edit:
+    with pytest.raises(kv.errors.EditError, match="no datum 'a'"), model.edit() as edit:
         edit.remove("0")
-        with pytest.raises(kv.EditError):
+        with pytest.raises(kv.errors.EditError):
             len(model.data)
     assert state_of(model) == before
     with model.edit() as edit:
         edit.remove("0")
-        with pytest.raises(kv.EditError):
+        with pytest.raises(kv.errors.EditError):
             len(model.data)
         edit.insert(Put("a", 6), "0", before="1")
     assert dict(model.data) == {"a": 6, "b": 7}
@@ -397,7 +399,7 @@ def test_constraints_may_change_names_with_what_they_read() -> None:
     assert list(model.constraints) == ["l/1", "l/2"]
     before = state_of(model)
     with (
-        pytest.raises(kv.EditError, match=r"'3': There is a constraint 'l/1' already, made by '2'"),
+        pytest.raises(kv.errors.EditError, match=r"'3': There is a constraint 'l/1' already, made by '2'"),
         model.edit() as edit,
     ):
         edit.replace("1", Put("b", 1))
@@ -411,7 +413,7 @@ def test_a_constraint_may_take_the_name_of_a_later_one_that_gets_another() -> No
     assert list(model.constraints) == ["c/2", "c/0"]
     before = state_of(model)
     with (
-        pytest.raises(kv.EditError, match="'3': There is a constraint 'c/2' already, made by '1'"),
+        pytest.raises(kv.errors.EditError, match="'3': There is a constraint 'c/2' already, made by '1'"),
         model.edit() as edit,
     ):
         edit.insert(Put("b", 7), before="2")
@@ -441,20 +443,20 @@ def test_removing_and_adding_a_frame_in_one_edit_runs_its_children_once() -> Non
 
 def test_an_operation_that_raises_half_way() -> None:
     class HalfWay(kv.Operation):
-        def apply(self, model: kv.Reader) -> kv.Effects:
+        def apply(self, model: kv.model.ReadRecorder) -> kv.model.Writes:
             len(model.frames)
             model.fk("f")
             raise RuntimeError("half way")
 
     model = build(Place("f", "world"))
     before = state_of(model)
-    with pytest.raises(kv.EditError, match="'x' raised RuntimeError: half way"), model.edit() as edit:
+    with pytest.raises(kv.errors.EditError, match="'x' raised RuntimeError: half way"), model.edit() as edit:
         edit.apply(Place("g", "f"))
         edit.apply(HalfWay(), "x")
     assert state_of(model) == before
     with model.edit() as edit:
         edit.apply(Place("g", "f"))
-        with pytest.raises(kv.EditError):
+        with pytest.raises(kv.errors.EditError):
             edit.apply(HalfWay(), "x")
         edit.apply(Place("h", "g"), "x")
     check(model, [("0", Place("f", "world")), ("place g", Place("g", "f")), ("x", Place("h", "g"))])

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from model_steps import Next, Place, Put, Sum, state_of
+from history_operations import Next, Place, Put, Sum, state_of
 
 import kineverse as kv
 
@@ -31,8 +31,8 @@ def door() -> kv.Model:
     return model
 
 
-def recorded(model: kv.Model, **filters: Any) -> list[kv.Diff]:
-    heard: list[kv.Diff] = []
+def recorded(model: kv.Model, **filters: Any) -> list[kv.model.Diff]:
+    heard: list[kv.model.Diff] = []
     model.listen(heard.append, **filters)
     return heard
 
@@ -49,7 +49,7 @@ def test_an_edit_commits_whole_and_counts_a_version() -> None:
     assert (model.version, dict(model.data)) == (1, {"x": 1, "y": 2})
 
 
-@pytest.mark.parametrize("error", [ValueError, kv.ModelError, KeyboardInterrupt, GeneratorExit])
+@pytest.mark.parametrize("error", [ValueError, kv.errors.ModelError, KeyboardInterrupt, GeneratorExit])
 def test_whatever_is_raised_in_the_block_undoes_all_of_it(error: type[BaseException]) -> None:
     model = door()
     before = state_of(model)
@@ -92,14 +92,14 @@ def test_an_edit_is_over_at_the_end_of_its_block() -> None:
         lambda: edit.remove("data colour"),
         lambda: edit.replace("data colour", Put("x")),
     ):
-        with pytest.raises(kv.EditError, match="over"):
+        with pytest.raises(kv.errors.EditError, match="over"):
             call()
 
 
 def test_one_edit_at_a_time() -> None:
     model = door()
     before = state_of(model)
-    with pytest.raises(kv.EditError, match="edited already"), model.edit() as edit:
+    with pytest.raises(kv.errors.EditError, match="edited already"), model.edit() as edit:
         edit.apply(Put("x"))
         with model.edit():
             pass
@@ -211,7 +211,7 @@ def test_recomputed_dependents_and_deletions_are_heard_of() -> None:
 def test_a_refused_edit_is_not_heard_of() -> None:
     model = door()
     heard = recorded(model)
-    with pytest.raises(kv.EditError), model.edit() as edit:
+    with pytest.raises(kv.errors.EditError), model.edit() as edit:
         edit.remove("frame door")
     assert heard == []
 
@@ -219,7 +219,7 @@ def test_a_refused_edit_is_not_heard_of() -> None:
 def test_a_listener_that_raises_is_logged_and_others_still_hear(caplog: pytest.LogCaptureFixture) -> None:
     model = door()
 
-    def raising(_: kv.Diff) -> None:
+    def raising(_: kv.model.Diff) -> None:
         raise RuntimeError("of my own")
 
     model.listen(raising)
@@ -237,7 +237,7 @@ def test_a_listener_may_edit_the_model_and_everyone_hears_in_order() -> None:
     first: list[int] = []
     second: list[tuple[int, tuple[str, ...]]] = []
 
-    def react(diff: kv.Diff) -> None:
+    def react(diff: kv.model.Diff) -> None:
         first.append(diff.version)
         if diff.version < 4:
             with model.edit() as edit:
@@ -256,7 +256,7 @@ def test_closing_a_listener() -> None:
     heard: list[str] = []
     late = None
 
-    def closing(_: kv.Diff) -> None:
+    def closing(_: kv.model.Diff) -> None:
         heard.append("closing")
         assert late is not None
         late.close()
@@ -273,7 +273,7 @@ def test_closing_a_listener() -> None:
 
 
 def test_wrong_filters() -> None:
-    with pytest.raises(kv.ExpressionError):
+    with pytest.raises(kv.errors.ExpressionError):
         kv.Model().listen(print, symbols=["a"])
 
 
@@ -316,7 +316,7 @@ def test_copies_go_their_own_way(how: Any) -> None:
     assert "n" not in model.data
     assert heard == []
     assert model.fk("door/handle") == other.fk("door/handle")
-    with pytest.raises(kv.EditError), other.edit() as edit:
+    with pytest.raises(kv.errors.EditError), other.edit() as edit:
         edit.remove("frame door")
 
 
@@ -333,14 +333,18 @@ def test_a_model_with_rates_and_augmented_expressions_survives_pickling() -> Non
 class Doubled(kv.Operation):
     name: str
 
-    def apply(self, model: kv.Reader) -> kv.Effects:
-        return kv.Effects(data={self.name: 2 * model.data["x"]})
+    def apply(self, model: kv.model.ReadRecorder) -> kv.model.Writes:
+        return kv.model.Writes(data={self.name: 2 * model.data["x"]})
 
 
 def test_a_model_reaches_another_process(tmp_path: Path) -> None:
     model = door()
     with model.edit() as edit:
-        edit.apply(kv.DifferentialDrive(name="base", parent="world", child="base", radius=0.1, track=0.4))
+        edit.apply(
+            kv.articulations.DifferentialDrive(
+                name="base", parent="world", child="base", radius=0.1, track=0.4
+            )
+        )
         edit.apply(Put("x", 2))
         edit.apply(Next("y", "x"))
         edit.constrain("logic", 0, a.augment({b.derivative(): 2 * a}), 1)
@@ -439,7 +443,7 @@ def test_what_edit_returned_may_be_used_again() -> None:
     assert (list(model.data), model.version) == (["a", "b"], 2)
     with again as edit:
         edit.write("c", 1)
-        with pytest.raises(kv.EditError, match="being edited already"), again:
+        with pytest.raises(kv.errors.EditError, match="being edited already"), again:
             pass
         edit.write("d", 1)
     assert (list(model.data), model.version) == (["a", "b", "c", "d"], 3)

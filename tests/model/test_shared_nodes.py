@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 
 import kineverse as kv
-from kineverse.formats.document import document_of, operations_from
-from kineverse.model.rates import Rates, all_symbols, as_row, plain
+from kineverse.formats.document import read_operations, to_json
+from kineverse.model.rate_nodes import collect_symbols, to_plain
+from kineverse.model.rates import Rates, as_row
 
 a, b = kv.position("a"), kv.position("b")
 w = kv.velocity("w")
@@ -41,13 +42,13 @@ def test_a_model_of_shared_nodes(kind):
         edit.set_rate(a, {w: np.cos(a)})
     carried = model.fk("f")
     values = {"a": 0.25, "b": 0.5}
-    assert plain(carried)(values)[0, 3] == e(values)
-    assert all_symbols(carried) == {a, b}
+    assert to_plain(carried)(values)[0, 3] == e(values)
+    assert collect_symbols(carried) == {a, b}
     assert w in carried.gradient()
     moved = carried.substitute({a: a + b})
-    assert plain(moved)(values)[0, 3] == e({"a": 0.75, "b": 0.5})
+    assert to_plain(moved)(values)[0, 3] == e({"a": 0.75, "b": 0.5})
     assert model.constraints["c"].expression == carried[0, 3]
-    assert operations_from(document_of(model))
+    assert read_operations(to_json(model))
 
 
 def test_rates_of_shared_nodes():
@@ -76,7 +77,7 @@ def test_a_small_document_is_read_at_once():
     )
     model = kv.Model()
     with model.edit() as edit:
-        for tag, operation in operations_from(text):
+        for tag, operation in read_operations(text):
             edit.apply(operation, tag)
     assert model.violations({"a": -1.0}).unchecked == ()
 
@@ -89,5 +90,5 @@ def test_three_thousand_levels_are_no_recursion():
     with model.edit() as edit:
         edit.constrain("c", 0, e, 1)
     assert model.constraints["c"].expression == e
-    assert all_symbols(e) == {a}
-    assert plain(e) is e
+    assert collect_symbols(e) == {a}
+    assert to_plain(e) is e

@@ -14,14 +14,14 @@ import numpy as np
 import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
-from model_trees import random_speeds, random_state, random_tree
+from random_models import random_speeds, random_state, random_tree
 from scipy.optimize import linprog
 from scipy.spatial import HalfspaceIntersection
 
 import kineverse as kv
-from attempts import attempts
-from kineverse.errors import ValueRejectedError
-from kineverse.model.velocity import VelocityRows
+from hypothesis_profiles import attempts
+from kineverse.errors import InvalidValueError
+from kineverse.model.velocity_rows import VelocityRows
 
 a, b, c = (kv.position(n) for n in "abc")
 va, vb, vc = (s.derivative() for s in (a, b, c))
@@ -378,7 +378,9 @@ def test_the_limit_of_a_norm_may_be_an_expression() -> None:
 
 def test_a_norm_of_wheels_is_written_in_wheels() -> None:
     """A drive's speed over the floor, whichever way it points, is within 1.92 % of its limit."""
-    drive = kv.DifferentialDrive(name="base", parent="world", child="base", radius=0.1, track=0.5)
+    drive = kv.articulations.DifferentialDrive(
+        name="base", parent="world", child="base", radius=0.1, track=0.5
+    )
     floor = kv.norm(kv.array([kv.velocity("base/x"), kv.velocity("base/y")]))
     model = constrained({"floor": (-math.inf, floor, 0.3)}, drive)
     rows = model.velocity_rows(DT)
@@ -391,7 +393,9 @@ def test_a_norm_of_wheels_is_written_in_wheels() -> None:
 
 
 def test_left_over_speeds_of_what_wheels_move_are_put_through_their_rows() -> None:
-    drive = kv.DifferentialDrive(name="base", parent="world", child="base", radius=0.1, track=0.5)
+    drive = kv.articulations.DifferentialDrive(
+        name="base", parent="world", child="base", radius=0.1, track=0.5
+    )
     model = constrained({}, drive)
     x = kv.position("base/x")
     with model.edit() as edit:
@@ -476,13 +480,13 @@ def test_columns_may_be_chosen() -> None:
 
 @pytest.mark.parametrize("dt", [0, -0.1, math.inf, math.nan])
 def test_a_step_is_a_positive_time(dt: float) -> None:
-    with pytest.raises(ValueRejectedError, match="positive time"):
+    with pytest.raises(InvalidValueError, match="positive time"):
         rows_of({"a": (-1, a, 1)}, dt)
 
 
 @pytest.mark.parametrize("gain", [0, -1, 10.1, math.nan])
 def test_a_gain_that_would_cross_the_bound_is_refused(gain: float) -> None:
-    with pytest.raises(ValueRejectedError, match=r"\(0, 1/dt\]"):
+    with pytest.raises(InvalidValueError, match=r"\(0, 1/dt\]"):
         rows_of({"a": (-1, a, 1)}, gain=gain)
 
 

@@ -19,7 +19,7 @@ DOOR = kv.position("door")
 def ball(**fields) -> kv.Model:
     model = kv.Model()
     with model.edit() as edit:
-        edit.apply(kv.Ball(name="ball", parent="world", child="ball", **fields))
+        edit.apply(kv.articulations.Ball(name="ball", parent="world", child="ball", **fields))
     return model
 
 
@@ -61,7 +61,7 @@ def test_entries_of_a_rotation_are_within_one() -> None:
 def test_a_void_that_is_none_is_found_out() -> None:
     model = limited(0.5, leaning(), 2)
     assert interlocks(model) == Interlocks([])
-    wrong = Interlock(leaning(), "has no value", ("limit",), (reasoning.Box({}),))
+    wrong = Interlock(leaning(), "has no value", ("limit",), (reasoning.IntervalBox({}),))
     assert reasoning.contradictions(model, Interlocks([wrong]))
 
 
@@ -100,7 +100,11 @@ def test_wheels_are_no_orientation() -> None:
     """A differential drive has two wheels for three coordinates, whose squares add up to nothing fixed."""
     model = kv.Model()
     with model.edit() as edit:
-        edit.apply(kv.DifferentialDrive(name="base", parent="world", child="base", radius=0.1, track=0.4))
+        edit.apply(
+            kv.articulations.DifferentialDrive(
+                name="base", parent="world", child="base", radius=0.1, track=0.4
+            )
+        )
         x, y = kv.position("base/x"), kv.position("base/y")
         edit.constrain("fence", 0, x * x + y * y, 4)
     (unknown,) = interlocks(model).undecided

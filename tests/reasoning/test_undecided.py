@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from constraints import model
+from constraint_models import model
 
 import kineverse as kv
 from kineverse import reasoning
-from kineverse.reasoning import Box, Interval, interlocks
-from kineverse.reasoning.distinguishing import CASES_AT_MOST
+from kineverse.reasoning import Interval, IntervalBox, interlocks
+from kineverse.reasoning.case_split import MAX_CASES
 
 A, B, C = (kv.position(name) for name in "abc")
 SPEED = A.derivative()
@@ -26,13 +26,13 @@ def undecided(lower, upper, **others) -> tuple[reasoning.Undecided, ...]:
 def test_two_coordinates_in_what_is_not_linear() -> None:
     (unknown,) = undecided(-1, B * C < 0.3)
     assert unknown.reason == "b and c occur together in a condition that is not linear"
-    assert unknown.where == (Box({}),)
+    assert unknown.where == (IntervalBox({}),)
     assert str(unknown).startswith("lock: unknown, as b and c occur together")
 
 
 def test_only_where_it_matters() -> None:
     (unknown,) = undecided(-1, (np.sin(B * C) < 0.3) & (B < 0.5))
-    assert unknown.where == (Box({B: Interval(upper=0.5)}),)
+    assert unknown.where == (IntervalBox({B: Interval(upper=0.5)}),)
 
 
 def test_what_limits_decide_is_decided() -> None:
@@ -43,9 +43,12 @@ def test_what_limits_decide_is_decided() -> None:
 
 def test_no_numbers() -> None:
     (unknown,) = undecided(-1, np.sqrt(B) + 0.1)
-    assert (unknown.reason, unknown.where) == ("a bound is not a number", (Box({B: Interval(upper=0)}),))
+    assert (unknown.reason, unknown.where) == (
+        "a bound is not a number",
+        (IntervalBox({B: Interval(upper=0)}),),
+    )
     (unknown,) = undecided(-1, np.arccos(2 * B) < 1)
-    assert unknown.where == (Box({B: Interval(upper=-0.5)}), Box({B: Interval(lower=0.5)}))
+    assert unknown.where == (IntervalBox({B: Interval(upper=-0.5)}), IntervalBox({B: Interval(lower=0.5)}))
     (unknown,) = undecided(-1, 1 / B**2)
     assert unknown.where[0][B] == Interval(0, 0, True, True)
     # In the branch that is not taken NaN does no harm.
@@ -67,7 +70,7 @@ def test_thresholds_that_are_only_touched() -> None:
 
 
 def test_ramps() -> None:
-    (unknown,) = undecided(-1, kv.less(B, 0.1, contrast=100))
+    (unknown,) = undecided(-1, kv.logic.less(B, 0.1, contrast=100))
     assert unknown.reason == "a comparison of contrast 100 is on its ramp, 0.4 wide"
     side = unknown.where[0][B]
     assert (side.lower, side.upper) == pytest.approx((-0.1, 0.3))
@@ -75,12 +78,12 @@ def test_ramps() -> None:
 
 def test_too_many_cases() -> None:
     many = [kv.position(f"x{i}") for i in range(9)]
-    parity = kv.less(many[0], 0.5)
+    parity = kv.logic.less(many[0], 0.5)
     for x in many[1:]:
-        other = kv.less(x, 0.5)
+        other = kv.logic.less(x, 0.5)
         parity = (parity & ~other) | (~parity & other)
     unknown = undecided(-1, parity)
-    assert f"there are more than {CASES_AT_MOST} cases to distinguish" in {u.reason for u in unknown}
+    assert f"there are more than {MAX_CASES} cases to distinguish" in {u.reason for u in unknown}
 
 
 def test_several_coordinates_at_once() -> None:

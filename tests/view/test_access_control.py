@@ -6,7 +6,7 @@ import socket
 
 import pytest
 
-from kineverse.errors import KineverseError, ValueRejectedError
+from kineverse.errors import InvalidValueError, KineverseError
 from kineverse.view import server as web
 from kineverse.view.access_control import AccessControl
 
@@ -220,12 +220,12 @@ def test_viser_and_websockets_stay_what_they_are_for_others():
 
 
 def test_hosts_that_are_none_of_this_computer_are_refused(monkeypatch):
-    with pytest.raises(ValueRejectedError, match=r"'192\.0\.2\.77' is no address of this computer"):
+    with pytest.raises(InvalidValueError, match=r"'192\.0\.2\.77' is no address of this computer"):
         web.start(0, host="192.0.2.77")
 
     def unknown(*_, **__):
         raise socket.gaierror(-2, "Name or service not known")
 
     monkeypatch.setattr(socket, "getaddrinfo", unknown)
-    with pytest.raises(ValueRejectedError, match="there is no host 'nowhere': Name or service not known"):
+    with pytest.raises(InvalidValueError, match="there is no host 'nowhere': Name or service not known"):
         web.start(0, host="nowhere")

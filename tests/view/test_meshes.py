@@ -9,9 +9,8 @@ from small_models import with_mesh
 
 from kineverse.geometry import mesh_files
 from kineverse.model.body import Body, Box, Mesh, Shape
-from kineverse.view.hulls import load_hull
-from kineverse.view.meshes import load
-from kineverse.view.parts import MISSING, parts
+from kineverse.view.drawables import MISSING, collect_drawables, load_hull
+from kineverse.view.meshes import load_mesh
 
 trimesh = pytest.importorskip("trimesh", reason="reading meshes needs the extra 'view'")
 
@@ -41,19 +40,19 @@ def tetrahedron(tmp_path):
 
 @pytest.mark.parametrize("name", ["two.obj", "two.stl"])
 def test_a_mesh_has_its_size_and_scale(tetrahedron, name):
-    surface = load(Mesh(name, scale=(1.0, 2.0, 0.001), folder=str(tetrahedron))).surface
+    surface = load_mesh(Mesh(name, scale=(1.0, 2.0, 0.001), folder=str(tetrahedron))).surface
     np.testing.assert_allclose(surface.bounds, [[0, 0, 0], [1, 2, 0.001]], atol=1e-7)
     assert len(surface.faces) == 4
 
 
 def test_materials_of_an_obj_become_colours(tetrahedron):
-    colors = load(Mesh("two.obj", folder=str(tetrahedron))).surface.colors
+    colors = load_mesh(Mesh("two.obj", folder=str(tetrahedron))).surface.colors
     assert {tuple(color) for color in colors.tolist()} == {(1.0, 0.0, 0.0, 1.0), (0.0, 1.0, 0.0, 1.0)}
 
 
 def test_equal_files_are_read_once(tetrahedron):
     (tetrahedron / "copy.stl").write_bytes((tetrahedron / "two.stl").read_bytes())
-    one, other = (load(Mesh(name, folder=str(tetrahedron))) for name in ("two.stl", "copy.stl"))
+    one, other = (load_mesh(Mesh(name, folder=str(tetrahedron))) for name in ("two.stl", "copy.stl"))
     assert one.surface is other.surface
 
 
@@ -66,7 +65,7 @@ def test_a_unit_of_collada_is_honoured(tmp_path):
     (tmp_path / "box.dae").write_bytes(data)
     (tmp_path / "inches.dae").write_bytes(inches)
     for name, edge in (("box.dae", 1.0), ("inches.dae", 0.0254)):
-        low, high = load(Mesh(name, folder=str(tmp_path))).surface.bounds
+        low, high = load_mesh(Mesh(name, folder=str(tmp_path))).surface.bounds
         np.testing.assert_allclose(high - low, edge, rtol=1e-6)
 
 
@@ -78,7 +77,7 @@ def test_what_cannot_be_loaded_is_a_marked_placeholder_and_said_once(tmp_path, c
         (tmp_path / uri).write_bytes(content)
     caplog.set_level(logging.DEBUG)
     for scale in (1.0, 2.0):
-        (part,) = parts(with_mesh(uri, str(tmp_path), scale=(scale, scale, scale)))
+        (part,) = collect_drawables(with_mesh(uri, str(tmp_path), scale=(scale, scale, scale)))
         assert part.placeholder
         assert part.problem
         assert "\n" not in part.problem
@@ -95,7 +94,7 @@ def test_a_body_whose_meshes_are_missing_is_shown_by_its_collision_shapes(tmp_pa
             visuals=(Shape(Mesh("gone.stl", folder=str(tmp_path))),), collisions=(Shape(Box((1, 2, 3))),)
         )
         edit.add_frame("other", parent="world", transform=np.eye(4), body=body)
-    by_frame = {part.frame: part for part in parts(model)}
+    by_frame = {part.frame: part for part in collect_drawables(model)}
     assert by_frame["part"].placeholder
     assert not by_frame["other"].placeholder
     assert "gone.stl" in by_frame["other"].problem
@@ -109,8 +108,8 @@ def test_a_model_that_is_only_there_to_be_touched_is_shown_by_that():
     with model.edit() as edit:
         body = Body(collisions=(Shape(Box((1, 2, 3))),))
         edit.add_frame("stone", parent="world", transform=np.eye(4), body=body)
-    assert [part.kind for part in parts(model)] == ["visual"]
-    assert [part.kind for part in parts(model, "collision")] == ["collision"]
+    assert [part.kind for part in collect_drawables(model)] == ["visual"]
+    assert [part.kind for part in collect_drawables(model, "collision")] == ["collision"]
 
 
 def test_a_mesh_opens_what_lies_beside_it_and_nothing_outside(tetrahedron, tmp_path):
@@ -118,11 +117,11 @@ def test_a_mesh_opens_what_lies_beside_it_and_nothing_outside(tetrahedron, tmp_p
     (inside / "materials").mkdir(parents=True)
     (inside / "two.obj").write_text(OBJ.replace("two.mtl", "materials/two.mtl"))
     (inside / "materials" / "two.mtl").write_text(MTL)
-    assert load(Mesh("two.obj", folder=str(inside))).surface.colors is not None
+    assert load_mesh(Mesh("two.obj", folder=str(inside))).surface.colors is not None
     (inside / "link.mtl").symlink_to(tetrahedron / "two.mtl")
     for k, name in enumerate(("../two.mtl", str(tetrahedron / "two.mtl"), "link.mtl")):
         (inside / f"{k}.obj").write_text(OBJ.replace("two.mtl", name))
-        colors = load(Mesh(f"{k}.obj", folder=str(inside))).surface.colors
+        colors = load_mesh(Mesh(f"{k}.obj", folder=str(inside))).surface.colors
         assert colors is None or len({tuple(color) for color in colors.tolist()}) == 1
     files = trimesh.creation.box().export(file_type="gltf")
     for name, content in files.items():
@@ -130,17 +129,17 @@ def test_a_mesh_opens_what_lies_beside_it_and_nothing_outside(tetrahedron, tmp_p
         if name.endswith(".gltf"):
             (inside / name).write_bytes(content.replace(b'"uri":"', b'"uri":"../'))
             named = name
-    assert not load(Mesh(named, folder=str(tmp_path))).problem
-    assert load(Mesh(named, folder=str(inside))).problem
+    assert not load_mesh(Mesh(named, folder=str(tmp_path))).problem
+    assert load_mesh(Mesh(named, folder=str(inside))).problem
 
 
 def test_what_is_packed_is_bounded_by_what_it_unpacks_to(tetrahedron, monkeypatch):
     with zipfile.ZipFile(tetrahedron / "two.zip", "w", zipfile.ZIP_DEFLATED) as packed:
         packed.write(tetrahedron / "two.stl", "two.stl")
     (tetrahedron / "two.zae").write_bytes((tetrahedron / "two.zip").read_bytes())
-    assert "is an archive" in load(Mesh("two.zip", folder=str(tetrahedron))).problem
-    monkeypatch.setattr(mesh_files, "LARGEST", (tetrahedron / "two.stl").stat().st_size - 1)
-    assert "unpacks to" in load(Mesh("two.zae", folder=str(tetrahedron))).problem
+    assert "is an archive" in load_mesh(Mesh("two.zip", folder=str(tetrahedron))).problem
+    monkeypatch.setattr(mesh_files, "LARGEST_FILE", (tetrahedron / "two.stl").stat().st_size - 1)
+    assert "unpacks to" in load_mesh(Mesh("two.zae", folder=str(tetrahedron))).problem
 
 
 def test_what_one_description_may_open_another_does_not_get(tetrahedron, tmp_path):
@@ -148,6 +147,6 @@ def test_what_one_description_may_open_another_does_not_get(tetrahedron, tmp_pat
     own = Mesh("two.stl", folder=str(tetrahedron))
     other = Mesh("two.stl", folder=str(tetrahedron), root=str(tmp_path / "in"))
     assert own == other
-    for opened in (load, load_hull):
+    for opened in (load_mesh, load_hull):
         assert not opened(own).problem
         assert "leads out of the root" in opened(other).problem

@@ -8,9 +8,9 @@ import pytest
 from small_models import BLUE, RED, cabinet
 
 import kineverse as kv
-from kineverse.errors import FormatError, ShapeError, UnknownNameError, ValueRejectedError
-from kineverse.view import Camera, picture, save
-from kineverse.view.png import encode_png, write_png
+from kineverse.errors import FormatError, InvalidValueError, ShapeError, UnknownNameError
+from kineverse.view import Camera, picture, save_picture
+from kineverse.view.pictures import encode_png, write_png
 
 FRONT = Camera((-3.0, 0.3, 1.0), (0.0, 0.0, 0.5))
 SMALL = (160, 120)
@@ -92,7 +92,7 @@ def test_models_without_bodies_show_their_frames(frames):
 
 @pytest.mark.parametrize("size", [(0, 10), (10, -1), (100_000, 100_000)])
 def test_sizes_that_are_no_picture_are_refused(size):
-    with pytest.raises(ValueRejectedError):
+    with pytest.raises(InvalidValueError):
         picture(cabinet(), size=size)
 
 
@@ -108,7 +108,7 @@ def test_pictures_are_the_same_every_time():
 
 def test_save_writes_a_png_that_others_read(tmp_path):
     imaging = pytest.importorskip("PIL.Image")
-    save(tmp_path / "cabinet.png", cabinet(), {"cabinet/door": 0.7}, size=SMALL)
+    save_picture(tmp_path / "cabinet.png", cabinet(), {"cabinet/door": 0.7}, size=SMALL)
     with imaging.open(tmp_path / "cabinet.png") as file:
         np.testing.assert_array_equal(np.asarray(file), picture(cabinet(), {"cabinet/door": 0.7}, size=SMALL))
 

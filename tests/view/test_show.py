@@ -15,7 +15,7 @@ from small_models import cabinet, held_door
 
 import kineverse as kv
 from kineverse.view import show, view
-from kineverse.view.title import title_of, title_of_file
+from kineverse.view.title import choose_title, read_title
 from kineverse.view.viewer import Viewer
 
 pytest.importorskip("viser", reason="the page needs the extra 'view'")
@@ -124,9 +124,9 @@ def test_what_is_no_model_is_refused_and_nothing_is_left():
         (None, "not a NoneType"),
         (cabinet().default_state(), "not a State"),
     ):
-        with pytest.raises(kv.ValueRejectedError, match=words):
+        with pytest.raises(kv.errors.InvalidValueError, match=words):
             kv.show(wrong, block=False)
-    with pytest.raises(kv.UnknownNameError, match="Did you mean 'cabinet/door'"):
+    with pytest.raises(kv.errors.UnknownNameError, match="Did you mean 'cabinet/door'"):
         kv.show(cabinet(), {"cabinet/dor": 1.0}, block=False)
 
 
@@ -159,8 +159,8 @@ def test_pages_are_called_what_models_are_called(tmp_path):
     both = kv.Model()
     both.include("shelf_door")
     both.include("shelf_drawers")
-    assert (title_of(cabinet()), title_of(both)) == ("cabinet", "shelf_door, shelf_drawers")
-    assert (title_of(kv.Model()), title_of(held_door())) == ("Kineverse", "Kineverse")
+    assert (choose_title(cabinet()), choose_title(both)) == ("cabinet", "shelf_door, shelf_drawers")
+    assert (choose_title(kv.Model()), choose_title(held_door())) == ("Kineverse", "Kineverse")
     with view(cabinet(), port=0) as page, urllib.request.urlopen(page.address, timeout=10) as answer:
         assert b"<title>cabinet</title>" in answer.read()
     for name, text, title in (
@@ -173,6 +173,6 @@ def test_pages_are_called_what_models_are_called(tmp_path):
         ("g.urdf", f'<robot name="{"x" * 100}"><link name="foot"/></robot>', "x" * 59 + "…"),
     ):
         (tmp_path / name).write_text(text)
-        assert title_of_file(str(tmp_path / name)) == title
-    assert title_of_file("kitchen") == "kitchen"
-    assert title_of_file("articulations/screw") == "screw"
+        assert read_title(str(tmp_path / name)) == title
+    assert read_title("kitchen") == "kitchen"
+    assert read_title("articulations/screw") == "screw"

@@ -10,7 +10,7 @@ import pytest
 from small_models import cabinet, dependent, with_mesh
 
 import kineverse as kv
-from kineverse.errors import MissingExtraError, UnknownNameError, ValueRejectedError
+from kineverse.errors import InvalidValueError, MissingDependencyError, UnknownNameError
 from kineverse.model.body import Body, Box, Shape
 from kineverse.view import view
 
@@ -216,9 +216,9 @@ def test_missing_meshes_are_said(tmp_path):
 
 def test_ports_that_are_taken_or_none_are_refused(page):
     taken = int(page.address.rpartition(":")[2])
-    with pytest.raises(ValueRejectedError, match="taken"):
+    with pytest.raises(InvalidValueError, match="taken"):
         view(cabinet(), port=taken)
-    with pytest.raises(ValueRejectedError, match="65535"):
+    with pytest.raises(InvalidValueError, match="65535"):
         view(cabinet(), port=70_000)
 
 
@@ -233,7 +233,7 @@ def test_stopping_twice_is_fine_and_frees_the_port():
 
 def test_without_viser_the_extra_is_named(monkeypatch):
     monkeypatch.setitem(sys.modules, "viser", None)
-    with pytest.raises(MissingExtraError, match=r"pip install -e '.*\[view\]'"):
+    with pytest.raises(MissingDependencyError, match=r"pip install -e '.*\[view\]'"):
         view(cabinet(), port=0)
 
 

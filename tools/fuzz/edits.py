@@ -9,9 +9,8 @@ from typing import Any
 
 import kineverse as kv
 from kineverse.model.body import Pose
-from kineverse.model.contents import mapped
-from kineverse.model.operation import BODIES, DATA, FRAMES
-from kineverse.model.reader import Cell, Reader
+from kineverse.model.operation import BODIES, DATA, FRAMES, Cell, map_expressions
+from kineverse.model.read_recorder import ReadRecorder
 
 ATTEMPTS = 2
 _NUMBERS = (1.0, -0.5, 1e-9, 1e200, 0)
@@ -23,9 +22,9 @@ class Rewritten(kv.Operation):
 
     content: tuple[tuple[Cell, Any], ...]
 
-    def apply(self, model: Reader) -> kv.Effects:
+    def apply(self, model: ReadRecorder) -> kv.model.Writes:
         """Write it."""
-        return kv.Effects.of(dict(self.content))
+        return kv.model.Writes.of(dict(self.content))
 
 
 def edits(model: kv.Model, seed: int, whole: Callable[[], object]) -> None:
@@ -64,7 +63,7 @@ def edits(model: kv.Model, seed: int, whole: Callable[[], object]) -> None:
                 edit.replace(tag, old)
 
 
-def _put_back(edit: kv.Edit, old: kv.Operation, tag: str, tags: list[str]) -> None:
+def _put_back(edit: kv.model.Edit, old: kv.Operation, tag: str, tags: list[str]) -> None:
     """Insert an operation where it was among the tags."""
     place = tags.index(tag)
     if place:
@@ -97,4 +96,4 @@ def _other(kind: str, value: Any, random: Random) -> Any:
         return replace(value, visuals=())
     if kind == DATA and random.random() < 0.5:
         return random.choice((number, more, None, "text", (1.0, (symbol,)), symbol))
-    return mapped(kind, value, lambda e: e + more if not e.shape else e)
+    return map_expressions(kind, value, lambda e: e + more if not e.shape else e)

@@ -23,7 +23,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 import kineverse as kv
-from kineverse.formats.document import document_of, operations_from
+from kineverse.formats.document import read_operations, to_json
 
 from .edits import edits
 from .ways import Way
@@ -108,7 +108,7 @@ def _model(target: Target, data: bytes, folder: Path, way: Way) -> kv.Model:
     try:
         operations = list(target.operations(data, folder, way.prefix))
     except kv.KineverseError as error:
-        if not isinstance(error, kv.FormatError):
+        if not isinstance(error, kv.errors.FormatError):
             raise BrokenError(f"an error of another kind, at {_place(error)}: {error!r}") from error
         if str(error) and not _FILE.match(str(error)):
             raise BrokenError(f"an error without place, at {_place(error)}: {error}") from error
@@ -141,19 +141,19 @@ def _use(target: Target, model: kv.Model, way: Way) -> None:
         edits(loaded, way.seed, lambda: _saved(loaded))
     except kv.KineverseError as error:
         raise BrokenError(f"an edit cannot be taken back, at {_place(error)}: {error}") from error
-    if document_of(loaded) != text:
+    if to_json(loaded) != text:
         raise BrokenError("an edit that was refused or taken back left something behind")
 
 
 def _saved(model: kv.Model) -> tuple[str, kv.Model]:
     """Return the document of a model, and what is loaded from it, whose document is the same."""
     try:
-        text = document_of(model)
+        text = to_json(model)
         again = kv.Model()
         with again.edit() as edit:
-            for tag, operation in operations_from(text, "saved"):
+            for tag, operation in read_operations(text, "saved"):
                 edit.apply(operation, tag)
-        if document_of(again) != text:
+        if to_json(again) != text:
             raise BrokenError("saved and loaded, the model is another one")
     except kv.KineverseError as error:
         raise BrokenError(f"it cannot be saved and loaded, at {_place(error)}: {error}") from error

@@ -23,8 +23,8 @@ import numpy as np
 import pinocchio
 
 import kineverse as kv
-from kineverse.formats.closures import Closures
-from kineverse.formats.numerals import LARGEST
+from kineverse.formats.loop_closures import LoopClosures
+from kineverse.formats.xml_values import LARGEST
 
 from .inputs import inputs
 from .targets import TARGETS, Target
@@ -64,7 +64,7 @@ def refusal(target: Target, data: bytes, folder: Path) -> str:
         model = kv.Model()
         with model.edit() as edit:
             # As kv.load does: what cannot be followed is kept as a constraint.
-            closures = Closures(edit, edit.model, "input", "equality", "solve")
+            closures = LoopClosures(edit, edit.model, "input", "equality", "solve")
             for tag, operation in target.operations(data, folder, None):
                 list(closures.apply(tag, operation))
             list(closures.finish())

@@ -12,11 +12,11 @@ import numpy as np
 
 import kineverse as kv
 from kineverse.expressions.expression import as_expression
-from kineverse.formats.document import document_of
-from kineverse.model.edit import AddFrame, Constrain, Write
+from kineverse.formats.document import to_json
 from kineverse.model.frame import Frame
-from kineverse.model.reader import Reader
-from kineverse.spatial import unit
+from kineverse.model.operations import AddFrame, Constrain, SetData
+from kineverse.model.read_recorder import ReadRecorder
+from kineverse.spatial import unit_vector
 
 SYMBOLS = tuple(kv.position(name) for name in ("a", "b", "x"))
 FRAMES = ("f", "g", "h", "p0", "p1", "world")
@@ -29,7 +29,7 @@ class Setting:
     """A parameter that is a record, with others inside."""
 
     number: float
-    pose: kv.Pose
+    pose: kv.model.Pose
     inside: tuple[Any, ...]
 
 
@@ -40,9 +40,9 @@ class Rate(kv.Operation):
     coordinate: kv.Symbol
     rate: Any
 
-    def apply(self, model: Reader) -> kv.Effects:
+    def apply(self, model: ReadRecorder) -> kv.model.Writes:
         """Write that."""
-        return kv.Effects(rates={self.coordinate: self.rate})
+        return kv.model.Writes(rates={self.coordinate: self.rate})
 
 
 @dataclass(frozen=True)
@@ -56,13 +56,13 @@ class Program(kv.Operation):
     steps: tuple[tuple[str, int, int], ...]
     setting: Setting
 
-    def apply(self, model: Reader) -> kv.Effects:
+    def apply(self, model: ReadRecorder) -> kv.model.Writes:
         """Write the last results as data, a constraint and a frame."""
         work = _Work(model)
         for step, i, j in self.steps:
             STEPS[step](work, i, j)
         last = work.at(-1)
-        return kv.Effects(
+        return kv.model.Writes(
             frames={self.name: ("world", work.pose @ kv.translation(0, last, 0))},
             constraints={f"{self.name}/c": (-1, last, 1)} if last.symbols else {},
             data={f"{self.name}/d": tuple(work.results[-3:])},
@@ -72,7 +72,7 @@ class Program(kv.Operation):
 class _Work:
     """What a program has found so far."""
 
-    def __init__(self, model: Reader) -> None:
+    def __init__(self, model: ReadRecorder) -> None:
         self.model = model
         self.results: list[Any] = [as_expression(0.5), SYMBOLS[0]]
         self.pose: Any = kv.translation(0, 0, 1)
@@ -157,7 +157,7 @@ STEPS: dict[str, Step] = {
     "partial": lambda w, i, j: w.keep(w.at(i).partial(list(SYMBOLS))[j % 3]),
     "gradient": _gradient,
     "substitute": lambda w, i, j: w.keep(w.at(i).substitute({SYMBOLS[j % 3]: w.at(j)})),
-    "unit": lambda w, i, j: w.keep(unit(kv.array([w.at(i), w.at(j), 1.0]))[0]),
+    "unit": lambda w, i, j: w.keep(unit_vector(kv.array([w.at(i), w.at(j), 1.0]))[0]),
     "quaternion": lambda w, i, j: w.keep_pose(kv.quaternion(w.at(i), 0.1, w.at(j), 1.0)),
     "add": lambda w, i, j: w.keep(w.at(i) + w.at(j)),
     "times": lambda w, i, j: w.keep(w.at(i) * w.at(j)),
@@ -174,7 +174,7 @@ def base(random: Random) -> list[kv.Operation]:
     """Return operations for others to read from; the same names with other values for another seed."""
     a, b, x = SYMBOLS
     number = round(random.uniform(-1, 1), 3)
-    pose = kv.Pose.of(kv.translation(number, 0, 1) @ kv.rotation_x(number))
+    pose = kv.model.Pose.of(kv.translation(number, 0, 1) @ kv.rotation_x(number))
     datum: Any = random.choice((number, 2, a + number, (number, b), "text", None))
     transform = random.choice((kv.rotation_y(b), kv.translation(0, x, number), kv.rotation_x(a * b)))
     lower, upper = sorted((number, random.uniform(-2, 2)))
@@ -193,9 +193,9 @@ def base(random: Random) -> list[kv.Operation]:
             dynamics=(("effort", number),),
         ),
         AddFrame("h", Frame(random.choice(("g", "f")), (pose, transform))),
-        Write("n", number),
-        Write("e", a * number + np.sin(b)),
-        Write("t", datum),
+        SetData("n", number),
+        SetData("e", a * number + np.sin(b)),
+        SetData("t", datum),
         Constrain("c", kv.Constraint.of(-1, a + number * b, random.choice((1, x, float("inf"))))),
         Rate(x, rate),
     ]
@@ -204,7 +204,7 @@ def base(random: Random) -> list[kv.Operation]:
 def program(random: Random, name: str) -> Program:
     """Return a program of some steps."""
     steps = [(random.choice(list(STEPS)), random.randrange(12), random.randrange(12)) for _ in range(6)]
-    pose = kv.Pose.of(kv.translation(1, 2, 3))
+    pose = kv.model.Pose.of(kv.translation(1, 2, 3))
     inside = random.choice(((1, "a"), ({"k": (1.0, None)},), (pose, SYMBOLS[1]), (float("inf"), 1 << 80)))
     return Program(name, tuple(steps[: random.randint(1, 6)]), Setting(0.5, pose, inside))
 
@@ -224,6 +224,6 @@ def model(random: Random) -> kv.Model:
 
 def document(random: Random) -> bytes:
     """Return such a model as a document, without the hash that forbids to change it."""
-    tree = json.loads(document_of(model(random)))
+    tree = json.loads(to_json(model(random)))
     del tree["sha256"]
     return json.dumps(tree).encode()

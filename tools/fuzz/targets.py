@@ -12,15 +12,15 @@ import mujoco  # noqa: F401  - it looks about when it is imported, so before any
 
 import kineverse as kv
 from kineverse import gallery
-from kineverse.formats.document import document_of, operations_from
-from kineverse.formats.document.reading import operations_unpacked
+from kineverse.formats.document import read_operations, to_json
+from kineverse.formats.document.reader import read_packed_operations
 from kineverse.formats.mjcf import parse_mjcf
-from kineverse.formats.mjcf.operations import scene_operations as mjcf_operations
-from kineverse.formats.sdf.operations import scene_operations
+from kineverse.formats.mjcf.operations import mjcf_operations
+from kineverse.formats.sdf.operations import sdf_operations
 from kineverse.formats.sdf.reader import parse_sdf
-from kineverse.formats.set_body import SetBody
 from kineverse.formats.urdf import parse_urdf
-from kineverse.formats.urdf.operations import robot_operations
+from kineverse.formats.urdf.operations import urdf_operations
+from kineverse.model.operations import SetBody
 
 from . import json_trees, programs, xml_trees
 from .grammars import document, mjcf, sdf, urdf
@@ -82,12 +82,12 @@ class Target:
 
 def _urdf(data: bytes, folder: Path, prefix: str | None) -> Operations:
     robot = parse_urdf(data, source="input.urdf", folder=str(folder))
-    return ((None, operation) for operation in robot_operations(robot, prefix))
+    return ((None, operation) for operation in urdf_operations(robot, prefix))
 
 
 def _sdf(data: bytes, folder: Path, prefix: str | None) -> Operations:
     scene = parse_sdf(data, source="input.sdf", folder=str(folder))
-    return ((None, operation) for operation in scene_operations(scene, prefix))
+    return ((None, operation) for operation in sdf_operations(scene, prefix))
 
 
 def _mjcf(data: bytes, folder: Path, prefix: str | None) -> Operations:
@@ -96,11 +96,11 @@ def _mjcf(data: bytes, folder: Path, prefix: str | None) -> Operations:
 
 
 def _document(data: bytes, folder: Path, prefix: str | None) -> Operations:
-    return list(operations_from(data, "input.kv.json", prefix))
+    return list(read_operations(data, "input.kv.json", prefix))
 
 
 def _packed(data: bytes, folder: Path, prefix: str | None) -> Operations:
-    return list(operations_unpacked(data, "input.kv.msgpack", prefix))
+    return list(read_packed_operations(data, "input.kv.msgpack", prefix))
 
 
 def _in_msgpack(data: bytes) -> bytes:
@@ -121,7 +121,7 @@ def _scenes() -> list[bytes]:
             for operation in gallery.operations(name):
                 if not isinstance(operation, SetBody):
                     edit.apply(operation)
-        tree = json.loads(document_of(model))
+        tree = json.loads(to_json(model))
         tree.pop("sha256", None)
         found.append(json.dumps(tree).encode())
     return [data for data in found if len(data) <= MAX_SEED]

@@ -16,10 +16,10 @@ from PIL import Image
 import kineverse as kv
 from kineverse import gallery
 from kineverse.view import picture
-from kineverse.view.camera import Camera, framing
-from kineverse.view.parts import parts
-from kineverse.view.poses import Poses, complete
-from kineverse.view.surfaces import Surfaces
+from kineverse.view.camera import Camera, fit_camera
+from kineverse.view.drawables import collect_drawables
+from kineverse.view.poses import FramePoses, complete
+from kineverse.view.rasterizer import TriangleSoup
 
 FOLDER = Path(__file__).resolve().parents[2] / "docs" / "pictures"
 WIDTH, GAP = 480, 4
@@ -81,12 +81,12 @@ def drawn(name: str, take: Take) -> np.ndarray:
 
 def camera(model: kv.Model, states: list[dict[str, float]], take: Take, aspect: float) -> Camera:
     """Return a camera that has the scene in all its states in the picture."""
-    poses, items = Poses(model), parts(model)
+    poses, items = FramePoses(model), collect_drawables(model)
     corners = [
-        Surfaces.of(items, dict(zip(poses.names, poses.at(state), strict=True))).corners.reshape(-1, 3)
+        TriangleSoup.of(items, dict(zip(poses.names, poses.at(state), strict=True))).corners.reshape(-1, 3)
         for state in states
     ]
-    return framing(np.concatenate(corners), take.azimuth, take.elevation, aspect, 0.4, margin=0.04)
+    return fit_camera(np.concatenate(corners), take.azimuth, take.elevation, aspect, 0.4, margin=0.04)
 
 
 def encoded(pixels: np.ndarray) -> bytes:

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-
-from kineverse.view.living import Life
-from kineverse.view.living.picture import picture
+from living_kitchen.picture import picture
+from living_kitchen.simulation import Life
 
 
 def drawn() -> np.ndarray:

@@ -1,13 +1,11 @@
 """The library of articulations: operations that connect frames."""
 
-from kineverse.vocabulary import MODULE, unknown_attribute
+from kineverse._synonyms import MODULE_SYNONYMS, unknown_attribute_error
 
-from .axis_joints import Continuous, Cylindrical, Prismatic, Revolute, Screw
 from .bases import Ackermann, Base, DifferentialDrive, Mecanum, OmniBase
-from .couplings import Cam, Coupling, Gearbox, RackAndPinion
-from .free_joints import Ball, Floating, Planar, Universal
-from .joint import AxialJoint, AxisJoint, Fixed, Joint
+from .joint import Fixed, Joint, OneAxisMotion, OneDofJoint
 from .limits import Limits
+from .locks import position_lock, speed_lock, tabulated_limit
 from .mechanisms import (
     DeskLamp,
     DoorWithHandle,
@@ -23,16 +21,16 @@ from .mechanisms import (
     ScissorLift,
     ScrewAndNut,
 )
+from .multi_axis import Ball, Floating, Planar, Universal
+from .single_axis import Continuous, Cylindrical, Prismatic, Revolute, Screw
+from .transmissions import Cam, Gearbox, RackAndPinion, Transmission
 
 __all__ = [
     "Ackermann",
-    "AxialJoint",
-    "AxisJoint",
     "Ball",
     "Base",
     "Cam",
     "Continuous",
-    "Coupling",
     "Cylindrical",
     "DeskLamp",
     "DifferentialDrive",
@@ -50,6 +48,8 @@ __all__ = [
     "Mechanism",
     "Microwave",
     "OmniBase",
+    "OneAxisMotion",
+    "OneDofJoint",
     "PedalBin",
     "PistonAndRod",
     "Planar",
@@ -60,9 +60,13 @@ __all__ = [
     "ScissorLift",
     "Screw",
     "ScrewAndNut",
+    "Transmission",
     "Universal",
+    "position_lock",
+    "speed_lock",
+    "tabulated_limit",
 ]
 
 
 def __getattr__(name: str) -> object:
-    raise unknown_attribute("The package kineverse.articulations", name, __all__, MODULE)
+    raise unknown_attribute_error("The package kineverse.articulations", name, __all__, MODULE_SYNONYMS)

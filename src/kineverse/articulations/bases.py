@@ -15,18 +15,18 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from kineverse.errors import ValueRejectedError
+from kineverse.errors import InvalidValueError
 from kineverse.expressions.expression import Expression, array
 from kineverse.expressions.functions import norm
 from kineverse.model.constraint import Constraint
 from kineverse.model.frame import Frame
-from kineverse.model.operation import Effects
-from kineverse.model.reader import Reader
+from kineverse.model.operation import Writes
+from kineverse.model.read_recorder import ReadRecorder
 from kineverse.spatial import rotation_z, translation
 from kineverse.symbols import Symbol, position, velocity
 
-from .joint import Joint, checked_number
-from .limits import checked_limit, limits
+from .joint import Joint, check_joint_number
+from .limits import check_speed_limit, limit_constraints
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -52,19 +52,19 @@ class Base(Joint):
 
         Raises
         ------
-        ValueRejectedError
+        InvalidValueError
             If they are more or less, the same twice, or no texts.
         """
         given = paths if isinstance(paths, (tuple, list)) else ()
         texts = {path for path in given if isinstance(path, str) and path}
         if len(given) != count or len(texts) != count:
-            raise ValueRejectedError(
+            raise InvalidValueError(
                 f"The wheels of the {self.noun} '{self.name}' are {count} different paths, not {paths!r}."
             )
 
     def limit(self, field: str) -> float | None:
         """Return a limit among the fields, None if there is none."""
-        return checked_limit(getattr(self, field), f"'{field}' of the {self.noun} '{self.name}'")
+        return check_speed_limit(getattr(self, field), f"'{field}' of the {self.noun} '{self.name}'")
 
     def within(self, field: str, speed: Expression, name: str = "") -> dict[str, Constraint]:
         """Return the constraint that keeps a speed within a limit either way, if there is one."""
@@ -94,11 +94,11 @@ class OmniBase(Base):
     speed: float | None = 1.0
     turn: float | None = 0.6
 
-    def apply(self, model: Reader) -> Effects:
+    def apply(self, model: ReadRecorder) -> Writes:
         """Write the child frame and the speed limits."""
         x, y, angle = self.coordinates
         dx, dy, turning = speeds = tuple(c.derivative() for c in (x, y, angle))
-        return Effects(
+        return Writes(
             frames=self.frames,
             constraints={**self.slower("speed", (dx, dy)), **self.within("turn", turning)},
             articulations={self.name: self.record((x, y, angle), (0.0, 0.0, 0.0), speeds)},
@@ -127,7 +127,7 @@ class DifferentialDrive(Base):
 
     Raises
     ------
-    ValueRejectedError
+    InvalidValueError
         For a radius or a track that is not positive, or one wheel on both sides.
     """
 
@@ -153,12 +153,12 @@ class DifferentialDrive(Base):
             f"{self.name}/right_wheel" if self.right == "" else self.right,
         )
 
-    def apply(self, model: Reader) -> Effects:
+    def apply(self, model: ReadRecorder) -> Writes:
         """Write the child frame, the rates and the limits."""
         x, y, angle = self.coordinates
         left, right = map(velocity, self.wheels)
         along, about = self.radius / 2, self.radius / self.track
-        return Effects(
+        return Writes(
             frames=self.frames,
             constraints={
                 **self.within("wheel_speed", left, "left_wheel_speed"),
@@ -199,9 +199,9 @@ class Ackermann(Base):
 
     Raises
     ------
-    ValueRejectedError
+    InvalidValueError
         For a wheelbase that is not positive, or a steering angle outside (0, π/2).
-    NameTakenError
+    DuplicateNameError
         For an articulation or a frame that exists.
     """
 
@@ -214,21 +214,21 @@ class Ackermann(Base):
         super().__post_init__()
         self.lengths("wheelbase")
         text = f"The steering angle of the {self.noun} '{self.name}'"
-        if not 0 < checked_number(self.steering, text) < math.pi / 2:
-            raise ValueRejectedError(
-                f"{text} is limited to something in (0, π/2) rad, not {self.steering!r}."
-            )
+        if not 0 < check_joint_number(self.steering, text) < math.pi / 2:
+            raise InvalidValueError(f"{text} is limited to something in (0, π/2) rad, not {self.steering!r}.")
 
-    def apply(self, model: Reader) -> Effects:
+    def apply(self, model: ReadRecorder) -> Writes:
         """Write the child frame, the rates and the limits."""
         self.check_free(model)
         x, y, angle = self.coordinates
         steering, drive = position(f"{self.name}/steering"), velocity(f"{self.name}/drive")
         bound = self.limit("steering_speed")
-        return Effects(
+        return Writes(
             frames=self.frames,
             constraints={
-                **dict(limits(f"{self.name}/steering", steering, -self.steering, self.steering, bound)),
+                **dict(
+                    limit_constraints(f"{self.name}/steering", steering, -self.steering, self.steering, bound)
+                ),
                 **self.within("speed", drive),
             },
             rates={
@@ -278,9 +278,9 @@ class Mecanum(Base):
 
     Raises
     ------
-    ValueRejectedError
+    InvalidValueError
         For lengths that are not positive, or another number of wheels than four.
-    NameTakenError
+    DuplicateNameError
         For an articulation or a frame that exists.
     """
 
@@ -299,7 +299,7 @@ class Mecanum(Base):
             self.check_wheels(self.wheels, 4)
             object.__setattr__(self, "wheels", tuple(self.wheels))
 
-    def apply(self, model: Reader) -> Effects:
+    def apply(self, model: ReadRecorder) -> Writes:
         """Write the child frame, the rates and the limits."""
         self.check_free(model)
         x, y, angle = self.coordinates
@@ -315,7 +315,7 @@ class Mecanum(Base):
         constraints |= self.slower("speed", (_total(forward), _total(sideways)))
         constraints |= self.within("turn", _total(turning))
         c, s = np.cos(angle), np.sin(angle)
-        return Effects(
+        return Writes(
             frames=self.frames,
             constraints=constraints,
             rates={

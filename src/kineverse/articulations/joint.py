@@ -9,22 +9,22 @@ from collections.abc import Container, Iterable
 from dataclasses import dataclass
 from typing import Any
 
-from kineverse.errors import KineverseError, NameTakenError, ValueRejectedError
+from kineverse._checks import real_number
+from kineverse.errors import DuplicateNameError, InvalidValueError, KineverseError
 from kineverse.expressions.expression import Expression, ExpressionLike
 from kineverse.model.articulation import Articulation
 from kineverse.model.body import AxisLike, Pose, Vector3
 from kineverse.model.frame import TransformLike
-from kineverse.model.operation import Effects, Operation
-from kineverse.model.reader import Reader
-from kineverse.number import real_number
-from kineverse.spatial import normalised
+from kineverse.model.operation import Operation, Writes
+from kineverse.model.read_recorder import ReadRecorder
+from kineverse.spatial import normalize
 from kineverse.symbols import Symbol, position
 
-from .limits import limits
+from .limits import limit_constraints
 
 
 @dataclass(frozen=True, kw_only=True)
-class Placed(Operation):
+class PlacedOperation(Operation):
     """Base of what has a name and a place in a parent frame.
 
     Attributes
@@ -50,9 +50,9 @@ class Placed(Operation):
         try:
             object.__setattr__(self, "origin", Pose.of(self.origin))
         except (KineverseError, TypeError, ValueError) as error:
-            raise ValueRejectedError(
+            raise InvalidValueError(
                 f"The origin of the {self.noun} '{self.name}' is not a pose. {error} It is a 4×4 transform: "
-                f"{_place(self.origin)}, a kv.Pose, or a 4×4 array of numbers."
+                f"{_place(self.origin)}, a kv.model.Pose, or a 4×4 array of numbers."
             ) from None
 
     @property
@@ -70,11 +70,11 @@ class Placed(Operation):
 
         Raises
         ------
-        ValueRejectedError
+        InvalidValueError
             If one is not positive.
         """
         for field in fields:
-            checked_number(
+            check_joint_number(
                 getattr(self, field), f"The {field} of the {self.noun} '{self.name}'", positive=True
             )
 
@@ -83,28 +83,28 @@ class Placed(Operation):
 
         Raises
         ------
-        ValueRejectedError
+        InvalidValueError
             If one is no text, or empty.
         """
         for field in fields:
             given = getattr(self, field)
             if not isinstance(given, str) or not given:
                 what = f"The {field} of the {self.noun} '{self.name}'"
-                raise ValueRejectedError(f"{what} is a path like 'kitchen/door', not {given!r}.")
+                raise InvalidValueError(f"{what} is a path like 'kitchen/door', not {given!r}.")
 
-    def check_names(self, model: Reader, frames: Iterable[str]) -> None:
+    def check_names(self, model: ReadRecorder, frames: Iterable[str]) -> None:
         """Look whether the names of the articulation and of its frames are free.
 
         Raises
         ------
-        NameTakenError
+        DuplicateNameError
             If they are not.
         """
         wanted: list[tuple[str, str, Container[str]]] = [("an articulation", self.name, model.articulations)]
         wanted += [("a frame", frame, model.frames) for frame in frames]
         for what, name, names in wanted:
             if name in names:
-                raise NameTakenError(
+                raise DuplicateNameError(
                     f"There is {what} '{name}' already, so the {self.noun} '{self.name}' cannot create it. "
                     "Choose another name, or replace the operation that wrote it."
                 )
@@ -120,7 +120,7 @@ def _place(given: object) -> str:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Joint(Placed):
+class Joint(PlacedOperation):
     """Base of the joints that connect a child frame to a parent frame.
 
     Attributes
@@ -156,12 +156,12 @@ class Joint(Placed):
             self.kind, self.parent, self.child, coordinates, home, speeds, self.dynamics, follows
         )
 
-    def check_free(self, model: Reader) -> None:
+    def check_free(self, model: ReadRecorder) -> None:
         """Look whether the names of the articulation and of its child are free.
 
         Raises
         ------
-        NameTakenError
+        DuplicateNameError
             If they are not.
         """
         self.check_names(model, [self.child])
@@ -171,15 +171,15 @@ class Joint(Placed):
 class Fixed(Joint):
     """A rigid connection: parent_T_child = origin."""
 
-    def apply(self, model: Reader) -> Effects:
+    def apply(self, model: ReadRecorder) -> Writes:
         """Write the child frame."""
-        return Effects(
+        return Writes(
             frames={self.child: (self.parent, self.origin)}, articulations={self.name: self.record()}
         )
 
 
 @dataclass(frozen=True, kw_only=True)
-class AxialJoint(Joint):
+class OneAxisMotion(Joint):
     """Base of what moves by one number q along or about an axis, whatever that number is.
 
     Attributes
@@ -199,25 +199,25 @@ class AxialJoint(Joint):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        object.__setattr__(self, "axis", checked_axis(self.axis, self.name))
+        object.__setattr__(self, "axis", check_axis(self.axis, self.name))
 
     @abstractmethod
     def motion(self, q: Expression) -> tuple[Pose | Expression, ...]:
         """Return joint_T_child as factors."""
 
-    def moved_by(self, q: Expression) -> Effects:
+    def moved_by(self, q: Expression) -> Writes:
         """Return the child frame, the limits and the record for a coordinate of its own or another number."""
         own = (q,) if isinstance(q, Symbol) and q == position(self.name) else ()
         record = self.record(own, (0.0,) * len(own), tuple(s.derivative() for s in own), None if own else q)
-        return Effects(
+        return Writes(
             frames={self.child: (self.parent, (self.origin, *self.motion(q)))},
-            constraints=dict(limits(self.name, q, self.lower, self.upper, self.velocity)),
+            constraints=dict(limit_constraints(self.name, q, self.lower, self.upper, self.velocity)),
             articulations={self.name: record},
         )
 
 
 @dataclass(frozen=True, kw_only=True)
-class AxisJoint(AxialJoint):
+class OneDofJoint(OneAxisMotion):
     """Base of the joints with one coordinate q along or about an axis.
 
     Attributes
@@ -232,67 +232,67 @@ class AxisJoint(AxialJoint):
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.position is not None:
-            checked_position(self.position, f"The position of the {self.noun} '{self.name}'")
+            check_position_expression(self.position, f"The position of the {self.noun} '{self.name}'")
 
     @property
     def q(self) -> Expression:
         """The coordinate, or the expression that stands for it."""
         return position(self.name) if self.position is None else self.position
 
-    def apply(self, model: Reader) -> Effects:
+    def apply(self, model: ReadRecorder) -> Writes:
         """Write the child frame and the limits."""
         return self.moved_by(self.q)
 
 
-def checked_axis(axis: AxisLike, name: str) -> Vector3:
+def check_axis(axis: AxisLike, name: str) -> Vector3:
     """Return the axis of a joint as a tuple of numbers.
 
     Raises
     ------
-    ValueRejectedError
+    InvalidValueError
         If it is not three numbers with a direction.
     """
     try:
         x, y, z = map(real_number, axis)
     except (TypeError, ValueError, OverflowError):
-        raise ValueRejectedError(f"The axis of joint '{name}' is three numbers, not {axis!r}.") from None
-    if normalised((x, y, z)) is None:
+        raise InvalidValueError(f"The axis of joint '{name}' is three numbers, not {axis!r}.") from None
+    if normalize((x, y, z)) is None:
         problem = "has length zero" if (x, y, z) == (0, 0, 0) else f"is {(x, y, z)}, which is no direction"
-        raise ValueRejectedError(f"The axis of joint '{name}' {problem}.")
+        raise InvalidValueError(f"The axis of joint '{name}' {problem}.")
     return x, y, z
 
 
-def checked_position(expression: object, what: str) -> Expression:
+def check_position_expression(expression: object, what: str) -> Expression:
     """Return a scalar expression of positions.
 
     Raises
     ------
-    ValueRejectedError
+    InvalidValueError
         If it is something else.
     """
     if not isinstance(expression, Expression):
-        raise ValueRejectedError(f"{what} is an expression, not {expression!r}.")
+        raise InvalidValueError(f"{what} is an expression, not {expression!r}.")
     if expression.shape:
-        raise ValueRejectedError(f"{what} is a scalar, not of shape {expression.shape}.")
+        raise InvalidValueError(f"{what} is a scalar, not of shape {expression.shape}.")
     moving = [str(s) for s in expression.symbols if s.order]
     if moving:
-        raise ValueRejectedError(f"{what} is about positions, and not about {', '.join(moving)}.")
+        raise InvalidValueError(f"{what} is about positions, and not about {', '.join(moving)}.")
     return expression
 
 
-def checked_number(number: object, what: str, *, positive: bool = False) -> float:
+def check_joint_number(number: object, what: str, *, positive: bool = False) -> float:
     """Return a finite number.
 
     Raises
     ------
-    ValueRejectedError
+    InvalidValueError
         If it is none, or not positive where it has to be.
     """
     try:
         value = real_number(number)
     except (TypeError, ValueError, OverflowError):
-        raise ValueRejectedError(f"{what} is a number, not {number!r}.") from None
+        raise InvalidValueError(f"{what} is a number, not {number!r}.") from None
     if not math.isfinite(value) or (positive and value <= 0):
         kind = "a positive, finite number" if positive else "a finite number"
-        raise ValueRejectedError(f"{what} is {kind}, not {number!r}.")
+        raise InvalidValueError(f"{what} is {kind}, not {number!r}.")
     return value

@@ -6,11 +6,11 @@ import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 
-from kineverse.errors import KineverseError, ValueRejectedError
+from kineverse._checks import real_number
+from kineverse.errors import InvalidValueError, KineverseError
 from kineverse.expressions.expression import Expression, ExpressionLike
 from kineverse.expressions.gradient import total_derivative
 from kineverse.model.constraint import Constraint
-from kineverse.number import real_number
 
 
 @dataclass(frozen=True)
@@ -31,7 +31,7 @@ class Limits:
 
     def on(self, name: str, q: Expression) -> Iterator[tuple[str, Constraint]]:
         """Yield the constraints ``name/position`` and ``name/velocity``, as far as there are any."""
-        return limits(name, q, self.lower, self.upper, self.velocity)
+        return limit_constraints(name, q, self.lower, self.upper, self.velocity)
 
 
 FREE = Limits()
@@ -43,14 +43,14 @@ def check_limits(given: object, what: str) -> None:
 
     Raises
     ------
-    ValueRejectedError
+    InvalidValueError
         If they are something else.
     """
     if not isinstance(given, Limits):
-        raise ValueRejectedError(f"{what} is kv.Limits(lower, upper, velocity), not {given!r}.")
+        raise InvalidValueError(f"{what} is kv.Limits(lower, upper, velocity), not {given!r}.")
 
 
-def limits(
+def limit_constraints(
     name: str,
     q: Expression,
     lower: ExpressionLike | None,
@@ -61,7 +61,7 @@ def limits(
 
     Raises
     ------
-    ValueRejectedError
+    InvalidValueError
         Naming the limits that leave nothing between them, are NaN, or a negative speed.
     """
     if (lower is not None or upper is not None) and q.symbols:
@@ -70,21 +70,21 @@ def limits(
                 -math.inf if lower is None else lower, q, math.inf if upper is None else upper
             )
         except KineverseError as error:
-            raise ValueRejectedError(f"The limits of '{name}' are no range. {error}") from None
+            raise InvalidValueError(f"The limits of '{name}' are no range. {error}") from None
         yield f"{name}/position", range_of
-    bound = checked_limit(velocity, f"The velocity limit of '{name}'")
+    bound = check_speed_limit(velocity, f"The velocity limit of '{name}'")
     if bound is not None:
         rate = total_derivative(q)
         if rate.symbols:
             yield f"{name}/velocity", Constraint.of(-bound, rate, bound)
 
 
-def checked_limit(limit: object, what: str) -> float | None:
+def check_speed_limit(limit: object, what: str) -> float | None:
     """Return a limit of a speed, None where there is none.
 
     Raises
     ------
-    ValueRejectedError
+    InvalidValueError
         If it is negative, NaN, or no number.
     """
     if limit is None:
@@ -92,7 +92,7 @@ def checked_limit(limit: object, what: str) -> float | None:
     try:
         value = real_number(limit)
     except (TypeError, ValueError, OverflowError):
-        raise ValueRejectedError(f"{what} is a number or None, not {limit!r}.") from None
+        raise InvalidValueError(f"{what} is a number or None, not {limit!r}.") from None
     if not value >= 0:
-        raise ValueRejectedError(f"{what} is {limit!r}; it cannot be negative.")
+        raise InvalidValueError(f"{what} is {limit!r}; it cannot be negative.")
     return value if math.isfinite(value) else None

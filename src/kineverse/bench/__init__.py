@@ -1,26 +1,25 @@
 """Layer 7: speed, measured beside the peers.
 
-:func:`measure` yields a :class:`Result` for each benchmark. Nothing here decides whether a build passes: a
+:func:`run_benchmarks` yields a :class:`BenchmarkResult` for each benchmark. Nothing here decides whether a build passes: a
 benchmark measures, a test decides.
 """
 
-from .agreement import DisagreementError
-from .machine import Machine, machine
-from .registry import BENCHMARKS, chosen, measure
-from .result import Bar, Comparison, Measurement, Result
-from .settings import QUICK, Settings
+from .harness import QUICK, BenchmarkSettings, DisagreementError
+from .machine import Machine, describe_machine
+from .registry import BENCHMARKS, run_benchmarks, select_benchmarks
+from .result import Bar, BenchmarkResult, Comparison, Measurement
 
 __all__ = [
     "BENCHMARKS",
     "QUICK",
     "Bar",
+    "BenchmarkResult",
+    "BenchmarkSettings",
     "Comparison",
     "DisagreementError",
     "Machine",
     "Measurement",
-    "Result",
-    "Settings",
-    "chosen",
-    "machine",
-    "measure",
+    "describe_machine",
+    "run_benchmarks",
+    "select_benchmarks",
 ]

@@ -10,7 +10,7 @@ from importlib import metadata
 from kineverse import position, rotation_z
 from kineverse._version import __version__
 from kineverse.compile import CompilerInformation, compile, compiler_information  # noqa: A004
-from kineverse.compile.native import native
+from kineverse.compile.call_extension import call_extension
 
 VERSIONS = ("casadi", "numpy", "pin", "mujoco", "coal", "pybullet")
 
@@ -39,10 +39,10 @@ class Machine:
     versions: dict[str, str | None]
 
 
-def machine() -> Machine:
+def describe_machine() -> Machine:
     """Return where this is."""
     return Machine(
-        tier=_tier(),
+        tier=_evaluation_tier(),
         compiler=compiler_information(),
         processor=_processor(),
         system=f"{platform.system()} {platform.release()} {platform.machine()}",
@@ -51,9 +51,9 @@ def machine() -> Machine:
     )
 
 
-def _tier() -> str:
+def _evaluation_tier() -> str:
     function = compile(rotation_z(position("angle")), wait=True)
-    return "c extension" if function.tier == "c" and native.module is not None else function.tier
+    return "c extension" if function.tier == "c" and call_extension.module is not None else function.tier
 
 
 def _processor() -> str:

@@ -11,14 +11,10 @@ import numpy as np
 
 from kineverse.compile import compile, compiler_information  # noqa: A004
 
-from .agreement import Array
-from .casadi_map import BoundMap, compiled_map, graph
-from .numpy_graph import NumpyGraph
-from .peers import Field
-from .result import Result, faster
-from .robot import Robot, find_robot
-from .settings import Settings
-from .timing import Contender, race, timed
+from .harness import Array, BenchmarkSettings, Contender, Contenders, time_calls, time_contenders
+from .peers.casadi import BoundMap, NumpyGraph, compile_map, make_casadi_function
+from .result import BenchmarkResult, compare_speed
+from .workloads import BenchmarkRobot, find_robot
 
 ONE_CORE, ALL_CORES, FRESH = (
     "kineverse, one core",
@@ -28,17 +24,17 @@ ONE_CORE, ALL_CORES, FRESH = (
 CASADI, NUMPY, PINOCCHIO = "casadi, map in C", "numpy, same graph", "pinocchio, loop over the reduced robot"
 
 
-def measure(settings: Settings) -> Result:
+def measure(settings: BenchmarkSettings) -> BenchmarkResult:
     """Measure batches; everybody but those who say otherwise on the same one core."""
     robot = find_robot(settings)
     configurations = robot.configurations(settings.rows)
     points = robot.of_chain(configurations)
     with tempfile.TemporaryDirectory(prefix="kineverse-bench-") as folder:
-        field = Field(list(_ours(robot, points)))
+        field = Contenders(list(_ours(robot, points)))
         field.contenders += _of_the_graph(robot, points, Path(folder), field.missing)
         field.admit("pinocchio", lambda: [_pinocchio(robot, configurations)])
-        measured = race("batch", field.contenders, settings.rounds, settings.progress)
-    return Result(
+        measured = time_contenders("batch", field.contenders, settings.rounds, settings.progress)
+    return BenchmarkResult(
         name="batch",
         work=(
             f"pose 4x4 and Jacobian 6x{len(robot.chain)} of {robot.frame} at {len(points)} configurations; "
@@ -46,16 +42,16 @@ def measure(settings: Settings) -> Result:
         ),
         measurements=tuple(measured.values()),
         comparisons=(
-            faster(measured, ONE_CORE, PINOCCHIO, 40.0),
-            faster(measured, ONE_CORE, CASADI, 2.0),
-            faster(measured, ONE_CORE, NUMPY),
-            faster(measured, ALL_CORES, ONE_CORE),
+            compare_speed(measured, ONE_CORE, PINOCCHIO, 40.0),
+            compare_speed(measured, ONE_CORE, CASADI, 2.0),
+            compare_speed(measured, ONE_CORE, NUMPY),
+            compare_speed(measured, ALL_CORES, ONE_CORE),
         ),
         missing=tuple(field.missing),
     )
 
 
-def _ours(robot: Robot, points: Array) -> Iterator[Contender]:
+def _ours(robot: BenchmarkRobot, points: Array) -> Iterator[Contender]:
     model = robot.model
     tier = "c" if compiler_information().compiler else "auto"
     function = compile([model.fk(robot.frame), model.jacobian(robot.frame)], robot.chain, tier=tier)  # type: ignore[call-overload]
@@ -70,33 +66,35 @@ def _ours(robot: Robot, points: Array) -> Iterator[Contender]:
     def results() -> list[Array]:
         return list(function.batch(points))
 
-    yield Contender(ONE_CORE, on_one_core(timed(run, len(points))), results)
-    yield Contender(FRESH, on_one_core(timed(fresh, len(points))))
-    yield Contender(ALL_CORES, timed(run, len(points)))
+    yield Contender(ONE_CORE, pin_to_one_core(time_calls(run, len(points))), results)
+    yield Contender(FRESH, pin_to_one_core(time_calls(fresh, len(points))))
+    yield Contender(ALL_CORES, time_calls(run, len(points)))
 
 
-def _of_the_graph(robot: Robot, points: Array, folder: Path, missing: list[str]) -> Iterator[Contender]:
+def _of_the_graph(
+    robot: BenchmarkRobot, points: Array, folder: Path, missing: list[str]
+) -> Iterator[Contender]:
     """Yield those who evaluate the graph that Kineverse makes, in their own ways."""
-    rows, function = len(points), graph(robot)
+    rows, function = len(points), make_casadi_function(robot)
     by_numpy = NumpyGraph(function)
     outputs = _outputs(robot, rows)
     yield Contender(
         NUMPY,
-        on_one_core(timed(lambda: by_numpy(points, outputs), rows)),
+        pin_to_one_core(time_calls(lambda: by_numpy(points, outputs), rows)),
         _results(lambda: by_numpy(points, outputs), outputs),
     )
     if compiler_information().compiler is None:
         missing.append("casadi's map in C is missing: there is no C compiler")
         return
     written = _outputs(robot, rows)
-    mapped = BoundMap(compiled_map(function, rows, folder), points, written)
-    yield Contender(CASADI, on_one_core(timed(mapped, rows)), _results(mapped, written))
+    mapped = BoundMap(compile_map(function, rows, folder), points, written)
+    yield Contender(CASADI, pin_to_one_core(time_calls(mapped, rows)), _results(mapped, written))
 
 
-def _pinocchio(robot: Robot, configurations: Array) -> Contender:
+def _pinocchio(robot: BenchmarkRobot, configurations: Array) -> Contender:
     import pinocchio as pin
 
-    from .pinocchio_robot import PinocchioRobot
+    from .peers.pinocchio import PinocchioRobot
 
     peer = PinocchioRobot(robot, reduced=True)
     rows = peer.rows(robot.positions(configurations))
@@ -113,10 +111,10 @@ def _pinocchio(robot: Robot, configurations: Array) -> Contender:
         run()
         return [poses, jacobians[:, :, peer.columns]]
 
-    return Contender(PINOCCHIO, on_one_core(timed(run, len(rows))), results)
+    return Contender(PINOCCHIO, pin_to_one_core(time_calls(run, len(rows))), results)
 
 
-def _outputs(robot: Robot, rows: int) -> tuple[Array, Array]:
+def _outputs(robot: BenchmarkRobot, rows: int) -> tuple[Array, Array]:
     return np.zeros((rows, 4, 4)), np.zeros((rows, 6, len(robot.chain)))
 
 
@@ -128,7 +126,7 @@ def _results(run: Callable[[], object], outputs: tuple[Array, ...]) -> Callable[
     return results
 
 
-def on_one_core(sample: Callable[[], float]) -> Callable[[], float]:
+def pin_to_one_core(sample: Callable[[], float]) -> Callable[[], float]:
     """Return a sample that is taken on one core, where the system lets a process choose."""
     if not hasattr(os, "sched_setaffinity"):
         return sample

@@ -12,17 +12,14 @@ from time import perf_counter
 import numpy as np
 
 from kineverse.compile import CompiledFunction, Evaluator, compile  # noqa: A004
-from kineverse.compile.library import optimisation
+from kineverse.compile.c_library import optimisation_level
 from kineverse.compile.program import Program
-from kineverse.compile.toolchain import CLOSED, toolchain
+from kineverse.compile.toolchain import NO_UNDEFINED_FLAGS, toolchain
 from kineverse.expressions import array
 
-from .agreement import Array
-from .peers import Field
-from .result import Measurement, Result, at_most, faster
-from .robot import Robot, find_robot
-from .settings import Settings
-from .timing import Contender, race, timed
+from .harness import Array, BenchmarkSettings, Contender, Contenders, time_calls, time_contenders
+from .result import BenchmarkResult, Measurement, bound_median, compare_speed
+from .workloads import BenchmarkRobot, find_robot
 
 BOUND, WRITTEN, PLAIN = "kineverse, bound call", "kineverse, bound call with input", "kineverse, plain call"
 REDUCED, HELD = "pinocchio, reduced to the chain", "pinocchio, reduced, placement held"
@@ -34,16 +31,16 @@ _BOUND_AT_ONCE = 40
 _TABLE = 147, 62
 
 
-def measure(settings: Settings) -> Result:
+def measure(settings: BenchmarkSettings) -> BenchmarkResult:
     """Measure calls that take turns through the same configurations."""
     robot = find_robot(settings)
     configurations = robot.configurations(settings.configurations)
-    field = Field(list(_ours(robot, configurations)))
+    field = Contenders(list(_ours(robot, configurations)))
     field.admit("pinocchio", lambda: _pinocchio(robot, configurations))
     field.admit("mujoco", lambda: [_mujoco(robot, configurations)])
-    measured = race("call", field.contenders, settings.rounds, settings.progress)
+    measured = time_contenders("call", field.contenders, settings.rounds, settings.progress)
     tables = list(_table_compiled(settings.processes))
-    return Result(
+    return BenchmarkResult(
         name="call",
         work=(
             f"pose 4x4 and Jacobian 6x{len(robot.chain)} of {robot.frame}, one configuration, from Python; "
@@ -51,20 +48,20 @@ def measure(settings: Settings) -> Result:
         ),
         measurements=(*measured.values(), *tables),
         comparisons=(
-            faster(measured, BOUND, REDUCED, 8.0),
-            faster(measured, BOUND, HELD),
-            *(faster(measured, WRITTEN, peer, 3.0) for peer in (REDUCED, HELD)),
-            *(faster(measured, PLAIN, peer, 1.3) for peer in (REDUCED, HELD)),
-            faster(measured, PLAIN, PATH),
-            faster(measured, PLAIN, WHOLE, 3.0),
-            faster(measured, PLAIN, MUJOCO),
-            *(at_most(table, 2.0) for table in tables),
+            compare_speed(measured, BOUND, REDUCED, 8.0),
+            compare_speed(measured, BOUND, HELD),
+            *(compare_speed(measured, WRITTEN, peer, 3.0) for peer in (REDUCED, HELD)),
+            *(compare_speed(measured, PLAIN, peer, 1.3) for peer in (REDUCED, HELD)),
+            compare_speed(measured, PLAIN, PATH),
+            compare_speed(measured, PLAIN, WHOLE, 3.0),
+            compare_speed(measured, PLAIN, MUJOCO),
+            *(bound_median(table, 2.0) for table in tables),
         ),
         missing=tuple(field.missing),
     )
 
 
-def pose_and_jacobian(robot: Robot) -> CompiledFunction:
+def pose_and_jacobian(robot: BenchmarkRobot) -> CompiledFunction:
     """Return the function that is measured, compiled as far as it goes here."""
     model = robot.model
     return compile([model.fk(robot.frame), model.jacobian(robot.frame)], robot.chain, wait=True)
@@ -81,14 +78,14 @@ def _table_compiled(times: int) -> Iterator[Measurement]:
         for _ in range(times):
             start = perf_counter()
             program = Program([array(numbers)], ())
-            flags = (optimisation(program.instructions) or "", *CLOSED)
+            flags = (optimisation_level(program.instructions) or "", *NO_UNDEFINED_FLAGS)
             command = compiler.arguments(flags, str(Path(folder, "library.so")))
             subprocess.run(command, input=program.source().encode(), check=True)
             samples.append(perf_counter() - start)
     yield Measurement("kineverse, {}x{} constants compiled".format(*_TABLE), "s", tuple(samples))
 
 
-def _ours(robot: Robot, configurations: Array) -> Iterator[Contender]:
+def _ours(robot: BenchmarkRobot, configurations: Array) -> Iterator[Contender]:
     function = pose_and_jacobian(robot)
     points = list(robot.of_chain(configurations))
     evaluator = function.bind()
@@ -127,15 +124,15 @@ def _ours(robot: Robot, configurations: Array) -> Iterator[Contender]:
     def results(bound: bool) -> list[Array]:
         return _stacked(outputs(evaluators[0], point, bound) for point in points[:_CHECKED])
 
-    yield Contender(PLAIN, timed(plain, len(points)), lambda: _stacked(map(function, points[:_CHECKED])))
-    yield Contender(WRITTEN, timed(written, len(points)), lambda: results(False))
+    yield Contender(PLAIN, time_calls(plain, len(points)), lambda: _stacked(map(function, points[:_CHECKED])))
+    yield Contender(WRITTEN, time_calls(written, len(points)), lambda: results(False))
     yield Contender(BOUND, bound, lambda: results(True))
 
 
-def _pinocchio(robot: Robot, configurations: Array) -> Iterator[Contender]:
+def _pinocchio(robot: BenchmarkRobot, configurations: Array) -> Iterator[Contender]:
     import pinocchio as pin
 
-    from .pinocchio_robot import PinocchioRobot
+    from .peers.pinocchio import PinocchioRobot
 
     positions = robot.positions(configurations)
     compute, aligned = pin.computeFrameJacobian, pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
@@ -169,13 +166,13 @@ def _pinocchio(robot: Robot, configurations: Array) -> Iterator[Contender]:
     ):
         rows = peer.rows(positions)
         work, checked = partial(run, peer, rows), partial(map, peer.pose_and_jacobian, rows[:_CHECKED])
-        yield Contender(name, timed(work, len(rows)), lambda checked=checked: _stacked(checked()))  # type: ignore[misc]
+        yield Contender(name, time_calls(work, len(rows)), lambda checked=checked: _stacked(checked()))  # type: ignore[misc]
 
 
-def _mujoco(robot: Robot, configurations: Array) -> Contender:
+def _mujoco(robot: BenchmarkRobot, configurations: Array) -> Contender:
     import mujoco
 
-    from .mujoco_robot import MujocoRobot
+    from .peers.mujoco_kinematics import MujocoRobot
 
     peer = MujocoRobot(robot)
     rows = peer.rows(robot.positions(configurations))
@@ -192,7 +189,7 @@ def _mujoco(robot: Robot, configurations: Array) -> Contender:
             jacobian(model, data, linear, angular, body)
 
     return Contender(
-        MUJOCO, timed(run, len(rows)), lambda: _stacked(map(peer.pose_and_jacobian, rows[:_CHECKED]))
+        MUJOCO, time_calls(run, len(rows)), lambda: _stacked(map(peer.pose_and_jacobian, rows[:_CHECKED]))
     )
 
 

@@ -1,42 +1,156 @@
-"""``edit``: what changes of a model cost, when it is large and when it is a robot."""
+"""``edit``: changes of a large model, and of one joint of a robot until its next pose."""
 
 from __future__ import annotations
 
 import tempfile
 from dataclasses import replace
+from itertools import count
 from pathlib import Path
+from xml.etree import ElementTree
 
-from .edited_robot import JOINT, MUJOCO, PINOCCHIO, compiled_again, joint_replaced, read_again
-from .large_model import (
+import numpy as np
+
+from kineverse.articulations.joint import Joint
+from kineverse.model import Pose
+
+from .harness import Array, BenchmarkSettings, Contender, Contenders, time_calls, time_contenders
+from .large_models import (
     COPY,
     READERS,
     RELEVANT,
     TO_EMPTY,
     TO_LARGE,
-    large_model,
-    on_large,
-    runs_of_replacing,
+    count_reruns,
+    large_model_contenders,
+    make_large_model,
 )
-from .peers import Field
-from .result import Bar, Comparison, Measurement, Result, at_most, faster
-from .robot import find_robot
-from .settings import Settings
-from .timing import race
+from .result import Bar, BenchmarkResult, Comparison, Measurement, bound_median, compare_speed
+from .workloads import BenchmarkRobot, find_robot, strip_shapes
+
+JOINT, PINOCCHIO, MUJOCO = (
+    "kineverse, joint replaced",
+    "pinocchio, file read again",
+    "mujoco, joint moved, compiled",
+)
+
+_SHIFT = 0.01
+"""How far the joint is moved [m]."""
+
+_CONFIGURATION_RANGE = 0.3
+"""Where all coordinates are [rad], [m]."""
 
 
-def measure(settings: Settings) -> Result:
+def replace_joint(robot: BenchmarkRobot) -> Contender:
+    """Return who replaces an operation, and evaluates the new pose."""
+    model = robot.model.copy()
+    tag, joint = _middle_joint(robot)
+    origin = joint.origin
+    assert isinstance(origin, Pose)  # descriptions have no others
+    values = dict.fromkeys(robot.chain, _CONFIGURATION_RANGE)
+    shifts = count(1)
+
+    def at(shift: float) -> Array:
+        with model.edit() as edit:
+            edit.replace(tag, replace(joint, origin=_shift_origin(origin, shift)))
+        return np.asarray(model.fk(robot.frame)(values))
+
+    # Every time by another shift: a model that is what it was before would be done at once.
+    return Contender(JOINT, time_calls(lambda: at(_SHIFT * next(shifts))), lambda: [at(_SHIFT)])
+
+
+def _middle_joint(robot: BenchmarkRobot) -> tuple[str, Joint]:
+    """Return tag and operation of the middle one of the joints that move the frame."""
+    name = robot.chain[len(robot.chain) // 2].path
+    for tag in robot.model.history.tags:
+        operation = robot.model.history.entry(tag).operation
+        if isinstance(operation, Joint) and operation.name == name:
+            return tag, operation
+    raise LookupError(name)
+
+
+def _shift_origin(origin: Pose, shift: float) -> Pose:
+    matrix = np.array(origin.matrix)
+    matrix[0, 3] += shift
+    return Pose.of(matrix)
+
+
+def _sampled_configurations(robot: BenchmarkRobot) -> dict[str, Array]:
+    return robot.positions(np.full((1, len(robot.coordinates)), _CONFIGURATION_RANGE))
+
+
+def reread_file(robot: BenchmarkRobot, folder: Path) -> Contender:
+    """Return who reads a file in which the joint is moved, as a model in pinocchio stays what it is."""
+    import pinocchio as pin
+
+    from .peers.pinocchio import PinocchioRobot
+
+    file = folder / "edited.urdf"
+    file.write_text(_edited_text(robot), encoding="utf-8")
+    edited = replace(robot, file=file)
+
+    def at() -> Array:
+        peer = PinocchioRobot(edited)
+        (row,) = peer.rows(_sampled_configurations(robot))
+        pin.framesForwardKinematics(peer.model, peer.data, row)
+        pose: Array = peer.pose.homogeneous
+        return pose
+
+    return Contender(PINOCCHIO, time_calls(at), lambda: [at()])
+
+
+def recompile_specification(robot: BenchmarkRobot) -> Contender:
+    """Return who moves a body in MuJoCo's specification, and compiles that."""
+    import mujoco
+
+    from .peers.mujoco_kinematics import MujocoRobot, make_robot_mjcf
+
+    joint = _middle_joint(robot)[1]
+    peer = MujocoRobot(robot)
+    (row,) = peer.rows(_sampled_configurations(robot))
+    specification = mujoco.MjSpec.from_string(make_robot_mjcf(robot))
+    place = specification.body(joint.child).pos
+    start = np.array(place)
+    shifts = count(1)
+
+    def at(shift: float) -> Array:
+        place[:] = start + np.array([shift, 0.0, 0.0])
+        peer.model = specification.compile()
+        peer.data = mujoco.MjData(peer.model)
+        peer.data.qpos[:] = row
+        mujoco.mj_kinematics(peer.model, peer.data)
+        return peer.pose(peer.body)
+
+    return Contender(MUJOCO, time_calls(lambda: at(_SHIFT * next(shifts))), lambda: [at(_SHIFT)])
+
+
+def _edited_text(robot: BenchmarkRobot) -> str:
+    """Return the robot's file with the joint moved, without shapes."""
+    name = _middle_joint(robot)[1].name
+    root = ElementTree.fromstring(strip_shapes(robot.file))
+    element = next(e for e in root.iterfind("joint") if e.get("name") == name)
+    origin = element.find("origin")
+    if origin is None:
+        origin = ElementTree.SubElement(element, "origin")
+    x, y, z = map(float, origin.get("xyz", "0 0 0").split())
+    origin.set("xyz", f"{x + _SHIFT!r} {y!r} {z!r}")
+    return ElementTree.tostring(root, encoding="unicode")
+
+
+def measure(settings: BenchmarkSettings) -> BenchmarkResult:
     """Measure what edits of a large model and of a robot cost."""
     robot = find_robot(settings)
-    large = large_model(settings.operations)
-    measured = race("edit", list(on_large(large)), settings.rounds, settings.progress)
-    runs = Measurement("operations run by that", "operations", (float(runs_of_replacing(large)),))
+    large = make_large_model(settings.operations)
+    measured = time_contenders(
+        "edit", list(large_model_contenders(large)), settings.rounds, settings.progress
+    )
+    runs = Measurement("operations run by that", "operations", (float(count_reruns(large)),))
     with tempfile.TemporaryDirectory(prefix="kineverse-bench-") as folder:
-        field = Field([joint_replaced(robot)])
-        field.admit("pinocchio", lambda: [read_again(robot, Path(folder))])
-        field.admit("mujoco", lambda: [compiled_again(robot)])
-        edited = race("edit", field.contenders, settings.rounds, settings.progress)
-    ratio = faster(measured, TO_LARGE, TO_EMPTY)
-    return Result(
+        field = Contenders([replace_joint(robot)])
+        field.admit("pinocchio", lambda: [reread_file(robot, Path(folder))])
+        field.admit("mujoco", lambda: [recompile_specification(robot)])
+        edited = time_contenders("edit", field.contenders, settings.rounds, settings.progress)
+    ratio = compare_speed(measured, TO_LARGE, TO_EMPTY)
+    return BenchmarkResult(
         name="edit",
         work=(
             f"edits of a model of {len(large.history.tags)} operations and {len(large.constraints)} "
@@ -46,11 +160,11 @@ def measure(settings: Settings) -> Result:
         comparisons=(
             replace(ratio, bar=Bar(0.5, at_least=True)),
             Comparison(runs.name, runs.median, runs.unit, Bar(1 + READERS, at_least=False)),
-            at_most(measured[RELEVANT], 50e-6),
-            at_most(measured[COPY], 20e-6),
-            at_most(edited[JOINT], 5e-3),
-            faster(edited, JOINT, PINOCCHIO),
-            faster(edited, JOINT, MUJOCO),
+            bound_median(measured[RELEVANT], 50e-6),
+            bound_median(measured[COPY], 20e-6),
+            bound_median(edited[JOINT], 5e-3),
+            compare_speed(edited, JOINT, PINOCCHIO),
+            compare_speed(edited, JOINT, MUJOCO),
         ),
         missing=tuple(field.missing),
     )

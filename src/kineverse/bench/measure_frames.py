@@ -8,28 +8,25 @@ import numpy as np
 
 from kineverse.compile import compile  # noqa: A004
 
-from .agreement import Array
-from .peers import Field
-from .result import Result, faster
-from .robot import Robot, find_robot
-from .settings import Settings
-from .timing import Contender, race, timed
+from .harness import Array, BenchmarkSettings, Contender, Contenders, time_calls, time_contenders
+from .result import BenchmarkResult, compare_speed
+from .workloads import BenchmarkRobot, find_robot
 
 KINEVERSE, PINOCCHIO, MUJOCO = "kineverse, bound call with input", "pinocchio", "mujoco"
 
 _CHECKED = 10
 
 
-def measure(settings: Settings) -> Result:
+def measure(settings: BenchmarkSettings) -> BenchmarkResult:
     """Measure all frames at once."""
     robot = find_robot(settings)
     frames = list(robot.model.frames)
     configurations = robot.configurations(settings.configurations)
-    field = Field([_ours(robot, frames, configurations)])
+    field = Contenders([_ours(robot, frames, configurations)])
     field.admit("pinocchio", lambda: [_pinocchio(robot, frames, configurations)])
     field.admit("mujoco", lambda: [_mujoco(robot, frames, configurations)])
-    measured = race("frames", field.contenders, settings.rounds, settings.progress)
-    return Result(
+    measured = time_contenders("frames", field.contenders, settings.rounds, settings.progress)
+    return BenchmarkResult(
         name="frames",
         work=(
             f"the poses of all {len(frames)} links of {robot.file.name}, one configuration, from Python; "
@@ -37,14 +34,14 @@ def measure(settings: Settings) -> Result:
         ),
         measurements=tuple(measured.values()),
         comparisons=(
-            faster(measured, KINEVERSE, PINOCCHIO, 2.5),
-            faster(measured, KINEVERSE, MUJOCO),
+            compare_speed(measured, KINEVERSE, PINOCCHIO, 2.5),
+            compare_speed(measured, KINEVERSE, MUJOCO),
         ),
         missing=tuple(field.missing),
     )
 
 
-def _ours(robot: Robot, frames: Sequence[str], configurations: Array) -> Contender:
+def _ours(robot: BenchmarkRobot, frames: Sequence[str], configurations: Array) -> Contender:
     function = compile([robot.model.fk(frame) for frame in frames], robot.coordinates, wait=True)
     evaluator = function.bind()
     points = list(configurations)
@@ -60,13 +57,13 @@ def _ours(robot: Robot, frames: Sequence[str], configurations: Array) -> Contend
             found.append(np.array(evaluator.outputs))
         return found
 
-    return Contender(KINEVERSE, timed(run, len(points)), results)
+    return Contender(KINEVERSE, time_calls(run, len(points)), results)
 
 
-def _pinocchio(robot: Robot, frames: Sequence[str], configurations: Array) -> Contender:
+def _pinocchio(robot: BenchmarkRobot, frames: Sequence[str], configurations: Array) -> Contender:
     import pinocchio as pin
 
-    from .pinocchio_robot import PinocchioRobot
+    from .peers.pinocchio import PinocchioRobot
 
     peer = PinocchioRobot(robot)
     model, data = peer.model, peer.data
@@ -85,13 +82,13 @@ def _pinocchio(robot: Robot, frames: Sequence[str], configurations: Array) -> Co
             found.append(np.array([data.oMf[k].homogeneous for k in numbers]))
         return found
 
-    return Contender(PINOCCHIO, timed(run, len(rows)), results)
+    return Contender(PINOCCHIO, time_calls(run, len(rows)), results)
 
 
-def _mujoco(robot: Robot, frames: Sequence[str], configurations: Array) -> Contender:
+def _mujoco(robot: BenchmarkRobot, frames: Sequence[str], configurations: Array) -> Contender:
     import mujoco
 
-    from .mujoco_robot import MujocoRobot
+    from .peers.mujoco_kinematics import MujocoRobot
 
     peer = MujocoRobot(robot)
     model, data = peer.model, peer.data
@@ -113,4 +110,4 @@ def _mujoco(robot: Robot, frames: Sequence[str], configurations: Array) -> Conte
             found.append(np.array([peer.pose(k) for k in numbers]))
         return found
 
-    return Contender(MUJOCO, timed(run, len(rows)), results)
+    return Contender(MUJOCO, time_calls(run, len(rows)), results)

@@ -11,17 +11,23 @@ from time import perf_counter
 import numpy as np
 
 from kineverse.geometry import Scene
-from kineverse.geometry.sweep_native import sweep_library
+from kineverse.geometry.bindings import collision_library
 
-from .agreement import Array, check_agreement
-from .crowd import LINKS, RADIUS, RULES, crowd
-from .crowd_peers import Finder, Mujoco, MujocoPairs, OurScene, PlainCoal
-from .kitchen_robot import KitchenRobot, kitchen_robot
-from .peers import Field, advice, installed
-from .result import Bar, Comparison, Measurement, Result, at_most, faster
-from .room_peers import BulletInRoom, MujocoInRoom, Room
-from .settings import Settings
-from .timing import Contender, race
+from .clutter import LINKS, RADIUS, RULES, make_clutter
+from .harness import (
+    Array,
+    BenchmarkSettings,
+    Contender,
+    Contenders,
+    check_equal,
+    has_peer,
+    install_advice,
+    time_contenders,
+)
+from .peers.clutter_search import CoalSearch, KineverseSearch, MujocoPairSearch, MujocoSearch, ProximitySearch
+from .peers.robot_search import BulletRobotSearch, MujocoRobotSearch, RobotSurroundings
+from .result import Bar, BenchmarkResult, Comparison, Measurement, bound_median, compare_speed
+from .workloads import KitchenRobot, make_kitchen_robot
 
 OURS, COAL = "kineverse", "coal and numpy"
 SEARCH, PAIRS, BULLET = "mujoco, mj_collision", "mujoco, mj_geomDistance and numpy", "bullet"
@@ -38,42 +44,46 @@ _CHECKED = 20
 
 
 @dataclass(frozen=True)
-class Entry:
+class SearchEntry:
     """Someone who finds what is near, and how exact that is [m]."""
 
     name: str
-    finder: Finder
+    finder: ProximitySearch
     accuracy: float
 
 
-def measure(settings: Settings) -> Result:
+def measure(settings: BenchmarkSettings) -> BenchmarkResult:
     """Measure an arm among boxes, among more boxes with as many near, and a robot in a kitchen."""
-    sweep_library.prepare(wait=True)
+    collision_library.prepare(wait=True)
     steps = min(settings.configurations, settings.steps)
     sizes = [settings.boxes // part for part in (30, 10, 3, 1)]
-    field = Field()
+    field = Contenders()
     with tempfile.TemporaryDirectory(prefix="kineverse-bench-") as folder:
         arm = list(_among_boxes(field, Path(folder), steps))
-        robot = kitchen_robot(steps)
-        rooms = list(_in_a_room(robot))
-        angles = crowd(steps=steps).angles
-        check(arm, angles)
-        check(rooms, robot.values)
+        robot = make_kitchen_robot(steps)
+        rooms = list(_around_robot(robot))
+        angles = make_clutter(steps=steps).angles
+        check_distances(arm, angles)
+        check_distances(rooms, robot.values)
         everything = [
-            Entry(f"{robot.name}: {OURS}{_WHOLE}", OurScene(robot.whole_scene(), _NEAR), _CURVED),
-            Entry(f"{robot.name}: {COAL}{_WHOLE}", PlainCoal(robot.whole_scene(), _NEAR), _CURVED),
+            SearchEntry(
+                f"{robot.name}: {OURS}{_WHOLE}", KineverseSearch(robot.whole_scene(), _NEAR), _CURVED
+            ),
+            SearchEntry(f"{robot.name}: {COAL}{_WHOLE}", CoalSearch(robot.whole_scene(), _NEAR), _CURVED),
         ]
         many = [
-            Entry(f"{OURS} among {boxes} boxes", OurScene(_scene(Path(folder), boxes, steps)), _EXACT)
+            SearchEntry(
+                f"{OURS} among {boxes} boxes", KineverseSearch(_scene(Path(folder), boxes, steps)), _EXACT
+            )
             for boxes in sizes
         ]
         field.contenders += [*_timed(arm, angles), *_timed(many, angles), *_timed(rooms, robot.values)]
         field.contenders += _timed(everything, robot.values)
-        measured = race("geometry", field.contenders, settings.rounds, settings.progress)
+        measured = time_contenders("geometry", field.contenders, settings.rounds, settings.progress)
     peers = (SEARCH, PAIRS, BULLET, COAL)
     room = {name: f"{robot.name}: {name}, {QUERY}" for name in (OURS, SEARCH, BULLET, COAL)}
     whole = f"{robot.name}: {OURS}{_WHOLE}, {QUERY}"
-    return Result(
+    return BenchmarkResult(
         name="geometry",
         work=(
             f"an arm of {LINKS} hulls, boxes and capsules among 60 boxes: all pairs within {RADIUS} m with "
@@ -82,21 +92,21 @@ def measure(settings: Settings) -> Result:
         ),
         measurements=tuple(measured.values()),
         comparisons=(
-            at_most(measured[f"{OURS}, {QUERY}"], 40e-6),
-            *(faster(measured, f"{OURS}, {QUERY}", f"{peer}, {QUERY}", 1.0) for peer in peers),
-            *(faster(measured, f"{OURS}, {UPDATE}", f"{peer}, {UPDATE}") for peer in peers),
-            faster(measured, room[OURS], room[SEARCH]),
-            *(faster(measured, room[OURS], room[peer], 1.0) for peer in (BULLET, COAL)),
-            at_most(measured[whole], 150e-6),
-            faster(measured, whole, room[OURS]),
-            faster(measured, whole, f"{robot.name}: {COAL}{_WHOLE}, {QUERY}", 1.0),
+            bound_median(measured[f"{OURS}, {QUERY}"], 40e-6),
+            *(compare_speed(measured, f"{OURS}, {QUERY}", f"{peer}, {QUERY}", 1.0) for peer in peers),
+            *(compare_speed(measured, f"{OURS}, {UPDATE}", f"{peer}, {UPDATE}") for peer in peers),
+            compare_speed(measured, room[OURS], room[SEARCH]),
+            *(compare_speed(measured, room[OURS], room[peer], 1.0) for peer in (BULLET, COAL)),
+            bound_median(measured[whole], 150e-6),
+            compare_speed(measured, whole, room[OURS]),
+            compare_speed(measured, whole, f"{robot.name}: {COAL}{_WHOLE}, {QUERY}", 1.0),
             _growth(measured, sizes),
         ),
         missing=tuple(field.missing),
     )
 
 
-def check(entries: Sequence[Entry], rows: Array) -> None:
+def check_distances(entries: Sequence[SearchEntry], rows: Array) -> None:
     """Compare what everybody finds at some states with what the first one finds.
 
     A pair that is found by one and not by another counts as being at the radius for the other, so that only
@@ -113,10 +123,10 @@ def check(entries: Sequence[Entry], rows: Array) -> None:
         table = [np.array([each.get(pair, RADIUS) for pair in pairs]) for each in found]
         for entry, distances in zip(entries[1:], table[1:], strict=True):
             names = [(entries[0].name, [table[0]]), (entry.name, [distances])]
-            check_agreement("geometry", names, entry.accuracy)
+            check_equal("geometry", names, entry.accuracy)
 
 
-def _distances(finder: Finder, row: Array) -> dict[tuple[str, str], float]:
+def _distances(finder: ProximitySearch, row: Array) -> dict[tuple[str, str], float]:
     finder.put(row)
     finder.find()
     least: dict[tuple[str, str], float] = {}
@@ -126,49 +136,49 @@ def _distances(finder: Finder, row: Array) -> dict[tuple[str, str], float]:
     return least
 
 
-def _among_boxes(field: Field, folder: Path, steps: int) -> Iterator[Entry]:
-    arm = crowd(steps=steps)
-    yield Entry(OURS, OurScene(_scene(folder, 60, steps)), _EXACT)
-    yield Entry(COAL, PlainCoal(_scene(folder, 60, steps)), _EXACT)
-    if installed("mujoco"):
-        yield Entry(SEARCH, Mujoco(arm), _EXACT)
-        yield Entry(PAIRS, MujocoPairs(arm), _EXACT)
+def _among_boxes(field: Contenders, folder: Path, steps: int) -> Iterator[SearchEntry]:
+    arm = make_clutter(steps=steps)
+    yield SearchEntry(OURS, KineverseSearch(_scene(folder, 60, steps)), _EXACT)
+    yield SearchEntry(COAL, CoalSearch(_scene(folder, 60, steps)), _EXACT)
+    if has_peer("mujoco"):
+        yield SearchEntry(SEARCH, MujocoSearch(arm), _EXACT)
+        yield SearchEntry(PAIRS, MujocoPairSearch(arm), _EXACT)
     else:
         field.admit("mujoco", list)
-    if installed("pybullet"):
-        from .bullet_crowd import Bullet
+    if has_peer("pybullet"):
+        from .peers.bullet import BulletSearch
 
-        yield Entry(BULLET, Bullet(arm), _MARGINS)
+        yield SearchEntry(BULLET, BulletSearch(arm), _MARGINS)
     else:
-        field.missing.append(advice("pybullet"))
+        field.missing.append(install_advice("pybullet"))
 
 
-def _in_a_room(robot: KitchenRobot) -> Iterator[Entry]:
+def _around_robot(robot: KitchenRobot) -> Iterator[SearchEntry]:
     """Yield who takes part where a robot moves; who does not is missed by :func:`_among_boxes`."""
-    yield Entry(f"{robot.name}: {OURS}", OurScene(robot.scene()), _CURVED)
-    yield Entry(f"{robot.name}: {COAL}", PlainCoal(robot.scene()), _CURVED)
-    if installed("mujoco"):
-        yield Entry(f"{robot.name}: {SEARCH}", MujocoInRoom(_room(robot)), _CURVED)
-    if installed("pybullet"):
-        yield Entry(f"{robot.name}: {BULLET}", BulletInRoom(_room(robot)), _MARGINS)
+    yield SearchEntry(f"{robot.name}: {OURS}", KineverseSearch(robot.scene()), _CURVED)
+    yield SearchEntry(f"{robot.name}: {COAL}", CoalSearch(robot.scene()), _CURVED)
+    if has_peer("mujoco"):
+        yield SearchEntry(f"{robot.name}: {SEARCH}", MujocoRobotSearch(_robot_surroundings(robot)), _CURVED)
+    if has_peer("pybullet"):
+        yield SearchEntry(f"{robot.name}: {BULLET}", BulletRobotSearch(_robot_surroundings(robot)), _MARGINS)
 
 
-def _room(robot: KitchenRobot) -> Room:
-    return Room(robot.scene(), robot.values[0], "robot/")
+def _robot_surroundings(robot: KitchenRobot) -> RobotSurroundings:
+    return RobotSurroundings(robot.scene(), robot.values[0], "robot/")
 
 
 def _scene(folder: Path, boxes: int, steps: int) -> Scene:
-    return Scene(crowd(boxes, steps).model(folder), rules=RULES)
+    return Scene(make_clutter(boxes, steps).model(folder), rules=RULES)
 
 
-def _timed(entries: Iterable[Entry], rows: Array) -> Iterator[Contender]:
+def _timed(entries: Iterable[SearchEntry], rows: Array) -> Iterator[Contender]:
     """Yield two contenders for each: both go through all states, and each counts its part of the time."""
     for entry in entries:
         yield Contender(f"{entry.name}, {UPDATE}", _sample(entry.finder, rows, whole=False))
         yield Contender(f"{entry.name}, {QUERY}", _sample(entry.finder, rows, whole=True))
 
 
-def _sample(finder: Finder, rows: Array, whole: bool) -> Callable[[], float]:
+def _sample(finder: ProximitySearch, rows: Array, whole: bool) -> Callable[[], float]:
     states = list(rows)
 
     def sample() -> float:
@@ -188,5 +198,5 @@ def _sample(finder: Finder, rows: Array, whole: bool) -> Callable[[], float]:
 
 def _growth(measured: Mapping[str, Measurement], sizes: Sequence[int]) -> Comparison:
     few, many = (f"{OURS} among {boxes} boxes, {QUERY}" for boxes in (sizes[0], sizes[-1]))
-    ratio = faster(measured, few, many)
+    ratio = compare_speed(measured, few, many)
     return Comparison(f"{many}, over {sizes[0]}, as many near", ratio.value, "x", Bar(2.0, at_least=False))

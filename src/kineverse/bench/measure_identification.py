@@ -10,15 +10,20 @@ from typing import Any
 import numpy as np
 
 from kineverse.estimation import Identifier, identify, pose_covariance
-from kineverse.estimation.identification.native import solver
-from kineverse.estimation.identification.rigid import pose
-from kineverse.estimation.rotations import exponential, logarithm
+from kineverse.estimation.identification.solver import solver
+from kineverse.lie import exp_so3, log_so3, transform
 
-from .agreement import Array
-from .peers import Field, advice, installed
-from .result import Result, at_most
-from .settings import Settings
-from .timing import Contender, race, timed
+from .harness import (
+    Array,
+    BenchmarkSettings,
+    Contender,
+    Contenders,
+    has_peer,
+    install_advice,
+    time_calls,
+    time_contenders,
+)
+from .result import BenchmarkResult, bound_median
 
 ALL = "kineverse, all families"
 HINGE = "kineverse, a hinge alone"
@@ -31,25 +36,25 @@ _POSITION, _ORIENTATION = 0.03, math.radians(3.0)
 _RANGE = math.pi / 2
 
 
-def measure(settings: Settings) -> Result:
+def measure(settings: BenchmarkSettings) -> BenchmarkResult:
     """Measure the identification of a hinge that was seen over a right angle."""
     solver.prepare(wait=True)
     parents, children = _recording()
-    field = Field([*_ours(parents, children)])
+    field = Contenders([*_ours(parents, children)])
     for module, peer in (("scipy", _scipy), ("ripl_articulation", _ripl)):
-        if installed(module):
+        if has_peer(module):
             field.contenders.append(peer(parents, children))
         else:
-            field.missing.append(advice(module))
-    measured = race("identification", field.contenders, settings.rounds, settings.progress)
-    return Result(
+            field.missing.append(install_advice(module))
+    measured = time_contenders("identification", field.contenders, settings.rounds, settings.progress)
+    return BenchmarkResult(
         name="identification",
         work=(
             f"a hinge over 90° from {_COUNT} poses of both parts with errors of 3 cm and 3°; scipy and "
             "ripl-articulation solve for one joint and do not weigh it against others"
         ),
         measurements=tuple(measured.values()),
-        comparisons=(at_most(measured[ALL], 5e-3), at_most(measured[ONE], 1e-3)),
+        comparisons=(bound_median(measured[ALL], 5e-3), bound_median(measured[ONE], 1e-3)),
         missing=tuple(field.missing),
     )
 
@@ -59,23 +64,27 @@ def _recording() -> tuple[Array, Array]:
     random = np.random.default_rng(0)
     count = _COUNT + 1
     angles = random.uniform(-_RANGE / 2, _RANGE / 2, count)
-    turns = exponential(angles[:, None] * (0.0, 0.0, 1.0))
-    hinge = pose(exponential(np.array([0.3, -0.2, 0.1])), np.array([0.5, 0.0, 0.0]))
-    relative = hinge @ pose(turns, np.zeros((count, 3))) @ pose(np.eye(3), np.array([0.4, 0.0, 0.0]))
-    parents = pose(exponential(random.normal(0.0, 1.0, (count, 3))), random.uniform(-1.0, 1.0, (count, 3)))
+    turns = exp_so3(angles[:, None] * (0.0, 0.0, 1.0))
+    hinge = transform(exp_so3(np.array([0.3, -0.2, 0.1])), np.array([0.5, 0.0, 0.0]))
+    relative = (
+        hinge @ transform(turns, np.zeros((count, 3))) @ transform(np.eye(3), np.array([0.4, 0.0, 0.0]))
+    )
+    parents = transform(exp_so3(random.normal(0.0, 1.0, (count, 3))), random.uniform(-1.0, 1.0, (count, 3)))
     return _noisy(parents, random), _noisy(parents @ relative, random)
 
 
 def _noisy(poses: Array, random: np.random.Generator) -> Array:
-    turns = exponential(random.normal(0.0, _ORIENTATION, (len(poses), 3)))
-    return pose(turns @ poses[:, :3, :3], poses[:, :3, 3] + random.normal(0.0, _POSITION, (len(poses), 3)))
+    turns = exp_so3(random.normal(0.0, _ORIENTATION, (len(poses), 3)))
+    return transform(
+        turns @ poses[:, :3, :3], poses[:, :3, 3] + random.normal(0.0, _POSITION, (len(poses), 3))
+    )
 
 
 def _ours(parents: Array, children: Array) -> Iterator[Contender]:
     noise = pose_covariance(_POSITION, _ORIENTATION)
     a, b = parents[:_COUNT], children[:_COUNT]
-    yield Contender(ALL, timed(lambda: identify(a, b, noise=noise)))
-    yield Contender(HINGE, timed(lambda: identify(a, b, noise=noise, families=["revolute"])))
+    yield Contender(ALL, time_calls(lambda: identify(a, b, noise=noise)))
+    yield Contender(HINGE, time_calls(lambda: identify(a, b, noise=noise, families=["revolute"])))
 
     def known() -> Identifier:
         identifier = Identifier(noise=noise)
@@ -88,7 +97,7 @@ def _ours(parents: Array, children: Array) -> Iterator[Contender]:
         identifier.add(parents[_COUNT], children[_COUNT])
         assert identifier.found
 
-    yield Contender(ONE, timed(one_more, prepare=known))
+    yield Contender(ONE, time_calls(one_more, prepare=known))
 
 
 def _scipy(parents: Array, children: Array) -> Contender:
@@ -99,23 +108,23 @@ def _scipy(parents: Array, children: Array) -> Contender:
     start = identify(a, b, noise=pose_covariance(_POSITION, _ORIENTATION), families=["revolute"]).best
 
     def apart(seen: Array, true: Array) -> Array:
-        turned = logarithm(seen[:, :3, :3] @ np.swapaxes(true[:, :3, :3], 1, 2))
+        turned = log_so3(seen[:, :3, :3] @ np.swapaxes(true[:, :3, :3], 1, 2))
         off: Array = np.concatenate([seen[:, :3, 3] - true[:, :3, 3], turned], axis=1) * scale
         return off
 
     def errors(unknown: Array) -> Array:
-        left = pose(exponential(unknown[:3]), unknown[3:6])
-        right = pose(exponential(unknown[6:9]), unknown[9:12])
-        turns = exponential(unknown[12 : 12 + _COUNT, None] * (0.0, 0.0, 1.0))
+        left = transform(exp_so3(unknown[:3]), unknown[3:6])
+        right = transform(exp_so3(unknown[6:9]), unknown[9:12])
+        turns = exp_so3(unknown[12 : 12 + _COUNT, None] * (0.0, 0.0, 1.0))
         moved = unknown[12 + _COUNT :].reshape(_COUNT, 6)
-        true = pose(exponential(moved[:, 3:]) @ a[:, :3, :3], a[:, :3, 3] + moved[:, :3])
-        there = true @ left @ pose(turns, np.zeros((_COUNT, 3))) @ right
+        true = transform(exp_so3(moved[:, 3:]) @ a[:, :3, :3], a[:, :3, 3] + moved[:, :3])
+        there = true @ left @ transform(turns, np.zeros((_COUNT, 3))) @ right
         return np.concatenate([apart(a, true), apart(b, there)]).ravel()
 
     left, right = start.frame, np.linalg.inv(start.frame) @ start.parameters["reference"]
-    sides = [np.concatenate([logarithm(side[:3, :3]), side[:3, 3]]) for side in (left, right)]
+    sides = [np.concatenate([log_so3(side[:3, :3]), side[:3, 3]]) for side in (left, right)]
     first = np.concatenate([*sides, start.joint_values[:, 0], np.zeros(6 * _COUNT)])
-    return Contender(SCIPY, timed(lambda: optimize.least_squares(errors, first, method="lm")))
+    return Contender(SCIPY, time_calls(lambda: optimize.least_squares(errors, first, method="lm")))
 
 
 def _ripl(parents: Array, children: Array) -> Contender:
@@ -123,4 +132,4 @@ def _ripl(parents: Array, children: Array) -> Contender:
     a, b = parents[:_COUNT], children[:_COUNT]
     # It takes the parts to coincide at joint value 0.
     aligned = b @ np.linalg.inv(np.linalg.inv(a[0]) @ b[0])
-    return Contender(RIPL, timed(lambda: peer.solve_articulation_from_poses(a, aligned)))
+    return Contender(RIPL, time_calls(lambda: peer.solve_articulation_from_poses(a, aligned)))

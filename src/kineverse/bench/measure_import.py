@@ -5,33 +5,38 @@ from __future__ import annotations
 from collections.abc import Iterator
 from importlib import metadata
 
-from .peers import Field, advice, installed
-from .processes import run_program
-from .result import Bar, Comparison, Measurement, Result, at_most, faster
-from .settings import Settings
-from .timing import Contender, race
+from .harness import (
+    BenchmarkSettings,
+    Contender,
+    Contenders,
+    has_peer,
+    install_advice,
+    run_program,
+    time_contenders,
+)
+from .result import Bar, BenchmarkResult, Comparison, Measurement, bound_median, compare_speed
 
 KINEVERSE = "import kineverse"
 PEERS = ("casadi", "pinocchio", "mujoco")
 CORE, MOST_PACKAGES = "kineverse-articulation", 14
 
 
-def measure(settings: Settings) -> Result:
+def measure(settings: BenchmarkSettings) -> BenchmarkResult:
     """Measure imports, and count packages."""
-    field = Field([_import("kineverse")])
+    field = Contenders([_import("kineverse")])
     for peer in PEERS:
         field.admit(peer, lambda peer=peer: [_import(peer)])  # type: ignore[misc]
-    measured = race("import", field.contenders, settings.processes, settings.progress)
-    comparisons = [at_most(measured[KINEVERSE], 0.5)]
-    comparisons += [faster(measured, KINEVERSE, f"import {peer}") for peer in PEERS]
+    measured = time_contenders("import", field.contenders, settings.processes, settings.progress)
+    comparisons = [bound_median(measured[KINEVERSE], 0.5)]
+    comparisons += [compare_speed(measured, KINEVERSE, f"import {peer}") for peer in PEERS]
     packages = []
-    if installed("packaging"):
+    if has_peer("packaging"):
         packages = list(_packages())
         bar = Bar(MOST_PACKAGES, at_least=False)
         comparisons.append(Comparison(packages[0].name, packages[0].median, "packages", bar))
     else:
-        field.missing.append(advice("packaging"))
-    return Result(
+        field.missing.append(install_advice("packaging"))
+    return BenchmarkResult(
         name="import",
         work="the import, in a fresh process; and the packages that pip installs for it, itself included",
         measurements=(*measured.values(), *packages),
@@ -47,13 +52,13 @@ def _import(module: str) -> Contender:
 def _packages() -> Iterator[Measurement]:
     for distribution in (CORE, "pin", "mujoco"):
         try:
-            count = len(closure(distribution))
+            count = len(find_requirements(distribution))
         except metadata.PackageNotFoundError:
             continue
         yield Measurement(f"packages for {distribution}", "packages", (float(count),))
 
 
-def closure(distribution: str) -> set[str]:
+def find_requirements(distribution: str) -> set[str]:
     """Return a distribution and all that it requires here, without extras that nobody asks for.
 
     Raises

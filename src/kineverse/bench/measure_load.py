@@ -9,42 +9,38 @@ from typing import Any
 
 import numpy as np
 
-from .agreement import Array
-from .peers import Field
-from .processes import run_program
-from .result import Result, at_most, faster
-from .robot import Robot, find_robot
-from .settings import Settings
-from .timing import Contender, race
+from .harness import Array, BenchmarkSettings, Contender, Contenders, run_program, time_contenders
+from .result import BenchmarkResult, bound_median, compare_speed
+from .workloads import BenchmarkRobot, find_robot
 
 COLD, CACHED = "kineverse, empty cache folder", "kineverse, cached"
 AGAIN = "kineverse, again in the same process"
 PINOCCHIO, MUJOCO = "pinocchio", "mujoco"
 
 
-def measure(settings: Settings) -> Result:
+def measure(settings: BenchmarkSettings) -> BenchmarkResult:
     """Measure loading, every time in a new process."""
     robot = find_robot(settings)
     with tempfile.TemporaryDirectory(prefix="kineverse-bench-") as folder:
-        field = Field(list(_ours(robot, Path(folder))))
+        field = Contenders(list(_ours(robot, Path(folder))))
         field.admit("pinocchio", lambda: [_peer(robot, PINOCCHIO, str(robot.file))])
         field.admit("mujoco", lambda: [_peer(robot, MUJOCO, _for_mujoco(robot, Path(folder)))])
-        measured = race("load", field.contenders, settings.processes, settings.progress)
-    return Result(
+        measured = time_contenders("load", field.contenders, settings.processes, settings.progress)
+    return BenchmarkResult(
         name="load",
         work=f"{robot} to pose and Jacobian of {robot.frame}, in a fresh process, after the import",
         measurements=tuple(measured.values()),
         comparisons=(
-            at_most(measured[COLD], 0.020),
-            at_most(measured[CACHED], 0.005),
-            at_most(measured[AGAIN], 0.005),
-            *(faster(measured, ours, peer) for ours in (COLD, CACHED) for peer in (PINOCCHIO, MUJOCO)),
+            bound_median(measured[COLD], 0.020),
+            bound_median(measured[CACHED], 0.005),
+            bound_median(measured[AGAIN], 0.005),
+            *(compare_speed(measured, ours, peer) for ours in (COLD, CACHED) for peer in (PINOCCHIO, MUJOCO)),
         ),
         missing=tuple(field.missing),
     )
 
 
-def _ours(robot: Robot, folder: Path) -> Iterator[Contender]:
+def _ours(robot: BenchmarkRobot, folder: Path) -> Iterator[Contender]:
     program, arguments = "load_with_kineverse", (str(robot.file), robot.frame)
     full = folder / "full"
     full.mkdir(mode=0o700)
@@ -64,22 +60,22 @@ def _ours(robot: Robot, folder: Path) -> Iterator[Contender]:
     yield Contender(AGAIN, lambda: float(cached()["again"]))
 
 
-def _peer(robot: Robot, name: str, file: str) -> Contender:
+def _peer(robot: BenchmarkRobot, name: str, file: str) -> Contender:
     def load() -> dict[str, Any]:
         return run_program(f"load_with_{name}", file, robot.frame)
 
     return Contender(name, lambda: float(load()["first"]), _results(robot, load))
 
 
-def _for_mujoco(robot: Robot, folder: Path) -> str:
-    from .mujoco_robot import mujoco_text
+def _for_mujoco(robot: BenchmarkRobot, folder: Path) -> str:
+    from .peers.mujoco_kinematics import make_robot_mjcf
 
     file = folder / "for_mujoco.urdf"
-    file.write_text(mujoco_text(robot), encoding="utf-8")
+    file.write_text(make_robot_mjcf(robot), encoding="utf-8")
     return str(file)
 
 
-def _results(robot: Robot, load: Callable[[], dict[str, Any]]) -> Callable[[], Sequence[Array]]:
+def _results(robot: BenchmarkRobot, load: Callable[[], dict[str, Any]]) -> Callable[[], Sequence[Array]]:
     """Return what gives pose and Jacobian, with columns in the order of the chain."""
 
     def results() -> list[Array]:

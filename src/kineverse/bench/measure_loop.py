@@ -16,11 +16,8 @@ from kineverse.model.frame import WORLD, Frame
 from kineverse.model.model import Model
 from kineverse.spatial import translation
 
-from .agreement import Array
-from .peers import Field
-from .result import Result, at_most, faster
-from .settings import Settings
-from .timing import Contender, race, timed
+from .harness import Array, BenchmarkSettings, Contender, Contenders, time_calls, time_contenders
+from .result import BenchmarkResult, bound_median, compare_speed
 
 BOUND, PLAIN = "kineverse, bound call with input", "kineverse, plain call"
 ROOTFINDER = "casadi, rootfinder in the interpreter"
@@ -29,12 +26,12 @@ _CRANK, _COUPLER, _ROCKER, _GROUND = 0.4, 1.1, 0.9, 1.0
 _CHECKED = 50
 
 
-def measure(settings: Settings) -> Result:
+def measure(settings: BenchmarkSettings) -> BenchmarkResult:
     """Measure the coupler's pose and Jacobian all around the crank."""
     angles = np.random.default_rng(0).uniform(-np.pi, np.pi, settings.configurations)
-    field = Field([*_ours(angles), _rootfinder(angles)])
-    measured = race("loop", field.contenders, settings.rounds, settings.progress)
-    return Result(
+    field = Contenders([*_ours(angles), _rootfinder(angles)])
+    measured = time_contenders("loop", field.contenders, settings.rounds, settings.progress)
+    return BenchmarkResult(
         name="loop",
         work=(
             "position of the coupler's end and its derivative by the crank of a four-bar linkage; the crank "
@@ -42,15 +39,15 @@ def measure(settings: Settings) -> Result:
         ),
         measurements=tuple(measured.values()),
         comparisons=(
-            at_most(measured[BOUND], 5e-6),
-            at_most(measured[PLAIN], 5e-6),
-            faster(measured, BOUND, ROOTFINDER),
+            bound_median(measured[BOUND], 5e-6),
+            bound_median(measured[PLAIN], 5e-6),
+            compare_speed(measured, BOUND, ROOTFINDER),
         ),
         missing=tuple(field.missing),
     )
 
 
-def four_bar() -> Model:
+def make_four_bar() -> Model:
     """Return crank and coupler, and the rocker that they are closed with."""
     model = Model()
     with model.edit() as edit:
@@ -69,7 +66,7 @@ def four_bar() -> Model:
 
 
 def _ours(angles: Array) -> Iterator[Contender]:
-    model = four_bar()
+    model = make_four_bar()
     crank = model.symbol("crank")
     position = model.fk("coupler end")[:3, 3]
     function = compile([position, position.jacobian([crank])], [crank], wait=True)
@@ -88,21 +85,21 @@ def _ours(angles: Array) -> Iterator[Contender]:
         found = [function(point) for point in points[:_CHECKED]]
         return [np.array([p[:2] for p, _ in found]), np.array([j[:2, 0] for _, j in found])]
 
-    yield Contender(BOUND, timed(bound, len(points)), results)
-    yield Contender(PLAIN, timed(plain, len(points)), results)
+    yield Contender(BOUND, time_calls(bound, len(points)), results)
+    yield Contender(PLAIN, time_calls(plain, len(points)), results)
 
 
 def _rootfinder(angles: Array) -> Contender:
     """Return CasADi's own way, started beside the solution: what a user of it would write."""
     crank, x = ca.SX.sym("crank"), ca.SX.sym("x", 2)
-    end = _at(crank, _CRANK) + _at(x[0], _COUPLER)
-    gap = end - _at(x[1], _ROCKER) - ca.vertcat(_GROUND, 0)
+    end = _link_transform(crank, _CRANK) + _link_transform(x[0], _COUPLER)
+    gap = end - _link_transform(x[1], _ROCKER) - ca.vertcat(_GROUND, 0)
     solver = ca.rootfinder("four_bar", "fast_newton", {"x": x, "p": crank, "g": gap})
     start, angle = ca.MX.sym("start", 2), ca.MX.sym("angle")
     solution = solver(x0=start, p=angle)["x"]
     position = ca.Function("end", [x, crank], [end])(solution, angle)
     function: Any = ca.Function("loop", [start, angle], [position, ca.jacobian(position, angle)])
-    starts = [_by_circles(angle) for angle in angles]
+    starts = [_closing_angles(angle) for angle in angles]
     buffer, run = function.buffer()
     guess, given, out, derivative = np.zeros(2), np.zeros(1), np.zeros(2), np.zeros(2)
     buffer.set_arg(0, guess.data)
@@ -126,14 +123,14 @@ def _rootfinder(angles: Array) -> Contender:
             found.append((out.copy(), derivative.copy()))
         return [np.array([p for p, _ in found]), np.array([d for _, d in found])]
 
-    return Contender(ROOTFINDER, timed(work, len(angles)), results)
+    return Contender(ROOTFINDER, time_calls(work, len(angles)), results)
 
 
-def _at(angle: ca.SX, length: float) -> ca.SX:
+def _link_transform(angle: ca.SX, length: float) -> ca.SX:
     return length * ca.vertcat(ca.cos(angle), ca.sin(angle))
 
 
-def _by_circles(crank: float) -> Array:
+def _closing_angles(crank: float) -> Array:
     """Return near what angles coupler and rocker meet: two circles intersect there."""
     pin = _CRANK * np.array([np.cos(crank), np.sin(crank)])
     way = np.array([_GROUND, 0.0]) - pin

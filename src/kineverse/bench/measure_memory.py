@@ -9,18 +9,15 @@ from pathlib import Path
 
 from kineverse.errors import KineverseError
 
+from .harness import BenchmarkSettings, Contender, Contenders, run_program, time_contenders
 from .measure_load import _for_mujoco
-from .peers import Field
-from .processes import run_program
-from .result import Result, at_most
-from .robot import Robot, find_robot
-from .settings import Settings
-from .timing import Contender, race
+from .result import BenchmarkResult, bound_median
+from .workloads import BenchmarkRobot, find_robot
 
 LOADED, EVALUATED = "kineverse, loaded", "kineverse, pose and Jacobian compiled"
 
 
-def measure(settings: Settings) -> Result:
+def measure(settings: BenchmarkSettings) -> BenchmarkResult:
     """Measure memory, every time in a new process.
 
     Raises
@@ -32,20 +29,20 @@ def measure(settings: Settings) -> Result:
         raise KineverseError("Benchmark 'memory' needs Linux, where processes are told how much they use.")
     robot = find_robot(settings)
     with tempfile.TemporaryDirectory(prefix="kineverse-bench-") as folder:
-        field = Field(list(_ours(robot)))
+        field = Contenders(list(_ours(robot)))
         field.admit("pinocchio", lambda: [_peer("pinocchio", str(robot.file), robot)])
         field.admit("mujoco", lambda: [_peer("mujoco", _for_mujoco(robot, Path(folder)), robot)])
-        measured = race("memory", field.contenders, settings.processes, settings.progress)
-    return Result(
+        measured = time_contenders("memory", field.contenders, settings.processes, settings.progress)
+    return BenchmarkResult(
         name="memory",
         work=f"{robot}, in a fresh process, over what the imports take",
         measurements=tuple(measured.values()),
-        comparisons=(at_most(measured[LOADED], 60.0), at_most(measured[EVALUATED], 60.0)),
+        comparisons=(bound_median(measured[LOADED], 60.0), bound_median(measured[EVALUATED], 60.0)),
         missing=tuple(field.missing),
     )
 
 
-def _ours(robot: Robot) -> Iterator[Contender]:
+def _ours(robot: BenchmarkRobot) -> Iterator[Contender]:
     for name, key in ((LOADED, "loaded"), (EVALUATED, "evaluated")):
 
         def sample(key: str = key) -> float:
@@ -54,7 +51,7 @@ def _ours(robot: Robot) -> Iterator[Contender]:
         yield Contender(name, sample, unit="MB")
 
 
-def _peer(library: str, file: str, robot: Robot) -> Contender:
+def _peer(library: str, file: str, robot: BenchmarkRobot) -> Contender:
     def sample() -> float:
         return float(run_program("memory_of_robot", library, file, robot.frame)["loaded"])
 

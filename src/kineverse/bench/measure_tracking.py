@@ -12,12 +12,9 @@ from kineverse.estimation import ObservedPose, Tracker, pose_covariance
 from kineverse.formats import load
 from kineverse.model.model import Model
 
-from .agreement import Array
-from .peers import Field
-from .result import Result, at_most, faster
-from .settings import Settings
-from .timing import Contender, race, timed
-from .tracking_numpy import Form, NumpyFilter
+from .harness import Array, BenchmarkSettings, Contender, Contenders, time_calls, time_contenders
+from .peers.kalman_filter import Form, NumpyFilter
+from .result import BenchmarkResult, bound_median, compare_speed
 
 ARRAY, MAPPING = "kineverse, poses as one array", "kineverse, poses by frame"
 GAIN, INFORMATION = "numpy, textbook gain", "numpy, information form"
@@ -31,17 +28,17 @@ _UPDATES = 25
 _CHECKED = 3
 
 
-def measure(settings: Settings) -> Result:
+def measure(settings: BenchmarkSettings) -> BenchmarkResult:
     """Measure updates of a tracker beside filters written in numpy."""
     model = load("kitchen")
     frames = [name for name in model.frames if model.speeds_of(name)]
     readings = _readings(model, frames, min(_UPDATES, settings.configurations))
     covariance = pose_covariance(POSITION, ORIENTATION)
-    field = Field(
+    field = Contenders(
         [*_ours(model, frames, covariance, readings), *_theirs(model, frames, covariance, readings)]
     )
-    measured = race("tracking", field.contenders, settings.rounds, settings.progress)
-    return Result(
+    measured = time_contenders("tracking", field.contenders, settings.rounds, settings.progress)
+    return BenchmarkResult(
         name="tracking",
         work=(
             f"an update of the {len(model.degrees_of_freedom)} coordinates of the shipped kitchen from the "
@@ -50,10 +47,10 @@ def measure(settings: Settings) -> Result:
         ),
         measurements=tuple(measured.values()),
         comparisons=(
-            at_most(measured[ARRAY], LONGEST),
-            at_most(measured[MAPPING], 3 * LONGEST),
-            faster(measured, ARRAY, INFORMATION),
-            faster(measured, ARRAY, GAIN),
+            bound_median(measured[ARRAY], LONGEST),
+            bound_median(measured[MAPPING], 3 * LONGEST),
+            compare_speed(measured, ARRAY, INFORMATION),
+            compare_speed(measured, ARRAY, GAIN),
         ),
     )
 
@@ -100,8 +97,8 @@ def _ours(model: Model, frames: list[str], covariance: Array, readings: list[Arr
         states = np.array([[e.state[s] for s in tracker.symbols] for e in estimates])
         return [states, np.array([np.diag(e.covariance) for e in estimates])]
 
-    yield Contender(ARRAY, timed(by_array, len(readings)), results)
-    yield Contender(MAPPING, timed(by_frame, len(readings)), results)
+    yield Contender(ARRAY, time_calls(by_array, len(readings)), results)
+    yield Contender(MAPPING, time_calls(by_frame, len(readings)), results)
 
 
 def _theirs(model: Model, frames: list[str], covariance: Array, readings: list[Array]) -> Iterator[Contender]:
@@ -121,4 +118,4 @@ def _theirs(model: Model, frames: list[str], covariance: Array, readings: list[A
         def run(other: NumpyFilter = other, some: list[Array] = some) -> None:
             other.run(some)
 
-        yield Contender(name, timed(run, len(some)), results)
+        yield Contender(name, time_calls(run, len(some)), results)

@@ -6,10 +6,10 @@ import importlib
 from collections.abc import Iterator, Mapping, Sequence
 from types import MappingProxyType
 
-from kineverse.errors import MissingExtraError, UnknownNameError, suggest
+from kineverse.errors import MissingDependencyError, UnknownNameError, suggest
 
-from .result import Result
-from .settings import Settings
+from .harness import BenchmarkSettings
+from .result import BenchmarkResult
 
 BENCHMARKS: Mapping[str, str] = MappingProxyType(
     {
@@ -30,7 +30,7 @@ BENCHMARKS: Mapping[str, str] = MappingProxyType(
 """What there is, in the order in which it is run; each name belongs to the module ``measure_NAME``."""
 
 
-def chosen(names: Sequence[str]) -> list[str]:
+def select_benchmarks(names: Sequence[str]) -> list[str]:
     """Return the names of the benchmarks to run, each once and in their order; all if none is named.
 
     Raises
@@ -47,7 +47,9 @@ def chosen(names: Sequence[str]) -> list[str]:
     return [name for name in BENCHMARKS if name in names or not names]
 
 
-def measure(names: Sequence[str] = (), settings: Settings | None = None) -> Iterator[Result]:
+def run_benchmarks(
+    names: Sequence[str] = (), settings: BenchmarkSettings | None = None
+) -> Iterator[BenchmarkResult]:
     """Run benchmarks, and yield each result when it is there.
 
     One that needs an extra which is not installed has nothing but a line about that.
@@ -66,11 +68,11 @@ def measure(names: Sequence[str] = (), settings: Settings | None = None) -> Iter
     DisagreementError
         If those who are compared do not compute the same.
     """
-    for name in chosen(names):
+    for name in select_benchmarks(names):
         # A benchmark is imported when it is run, as it brings its peers.
         module = importlib.import_module(f"{__package__}.measure_{name}")
         try:
-            result: Result = module.measure(settings or Settings())
-        except MissingExtraError as error:
-            result = Result(name, BENCHMARKS[name], (), (), (f"{name} is left out: {error}",))
+            result: BenchmarkResult = module.measure(settings or BenchmarkSettings())
+        except MissingDependencyError as error:
+            result = BenchmarkResult(name, BENCHMARKS[name], (), (), (f"{name} is left out: {error}",))
         yield result

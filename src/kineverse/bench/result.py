@@ -90,7 +90,7 @@ class Comparison:
 
 
 @dataclass(frozen=True, slots=True)
-class Result:
+class BenchmarkResult:
     """What a benchmark found.
 
     Attributes
@@ -114,7 +114,7 @@ class Result:
     missing: tuple[str, ...] = ()
 
 
-def faster(
+def compare_speed(
     measured: Mapping[str, Measurement], ours: str, theirs: str, at_least: float | None = None
 ) -> Comparison:
     """Return how many times as fast we are as a peer.
@@ -140,6 +140,6 @@ def faster(
     return Comparison(name, ratio, "x", bar, ours, theirs)
 
 
-def at_most(measurement: Measurement, limit: float) -> Comparison:
+def bound_median(measurement: Measurement, limit: float) -> Comparison:
     """Return the median of a measurement, held to a limit in its own unit."""
     return Comparison(measurement.name, measurement.median, measurement.unit, Bar(limit, at_least=False))

@@ -10,11 +10,11 @@ from collections.abc import Iterable
 from dataclasses import asdict, replace
 from typing import TYPE_CHECKING, Any
 
-from kineverse.cli.progress import progress
-from kineverse.cli.table import figure, table
+from kineverse.cli.output import format_table, show_progress
+from kineverse.expressions.printing import format_number
 
 if TYPE_CHECKING:
-    from kineverse.bench import Comparison, Machine, Result
+    from kineverse.bench import BenchmarkResult, Comparison, Machine
 
 HELP = """measure the speed of this installation, beside its peers where they are installed
 
@@ -48,39 +48,39 @@ def run(arguments: argparse.Namespace) -> int:
     from kineverse import bench
 
     if arguments.list:
-        print(_listing(bench.BENCHMARKS.items(), arguments.json))
+        print(_print_benchmarks(bench.BENCHMARKS.items(), arguments.json))
         return 0
-    names = bench.chosen(arguments.names)
+    names = bench.select_benchmarks(arguments.names)
     settings = replace(
-        bench.QUICK if arguments.quick else bench.Settings(),
+        bench.QUICK if arguments.quick else bench.BenchmarkSettings(),
         robot=arguments.robot,
         frame=arguments.frame,
-        progress=progress,
+        progress=show_progress,
     )
-    here = bench.machine()
+    here = bench.describe_machine()
     if arguments.json:
-        results = list(bench.measure(names, settings))
-        answer = {"machine": asdict(here), "benchmarks": list(map(as_json, results))}
+        results = list(bench.run_benchmarks(names, settings))
+        answer = {"machine": asdict(here), "benchmarks": list(map(benchmark_to_json, results))}
         print(json.dumps(answer, indent=2, allow_nan=False))
         return 0
-    print(_where(here), flush=True)
-    print(f"\n{RATIOS}")
+    print(_format_machine(here), flush=True)
+    print(f"\n{RATIO_NOTE}")
     missing: dict[str, None] = {}
-    for result in bench.measure(names, settings):
+    for result in bench.run_benchmarks(names, settings):
         if result.measurements:
-            print(f"\n{as_text(result, arguments.targets)}", flush=True)
+            print(f"\n{format_benchmark(result, arguments.targets)}", flush=True)
         missing.update(dict.fromkeys(result.missing))
     if missing:
         print("\n" + "\n".join(["not measured here:", *(f"  {line}" for line in missing)]))
     return 0
 
 
-RATIOS = """\
+RATIO_NOTE = """\
 "Times as fast" is how many times as long the other one takes for the same work; below 1, Kineverse is slower.
 Times drift on a machine that others use, ratios hardly."""
 
 
-def as_json(result: Result) -> dict[str, Any]:
+def benchmark_to_json(result: BenchmarkResult) -> dict[str, Any]:
     """Return a result as JSON has it: times in s; ``value`` is null where a peer is missing."""
     return {
         "name": result.name,
@@ -104,7 +104,7 @@ def as_json(result: Result) -> dict[str, Any]:
     }
 
 
-def as_text(result: Result, targets: bool = False) -> str:
+def format_benchmark(result: BenchmarkResult, targets: bool = False) -> str:
     """Return a result as tables; who is missing is left to whoever prints several.
 
     Parameters
@@ -114,57 +114,64 @@ def as_text(result: Result, targets: bool = False) -> str:
     targets
         Whether to say what the developers aim at.
     """
-    measured = [(m.name, quantity(m.median, m.unit), quantity(m.best, m.unit)) for m in result.measurements]
+    measured = [
+        (m.name, format_quantity(m.median, m.unit), format_quantity(m.best, m.unit))
+        for m in result.measurements
+    ]
     work = textwrap.fill(f"{result.name}: {result.work}", 100, subsequent_indent="  ")
-    parts = [f"{work}\n{table(('', 'median', 'best'), measured, '<>>')}"]
+    parts = [f"{work}\n{format_table(('', 'median', 'best'), measured, '<>>')}"]
     known = [c for c in result.comparisons if c.value is not None]
-    speeds = [(_times(c), c.ours, c.theirs) for c in known if c.theirs]
+    speeds = [(_format_speedup(c), c.ours, c.theirs) for c in known if c.theirs]
     if speeds:
-        parts.append(table(("times as fast", "is", "as"), speeds, "><<"))
-    lengths = [(_times(c), c.name) for c in known if c.unit == "x" and not c.theirs]
+        parts.append(format_table(("times as fast", "is", "as"), speeds, "><<"))
+    lengths = [(_format_speedup(c), c.name) for c in known if c.unit == "x" and not c.theirs]
     if lengths:
-        parts.append(table(("times as long", ""), lengths, "><"))
-    aimed = [(c.name, _value(c), _bar(c), c.status) for c in result.comparisons if c.bar is not None]
+        parts.append(format_table(("times as long", ""), lengths, "><"))
+    aimed = [
+        (c.name, _value_or_none(c), _format_target(c), c.status)
+        for c in result.comparisons
+        if c.bar is not None
+    ]
     if targets and aimed:
-        parts.append(table(("target", "", "bar", ""), aimed, "<>><"))
+        parts.append(format_table(("target", "", "bar", ""), aimed, "<>><"))
     return "\n\n".join(parts)
 
 
-def quantity(value: float, unit: str) -> str:
+def format_quantity(value: float, unit: str) -> str:
     """Return a number with its unit, times in the one that suits them."""
     if unit == "x":
-        return f"{figure(value, 3)} x"
+        return f"{format_number(value, 3)} x"
     if unit != "s":
-        return f"{figure(value, 3)} {unit}"
+        return f"{format_number(value, 3)} {unit}"
     for prefix, factor in (("", 1.0), ("m", 1e3), ("µ", 1e6)):
         if abs(value) * factor >= 0.9995:
-            return f"{figure(value * factor, 3)} {prefix}s"
-    return f"{figure(value * 1e9, 3)} ns"
+            return f"{format_number(value * factor, 3)} {prefix}s"
+    return f"{format_number(value * 1e9, 3)} ns"
 
 
-def _times(comparison: Comparison) -> str:
+def _format_speedup(comparison: Comparison) -> str:
     value = math.nan if comparison.value is None else comparison.value
-    return f"{value:.0f}" if abs(value) >= 1000.0 else figure(value, 3)
+    return f"{value:.0f}" if abs(value) >= 1000.0 else format_number(value, 3)
 
 
-def _value(comparison: Comparison) -> str:
-    return "-" if comparison.value is None else quantity(comparison.value, comparison.unit)
+def _value_or_none(comparison: Comparison) -> str:
+    return "-" if comparison.value is None else format_quantity(comparison.value, comparison.unit)
 
 
-def _bar(comparison: Comparison) -> str:
+def _format_target(comparison: Comparison) -> str:
     bar = comparison.bar
     if bar is None:
         return "-"
-    return f"{'>=' if bar.at_least else '<='} {quantity(bar.limit, comparison.unit)}"
+    return f"{'>=' if bar.at_least else '<='} {format_quantity(bar.limit, comparison.unit)}"
 
 
-def _listing(benchmarks: Iterable[tuple[str, str]], as_object: bool) -> str:
+def _print_benchmarks(benchmarks: Iterable[tuple[str, str]], as_object: bool) -> str:
     if as_object:
         return json.dumps(dict(benchmarks), indent=2)
-    return table(("benchmark", "what it measures"), benchmarks)
+    return format_table(("benchmark", "what it measures"), benchmarks)
 
 
-def _where(machine: Machine) -> str:
+def _format_machine(machine: Machine) -> str:
     compiler = machine.compiler
     versions = (f"{name} {version or 'missing'}" for name, version in machine.versions.items())
     rows = [
@@ -175,4 +182,4 @@ def _where(machine: Machine) -> str:
         ("system", f"{machine.system}, {machine.python}"),
         ("versions", ", ".join(versions)),
     ]
-    return table(("measured", "here"), rows)
+    return format_table(("measured", "here"), rows)

@@ -9,14 +9,13 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from kineverse.cli.paint import bounded
-from kineverse.cli.progress import doing
-from kineverse.cli.reading import add_reading_options, load
-from kineverse.errors import FormatError, NameTakenError, ValueRejectedError
+from kineverse.cli.arguments import add_model_options, load_model
+from kineverse.cli.output import show_activity, truncate_lines
+from kineverse.errors import DuplicateNameError, FormatError, InvalidValueError
 
 if TYPE_CHECKING:
     import kineverse as kv
-    from kineverse.formats.saving import Saved
+    from kineverse.formats.saver import Saved
 
 HELP = """write a model to a file, in the format that its name ends in
 
@@ -52,7 +51,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("target", metavar="OUT", help="path of the file to write; - for standard output")
     parser.add_argument("--prefix", metavar="NAME", help="put in front of all names, with a slash")
     parser.add_argument("--force", action="store_true", help="replace OUT if it is there")
-    add_reading_options(
+    add_model_options(
         parser, "refuse what is otherwise read or left out with a remark, such as constraints OUT cannot say"
     )
     parser.add_argument(
@@ -77,7 +76,7 @@ def run(arguments: argparse.Namespace) -> int:
     to_stdout = arguments.target == STDOUT
     if not to_stdout:
         # Before the model is loaded: a name that cannot be written to should not take seconds to be found.
-        check(arguments.target, arguments.source, arguments.force)
+        check_writable(arguments.target, arguments.source, arguments.force)
     else:
         given = {
             "--json": arguments.json,
@@ -87,33 +86,33 @@ def run(arguments: argparse.Namespace) -> int:
         }
         option = next((name for name, there in given.items() if there), None)
         if option is not None:
-            raise ValueRejectedError(
+            raise InvalidValueError(
                 f"{option} and - exclude each other: the output is a document, which says all."
             )
 
-    from kineverse.formats.remarks import listening
-    from kineverse.formats.saving import Saved
+    from kineverse.formats.reader_warnings import collect_warnings
+    from kineverse.formats.saver import Saved
 
-    with listening() as left_out, doing(f"reading {arguments.source}"):
-        model = load(arguments, arguments.source, arguments.prefix)
-    with doing(f"writing {arguments.target}"):
+    with collect_warnings() as left_out, show_activity(f"reading {arguments.source}"):
+        model = load_model(arguments, arguments.source, arguments.prefix)
+    with show_activity(f"writing {arguments.target}"):
         if to_stdout:
             saved, size = Saved(Path(STDOUT)), _print_document(model)
         else:
-            saved = _saved(model, arguments)
+            saved = _save_model(model, arguments)
             size = os.path.getsize(saved.path)
     if saved.left_out:
-        print("\n".join(_left_out(arguments, saved)), file=sys.stderr)
+        print("\n".join(_omission_notes(arguments, saved)), file=sys.stderr)
     if arguments.json:
         print(json.dumps(_as_json(arguments, model, size, left_out, saved), allow_nan=False))
     else:
-        lines = _report(arguments, model, size, left_out, saved)
+        lines = _print_report(arguments, model, size, left_out, saved)
         print("\n".join(lines), file=sys.stderr if to_stdout else sys.stdout)
     return 0
 
 
-def _saved(model: kv.Model, arguments: argparse.Namespace) -> Saved:
-    from kineverse.formats.export.refusals import UnsayableError
+def _save_model(model: kv.Model, arguments: argparse.Namespace) -> Saved:
+    from kineverse.formats.export.capabilities import UnsupportedError
 
     try:
         return model.save(
@@ -122,30 +121,30 @@ def _saved(model: kv.Model, arguments: argparse.Namespace) -> Saved:
             leave_out=arguments.leave_out,
             strict=arguments.strict,
         )
-    except UnsayableError as error:
-        raise error.told_with("--tolerance 0.001", "--leave-out NAME", "without --strict") from None
+    except UnsupportedError as error:
+        raise error.with_remedies("--tolerance 0.001", "--leave-out NAME", "without --strict") from None
 
 
-def check(target: str, source: str, force: bool = False) -> None:
+def check_writable(target: str, source: str, force: bool = False) -> None:
     """Look whether a file can be written, as far as that can be known before there is a model.
 
     Raises
     ------
     FormatError
         If the name has no ending that is written, its folder does not exist, or it is none of a file.
-    NameTakenError
+    DuplicateNameError
         If it is the source itself, or another file that may not be replaced.
     UnknownNameError
         If a file is there, and the source is not.
     """
-    from kineverse.formats.saving import ENDINGS
-    from kineverse.formats.sources import locate_model
+    from kineverse.formats.locate import locate_model
+    from kineverse.formats.saver import ENDINGS
 
     if not target:
         raise FormatError("Which file is to be written? Its name is empty.")
     path = Path(target).expanduser()
     if path.is_dir():
-        inside = path / f"{_stem(source)}{ENDINGS[0]}"
+        inside = path / f"{_source_stem(source)}{ENDINGS[0]}"
         raise FormatError(f"{target} is a folder; name a file in it, such as {inside}.")
     if not path.name.endswith(ENDINGS):
         raise FormatError(
@@ -159,64 +158,69 @@ def check(target: str, source: str, force: bool = False) -> None:
         raise FormatError(f"{target} is no regular file.")
     found = locate_model(source)
     if not found.scene and path.samefile(found.path):
-        raise NameTakenError(f"{target} is what is read; give the result another name.")
+        raise DuplicateNameError(f"{target} is what is read; give the result another name.")
     if not force:
-        raise NameTakenError(f"{target} is there already; --force replaces it.")
+        raise DuplicateNameError(f"{target} is there already; --force replaces it.")
 
 
-def _stem(source: str) -> str:
+def _source_stem(source: str) -> str:
     return Path(source).name.partition(".")[0] or "model"
 
 
 def _print_document(model: kv.Model) -> int:
     """Write a document to standard output; return its size [byte]."""
-    from kineverse.formats.document import document_of
+    from kineverse.formats.document import to_json
 
-    content = document_of(model).encode()
+    content = to_json(model).encode()
     sys.stdout.buffer.write(content)
     sys.stdout.flush()
     return len(content)
 
 
-def _report(
+def _print_report(
     arguments: argparse.Namespace, model: kv.Model, size: int, left_out: list[str], saved: Saved
 ) -> list[str]:
-    from kineverse.cli.wording import contents
+    from kineverse.cli.format_values import format_contents
 
-    lines = [f"{arguments.source} → {arguments.target}", f"  {contents(model)}, {_size(size)}"]
+    lines = [f"{arguments.source} → {arguments.target}", f"  {format_contents(model)}, {_format_size(size)}"]
     if saved.errors:
-        lines.append(f"  {_errors(saved)}")
+        lines.append(f"  {_approximation_errors(saved)}")
     most = None if arguments.all else SHOWN
     for when, texts in (("reading", left_out), ("writing", saved.remarks)):
         if texts:
-            lines += [f"  remarks on {when}", *bounded([f"    {text}" for text in texts], most, "    ")]
+            lines += [
+                f"  remarks on {when}",
+                *truncate_lines([f"    {text}" for text in texts], most, "    "),
+            ]
     return lines
 
 
-def _left_out(arguments: argparse.Namespace, saved: Saved) -> list[str]:
+def _omission_notes(arguments: argparse.Namespace, saved: Saved) -> list[str]:
     """Return what the file does not say, for standard error."""
-    from kineverse.cli.wording import number
+    from kineverse.cli.format_values import format_count
 
-    count = number(len(saved.left_out), "thing")
+    count = format_count(len(saved.left_out), "thing")
     lines = [f"  {name} {reason}" for name, reason in saved.left_out.items()]
     head = f"{arguments.target} leaves out {count} that it cannot say; --strict refuses instead:"
-    return [head, *bounded(lines, None if arguments.all else SHOWN, "  ")]
+    return [head, *truncate_lines(lines, None if arguments.all else SHOWN, "  ")]
 
 
-def _errors(saved: Saved) -> str:
+def _approximation_errors(saved: Saved) -> str:
     """Return by how much frames are off at most, and which ones."""
-    from kineverse.cli.wording import apart, number
+    from kineverse.cli.format_values import format_count, format_pose_difference
 
     errors = saved.errors
     furthest = max(errors, key=lambda name: errors[name].position)
     most_turned = max(errors, key=lambda name: errors[name].angle)
-    worst = [f"{apart(saved.error.position, 0.0)} ({furthest})"] if saved.error.position else []
+    worst = (
+        [f"{format_pose_difference(saved.error.position, 0.0)} ({furthest})"] if saved.error.position else []
+    )
     if saved.error.angle:
-        worst.append(f"{apart(0.0, saved.error.angle)} ({most_turned})")
-    return f"{number(len(errors), 'frame')} approximated, off by at most {' and '.join(worst)}"
+        worst.append(f"{format_pose_difference(0.0, saved.error.angle)} ({most_turned})")
+    return f"{format_count(len(errors), 'frame')} approximated, off by at most {' and '.join(worst)}"
 
 
-def _size(size: int) -> str:
+def _format_size(size: int) -> str:
     for unit, factor in (("MiB", 1 << 20), ("KiB", 1 << 10)):
         if size >= factor:
             return f"{size / factor:.3g} {unit}"

@@ -11,16 +11,14 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from kineverse.cli.assignments import parse_length
-from kineverse.cli.paint import paint
-from kineverse.cli.progress import doing, progress
-from kineverse.cli.reading import add_reading_options, load
-from kineverse.cli.table import figure, table
-from kineverse.errors import KineverseError, UnknownNameError, ValueRejectedError, suggest
+from kineverse.cli.arguments import add_model_options, load_model, parse_length
+from kineverse.cli.output import colorize, format_table, show_activity, show_progress
+from kineverse.errors import InvalidValueError, KineverseError, UnknownNameError, suggest
+from kineverse.expressions.printing import format_number
 from kineverse.model.body import Mesh
 
 if TYPE_CHECKING:
-    from kineverse.geometry.decomposition import Decomposition, Kept, Outcome
+    from kineverse.geometry.decomposition import CacheEntry, Decomposition, DecompositionOutcome
 
 HELP = """decompose meshes into convex hulls, once, for fast distances with a depth
 
@@ -46,7 +44,7 @@ WRONG_MESH, WRONG_MODEL = 1, 2
 
 
 @dataclass
-class Task:
+class MeshTask:
     """A mesh, and the links it belongs to, of which model; a mesh file has none."""
 
     mesh: Mesh
@@ -67,7 +65,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "names", metavar="MODEL_OR_MESH", nargs="*", help="name or path of a model, or a mesh file"
     )
-    add_reading_options(parser)
+    add_model_options(parser)
     parser.add_argument("--links", metavar="LINK", nargs="+", help="only the meshes of these links")
     parser.add_argument("--max-hulls", metavar="N", type=int, help="at most so many hulls of each mesh (32)")
     parser.add_argument(
@@ -89,7 +87,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Decompose, print, and return the worst status."""
     if arguments.list or arguments.clear:
-        return _on_cache(arguments)
+        return _manage_cache(arguments)
     if not arguments.names:
         raise UnknownNameError("Which model, or mesh? See kineverse decompose --help.")
     from kineverse.geometry.decomposition import decompose_all
@@ -99,20 +97,20 @@ def run(arguments: argparse.Namespace) -> int:
     order = {task.mesh: k for k, task in enumerate(tasks)}
     outcomes = decompose_all([task.mesh for task in tasks], settings, limits, arguments.force, jobs)
     found = sorted(
-        progress(outcomes, "decomposing", "mesh", len(tasks)), key=lambda outcome: order[outcome.mesh]
+        show_progress(outcomes, "decomposing", "mesh", len(tasks)), key=lambda outcome: order[outcome.mesh]
     )
     status = WRONG_MODEL if unread else WRONG_MESH if any(o.error for o in found) else 0
     if arguments.json:
-        meshes = [_as_json(task, outcome) for task, outcome in zip(tasks, found, strict=True)]
+        meshes = [_outcome_to_json(task, outcome) for task, outcome in zip(tasks, found, strict=True)]
         answer = {"status": status, "meshes": meshes, "not_read": unread}
         print(json.dumps(answer, allow_nan=False))
     else:
-        print("\n\n".join(_report(tasks, found, unread)))
+        print("\n\n".join(_print_results(tasks, found, unread)))
     return status
 
 
 def _settings(arguments: argparse.Namespace) -> tuple[Any, Any, int]:
-    from kineverse.geometry.decomposition import Limits, Settings
+    from kineverse.geometry.decomposition import DecompositionSettings, ResourceLimits
 
     asked: dict[str, Any] = {}
     if arguments.error is not None:
@@ -125,25 +123,25 @@ def _settings(arguments: argparse.Namespace) -> tuple[Any, Any, int]:
     if arguments.memory is not None:
         limits["memory"] = int(_positive(arguments.memory, "--memory") * 2**30)
     jobs = (os.cpu_count() or 1) if arguments.jobs is None else int(_positive(arguments.jobs, "--jobs"))
-    return Settings(**asked), Limits(**limits), jobs
+    return DecompositionSettings(**asked), ResourceLimits(**limits), jobs
 
 
 def _positive(value: float, option: str) -> float:
     if not 0.0 < value < 1e6:
-        raise ValueRejectedError(f"{option} {value:g}: write a positive number.")
+        raise InvalidValueError(f"{option} {value:g}: write a positive number.")
     return value
 
 
-def _tasks(arguments: argparse.Namespace) -> tuple[list[Task], dict[str, str]]:
+def _tasks(arguments: argparse.Namespace) -> tuple[list[MeshTask], dict[str, str]]:
     """Return each mesh once, and why models could not be read, by their names."""
-    tasks: dict[Mesh, Task] = {}
+    tasks: dict[Mesh, MeshTask] = {}
     unread: dict[str, str] = {}
     with_meshes: set[str] = set()
     links: Sequence[str] | None = arguments.links
     for name in arguments.names:
         if name.lower().endswith(ENDINGS):
             mesh = Mesh(os.path.abspath(name))
-            tasks.setdefault(mesh, Task(mesh))
+            tasks.setdefault(mesh, MeshTask(mesh))
             continue
         try:
             meshes = _meshes_of(name, arguments)
@@ -153,7 +151,7 @@ def _tasks(arguments: argparse.Namespace) -> tuple[list[Task], dict[str, str]]:
         for link, mesh in meshes:
             with_meshes.add(link)
             if links is None or link in links:
-                task = tasks.setdefault(mesh, Task(mesh))
+                task = tasks.setdefault(mesh, MeshTask(mesh))
                 task.links += [] if link in task.links else [link]
     if not unread:
         # Otherwise the link may well be of the model that cannot be read.
@@ -167,8 +165,8 @@ def _tasks(arguments: argparse.Namespace) -> tuple[list[Task], dict[str, str]]:
 
 def _meshes_of(name: str, arguments: argparse.Namespace) -> list[tuple[str, Mesh]]:
 
-    with doing(f"reading {name}"):
-        model = load(arguments, name)
+    with show_activity(f"reading {name}"):
+        model = load_model(arguments, name)
     return [
         (link, shape.geometry)
         for link, body in model.bodies.items()
@@ -177,7 +175,9 @@ def _meshes_of(name: str, arguments: argparse.Namespace) -> list[tuple[str, Mesh
     ]
 
 
-def _report(tasks: Sequence[Task], found: Sequence[Outcome], unread: dict[str, str]) -> list[str]:
+def _print_results(
+    tasks: Sequence[MeshTask], found: Sequence[DecompositionOutcome], unread: dict[str, str]
+) -> list[str]:
     rows, remarks, errors = [], [], []
     for task, outcome in zip(tasks, found, strict=True):
         made = outcome.decomposition
@@ -185,31 +185,33 @@ def _report(tasks: Sequence[Task], found: Sequence[Outcome], unread: dict[str, s
             errors.append(f"  {task.name}: {' '.join(str(outcome.error).split())}")
             continue
         time_ = "cached" if outcome.cached else f"{made.seconds:.1f} s"
-        rows.append((task.name, *_figures(made), time_))
+        rows.append((task.name, *_format_row(made), time_))
         remarks += [f"  {task.name}: {remark}" for remark in made.remarks]
     sections = [_table(("mesh", *HEAD, "time"), rows)] if rows else []
     sections += ["\n".join(["remarks", *remarks])] if remarks else []
-    sections += ["\n".join([paint("not decomposed", "!"), *errors])] if errors else []
+    sections += ["\n".join([colorize("not decomposed", "!"), *errors])] if errors else []
     unread_lines = [f"  {name}: {why}" for name, why in unread.items()]
-    sections += ["\n".join([paint("cannot be read", "!"), *unread_lines])] if unread else []
+    sections += ["\n".join([colorize("cannot be read", "!"), *unread_lines])] if unread else []
     return sections or ["There are no meshes."]
 
 
 HEAD = ("hulls", "mesh [l]", "hulls [l]", "one hull [l]", "error [mm]", "excess [mm]", "uncovered [mm]")
 
 
-def _figures(made: Decomposition) -> tuple[str, ...]:
+def _format_row(made: Decomposition) -> tuple[str, ...]:
     a = made.accuracy
-    volumes = ["open" if v is None else figure(1e3 * v) for v in (a.mesh_volume, a.volume, a.hull_volume)]
-    lengths = [figure(1e3 * length, 3) for length in (made.error, a.excess, a.uncovered)]
+    volumes = [
+        "open" if v is None else format_number(1e3 * v) for v in (a.mesh_volume, a.volume, a.hull_volume)
+    ]
+    lengths = [format_number(1e3 * length, 3) for length in (made.error, a.excess, a.uncovered)]
     return (str(len(made.hulls)), *volumes, *lengths)
 
 
 def _table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    return table(head, rows, "<" + ">" * (len(head) - 1))
+    return format_table(head, rows, "<" + ">" * (len(head) - 1))
 
 
-def _facts(made: Decomposition) -> dict[str, Any]:
+def _decomposition_to_json(made: Decomposition) -> dict[str, Any]:
     return {
         "file": made.name,
         "hulls": len(made.hulls),
@@ -222,9 +224,9 @@ def _facts(made: Decomposition) -> dict[str, Any]:
     }
 
 
-def _as_json(task: Task, outcome: Outcome) -> dict[str, Any]:
+def _outcome_to_json(task: MeshTask, outcome: DecompositionOutcome) -> dict[str, Any]:
     made = outcome.decomposition
-    facts = {"file": task.mesh.uri} if made is None else _facts(made)
+    facts = {"file": task.mesh.uri} if made is None else _decomposition_to_json(made)
     error = None if outcome.error is None else " ".join(str(outcome.error).split())
     return {
         **facts,
@@ -235,11 +237,11 @@ def _as_json(task: Task, outcome: Outcome) -> dict[str, Any]:
     }
 
 
-def _on_cache(arguments: argparse.Namespace) -> int:
+def _manage_cache(arguments: argparse.Namespace) -> int:
     from kineverse.geometry.decomposition import clear, folder, listing
 
     if arguments.names or (arguments.list and arguments.clear):
-        raise ValueRejectedError("--list and --clear are about the whole cache, and one at a time.")
+        raise InvalidValueError("--list and --clear are about the whole cache, and one at a time.")
     if arguments.clear:
         count = clear()
         told = json.dumps({"removed": count}) if arguments.json else f"{count} removed from {folder()}"
@@ -247,16 +249,19 @@ def _on_cache(arguments: argparse.Namespace) -> int:
         return 0
     kept = listing()
     if arguments.json:
-        entries = [{**_facts(k.decomposition), "made": k.decomposition.made, "bytes": k.bytes} for k in kept]
+        entries = [
+            {**_decomposition_to_json(k.decomposition), "made": k.decomposition.made, "bytes": k.bytes}
+            for k in kept
+        ]
         print(json.dumps({"folder": str(folder()), "decompositions": entries}, allow_nan=False))
     elif kept:
-        print(_table(("mesh", *HEAD, "made"), [_kept_row(k) for k in kept]))
+        print(_table(("mesh", *HEAD, "made"), [_cache_row(k) for k in kept]))
     else:
         print(f"There are no decompositions in {folder()}.")
     return 0
 
 
-def _kept_row(kept: Kept) -> tuple[str, ...]:
+def _cache_row(kept: CacheEntry) -> tuple[str, ...]:
     made = kept.decomposition
     when = time.strftime("%Y-%m-%d %H:%M", time.localtime(made.made))
-    return (Path(made.name).name, *_figures(made), when)
+    return (Path(made.name).name, *_format_row(made), when)

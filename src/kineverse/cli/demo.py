@@ -5,17 +5,20 @@ from __future__ import annotations
 import argparse
 import os
 import sys
+from pathlib import Path
 from typing import TYPE_CHECKING
 
-from kineverse.cli.progress import progress
-from kineverse.cli.table import figure, table
-from kineverse.cli.view import add_page_options, announce, page_options, until_interrupted
-from kineverse.errors import ValueRejectedError
+import kineverse
+from kineverse.cli.output import format_table, show_progress
+from kineverse.cli.view import add_page_options, handle_interrupts, page_options, print_address
+from kineverse.errors import InvalidValueError
+from kineverse.expressions.printing import format_number
 
 if TYPE_CHECKING:
+    from living_kitchen.track import Figures
+
     import kineverse as kv
     from kineverse.view.camera import Camera
-    from kineverse.view.living.following import Figures
 
 HELP = """show a kitchen that lives, tracked through noise, and a joint that is learned
 
@@ -89,47 +92,64 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Show the scene that is asked for, or compute it."""
-    from kineverse.view.png import check_png_name
+    from kineverse.view.pictures import check_png_name
 
     check_png_name(arguments.picture)
+    if not arguments.sliders and not _find_example():
+        print(
+            "kineverse: note: the living kitchen is an example of the source checkout "
+            "(examples/living_kitchen); these are its sliders.",
+            file=sys.stderr,
+        )
+        arguments.sliders = True
     if arguments.sliders:
-        return _by_hand(arguments)
-    from kineverse.view.living import Life
+        return _show_sliders(arguments)
+    from living_kitchen.simulation import Life
 
     if arguments.headless:
-        return _some_seconds(arguments)
-    from kineverse.view.living.page import LivingPage
+        return _simulate(arguments)
+    from living_kitchen.page import LivingPage
 
     with (
-        until_interrupted(),
+        handle_interrupts(),
         LivingPage(
             Life(stranger=arguments.stranger), label="Kineverse demo", **page_options(arguments)
         ) as page,
     ):
-        announce(page, browser=not arguments.no_browser)
+        print_address(page, browser=not arguments.no_browser)
         print(f"{page.life.kitchen}, tracked; a {page.life.stranger.name}, learned", flush=True)
         page.wait()
     return 0
 
 
-def _some_seconds(arguments: argparse.Namespace) -> int:
-    """Let the scene live for a while without a browser, say how it went, and write a picture of its end."""
-    from kineverse.view.living import Life
-    from kineverse.view.living.following import average
-    from kineverse.view.living.picture import save
-    from kineverse.view.living.report import table_of_learning, table_of_tracking
+def _find_example() -> bool:
+    """Make the package ``living_kitchen`` importable; return whether this is a checkout that has it."""
+    folder = Path(kineverse.__file__).resolve().parents[2] / "examples"
+    if not (folder / "living_kitchen" / "__init__.py").is_file():
+        return False
+    if str(folder) not in sys.path:
+        sys.path.append(str(folder))
+    return True
 
-    steps = _steps(arguments.seconds)
+
+def _simulate(arguments: argparse.Namespace) -> int:
+    """Let the scene live for a while without a browser, say how it went, and write a picture of its end."""
+    from living_kitchen.picture import save
+    from living_kitchen.report import table_of_learning, table_of_tracking
+    from living_kitchen.simulation import Life
+    from living_kitchen.track import average
+
+    steps = _count_steps(arguments.seconds)
     life = Life(stranger=arguments.stranger)
     # First: a path that cannot be written to should not be found out at the end.
     _try_to_write(arguments.picture)
     figures: list[Figures] = []
-    for _ in progress(range(steps), "living", "step"):
+    for _ in show_progress(range(steps), "living", "step"):
         life.step(STEP)
         if life.time > SETTLED or not figures:
             figures.append(life.now)
-    print(table(*table_of_tracking(life, average(figures)), "<>"), end="\n\n")
-    print(table(*table_of_learning(life), "<>"))
+    print(format_table(*table_of_tracking(life, average(figures)), "<>"), end="\n\n")
+    print(format_table(*table_of_learning(life), "<>"))
     save(arguments.picture, life)
     print(f"picture: {arguments.picture}")
     return 0
@@ -143,14 +163,14 @@ def _try_to_write(path: str) -> None:
         os.remove(path)
 
 
-def _steps(seconds: float) -> int:
+def _count_steps(seconds: float) -> int:
     """Return in how many steps so much time passes."""
     if not STEP <= seconds <= LONGEST:
-        raise ValueRejectedError(f"--seconds is between {STEP:.2g} and {LONGEST:g}, not {seconds!r}")
+        raise InvalidValueError(f"--seconds is between {STEP:.2g} and {LONGEST:g}, not {seconds!r}")
     return round(seconds / STEP)
 
 
-def _by_hand(arguments: argparse.Namespace) -> int:
+def _show_sliders(arguments: argparse.Namespace) -> int:
     """Load both models; show or drive them."""
     import kineverse as kv
 
@@ -158,22 +178,22 @@ def _by_hand(arguments: argparse.Namespace) -> int:
     for name in MODELS:
         model.include(name)
     if arguments.headless:
-        return _headless(model, arguments.picture)
+        return _exercise_models(model, arguments.picture)
     from kineverse.view.viewer import Viewer
 
     with (
-        until_interrupted(),
+        handle_interrupts(),
         Viewer(
-            model, _state(model), label="Kineverse demo", camera=_camera(), **page_options(arguments)
+            model, _initial_state(model), label="Kineverse demo", camera=_camera(), **page_options(arguments)
         ) as page,
     ):
-        announce(page, browser=not arguments.no_browser)
+        print_address(page, browser=not arguments.no_browser)
         print(_contents(model), flush=True)
         page.wait()
     return 0
 
 
-def _state(model: kv.Model) -> dict[str, float]:
+def _initial_state(model: kv.Model) -> dict[str, float]:
     """Return the opening scene, of which those symbols count that the models have."""
     known = {str(symbol) for symbol in model.symbols}
     return {name: value for name, value in STATE.items() if name in known}
@@ -198,21 +218,21 @@ def _contents(model: kv.Model) -> str:
                 str(sum(constraint.startswith(inside) for constraint in model.constraints)),
             )
         )
-    return table(("model", "frames", "DoF", "constraints"), rows, "<>>>")
+    return format_table(("model", "frames", "DoF", "constraints"), rows, "<>>>")
 
 
-def _headless(model: kv.Model, path: str) -> int:
+def _exercise_models(model: kv.Model, path: str) -> int:
     """Drive everything through its range, check it, write a picture, and say how it went."""
-    from kineverse.cli.drive import drive
-    from kineverse.view import save
+    from kineverse.cli.exercise import exercise_model
+    from kineverse.view import save_picture
 
     # First: a path that cannot be written to should not be found out at the end.
-    save(path, model, _state(model), camera=_camera())
+    save_picture(path, model, _initial_state(model), camera=_camera())
     print(_contents(model), flush=True)
-    result = drive(model)
+    result = exercise_model(model)
     print(
         f"{result.freedoms} DoF driven through their ranges: {result.poses} poses of frames at "
-        f"{figure(result.rate, 3)} poses/s, {result.violations} limits violated"
+        f"{format_number(result.rate, 3)} poses/s, {result.violations} limits violated"
     )
     for line in result.problems[:10]:
         print(f"kineverse: {line}", file=sys.stderr)

@@ -6,10 +6,9 @@ import argparse
 import json
 import math
 
-from kineverse.cli.paint import paint
-from kineverse.cli.progress import doing
-from kineverse.cli.reading import add_reading_options, load
-from kineverse.errors import ValueRejectedError
+from kineverse.cli.arguments import add_model_options, load_model
+from kineverse.cli.output import colorize, show_activity
+from kineverse.errors import InvalidValueError
 
 HELP = """print what two models differ in: operations, frames, constraints, bodies
 
@@ -43,7 +42,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
             name.lower(), metavar=name, help=f"{what}: name of a shipped one, or path of a file"
         )
     parser.add_argument("--prefix", metavar="NAME", help="put in front of all names of both, with a slash")
-    add_reading_options(parser)
+    add_model_options(parser)
     parser.add_argument(
         "--tolerance",
         metavar="X",
@@ -65,25 +64,26 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Load both, compare, print."""
     if not (math.isfinite(arguments.tolerance) and arguments.tolerance >= 0.0):
-        raise ValueRejectedError(f"--tolerance is a number from 0 on, not {arguments.tolerance}.")
+        raise InvalidValueError(f"--tolerance is a number from 0 on, not {arguments.tolerance}.")
 
-    from kineverse.cli.behaviour import Behaviour
-    from kineverse.cli.behaviour_report import BehaviourReport
-    from kineverse.cli.comparison import Comparison
-    from kineverse.cli.comparison_report import ComparisonReport
-    from kineverse.cli.wording import contents
+    from kineverse.cli.diff_report import BehaviourComparisonReport, ModelComparisonReport
+    from kineverse.cli.format_values import format_contents
+    from kineverse.model.compare import ModelComparison
+    from kineverse.model.sampled_comparison import BehaviourComparison
 
     models = []
     for source in (arguments.a, arguments.b):
-        with doing(f"reading {source}"):
-            models.append(load(arguments, source, arguments.prefix))
+        with show_activity(f"reading {source}"):
+            models.append(load_model(arguments, source, arguments.prefix))
     before, after = models
-    report: BehaviourReport | ComparisonReport
-    with doing("comparing"):
+    report: BehaviourComparisonReport | ModelComparisonReport
+    with show_activity("comparing"):
         if arguments.values:
-            report = BehaviourReport(Behaviour(before, after, arguments.tolerance))
+            report = BehaviourComparisonReport(BehaviourComparison(before, after, arguments.tolerance))
         else:
-            report = ComparisonReport(Comparison(before, after, arguments.tolerance, arguments.operations))
+            report = ModelComparisonReport(
+                ModelComparison(before, after, arguments.tolerance, arguments.operations)
+            )
     equal = report.found.equal
     if arguments.json:
         answer = {
@@ -95,7 +95,7 @@ def run(arguments: argparse.Namespace) -> int:
         print(json.dumps({**answer, **report.as_json()}, allow_nan=False))
     else:
         sides = (("-", arguments.a, before), ("+", arguments.b, after))
-        head = [paint(f"{sign * 3} {name}  {contents(model)}", sign) for sign, name, model in sides]
+        head = [colorize(f"{sign * 3} {name}  {format_contents(model)}", sign) for sign, name, model in sides]
         told = report.blocks(None if arguments.all else SHOWN)
         print("\n\n".join("\n".join(block) for block in ([] if equal else head, *told) if block))
     return EQUAL if equal else DIFFERENT

@@ -11,13 +11,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
-from kineverse.cli.assignments import parse_length, parse_value
-from kineverse.cli.progress import doing
-from kineverse.errors import ValueRejectedError
+from kineverse.cli.arguments import parse_length, parse_value
+from kineverse.cli.output import show_activity
+from kineverse.errors import InvalidValueError
 
 if TYPE_CHECKING:
-    from kineverse.estimation import Fit, Found
-    from kineverse.estimation.recording import Pair
+    from kineverse.estimation import Fit, IdentificationResult
+    from kineverse.estimation.recordings import RecordedPair
 
 Array = npt.NDArray[np.float64]
 
@@ -43,14 +43,14 @@ examples:
   kineverse fit handle.log --columns x,y,z,- --families prismatic,revolute
   kineverse fit poses.csv --child door --document door.kv.json     then: kineverse view door.kv.json"""
 
-UNDECIDED = 1
+AMBIGUOUS = 1
 
-MOST_TURNED = 2.0
+MAX_ROTATION_STEP = 2.0
 """Turns are counted where it turns by no more than this from one pose to the next [rad]."""
 
 
 @dataclass(frozen=True)
-class Noise:
+class ObservationNoise:
     """How far observations are believed to be off.
 
     Attributes
@@ -101,11 +101,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Read the table, learn the joint, and say, draw and write it."""
-    from kineverse.cli.fit_report import as_json, as_text
-    from kineverse.estimation.recording import read_recording
+    from kineverse.cli.fit_output import fit_to_json, format_fit
+    from kineverse.estimation.recordings import read_recording
 
     if arguments.document and not arguments.document.endswith(".kv.json"):
-        raise ValueRejectedError(
+        raise InvalidValueError(
             f"--document {arguments.document!r}: the joint is written as a document, whose name ends in "
             ".kv.json. Then: kineverse convert joint.kv.json joint.urdf"
         )
@@ -119,18 +119,18 @@ def run(arguments: argparse.Namespace) -> int:
         print(f"kineverse: note: {pair.alone} poses of one part without the other", file=sys.stderr)
     if arguments.thin is not None:
         pair = pair.thinned(arguments.thin)
-    with doing(f"learning from {len(pair.lines)} poses"):
-        learned = fitted(pair, stated, arguments.families, arguments.thin is None)
-    written = write(arguments, pair, learned)
+    with show_activity(f"learning from {len(pair.lines)} poses"):
+        learned = fit_joint(pair, stated, arguments.families, arguments.thin is None)
+    written = write_results(arguments, pair, learned)
     if arguments.json:
-        answer = {"poses": arguments.poses, **as_json(pair, learned), **written}
+        answer = {"poses": arguments.poses, **fit_to_json(pair, learned), **written}
         print(json.dumps(answer, indent=2, allow_nan=False))
     else:
-        print(as_text(arguments.poses, pair, learned))
+        print(format_fit(arguments.poses, pair, learned))
         for what, path in written.items():
             if path:
                 print(f"{what}: {path}")
-    return UNDECIDED if learned.found.cannot_tell else 0
+    return AMBIGUOUS if learned.found.is_ambiguous else 0
 
 
 def parse_noise(text: str) -> tuple[float, float | None]:
@@ -138,7 +138,7 @@ def parse_noise(text: str) -> tuple[float, float | None]:
 
     Raises
     ------
-    ValueRejectedError
+    InvalidValueError
         If it is something else.
     """
     first, comma, second = text.partition(",")
@@ -146,17 +146,17 @@ def parse_noise(text: str) -> tuple[float, float | None]:
         position = parse_length(first)
         orientation = parse_value(second) if comma else None
         good = position > 0.0 and (orientation is None or orientation > 0.0)
-    except ValueRejectedError:
+    except InvalidValueError:
         good = False
     if not good or second.strip().endswith("m"):
-        raise ValueRejectedError(
+        raise InvalidValueError(
             f"--noise {text!r}: write two positive numbers of m and rad: 0.003,0.02 or 3mm,1deg"
         )
     return position, orientation
 
 
 @dataclass(frozen=True)
-class Learned:
+class LearnedJoint:
     """What was learned from poses.
 
     Attributes
@@ -171,45 +171,47 @@ class Learned:
         The best one, with all poses: those that are wrong altogether are outlying.
     """
 
-    found: Found
-    noise: Noise
+    found: IdentificationResult
+    noise: ObservationNoise
     judged: int
     fit: Fit
 
 
-def fitted(
-    pair: Pair, stated: tuple[float, float | None] | None, families: str | None, thins: bool
-) -> Learned:
+def fit_joint(
+    pair: RecordedPair, stated: tuple[float, float | None] | None, families: str | None, thins: bool
+) -> LearnedJoint:
     """Return what is learned from poses; if it thins, from so many as tell something of their own.
 
     Raises
     ------
-    ValueRejectedError, UnknownNameError
-        See :func:`learn`.
+    InvalidValueError, UnknownNameError
+        See :func:`identify_joint`.
     """
     from kineverse.estimation import Outliers
-    from kineverse.estimation.identification.beside import completed
-    from kineverse.estimation.identification.observations import observations
-    from kineverse.estimation.recording import evenly
+    from kineverse.estimation.identification.observations import check_observations
+    from kineverse.estimation.identification.projection import complete_fit
+    from kineverse.estimation.recordings import spaced_indices
 
-    found, noise = learn(pair, stated, families)
-    count = telling(found, pair) if thins else len(pair.lines)
+    found, noise = identify_joint(pair, stated, families)
+    count = count_independent(found, pair) if thins else len(pair.lines)
     if count == len(pair.lines):
-        return Learned(found, noise, count, found.best)
-    judged = evenly(len(pair.lines), count)
-    found, noise = learn(pair.at(judged), stated, families)
-    covariance = covariance_of(noise.position, noise.orientation)
-    seen = observations(pair.parent_poses, pair.child_poses, covariance, covariance)
-    fit = completed(found.best, seen, judged, outliers=Outliers(), stated=noise.given, ordered=pair.timed)
-    return Learned(found, noise, count, fit)
+        return LearnedJoint(found, noise, count, found.best)
+    judged = spaced_indices(len(pair.lines), count)
+    found, noise = identify_joint(pair.at(judged), stated, families)
+    covariance = make_covariance(noise.position, noise.orientation)
+    seen = check_observations(pair.parent_poses, pair.child_poses, covariance, covariance)
+    fit = complete_fit(found.best, seen, judged, outliers=Outliers(), stated=noise.given, ordered=pair.timed)
+    return LearnedJoint(found, noise, count, fit)
 
 
-def learn(pair: Pair, stated: tuple[float, float | None] | None, families: str | None) -> tuple[Found, Noise]:
+def identify_joint(
+    pair: RecordedPair, stated: tuple[float, float | None] | None, families: str | None
+) -> tuple[IdentificationResult, ObservationNoise]:
     """Return what was found, and how far observations are off.
 
     Raises
     ------
-    ValueRejectedError
+    InvalidValueError
         If a noise of positions alone is stated for poses, or there is nothing to learn from the poses.
     UnknownNameError
         For a family that does not exist.
@@ -218,9 +220,9 @@ def learn(pair: Pair, stated: tuple[float, float | None] | None, families: str |
     from kineverse.estimation.identification.identify import UNKNOWN_NOISE
 
     if stated is not None and stated[1] is None and pair.is_whole:
-        raise ValueRejectedError("--noise: poses have two, of positions and orientations: 3mm,1deg")
+        raise InvalidValueError("--noise: poses have two, of positions and orientations: 3mm,1deg")
     chosen = None if families is None else [name.strip() for name in families.split(",")]
-    covariance = None if stated is None else covariance_of(*stated)
+    covariance = None if stated is None else make_covariance(*stated)
     found = identify(
         pair.parent_poses,
         pair.child_poses,
@@ -230,19 +232,19 @@ def learn(pair: Pair, stated: tuple[float, float | None] | None, families: str |
         ordered=pair.timed,
     )
     position, orientation = stated or (found.noise_scale * one for one in UNKNOWN_NOISE)
-    return found, Noise(position, orientation if pair.is_whole else None, stated is not None)
+    return found, ObservationNoise(position, orientation if pair.is_whole else None, stated is not None)
 
 
-def covariance_of(position: float, orientation: float | None) -> Array:
+def make_covariance(position: float, orientation: float | None) -> Array:
     """Return the covariance of poses; where only positions are seen, the other half is not looked at."""
     from kineverse.estimation import pose_covariance
 
     return pose_covariance(position, orientation or 1.0)
 
 
-def telling(found: Found, pair: Pair) -> int:
+def count_independent(found: IdentificationResult, pair: RecordedPair) -> int:
     """Return how many of the poses tell something of their own, by what the best joint leaves of them."""
-    from kineverse.estimation.recording import evenly, independent_count
+    from kineverse.estimation.recordings import effective_sample_size, spaced_indices
 
     count = len(pair.lines)
     # What is free leaves nothing.
@@ -251,25 +253,25 @@ def telling(found: Found, pair: Pair) -> int:
         return count
     # As many more as are wrong and tell nothing.
     right = len(fit.right)
-    judged = min(count, round(independent_count(fit.residuals[fit.right]) * count / right))
+    judged = min(count, round(effective_sample_size(fit.residuals[fit.right]) * count / right))
     # And enough to count turns.
-    while pair.timed and judged < count and fit.at(evenly(count, judged)).turned > MOST_TURNED:
+    while pair.timed and judged < count and fit.at(spaced_indices(count, judged)).turned > MAX_ROTATION_STEP:
         judged += 1
     return judged
 
 
-def write(arguments: argparse.Namespace, pair: Pair, learned: Learned) -> dict[str, Any]:
+def write_results(arguments: argparse.Namespace, pair: RecordedPair, learned: LearnedJoint) -> dict[str, Any]:
     """Write what was asked for, and return where it is."""
     fit = learned.fit
     if arguments.picture:
+        from kineverse.experiments.plots import SIZE, draw_fit
         from kineverse.experiments.report import Figure
-        from kineverse.view.identified import SIZE, draw_identified
 
         title = f"{pair.child} in {pair.parent}: {learned.found}"
-        picture = Figure(lambda c: draw_identified(c, fit, pair.relative, title), SIZE)
+        picture = Figure(lambda c: draw_fit(c, fit, pair.relative, title), SIZE)
         picture.save(arguments.picture)
     if arguments.document:
-        from kineverse.cli.fit_document import document_of
+        from kineverse.cli.fit_output import make_joint_model
 
-        document_of(pair.at(fit.right), fit).save(arguments.document)
+        make_joint_model(pair.at(fit.right), fit).save(arguments.document)
     return {"picture": arguments.picture, "document": arguments.document}

@@ -6,11 +6,16 @@ import argparse
 import json
 from typing import TYPE_CHECKING
 
-from kineverse.cli.assignments import add_set_option, parse_assignments
-from kineverse.cli.beyond_limits import note, remarks
-from kineverse.cli.reading import add_reading_options, load
-from kineverse.cli.table import figure
-from kineverse.errors import ValueRejectedError
+from kineverse.cli.arguments import (
+    add_model_options,
+    add_set_option,
+    find_limit_notes,
+    load_model,
+    parse_assignments,
+    print_notes,
+)
+from kineverse.errors import InvalidValueError
+from kineverse.expressions.printing import format_number
 
 if TYPE_CHECKING:
     pass
@@ -31,7 +36,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("frame", metavar="FRAME", help="name of a frame, such as kitchen/fridge_door")
     parser.add_argument("--relative-to", metavar="FRAME", default="world", help="in whose axes (world)")
     add_set_option(parser)
-    add_reading_options(parser)
+    add_model_options(parser)
     parser.add_argument("--json", action="store_true", help="one JSON object on standard output")
 
 
@@ -43,23 +48,22 @@ def run(arguments: argparse.Namespace) -> int:
     import numpy as np
 
     import kineverse as kv
-    from kineverse.view.poses import complete
-    from kineverse.view.rotation import quaternions, roll_pitch_yaw
+    from kineverse.view.poses import complete, roll_pitch_yaw, to_quaternions
 
-    model = load(arguments, arguments.model)
+    model = load_model(arguments, arguments.model)
     expression = model.fk(arguments.frame, arguments.relative_to)
     values = complete(model, assigned)
     pose = np.asarray(expression(kv.State(values)), dtype=float)
     used = {str(s): values[str(s)] for s in expression.symbols if str(s) in values}
     if not np.isfinite(pose).all():
-        note(remarks(model, values, arguments.assignments))
-        where = ", ".join(f"{name}={figure(value, 6)}" for name, value in used.items()) or "all values"
-        raise ValueRejectedError(
+        print_notes(find_limit_notes(model, values, arguments.assignments))
+        where = ", ".join(f"{name}={format_number(value, 6)}" for name, value in used.items()) or "all values"
+        raise InvalidValueError(
             f"The pose of '{arguments.frame}' in '{arguments.relative_to}' is not finite at {where}; "
             "set other positions with --set."
         )
     position, rpy = pose[:3, 3], roll_pitch_yaw(pose)
-    xyzw = np.roll(quaternions(pose[None])[0], -1)
+    xyzw = np.roll(to_quaternions(pose[None])[0], -1)
     if arguments.json:
         answer = {
             "frame": arguments.frame,
@@ -73,14 +77,18 @@ def run(arguments: argparse.Namespace) -> int:
         print(json.dumps(answer, allow_nan=False))
     else:
         print(f"{arguments.frame} in {arguments.relative_to}")
-        print("\n".join("  " + "".join(f"{figure(x, 6):>12}" for x in row) for row in pose))
+        print("\n".join("  " + "".join(f"{format_number(x, 6):>12}" for x in row) for row in pose))
         for name, numbers, unit in (
             ("position", position, "m"),
             ("roll pitch yaw", rpy, "rad"),
             ("quaternion xyzw", xyzw, ""),
         ):
-            print(f"  {name:<16}" + "".join(f"{figure(x, 6):>12}" for x in numbers) + f"  {unit}".rstrip())
+            print(
+                f"  {name:<16}"
+                + "".join(f"{format_number(x, 6):>12}" for x in numbers)
+                + f"  {unit}".rstrip()
+            )
         if used:
-            print("  at " + ", ".join(f"{name}={figure(value, 6)}" for name, value in used.items()))
-    note(remarks(model, values, arguments.assignments))
+            print("  at " + ", ".join(f"{name}={format_number(value, 6)}" for name, value in used.items()))
+    print_notes(find_limit_notes(model, values, arguments.assignments))
     return 0

@@ -1,4 +1,4 @@
-"""``kineverse info``: what a model consists of."""
+"""``kineverse info``: contents of a model, and the list of articulations."""
 
 from __future__ import annotations
 
@@ -7,14 +7,13 @@ import json
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
-from kineverse.cli.listing import asked_for, print_articulations
-from kineverse.cli.paint import bounded
-from kineverse.cli.reading import add_reading_options, load
-from kineverse.cli.table import figure, table
+from kineverse.cli.arguments import add_model_options, load_model
+from kineverse.cli.output import format_table, truncate_lines
+from kineverse.expressions.printing import format_number
 
 if TYPE_CHECKING:
-    from kineverse.cli.summary import Summary
-    from kineverse.geometry import Closest
+    from kineverse.cli.summary import ModelSummary
+    from kineverse.geometry import DistanceResult
 
 HELP = """print what a model consists of: frames, degrees of freedom, constraints, size
 
@@ -35,31 +34,31 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--frames", action="store_true", help="also print the tree of frames")
     parser.add_argument("--constraints", action="store_true", help="also print all constraints")
     parser.add_argument("--json", action="store_true", help="everything, as one JSON object")
-    add_reading_options(parser)
+    add_model_options(parser)
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Load, count and print."""
-    if asked_for(arguments.model):
+    if is_gallery_list(arguments.model):
         return print_articulations(arguments.json)
 
-    from kineverse.cli.summary import summarise
-    from kineverse.formats.remarks import listening
+    from kineverse.cli.summary import summarize_model
+    from kineverse.formats.reader_warnings import collect_warnings
 
-    with listening() as remarks:
-        model = load(arguments, arguments.model)
-    summary = summarise(arguments.model, model)
+    with collect_warnings() as remarks:
+        model = load_model(arguments, arguments.model)
+    summary = summarize_model(arguments.model, model)
     if arguments.json:
-        print(json.dumps({**as_json(summary), "remarks": remarks}, allow_nan=False))
+        print(json.dumps({**summary_to_json(summary), "remarks": remarks}, allow_nan=False))
         return 0
-    found = sections(summary, arguments.frames, arguments.constraints)
+    found = format_sections(summary, arguments.frames, arguments.constraints)
     if remarks:
-        found.append("\n".join(["remarks", *bounded([f"  {text}" for text in remarks], SHOWN, "  ")]))
+        found.append("\n".join(["remarks", *truncate_lines([f"  {text}" for text in remarks], SHOWN, "  ")]))
     print("\n\n".join(found))
     return 0
 
 
-def sections(summary: Summary, frames: bool = False, constraints: bool = False) -> list[str]:
+def format_sections(summary: ModelSummary, frames: bool = False, constraints: bool = False) -> list[str]:
     """Return the paragraphs of the report."""
     extent = " x ".join(f"{edge:.2f}" for edge in summary.extent)
     frames_, freedoms, conditions = map(len, (summary.frames, summary.freedoms, summary.constraints))
@@ -79,25 +78,32 @@ def sections(summary: Summary, frames: bool = False, constraints: bool = False) 
         )
         lines.append(f"  {bodies} no collision shapes; distances are to hulls of what is seen")
     if summary.contacts:
-        lines.append(_contacts(summary.contacts))
+        lines.append(_format_contacts(summary.contacts))
     if summary.sha256:
         lines.append(f"  document, sha256 {summary.sha256}")
     found = ["\n".join(lines)]
     if summary.freedoms:
         rows = [
-            (f.name, f.unit, figure(f.lower), figure(f.upper), figure(f.default), figure(f.speed))
+            (
+                f.name,
+                f.unit,
+                format_number(f.lower),
+                format_number(f.upper),
+                format_number(f.default),
+                format_number(f.speed),
+            )
             for f in summary.freedoms
         ]
-        found.append(table(("DoF", "unit", "lower", "upper", "default", "speed"), rows, "<<>>>>"))
+        found.append(format_table(("DoF", "unit", "lower", "upper", "default", "speed"), rows, "<<>>>>"))
     if summary.interlocks:
         found.append("\n".join(["interlocks", *(f"  {interlock}" for interlock in summary.interlocks)]))
     said = {name for interlock in summary.interlocks for name in interlock.constraints}
     shown = [c for c in summary.constraints if constraints or not (c.simple or c.name in said)]
     if shown:
         title = "constraint" if constraints else "other constraints"
-        found.append(table((title, ""), [(c.name, c.text) for c in shown]))
+        found.append(format_table((title, ""), [(c.name, c.text) for c in shown]))
     if frames:
-        found.append("frames\n" + "\n".join(_tree(summary.frames)))
+        found.append("frames\n" + "\n".join(_format_tree(summary.frames)))
     hidden = [] if frames else ["--frames"]
     if not constraints and len(shown) < len(summary.constraints):
         hidden.append("--constraints")
@@ -106,7 +112,7 @@ def sections(summary: Summary, frames: bool = False, constraints: bool = False) 
     return found
 
 
-def as_json(summary: Summary) -> dict[str, Any]:
+def summary_to_json(summary: ModelSummary) -> dict[str, Any]:
     """Return the summary as what JSON can say; a limit that is not there is null."""
 
     def finite(value: float) -> float | None:
@@ -148,18 +154,20 @@ def as_json(summary: Summary) -> dict[str, Any]:
     }
 
 
-def _contacts(pairs: Sequence[Closest]) -> str:
+def _format_contacts(pairs: Sequence[DistanceResult]) -> str:
     """Return how many pairs touch, and which is the deepest."""
-    from kineverse.cli.contacts import TOUCHING
+    from kineverse.cli.summary import CONTACT_DEPTH
 
     pair, depth = pairs[0], -pairs[0].distance
-    deepest = f"{pair.a} and {pair.b}" + (f", {figure(depth, 3)} m deep" if depth > TOUCHING else "")
+    deepest = f"{pair.a} and {pair.b}" + (
+        f", {format_number(depth, 3)} m deep" if depth > CONTACT_DEPTH else ""
+    )
     if len(pairs) == 1:
         return f"  1 pair of bodies touches at the default state: {deepest}"
     return f"  {len(pairs)} pairs of bodies touch at the default state, first {deepest}"
 
 
-def _tree(frames: dict[str, str]) -> list[str]:
+def _format_tree(frames: dict[str, str]) -> list[str]:
     """Return the frames, each below its parent and two spaces to the right of it."""
     children: dict[str, list[str]] = {}
     for name, parent in frames.items():
@@ -170,3 +178,32 @@ def _tree(frames: dict[str, str]) -> list[str]:
         lines.append("  " * depth + name)
         stack.extend((child, depth + 1) for child in reversed(children.get(name, [])))
     return lines
+
+
+def is_gallery_list(model: str) -> bool:
+    """Return whether it is the list that a user wants instead of a model."""
+    from kineverse.formats.locate import GALLERY
+
+    return model.rstrip("/") == GALLERY
+
+
+def print_articulations(as_json: bool = False) -> int:
+    """Print a line for each articulation, and return the exit status."""
+    from kineverse import gallery
+    from kineverse.formats.locate import GALLERY
+
+    rows = [(f"{GALLERY}/{name}", gallery.summary(name)) for name in gallery.names()]
+    if as_json:
+        print(json.dumps({"models": [{"name": name, "shows": text} for name, text in rows]}))
+    else:
+        print(format_table(("model", "shows"), rows, "<<"))
+        print(f"\nMove one with: kineverse view {rows[0][0]}")
+    return 0
+
+
+def print_models() -> int:
+    """Print a line for each shipped model and each articulation, and return the exit status."""
+    from kineverse.formats import shipped_models
+
+    print("models: " + ", ".join(shipped_models()), end="\n\n")
+    return print_articulations()

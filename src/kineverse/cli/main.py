@@ -19,7 +19,7 @@ COMMANDS = {
     for module in (info, fk, view, convert, diff, validate, decompose, fit, demo, bench, reproduce)
 }
 
-WRONG, INTERRUPTED, PIPE_CLOSED = 2, 130, 141
+ERROR, INTERRUPTED, PIPE_CLOSED = 2, 130, 141
 """Exit statuses: what was asked for cannot be done; Ctrl-C; nobody reads on (128 and the signal's number)."""
 
 # Meshes that are missing are counted by the commands, and without a compiler they answer the same.
@@ -55,32 +55,32 @@ def main(argv: Sequence[str] | None = None) -> int:
     """
     words = sys.argv[1:] if argv is None else list(argv)
     if not set(words) - {"-v", "--verbose"}:
-        parser().print_help()
+        make_parser().print_help()
         return 0
     try:
-        arguments = _parsed(words)
+        arguments = _parse_arguments(words)
     except SystemExit as stop:  # argparse ends the process itself; a function returns.
-        return stop.code if isinstance(stop.code, int) else WRONG
+        return stop.code if isinstance(stop.code, int) else ERROR
     except UnknownNameError as error:
-        print(f"kineverse: {one_line(error)}", file=sys.stderr)
-        return WRONG
+        print(f"kineverse: {format_error(error)}", file=sys.stderr)
+        return ERROR
     try:
-        with _warnings_on(sys.stderr, arguments.verbose):
+        with _log_warnings_to(sys.stderr, arguments.verbose):
             status: int = arguments.run(arguments)
         sys.stdout.flush()
     except BrokenPipeError:
-        _forget_stdout()
+        _discard_stdout()
         return PIPE_CLOSED
     except KeyboardInterrupt:
         print(file=sys.stderr)
         return INTERRUPTED
     except (KineverseError, OSError) as error:
-        print(f"kineverse: {one_line(error)}", file=sys.stderr)
-        return WRONG
+        print(f"kineverse: {format_error(error)}", file=sys.stderr)
+        return ERROR
     return status
 
 
-def parser() -> argparse.ArgumentParser:
+def make_parser() -> argparse.ArgumentParser:
     """Return the parser of the whole command line."""
     top = argparse.ArgumentParser(
         prog="kineverse",
@@ -104,7 +104,7 @@ def parser() -> argparse.ArgumentParser:
     return top
 
 
-def _parsed(words: Sequence[str]) -> argparse.Namespace:
+def _parse_arguments(words: Sequence[str]) -> argparse.Namespace:
     """Return the arguments that words are.
 
     Raises
@@ -116,8 +116,8 @@ def _parsed(words: Sequence[str]) -> argparse.Namespace:
     """
     name = next((word for word in words if not word.startswith("-")), None)
     if name is not None and name not in COMMANDS:
-        raise UnknownNameError(f"There is no command {name!r}. {_instead(name)}")
-    arguments, unknown = parser().parse_known_args(words)
+        raise UnknownNameError(f"There is no command {name!r}. {_suggest_command(name)}")
+    arguments, unknown = make_parser().parse_known_args(words)
     if unknown:
         sub: argparse.ArgumentParser = arguments.command
         word = unknown[0].partition("=")[0]
@@ -130,16 +130,16 @@ def _parsed(words: Sequence[str]) -> argparse.Namespace:
     return arguments
 
 
-def _instead(name: str) -> str:
+def _suggest_command(name: str) -> str:
     """Return what may have been meant by a command that does not exist."""
-    from kineverse.formats.sources import shipped_models
+    from kineverse.formats.locate import shipped_models
 
     if name in shipped_models() or os.path.exists(name):
         return f"It is a model or file: 'kineverse info {name}' says what it consists of."
     return f"{suggest(name, COMMANDS, 'command')} 'kineverse --help' says what each does."
 
 
-def one_line(error: BaseException) -> str:
+def format_error(error: BaseException) -> str:
     """Return what an error says, on one line."""
     if isinstance(error, OSError) and error.strerror:
         where = f"{error.filename}: " if error.filename else ""
@@ -148,7 +148,7 @@ def one_line(error: BaseException) -> str:
 
 
 @contextmanager
-def _warnings_on(stream: TextIO, verbose: bool) -> Iterator[None]:
+def _log_warnings_to(stream: TextIO, verbose: bool) -> Iterator[None]:
     """Show what the library logs, on a line each, but for what commands leave to ``--verbose``."""
     handler = logging.StreamHandler(stream)
     handler.setFormatter(logging.Formatter("kineverse: %(message)s"))
@@ -166,7 +166,7 @@ def _warnings_on(stream: TextIO, verbose: bool) -> Iterator[None]:
             logger.setLevel(level)
 
 
-def _forget_stdout() -> None:
+def _discard_stdout() -> None:
     """Send what is left of the output nowhere, so that the interpreter does not complain at its end."""
     try:
         nowhere = os.open(os.devnull, os.O_WRONLY)

@@ -7,12 +7,12 @@ import json
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from kineverse.cli.progress import progress
-from kineverse.cli.table import figure, table
-from kineverse.errors import MissingExtraError, UnknownNameError
+from kineverse.cli.output import format_table, show_progress
+from kineverse.errors import MissingDependencyError, UnknownNameError
+from kineverse.expressions.printing import format_number
 
 if TYPE_CHECKING:
-    from kineverse.experiments import Report, Table
+    from kineverse.experiments import Report, ReportTable
 
 HELP = """make an experiment of the papers again: a table here, a figure in a file
 
@@ -47,14 +47,18 @@ def run(arguments: argparse.Namespace) -> int:
 
     if arguments.list:
         listing = dict(EXPERIMENTS)
-        print(json.dumps(listing, indent=2) if arguments.json else table(("name", "about"), listing.items()))
+        print(
+            json.dumps(listing, indent=2)
+            if arguments.json
+            else format_table(("name", "about"), listing.items())
+        )
         return 0
     if arguments.name is None:
         raise UnknownNameError(f"Which experiment? There are: {', '.join(EXPERIMENTS)}.")
     options = Options(quick=arguments.quick, data=arguments.data, model=arguments.model)
     if arguments.figure is not None:
         check_drawing()  # before minutes are spent on numbers
-    report = reproduce(arguments.name, progress, options)
+    report = reproduce(arguments.name, show_progress, options)
     if arguments.json:
         if arguments.figure is not None:
             report.figure.save(arguments.figure)
@@ -66,18 +70,18 @@ def run(arguments: argparse.Namespace) -> int:
         }
         print(json.dumps(answer, indent=2, allow_nan=False))
         return 0
-    print(as_text(report), flush=True)
+    print(format_report(report), flush=True)
     if not arguments.no_figure:
-        _draw(report, arguments.figure)
+        _save_figure(report, arguments.figure)
     return 0
 
 
-def _draw(report: Report, asked: Path | None) -> None:
+def _save_figure(report: Report, asked: Path | None) -> None:
     """Write the figure where it is asked for; without being asked, only if there is what it takes."""
     path = asked or Path(f"{report.name}.png")
     try:
         report.figure.save(path)
-    except MissingExtraError as error:
+    except MissingDependencyError as error:
         if asked:
             raise
         print(f"\nThere is no figure. {error}")
@@ -85,11 +89,11 @@ def _draw(report: Report, asked: Path | None) -> None:
         print(f"\nThe figure is in {path}.")
 
 
-def as_text(report: Report) -> str:
+def format_report(report: Report) -> str:
     """Return a report as tables."""
-    return "\n\n".join([report.title, *map(_table, report.tables)])
+    return "\n\n".join([report.title, *map(_format_report_table, report.tables)])
 
 
-def _table(part: Table) -> str:
-    rows = [[cell if isinstance(cell, str) else figure(cell) for cell in row] for row in part.rows]
-    return f"{part.title}\n{table(part.head, rows, '>' * len(part.head))}"
+def _format_report_table(part: ReportTable) -> str:
+    rows = [[cell if isinstance(cell, str) else format_number(cell) for cell in row] for row in part.rows]
+    return f"{part.title}\n{format_table(part.head, rows, '>' * len(part.head))}"

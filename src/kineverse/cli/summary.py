@@ -1,28 +1,70 @@
-"""A model in numbers and names, for people and for JSON."""
+"""Summary of a model: frames, degrees of freedom, constraints, extent, mass, contacts."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from kineverse.cli.contacts import contacts
+from kineverse.errors import KineverseError
+from kineverse.expressions.printing import format_number
 from kineverse.formats.document import document_hash
-from kineverse.geometry import Closest
-from kineverse.geometry.pieces import touched_by_what_is_seen
+from kineverse.formats.validate import ModelProblem
+from kineverse.geometry import DistanceResult, Scene
+from kineverse.geometry.exclusions import find_unusable_shapes, is_installed
+from kineverse.geometry.objects import bodies_with_visual_collision
+from kineverse.geometry.shapes import import_coal
 from kineverse.model.constraint import Constraint
-from kineverse.model.view import ModelView
+from kineverse.model.model_view import ModelView
 from kineverse.reasoning import Interlocks, interlocks
 from kineverse.symbols import Symbol
-from kineverse.view.parts import parts
-from kineverse.view.poses import Poses, complete
-from kineverse.view.surfaces import Surfaces
-from kineverse.view.units import units
+from kineverse.view.drawables import collect_drawables
+from kineverse.view.poses import FramePoses, complete
+from kineverse.view.rasterizer import TriangleSoup
+from kineverse.view.sliders import infer_units
+
+CONTACT_DEPTH = 1e-5
+"""What is less deep than this only touches, as a drawer lies on its rail [m]."""
+
+
+def find_contacts(model: ModelView) -> Sequence[DistanceResult] | None:
+    """Return the pairs that touch or penetrate at the default state, deepest first; None if nobody can say.
+
+    Shapes that cannot be used are left out. Nobody can say without the extra ``geometry``, or where
+    there are no poses at the default state.
+    """
+    if not is_installed():
+        return None
+    try:
+        return _touching_pairs(model)
+    except KineverseError:  # What is not finite there is reported for itself.
+        return None
+
+
+def find_penetrations(model: ModelView) -> Iterator[ModelProblem]:
+    """Yield the pairs of bodies that are in each other at the default state.
+
+    Raises
+    ------
+    MissingDependencyError
+        If the extra ``geometry`` is not installed.
+    """
+    import_coal()
+    for pair in find_contacts(model) or ():
+        if pair.distance < -CONTACT_DEPTH:
+            text = f"in {pair.b} by {format_number(-pair.distance, 3)} m at the default state"
+            yield ModelProblem("contact", pair.a, text)
+
+
+def _touching_pairs(model: ModelView) -> Sequence[DistanceResult]:
+    scene = Scene(model, leave_out=find_unusable_shapes(model))
+    scene.update(model.default_state())
+    return scene.within(0.0)
 
 
 @dataclass(frozen=True, slots=True)
-class Freedom:
+class DofSummary:
     """A degree of freedom: its limits and default [unit], and the limit of its speed [unit/s]."""
 
     name: str
@@ -34,7 +76,7 @@ class Freedom:
 
 
 @dataclass(frozen=True, slots=True)
-class Condition:
+class ConstraintSummary:
     """A constraint as text; ``simple`` if it bounds a single symbol by numbers."""
 
     name: str
@@ -44,21 +86,21 @@ class Condition:
 
 
 @dataclass(frozen=True, slots=True)
-class Summary:
+class ModelSummary:
     """What a model consists of.
 
     ``frames`` are the parents by name; ``low``, ``high`` and ``extent`` the box around all shapes at the
     default state [m]; ``mass`` that of all bodies [kg]; ``problems`` what could not be loaded; ``unplaced``
     the frames whose pose there is not finite, which the box leaves out; ``interlocks`` what locks what;
     ``touched_as_seen`` the bodies without collision shapes, for which distances are to hulls of what is seen;
-    ``contacts`` the pairs that touch at the default state, deepest first, None if nobody can say;
+    ``find_contacts`` the pairs that touch at the default state, deepest first, None if nobody can say;
     ``sha256`` the hash of the content if the model is from a document, else empty.
     """
 
     name: str
     frames: dict[str, str]
-    freedoms: list[Freedom]
-    constraints: list[Condition]
+    freedoms: list[DofSummary]
+    constraints: list[ConstraintSummary]
     low: list[float]
     high: list[float]
     extent: list[float]
@@ -68,33 +110,33 @@ class Summary:
     unplaced: list[str]
     interlocks: Interlocks
     touched_as_seen: list[str]
-    contacts: Sequence[Closest] | None
+    contacts: Sequence[DistanceResult] | None
     sha256: str
 
 
-def summarise(name: str, model: ModelView) -> Summary:
+def summarize_model(name: str, model: ModelView) -> ModelSummary:
     """Return the summary of a model; reads its meshes for the size."""
     values = complete(model)
-    poses = Poses(model)
+    poses = FramePoses(model)
     places = poses.at(values)
     unplaced = poses.unplaced(places)
     at = dict(zip(poses.names, places, strict=True))
     for frame in unplaced:
         del at[frame]
-    shown = parts(model)
+    shown = collect_drawables(model)
     loaded = [part for part in shown if not part.placeholder and part.frame in at]
-    corners = Surfaces.of(loaded, at).corners.reshape(-1, 3)
+    corners = TriangleSoup.of(loaded, at).corners.reshape(-1, 3)
     if not len(corners):
         corners = np.array([pose[:3, 3] for pose in at.values()])
     low, high = corners.min(axis=0), corners.max(axis=0)
     free = model.degrees_of_freedom
-    unit = units(model, values, [str(symbol) for symbol in free])
+    unit = infer_units(model, values, [str(symbol) for symbol in free])
     masses = (body.inertia.mass for body in model.bodies.values() if body.inertia is not None)
-    return Summary(
+    return ModelSummary(
         name=name,
         frames={frame: model.frames[frame].parent for frame in model.frames},
-        freedoms=[_freedom(model, symbol, unit[str(symbol)], values[str(symbol)]) for symbol in free],
-        constraints=[_condition(key, constraint) for key, constraint in model.constraints.items()],
+        freedoms=[_summarize_dof(model, symbol, unit[str(symbol)], values[str(symbol)]) for symbol in free],
+        constraints=[_summarize_constraint(key, constraint) for key, constraint in model.constraints.items()],
         low=low.tolist(),
         high=high.tolist(),
         extent=(high - low).tolist(),
@@ -103,31 +145,31 @@ def summarise(name: str, model: ModelView) -> Summary:
         problems=sorted(part.frame for part in shown if part.problem),
         unplaced=unplaced,
         interlocks=interlocks(model),
-        touched_as_seen=touched_by_what_is_seen(model),
-        contacts=contacts(model),
+        touched_as_seen=bodies_with_visual_collision(model),
+        contacts=find_contacts(model),
         sha256=document_hash(model) if name.endswith((".kv.json", ".kv.msgpack")) else "",
     )
 
 
-def _freedom(model: ModelView, symbol: Symbol, unit: str, default: float) -> Freedom:
+def _summarize_dof(model: ModelView, symbol: Symbol, unit: str, default: float) -> DofSummary:
     lower, upper = model.limits(symbol)
     slowest, fastest = model.limits(symbol.derivative())
-    return Freedom(str(symbol), unit, lower, upper, default, max(abs(slowest), abs(fastest)))
+    return DofSummary(str(symbol), unit, lower, upper, default, max(abs(slowest), abs(fastest)))
 
 
-def _condition(name: str, constraint: Constraint) -> Condition:
+def _summarize_constraint(name: str, constraint: Constraint) -> ConstraintSummary:
     bounds_are_numbers = not (constraint.lower.symbols or constraint.upper.symbols)
     only = constraint.expression.symbols[0] if len(constraint.expression.symbols) == 1 else None
     simple = bounds_are_numbers and only is not None and bool(constraint.expression == only)
-    return Condition(
+    return ConstraintSummary(
         name=name,
-        text=f"{_bound(constraint.lower)} <= {constraint.expression!r} <= {_bound(constraint.upper)}",
+        text=f"{_format_bound(constraint.lower)} <= {constraint.expression!r} <= {_format_bound(constraint.upper)}",
         symbols=[str(symbol) for symbol in constraint.symbols],
         simple=simple,
     )
 
 
-def _bound(expression: object) -> str:
+def _format_bound(expression: object) -> str:
     text = repr(expression)
     try:
         return f"{float(text):.4g}"

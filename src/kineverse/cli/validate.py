@@ -6,14 +6,12 @@ import argparse
 import json
 from typing import TYPE_CHECKING, Any
 
-from kineverse.cli.paint import bounded, paint
-from kineverse.cli.progress import progress
-from kineverse.cli.reading import add_reading_options
-from kineverse.cli.table import table
-from kineverse.cli.wording import number
+from kineverse.cli.arguments import add_model_options
+from kineverse.cli.format_values import format_count
+from kineverse.cli.output import colorize, format_table, show_progress, truncate_lines
 
 if TYPE_CHECKING:
-    from kineverse.cli.examination import Examination
+    from kineverse.cli.file_validation import ValidationResult
 
 HELP = """read files strictly, and say what is wrong with them
 
@@ -54,7 +52,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--contacts", action="store_true", help="bodies that penetrate each other are problems (needs coal)"
     )
-    add_reading_options(parser, "remarks count as problems")
+    add_model_options(parser, "remarks count as problems")
     parser.add_argument(
         "--all", action="store_true", help=f"print all remarks and problems, not {SHOWN} of a kind"
     )
@@ -63,39 +61,41 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Examine, print, and return the worst status."""
-    from kineverse.cli.examination import examine
-    from kineverse.geometry.solids import coal_engine
+    from kineverse.cli.file_validation import validate_file
+    from kineverse.geometry.shapes import import_coal
 
-    files = progress(arguments.files, "validating", "file")
+    files = show_progress(arguments.files, "validating", "file")
     if arguments.contacts:
-        coal_engine()
+        import_coal()
     meshes, strict, touch = not arguments.no_meshes, arguments.strict, arguments.contacts
-    found = [examine(file, meshes, strict, touch, arguments.root, arguments.loops) for file in files]
+    found = [validate_file(file, meshes, strict, touch, arguments.root, arguments.loops) for file in files]
     status = max(examination.status for examination in found)
     most = None if arguments.all else SHOWN if len(found) == 1 else SHOWN_OF_SEVERAL
     if arguments.json:
-        print(json.dumps({"status": status, "files": [as_json(e) for e in found]}, allow_nan=False))
+        print(
+            json.dumps({"status": status, "files": [validation_to_json(e) for e in found]}, allow_nan=False)
+        )
     elif len(found) > 1:
-        told = [report(e, most) for e in found if e.status]
-        print("\n\n".join([_table(found), *("\n".join(lines) for lines in told)]))
+        told = [format_validation(e, most) for e in found if e.status]
+        print("\n\n".join([_format_results(found), *("\n".join(lines) for lines in told)]))
     elif found[0].error is not None:
         raise found[0].error
     else:
-        print("\n".join(report(found[0], most)))
+        print("\n".join(format_validation(found[0], most)))
     return status
 
 
-def report(found: Examination, most: int | None) -> list[str]:
+def format_validation(found: ValidationResult, most: int | None) -> list[str]:
     """Return what was found in one file, with at most so many remarks, and problems of a kind."""
     if found.error is not None:
-        return [found.name, f"  {paint('cannot be read', '!')}: {found.reason}"]
-    lines = [f"{found.name}: {found.kind}", f"  {found.contents}", f"  {_verdict(found)}"]
-    for kind, texts in _by_kind(found).items():
-        lines += [f"  {kind}", *bounded([f"    {text}" for text in texts], most, "    ")]
+        return [found.name, f"  {colorize('cannot be read', '!')}: {found.reason}"]
+    lines = [f"{found.name}: {found.kind}", f"  {found.contents}", f"  {_format_verdict(found)}"]
+    for kind, texts in _group_by_kind(found).items():
+        lines += [f"  {kind}", *truncate_lines([f"    {text}" for text in texts], most, "    ")]
     return lines
 
 
-def _by_kind(found: Examination) -> dict[str, list[str]]:
+def _group_by_kind(found: ValidationResult) -> dict[str, list[str]]:
     """Return the problems under their kinds, and the remarks at the end."""
     kinds: dict[str, list[str]] = {"mistakes": list(found.faults)} if found.faults else {}
     for problem in found.problems:
@@ -103,16 +103,16 @@ def _by_kind(found: Examination) -> dict[str, list[str]]:
     return {**kinds, "remarks": list(found.remarks)} if found.remarks else kinds
 
 
-def _verdict(found: Examination) -> str:
+def _format_verdict(found: ValidationResult) -> str:
     problems, remarks = len(found.problems), len(found.remarks)
     text = f"{problems or 'no'} problem{'' if problems == 1 else 's'}"
     if found.faults:
-        text = f"not read strictly: {number(len(found.faults), 'mistake')}, {text}"
+        text = f"not read strictly: {format_count(len(found.faults), 'mistake')}, {text}"
     noted = f", {remarks} remark{'' if remarks == 1 else 's'}" if remarks else ""
-    return f"{paint(text, '!' if found.status else '+')}{noted}"
+    return f"{colorize(text, '!' if found.status else '+')}{noted}"
 
 
-def _table(found: list[Examination]) -> str:
+def _format_results(found: list[ValidationResult]) -> str:
     rows = [
         (e.name, e.format, "", "", "", "", "cannot be read")
         if e.model is None
@@ -127,10 +127,12 @@ def _table(found: list[Examination]) -> str:
         )
         for e in found
     ]
-    return table(("file", "format", "frames", "DoF", "constraints", "remarks", "problems"), rows, "<<>>>>>")
+    return format_table(
+        ("file", "format", "frames", "DoF", "constraints", "remarks", "problems"), rows, "<<>>>>>"
+    )
 
 
-def as_json(found: Examination) -> dict[str, Any]:
+def validation_to_json(found: ValidationResult) -> dict[str, Any]:
     """Return everything about one file as JSON has it."""
     model = found.model
     counts = None

@@ -7,19 +7,23 @@ import signal
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Protocol
 
-from kineverse.cli.assignments import add_set_option, parse_assignments, parse_length
-from kineverse.cli.beyond_limits import note, remarks
-from kineverse.cli.listing import asked_for, print_articulations, print_models
-from kineverse.cli.progress import progress
-from kineverse.cli.reading import add_reading_options, load
-from kineverse.errors import ValueRejectedError
+from kineverse.cli.arguments import (
+    add_model_options,
+    add_set_option,
+    find_limit_notes,
+    load_model,
+    parse_assignments,
+    parse_length,
+    print_notes,
+)
+from kineverse.cli.info import is_gallery_list, print_articulations, print_models
+from kineverse.cli.output import show_progress
+from kineverse.errors import InvalidValueError
 
 if TYPE_CHECKING:
     import kineverse as kv
-    from kineverse.view.living.page import LivingPage
-    from kineverse.view.viewer import Viewer
 
 HELP = """show a model in the browser, with a slider for everything that moves
 
@@ -56,7 +60,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--degrees", action="store_true", help="show angles in degrees")
     parser.add_argument("--picture", metavar="PATH", help="write a picture (.png) instead of opening a page")
-    add_reading_options(parser)
+    add_model_options(parser)
     add_page_options(parser)
 
 
@@ -82,27 +86,27 @@ def run(arguments: argparse.Namespace) -> int:
     near = None if arguments.near is None else parse_length(arguments.near)
     if arguments.model is None:
         if arguments.picture is not None:
-            raise ValueRejectedError("--picture needs a MODEL to draw; 'kineverse view' alone lists them")
+            raise InvalidValueError("--picture needs a MODEL to draw; 'kineverse view' alone lists them")
         return print_models()
-    if asked_for(arguments.model):
+    if is_gallery_list(arguments.model):
         return print_articulations()
 
     from kineverse.view import meshes
     from kineverse.view.poses import complete
-    from kineverse.view.title import title_of_file
+    from kineverse.view.title import read_title
     from kineverse.view.viewer import Viewer
 
-    label = title_of_file(arguments.model)
-    model = load(arguments, arguments.model)
+    label = read_title(arguments.model)
+    model = load_model(arguments, arguments.model)
     if assigned:
-        note(remarks(model, complete(model, assigned), arguments.assignments))
-    for mesh in progress(meshes.seen_in(model), "reading meshes", "file"):
-        meshes.load(mesh)  # and remembered: whoever draws them finds them read
+        print_notes(find_limit_notes(model, complete(model, assigned), arguments.assignments))
+    for mesh in show_progress(meshes.list_visual_meshes(model), "reading meshes", "file"):
+        meshes.load_mesh(mesh)  # and remembered: whoever draws them finds them read
     if arguments.picture is not None:
         return _write_picture(arguments, model, assigned, near)
     options = page_options(arguments)
     with (
-        until_interrupted(),
+        handle_interrupts(),
         Viewer(model, assigned, label=label, degrees=arguments.degrees, **options) as page,
     ):
         if near is not None:
@@ -111,11 +115,11 @@ def run(arguments: argparse.Namespace) -> int:
             page.collisions.show_decomposed()
         if arguments.collisions:
             page.collisions.show_shapes()
-        note_problems(page.problems)
+        print_mesh_problems(page.problems)
         if page.unplaced:
             names = ", ".join(page.unplaced)
             print(f"kineverse: note: not finite at this state, and hidden: {names}", file=sys.stderr)
-        announce(page, browser=not arguments.no_browser)
+        print_address(page, browser=not arguments.no_browser)
         print(model, flush=True)
         page.wait()
     return 0
@@ -125,21 +129,32 @@ def _write_picture(
     arguments: argparse.Namespace, model: kv.Model, state: dict[str, float], near: float | None
 ) -> int:
     """Write a picture of the state, and say what it cannot show."""
-    from kineverse.geometry.left_out import remarks, unusable
-    from kineverse.view import meshes, save
+    from kineverse.geometry.exclusions import find_unusable_shapes, label_unusable_shapes
+    from kineverse.view import meshes, save_picture
 
     shown = {"collisions": arguments.collisions, "near": near, "decomposed": arguments.decomposed}
-    save(arguments.picture, model, state, **shown)
-    problems = [f"{m.uri}: {meshes.load(m).problem}" for m in meshes.seen_in(model) if meshes.load(m).problem]
-    note_problems(problems)
-    left_out = remarks(model, unusable(model)) if near is not None else {}
+    save_picture(arguments.picture, model, state, **shown)
+    problems = [
+        f"{m.uri}: {meshes.load_mesh(m).problem}"
+        for m in meshes.list_visual_meshes(model)
+        if meshes.load_mesh(m).problem
+    ]
+    print_mesh_problems(problems)
+    left_out = label_unusable_shapes(model, find_unusable_shapes(model)) if near is not None else {}
     if left_out:
         print(f"kineverse: note: no distances to {', '.join(left_out)}", file=sys.stderr)
     print(f"picture: {arguments.picture}")
     return 0
 
 
-def announce(page: Viewer | LivingPage, browser: bool) -> None:
+class _Page(Protocol):
+    @property
+    def address(self) -> str:
+        """URL with the token of the page."""
+        ...  # pragma: no cover
+
+
+def print_address(page: _Page, browser: bool) -> None:
     """Print the address of a page and open it, if there is a screen to open it on."""
     print(f"{page.address}   (Ctrl-C ends)", flush=True)
     if browser:
@@ -148,7 +163,7 @@ def announce(page: Viewer | LivingPage, browser: bool) -> None:
         open_page(page.address)
 
 
-def note_problems(problems: list[str]) -> None:
+def print_mesh_problems(problems: list[str]) -> None:
     """Say on standard error, in one line, that meshes are missing."""
     if problems:
         more = f" and {len(problems) - 1} more" if len(problems) > 1 else ""
@@ -156,7 +171,7 @@ def note_problems(problems: list[str]) -> None:
 
 
 @contextmanager
-def until_interrupted() -> Iterator[None]:
+def handle_interrupts() -> Iterator[None]:
     """Take Ctrl-C as the way to leave that it is, and SIGTERM, by which programs are stopped, as the same."""
 
     def interrupt(*_: object) -> None:

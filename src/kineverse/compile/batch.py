@@ -1,24 +1,94 @@
-"""Evaluation at many points: on vectors of configurations, and what there is until that is compiled."""
+"""Evaluation at many points, into reused aligned buffers.
+
+Memory that is new to a process is filled with zeros by the system at first touch, which takes three times as
+long as computing and writing poses does. A loop over batches drops one result for each it makes, so it gets
+that memory back.
+"""
 
 from __future__ import annotations
 
 import ctypes
 import itertools
+import weakref
 from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from kineverse.errors import CompileError, ShapeError, UnsolvedError
+from kineverse.errors import CompileError, NoSolutionError, ShapeError
 
-from .batch_source import KIND, batch_source, vectorisable
-from .binding import Array, Shape, bind
-from .library import Library
-from .memory import aligned
+from .batch_codegen import BATCH_KIND, generate_batch_source, is_vectorizable
+from .c_library import ProgramLibrary
+from .evaluator import Array, OutputShape, bind
+from .parallel import cores, parallel_rows
 from .program import CasadiFunction, Program
-from .rows import cores, over_rows
-from .signature import Signature, numbers
+from .signature import Signature, as_doubles
+
+_CACHE_LINE = 64
+# Smaller blocks the C library keeps by itself.
+_SMALLEST_BUFFER = 4 * 2**20
+_LARGEST_TOTAL = 128 * 2**20
+
+# Longest free first. Used by operations that are atomic: garbage collection may interrupt this very code to
+# give back a block.
+_free_blocks: list[npt.NDArray[np.float64]] = []
+
+
+def allocate_aligned(size: int) -> npt.NDArray[np.float64]:
+    """Return an uninitialised vector that begins at a cache line.
+
+    Its memory is used for another vector only after this one and all arrays made from it are gone.
+
+    Parameters
+    ----------
+    size
+        How many numbers.
+    """
+    if 8 * size < _SMALLEST_BUFFER:
+        return _from_line(np.empty(size + _CACHE_LINE // 8))[:size]
+    block = _take_free_block(size + _CACHE_LINE // 8)
+    if block is None:
+        block = np.empty(size + _CACHE_LINE // 8)
+    lease = _Lease(block)
+    weakref.finalize(lease, _give_back, block).atexit = False
+    return _from_line(np.asarray(lease))[:size]
+
+
+class _Lease:
+    """What arrays in a block are made from: they refer to it, so it lives as long as the last of them."""
+
+    __slots__ = ("__array_interface__", "__weakref__")
+
+    def __init__(self, block: npt.NDArray[np.float64]) -> None:
+        self.__array_interface__ = block.__array_interface__
+
+
+def _from_line(block: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+    return block[-block.__array_interface__["data"][0] % _CACHE_LINE // 8 :]
+
+
+def _take_free_block(size: int) -> npt.NDArray[np.float64] | None:
+    """Return a free block of this size, if there is one."""
+    for _ in range(len(_free_blocks)):
+        try:
+            block = _free_blocks.pop(0)
+        except IndexError:
+            break
+        if block.size == size:
+            return block
+        _free_blocks.append(block)
+    return None
+
+
+def _give_back(block: npt.NDArray[np.float64]) -> None:
+    _free_blocks.append(block)
+    while sum(b.nbytes for b in _free_blocks[:]) > _LARGEST_TOTAL:
+        try:
+            _free_blocks.pop(0)
+        except IndexError:
+            break
+
 
 # Results beyond this are written past the caches: nobody could read them from there in time.
 _STREAMED_BYTES = 8 * 2**20
@@ -28,7 +98,7 @@ _INTERPRETING, _INTERPRETING_ONE = 50e-9, 3e-9
 # So many rows at a time go through CasADi's map.
 _MAPPED = 32
 
-Compiled = Callable[[int, int, int, int], int]
+BatchFunction = Callable[[int, int, int, int], int]
 
 
 class Batch:
@@ -54,7 +124,7 @@ class Batch:
     """
 
     def __init__(
-        self, program: Program, signature: Signature, shapes: Sequence[Shape], single: bool, tier: str
+        self, program: Program, signature: Signature, shapes: Sequence[OutputShape], single: bool, tier: str
     ) -> None:
         self._program = program
         self._signature = signature
@@ -62,9 +132,9 @@ class Batch:
         self._single = single
         self._insist = tier == "c"
         self._spent = 0.0
-        self._library: Library[Compiled] | None = None
-        if tier != "interpreter" and vectorisable(program):
-            self._library = Library(program, KIND, lambda: batch_source(program), _load)
+        self._library: ProgramLibrary[BatchFunction] | None = None
+        if tier != "interpreter" and is_vectorizable(program):
+            self._library = ProgramLibrary(program, BATCH_KIND, lambda: generate_batch_source(program), _load)
 
     def __call__(self, x: npt.ArrayLike, out: Any, function: CasadiFunction) -> Any:
         """Return the outputs at all rows of ``x``, see :meth:`CompiledFunction.batch`.
@@ -100,13 +170,13 @@ class Batch:
         for row in np.flatnonzero(rows):
             try:
                 self._program.check(points[row], [r[row] for r in results])
-            except UnsolvedError as error:
-                raise UnsolvedError(f"Row {row}: {error}") from None
+            except NoSolutionError as error:
+                raise NoSolutionError(f"Row {row}: {error}") from None
 
     def _points(self, x: npt.ArrayLike) -> Array:
         size = self._signature.size
         wanted = f"an array of shape (N, {size}), a configuration per row"
-        points = numbers(x, wanted)
+        points = as_doubles(x, wanted)
         if points.ndim != 2 or points.shape[1] != size:
             raise ShapeError(f"Expected {wanted}, not an array of shape {points.shape}.")
         return np.ascontiguousarray(points)
@@ -114,7 +184,7 @@ class Batch:
     def _allocated(self, rows: int) -> list[Array]:
         """Return arrays that begin at cache lines, so that they can be written in whole lines."""
         return [
-            aligned(rows * size).reshape(rows, *shape)
+            allocate_aligned(rows * size).reshape(rows, *shape)
             for shape, size in zip(self._shapes, self._program.sizes, strict=True)
         ]
 
@@ -137,7 +207,7 @@ class Batch:
             raise ShapeError("out= has arrays that share memory.")
         return given
 
-    def _code(self, rows: int) -> Compiled | None:
+    def _code(self, rows: int) -> BatchFunction | None:
         """Return compiled code if there is some, or if it pays to wait for it."""
         library = self._library
         if library is None or library.error is not None:
@@ -155,7 +225,7 @@ class Batch:
                 library.request()
         return library.code
 
-    def _run(self, code: Compiled, points: Array, results: list[Array]) -> None:
+    def _run(self, code: BatchFunction, points: Array, results: list[Array]) -> None:
         rows, size = points.shape
         sizes = self._program.sizes
         streaming = sum(result.nbytes for result in results) > _STREAMED_BYTES
@@ -169,7 +239,7 @@ class Batch:
                 raise MemoryError("There is no memory for a batch.")
 
         # Some 100 µs of work, twice of what it takes to wake a thread.
-        over_rows(work, rows, 2_000_000 // (self._program.instructions + 20))
+        parallel_rows(work, rows, 2_000_000 // (self._program.instructions + 20))
 
     def _interpret(self, points: Array, results: list[Array], function: CasadiFunction) -> None:
         flat = [r.reshape(len(points), size) for r, size in zip(results, self._program.sizes, strict=True)]
@@ -189,7 +259,7 @@ class Batch:
                 for target, output in zip(flat, outputs, strict=True):
                     target[start:stop] = output[: stop - start]
 
-        over_rows(work, rows, 200_000 // (self._program.instructions + 20), _MAPPED)
+        parallel_rows(work, rows, 200_000 // (self._program.instructions + 20), _MAPPED)
 
 
 def _overlap(arrays: Sequence[Array]) -> bool:
@@ -203,7 +273,7 @@ def _address(array: Array) -> int:
     return address
 
 
-def _load(path: str) -> Compiled:
+def _load(path: str) -> BatchFunction:
     code = ctypes.CDLL(path).kineverse_batch
     code.argtypes = (ctypes.c_void_p, ctypes.c_void_p, ctypes.c_longlong, ctypes.c_int)
     code.restype = ctypes.c_int

@@ -1,4 +1,4 @@
-"""Compiled libraries on disk, by the digest of what they are made from.
+"""Disk cache of compiled libraries, keyed by the digest of their source.
 
 Code from this folder is loaded into the process, so nobody else may be able to write there, see
 :mod:`.private_folder`. Every library ends in a digest of itself that is checked before it is loaded, and it
@@ -185,7 +185,8 @@ def private_subfolder(name: str) -> PrivateFolder:
         return PrivateFolder(path)
     except (NotPrivateError, OSError) as error:
         logger.warning(
-            "What is computed is not kept for other processes: the cache folder %s", _said(path, error)
+            "What is computed is not kept for other processes: the cache folder %s",
+            _describe_failure(path, error),
         )
     path = Path(_private_folder().name) / name
     path.mkdir(mode=0o700, exist_ok=True)
@@ -204,14 +205,15 @@ def _open(folder: str | None, caches: str | None, home: str | None) -> LibraryCa
         return LibraryCache(wanted)
     except (NotPrivateError, OSError) as error:
         logger.warning(
-            "Compiled functions are not kept for other processes: the cache folder %s", _said(wanted, error)
+            "Compiled functions are not kept for other processes: the cache folder %s",
+            _describe_failure(wanted, error),
         )
     if not _private_folder_is_there():
         _private_folder.cache_clear()
     return LibraryCache(Path(_private_folder().name), made=True)
 
 
-def _said(folder: Path, error: Exception) -> str:
+def _describe_failure(folder: Path, error: Exception) -> str:
     if isinstance(error, OSError):
         return f"{folder} cannot be made or opened ({error.strerror})."
     return (

@@ -14,17 +14,16 @@ import casadi as ca
 import numpy as np
 import numpy.typing as npt
 
-from kineverse.errors import CompileError, ValueRejectedError
+from kineverse.errors import CompileError, InvalidValueError
 from kineverse.expressions import Expression, ExpressionLike, array
 from kineverse.symbols import Symbol
 
 from .batch import Batch
-from .binding import Array, Shape, bind, pooled
-from .evaluator import Evaluator
-from .library import Library
-from .native import MOST_OUTPUTS, native
-from .program import NAME, SINGLE, CasadiFunction, Program, Vector
-from .signature import signature
+from .c_library import ProgramLibrary
+from .call_extension import MOST_OUTPUTS, call_extension
+from .evaluator import Array, Evaluator, OutputShape, bind, make_pooled_call
+from .program import FUNCTION_NAME, SINGLE_KIND, CasadiFunction, DoubleVector, Program
+from .signature import make_signature
 
 if TYPE_CHECKING:
     from typing_extensions import TypeVar
@@ -86,7 +85,7 @@ def compile(  # noqa: A001
         An expression (calls return one array), or a list or tuple of them (calls return a tuple of arrays).
     inputs
         The symbols that make up the input vector, in this order; by default all symbols of the outputs,
-        sorted by name, which is not the order of a chain: that is ``model.symbols_of(frame)``.
+        sorted by name, which is not the order of a chain: that is ``model.find_term_symbols(frame)``.
     tier
         ``"auto"`` as described; without a C compiler, or where C is of no use, the interpreter stays.
         ``"interpreter"`` never compiles. ``"c"`` insists on C.
@@ -97,7 +96,7 @@ def compile(  # noqa: A001
     ------
     ExpressionError
         If something else than symbols is among the inputs.
-    NameTakenError
+    DuplicateNameError
         If a symbol is among the inputs twice.
     UnknownNameError
         If outputs depend on symbols that are not among the inputs.
@@ -105,7 +104,7 @@ def compile(  # noqa: A001
         If there is nothing to compile, or if tier ``"c"`` is known to be impossible.
     """
     if tier not in ("auto", "interpreter", "c"):
-        raise ValueRejectedError(f"Unknown tier {tier!r}; tiers are 'auto', 'interpreter' and 'c'.")
+        raise InvalidValueError(f"Unknown tier {tier!r}; tiers are 'auto', 'interpreter' and 'c'.")
     single = not isinstance(outputs, (list, tuple))
     expressions = tuple(array(o) for o in ((outputs,) if single else outputs))  # type: ignore[union-attr]
     if not expressions:
@@ -151,7 +150,7 @@ class CompiledFunction(Generic[Results]):
 
     inputs: tuple[Symbol, ...]
     names: tuple[str, ...]
-    shapes: tuple[Shape, ...]
+    shapes: tuple[OutputShape, ...]
     tier: Tier
     _call: Callable[[Any], Results]
 
@@ -164,7 +163,7 @@ class CompiledFunction(Generic[Results]):
         tier: WantedTier = "auto",
         wait: bool = False,
     ) -> None:
-        self._signature = signature(outputs, inputs)
+        self._signature = make_signature(outputs, inputs)
         self.inputs = self._signature.inputs
         self.names = self._signature.names
         self.shapes = tuple(e.shape for e in outputs)
@@ -175,14 +174,14 @@ class CompiledFunction(Generic[Results]):
         self._evaluators: WeakSet[Evaluator] = WeakSet()
         self._program = program = Program(outputs, self.inputs)
         self._batch: Batch | None = None
-        self._library: Library[_Code] | None = None
+        self._library: ProgramLibrary[_Code] | None = None
         if tier == "c" or (tier == "auto" and program.instructions >= _WORTH_COMPILING):
-            self._library = Library(program, SINGLE, program.source, _load, self._ready)
+            self._library = ProgramLibrary(program, SINGLE_KIND, program.source, _load, self._ready)
             if tier == "c" and self._library.error:
                 raise CompileError(f"The function cannot be compiled: {self._library.error}.")
         if self._library is not None:
             # First, so that it is there when the function's own library is.
-            native.prepare(self._ready, urgent=wait)
+            call_extension.prepare(self._ready, urgent=wait)
         if self._library is not None and self._library.find():
             self._ready()
             return
@@ -214,7 +213,7 @@ class CompiledFunction(Generic[Results]):
             If ``x`` is no vector of n numbers.
         UnknownNameError
             If a mapping misses a symbol or knows one that is not among the inputs.
-        ValueRejectedError
+        InvalidValueError
             If a mapping contains NaN or what is not a number.
         """
         return self._call(x)
@@ -303,13 +302,13 @@ class CompiledFunction(Generic[Results]):
             Where its C is, if it is compiled.
         """
         shapes, check, convert = self.shapes, self._program.checked, self._signature.vector
-        direct = address is not None and len(shapes) <= MOST_OUTPUTS and native.module is not None
+        direct = address is not None and len(shapes) <= MOST_OUTPUTS and call_extension.module is not None
         if direct:
             lengthy = self._program.instructions > _LENGTHY
             size = self._signature.size
-            call = native.module.Call(address, size, shapes, self._single, lengthy, convert, check)
+            call = call_extension.module.Call(address, size, shapes, self._single, lengthy, convert, check)
         else:
-            call = pooled(function, self._signature.size, shapes, self._single, convert, check)
+            call = make_pooled_call(function, self._signature.size, shapes, self._single, convert, check)
         with self._lock:
             self._function = function
             self._native = address if direct else None
@@ -330,9 +329,9 @@ class CompiledFunction(Generic[Results]):
             check = self._program.checked
             evaluator._evaluate_by(*bind(self._function, evaluator.input, evaluator.outputs, check))
 
-    def _native_evaluator(self, vector: Vector, outputs: tuple[Array, ...]) -> Evaluator:
+    def _native_evaluator(self, vector: DoubleVector, outputs: tuple[Array, ...]) -> Evaluator:
         lengthy = self._program.instructions > _LENGTHY
-        evaluator: Evaluator = native.module.Evaluator(
+        evaluator: Evaluator = call_extension.module.Evaluator(
             self._native, vector, outputs, lengthy, self._signature.vector, self._program.checked
         )
         return evaluator
@@ -361,8 +360,8 @@ class _Code:
 
 
 def _load(path: str) -> _Code:
-    address = ctypes.cast(ctypes.CDLL(path)[NAME], ctypes.c_void_p).value
-    return _Code(ca.external(NAME, path), address or 0)
+    address = ctypes.cast(ctypes.CDLL(path)[FUNCTION_NAME], ctypes.c_void_p).value
+    return _Code(ca.external(FUNCTION_NAME, path), address or 0)
 
 
 def _restore(

@@ -1,4 +1,4 @@
-"""A folder that nobody else can write to, held open, so that nobody can put another one in its place.
+"""Folder that only this user can write to, held open against replacement.
 
 Code from the cache is loaded into the process. So the way to the folder is walked one step after the other:
 every folder on it belongs to root or to this user and cannot be written by others, unless it is sticky like

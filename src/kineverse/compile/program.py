@@ -17,14 +17,14 @@ import numpy.typing as npt
 
 from kineverse.errors import CompileError
 from kineverse.expressions import Expression, layout
-from kineverse.expressions.implicit import explain, implicit_nodes
+from kineverse.expressions.implicit import explain_no_solution, implicit_nodes
 from kineverse.symbols import Symbol
 
 CasadiFunction: TypeAlias = Any
-Vector: TypeAlias = npt.NDArray[np.float64]
-Check: TypeAlias = Callable[[Vector, Vector | Sequence[Vector]], None]
+DoubleVector: TypeAlias = npt.NDArray[np.float64]
+Check: TypeAlias = Callable[[DoubleVector, DoubleVector | Sequence[DoubleVector]], None]
 
-NAME = "kineverse_function"
+FUNCTION_NAME = "kineverse_function"
 
 # Of two zeros CasADi's interpreter returns the first, the C library the second.
 _PRELUDE = """
@@ -37,7 +37,7 @@ static inline double first_larger(double x, double y) { return x >= y || y != y 
 """
 
 # Raise the number when other source is generated from the same program.
-SINGLE = "single 2"
+SINGLE_KIND = "single 2"
 
 # From so many constants on an output begins as a copy of a table: the time of a compiler goes by statements.
 _TABLE = 64
@@ -63,7 +63,7 @@ class Program:
         self._columns = ca.substitute(columns, [symbols], [self._vector])
         self._function: CasadiFunction = None
         # Common parts are not shared yet: for a library that exists already, that would be time lost.
-        graph = ca.Function(NAME, [self._vector], self._columns)
+        graph = ca.Function(FUNCTION_NAME, [self._vector], self._columns)
         self.instructions: int = graph.n_instructions()
         # Closed loops, which have no solution everywhere.
         self.implicit = implicit_nodes(outputs)
@@ -83,7 +83,7 @@ class Program:
         digest.update(repr(details).encode())
         return digest.hexdigest()[:40]
 
-    def check(self, vector: Vector, results: Vector | Sequence[Vector]) -> None:
+    def check(self, vector: DoubleVector, results: DoubleVector | Sequence[DoubleVector]) -> None:
         """Raise an error if results are NaN because an implicit function has no solution.
 
         Parameters
@@ -95,12 +95,12 @@ class Program:
 
         Raises
         ------
-        UnsolvedError
+        NoSolutionError
             Naming the function, and where it was asked for.
         """
         arrays = (results,) if isinstance(results, np.ndarray) else results
         if any(np.isnan(array).any() for array in arrays):
-            error = explain(self.implicit, self._symbols, vector)
+            error = explain_no_solution(self.implicit, self._symbols, vector)
             if error is not None:
                 raise error
 
@@ -113,7 +113,7 @@ class Program:
     def function(self) -> CasadiFunction:
         """CasADi's function of one input vector, common parts shared."""
         if self._function is None:
-            self._function = ca.Function(NAME, [self._vector], self._shared())
+            self._function = ca.Function(FUNCTION_NAME, [self._vector], self._shared())
         return self._function
 
     def _shared(self) -> list[ca.SX]:
@@ -143,7 +143,7 @@ class Program:
                 elements = [0.0 if n in table else e for n, e in enumerate(elements)]
             columns.append(ca.densify(ca.vertcat(*elements)) if elements else column)
         generator = ca.CodeGenerator("kineverse.c")
-        generator.add(ca.Function(NAME, [self._vector], columns))
+        generator.add(ca.Function(FUNCTION_NAME, [self._vector], columns))
         # Comments hold the names of functions that are called inside, such as those of loops.
         code = re.sub(r"/\*.*?\*/", "", generator.dump(), flags=re.DOTALL)
         if re.search(r"\berfinv\(", code):
@@ -151,7 +151,9 @@ class Program:
         main = _MAIN.search(code)
         if main is None:
             raise CompileError("CasADi's C is not what it was: its function is not found in it.")
-        return _PRELUDE + code[: main.start()] + _straight(main, self.sizes, tables) + code[main.end() :]
+        return (
+            _PRELUDE + code[: main.start()] + _remove_branches(main, self.sizes, tables) + code[main.end() :]
+        )
 
 
 # The function itself; those that it calls come after it and may be asked for a part of their results.
@@ -162,7 +164,7 @@ _INPUT = re.compile(r"arg\[0\]\? arg\[0\]\[(\d+)\] : 0")
 _OUTPUT = re.compile(r"  if \(res\[(\d+)\]!=0\) res\[\d+\]\[(\d+)\]=(\w+);\n")
 
 
-def _straight(main: re.Match[str], sizes: Sequence[int], tables: dict[int, dict[int, float]]) -> str:
+def _remove_branches(main: re.Match[str], sizes: Sequence[int], tables: dict[int, dict[int, float]]) -> str:
     """Return a function without a branch for each number, and with constants that come from tables."""
     declared, body = main.groups()
 
@@ -175,13 +177,13 @@ def _straight(main: re.Match[str], sizes: Sequence[int], tables: dict[int, dict[
         raise CompileError("CasADi's C is not what it was: its results are not found in it.")
     data, copies = "", ""
     for k, table in tables.items():
-        numbers = ", ".join(literal(table.get(place, 0.0)) for place in range(sizes[k]))
+        numbers = ", ".join(c_literal(table.get(place, 0.0)) for place in range(sizes[k]))
         data += f"static const casadi_real constants{k}[] = {{{numbers}}};\n"
         copies += f"  __builtin_memcpy(res[{k}], constants{k}, sizeof constants{k});\n"
     return data + declared + copies + body
 
 
-def literal(x: float) -> str:
+def c_literal(x: float) -> str:
     """Return a number as C has it, exactly."""
     if x != x:
         return "NAN"

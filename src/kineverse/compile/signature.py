@@ -8,17 +8,17 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from kineverse._checks import real_number
 from kineverse.errors import (
+    DuplicateNameError,
     ExpressionError,
-    NameTakenError,
+    InvalidValueError,
     ShapeError,
     UnknownNameError,
-    ValueRejectedError,
-    given_twice,
+    duplicate_value_error,
     suggest,
 )
 from kineverse.expressions import Expression
-from kineverse.number import real_number
 from kineverse.state import State
 from kineverse.symbols import Symbol
 
@@ -63,14 +63,14 @@ class Signature:
             If it is no vector of n numbers.
         UnknownNameError
             If a mapping lacks a symbol that has no value of its own, or has one that is none of the inputs.
-        ValueRejectedError
+        InvalidValueError
             If a mapping has NaN or what is not a number.
         """
         if isinstance(x, Mapping):
             return self._from_mapping(x)
         if self.size and isinstance(x, tuple) and not x:
             raise ShapeError(f"Nothing is given; a call takes a vector of {self._described()}, or a mapping.")
-        array = numbers(x, f"a vector of {self._described()}")
+        array = as_doubles(x, f"a vector of {self._described()}")
         if array.shape != (self.size,):
             raise ShapeError(
                 f"Expected a vector of {self._described()}, not an array of shape {array.shape}."
@@ -91,7 +91,7 @@ class Signature:
                 unknown.append(str(key))
                 continue
             if position in given:
-                raise given_twice(self.names[position])
+                raise duplicate_value_error(self.names[position])
             given.add(position)
             vector[position] = self._number(position, value)
         # Such mappings are written for this function, typing errors included.
@@ -111,18 +111,18 @@ class Signature:
         try:
             number = real_number(value)
         except (TypeError, ValueError, OverflowError, ExpressionError):
-            raise ValueRejectedError(
+            raise InvalidValueError(
                 f"The value of '{self.names[position]}' is not a number: {value!r}."
             ) from None
         if number != number:
-            raise ValueRejectedError(f"The value of '{self.names[position]}' is NaN.")
+            raise InvalidValueError(f"The value of '{self.names[position]}' is NaN.")
         return number
 
     def _described(self) -> str:
         return f"{self.size} numbers ({_listed(self.names, 6)})" if self.size else "no numbers"
 
 
-def signature(outputs: Sequence[Expression], inputs: Iterable[Symbol] | None) -> Signature:
+def make_signature(outputs: Sequence[Expression], inputs: Iterable[Symbol] | None) -> Signature:
     """Return the signature of a function of ``outputs``.
 
     Parameters
@@ -136,7 +136,7 @@ def signature(outputs: Sequence[Expression], inputs: Iterable[Symbol] | None) ->
     ------
     ExpressionError
         If something else than symbols is among the inputs.
-    NameTakenError
+    DuplicateNameError
         If a symbol occurs twice, or two have the same text name.
     UnknownNameError
         If the outputs depend on symbols that are not among the inputs.
@@ -156,13 +156,13 @@ def signature(outputs: Sequence[Expression], inputs: Iterable[Symbol] | None) ->
         names = sorted({n for n in found.names if found.names.count(n) > 1})
         equal = len(set(found.inputs)) < found.size
         reason = "given twice" if equal else "the name of several symbols (of different roles or values)"
-        raise NameTakenError(
+        raise DuplicateNameError(
             f"The inputs of a function have names of their own: {_listed(names)} is {reason}."
         )
     return found
 
 
-def numbers(x: Any, wanted: str) -> npt.NDArray[np.float64]:
+def as_doubles(x: Any, wanted: str) -> npt.NDArray[np.float64]:
     """Return what holds real numbers as an array of doubles, of any shape and strides.
 
     Raises

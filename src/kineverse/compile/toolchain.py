@@ -1,4 +1,4 @@
-"""The C compiler of this machine, how it is called, and what identifies the code it makes.
+"""C compiler of this machine: detection, flags and identity.
 
 Compiled libraries are kept on disk, where another machine may find them (a home directory on a network) and
 where they outlive an update of the compiler. So everything that code made here depends on goes into
@@ -25,9 +25,9 @@ logger = logging.getLogger(__name__)
 # What makes C and interpreter agree to the last bit. No -ffast-math, which also deletes checks for NaN; no
 # contraction to fused operations; no values of functions computed by the compiler (-frounding-math), which
 # rounds them better than the C library.
-ARITHMETIC = ("-march=native", "-ffp-contract=off", "-fno-math-errno", "-frounding-math")
+FLOATING_POINT_FLAGS = ("-march=native", "-ffp-contract=off", "-fno-math-errno", "-frounding-math")
 # Undefined names shall fail when a function is linked and not when it is called.
-CLOSED = ("-Wl,-z,defs",) if sys.platform.startswith("linux") else ()
+NO_UNDEFINED_FLAGS = ("-Wl,-z,defs",) if sys.platform.startswith("linux") else ()
 
 _CPU_LINES = (
     "vendor_id", "cpu family", "model", "stepping", "flags",
@@ -61,7 +61,7 @@ class Toolchain:
             Where the library is written.
         """
         always = ("-std=gnu11", "-fPIC", "-shared", "-fvisibility=hidden", "-w")
-        return [*self.command, *ARITHMETIC, *always, *flags, "-x", "c", "-", "-o", output, "-lm"]
+        return [*self.command, *FLOATING_POINT_FLAGS, *always, *flags, "-x", "c", "-", "-o", output, "-lm"]
 
     def version(self) -> str:
         """Return the first line of what the compiler says about itself."""
@@ -69,7 +69,7 @@ class Toolchain:
 
     def vector_unit(self) -> str:
         """Return the widest vector instructions of doubles it uses: avx512, avx2, avx, sse2, neon or none."""
-        macros = self._ask(*ARITHMETIC, "-dM", "-E", "-x", "c", os.devnull)
+        macros = self._ask(*FLOATING_POINT_FLAGS, "-dM", "-E", "-x", "c", os.devnull)
         units = {
             "__AVX512DQ__": "avx512",
             "__AVX2__": "avx2",
@@ -116,7 +116,7 @@ def _find(preferred: str, path: str) -> Toolchain | None:
 def _identity(command: tuple[str, ...]) -> str:
     program = os.path.realpath(command[0])
     file = os.stat(program)
-    compiler = (program, file.st_size, file.st_mtime_ns, command[1:], ARITHMETIC)
+    compiler = (program, file.st_size, file.st_mtime_ns, command[1:], FLOATING_POINT_FLAGS)
     parts = (compiler, platform.system(), platform.machine(), _cpu())
     return hashlib.sha256(repr(parts).encode()).hexdigest()[:16]
 

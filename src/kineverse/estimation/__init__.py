@@ -2,19 +2,24 @@
 
 :mod:`kineverse.estimation.tracking` estimates the state of a model that is known,
 :mod:`kineverse.estimation.identification` the model of parts whose poses are known, and
-:mod:`kineverse.estimation.rating` says whether a model explains what is seen.
+:mod:`kineverse.estimation.plausibility` says whether a model explains what is seen.
 """
 
-from kineverse.vocabulary import MODULE, unknown_attribute
+from kineverse._synonyms import MODULE_SYNONYMS, unknown_attribute_error
 
-from .identification import Family, Fit, Found, Identifier, Unknown, identify
-from .identification.bodies import RigidBody
-from .identification.graph import Edge, Graph, identify_graph
+from .identification import Family, FamilyParameter, Fit, IdentificationResult, Identifier, identify
+from .identification.kinematic_graph.graph import KinematicEdge, KinematicGraph, RigidBody, identify_graph
 from .noise import pose_covariance
-from .rating import ImplausibleError, Plausibility, PlausibilityMonitor, Rating, plausibility
+from .plausibility import (
+    ImplausibleError,
+    JointVerdict,
+    Plausibility,
+    PlausibilityMonitor,
+    check_plausibility,
+)
 from .tracking import (
     Estimate,
-    Hypotheses,
+    HypothesisBank,
     ObservedExpression,
     ObservedPose,
     ObservedPosition,
@@ -23,31 +28,31 @@ from .tracking import (
 )
 
 __all__ = [
-    "Edge",
     "Estimate",
     "Family",
+    "FamilyParameter",
     "Fit",
-    "Found",
-    "Graph",
-    "Hypotheses",
+    "HypothesisBank",
+    "IdentificationResult",
     "Identifier",
     "ImplausibleError",
+    "JointVerdict",
+    "KinematicEdge",
+    "KinematicGraph",
     "ObservedExpression",
     "ObservedPose",
     "ObservedPosition",
     "Outliers",
     "Plausibility",
     "PlausibilityMonitor",
-    "Rating",
     "RigidBody",
     "Tracker",
-    "Unknown",
+    "check_plausibility",
     "identify",
     "identify_graph",
-    "plausibility",
     "pose_covariance",
 ]
 
 
 def __getattr__(name: str) -> object:
-    raise unknown_attribute("The package kineverse.estimation", name, __all__, MODULE)
+    raise unknown_attribute_error("The package kineverse.estimation", name, __all__, MODULE_SYNONYMS)

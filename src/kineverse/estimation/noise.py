@@ -1,4 +1,4 @@
-"""What an error of a pose is, for everything that observes poses.
+"""Convention for pose errors and their covariance.
 
 A measured pose is ``(p + δp, Exp(δθ) R)`` for a true position p and orientation R: both errors are written in
 the axes of the frame in which the pose was measured, linear part first, as the rows of
@@ -9,13 +9,14 @@ the axes of the frame in which the pose was measured, linear part first, as the 
 from __future__ import annotations
 
 import math
+from typing import TYPE_CHECKING
 
 import numpy as np
-import numpy.typing as npt
 
-from kineverse.errors import ValueRejectedError
+from kineverse.errors import InvalidValueError
 
-Array = npt.NDArray[np.float64]
+if TYPE_CHECKING:
+    from kineverse.lie import Array
 
 
 def pose_covariance(position: float, orientation: float) -> Array:
@@ -30,12 +31,12 @@ def pose_covariance(position: float, orientation: float) -> Array:
 
     Raises
     ------
-    ValueRejectedError
+    InvalidValueError
         If one of them is not a positive finite number.
     """
     for name, value in (("position", position), ("orientation", orientation)):
         if not (math.isfinite(value) and value > 0.0):
-            raise ValueRejectedError(
+            raise InvalidValueError(
                 f"The standard deviation of the {name} is {value}. It has to be positive and finite; what is "
                 "not measured at all is left out."
             )

@@ -1,7 +1,6 @@
 """The papers' experiments, made again: each measures, says beside it what the papers report, and draws."""
 
-from .options import Options
-from .registry import EXPERIMENTS, reproduce
-from .report import Figure, Report, Table
+from .registry import EXPERIMENTS, Options, reproduce
+from .report import Figure, Report, ReportTable
 
-__all__ = ["EXPERIMENTS", "Figure", "Options", "Report", "Table", "reproduce"]
+__all__ = ["EXPERIMENTS", "Figure", "Options", "Report", "ReportTable", "reproduce"]

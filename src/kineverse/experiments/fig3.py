@@ -20,9 +20,8 @@ from kineverse.model.frame import WORLD
 from kineverse.model.model import Model
 from kineverse.spatial import point
 
-from .options import Options
-from .registry import Progress
-from .report import Figure, Report, Table
+from .registry import Options, Progress
+from .report import Figure, Report, ReportTable
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure as Canvas
@@ -42,7 +41,7 @@ _BEFORE_CLOSED = tuple(10.0**-k for k in range(1, 9))
 
 
 @dataclass(frozen=True)
-class Measured:
+class GarageDoorCurves:
     """What both plots show, and the slopes.
 
     Attributes
@@ -63,19 +62,22 @@ class Measured:
 
 def run(progress: Progress, options: Options) -> Report:
     """Evaluate the door and its lock where the paper does."""
-    published, regular = _door("published"), _door("regular")
+    published, regular = _make_door("published"), _make_door("regular")
     paths = {
-        name: _path(published, part, _OPENINGS) for name, part in progress(PARTS.items(), "fig3", "point")
+        name: _edge_path(published, part, _OPENINGS)
+        for name, part in progress(PARTS.items(), "fig3", "point")
     }
     angles = np.arccos(_OPENINGS / LENGTH)
-    apart = max(float(np.abs(_path(regular, part, angles) - paths[n]).max()) for n, part in PARTS.items())
+    apart = max(
+        float(np.abs(_edge_path(regular, part, angles) - paths[n]).max()) for n, part in PARTS.items()
+    )
     inputs = [published.symbol("garage/door"), published.symbol("garage/bolt")]
     bound = compile(published.constraints["garage/lock"].upper, inputs)
     unlocked = {a: bound.batch(np.column_stack([np.full(50, a), _HANDLE])) for a in _LOCK_AT}
     slopes = _slopes(published, LENGTH - np.array(_BEFORE_CLOSED))
     regular_slopes = _slopes(regular, np.arccos(1 - np.array(_BEFORE_CLOSED) / LENGTH))
     closed = float(_slopes(regular, np.array([0.0]))[0])
-    measured = Measured(
+    measured = GarageDoorCurves(
         paths,
         unlocked,
         _slopes(published, np.linspace(0, LENGTH - 1e-3, 200)),
@@ -86,7 +88,7 @@ def run(progress: Progress, options: Options) -> Report:
         name="fig3",
         title="The garage door and its lock (2022 paper, Fig. 3, Eqs. 11-13)",
         tables=(
-            Table(
+            ReportTable(
                 "Ends of the door at some openings",
                 ("a [m]", "A: x [m]", "A: z [m]", "B: x [m]", "B: z [m]", "angle [deg]"),
                 tuple(
@@ -95,14 +97,14 @@ def run(progress: Progress, options: Options) -> Report:
                     if i in (0, 5, 10, 15, 19)
                 ),
             ),
-            Table(
+            ReportTable(
                 "The lock: upper bound of the speed",
                 ("a [m]", "b = 0", "b = 0.29", "b = 0.31", "b = 0.6", "unlocked from b ="),
                 tuple(
                     (a, *(float(bound([a, b])) for b in (0.0, 0.29, 0.31, 0.6)), steps[a]) for a in _LOCK_AT
                 ),
             ),
-            Table(
+            ReportTable(
                 "How far the upper edge moves, shortly before the door is closed",
                 ("before closed [m]", "published: per m of a", "regular: per rad of the angle"),
                 (
@@ -128,14 +130,14 @@ def run(progress: Progress, options: Options) -> Report:
     )
 
 
-def _door(form: str) -> Model:
+def _make_door(form: str) -> Model:
     model = Model()
     with model.edit() as edit:
         edit.apply(GarageDoor(name="garage", parent=WORLD, length=LENGTH, form=form))  # type: ignore[arg-type]
     return model
 
 
-def _path(model: Model, part: float, coordinates: Array) -> Array:
+def _edge_path(model: Model, part: float, coordinates: Array) -> Array:
     """Return a point of the door in x and z at coordinates, (N, 2)."""
     place = (model.fk("garage/door") @ point(0, 0, part * LENGTH))[[0, 2]]
     found: Array = compile(place, [model.symbol("garage/door")]).batch(coordinates[:, None])
@@ -151,7 +153,7 @@ def _slopes(model: Model, coordinates: Array) -> Array:
     return slopes
 
 
-def _draw(canvas: Canvas, measured: Measured) -> None:
+def _draw(canvas: Canvas, measured: GarageDoorCurves) -> None:
     way, lock, slope = canvas.subplots(1, 3)
     for i in range(len(_OPENINGS)):
         ends = np.array([measured.paths[name][i] for name in ("A", "B")])

@@ -1,16 +1,51 @@
-"""The experiments by name."""
+"""Experiments by name, and their options."""
 
 from __future__ import annotations
 
 import importlib
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, fields
+from pathlib import Path
 from types import MappingProxyType
 from typing import Any, TypeAlias
 
-from kineverse.errors import UnknownNameError, suggest
+from kineverse.errors import InvalidValueError, UnknownNameError, suggest
 
-from .options import Options
 from .report import Report
+
+
+@dataclass(frozen=True)
+class Options:
+    """What is asked of an experiment beside its name; each takes some of these.
+
+    Attributes
+    ----------
+    quick
+        A part of it, in seconds.
+    data
+        The folder of the recordings that it is about.
+    model
+        The model that it is about, a name or path.
+    """
+
+    quick: bool = False
+    data: Path | None = None
+    model: str | None = None
+
+    def check(self, name: str, taken: Sequence[str]) -> None:
+        """Look whether an experiment takes what was given.
+
+        Raises
+        ------
+        InvalidValueError
+            If not, with what it takes.
+        """
+        given = [field.name for field in fields(self) if getattr(self, field.name) != field.default]
+        for option in given:
+            if option not in taken:
+                takes = ", ".join(f"--{known}" for known in taken) or "none"
+                raise InvalidValueError(f"The experiment '{name}' takes no --{option}. It takes {takes}.")
+
 
 Progress: TypeAlias = Callable[[Iterable[Any], str, str], Iterable[Any]]
 
@@ -33,7 +68,7 @@ def reproduce(name: str, progress: Progress | None = None, options: Options | No
     name
         One of :data:`EXPERIMENTS`.
     progress
-        Wraps what is worked on, like :func:`kineverse.cli.progress.progress`; None for silence.
+        Wraps what is worked on, like :func:`kineverse.cli.output.show_progress`; None for silence.
     options
         How it is made; None for the defaults.
 
@@ -41,7 +76,7 @@ def reproduce(name: str, progress: Progress | None = None, options: Options | No
     ------
     UnknownNameError
         If there is no such experiment, with similar names.
-    ValueRejectedError
+    InvalidValueError
         If it does not take an option.
     """
     if name not in EXPERIMENTS:
@@ -52,9 +87,9 @@ def reproduce(name: str, progress: Progress | None = None, options: Options | No
     module = importlib.import_module(f"{__package__}.{name.replace('-', '_')}")
     options = options or Options()
     options.check(name, module.OPTIONS)
-    report: Report = module.run(progress or _silent, options)
+    report: Report = module.run(progress or _no_progress, options)
     return report
 
 
-def _silent(items: Iterable[Any], what: str, unit: str) -> Iterable[Any]:
+def _no_progress(items: Iterable[Any], what: str, unit: str) -> Iterable[Any]:
     return items

@@ -8,15 +8,15 @@ from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
-from kineverse.errors import FormatError, MissingExtraError
-from kineverse.installation import install_command
+from kineverse._extras import install_command
+from kineverse.errors import FormatError, MissingDependencyError
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure as Canvas
 
 
 @dataclass(frozen=True)
-class Table:
+class ReportTable:
     """Rows of cells, numbers or texts.
 
     Attributes
@@ -54,7 +54,7 @@ class Figure:
 
         Raises
         ------
-        MissingExtraError
+        MissingDependencyError
             Without matplotlib.
         FormatError
             If the file cannot be written, or in no format of that suffix.
@@ -86,7 +86,7 @@ class Report:
 
     name: str
     title: str
-    tables: tuple[Table, ...]
+    tables: tuple[ReportTable, ...]
     numbers: Mapping[str, Any]
     figure: Figure
 
@@ -96,7 +96,7 @@ def check_drawing() -> None:
 
     Raises
     ------
-    MissingExtraError
+    MissingDependencyError
         Without matplotlib.
     """
     _matplotlib("matplotlib.figure")
@@ -108,4 +108,4 @@ def _matplotlib(module: str) -> ModuleType:
     try:
         return importlib.import_module(module)
     except ImportError:
-        raise MissingExtraError(f"Figures need matplotlib: {install_command('figures')}") from None
+        raise MissingDependencyError(f"Figures need matplotlib: {install_command('figures')}") from None

@@ -2,8 +2,7 @@
 
 from .expression import Expression, ExpressionLike, array, as_expression
 from .gradient import total_derivative
-from .leaves import gradient_keys
-from .lowering import lower
+from .graph import gradient_keys, lower
 
 __all__ = [
     "Expression",

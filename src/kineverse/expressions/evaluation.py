@@ -13,18 +13,18 @@ import casadi as ca
 import numpy as np
 import numpy.typing as npt
 
+from kineverse._checks import real_number
 from kineverse.errors import (
+    DuplicateNameError,
     ExpressionError,
-    NameTakenError,
+    InvalidValueError,
     UnknownNameError,
-    ValueRejectedError,
-    given_twice,
+    duplicate_value_error,
     suggest,
 )
-from kineverse.number import real_number
 
 from .expression import Expression
-from .lowering import dense_column
+from .graph import dense_column
 
 
 def evaluate(
@@ -34,21 +34,21 @@ def evaluate(
     symbols = expression.symbols
     if by_name and isinstance(values, Mapping):
         values = {**values, **by_name}
-    vector = assign(symbols, values, derived=True)
+    vector = symbol_values(symbols, values, derived=True)
     # Looking for common parts would take longer than computing them twice, once.
     column = dense_column(expression)
     inputs = ca.vertcat(*(s._sx for s in symbols)) if symbols else ca.SX(0, 1)
     result = np.array(ca.Function("e", [inputs], [column])(vector)).reshape(expression.shape)
     if np.isnan(result).any():
-        from .implicit import explain, implicit_nodes
+        from .implicit import explain_no_solution, implicit_nodes
 
-        error = explain(implicit_nodes([expression]), symbols, vector)
+        error = explain_no_solution(implicit_nodes([expression]), symbols, vector)
         if error is not None:
             raise error
     return result[()]
 
 
-def assign(
+def symbol_values(
     symbols: tuple[Any, ...], values: Mapping[Any, Any], derived: bool = False
 ) -> npt.NDArray[np.float64]:
     """Return the numbers of ``symbols`` in their order, from a mapping by symbol or by name.
@@ -61,9 +61,9 @@ def assign(
     ------
     UnknownNameError
         For symbols without a value and values without a symbol.
-    NameTakenError
+    DuplicateNameError
         If several of the symbols have the name that a value is given by, or a symbol has two values.
-    ValueRejectedError
+    InvalidValueError
         For NaN and whatever is not a number.
     """
     from kineverse.state import State
@@ -86,10 +86,10 @@ def assign(
         raise UnknownNameError(f"Unknown symbol {unknown[0]!r}. {suggest(unknown[0], names, 'symbol')}{more}")
     twice = [s for s in symbols if s in given and str(s) in given]
     if twice:
-        raise given_twice(twice[0])
+        raise duplicate_value_error(twice[0])
     ambiguous = [n for n, count in Counter(names).items() if count > 1 and n in given]
     if ambiguous:
-        raise NameTakenError(
+        raise DuplicateNameError(
             f"Several symbols have the name '{ambiguous[0]}'; give their values by symbol, not by name."
         )
     missing = [
@@ -114,7 +114,7 @@ def assign(
         try:
             vector[i] = real_number(value)
         except (TypeError, ValueError, OverflowError):
-            raise ValueRejectedError(f"The value of '{name}' is not a number: {value!r}.") from None
+            raise InvalidValueError(f"The value of '{name}' is not a number: {value!r}.") from None
         if vector[i] != vector[i]:
-            raise ValueRejectedError(f"The value of '{name}' is NaN.")
+            raise InvalidValueError(f"The value of '{name}' is NaN.")
     return vector

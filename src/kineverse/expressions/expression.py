@@ -17,19 +17,19 @@ import casadi as ca
 import numpy as np
 import numpy.typing as npt
 
-from kineverse.errors import ExpressionError, ShapeError, ValueRejectedError
-from kineverse.vocabulary import EXPRESSION, unknown_attribute
+from kineverse._synonyms import EXPRESSION_SYNONYMS, unknown_attribute_error
+from kineverse.errors import ExpressionError, InvalidValueError, ShapeError
 
 from . import layout
 from .array_methods import ArrayMethods
-from .layout import SX, Shape
+from .layout import SX, ArrayShape
 
 if TYPE_CHECKING:
     from typing_extensions import deprecated
 
     from kineverse.symbols import Symbol
 
-    from .node import Node, Watcher
+    from .node import AccessListener, Node
 
 ExpressionLike: TypeAlias = "Expression | float | int | npt.ArrayLike | Sequence[Any]"
 
@@ -56,18 +56,18 @@ class Expression(ArrayMethods):
     __array_priority__ = 1000.0
 
     _sx: SX
-    _shape: Shape
+    _shape: ArrayShape
     _nodes: frozenset[Node]
 
     def __new__(cls, value: ExpressionLike) -> Expression:
         """Return numbers, arrays and nested sequences of expressions as an expression."""
         return as_expression(value)
 
-    def _set(self, sx: SX, shape: Shape, nodes: frozenset[Node]) -> None:
+    def _set(self, sx: SX, shape: ArrayShape, nodes: frozenset[Node]) -> None:
         self._sx = sx
         self._describe(shape, nodes)
 
-    def _describe(self, shape: Shape, nodes: frozenset[Node]) -> None:
+    def _describe(self, shape: ArrayShape, nodes: frozenset[Node]) -> None:
         """Set all but the graph."""
         self._shape = shape
         self._nodes = nodes
@@ -79,7 +79,7 @@ class Expression(ArrayMethods):
     # -- what it is ----------------------------------------------------------------------------------------
 
     @property
-    def shape(self) -> Shape:
+    def shape(self) -> ArrayShape:
         """The shape, as numpy has it; ``()`` for a scalar."""
         return self._shape
 
@@ -96,14 +96,14 @@ class Expression(ArrayMethods):
     @property
     def casadi(self) -> SX:
         """CasADi's ``SX`` of the values, nodes lowered: (n, m) as stored, see :mod:`.layout`."""
-        from .lowering import lowered
+        from .graph import expand_nodes
 
-        return lowered(self)
+        return expand_nodes(self)
 
     @property
     def symbols(self) -> tuple[Symbol, ...]:
         """The free symbols V(e) of the values, sorted by path and order (2022 paper, III-A)."""
-        from .leaves import free_symbols
+        from .graph import free_symbols
 
         return free_symbols(self)
 
@@ -112,9 +112,9 @@ class Expression(ArrayMethods):
         """Whether the value depends on no symbol and the gradient is empty."""
         if not self._nodes:
             return bool(self._sx.is_constant())
-        from .leaves import leaves
+        from .graph import leaves
 
-        symbols, nodes = leaves(looked_at(self))
+        symbols, nodes = leaves(notify_access(self))
         return not symbols and all(node.is_constant for node in nodes)
 
     @property
@@ -141,7 +141,7 @@ class Expression(ArrayMethods):
             )
         if type(key) is tuple and len(key) == 2 and type(key[0]) is int and type(key[1]) is int:
             if len(self._shape) == 2 and 0 <= key[0] < self._shape[0] and 0 <= key[1] < self._shape[1]:
-                return make(self._sx[key[0], key[1]], (), self._nodes)
+                return from_casadi(self._sx[key[0], key[1]], (), self._nodes)
         try:
             index = layout.indices(self._shape)[key]
         except IndexError as error:
@@ -154,8 +154,8 @@ class Expression(ArrayMethods):
             "or numpy.concatenate."
         )
 
-    def _rearranged(self, index: layout.Indices) -> Expression:
-        return make(layout.gather(self._sx, self._shape, index), index.shape, self._nodes)
+    def _rearranged(self, index: layout.IndexArray) -> Expression:
+        return from_casadi(layout.gather(self._sx, self._shape, index), index.shape, self._nodes)
 
     # -- rearranging (the other methods of arrays are in ArrayMethods) ---------------------------------------
 
@@ -178,7 +178,7 @@ class Expression(ArrayMethods):
     def transpose(self, *axes: Any) -> Expression:
         """Return the array with its axes permuted; reversed if none are given."""
         if len(self._shape) == 2 and not axes:
-            return make(self._sx.T, self._shape[::-1], self._nodes)
+            return from_casadi(self._sx.T, self._shape[::-1], self._nodes)
         return self._rearranged(layout.indices(self._shape).transpose(*axes))
 
     # -- arithmetic ----------------------------------------------------------------------------------------
@@ -208,32 +208,32 @@ class Expression(ArrayMethods):
         return binary(ca.OP_DIV, other, self)
 
     def __pow__(self, other: ExpressionLike) -> Expression:
-        from .kinks import power
+        from .nonsmooth import power
 
         return power(self, other)
 
     def __rpow__(self, other: ExpressionLike) -> Expression:
-        from .kinks import power
+        from .nonsmooth import power
 
         return power(other, self)
 
     def __mod__(self, other: ExpressionLike) -> Expression:
-        from .rounding import remainder
+        from .functions import remainder
 
         return remainder(self, other)
 
     def __rmod__(self, other: ExpressionLike) -> Expression:
-        from .rounding import remainder
+        from .functions import remainder
 
         return remainder(other, self)
 
     def __floordiv__(self, other: ExpressionLike) -> Expression:
-        from .rounding import floor_divide
+        from .functions import floor_divide
 
         return floor_divide(self, other)
 
     def __rfloordiv__(self, other: ExpressionLike) -> Expression:
-        from .rounding import floor_divide
+        from .functions import floor_divide
 
         return floor_divide(other, self)
 
@@ -244,7 +244,7 @@ class Expression(ArrayMethods):
         return self.__rfloordiv__(other), self.__rmod__(other)
 
     def __round__(self, decimals: int | None = None) -> Expression:
-        from .rounding import around
+        from .functions import around
 
         return around(self, decimals or 0)
 
@@ -436,16 +436,16 @@ class Expression(ArrayMethods):
         def __getattr__(self, name):
             if hasattr(type(self), name):  # a slot that is not filled yet, which some classes ask about
                 raise AttributeError(name)
-            raise unknown_attribute("An expression", name, dir(type(self)), EXPRESSION)
+            raise unknown_attribute_error("An expression", name, dir(type(self)), EXPRESSION_SYNONYMS)
 
     # -- identity ------------------------------------------------------------------------------------------
 
     @property
     def key(self) -> bytes:
         """A digest of shape and structure, the same in every process."""
-        from .structure import structural_key
+        from .graph import structural_hash
 
-        return structural_key(looked_at(self))
+        return structural_hash(notify_access(self))
 
     if TYPE_CHECKING:
         # For checkers that report deprecated calls: nobody means to ask whether a symbol is a number.
@@ -473,7 +473,7 @@ class Expression(ArrayMethods):
             if not isinstance(other, Expression):
                 try:
                     other = as_expression(other)
-                except (ExpressionError, ValueRejectedError, ShapeError):
+                except (ExpressionError, InvalidValueError, ShapeError):
                     return NotImplemented
             return self._shape == other._shape and self.key == other.key
 
@@ -481,7 +481,7 @@ class Expression(ArrayMethods):
         return hash(self.key)
 
     def __reduce__(self) -> Any:
-        from .structure import pack, unpack
+        from .graph import pack, unpack
 
         if not self._shape and self._sx.is_constant():
             return as_expression, (float(self._sx),)
@@ -496,12 +496,12 @@ class Expression(ArrayMethods):
     def __repr__(self) -> str:
         from .printing import text
 
-        return text(looked_at(self))
+        return text(notify_access(self))
 
     def _repr_latex_(self) -> str | None:
         from .printing import latex
 
-        formula = latex(looked_at(self))
+        formula = latex(notify_access(self))
         return None if formula is None else f"$\\displaystyle {formula}$"
 
     def _repr_html_(self) -> str | None:
@@ -529,18 +529,18 @@ class Expression(ArrayMethods):
         return apply_function(function, args, options)
 
 
-def watcher_of(expression: Expression) -> Watcher | None:
+def access_listener(expression: Expression) -> AccessListener | None:
     """Return who wants to know how closely an expression is looked at; None but while code is traced."""
     return next((node.watcher for node in expression._nodes if node.watcher is not None), None)
 
 
-def looked_at(expression: Expression) -> Expression:
+def notify_access(expression: Expression) -> Expression:
     """Return an expression for those who decide by what it is, and let it be known that they do."""
-    watcher = watcher_of(expression) if expression._nodes else None
+    watcher = access_listener(expression) if expression._nodes else None
     return expression if watcher is None else watcher.settled(expression)
 
 
-def make(sx: SX, shape: Shape, nodes: frozenset[Node]) -> Expression:
+def from_casadi(sx: SX, shape: ArrayShape, nodes: frozenset[Node]) -> Expression:
     """Wrap an ``SX`` that only contains known symbols and the symbols of ``nodes``.
 
     A scalar that is nothing but a symbol is that :class:`Symbol`, so ``v[0]`` can be used as a key.
@@ -559,7 +559,7 @@ def as_expression(value: ExpressionLike) -> Expression:
 
     Raises
     ------
-    ValueRejectedError
+    InvalidValueError
         For NaN.
     ShapeError
         For ragged sequences.
@@ -570,11 +570,11 @@ def as_expression(value: ExpressionLike) -> Expression:
         return value
     if isinstance(value, (float, int)) and not isinstance(value, bool):
         if value != value:
-            raise ValueRejectedError("NaN is not accepted as a constant.")
+            raise InvalidValueError("NaN is not accepted as a constant.")
         try:
             return _constant(float(value))
         except OverflowError:
-            raise ValueRejectedError("The number is too large for a 64-bit float.") from None
+            raise InvalidValueError("The number is too large for a 64-bit float.") from None
     if isinstance(value, (list, tuple)):
         return array(value)
     if isinstance(value, np.ndarray) and value.dtype == object and not isinstance(value, np.ma.MaskedArray):
@@ -595,8 +595,8 @@ def as_expression(value: ExpressionLike) -> Expression:
             f"{type(value).__name__} is not an expression or an array of numbers: {error}"
         ) from None
     if np.isnan(numbers).any():
-        raise ValueRejectedError(f"NaN is not accepted as a constant (in an array of shape {numbers.shape}).")
-    return make(layout.from_array(numbers), numbers.shape, NO_NODES)
+        raise InvalidValueError(f"NaN is not accepted as a constant (in an array of shape {numbers.shape}).")
+    return from_casadi(layout.from_array(numbers), numbers.shape, NO_NODES)
 
 
 def _refuse(value: object) -> NoReturn:
@@ -650,16 +650,16 @@ def array(values: Any) -> Expression:
         columns = 1 if len(full) == 1 else full[-1]
         for i in symbolic:
             sx[i // columns, i % columns] = flat[i]._sx
-        return make(sx, full, union(flat))
+        return from_casadi(sx, full, union_nodes(flat))
     elements = ca.vertcat(*(layout.column(e._sx, e.shape) for e in flat))
-    return make(layout.from_column(elements, full), full, union(flat))
+    return from_casadi(layout.from_column(elements, full), full, union_nodes(flat))
 
 
 _MOST_DIMENSIONS = 32
 """Those that every version of numpy has."""
 
 
-def _flatten(values: Any, flat: list[Expression], depth: int = 0) -> Shape | None:
+def _flatten(values: Any, flat: list[Expression], depth: int = 0) -> ArrayShape | None:
     """Append the entries of nested sequences to ``flat``; return the shape, None if it is ragged."""
     if not isinstance(values, (list, tuple)):
         entry = as_expression(values)
@@ -676,7 +676,7 @@ def _flatten(values: Any, flat: list[Expression], depth: int = 0) -> Shape | Non
     return None if shapes or inner is None else (len(values), *inner)
 
 
-def union(expressions: Sequence[Expression]) -> frozenset[Node]:
+def union_nodes(expressions: Sequence[Expression]) -> frozenset[Node]:
     """Return the nodes of several expressions together."""
     # Most of them share one and the same set.
     sets = {id(e._nodes): e._nodes for e in expressions if e._nodes}
@@ -687,7 +687,7 @@ def union(expressions: Sequence[Expression]) -> frozenset[Node]:
 
 def unary(op: int, operand: Expression) -> Expression:
     """Apply an elementwise CasADi operation."""
-    return make(ca.SX.unary(op, operand._sx), operand._shape, operand._nodes)
+    return from_casadi(ca.SX.unary(op, operand._sx), operand._shape, operand._nodes)
 
 
 def binary(op: int, left: ExpressionLike, right: ExpressionLike) -> Expression:
@@ -698,9 +698,9 @@ def binary(op: int, left: ExpressionLike, right: ExpressionLike) -> Expression:
     else:
         nodes = b._nodes
     if a._shape == b._shape or not b._shape or not a._shape:
-        return make(ca.SX.binary(op, a._sx, b._sx), a._shape or b._shape, nodes)
+        return from_casadi(ca.SX.binary(op, a._sx, b._sx), a._shape or b._shape, nodes)
     a, b = broadcast(a, b)
-    return make(ca.SX.binary(op, a._sx, b._sx), a._shape, nodes)
+    return from_casadi(ca.SX.binary(op, a._sx, b._sx), a._shape, nodes)
 
 
 def broadcast(*operands: Expression) -> tuple[Expression, ...]:
@@ -719,7 +719,7 @@ def broadcast(*operands: Expression) -> tuple[Expression, ...]:
     return tuple(broadcast_to(o, shape) for o in operands)
 
 
-def broadcast_to(operand: Expression, shape: Shape) -> Expression:
+def broadcast_to(operand: Expression, shape: ArrayShape) -> Expression:
     """Repeat an operand to fill ``shape``."""
     if operand.shape == shape:
         return operand
@@ -738,9 +738,9 @@ def matmul(left: ExpressionLike, right: ExpressionLike) -> Expression:
             + ("; use * to scale by a number." if not a.ndim or not b.ndim else ".")
         )
     if a.ndim > 2 or b.ndim > 2:
-        from .contractions import stacked_product
+        from .linear_algebra import stacked_product
 
         return stacked_product(a, b)
     product = ca.mtimes(a._sx.T if a.ndim == 1 else a._sx, b._sx)
     stored = product.T if a.ndim == 1 else product
-    return make(stored, a.shape[:-1] + b.shape[1:], union((a, b)))
+    return from_casadi(stored, a.shape[:-1] + b.shape[1:], union_nodes((a, b)))

@@ -1,6 +1,9 @@
-"""Elementary functions of expressions; numpy's functions of the same names give the same.
+"""Elementary functions and rounding, elementwise, with numpy's names.
 
-What has a kink is a node of :mod:`kineverse.expressions.kinks`.
+What has a kink is a node of :mod:`kineverse.expressions.nonsmooth`.
+
+All of these are steps, so their gradients are 0, but for that of the remainder,
+D(a % b) = D(a) - (a // b)·D(b).
 """
 
 from __future__ import annotations
@@ -20,15 +23,15 @@ from .expression import (
     as_expression,
     binary,
     broadcast,
-    make,
+    from_casadi,
     matmul,
     unary,
 )
-from .kinks import Extremum as Extremum
-from .kinks import Norm as Norm
-from .kinks import Power as Power
-from .kinks import Select as Select
-from .kinks import power as power
+from .nonsmooth import Extremum as Extremum
+from .nonsmooth import Norm as Norm
+from .nonsmooth import Power as Power
+from .nonsmooth import Select as Select
+from .nonsmooth import power as power
 
 
 def sin(x: ExpressionLike) -> Expression:
@@ -137,7 +140,7 @@ def cbrt(x: ExpressionLike) -> Expression:
     root = binary(ca.OP_POW, operand, 1 / 3), -binary(ca.OP_POW, -operand, 1 / 3)
     holds = binary(ca.OP_LE, 0.0, operand)
     chosen = ca.if_else(holds._sx, root[0]._sx, root[1]._sx)
-    return make(chosen, operand._shape, operand._nodes)
+    return from_casadi(chosen, operand._shape, operand._nodes)
 
 
 def square(x: ExpressionLike) -> Expression:
@@ -243,7 +246,7 @@ def hypot(a: ExpressionLike, b: ExpressionLike) -> Expression:
 def sum_along(x: ExpressionLike, axis: int | tuple[int, ...] | None = None) -> Expression:
     """Return the sum over all elements, or along one axis or several."""
     rows, rest = axis_first(x, axis)
-    return make(ca.sum1(rows._sx).T, (rows.shape[1],), rows._nodes).reshape(rest)
+    return from_casadi(ca.sum1(rows._sx).T, (rows.shape[1],), rows._nodes).reshape(rest)
 
 
 def product_along(x: ExpressionLike, axis: int | tuple[int, ...] | None = None) -> Expression:
@@ -255,23 +258,23 @@ def product_along(x: ExpressionLike, axis: int | tuple[int, ...] | None = None) 
     return result.reshape(rest)
 
 
-def smallest(x: ExpressionLike, axis: int | tuple[int, ...] | None = None) -> Expression:
+def min_along(x: ExpressionLike, axis: int | tuple[int, ...] | None = None) -> Expression:
     """Return the smallest of all elements, or along one axis or several.
 
     The gradient is the mean of those of all the elements that are the smallest; see :func:`minimum`.
     """
-    return _among(x, axis, "min")
+    return _extremum_along(x, axis, "min")
 
 
-def largest(x: ExpressionLike, axis: int | tuple[int, ...] | None = None) -> Expression:
+def max_along(x: ExpressionLike, axis: int | tuple[int, ...] | None = None) -> Expression:
     """Return the largest of all elements, or along one axis or several.
 
     The gradient is the mean of those of all the elements that are the largest; see :func:`maximum`.
     """
-    return _among(x, axis, "max")
+    return _extremum_along(x, axis, "max")
 
 
-def _among(x: ExpressionLike, axis: int | tuple[int, ...] | None, which: str) -> Expression:
+def _extremum_along(x: ExpressionLike, axis: int | tuple[int, ...] | None, which: str) -> Expression:
     rows, rest = axis_first(x, axis)
     if not rows.shape[0]:
         raise ShapeError("Nothing has no smallest or largest element.")
@@ -291,7 +294,7 @@ def axis_first(x: ExpressionLike, axis: int | tuple[int, ...] | None) -> tuple[E
     return operand._rearranged(index.reshape(math.prod(along), math.prod(rest))), rest
 
 
-def inverse(matrix: ExpressionLike) -> Expression:
+def matrix_inverse(matrix: ExpressionLike) -> Expression:
     """Return the inverse of a square matrix, ``D(A⁻¹) = -A⁻¹ D(A) A⁻¹``.
 
     For homogeneous transforms use :func:`kineverse.spatial.inverse`, which is far smaller.
@@ -299,7 +302,7 @@ def inverse(matrix: ExpressionLike) -> Expression:
     a = as_expression(matrix)
     if a.ndim != 2 or a.shape[0] != a.shape[1]:
         raise ShapeError(f"Only a square matrix has an inverse, not one of shape {a.shape}.")
-    return make(ca.inv(a._sx), a.shape, a._nodes)
+    return from_casadi(ca.inv(a._sx), a.shape, a._nodes)
 
 
 def determinant(matrix: ExpressionLike) -> Expression:
@@ -311,7 +314,7 @@ def determinant(matrix: ExpressionLike) -> Expression:
     if not n:
         return as_expression(1.0)
     if n < 5:
-        return make(ca.det(a._sx), (), a._nodes)
+        return from_casadi(ca.det(a._sx), (), a._nodes)
     # Minors grow with n!, so larger ones by the characteristic polynomial (Faddeev-LeVerrier).
     identity = as_expression(np.eye(n))
     power, coefficient = identity, as_expression(1.0)
@@ -320,3 +323,75 @@ def determinant(matrix: ExpressionLike) -> Expression:
         coefficient = sum_along(product[np.arange(n), np.arange(n)]) / -k
         power = product + coefficient * identity
     return coefficient if n % 2 == 0 else -coefficient
+
+
+def floor_divide(a: ExpressionLike, b: ExpressionLike) -> Expression:
+    """Return the largest whole number not greater than the quotient, elementwise.
+
+    As numpy and Python have it: of the true quotient, so that ``1.0 // 0.1`` is 9, since 0.1 is a little more
+    than a tenth. By 0 it is the quotient: infinite, or NaN.
+    """
+    _, numerator, denominator = _with_positive_divisor(a, b)
+    rest = binary(ca.OP_FMOD, numerator, denominator)
+    quotient = (numerator - rest) / denominator - binary(ca.OP_LT, rest, 0.0)
+    whole = floor(quotient)
+    # What should be whole may be off by its rounding.
+    whole = whole + binary(ca.OP_LT, 0.5, quotient - whole)
+    if not _nonzero_divisor(denominator):
+        by_zero = binary(ca.OP_EQ, denominator, 0.0)
+        infinite = binary(ca.OP_IF_ELSE_ZERO, by_zero, sign(numerator) * math.inf)
+        whole = binary(ca.OP_IF_ELSE_ZERO, unary(ca.OP_NOT, by_zero), whole) + infinite
+    # Last, as sums lose the sign of 0.
+    return copysign(whole, numerator)
+
+
+def remainder(a: ExpressionLike, b: ExpressionLike) -> Expression:
+    """Return ``a - (a // b)·b`` without its rounding, elementwise; it has the sign of b."""
+    sense, numerator, denominator = _with_positive_divisor(a, b)
+    rest = binary(ca.OP_FMOD, numerator, denominator)
+    # A rest of -0 becomes +0 here, as its sign is that of b too.
+    return sense * (rest + binary(ca.OP_IF_ELSE_ZERO, binary(ca.OP_LT, rest, 0.0), denominator))
+
+
+def fmod(a: ExpressionLike, b: ExpressionLike) -> Expression:
+    """Return the remainder of the division rounded towards 0, elementwise: it has the sign of a."""
+    return binary(ca.OP_FMOD, a, b)
+
+
+def _with_positive_divisor(a: ExpressionLike, b: ExpressionLike) -> tuple[Expression, Expression, Expression]:
+    """Return the sign of b, and both operands times it: a divisor that is not negative."""
+    divisor = as_expression(b)
+    sense = copysign(1.0, divisor)
+    return sense, sense * as_expression(a), sense * divisor
+
+
+def _nonzero_divisor(x: Expression) -> bool:
+    return bool(x._sx.is_constant()) and not any(float(e) == 0 for e in x._sx.elements())
+
+
+def rint(x: ExpressionLike) -> Expression:
+    """Return the nearest whole number, elementwise; of two, the even one."""
+    operand = as_expression(x)
+    below = floor(operand)
+    above_half = operand - below
+    odd = binary(ca.OP_LT, 2 * floor(below / 2), below)
+    up = binary(
+        ca.OP_OR,
+        binary(ca.OP_LT, 0.5, above_half),
+        binary(ca.OP_AND, binary(ca.OP_EQ, above_half, 0.5), odd),
+    )
+    return copysign(below + up, operand)
+
+
+def around(x: ExpressionLike, decimals: int = 0) -> Expression:
+    """Return x rounded to a number of decimals, elementwise; of two equally near, the even one."""
+    digits = int(decimals)
+    if not digits:
+        return rint(x)
+    scale = 10.0 ** abs(digits)
+    return rint(as_expression(x) * scale) / scale if digits > 0 else rint(as_expression(x) / scale) * scale
+
+
+def trunc(x: ExpressionLike) -> Expression:
+    """Return x rounded towards 0, elementwise."""
+    return copysign(floor(absolute(x)), x)

@@ -17,9 +17,9 @@ import numpy as np
 from kineverse.errors import ExpressionError, UnknownNameError, suggest
 
 from . import layout
-from .expression import NO_NODES, Expression, array, as_expression, make, union, watcher_of
-from .leaves import bottom_up, leaves
-from .substitution import apply, renamed, replace_nodes, stand_ins
+from .expression import NO_NODES, Expression, access_listener, array, as_expression, from_casadi, union_nodes
+from .graph import leaves, topological_order
+from .substitution import apply_substitution, dummy_symbols, rename_symbols, replace_nodes
 
 if TYPE_CHECKING:
     from kineverse.symbols import Symbol
@@ -108,7 +108,9 @@ def _gradient(expression: Expression, heuristic: bool) -> dict[Symbol, Expressio
     # Only leaves with a gradient take part: the partial derivative by a parameter in an exponent is NaN for a
     # negative base, and nobody asked for it.
     moving = [s for s in symbols if s.has_derivative]
-    for node in bottom_up(inner, lambda n: n.differentiated(heuristic), lambda n: heuristic in n._gradients):
+    for node in topological_order(
+        inner, lambda n: n.differentiated(heuristic), lambda n: heuristic in n._gradients
+    ):
         node.gradient(heuristic)
     if len(inner) == 1 and expression._sx is inner[0].sx:
         return dict(sorted(inner[0].gradient(heuristic).items(), key=lambda item: item[0].sort_key))
@@ -136,7 +138,7 @@ def _gradient(expression: Expression, heuristic: bool) -> dict[Symbol, Expressio
         rows = ca.SX(node.size, len(keys))
         for key, value in entries.items():
             rows[:, position[key]] = layout.column(value._sx, value._shape)
-        nodes = nodes | union(list(entries.values()))
+        nodes = nodes | union_nodes(list(entries.values()))
         seeds.append(ca.sparsify(rows))
     # Cheaper than ca.jtimes, which differentiates once per key.
     by_key = ca.mtimes(ca.jacobian(elements, ca.vertcat(*blocks)), ca.vertcat(*seeds))
@@ -155,7 +157,7 @@ def _collect(
     for key, index in zip(keys, columns, strict=True):
         entry = by_key[:, index]
         if not entry.is_zero():
-            result[key] = make(layout.from_column(ca.densify(entry), shape), shape, nodes)
+            result[key] = from_casadi(layout.from_column(ca.densify(entry), shape), shape, nodes)
     return result
 
 
@@ -170,7 +172,7 @@ def jacobian(expression: Expression, symbols: Sequence[Symbol], heuristic: bool 
                 f"Parameter '{symbol}' has no derivative to read a column from; "
                 "use partial([...]) for ∂/∂parameter."
             )
-    watcher = watcher_of(expression)
+    watcher = access_listener(expression)
     if watcher is not None:
         anew: Expression = watcher.ask("jacobian" if heuristic else "facts", expression, array(list(wanted)))
         return anew
@@ -178,7 +180,7 @@ def jacobian(expression: Expression, symbols: Sequence[Symbol], heuristic: bool 
     columns = [entries.get(symbol.derivative()) for symbol in wanted]
     if wanted and not any(column is not None for column in columns):
         _refuse_speeds([symbol for symbol in wanted if symbol in entries])
-    return _side_by_side(columns, expression._shape)
+    return _stack_columns(columns, expression._shape)
 
 
 def _refuse_speeds(speeds: Sequence[Symbol]) -> None:
@@ -197,16 +199,18 @@ def partial(expression: Expression, symbols: Sequence[Symbol]) -> Expression:
     from kineverse.symbols import check_symbols
 
     wanted = check_symbols(symbols)
-    watcher = watcher_of(expression)
+    watcher = access_listener(expression)
     if watcher is not None:
         anew: Expression = watcher.ask("partial", expression, array(list(wanted)))
         return anew
     # Parameters do not move, so D has nothing to say about them; symbols that do move take their places.
-    moving = stand_ins(wanted)
-    entries = gradient(renamed(_without_augmentation(expression), moving), False)
+    moving = dummy_symbols(wanted)
+    entries = gradient(rename_symbols(_without_augmentation(expression), moving), False)
     back = {stand_in: s for s, stand_in in moving.items()}
     columns = [entries.get(moving.get(s, s).derivative()) for s in wanted]
-    return _side_by_side([c if c is None else apply(c, back) for c in columns], expression._shape)
+    return _stack_columns(
+        [c if c is None else apply_substitution(c, back) for c in columns], expression._shape
+    )
 
 
 def _without_augmentation(expression: Expression) -> Expression:
@@ -216,22 +220,22 @@ def _without_augmentation(expression: Expression) -> Expression:
     def parts(node: Node) -> tuple[Expression, ...]:
         return node.arguments if node.own_partials else (node.value,)
 
-    for node in bottom_up(leaves(expression)[1], parts, plain.__contains__):
+    for node in topological_order(leaves(expression)[1], parts, plain.__contains__):
         replaced = tuple(replace_nodes(part, plain) for part in parts(node))
         plain[node] = type(node).of(replaced, node.shape, node.options) if node.own_partials else replaced[0]
     return replace_nodes(expression, plain)
 
 
-def _side_by_side(columns: list[Expression | None], shape: layout.Shape) -> Expression:
+def _stack_columns(columns: list[Expression | None], shape: layout.ArrayShape) -> Expression:
     """Return expressions of one shape, None for zero, along a new last axis."""
     size = math.prod(shape)
     stored = [ca.SX.zeros(size, 1) if c is None else layout.column(c._sx, c._shape) for c in columns]
     matrix = ca.horzcat(*stored) if stored else ca.SX.zeros(size, 0)
     full = (*shape, len(columns))
-    return make(_last_axis(matrix, full), full, union([c for c in columns if c is not None]))
+    return from_casadi(_last_axis(matrix, full), full, union_nodes([c for c in columns if c is not None]))
 
 
-def _last_axis(matrix: layout.SX, shape: layout.Shape) -> layout.SX:
+def _last_axis(matrix: layout.SX, shape: layout.ArrayShape) -> layout.SX:
     # rows are the elements of the expression in C order, so this already is the layout of the longer shape;
     # only a vector of columns, which is stored upright, has to be turned.
     return matrix.T if len(shape) == 1 else matrix
@@ -244,9 +248,9 @@ def total_derivative(expression: Expression, heuristic: bool = False) -> Express
         return (
             symbol.derivative()
             if symbol.has_derivative
-            else make(layout.from_array(np.zeros(())), (), NO_NODES)
+            else from_casadi(layout.from_array(np.zeros(())), (), NO_NODES)
         )
-    rate = make(layout.from_array(np.zeros(expression.shape)), expression.shape, NO_NODES)
+    rate = from_casadi(layout.from_array(np.zeros(expression.shape)), expression.shape, NO_NODES)
     for key, entry in gradient(expression, heuristic).items():
         rate = rate + entry * key
     return rate

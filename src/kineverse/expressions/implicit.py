@@ -8,7 +8,7 @@ earlier calls. Derivatives come from the implicit function theorem and not from 
 
 and again from it where these are differentiated, so they are exact to every order. Where the steps do not
 arrive, because there is no solution or it is singular, the value is NaN inside the graph; whoever evaluates
-asks :func:`explain` and raises. So it is outside of the *domain*, the inputs for which the seed is known to
+asks :func:`explain_no_solution` and raises. So it is outside of the *domain*, the inputs for which the seed is known to
 lead to its branch: another solution has a residual of zero as well.
 """
 
@@ -25,20 +25,19 @@ import casadi as ca
 import numpy as np
 import numpy.typing as npt
 
-from kineverse.errors import ShapeError, UnsolvedError, ValueRejectedError
+from kineverse.errors import InvalidValueError, NoSolutionError, ShapeError
 
-from .expression import Expression, make, union
+from .expression import Expression, from_casadi, union_nodes
 from .functions import maximum, minimum
+from .graph import expand_nodes, leaves, topological_order
 from .layout import SX
-from .leaves import bottom_up, leaves
-from .lowering import lowered
 from .node import Node
-from .substitution import apply
+from .substitution import apply_substitution
 
 if TYPE_CHECKING:
     from kineverse.symbols import Symbol
 
-TOLERANCE = 1e-10
+RESIDUAL_TOLERANCE = 1e-10
 """What a residual may be, in its own unit [m] or [rad]."""
 
 
@@ -69,7 +68,7 @@ class ImplicitFunction:
     ------
     ShapeError
         If the parts do not fit together.
-    ValueRejectedError
+    InvalidValueError
         If residual or seed are about other symbols, steps are negative, or the domain is empty in between.
     """
 
@@ -92,7 +91,7 @@ class ImplicitFunction:
         if not all(0 <= row < self.residual.shape[0] for row in self.rows) or len(set(self.rows)) < n:
             raise ShapeError(f"'{self.name}': rows are {n} different ones of {self.residual.shape[0]}.")
         if self.steps < 0:
-            raise ValueRejectedError(f"'{self.name}' cannot make {self.steps} steps.")
+            raise InvalidValueError(f"'{self.name}' cannot make {self.steps} steps.")
         if self.domain and len(self.domain) != len(self.inputs):
             raise ShapeError(
                 f"'{self.name}' has {len(self.inputs)} inputs, and a domain for {len(self.domain)}."
@@ -100,21 +99,21 @@ class ImplicitFunction:
         domain = tuple((float(lower), float(upper)) for lower, upper in self.domain)
         for (lower, upper), symbol in zip(domain, self.inputs, strict=False):
             if not lower <= upper:
-                raise ValueRejectedError(
+                raise InvalidValueError(
                     f"'{self.name}': no value lies within {lower} <= {symbol} <= {upper}."
                 )
         bounded = any(math.isfinite(end) for ends in domain for end in ends)
         object.__setattr__(self, "domain", domain if bounded else ())
         known = {*self.unknowns, *self.inputs}
         if len(known) < n + len(self.inputs):
-            raise ValueRejectedError(f"'{self.name}': a symbol is given twice.")
+            raise InvalidValueError(f"'{self.name}': a symbol is given twice.")
         for what, part, allowed in (
             ("residual", self.residual, known),
             ("seed", self.seed, set(self.inputs)),
         ):
             strange = sorted(str(s) for s in part.symbols if s not in allowed)
             if strange:
-                raise ValueRejectedError(f"'{self.name}': the {what} is about {', '.join(strange)}, too.")
+                raise InvalidValueError(f"'{self.name}': the {what} is about {', '.join(strange)}, too.")
 
     @cached_property
     def key(self) -> bytes:
@@ -161,7 +160,7 @@ class ImplicitFunction:
 
     def at(self, part: Expression, x: Sequence[Expression], u: Sequence[Expression]) -> Expression:
         """Return a part of the definition with unknowns and inputs put in."""
-        return apply(part, dict(zip((*self.unknowns, *self.inputs), (*x, *u), strict=True)))
+        return apply_substitution(part, dict(zip((*self.unknowns, *self.inputs), (*x, *u), strict=True)))
 
     def __reduce__(self) -> Any:
         return ImplicitFunction, (
@@ -204,15 +203,15 @@ class Implicit(Node):
         for _ in range(f.steps):
             point = [x[i] for i in range(n)]
             matrix, residual = f.at(f.by_unknowns, point, u), f.at(f.chosen, point, u)
-            x = x - _solved(matrix, residual)
+            x = x - _solve(matrix, residual)
         error = f.at(f.residual, [x[i] for i in range(n)], u)
-        fits = ca.sumsqr(error._sx) <= TOLERANCE**2
+        fits = ca.sumsqr(error._sx) <= RESIDUAL_TOLERANCE**2
         for argument, (lower, upper) in zip(u, f.domain, strict=False):
             if lower > -math.inf:
                 fits = ca.logic_and(fits, lower <= argument._sx)
             if upper < math.inf:
                 fits = ca.logic_and(fits, argument._sx <= upper)
-        return make(ca.if_else(fits, x._sx, ca.SX.nan(n, 1)), (n,), union((x, error)))
+        return from_casadi(ca.if_else(fits, x._sx, ca.SX.nan(n, 1)), (n,), union_nodes((x, error)))
 
     def _gradient(self, heuristic: bool) -> Mapping[Symbol, Expression]:
         f, u = self.function, self.arguments
@@ -220,7 +219,7 @@ class Implicit(Node):
         keys = sorted(set().union(*gradients), key=lambda s: s.sort_key)
         if not keys:
             return {}
-        itself = make(self.sx, self.shape, frozenset((self,)))
+        itself = from_casadi(self.sx, self.shape, frozenset((self,)))
         x = [itself[i] for i in range(len(f.unknowns))]
         matrix, by_inputs = f.at(f.by_unknowns, x, u), f.at(f.by_inputs, x, u)
         columns = []
@@ -228,21 +227,23 @@ class Implicit(Node):
             entries = [g.get(key) for g in gradients]
             parts = [by_inputs[:, j] * e for j, e in enumerate(entries) if e is not None]
             columns.append(sum(parts[1:], parts[0]))
-        moved = make(
-            ca.horzcat(*(ca.densify(c._sx) for c in columns)), (len(x), len(keys)), union(tuple(columns))
+        moved = from_casadi(
+            ca.horzcat(*(ca.densify(c._sx) for c in columns)),
+            (len(x), len(keys)),
+            union_nodes(tuple(columns)),
         )
-        solved = _solved(matrix, moved)
+        solved = _solve(matrix, moved)
         return {key: -solved[:, i] for i, key in enumerate(keys)}
 
 
-def _solved(matrix: Expression, right: Expression) -> Expression:
+def _solve(matrix: Expression, right: Expression) -> Expression:
     """Return matrix⁻¹ right, which has one or two dimensions."""
     a, b = matrix._sx, right._sx
     sx: SX = b / a if a.numel() == 1 else ca.solve(ca.densify(a), ca.densify(b))
-    return make(sx, right.shape, union((matrix, right)))
+    return from_casadi(sx, right.shape, union_nodes((matrix, right)))
 
 
-def held(expression: Expression) -> Expression:
+def clamp_to_domains(expression: Expression) -> Expression:
     """Hold what implicit functions are about at the edge of their domains, in all of an expression.
 
     For whoever leads back into the domain and so has to look at what is outside of it: there, the expression
@@ -258,13 +259,15 @@ def held(expression: Expression) -> Expression:
             if symbol is not None:
                 low, high = ends.get(symbol, (-math.inf, math.inf))
                 ends[symbol] = max(low, lower), min(high, upper)
-    return apply(expression, {s: maximum(low, minimum(high, s)) for s, (low, high) in ends.items()})
+    return apply_substitution(
+        expression, {s: maximum(low, minimum(high, s)) for s, (low, high) in ends.items()}
+    )
 
 
 def _symbol_of(argument: Expression) -> Symbol | None:
     """Return the symbol that an argument is worth; None if it is something else."""
     symbols = argument.symbols
-    if len(symbols) == 1 and ca.is_equal(lowered(argument), symbols[0]._sx):
+    if len(symbols) == 1 and ca.is_equal(expand_nodes(argument), symbols[0]._sx):
         return symbols[0]
     return None
 
@@ -273,7 +276,7 @@ def implicit_nodes(expressions: Sequence[Expression]) -> tuple[Implicit, ...]:
     """Return the implicit functions inside of values, those first that others need."""
     found = [
         node
-        for node in bottom_up(
+        for node in topological_order(
             (n for e in expressions for n in leaves(e)[1]), lambda n: (n.value, *n.arguments), lambda _: False
         )
         if isinstance(node, Implicit)
@@ -281,16 +284,16 @@ def implicit_nodes(expressions: Sequence[Expression]) -> tuple[Implicit, ...]:
     return tuple(dict.fromkeys(found))
 
 
-def explain(
+def explain_no_solution(
     nodes: Sequence[Implicit], symbols: Sequence[Symbol], numbers: npt.NDArray[np.float64]
-) -> UnsolvedError | None:
+) -> NoSolutionError | None:
     """Return why values are NaN: the first function that has no solution here, None if all have one."""
     if not nodes:
         return None
     vector = ca.vertcat(*(s._sx for s in symbols)) if symbols else ca.SX(0, 1)
     for node in nodes:
-        arguments = [ca.densify(lowered(a)) for a in node.arguments]
-        outputs = [ca.densify(lowered(node.value)), ca.vertcat(*arguments)]
+        arguments = [ca.densify(expand_nodes(a)) for a in node.arguments]
+        outputs = [ca.densify(expand_nodes(node.value)), ca.vertcat(*arguments)]
         # What cancels in the expression has no value here, and any will do.
         given = {s.element_hash() for s in ca.symvar(vector)}
         others = [s for s in ca.symvar(ca.vertcat(*outputs)) if s.element_hash() not in given]
@@ -301,13 +304,13 @@ def explain(
             names = node.function.inputs
             for symbol, x, (lower, upper) in zip(names, inputs, node.function.domain, strict=False):
                 if not lower <= x <= upper:
-                    return UnsolvedError(
+                    return NoSolutionError(
                         f"'{node.label}' has no solution at {symbol} = {x:.6g} that is known to be on its "
                         f"branch: it holds for {lower:.6g} <= {symbol} <= {upper:.6g}, the limits it was "
                         "made for and a margin around them. Stay within, or make it for wider limits."
                     )
             where = ", ".join(f"{s} = {x:.6g}" for s, x in zip(names, inputs, strict=True))
-            return UnsolvedError(
+            return NoSolutionError(
                 f"'{node.label}' has no solution at {where}. Stay within the limits it was made for, "
                 "or away from configurations in which it is singular."
             )

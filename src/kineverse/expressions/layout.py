@@ -15,11 +15,11 @@ import numpy as np
 import numpy.typing as npt
 
 SX: TypeAlias = Any
-Shape: TypeAlias = tuple[int, ...]
-Indices: TypeAlias = npt.NDArray[np.intp]
+ArrayShape: TypeAlias = tuple[int, ...]
+IndexArray: TypeAlias = npt.NDArray[np.intp]
 
 
-def rows_and_columns(shape: Shape) -> tuple[int, int]:
+def rows_and_columns(shape: ArrayShape) -> tuple[int, int]:
     """Return the size of the matrix that stores an array of this shape."""
     if not shape:
         return 1, 1
@@ -28,12 +28,12 @@ def rows_and_columns(shape: Shape) -> tuple[int, int]:
     return math.prod(shape[:-1]), shape[-1]
 
 
-def indices(shape: Shape) -> Indices:
+def indices(shape: ArrayShape) -> IndexArray:
     """Return an array of this shape that numbers the elements in C order."""
     return np.arange(math.prod(shape)).reshape(shape)
 
 
-def gather(sx: SX, shape: Shape, index: Indices) -> SX:
+def gather(sx: SX, shape: ArrayShape, index: IndexArray) -> SX:
     """Return the matrix that stores ``array.ravel()[index]``, for ``sx`` storing an array of ``shape``."""
     rows, columns = rows_and_columns(shape)
     if rows > 1 and columns > 1:
@@ -45,14 +45,14 @@ def gather(sx: SX, shape: Shape, index: Indices) -> SX:
     return ca.reshape(sx[flat], out_rows, out_columns)
 
 
-def column(sx: SX, shape: Shape) -> SX:
+def column(sx: SX, shape: ArrayShape) -> SX:
     """Return the elements in C order as one column."""
     if sx.shape[1] == 1:
         return sx
     return ca.reshape(sx.T, sx.numel(), 1)
 
 
-def from_column(sx: SX, shape: Shape) -> SX:
+def from_column(sx: SX, shape: ArrayShape) -> SX:
     """Undo :func:`column` for an array of this shape."""
     rows, columns = rows_and_columns(shape)
     if columns == 1:

@@ -21,9 +21,8 @@ import casadi as ca
 from kineverse.errors import ExpressionError, ShapeError
 
 from . import layout
-from .expression import NODES, Expression, ExpressionLike, as_expression, broadcast_to, make
-from .leaves import gradient_keys, symbols_below
-from .structure import structural_key
+from .expression import NODES, Expression, ExpressionLike, as_expression, broadcast_to, from_casadi
+from .graph import gradient_keys, node_symbols, structural_hash
 
 if TYPE_CHECKING:
     from kineverse.symbols import Symbol
@@ -34,7 +33,7 @@ _INTERNED: WeakValueDictionary[bytes, Node] = WeakValueDictionary()
 _INTERNING = threading.Lock()
 
 
-class Watcher(Protocol):
+class AccessListener(Protocol):
     """Who wants to know how closely code looks at expressions that it was given, see :mod:`.model.traces`."""
 
     def settled(self, expression: Expression) -> Expression:
@@ -74,11 +73,11 @@ class Node(ABC):
     arguments: tuple[Expression, ...]
     options: tuple[Any, ...]
     depth: int
-    watcher: Watcher | None
+    watcher: AccessListener | None
 
     @classmethod
     def of(
-        cls, arguments: tuple[Expression, ...], shape: layout.Shape, options: tuple[Any, ...] = ()
+        cls, arguments: tuple[Expression, ...], shape: layout.ArrayShape, options: tuple[Any, ...] = ()
     ) -> Expression:
         """Return the expression that is this node, made once for equal arguments and options."""
         key = cls._content_key(arguments, shape, options)
@@ -89,15 +88,15 @@ class Node(ABC):
             with _INTERNING:
                 node = _INTERNED.setdefault(key, node)
                 NODES.update(dict.fromkeys(node.elements, node))
-        return make(node.sx, node.shape, frozenset((node,)))
+        return from_casadi(node.sx, node.shape, frozenset((node,)))
 
     @classmethod
     def _content_key(
-        cls, arguments: tuple[Expression, ...], shape: layout.Shape, options: tuple[Any, ...]
+        cls, arguments: tuple[Expression, ...], shape: layout.ArrayShape, options: tuple[Any, ...]
     ) -> bytes:
         digest = hashlib.blake2b(f"{cls.kind}{shape}{cls._options_key(options)}".encode(), digest_size=16)
         for argument in arguments:
-            digest.update(structural_key(argument))
+            digest.update(structural_hash(argument))
         return digest.digest()
 
     @classmethod
@@ -105,7 +104,11 @@ class Node(ABC):
         return repr(options)
 
     def _initialise(
-        self, key: bytes, arguments: tuple[Expression, ...], shape: layout.Shape, options: tuple[Any, ...]
+        self,
+        key: bytes,
+        arguments: tuple[Expression, ...],
+        shape: layout.ArrayShape,
+        options: tuple[Any, ...],
     ) -> None:
         self.key = key
         self.arguments = arguments
@@ -125,7 +128,7 @@ class Node(ABC):
     def symbols(self) -> frozenset[Symbol]:
         """The symbols that the value depends on."""
         if self._symbols is None:
-            self._symbols = symbols_below(self)
+            self._symbols = node_symbols(self)
         return self._symbols
 
     @property
@@ -178,9 +181,11 @@ class Node(ABC):
 
     def substitute(self, substitution: Substitution) -> Expression:
         """Return the composition: the same kind of node over the substituted arguments."""
-        from .substitution import apply
+        from .substitution import apply_substitution
 
-        return type(self).of(tuple(apply(a, substitution) for a in self.arguments), self.shape, self.options)
+        return type(self).of(
+            tuple(apply_substitution(a, substitution) for a in self.arguments), self.shape, self.options
+        )
 
     def __reduce__(self) -> Any:
         return _restore, (type(self), self.arguments, self.shape, self.options)
@@ -198,7 +203,7 @@ class Node(ABC):
 
 
 def _restore(
-    kind: type[Node], arguments: tuple[Expression, ...], shape: layout.Shape, options: tuple[Any, ...]
+    kind: type[Node], arguments: tuple[Expression, ...], shape: layout.ArrayShape, options: tuple[Any, ...]
 ) -> Node:
     (node,) = kind.of(arguments, shape, options)._nodes
     return node
@@ -260,11 +265,11 @@ class Augment(Node):
 
     def substitute(self, substitution: Substitution) -> Expression:
         """Return what the node becomes under a substitution."""
-        from .substitution import apply, compose_gradient
+        from .substitution import apply_substitution, compose_gradient
 
         # After composition an overridden ẇ may also be reached through a replaced symbol, so what was
         # "override these, keep the rest" becomes the complete mapping, for facts and trends separately.
-        value = apply(self.arguments[0], substitution)
+        value = apply_substitution(self.arguments[0], substitution)
         facts = compose_gradient(self.gradient(False), substitution, False)
         trends = compose_gradient(self.gradient(True), substitution, True)
         result = augment(value, facts, replace=True, heuristic=False)

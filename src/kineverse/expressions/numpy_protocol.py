@@ -16,11 +16,11 @@ import numpy as np
 
 from kineverse.errors import ExpressionError, KineverseError, ShapeError
 
-from . import contractions as c
+from . import functions, layout
 from . import functions as f
-from . import layout, rounding
+from . import linear_algebra as c
 from . import reductions as r
-from .expression import Expression, as_expression, binary, make, matmul, unary, union
+from .expression import Expression, as_expression, binary, from_casadi, matmul, unary, union_nodes
 
 _UNARY_OPS = {
     np.negative: ca.OP_NEG, np.sin: ca.OP_SIN, np.cos: ca.OP_COS, np.tan: ca.OP_TAN, np.arcsin: ca.OP_ASIN,
@@ -41,11 +41,11 @@ _UFUNCS: dict[Any, Callable[..., Any]] = {
     np.copysign: f.copysign,
     np.power: f.power,
     np.float_power: f.power,
-    np.floor_divide: rounding.floor_divide,
-    np.remainder: rounding.remainder,
-    np.divmod: lambda a, b: (rounding.floor_divide(a, b), rounding.remainder(a, b)),
-    np.rint: rounding.rint,
-    np.trunc: rounding.trunc,
+    np.floor_divide: functions.floor_divide,
+    np.remainder: functions.remainder,
+    np.divmod: lambda a, b: (functions.floor_divide(a, b), functions.remainder(a, b)),
+    np.rint: functions.rint,
+    np.trunc: functions.trunc,
     np.log10: f.log10,
     np.log2: f.log2,
     np.exp2: lambda a: f.power(2.0, a),
@@ -84,7 +84,7 @@ _LATER_UFUNCS: dict[str, Callable[..., Any]] = {
 }
 _UFUNCS |= {getattr(np, name): function for name, function in _LATER_UFUNCS.items() if hasattr(np, name)}
 
-_REDUCTIONS = {np.add: r.total, np.multiply: r.product, np.minimum: r.smallest, np.maximum: r.largest}
+_REDUCTIONS = {np.add: r.sum_axes, np.multiply: r.prod_axes, np.minimum: r.min_axes, np.maximum: r.max_axes}
 _AXIS_OF_ITS_OWN = {getattr(np, "vecdot", None)}
 
 
@@ -236,7 +236,9 @@ def _join(function: Any, parts: Sequence[Any], args: Sequence[Any], options: Map
     blocks = numbered(parts) if function is np.block else [numbered(part) for part in parts]
     index = np.asarray(function(blocks, *args, **options))
     elements = ca.vertcat(*(layout.column(o._sx, o.shape) for o in operands))
-    return make(layout.gather(elements, (offset,), index.astype(int)), index.shape, union(operands))
+    return from_casadi(
+        layout.gather(elements, (offset,), index.astype(int)), index.shape, union_nodes(operands)
+    )
 
 
 def _leaves(parts: Any) -> list[Any]:
@@ -268,20 +270,20 @@ def _clip(
 _FUNCTIONS: dict[Any, Callable[..., Any]] = {
     np.where: f.where,
     np.clip: _clip,
-    np.sum: r.total,
-    np.mean: r.mean,
-    np.min: r.smallest,
-    np.max: r.largest,
-    np.amin: r.smallest,
-    np.amax: r.largest,
-    np.ptp: r.extent,
-    np.prod: r.product,
+    np.sum: r.sum_axes,
+    np.mean: r.mean_axes,
+    np.min: r.min_axes,
+    np.max: r.max_axes,
+    np.amin: r.min_axes,
+    np.amax: r.max_axes,
+    np.ptp: r.ptp_axes,
+    np.prod: r.prod_axes,
     np.cumsum: r.cumsum,
     np.cumprod: r.cumprod,
     np.diff: r.diff,
-    np.round: rounding.around,
-    np.around: rounding.around,
-    np.fix: rounding.trunc,
+    np.round: functions.around,
+    np.around: functions.around,
+    np.fix: functions.trunc,
     np.copy: as_expression,
     np.trace: _trace,
     np.dot: c.dot,
@@ -292,10 +294,10 @@ _FUNCTIONS: dict[Any, Callable[..., Any]] = {
     np.kron: c.kron,
     np.einsum: c.einsum,
     np.tensordot: c.tensordot,
-    np.linalg.norm: r.norms,
-    np.linalg.inv: f.inverse,
+    np.linalg.norm: r.norm_axes,
+    np.linalg.inv: f.matrix_inverse,
     np.linalg.det: f.determinant,
-    np.linalg.solve: c.solve,
+    np.linalg.solve: c.solve_linear,
     np.linalg.matrix_power: c.matrix_power,
     np.linalg.multi_dot: lambda arrays: reduce(c.dot, arrays),
     np.shape: lambda a: as_expression(a).shape,

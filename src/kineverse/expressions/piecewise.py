@@ -15,16 +15,16 @@ from typing import TYPE_CHECKING
 import casadi as ca
 import numpy as np
 
-from kineverse.errors import ValueRejectedError
+from kineverse.errors import InvalidValueError
 
 from . import layout
-from .expression import Expression, ExpressionLike, as_expression, make
+from .expression import Expression, ExpressionLike, as_expression, from_casadi
 from .node import Node
 
 if TYPE_CHECKING:
     from kineverse.symbols import Symbol
 
-Pieces = tuple[tuple[float, ...], ...]
+PolynomialPieces = tuple[tuple[float, ...], ...]
 
 
 def spline(
@@ -64,23 +64,23 @@ def spline(
 
     Raises
     ------
-    ValueRejectedError
+    InvalidValueError
         For knots that do not increase, as many values as there are not knots, NaN, or a periodic spline that
         does not end where it begins.
     """
     t, y = _numbers(knots, "knot"), _numbers(values, "value")
     _check_knots(t)
     if len(y) != len(t):
-        raise ValueRejectedError(f"A spline has as many values as knots, not {len(y)} for {len(t)}.")
+        raise InvalidValueError(f"A spline has as many values as knots, not {len(y)} for {len(t)}.")
     if periodic and y[0] != y[-1]:
-        raise ValueRejectedError(
+        raise InvalidValueError(
             f"A periodic spline ends where it begins: its last value {y[-1]:g} is not its first, {y[0]:g}."
         )
     if periodic and slopes is not None:
-        raise ValueRejectedError("A periodic spline has no ends that slopes could be given for.")
+        raise InvalidValueError("A periodic spline has no ends that slopes could be given for.")
     ends = _numbers((0.0, 0.0) if slopes is None else slopes, "slope")
     if len(ends) != 2:
-        raise ValueRejectedError(f"A spline has two slopes, at its ends, not {len(ends)}.")
+        raise InvalidValueError(f"A spline has two slopes, at its ends, not {len(ends)}.")
     h, rise = np.diff(t), np.diff(y)
     d = rise / h
     m = _periodic_slopes(h, d) if periodic else _slopes(h, d, *ends)
@@ -111,25 +111,25 @@ def piecewise(
 
     Raises
     ------
-    ValueRejectedError
+    InvalidValueError
         For knots that do not increase, another number of pieces, or numbers that are not finite.
     """
     operand = as_expression(x)
-    return Piecewise.of((operand,), operand.shape, checked_pieces(periodic, knots, pieces))
+    return Piecewise.of((operand,), operand.shape, check_pieces(periodic, knots, pieces))
 
 
-def checked_pieces(
+def check_pieces(
     periodic: bool, knots: Sequence[float], pieces: Sequence[Sequence[float]]
-) -> tuple[bool, tuple[float, ...], Pieces]:
+) -> tuple[bool, tuple[float, ...], PolynomialPieces]:
     """Return the options of a node, from what :func:`piecewise` takes."""
     t = _numbers(knots, "knot")
     _check_knots(t)
     table = tuple(tuple(_numbers(piece, "coefficient")) for piece in pieces)
     wanted = len(t) - 1 if periodic else len(t) + 1
     if len(table) != wanted:
-        raise ValueRejectedError(f"{len(t)} knots make {wanted} pieces here, not {len(table)}.")
+        raise InvalidValueError(f"{len(t)} knots make {wanted} pieces here, not {len(table)}.")
     if not table[0] or len({len(piece) for piece in table}) > 1:
-        raise ValueRejectedError("All pieces have equally many coefficients, and at least one.")
+        raise InvalidValueError("All pieces have equally many coefficients, and at least one.")
     return bool(periodic), tuple(t), table
 
 
@@ -152,9 +152,9 @@ class Piecewise(Node):
         return knots
 
     @property
-    def pieces(self) -> Pieces:
+    def pieces(self) -> PolynomialPieces:
         """The coefficients of each piece, constant first."""
-        pieces: Pieces = self.options[2]
+        pieces: PolynomialPieces = self.options[2]
         return pieces
 
     def _value(self) -> Expression:
@@ -163,7 +163,7 @@ class Piecewise(Node):
             return x
         elements = ca.densify(layout.column(x._sx, x.shape))
         values = [self._at(elements[i]) for i in range(x.size)]
-        return make(layout.from_column(ca.vertcat(*values), x.shape), x.shape, x._nodes)
+        return from_casadi(layout.from_column(ca.vertcat(*values), x.shape), x.shape, x._nodes)
 
     def _at(self, x: layout.SX) -> layout.SX:
         t = self.knots
@@ -208,21 +208,19 @@ def _numbers(given: Iterable[float], what: str) -> list[float]:
     try:
         numbers = [float(number) for number in given]
     except (TypeError, ValueError):
-        raise ValueRejectedError(f"Every {what} is a number, which is not so in {given!r:.80}.") from None
+        raise InvalidValueError(f"Every {what} is a number, which is not so in {given!r:.80}.") from None
     for i, number in enumerate(numbers):
         if not math.isfinite(number):
-            raise ValueRejectedError(f"Every {what} is a finite number, and number {i} is {number}.")
+            raise InvalidValueError(f"Every {what} is a finite number, and number {i} is {number}.")
     return numbers
 
 
 def _check_knots(t: list[float]) -> None:
     if len(t) < 2:
-        raise ValueRejectedError(f"There are at least two knots, not {len(t)}.")
+        raise InvalidValueError(f"There are at least two knots, not {len(t)}.")
     for i, (before, after) in enumerate(itertools.pairwise(t)):
         if not after > before:
-            raise ValueRejectedError(
-                f"Knots increase: knot {i + 1} is {after:g}, and knot {i} is {before:g}."
-            )
+            raise InvalidValueError(f"Knots increase: knot {i + 1} is {after:g}, and knot {i} is {before:g}.")
 
 
 def _slopes(

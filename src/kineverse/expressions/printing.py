@@ -1,9 +1,10 @@
-"""Expressions as text and as LaTeX, always of bounded length."""
+"""Expressions as text, LaTeX and HTML of bounded length; HTML tables for notebooks."""
 
 from __future__ import annotations
 
 import itertools
-from collections.abc import Mapping
+import math
+from collections.abc import Mapping, Sequence
 from html import escape
 from typing import TYPE_CHECKING, Any
 
@@ -15,7 +16,6 @@ from .layout import SX, column, rows_and_columns
 
 if TYPE_CHECKING:
     from kineverse.symbols import Symbol
-
 
 _LIMIT = 400
 _ELEMENTS = 16
@@ -85,7 +85,7 @@ def mapping_text(gradient: Mapping[Symbol, Expression]) -> str:
     """Return a gradient in the form of a dictionary, its first entries if it has many."""
     shown, length = [], 0
     for key, entry in gradient.items():
-        shown.append(f"{key}: {_short(repr(entry))}")
+        shown.append(f"{key}: {_truncate(repr(entry))}")
         length += len(shown[-1])
         if length > _LONGEST_MAPPING:
             break
@@ -96,7 +96,7 @@ def mapping_text(gradient: Mapping[Symbol, Expression]) -> str:
 def mapping_html(gradient: Mapping[Symbol, Expression]) -> str:
     """Return a gradient as a table of HTML, its first entries if it has many."""
     rows = [
-        f"<tr><td>{escape(_short(str(key)))}</td><td><code>{escape(_short(repr(entry)))}</code></td></tr>"
+        f"<tr><td>{escape(_truncate(str(key)))}</td><td><code>{escape(_truncate(repr(entry)))}</code></td></tr>"
         for key, entry in itertools.islice(gradient.items(), _ROWS)
     ]
     if len(gradient) > _ROWS:
@@ -104,7 +104,7 @@ def mapping_html(gradient: Mapping[Symbol, Expression]) -> str:
     return f"<table><tr><th>speed</th><th>entry of D</th></tr>{''.join(rows)}</table>"
 
 
-def _short(text: str) -> str:
+def _truncate(text: str) -> str:
     return text if len(text) <= _LIMIT else f"{text[:_LIMIT]} ..."
 
 
@@ -217,7 +217,7 @@ class _Latex(_Writer):
         return rf"\operatorname{{{name}}}\left({', '.join(arguments)}\right)"
 
     def symbol(self, symbol: Symbol) -> str:
-        name = _escaped(symbol.path)
+        name = _escape_latex(symbol.path)
         if symbol.order == 0:
             return name
         if symbol.order <= 4:
@@ -225,7 +225,7 @@ class _Latex(_Writer):
         return rf"{name}^{{({symbol.order})}}"
 
 
-def _escaped(path: str) -> str:
+def _escape_latex(path: str) -> str:
     if len(path) == 1:
         return path
     table: dict[str, Any] = {
@@ -238,3 +238,34 @@ def _escaped(path: str) -> str:
         "\\": r"\backslash ",
     }
     return r"\mathrm{" + "".join(table.get(c, c) for c in path) + "}"
+
+
+_MOST_TABLE_ROWS = 50
+_LONGEST_CELL = 200
+
+
+def html_table(caption: str, header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    """Return a table of texts, which are escaped; long ones are cut, and so are many rows."""
+    head = "".join(f"<th>{escape(title)}</th>" for title in header)
+    body = "".join(
+        f"<tr>{''.join(f'<td>{escape(_shorten_cell(cell))}</td>' for cell in row)}</tr>"
+        for row in rows[:_MOST_TABLE_ROWS]
+    )
+    if len(rows) > _MOST_TABLE_ROWS:
+        body += f'<tr><td colspan="{len(header)}">... {len(rows) - _MOST_TABLE_ROWS} more</td></tr>'
+    return (
+        f"<table><caption>{escape(caption)}</caption><thead><tr>{head}</tr></thead>"
+        f"<tbody>{body}</tbody></table>"
+    )
+
+
+def _shorten_cell(text: str) -> str:
+    return text if len(text) <= _LONGEST_CELL else f"{text[: _LONGEST_CELL - 1]}…"
+
+
+def format_number(value: float, digits: int = 4) -> str:
+    """Return a number in few digits; an absent limit as ``-``."""
+    if math.isinf(value):
+        return "-"
+    text = f"{value:.{digits}g}"
+    return "0" if float(text) == 0.0 else text

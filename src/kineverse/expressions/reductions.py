@@ -16,32 +16,32 @@ from .array_methods import Axis
 from .expression import Expression, ExpressionLike, array, as_expression
 
 
-def total(a: ExpressionLike, axis: Axis = None, *, keepdims: bool = False) -> Expression:
+def sum_axes(a: ExpressionLike, axis: Axis = None, *, keepdims: bool = False) -> Expression:
     """Return the sum over all elements, or along axes, which stay with length 1 if they are kept."""
-    return _kept(f.sum_along(a, axis), a, axis, keepdims)
+    return _keep_axes(f.sum_along(a, axis), a, axis, keepdims)
 
 
-def product(a: ExpressionLike, axis: Axis = None, *, keepdims: bool = False) -> Expression:
+def prod_axes(a: ExpressionLike, axis: Axis = None, *, keepdims: bool = False) -> Expression:
     """Return the product of all elements, or along axes."""
-    return _kept(f.product_along(a, axis), a, axis, keepdims)
+    return _keep_axes(f.product_along(a, axis), a, axis, keepdims)
 
 
-def smallest(a: ExpressionLike, axis: Axis = None, *, keepdims: bool = False) -> Expression:
+def min_axes(a: ExpressionLike, axis: Axis = None, *, keepdims: bool = False) -> Expression:
     """Return the smallest of all elements, or along axes."""
-    return _kept(f.smallest(a, axis), a, axis, keepdims)
+    return _keep_axes(f.min_along(a, axis), a, axis, keepdims)
 
 
-def largest(a: ExpressionLike, axis: Axis = None, *, keepdims: bool = False) -> Expression:
+def max_axes(a: ExpressionLike, axis: Axis = None, *, keepdims: bool = False) -> Expression:
     """Return the largest of all elements, or along axes."""
-    return _kept(f.largest(a, axis), a, axis, keepdims)
+    return _keep_axes(f.max_along(a, axis), a, axis, keepdims)
 
 
-def extent(a: ExpressionLike, axis: Axis = None, *, keepdims: bool = False) -> Expression:
+def ptp_axes(a: ExpressionLike, axis: Axis = None, *, keepdims: bool = False) -> Expression:
     """Return the largest less the smallest of all elements, or along axes."""
-    return largest(a, axis, keepdims=keepdims) - smallest(a, axis, keepdims=keepdims)
+    return max_axes(a, axis, keepdims=keepdims) - min_axes(a, axis, keepdims=keepdims)
 
 
-def mean(a: ExpressionLike, axis: Axis = None, *, keepdims: bool = False) -> Expression:
+def mean_axes(a: ExpressionLike, axis: Axis = None, *, keepdims: bool = False) -> Expression:
     """Return the mean of all elements, or along axes.
 
     Raises
@@ -53,10 +53,10 @@ def mean(a: ExpressionLike, axis: Axis = None, *, keepdims: bool = False) -> Exp
     if summed.size and not operand.size:
         raise ShapeError(f"Nothing has no mean (of shape {operand.shape}).")
     result = summed * (summed.size / operand.size) if summed.size else summed
-    return _kept(result, a, axis, keepdims)
+    return _keep_axes(result, a, axis, keepdims)
 
 
-def _kept(result: Expression, a: ExpressionLike, axis: Axis, keepdims: bool) -> Expression:
+def _keep_axes(result: Expression, a: ExpressionLike, axis: Axis, keepdims: bool) -> Expression:
     if not keepdims:
         return result
     shape = as_expression(a).shape
@@ -67,35 +67,37 @@ def _kept(result: Expression, a: ExpressionLike, axis: Axis, keepdims: bool) -> 
 
 def cumsum(a: ExpressionLike, axis: int | None = None) -> Expression:
     """Return the sums up to each element, along an axis or of all elements in C order."""
-    return _running(lambda x, y: x + y, a, axis)
+    return _accumulate(lambda x, y: x + y, a, axis)
 
 
 def cumprod(a: ExpressionLike, axis: int | None = None) -> Expression:
     """Return the products up to each element, along an axis or of all elements in C order."""
-    return _running(lambda x, y: x * y, a, axis)
+    return _accumulate(lambda x, y: x * y, a, axis)
 
 
-def _running(
+def _accumulate(
     join: Callable[[Expression, Expression], Expression], a: ExpressionLike, axis: Any
 ) -> Expression:
-    rows = _first(as_expression(a).ravel() if axis is None else as_expression(a), 0 if axis is None else axis)
+    rows = _axis_to_front(
+        as_expression(a).ravel() if axis is None else as_expression(a), 0 if axis is None else axis
+    )
     found: list[Expression] = []
     for row in rows:
         found.append(join(found[-1], row) if found else row)
-    return _back(array(found).reshape(rows.shape), 0 if axis is None else axis)
+    return _axis_from_front(array(found).reshape(rows.shape), 0 if axis is None else axis)
 
 
 def diff(a: ExpressionLike, n: int = 1, axis: int = -1) -> Expression:
     """Return the differences of neighbours along an axis, n times."""
     if not isinstance(n, (int, np.integer)) or n < 0:
         raise ExpressionError(f"Differences are taken a whole number of times, not {n!r}.")
-    rows = _first(as_expression(a), axis)
+    rows = _axis_to_front(as_expression(a), axis)
     for _ in range(int(n)):
         rows = rows[1:] - rows[:-1]
-    return _back(rows, axis)
+    return _axis_from_front(rows, axis)
 
 
-def norms(
+def norm_axes(
     x: ExpressionLike,
     ord: Any = None,  # noqa: A002 - numpy's name
     axis: Axis = None,
@@ -128,9 +130,9 @@ def vector_norm(
     if ord == 2:
         return _euclidean(as_expression(x), axis, keepdims)
     if ord == 1:
-        return total(f.absolute(x), axis, keepdims=keepdims)
+        return sum_axes(f.absolute(x), axis, keepdims=keepdims)
     if ord in (math.inf, -math.inf):
-        return (largest if ord > 0 else smallest)(f.absolute(x), axis, keepdims=keepdims)
+        return (max_axes if ord > 0 else min_axes)(f.absolute(x), axis, keepdims=keepdims)
     raise _no_such_norm(ord, "a vector")
 
 
@@ -155,13 +157,13 @@ def _no_such_norm(ord: Any, what: str) -> ExpressionError:  # noqa: A002
 
 def _euclidean(x: Expression, axis: Axis, keepdims: bool) -> Expression:
     if axis is None:
-        return _kept(f.norm(x), x, axis, keepdims)
+        return _keep_axes(f.norm(x), x, axis, keepdims)
     rows, rest = f.axis_first(x, axis)
     found = array([f.norm(column) for column in rows.T]).reshape(rest)
-    return _kept(found, x, axis, keepdims)
+    return _keep_axes(found, x, axis, keepdims)
 
 
-def _first(x: Expression, axis: int) -> Expression:
+def _axis_to_front(x: Expression, axis: int) -> Expression:
     """Return an array with one of its axes moved to the front."""
     try:
         return x._rearranged(np.moveaxis(layout.indices(x.shape), axis, 0))
@@ -169,5 +171,5 @@ def _first(x: Expression, axis: int) -> Expression:
         raise ShapeError(f"Axis {axis} does not fit an array of shape {x.shape}.") from None
 
 
-def _back(x: Expression, axis: int) -> Expression:
+def _axis_from_front(x: Expression, axis: int) -> Expression:
     return x._rearranged(np.moveaxis(layout.indices(x.shape), 0, axis))

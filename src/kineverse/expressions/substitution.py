@@ -9,9 +9,17 @@ import casadi as ca
 
 from kineverse.errors import ExpressionError, ShapeError
 
-from .expression import NO_NODES, Expression, ExpressionLike, array, as_expression, make, watcher_of
+from .expression import (
+    NO_NODES,
+    Expression,
+    ExpressionLike,
+    access_listener,
+    array,
+    as_expression,
+    from_casadi,
+)
+from .graph import gradient_keys, leaves, topological_order
 from .layout import SX
-from .leaves import bottom_up, gradient_keys, leaves
 
 if TYPE_CHECKING:
     from kineverse.symbols import Symbol
@@ -46,7 +54,7 @@ class Substitution(dict["Symbol", Expression]):
 
     def meet(self, nodes: Iterable[Node]) -> None:
         """Find out what nodes become, those below them first."""
-        for node in bottom_up(nodes, lambda n: n.arguments, self._images.__contains__):
+        for node in topological_order(nodes, lambda n: n.arguments, self._images.__contains__):
             self._images[node] = node.substitute(self) if node.depends_on(self) else None
 
 
@@ -67,28 +75,28 @@ def substitute(expression: Expression, values: Mapping[Symbol, ExpressionLike]) 
             )
         if replacement is not symbol:
             substitution[symbol] = replacement
-    watcher = watcher_of(expression)
+    watcher = access_listener(expression)
     if watcher is not None and substitution:
         anew: Expression = watcher.ask(
             "substitute", expression, array(list(substitution)), array(list(substitution.values()))
         )
         return anew
-    moving = stand_ins(s for s, e in substitution.items() if not s.has_derivative and gradient_keys(e))
+    moving = dummy_symbols(s for s, e in substitution.items() if not s.has_derivative and gradient_keys(e))
     if moving:
         # D of a parameter is empty; for a while it is a symbol that has one, which is then replaced.
-        expression = renamed(expression, moving)
+        expression = rename_symbols(expression, moving)
         substitution |= {stand_in: substitution[s] for s, stand_in in moving.items()}
-    return apply(expression, substitution)
+    return apply_substitution(expression, substitution)
 
 
-def stand_ins(parameters: Iterable[Symbol]) -> dict[Symbol, Symbol]:
+def dummy_symbols(parameters: Iterable[Symbol]) -> dict[Symbol, Symbol]:
     """Return symbols that move and occur nowhere else, for parameters to be differentiated by."""
     from kineverse.symbols import Symbol
 
     return {p: Symbol(f"∂/{i}/{p.path}") for i, p in enumerate(parameters) if not p.has_derivative}
 
 
-def renamed(expression: Expression, names: Mapping[Symbol, Symbol]) -> Expression:
+def rename_symbols(expression: Expression, names: Mapping[Symbol, Symbol]) -> Expression:
     """Return the expression with symbols exchanged for ones that occur nowhere in it."""
     images: dict[Node, Expression] = {}
 
@@ -98,14 +106,14 @@ def renamed(expression: Expression, names: Mapping[Symbol, Symbol]) -> Expressio
         if not chosen:
             return inner
         (sx,) = ca.substitute([inner._sx], [s._sx for s in chosen], [names[s]._sx for s in chosen])
-        return make(sx, part._shape, inner._nodes)
+        return from_casadi(sx, part._shape, inner._nodes)
 
-    for node in bottom_up(leaves(expression)[1], lambda n: n.arguments, images.__contains__):
+    for node in topological_order(leaves(expression)[1], lambda n: n.arguments, images.__contains__):
         images[node] = type(node).of(tuple(map(rename, node.arguments)), node.shape, node.options)
     return rename(expression)
 
 
-def apply(expression: Expression, replacements: Mapping[Symbol, Expression]) -> Expression:
+def apply_substitution(expression: Expression, replacements: Mapping[Symbol, Expression]) -> Expression:
     """Return e∘S for a substitution that is known to be well formed."""
     if not replacements:
         return expression
@@ -132,7 +140,7 @@ def apply(expression: Expression, replacements: Mapping[Symbol, Expression]) -> 
     if not old:
         return expression
     (sx,) = ca.substitute([expression._sx], old, new)
-    return make(sx, expression._shape, frozenset(kept) or NO_NODES)
+    return from_casadi(sx, expression._shape, frozenset(kept) or NO_NODES)
 
 
 def replace_nodes(expression: Expression, replacements: Mapping[Node, Expression]) -> Expression:
@@ -147,7 +155,7 @@ def replace_nodes(expression: Expression, replacements: Mapping[Node, Expression
     (sx,) = ca.substitute(
         [expression._sx], [n.sx for n in chosen], [ca.densify(replacements[n]._sx) for n in chosen]
     )
-    return make(sx, expression._shape, kept)
+    return from_casadi(sx, expression._shape, kept)
 
 
 def compose_gradient(
@@ -162,7 +170,7 @@ def compose_gradient(
 
     replaced = {a.derivative(): s for a, s in substitution.items() if a.has_derivative}
     for key, entry in entries.items():
-        carried = apply(entry, substitution)
+        carried = apply_substitution(entry, substitution)
         if key in replaced:
             for inner, rate in replaced[key].gradient(heuristic).items():
                 add(inner, carried * rate)

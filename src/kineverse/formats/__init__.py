@@ -1,6 +1,20 @@
 """Readers and writers of robot and scene descriptions."""
 
-from .loading import load
-from .sources import locate_model, shipped_models
+from typing import TYPE_CHECKING
 
-__all__ = ["load", "locate_model", "shipped_models"]
+from .loader import load
+from .locate import locate_model, shipped_models
+
+if TYPE_CHECKING:
+    from .document import document_hash, from_bytes, to_bytes
+
+__all__ = ["document_hash", "from_bytes", "load", "locate_model", "shipped_models", "to_bytes"]
+
+
+def __getattr__(name: str) -> object:
+    # The document reader is heavy at start-up.
+    import importlib
+
+    if name in ("document_hash", "from_bytes", "to_bytes"):
+        return getattr(importlib.import_module("kineverse.formats.document"), name)
+    raise AttributeError(f"module 'kineverse.formats' has no attribute {name!r}")

@@ -6,7 +6,7 @@
 (screw/bolt,)
 
 ``kineverse view articulations/screw`` shows it. Each module has scenes of one family: functions of a
-:class:`~kineverse.gallery.scene.Scene` that put joints and bodies into it, and whose docstring says in one
+:class:`~kineverse.gallery.scene.SceneBuilder` that put joints and bodies into it, and whose docstring says in one
 line what it shows.
 """
 
@@ -18,12 +18,12 @@ from functools import cache
 from kineverse.errors import UnknownNameError, suggest
 from kineverse.model.operation import Operation
 
-from . import axes, bases, couplings, freedoms, linkages, mechanisms
-from .scene import Build, Scene
+from . import bases, linkages, mechanisms, multi_axis, single_axis, transmissions
+from .scene import Build, SceneBuilder
 
 __all__ = ["names", "operations", "summary"]
 
-_FAMILIES = (axes, freedoms, couplings, bases, mechanisms, linkages)
+_FAMILIES = (single_axis, multi_axis, transmissions, bases, mechanisms, linkages)
 
 
 def names() -> tuple[str, ...]:
@@ -52,7 +52,7 @@ def operations(name: str, prefix: str | None = None) -> Iterator[Operation]:
     UnknownNameError
         If there is no such scene, with similar names.
     """
-    scene = Scene(prefix)
+    scene = SceneBuilder(prefix)
     _build(name)(scene)
     yield from scene.operations
 

@@ -7,30 +7,13 @@ import math
 import numpy as np
 
 from kineverse.articulations import Ackermann, Continuous, DifferentialDrive, Mecanum, OmniBase, Revolute
+from kineverse.articulations.mechanisms.simple_bodies import BLUE, DARK, STEEL
 
-from .scene import Scene
-from .shapes import (
-    BLUE,
-    DARK,
-    GREEN,
-    ORANGE,
-    RED,
-    STEEL,
-    WHITE,
-    Shapes,
-    Y,
-    Z,
-    arrow,
-    bone,
-    box,
-    disc,
-    rod,
-    sphere,
-    wheel,
-)
+from .scene import SceneBuilder
+from .shapes import GREEN, ORANGE, RED, WHITE, Shapes, Y, Z, arrow, bone, box, disc, rod, sphere, wheel
 
 
-def omni_base(scene: Scene) -> None:
+def omni_base(scene: SceneBuilder) -> None:
     """Show a round base that goes any way and turns: all its coordinates are free."""
     _floor(scene)
     base = disc(0.25, 0.14, (0, 0, 0.13), color=BLUE) + arrow(0.36, 0.02, (0, 0, 0.21), WHITE)
@@ -47,7 +30,7 @@ def omni_base(scene: Scene) -> None:
     scene.joint(OmniBase, "base", base)
 
 
-def differential_drive(scene: Scene) -> None:
+def differential_drive(scene: SceneBuilder) -> None:
     """Show two driven wheels and a caster: it turns on the spot and never goes sideways."""
     _floor(scene)
     radius, track = 0.08, 0.34
@@ -62,7 +45,7 @@ def differential_drive(scene: Scene) -> None:
         scene.joint(Continuous, name, wheel(radius, 0.035), parent="base", at=at, axis=Y)
 
 
-def ackermann(scene: Scene) -> None:
+def ackermann(scene: SceneBuilder) -> None:
     """Show a car: it goes where its front wheels point, each on its own circle about one centre."""
     _floor(scene)
     length, track, radius = 0.5, 0.34, 0.075
@@ -90,7 +73,7 @@ def ackermann(scene: Scene) -> None:
         )
 
 
-def mecanum(scene: Scene) -> None:
+def mecanum(scene: SceneBuilder) -> None:
     """Show four wheels with oblique rollers: it goes sideways as well."""
     _floor(scene)
     radius, track, length = 0.08, 0.42, 0.44
@@ -111,7 +94,7 @@ def mecanum(scene: Scene) -> None:
         scene.joint(Continuous, f"base/{name}_wheel", shapes, parent="base", at=at, axis=Y)
 
 
-def _floor(scene: Scene) -> None:
+def _floor(scene: SceneBuilder) -> None:
     """Put a plate below everything, with the place of the start on it."""
     plate = box((2.2, 2.2, 0.02), (0, 0, -0.01), (0.84, 0.86, 0.87, 1.0))
     lines = box((0.5, 0.015, 0.002), (0, 0, 0), STEEL) + box((0.015, 0.5, 0.002), (0, 0, 0), STEEL)

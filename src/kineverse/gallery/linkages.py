@@ -9,33 +9,16 @@ import math
 from typing import Any
 
 from kineverse.articulations import Prismatic, Revolute
+from kineverse.articulations.mechanisms.simple_bodies import BLUE, DARK, STEEL, WOOD
 from kineverse.expressions.expression import Expression
 from kineverse.model.body import Rgba
 from kineverse.spatial import rotation_x, rotation_z, translation
 
-from .scene import Scene
-from .shapes import (
-    BLUE,
-    DARK,
-    GREEN,
-    ORANGE,
-    RED,
-    STEEL,
-    WOOD,
-    Point,
-    Shapes,
-    X,
-    Y,
-    Z,
-    box,
-    disc,
-    link,
-    rod,
-    sphere,
-)
+from .scene import SceneBuilder
+from .shapes import GREEN, ORANGE, RED, Point, Shapes, X, Y, Z, box, disc, link, rod, sphere
 
 
-def four_bar(scene: Scene) -> None:
+def four_bar(scene: SceneBuilder) -> None:
     """Show a crank that goes round, and a rocker that swings to and fro."""
     crank, coupler, rocker, ground = 0.12, 0.33, 0.27, 0.3
     _board(scene, 0.28, _foot(0, 0.24) + _foot(ground, 0.24) + box((0.6, 0.03, 0.2), (0.15, -0.27, 0), DARK))
@@ -45,7 +28,7 @@ def four_bar(scene: Scene) -> None:
     scene.loop("four_bar", "coupler_end", "rocker_end")
 
 
-def slider_crank(scene: Scene) -> None:
+def slider_crank(scene: SceneBuilder) -> None:
     """Show a crank, a rod, and a slider on a rail."""
     crank, length = 0.1, 0.3
     rail = box((0.5, 0.03, 0.08), (0.32, -0.055, 0), DARK) + box((0.8, 0.03, 0.2), (0.2, -0.24, 0), DARK)
@@ -63,7 +46,7 @@ def slider_crank(scene: Scene) -> None:
     scene.loop("slider_crank", "rod_end", "slider", home={"slider": crank + length})
 
 
-def spatial_four_bar(scene: Scene) -> None:
+def spatial_four_bar(scene: SceneBuilder) -> None:
     """Show a crank about one axis and a rocker about another, with a rod between two balls."""
     ground = box((0.74, 0.56, 0.03), (0.2, 0.16, -0.205), DARK) + rod((0, 0, -0.2), (0, 0, 0), 0.03, STEEL)
     for x in (0.34, 0.46):
@@ -86,7 +69,7 @@ def spatial_four_bar(scene: Scene) -> None:
     scene.loop("spatial_four_bar", "rod_end", "driven_ball")
 
 
-def parallel_gripper(scene: Scene) -> None:
+def parallel_gripper(scene: SceneBuilder) -> None:
     """Show two fingers on parallelograms, which stay parallel; the second one mirrors the first."""
     length = 0.1
     palm = box((0.07, 0.2, 0.05), (-0.035, 0, 0), DARK) + disc(0.035, 0.12, (-0.12, 0, 0), X, STEEL)
@@ -112,7 +95,7 @@ def parallel_gripper(scene: Scene) -> None:
         )
 
 
-def scissor_linkage(scene: Scene) -> None:
+def scissor_linkage(scene: SceneBuilder) -> None:
     """Show three pairs of crossing bars, which stretch as the lowest one rises."""
     length, stages = 0.36, 3
     ground = box((0.5, 0.03, 0.16), (0.18, -0.035, 0), DARK)
@@ -132,7 +115,7 @@ def scissor_linkage(scene: Scene) -> None:
     scene.frame("tip", sphere(0.03, color=RED), parent=f"bar_a{stages - 1}", at=(length, 0, 0.03))
 
 
-def delta_robot(scene: Scene) -> None:
+def delta_robot(scene: SceneBuilder) -> None:
     """Show three motors move a platform that never tilts."""
     base, upper, forearm, platform = 0.16, 0.2, 0.42, 0.06
     frame = disc(0.2, 0.04, (0, 0, 0.03), color=DARK)
@@ -175,7 +158,7 @@ _JANSEN = {
 }  # fmt: skip
 
 
-def jansen_leg(scene: Scene) -> None:
+def jansen_leg(scene: SceneBuilder) -> None:
     """Show Theo Jansen's leg: one crank, and a foot that walks on a flat path."""
     s = {name: value / 200 for name, value in _JANSEN.items()}
     # The crank turns at the origin, the other pin that stands still is at (-a, -l).
@@ -219,7 +202,7 @@ def jansen_leg(scene: Scene) -> None:
     scene.frame("tip", disc(0.03, 0.05, color=RED), parent="foot", at=(0, 0, 0.06))
 
 
-def _board(scene: Scene, height: float, shapes: Shapes, turn: Expression | None = None) -> None:
+def _board(scene: SceneBuilder, height: float, shapes: Shapes, turn: Expression | None = None) -> None:
     upright = translation(0, 0, height) @ rotation_x(math.pi / 2) if turn is None else turn
     scene.frame("board", shapes, at=upright)
 
@@ -241,7 +224,7 @@ def _between(
 
 
 def _bar(
-    scene: Scene,
+    scene: SceneBuilder,
     name: str,
     parent: str,
     at: tuple[float, float],
@@ -260,7 +243,7 @@ def _bar(
 
 
 def _cross(
-    scene: Scene,
+    scene: SceneBuilder,
     name: str,
     parent: str,
     at: tuple[float, float],
@@ -282,7 +265,7 @@ def _cross(
 
 
 def _triangle(
-    scene: Scene, name: str, parent: str, base: float, near: float, far: float, layer: int, color: Rgba
+    scene: SceneBuilder, name: str, parent: str, base: float, near: float, far: float, layer: int, color: Rgba
 ) -> None:
     """Put the third corner over a bar, left of it, at distances from its beginning and its end."""
     x = (base**2 + near**2 - far**2) / (2 * base)

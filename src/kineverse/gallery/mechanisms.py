@@ -16,74 +16,75 @@ from kineverse.articulations.mechanisms import (
     ScissorLift,
     ScrewAndNut,
 )
+from kineverse.articulations.mechanisms.simple_bodies import STEEL
 
-from .scene import Scene
-from .shapes import RED, STEEL, box, rod, sphere
+from .scene import SceneBuilder
+from .shapes import RED, box, rod, sphere
 
 
-def garage_door(scene: Scene) -> None:
+def garage_door(scene: SceneBuilder) -> None:
     """Show a garage door, locked by its bolt while it is closed."""
     scene.mechanism(GarageDoor, "garage")
 
 
-def garage_door_as_published(scene: Scene) -> None:
+def garage_door_as_published(scene: SceneBuilder) -> None:
     """Show the garage door with the coordinate of the papers, whose slope is infinite where it is closed."""
     scene.mechanism(GarageDoor, "garage", form="published")
 
 
-def folding_door(scene: Scene) -> None:
+def folding_door(scene: SceneBuilder) -> None:
     """Show a cupboard whose door folds while it rises; a spring opens it, and past a point shuts it."""
     scene.mechanism(FoldingDoor, "door")
 
 
-def door_with_handle(scene: Scene) -> None:
+def door_with_handle(scene: SceneBuilder) -> None:
     """Show a door that opens while its handle is pressed."""
     scene.mechanism(DoorWithHandle, "room")
 
 
-def latch(scene: Scene) -> None:
+def latch(scene: SceneBuilder) -> None:
     """Show a door that a sprung bolt holds shut."""
     scene.mechanism(Latch, "gate", width=0.4, height=0.6, thickness=0.05)
 
 
-def microwave(scene: Scene) -> None:
+def microwave(scene: SceneBuilder) -> None:
     """Show a microwave, whose button lets the door go."""
     scene.mechanism(Microwave, "oven")
 
 
-def faucet(scene: Scene) -> None:
+def faucet(scene: SceneBuilder) -> None:
     """Show a tap: its lever is lifted for more water and turned for warmer water."""
     scene.mechanism(Faucet, "tap")
 
 
-def piston(scene: Scene) -> None:
+def piston(scene: SceneBuilder) -> None:
     """Show a piston that a crank moves by a rod, over the whole turn."""
     scene.mechanism(PistonAndRod, "engine")
 
 
-def pedal_bin(scene: Scene) -> None:
+def pedal_bin(scene: SceneBuilder) -> None:
     """Show a bin whose lid a pedal opens."""
     scene.mechanism(PedalBin, "bin")
 
 
-def screw_and_nut(scene: Scene) -> None:
+def screw_and_nut(scene: SceneBuilder) -> None:
     """Show a screw that turns in its place, and a nut that slides along it."""
     scene.mechanism(ScrewAndNut, "vise", pitch=0.04, travel=0.16, radius=0.015)
     grip = rod((0, 0, 0.19), (0, 0, 0.22), 0.012, STEEL) + rod((0, 0, 0.22), (0.05, 0, 0.22), 0.006, RED)
     scene.frame("grip", grip + sphere(0.01, (0.05, 0, 0.22), RED), parent="vise/screw")
 
 
-def scissor_lift(scene: Scene) -> None:
+def scissor_lift(scene: SceneBuilder) -> None:
     """Show a platform on three pairs of crossed arms."""
     scene.mechanism(ScissorLift, "lift")
 
 
-def desk_lamp(scene: Scene) -> None:
+def desk_lamp(scene: SceneBuilder) -> None:
     """Show a lamp on two parallelograms, whose head keeps its direction."""
     scene.mechanism(DeskLamp, "lamp")
 
 
-def ratchet(scene: Scene) -> None:
+def ratchet(scene: SceneBuilder) -> None:
     """Show a wheel that turns one way only, until its pawl is lifted."""
     scene.mechanism(Ratchet, "winch")
     # Of a disc alone one would not see that it turns.

@@ -8,19 +8,18 @@ from typing import Any, TypeAlias
 from kineverse.articulations import Joint
 from kineverse.articulations.mechanisms import Mechanism
 from kineverse.expressions.expression import Expression
-from kineverse.formats.set_body import SetBody
 from kineverse.loops import CloseLoop
 from kineverse.model.body import Body, Pose
-from kineverse.model.edit import AddFrame
 from kineverse.model.frame import WORLD, Frame
 from kineverse.model.operation import Operation
+from kineverse.model.operations import AddFrame, SetBody
 from kineverse.spatial import translation
 from kineverse.symbols import Symbol, position
 
 from .shapes import Shapes
 
 
-class Scene:
+class SceneBuilder:
     """Collects operations whose names it puts below a prefix.
 
     Attributes
@@ -107,5 +106,5 @@ class Scene:
         self.operations.append(loop)
 
 
-Build: TypeAlias = Callable[[Scene], None]
+Build: TypeAlias = Callable[[SceneBuilder], None]
 """What puts everything into a scene; its name is that of the scene."""

@@ -12,8 +12,8 @@ from typing import TypeAlias
 import numpy as np
 import numpy.typing as npt
 
-from kineverse.articulations.mechanisms import solids
-from kineverse.articulations.mechanisms.solids import BLUE, DARK, STEEL, WOOD
+from kineverse.articulations.mechanisms import simple_bodies
+from kineverse.articulations.mechanisms.simple_bodies import BLUE, DARK, STEEL, WOOD
 from kineverse.model.body import Box, Capsule, Cylinder, Geometry, Pose, Rgba, Shape, Sphere, Vector3
 
 __all__ = [
@@ -30,13 +30,13 @@ __all__ = [
     "X",
     "Y",
     "Z",
-    "across",
     "arrow",
     "bone",
     "box",
     "disc",
     "gear",
     "link",
+    "perpendicular",
     "rod",
     "sphere",
     "wheel",
@@ -47,8 +47,8 @@ Point: TypeAlias = Sequence[float] | npt.NDArray[np.float64]
 
 ORANGE: Rgba = (0.93, 0.56, 0.17, 1.0)
 GREEN: Rgba = (0.35, 0.62, 0.38, 1.0)
-WHITE = solids.PALE
-RED = solids.RED
+WHITE = simple_bodies.PALE
+RED = simple_bodies.RED
 """The colour of marks, by which one sees what turns."""
 
 X, Y, Z = (1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)
@@ -74,7 +74,7 @@ def sphere(radius: float, at: Point = ORIGIN, color: Rgba = STEEL) -> Shapes:
 
 def rod(start: Point, end: Point, radius: float, color: Rgba = STEEL) -> Shapes:
     """Return a cylinder from one point to another."""
-    return (solids.rod(_triple(start), _triple(end), radius, color),)
+    return (simple_bodies.rod_shape(_triple(start), _triple(end), radius, color),)
 
 
 def bone(start: Point, end: Point, radius: float, color: Rgba = STEEL) -> Shapes:
@@ -108,7 +108,7 @@ def link(
 def gear(
     radius: float, teeth: int, thickness: float, at: Point = ORIGIN, axis: Point = Z, color: Rgba = STEEL
 ) -> Shapes:
-    """Return a gear of a pitch radius; the first tooth, which has a mark, is where :func:`across` points."""
+    """Return a gear of a pitch radius; the first tooth, which has a mark, is where :func:`perpendicular` points."""
     size = math.pi * radius / teeth
     turn = _frame(axis)
     shapes = disc(radius - 0.5 * size, thickness, at, axis, color)
@@ -143,7 +143,7 @@ def arrow(length: float, height: float, at: Point = ORIGIN, color: Rgba = RED) -
     return shaft + tips
 
 
-def across(axis: Point) -> tuple[float, float, float]:
+def perpendicular(axis: Point) -> tuple[float, float, float]:
     """Return the direction from which turning about an axis is counted in this module."""
     x, y, z = _frame(axis)[:, 0].tolist()
     return x, y, z

@@ -1,15 +1,24 @@
-"""Layer 4: the collision scene of a model. It needs the extra ``geometry`` when a scene is made."""
+"""Collision geometry of a model (layer 4); a scene needs the extra ``geometry``."""
 
-from kineverse.vocabulary import MODULE, unknown_attribute
+from kineverse._synonyms import MODULE_SYNONYMS, unknown_attribute_error
 
-from .expressions import PairDistance
-from .found import Found
-from .results import Closest, Hit, Nearby
-from .rules import RULES, Rule, rules_as_data
+from .collision_filter import RULES, Rule, rules_as_data
+from .distance_expressions import PairDistance
+from .results import DistanceResult, DistanceResults, NearestPoint, RayHit
 from .scene import Scene
 
-__all__ = ["RULES", "Closest", "Found", "Hit", "Nearby", "PairDistance", "Rule", "Scene", "rules_as_data"]
+__all__ = [
+    "RULES",
+    "DistanceResult",
+    "DistanceResults",
+    "NearestPoint",
+    "PairDistance",
+    "RayHit",
+    "Rule",
+    "Scene",
+    "rules_as_data",
+]
 
 
 def __getattr__(name: str) -> object:
-    raise unknown_attribute("The package kineverse.geometry", name, __all__, MODULE)
+    raise unknown_attribute_error("The package kineverse.geometry", name, __all__, MODULE_SYNONYMS)

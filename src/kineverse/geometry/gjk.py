@@ -1,4 +1,4 @@
-"""How far two convex solids are apart, in Python: for what coal gets wrong.
+"""Distance of two convex solids by GJK, in Python.
 
 This is the iteration of :mod:`.narrow_source`, a thousand times slower, with the same two bounds: an answer
 is given only once they meet.
@@ -11,8 +11,8 @@ from itertools import combinations
 import numpy as np
 
 from .mesh_files import Faces, Floats
-from .reach import Placed, support
-from .solids import Core, Solid
+from .shapes import Core, Solid
+from .support import PlacedSolid, support
 
 _STEPS = 200
 _MET, _STUCK = 1e-11, 1e-7
@@ -20,7 +20,7 @@ _MET, _STUCK = 1e-11, 1e-7
 than 1 m this part."""
 
 
-def separation(a: Placed, b: Placed) -> tuple[float, Floats, Floats] | None:
+def separation(a: PlacedSolid, b: PlacedSolid) -> tuple[float, Floats, Floats] | None:
     """Return the distance of two solids [m], the nearest point (3,) of the first, and the normal from it.
 
     None if they touch, or if that is not certain.
@@ -54,7 +54,7 @@ def separation(a: Placed, b: Placed) -> tuple[float, Floats, Floats] | None:
 
 
 def separation_of_faces(
-    a: Placed, faces: Faces, rotation: Floats, position: Floats
+    a: PlacedSolid, faces: Faces, rotation: Floats, position: Floats
 ) -> tuple[float, Floats, Floats] | None:
     """Return what :func:`separation` does, for a convex solid and triangles at a pose; None in touch."""
     solid, rotation_a, at_a = a

@@ -1,4 +1,4 @@
-"""Mesh files: found, checked, read and kept by content."""
+"""Mesh files: search, checks, and reading with a cache by content."""
 
 from __future__ import annotations
 
@@ -17,16 +17,16 @@ from typing import Any, TypeAlias
 import numpy as np
 import numpy.typing as npt
 
-from kineverse.errors import FormatError, MissingExtraError
-from kineverse.formats.packages import locate_mesh
-from kineverse.formats.roots import is_below
-from kineverse.installation import install_command
+from kineverse._extras import install_command
+from kineverse.errors import FormatError, MissingDependencyError
+from kineverse.formats.resource_paths import locate_mesh
+from kineverse.formats.root_folder import is_below
 from kineverse.model.body import Mesh
 
 Floats: TypeAlias = npt.NDArray[np.float64]
 Integers: TypeAlias = npt.NDArray[np.int64]
 
-LARGEST = 256 * 2**20
+LARGEST_FILE = 256 * 2**20
 """No mesh file above this size is read [bytes]: a description is not trusted with memory."""
 
 _ARCHIVES = (".zip", ".gz", ".bz2", ".tgz", ".xz")
@@ -57,7 +57,7 @@ _by_content: dict[tuple[str, str], Faces] = {}
 _reading = threading.Lock()
 
 
-def find(mesh: Mesh) -> MeshFile:
+def find_mesh_file(mesh: Mesh) -> MeshFile:
     """Return the file of a mesh.
 
     Raises
@@ -65,12 +65,14 @@ def find(mesh: Mesh) -> MeshFile:
     FormatError
         If there is none, or it lies outside of the root of the description.
     OSError
-        If it cannot be read, or is larger than :data:`LARGEST`.
+        If it cannot be read, or is larger than :data:`LARGEST_FILE`.
     """
     path = locate_mesh(mesh)
     size = path.stat().st_size
-    if size > LARGEST:
-        raise OSError(f"{path} has {size / 2**20:.0f} MiB, more than the {LARGEST / 2**20:.0f} MiB read here")
+    if size > LARGEST_FILE:
+        raise OSError(
+            f"{path} has {size / 2**20:.0f} MiB, more than the {LARGEST_FILE / 2**20:.0f} MiB read here"
+        )
     return MeshFile(path, hashlib.sha256(path.read_bytes()).hexdigest())
 
 
@@ -85,20 +87,22 @@ def read_faces(file: MeshFile) -> Faces:
     key = (file.digest, file.kind)
     with _reading:
         if key not in _by_content:
-            _by_content[key] = _read(file)
+            _by_content[key] = _read_file(file)
         return _by_content[key]
 
 
-def _read(file: MeshFile) -> Faces:
+def _read_file(file: MeshFile) -> Faces:
     try:
-        found = parts(file)
-    except MissingExtraError:
+        found = load_mesh_parts(file)
+    except MissingDependencyError:
         raise
     except Exception as error:  # Parsers of other people's formats raise anything at all.
         reason = (str(error).strip().splitlines() or [type(error).__name__])[0]
         raise FormatError(f"{file.path} cannot be read as a mesh: {reason}") from error
     sizes = np.cumsum([0, *(len(part.vertices) for part in found[:-1])])
-    vertices = np.concatenate([np.asarray(part.vertices, dtype=float) for part in found]) * metres(file.path)
+    vertices = np.concatenate([np.asarray(part.vertices, dtype=float) for part in found]) * unit_length(
+        file.path
+    )
     faces = np.concatenate(
         [np.asarray(part.faces, dtype=np.int64) + n for part, n in zip(found, sizes, strict=True)]
     )
@@ -110,12 +114,12 @@ def _read(file: MeshFile) -> Faces:
     return Faces(vertices, faces)
 
 
-def parts(file: MeshFile) -> list[Any]:
+def load_mesh_parts(file: MeshFile) -> list[Any]:
     """Return the parts of a file as ``trimesh.Trimesh``, at least one, in the file's own unit of length.
 
     Raises
     ------
-    MissingExtraError
+    MissingDependencyError
         If trimesh is not installed.
     OSError
         If there are no triangles; whatever trimesh raises for what it cannot read.
@@ -123,10 +127,12 @@ def parts(file: MeshFile) -> list[Any]:
     try:
         import trimesh
     except ImportError as error:
-        raise MissingExtraError(f"reading meshes needs trimesh: {install_command('geometry')}") from error
+        raise MissingDependencyError(
+            f"reading meshes needs trimesh: {install_command('geometry')}"
+        ) from error
     _check_packing(file)
-    with _quiet("trimesh"):
-        scene = trimesh.load_scene(file.path, process=False, resolver=_Beside(file.path.parent))
+    with _without_logging("trimesh"):
+        scene = trimesh.load_scene(file.path, process=False, resolver=_FolderFiles(file.path.parent))
         found = [g for g in scene.dump() if isinstance(g, trimesh.Trimesh) and len(g.faces)]
     if not found:
         raise OSError(f"{file.path} holds no triangles")
@@ -140,12 +146,12 @@ def _check_packing(file: MeshFile) -> None:
     if zipfile.is_zipfile(file.path):
         with zipfile.ZipFile(file.path) as packed:
             size = sum(part.file_size for part in packed.infolist())
-        if size > LARGEST:
-            most = f"the {LARGEST / 2**20:.0f} MiB read here"
+        if size > LARGEST_FILE:
+            most = f"the {LARGEST_FILE / 2**20:.0f} MiB read here"
             raise OSError(f"{file.path} unpacks to {size / 2**20:.0f} MiB, more than {most}")
 
 
-class _Beside(Mapping[str, bytes]):
+class _FolderFiles(Mapping[str, bytes]):
     """The files in and below the folder of a mesh: its materials, pictures and buffers, and no others."""
 
     def __init__(self, folder: Path) -> None:
@@ -156,7 +162,7 @@ class _Beside(Mapping[str, bytes]):
         for candidate in (name, name.lstrip("/"), os.path.basename(name)):
             path = os.path.realpath(os.path.join(self._folder, candidate))
             if "\0" not in name and is_below(path, self._folder) and os.path.isfile(path):
-                if os.path.getsize(path) > LARGEST:
+                if os.path.getsize(path) > LARGEST_FILE:
                     raise OSError(f"{path} is larger than what is read here")
                 return Path(path).read_bytes()
         raise FileNotFoundError(name)
@@ -168,7 +174,7 @@ class _Beside(Mapping[str, bytes]):
         return 0
 
 
-def metres(path: Path) -> float:
+def unit_length(path: Path) -> float:
     """Return the length of a file's unit [m].
 
     Only COLLADA says what its numbers mean; like RViz this honours the unit and ignores the up axis, which
@@ -186,7 +192,7 @@ def metres(path: Path) -> float:
 
 
 @contextmanager
-def _quiet(name: str) -> Iterator[None]:
+def _without_logging(name: str) -> Iterator[None]:
     """Keep a library from logging: a missing texture of a mesh costs it its colour, nothing else."""
     log, nowhere = logging.getLogger(name), logging.NullHandler()
     before = log.propagate

@@ -1,4 +1,4 @@
-"""Rays against solids, in the frame of the solid.
+"""Ray casts against solids, and ray and point queries in a collision world.
 
 A convex solid keeps a ray between the last place where it enters and the first where it leaves: a polytope
 cuts by half-spaces, everything round by quadrics.
@@ -9,19 +9,25 @@ from __future__ import annotations
 import math
 
 import numpy as np
+import numpy.typing as npt
 
+from kineverse.errors import InvalidValueError, ShapeError
 from kineverse.model.body import Box, Capsule, Cone, Cylinder, Ellipsoid, Sphere
 
+from .broadphase import FURTHEST
+from .collision_world import CollisionWorld
 from .mesh_files import Faces, Floats
-from .solids import Hull, Primitive, Solid
+from .narrowphase import ACCURACY, distance_to_point
+from .results import NearestPoint, RayHit
+from .shapes import Hull, Primitive, Solid
 
-Entry = tuple[float, Floats]
+RayEntry = tuple[float, Floats]
 """How far along the ray, and the outward normal there."""
 
 _PARALLEL = 1e-14
 
 
-def enter(solid: Solid, origin: Floats, direction: Floats) -> Entry | None:
+def intersect_ray(solid: Solid, origin: Floats, direction: Floats) -> RayEntry | None:
     """Return where a ray meets a solid first: the distance [m], 0 from inside, and the normal; None if never.
 
     Parameters
@@ -37,7 +43,7 @@ def enter(solid: Solid, origin: Floats, direction: Floats) -> Entry | None:
     return _primitive(surface, origin, direction)
 
 
-def _primitive(shape: Primitive, origin: Floats, direction: Floats) -> Entry | None:
+def _primitive(shape: Primitive, origin: Floats, direction: Floats) -> RayEntry | None:
     if isinstance(shape, Box):
         half = np.array(shape.size, dtype=float) / 2
         return _polytope(_AXES, np.concatenate([half, half]), origin, direction)
@@ -53,7 +59,7 @@ def _primitive(shape: Primitive, origin: Floats, direction: Floats) -> Entry | N
 _AXES = np.concatenate([np.eye(3), -np.eye(3)])
 
 
-def _polytope(normals: Floats, offsets: Floats, origin: Floats, direction: Floats) -> Entry | None:
+def _polytope(normals: Floats, offsets: Floats, origin: Floats, direction: Floats) -> RayEntry | None:
     speed, gap = normals @ direction, offsets - normals @ origin
     if ((np.abs(speed) < _PARALLEL) & (gap < 0.0)).any():
         return None
@@ -62,21 +68,21 @@ def _polytope(normals: Floats, offsets: Floats, origin: Floats, direction: Float
     first = int(np.argmax(np.where(inwards, times, -math.inf)))
     enters = times[first] if inwards.any() else -math.inf
     leaves = times[outwards].min() if outwards.any() else math.inf
-    return _between(float(enters), float(leaves), normals[first], direction)
+    return _entry_between(float(enters), float(leaves), normals[first], direction)
 
 
-def _between(enters: float, leaves: float, normal: Floats, direction: Floats) -> Entry | None:
+def _entry_between(enters: float, leaves: float, normal: Floats, direction: Floats) -> RayEntry | None:
     if enters > leaves or leaves < 0.0:
         return None
     return (enters, normal) if enters >= 0.0 else (0.0, -direction)
 
 
-def _ball(radii: Floats, origin: Floats, direction: Floats) -> Entry | None:
+def _ball(radii: Floats, origin: Floats, direction: Floats) -> RayEntry | None:
     span = _roots(origin / radii, direction / radii, 1.0)
     if span is None:
         return None
     point = (origin + span[0] * direction) / radii**2
-    return _between(*span, point / np.linalg.norm(point), direction)
+    return _entry_between(*span, point / np.linalg.norm(point), direction)
 
 
 def _roots(origin: Floats, direction: Floats, radius: float) -> tuple[float, float] | None:
@@ -91,7 +97,7 @@ def _roots(origin: Floats, direction: Floats, radius: float) -> tuple[float, flo
     return -b / a - root, -b / a + root
 
 
-def _capsule(shape: Capsule, origin: Floats, direction: Floats) -> Entry | None:
+def _capsule(shape: Capsule, origin: Floats, direction: Floats) -> RayEntry | None:
     half = np.array([0.0, 0.0, shape.length / 2])
     found = [_round(Cylinder(shape.radius, shape.length), origin, direction)]
     found += [_ball(np.full(3, shape.radius), origin + end, direction) for end in (half, -half)]
@@ -100,7 +106,7 @@ def _capsule(shape: Capsule, origin: Floats, direction: Floats) -> Entry | None:
     return min(hits, key=lambda hit: hit[0]) if hits else None
 
 
-def _round(shape: Cylinder | Cone, origin: Floats, direction: Floats) -> Entry | None:
+def _round(shape: Cylinder | Cone, origin: Floats, direction: Floats) -> RayEntry | None:
     """Cut between two discs by the wall x² + y² = r(z)², r linear in z; z runs between ±length/2."""
     radius, half = shape.radius, shape.length / 2
     slope = radius / shape.length if isinstance(shape, Cone) else 0.0
@@ -113,8 +119,8 @@ def _round(shape: Cylinder | Cone, origin: Floats, direction: Floats) -> Entry |
     a = float(direction[:2] @ direction[:2]) - dr * dr
     b = float(origin[:2] @ direction[:2]) - r * dr
     c = float(origin[:2] @ origin[:2]) - r * r
-    best: Entry | None = None
-    for low, high in _inside(a, b, c):
+    best: RayEntry | None = None
+    for low, high in _intervals_below_zero(a, b, c):
         enters, leaves = max(low, caps[0]), min(high, caps[1])
         if caps[0] >= low:
             normal = np.array([0.0, 0.0, -math.copysign(1.0, direction[2])])
@@ -122,7 +128,7 @@ def _round(shape: Cylinder | Cone, origin: Floats, direction: Floats) -> Entry |
             point = origin + enters * direction
             side = math.hypot(point[0], point[1])
             normal = np.array([point[0], point[1], slope * side]) / max(side * math.hypot(1.0, slope), 1e-300)
-        hit = _between(enters, leaves, normal, direction)
+        hit = _entry_between(enters, leaves, normal, direction)
         if hit is not None and (best is None or hit[0] < best[0]):
             best = hit
     return best
@@ -135,7 +141,7 @@ def _polytope_span(half: float, z: float, speed: float) -> tuple[float, float] |
     return min(one, other), max(one, other)
 
 
-def _inside(a: float, b: float, c: float) -> list[tuple[float, float]]:
+def _intervals_below_zero(a: float, b: float, c: float) -> list[tuple[float, float]]:
     """Return the intervals of t in which a t² + 2 b t + c <= 0."""
     if abs(a) < _PARALLEL:
         if abs(b) < _PARALLEL:
@@ -151,7 +157,7 @@ def _inside(a: float, b: float, c: float) -> list[tuple[float, float]]:
     return [(roots[0], roots[1])] if a > 0.0 else [(-math.inf, roots[0]), (roots[1], math.inf)]
 
 
-def _triangles(mesh: Faces, origin: Floats, direction: Floats) -> Entry | None:
+def _triangles(mesh: Faces, origin: Floats, direction: Floats) -> RayEntry | None:
     """Return the nearest crossing, of either side (Möller and Trumbore 1997)."""
     corners = mesh.vertices[mesh.faces]
     one, other = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
@@ -172,3 +178,82 @@ def _triangles(mesh: Faces, origin: Floats, direction: Floats) -> Entry | None:
     normal = np.cross(one[first], other[first])
     normal /= np.linalg.norm(normal)
     return float(times[first]), -normal if normal @ direction > 0.0 else normal
+
+
+def cast_ray(
+    mirror: CollisionWorld, origin: npt.ArrayLike, direction: npt.ArrayLike, length: float
+) -> RayHit | None:
+    """Return what a ray meets first within a length [m], None if nothing."""
+    start, way = _check_point(origin, "origin"), _check_vector(direction, "direction")
+    size = float(np.abs(way).max())
+    if size == 0.0:
+        raise InvalidValueError("The direction of a ray is a vector other than 0.")
+    if not length > 0.0:
+        raise InvalidValueError(f"The length of a ray is positive [m], not {length!r}.")
+    way = way / size  # first, so that squares neither overflow nor vanish
+    way /= np.linalg.norm(way)
+    mirror.ready()
+    table = mirror.table
+    # How far along the ray each sphere begins, if the ray goes through it.
+    to_centre = table.place - start
+    along = to_centre @ way
+    aside = ((to_centre - np.outer(along, way)) ** 2).sum(axis=1)
+    through = np.flatnonzero((aside <= (table.radius * (1 + 1e-9)) ** 2) & (along >= -table.radius))
+    begins = np.maximum(along[through] - table.radius[through], 0.0)
+    best: tuple[float, int, Floats] | None = None
+    limit = length
+    for k in through[np.argsort(begins, kind="stable")].tolist():
+        if along[k] - table.radius[k] > limit:
+            break
+        rotation, position = table.poses[k, :, :3], table.poses[k, :, 3]
+        entry = intersect_ray(mirror.solid(k), rotation.T @ (start - position), rotation.T @ way)
+        if entry is not None and entry[0] <= limit and (best is None or (entry[0], k) < best[:2]):
+            best = entry[0], k, rotation @ entry[1]
+            limit = entry[0]
+    if best is None:
+        return None
+    distance, k, normal = best
+    piece = mirror.pieces[k]
+    return RayHit(piece.body, piece.number, distance, start + distance * way, normal)
+
+
+def find_nearest_point(mirror: CollisionWorld, point: npt.ArrayLike, radius: float) -> NearestPoint | None:
+    """Return what is nearest to a point within a radius [m], deepest if it is inside; None if nothing is."""
+    place = _check_point(point, "point")
+    if not radius >= 0.0:
+        raise InvalidValueError(f"A radius is a distance from 0 on [m], not {radius!r}.")
+    mirror.ready()
+    table = mirror.table
+    to_point = place - table.place
+    lows = np.linalg.norm(to_point, axis=1) - table.radius
+    inside = np.einsum("kji,kj->ki", table.poses[:, :, :3], to_point)
+    outside = np.maximum(np.abs(inside) - table.half, 0.0)
+    lows = np.maximum(lows, np.where(outside.any(axis=1), np.linalg.norm(outside, axis=1), -math.inf))
+    best: NearestPoint | None = None
+    for k in np.argsort(lows, kind="stable").tolist():
+        if lows[k] > (radius if best is None else best.distance) + ACCURACY:
+            break
+        distance, nearest, normal = distance_to_point(mirror.solid(k), table.poses[k], place)
+        if distance <= radius and (best is None or distance < best.distance):
+            piece = mirror.pieces[k]
+            best = NearestPoint(piece.body, piece.number, distance, nearest, normal)
+    return best
+
+
+def _check_point(values: npt.ArrayLike, what: str) -> Floats:
+    place = _check_vector(values, what)
+    if np.abs(place).max() > FURTHEST:
+        raise InvalidValueError(f"The {what} {place} is further than {FURTHEST:g} m away.")
+    return place
+
+
+def _check_vector(values: npt.ArrayLike, what: str) -> Floats:
+    try:
+        vector = np.asarray(values, dtype=float)
+    except (TypeError, ValueError):
+        vector = np.zeros(0)
+    if vector.shape != (3,):
+        raise ShapeError(f"The {what} is a vector of three numbers in the world, not {values!r}.")
+    if not np.isfinite(vector).all():
+        raise InvalidValueError(f"The {what} {vector} is not finite.")
+    return vector

@@ -1,14 +1,18 @@
-"""What a scene answers: everything in the world frame, [m]."""
+"""Results of distance, ray and point queries, in the world frame [m]."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import overload
 
+from .broadphase import Indices
+from .collision_world import CollisionWorld
 from .mesh_files import Floats
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Closest:
+class DistanceResult:
     """How near two bodies are.
 
     Attributes
@@ -42,9 +46,9 @@ class Closest:
     def __str__(self) -> str:
         return f"{self.a} and {self.b}: {self.distance:.4g} m"
 
-    def swapped(self) -> Closest:
+    def swapped(self) -> DistanceResult:
         """Return the same, seen from b."""
-        return Closest(
+        return DistanceResult(
             self.b,
             self.a,
             self.distance,
@@ -57,7 +61,7 @@ class Closest:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Hit:
+class RayHit:
     """Where a ray meets a body first.
 
     Attributes
@@ -78,7 +82,7 @@ class Hit:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Nearby:
+class NearestPoint:
     """What is nearest to a point.
 
     Attributes
@@ -101,3 +105,58 @@ class Nearby:
     def inside(self) -> bool:
         """Whether the point is inside."""
         return self.distance < 0.0
+
+
+class DistanceResults(Sequence[DistanceResult]):
+    """Pairs of bodies, nearest first, each of which is made when it is looked at.
+
+    Parameters
+    ----------
+    mirror
+        Where the pieces are from.
+    pieces, bodies, distances, witnesses
+        (K, 2) pieces, (K, 2) their bodies, that first which is before the other in the model, (K,) their
+        distances [m], (K, 9) the nearest points of both and the normals.
+
+    Attributes
+    ----------
+    distances
+        (K,) [m].
+    points_a, points_b, normals
+        (K, 3) each, as in :class:`DistanceResult`.
+    """
+
+    def __init__(
+        self, mirror: CollisionWorld, pieces: Indices, bodies: Indices, distances: Floats, witnesses: Floats
+    ) -> None:
+        self._bodies, self._pieces = mirror.bodies, mirror.pieces
+        self._numbers, self._owners = pieces, bodies
+        self.distances = distances
+        self.points_a, self.points_b, self.normals = witnesses[:, :3], witnesses[:, 3:6], witnesses[:, 6:]
+
+    def __len__(self) -> int:
+        return len(self.distances)
+
+    @overload
+    def __getitem__(self, index: int) -> DistanceResult: ...
+    @overload
+    def __getitem__(self, index: slice) -> list[DistanceResult]: ...
+    def __getitem__(self, index: int | slice) -> DistanceResult | list[DistanceResult]:
+        if isinstance(index, slice):
+            return [self[k] for k in range(*index.indices(len(self)))]
+        (a, b), (i, j) = self._owners[index].tolist(), self._numbers[index].tolist()
+        return DistanceResult(
+            self._bodies[a],
+            self._bodies[b],
+            float(self.distances[index]),
+            self.points_a[index],
+            self.points_b[index],
+            self.normals[index],
+            self._pieces[i].number,
+            self._pieces[j].number,
+        )
+
+    def __repr__(self) -> str:
+        listed = "".join(f"\n  {pair}" for pair in self[:12])
+        more = f"\n  and {len(self) - 12} more" if len(self) > 12 else ""
+        return f"<{len(self)} pairs{listed}{more}>"

@@ -1,7 +1,6 @@
 """Closed loops: coordinates that follow others so that two frames stay together."""
 
-from .closing import Closed, close
-from .constraint import LoopConstraint
-from .operation import CloseLoop
+from .close_loop import CloseLoop, LoopConstraint
+from .solve_branch import SolvedLoop, solve_loop
 
-__all__ = ["CloseLoop", "Closed", "LoopConstraint", "close"]
+__all__ = ["CloseLoop", "LoopConstraint", "SolvedLoop", "solve_loop"]

@@ -1,22 +1,79 @@
-"""The equations of a loop, as functions of numbers."""
+"""Loop-closure residual between two frames, and its numeric solution."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
 
 from kineverse.compile import compile  # noqa: A004
-from kineverse.errors import UnsolvedError
-from kineverse.expressions.expression import Expression
+from kineverse.errors import InvalidValueError, NoSolutionError
+from kineverse.expressions.expression import Expression, array
 from kineverse.symbols import Symbol
+
+AXES = ("x", "y", "z", "rx", "ry", "rz")
+
+
+def as_mask(given: Any, name: str) -> tuple[str, ...]:
+    """Return a mask, a sequence or text of different names out of :data:`AXES`, as a tuple."""
+    mask = tuple(given) if isinstance(given, list | tuple | str) else ()
+    if not mask or not all(axis in AXES for axis in mask) or len(set(mask)) < len(mask):
+        raise InvalidValueError(
+            f"The mask of loop '{name}' has names out of {', '.join(AXES)}, not {given!r}."
+        )
+    return mask
+
+
+def as_ends(given: Any, name: str) -> tuple[tuple[str, str], ...]:
+    """Return further pairs of frames that coincide as tuples."""
+    pairs = tuple(given) if isinstance(given, list | tuple) else (given,)
+    for pair in pairs:
+        if not isinstance(pair, list | tuple) or [type(end) for end in pair] != [str, str]:
+            raise InvalidValueError(
+                f"Loop '{name}' takes more=((frame, to), ...), pairs of names of frames, not {given!r}."
+            )
+    return tuple((frame, to) for frame, to in pairs)
+
+
+def residual_rows(pose: Expression, mask: Sequence[str]) -> dict[str, Expression]:
+    """Return the elements of a residual that a mask names: of p [m], and of ½(R - Rᵀ)^∨ [rad].
+
+    Parameters
+    ----------
+    pose
+        to_T_frame = (R, p), 4×4, where the frame coincides with ``to`` if all of it is zero.
+    mask
+        Names out of :data:`AXES`.
+    """
+    p, r = pose[:3, 3], pose[:3, :3]
+    axis = [(r[2, 1] - r[1, 2]) / 2, (r[0, 2] - r[2, 0]) / 2, (r[1, 0] - r[0, 1]) / 2]
+    rows = dict(zip(AXES, [p[0], p[1], p[2], *axis], strict=True))
+    return {name: rows[name] for name in mask}
+
+
+def upright_signs(pose: Expression, mask: Sequence[str]) -> list[Expression]:
+    """Return what is positive where the angles that a mask makes zero are not half a turn.
+
+    The sine of an angle is zero there, too.
+    """
+    turning = [axis for axis in "xyz" if f"r{axis}" in mask]
+    if not turning:
+        return []
+    x, y, z = pose[0, 0], pose[1, 1], pose[2, 2]
+    if len(turning) == 3:
+        return [x + y + z]
+    diagonal = dict(zip("xyz", (x, y, z), strict=True))
+    if len(turning) == 2:
+        return [diagonal[axis] for axis in "xyz" if axis not in turning]
+    return [sum((diagonal[axis] for axis in "xyz" if axis not in turning), array(0.0))]
+
 
 Array: TypeAlias = npt.NDArray[np.float64]
 
-CLOSED = 1e-11
+CLOSURE_TOLERANCE = 1e-11
 """What is left of the residual where a loop counts as closed while it is analysed [m] or [rad]."""
 
 _NEWTON = 30
@@ -28,7 +85,7 @@ MOST_EFFORT = 150_000.0
 
 
 @dataclass
-class Effort:
+class WorkBudget:
     """How much may still be spent on analysing a loop, the same in every process and on every machine.
 
     Attributes
@@ -40,7 +97,7 @@ class Effort:
 
     Raises
     ------
-    UnsolvedError
+    NoSolutionError
         When nothing is left.
     """
 
@@ -51,7 +108,7 @@ class Effort:
         """Take something from what is left."""
         self.left -= amount
         if self.left < 0:
-            raise UnsolvedError(
+            raise NoSolutionError(
                 f"Loop '{self.name}' is too much work: its branch is not known after {MOST_EFFORT:.0f} "
                 "evaluations. Narrow the limits, or close it in parts."
             )
@@ -71,7 +128,7 @@ class Equations:
     """
 
     def __init__(
-        self, residual: Expression, unknowns: Sequence[Symbol], inputs: Sequence[Symbol], effort: Effort
+        self, residual: Expression, unknowns: Sequence[Symbol], inputs: Sequence[Symbol], effort: WorkBudget
     ) -> None:
         self.unknowns, self.inputs = tuple(unknowns), tuple(inputs)
         self._effort, self._size = effort, 1 + residual.size * len(self.unknowns) / 100
@@ -87,7 +144,7 @@ class Equations:
         self._evaluate.input[n:] = u
         try:
             self._evaluate()
-        except UnsolvedError:
+        except NoSolutionError:
             # A loop that this one is built on does not close there.
             m, n_all = self._evaluate.outputs[1].shape
             return np.full(m, np.inf), np.zeros((m, n)), np.zeros((m, n_all - n))
@@ -122,7 +179,7 @@ class Equations:
             if left < gap:
                 x, residual, by_x, gap = tried, after, derivative, left
                 damping = damping / 10 if damping > 1e-6 else 0.0
-            elif gap < CLOSED:
+            elif gap < CLOSURE_TOLERANCE:
                 break
             else:
                 damping = max(10 * damping, 1e-4)
@@ -131,7 +188,9 @@ class Equations:
         return x, gap
 
 
-def periodic(equations: Equations, x: Array, u: Array) -> tuple[npt.NDArray[np.bool_], npt.NDArray[np.bool_]]:
+def find_periodic(
+    equations: Equations, x: Array, u: Array
+) -> tuple[npt.NDArray[np.bool_], npt.NDArray[np.bool_]]:
     """Return which unknowns and which inputs are angles: a whole turn changes nothing."""
     at = equations(x, u)[0]
 

@@ -1,4 +1,4 @@
-"""What is on record about closed loops: which frames they keep together, and which coordinates follow."""
+"""Record of a closed loop: frames, mask, free and dependent coordinates."""
 
 from __future__ import annotations
 
@@ -8,13 +8,13 @@ from typing import Any
 
 from kineverse.model.articulation import Articulation
 from kineverse.model.frame import WORLD
-from kineverse.model.view import ModelView
+from kineverse.model.model_view import ModelView
 from kineverse.symbols import symbol_name
 
-from .closing import Closed
+from .solve_branch import SolvedLoop
 
-KIND, CONSTRAINED = "closedloop", "loopconstraint"
-KINDS = (KIND, CONSTRAINED)
+SOLVED_LOOP, CONSTRAINED_LOOP = "closedloop", "loopconstraint"
+LOOP_KINDS = (SOLVED_LOOP, CONSTRAINED_LOOP)
 
 
 @dataclass(frozen=True)
@@ -43,11 +43,13 @@ class LoopRecord:
     constraints: tuple[str, ...] = ()
 
 
-def loop_record(ends: tuple[tuple[str, str], ...], mask: tuple[str, ...], closed: Closed) -> Articulation:
+def make_loop_record(
+    ends: tuple[tuple[str, str], ...], mask: tuple[str, ...], closed: SolvedLoop
+) -> Articulation:
     """Return what is put on record of a loop that was closed."""
     frame, to = ends[0]
     return Articulation(
-        KIND,
+        SOLVED_LOOP,
         to,
         frame,
         dynamics=(
@@ -65,17 +67,17 @@ def loop_record(ends: tuple[tuple[str, str], ...], mask: tuple[str, ...], closed
     )
 
 
-def constrained_record(
+def make_constrained_record(
     ends: tuple[tuple[str, str], ...], mask: tuple[str, ...], constraints: tuple[str, ...]
 ) -> Articulation:
     """Return what is put on record of a loop that constraints keep closed."""
     frame, to = ends[0]
     return Articulation(
-        CONSTRAINED, to, frame, dynamics=(("ends", ends), ("mask", mask), ("constraints", constraints))
+        CONSTRAINED_LOOP, to, frame, dynamics=(("ends", ends), ("mask", mask), ("constraints", constraints))
     )
 
 
-def loops_of(model: ModelView) -> Iterator[LoopRecord]:
+def find_loops(model: ModelView) -> Iterator[LoopRecord]:
     """Yield the loops of a model in the order in which they were closed.
 
     Those of a document are among them, without the code that closed them; of one that says less about its
@@ -84,7 +86,7 @@ def loops_of(model: ModelView) -> Iterator[LoopRecord]:
     followers = set(map(str, model.rates.dependent))
     for name, record in model.articulations.items():
         known = dict(record.dynamics)
-        if record.kind not in KINDS or not _is_complete(known, record.kind):
+        if record.kind not in LOOP_KINDS or not _is_complete(known, record.kind):
             continue
         loop = _as_named(name, record, known)
         there = followers >= set(loop.dependent) and all(c in model.constraints for c in loop.constraints)
@@ -95,7 +97,7 @@ def loops_of(model: ModelView) -> Iterator[LoopRecord]:
 def _is_complete(known: Mapping[str, Any], kind: str) -> bool:
     """Whether a record has what it should have: documents may contain anything under these names."""
     ends = known.get("ends")
-    said = ("mask", "free", "dependent") if kind == KIND else ("mask", "constraints")
+    said = ("mask", "free", "dependent") if kind == SOLVED_LOOP else ("mask", "constraints")
     texts = (known.get(key) for key in said)
     return (
         isinstance(ends, tuple)

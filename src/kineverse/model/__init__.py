@@ -2,15 +2,16 @@
 
 from .articulation import Articulation
 from .body import Body, Box, Capsule, Cone, Cylinder, Ellipsoid, Inertia, Mesh, Pose, Shape, Sphere
+from .compare import compare_models
 from .constraint import Constraint
 from .diff import Change, Diff
-from .difference import difference
-from .edit import AddFrame, Attach, Constrain, Edit, Override, SetRate, Write
+from .edit import Edit
 from .frame import WORLD, Frame
 from .model import Model, Snapshot
-from .operation import Effects, Operation
+from .operation import Operation, Writes
+from .operations import AddFrame, Attach, Constrain, Override, SetData, SetRate
 from .rates import Rates
-from .reader import Reader
+from .read_recorder import ReadRecorder
 from .violations import Violation, Violations
 
 __all__ = [
@@ -28,7 +29,6 @@ __all__ = [
     "Cylinder",
     "Diff",
     "Edit",
-    "Effects",
     "Ellipsoid",
     "Frame",
     "Inertia",
@@ -38,13 +38,14 @@ __all__ = [
     "Override",
     "Pose",
     "Rates",
-    "Reader",
+    "ReadRecorder",
+    "SetData",
     "SetRate",
     "Shape",
     "Snapshot",
     "Sphere",
     "Violation",
     "Violations",
-    "Write",
-    "difference",
+    "Writes",
+    "compare_models",
 ]

@@ -1,4 +1,4 @@
-"""What is on record about an articulation, beside the mathematics it wrote."""
+"""Record of an articulation: frames, coordinates, home, dynamics."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import math
 from dataclasses import dataclass
 from typing import Any
 
-from kineverse.errors import ValueRejectedError
+from kineverse.errors import InvalidValueError
 from kineverse.expressions.expression import Expression
 from kineverse.symbols import Symbol
 
@@ -33,7 +33,7 @@ class Articulation:
 
     Raises
     ------
-    ValueRejectedError
+    InvalidValueError
         If there are homes for other coordinates than it has.
     """
 
@@ -48,7 +48,7 @@ class Articulation:
 
     def __post_init__(self) -> None:
         if len(self.home) not in (0, len(self.coordinates)):
-            raise ValueRejectedError(
+            raise InvalidValueError(
                 f"The record of {self.kind} '{self.child}' has {len(self.home)} homes for "
                 f"{len(self.coordinates)} coordinates; give one for each, or none."
             )
@@ -64,18 +64,18 @@ def check_home(name: str, record: Articulation) -> None:
 
     Raises
     ------
-    ValueRejectedError
+    InvalidValueError
         If a number of it is not finite, or its orientation is a quaternion of length zero.
     """
     for symbol, value in zip(record.coordinates, record.home, strict=False):
         if isinstance(value, float | int) and not math.isfinite(value):
-            raise ValueRejectedError(
+            raise InvalidValueError(
                 f"The home of the articulation '{name}' is finite, and not {value!r} for '{symbol}'."
             )
     home = {str(s): value for s, value in zip(record.coordinates, record.home, strict=False)}
     x = next((path for path in home if path.endswith("/qx")), None)
     if x is not None and not any(home.get(f"{x[:-1]}{part}", 1.0) for part in "xyzw"):
-        raise ValueRejectedError(
+        raise InvalidValueError(
             f"The home of the articulation '{name}' has the quaternion 0 0 0 0, which is no orientation; "
             "that of no rotation is 0 0 0 1, with w last."
         )

@@ -13,7 +13,7 @@ from typing import Any, TypeAlias
 import numpy as np
 import numpy.typing as npt
 
-from kineverse.errors import ShapeError, ValueRejectedError
+from kineverse.errors import InvalidValueError, ShapeError
 from kineverse.expressions.expression import Expression
 
 _RIGID = 2e-5
@@ -45,7 +45,7 @@ class Pose:
             and all(-_RIGID < v < _RIGID for v in (*squares, *products))
             and all(-_FARTHEST <= v <= _FARTHEST for v in (x, y, z))
         ):
-            raise ValueRejectedError(
+            raise InvalidValueError(
                 f"The pose is not rigid: the first three columns of {self.rows} must be a rotation "
                 f"and all numbers finite, of at most {_FARTHEST:g}."
             )
@@ -56,7 +56,7 @@ class Pose:
 
         Raises
         ------
-        ShapeError, ValueRejectedError
+        ShapeError, InvalidValueError
             If it is not 4×4, or not rigid.
         """
         if np.shape(matrix) != (4, 4):
@@ -64,12 +64,12 @@ class Pose:
         if isinstance(matrix, Expression):
             if not matrix.is_constant:
                 names = ", ".join(map(str, matrix.symbols))
-                raise ValueRejectedError(f"A pose is constant, and this transform moves with {names}.")
+                raise InvalidValueError(f"A pose is constant, and this transform moves with {names}.")
             matrix = matrix({})
         numbers = np.asarray(matrix, dtype=float)
         x, y, z, w = numbers[3].tolist()
         if not max(abs(x), abs(y), abs(z), abs(w - 1)) < _RIGID:
-            raise ValueRejectedError(f"The last row of a rigid transform is (0, 0, 0, 1), not {numbers[3]}.")
+            raise InvalidValueError(f"The last row of a rigid transform is (0, 0, 0, 1), not {numbers[3]}.")
         return Pose(tuple(numbers[:3].ravel().tolist()))
 
     @property
@@ -175,3 +175,8 @@ class Body:
     visuals: tuple[Shape, ...] = ()
     collisions: tuple[Shape, ...] = ()
     inertia: Inertia | None = None
+
+
+def is_empty_body(body: Body) -> bool:
+    """Return whether there is nothing to give."""
+    return not body.visuals and not body.collisions and body.inertia is None

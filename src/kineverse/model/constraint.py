@@ -8,9 +8,9 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import TypeAlias
 
-from kineverse.errors import ShapeError, ValueRejectedError
-from kineverse.expressions.expression import Expression, ExpressionLike, as_expression, watcher_of
-from kineverse.expressions.leaves import gradient_keys
+from kineverse.errors import InvalidValueError, ShapeError
+from kineverse.expressions.expression import Expression, ExpressionLike, access_listener, as_expression
+from kineverse.expressions.graph import gradient_keys
 from kineverse.symbols import Symbol
 
 ConstraintLike: TypeAlias = "Constraint | Sequence[ExpressionLike]"
@@ -35,7 +35,7 @@ class Constraint:
         ------
         ShapeError
             If one of the three is not a scalar.
-        ValueRejectedError
+        InvalidValueError
             If the expression is constant, or constant bounds leave nothing between them, or one is NaN.
         """
         low, middle, high = as_expression(lower), as_expression(expression), as_expression(upper)
@@ -43,17 +43,17 @@ class Constraint:
             for part, name in ((low, "lower bound"), (middle, "expression"), (high, "upper bound")):
                 if part.shape:
                     raise ShapeError(f"The {name} of a constraint is a scalar, not of shape {part.shape}.")
-        if any(watcher_of(part) is not None for part in (low, middle, high)):
+        if any(access_listener(part) is not None for part in (low, middle, high)):
             return Constraint(low, middle, high)  # a trace looks when it knows what was read
         if not middle.symbols:
-            raise ValueRejectedError(
+            raise InvalidValueError(
                 f"The constrained expression ({middle!r}) depends on no symbol. "
                 "The order is lower, expression, upper."
             )
         if not low.symbols and not high.symbols:
             a, b = float(low), float(high)
             if a > b or a == math.inf or b == -math.inf:
-                raise ValueRejectedError(
+                raise InvalidValueError(
                     f"No value lies between the lower bound {a:g} and the upper bound {b:g}."
                 )
         return Constraint(low, middle, high)
@@ -96,7 +96,7 @@ def as_constraint(value: ConstraintLike) -> Constraint:
             return value
         return Constraint.of(value.lower, value.expression, value.upper)
     if isinstance(value, Expression) or not isinstance(value, Sequence) or len(value) != 3:
-        raise ValueRejectedError(f"A constraint is a triple (lower, expression, upper), not {value!r}.")
+        raise InvalidValueError(f"A constraint is a triple (lower, expression, upper), not {value!r}.")
     return Constraint.of(*value)
 
 

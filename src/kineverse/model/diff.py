@@ -1,4 +1,4 @@
-"""What a committed edit changed, or what two models differ in."""
+"""Changes between two versions of a model."""
 
 from __future__ import annotations
 
@@ -79,7 +79,7 @@ class Diff:
         return frozenset((*self.added, *self.removed, *self.replaced, *self.moved, *self.rerun))
 
 
-def moved_tags(before: Sequence[str], after: Sequence[str], among: Container[str]) -> tuple[str, ...]:
+def find_moved_tags(before: Sequence[str], after: Sequence[str], among: Container[str]) -> tuple[str, ...]:
     """Return the tags that stand elsewhere among the others, as few as possible, in the new order.
 
     Parameters

@@ -1,4 +1,4 @@
-"""What is shown of a model's values: a line each, as text and for notebooks."""
+"""One-line text and HTML tables of model data."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from collections.abc import Iterable, Mapping
 from itertools import islice
 
 from kineverse.expressions.expression import Expression
-from kineverse.html_table import html_table
+from kineverse.expressions.printing import html_table
 
 from .articulation import Articulation
 from .body import Body, Pose
@@ -18,7 +18,7 @@ _WIDTH = 100
 _HTML_ROWS = 50
 
 
-def line_of(value: object) -> str:
+def format_line(value: object) -> str:
     """Return one line about a value of a model."""
     if isinstance(value, Frame):
         moving = {str(s) for f in value.factors if isinstance(f, Expression) for s in f.symbols}
@@ -55,7 +55,7 @@ def as_lines(title: str, rows: Iterable[tuple[str, object]], count: int) -> str:
     """Return a title and a line for each of the first rows, of bounded width."""
     lines = [f"{title}{':' if count else ''}"]
     for name, value in islice(rows, _ROWS):
-        line = f"  {name}: {line_of(value)}"
+        line = f"  {name}: {format_line(value)}"
         lines.append(line if len(line) <= _WIDTH else f"{line[: _WIDTH - 1]}…")
     if count > _ROWS:
         lines.append(f"  ... {count - _ROWS} more")
@@ -64,6 +64,6 @@ def as_lines(title: str, rows: Iterable[tuple[str, object]], count: int) -> str:
 
 def as_html(title: str, rows: Iterable[tuple[str, object]], count: int) -> str:
     """Return a table of the first rows."""
-    shown = [(name, line_of(value)) for name, value in islice(rows, _HTML_ROWS)]
+    shown = [(name, format_line(value)) for name, value in islice(rows, _HTML_ROWS)]
     more = f", the first {_HTML_ROWS}" if count > _HTML_ROWS else ""
     return html_table(f"{title}{more}", ("name", "value"), shown)

@@ -1,137 +1,30 @@
-"""Editing a model: a transaction that happens whole or not at all."""
+"""Transactions on a model."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-from kineverse.collection import no_collection
-from kineverse.errors import EditError, NameTakenError
+from kineverse._checks import check_flag
+from kineverse._gc import no_collection
+from kineverse._synonyms import EDIT_SYNONYMS, unknown_attribute_error
+from kineverse.errors import DuplicateNameError, EditError
 from kineverse.expressions.expression import ExpressionLike
 from kineverse.symbols import Symbol
-from kineverse.vocabulary import EDIT, unknown_attribute
 
 from .body import Body, Pose
 from .constraint import Constraint
-from .diff import Change, Diff, moved_tags
+from .diff import Change, Diff, find_moved_tags
 from .frame import WORLD, Frame, TransformLike
-from .history import Entry, History
-from .keywords import check_flag
-from .operation import Effects, Operation
-from .rates import Row, as_row
-from .reader import Reader
+from .history import History, HistoryEntry
+from .operation import Operation
+from .operations import AddFrame, Attach, Constrain, Override, SetData, SetRate
+from .rates import as_row
 
 if TYPE_CHECKING:
-    from kineverse.formats.loops import Loops
+    from kineverse.formats.loader import LoopTreatment
 
-    from .view import ModelView
-
-
-@dataclass(frozen=True)
-class AddFrame(Operation):
-    """Places a frame in its parent, with what it carries."""
-
-    name: str
-    frame: Frame
-    body: Body | None = None
-
-    def apply(self, model: Reader) -> Effects:
-        """Write the frame, and its body if there is one."""
-        bodies = {} if self.body is None else {self.name: self.body}
-        return Effects(frames={self.name: self.frame}, bodies=bodies)
-
-    def default_tag(self) -> str:
-        """Return ``frame`` and the name."""
-        return f"frame {self.name}"
-
-
-@dataclass(frozen=True)
-class Constrain(Operation):
-    """Adds a constraint."""
-
-    name: str
-    constraint: Constraint
-
-    def apply(self, model: Reader) -> Effects:
-        """Write the constraint."""
-        return Effects(constraints={self.name: self.constraint})
-
-    def default_tag(self) -> str:
-        """Return ``constraint`` and the name."""
-        return f"constraint {self.name}"
-
-
-@dataclass(frozen=True)
-class SetRate(Operation):
-    """Says how a coordinate moves with speeds."""
-
-    coordinate: Symbol
-    row: Row
-
-    def apply(self, model: Reader) -> Effects:
-        """Write the row."""
-        return Effects(rates={self.coordinate: dict(self.row)})
-
-    def default_tag(self) -> str:
-        """Return ``rate`` and the coordinate."""
-        return f"rate {self.coordinate}"
-
-
-@dataclass(frozen=True)
-class Write(Operation):
-    """Stores data."""
-
-    name: str
-    value: Any
-
-    def apply(self, model: Reader) -> Effects:
-        """Write the value."""
-        return Effects(data={self.name: self.value})
-
-    def default_tag(self) -> str:
-        """Return ``data`` and the name."""
-        return f"data {self.name}"
-
-
-@dataclass(frozen=True)
-class Attach(Operation):
-    """Puts an existing frame, with everything below it, into another parent."""
-
-    name: str
-    frame: Frame
-
-    def apply(self, model: Reader) -> Effects:
-        """Write the frame anew."""
-        if self.name not in model.frames:
-            model.frames[self.name]  # raises, with similar names
-        return Effects(frames={self.name: self.frame})
-
-    def default_tag(self) -> str:
-        """Return ``attach``, the frame and its new parent."""
-        return f"attach {self.name} to {self.frame.parent}"
-
-
-@dataclass(frozen=True)
-class Override(Operation):
-    """Applies an operation that may write over what operations before it wrote."""
-
-    overrides = True
-
-    operation: Operation
-
-    @property
-    def traceable(self) -> bool:  # type: ignore[override]
-        """Whether what the operation computes can be written down as expressions of what it reads."""
-        return self.operation.traceable
-
-    def apply(self, model: Reader) -> Effects:
-        """Write what the operation writes."""
-        return self.operation.apply(model)
-
-    def default_tag(self) -> str:
-        """Return ``override`` and the tag of the operation, which what it writes over may have."""
-        return f"override {self.operation.default_tag()}"
+    from .model_view import ModelView
 
 
 class Edit:
@@ -149,12 +42,12 @@ class Edit:
         self._removed: dict[str, None] = {}
         self._replaced: dict[str, None] = {}
         self._again: dict[str, None] = {}
-        self._order: list[Entry] = []
+        self._order: list[HistoryEntry] = []
 
     if not TYPE_CHECKING:  # a type checker says so on its own
 
         def __getattr__(self, name):
-            raise unknown_attribute("An edit", name, dir(self), EDIT)
+            raise unknown_attribute_error("An edit", name, dir(self), EDIT_SYNONYMS)
 
     # -- operations ----------------------------------------------------------------------------------------
 
@@ -170,7 +63,7 @@ class Edit:
 
         Raises
         ------
-        NameTakenError
+        DuplicateNameError
             If the tag is taken, or the name of something that it writes; data may be written anew. An
             operation that has looked at what is there, as :class:`Attach` does, may write over it.
         EditError
@@ -308,7 +201,7 @@ class Edit:
 
     def write(self, name: str, value: Any, tag: str | None = None) -> str:
         """Store an immutable value under ``data``; the last one written under a name counts."""
-        return self.apply(Write(name, value), tag)
+        return self.apply(SetData(name, value), tag)
 
     def include(
         self,
@@ -317,16 +210,16 @@ class Edit:
         *,
         root: Any = None,
         strict: bool = False,
-        loops: Loops = "solve",
+        loops: LoopTreatment = "solve",
     ) -> list[str]:
         """Append the operations of a file or shipped model, see :func:`kineverse.load`; return their tags."""
-        from kineverse.formats.loading import include
+        from kineverse.formats.loader import include
 
         with no_collection():
             try:
                 return include(self, source, prefix, root=root, strict=strict, loops=loops)
-            except NameTakenError as error:
-                raise NameTakenError(
+            except DuplicateNameError as error:
+                raise DuplicateNameError(
                     f"{error} include(source, prefix=...) puts a prefix in front of all names."
                 ) from None
 
@@ -351,7 +244,7 @@ class Edit:
         moved: tuple[str, ...] = ()
         if self._again:
             old = [entry.tag for entry in self._order if entry.tag not in self._added]
-            moved = moved_tags(old, [entry.tag for entry in self._history.sequence], self._again)
+            moved = find_moved_tags(old, [entry.tag for entry in self._history.sequence], self._again)
         exchanged = self._added.keys() | self._replaced.keys()
         entries = self._history.entries
         rerun = [entries[tag] for tag in self._history.run_again - exchanged if tag in entries]

@@ -12,8 +12,8 @@ import numpy as np
 import numpy.typing as npt
 
 from kineverse.errors import ShapeError
-from kineverse.expressions.expression import Expression, as_expression, watcher_of
-from kineverse.motions import as_motion
+from kineverse.expressions.expression import Expression, access_listener, as_expression
+from kineverse.spatial import as_one_axis_transform
 
 from .body import Pose
 
@@ -60,7 +60,7 @@ class Frame:
         ------
         ShapeError
             If a transform is not 4×4.
-        ValueRejectedError
+        InvalidValueError
             If a constant one is not rigid.
         """
         if isinstance(transform, Pose):
@@ -84,7 +84,7 @@ class Frame:
 
 def _as_motion(factor: Any) -> Any:
     is_transform = isinstance(factor, Expression) and factor.shape == (4, 4)
-    return as_motion(factor) if is_transform else factor
+    return as_one_axis_transform(factor) if is_transform else factor
 
 
 def _factor(transform: TransformLike) -> Pose | Expression:
@@ -93,7 +93,7 @@ def _factor(transform: TransformLike) -> Pose | Expression:
     expression = as_expression(transform)
     if expression.shape != (4, 4):
         raise ShapeError(f"A frame is placed by a 4×4 transform, not by one of shape {expression.shape}.")
-    if watcher_of(expression) is not None or not expression.is_constant:
+    if access_listener(expression) is not None or not expression.is_constant:
         return expression
     matrix = np.array(ca.DM(expression.casadi))
     return Pose.of(matrix)

@@ -14,13 +14,19 @@ from contextlib import contextmanager
 from operator import attrgetter
 from typing import Any
 
-from kineverse.collection import no_collection
-from kineverse.errors import EditError, KineverseError, ModelError, NameTakenError, UnknownNameError, suggest
+from kineverse._gc import no_collection
+from kineverse.errors import (
+    DuplicateNameError,
+    EditError,
+    KineverseError,
+    ModelError,
+    UnknownNameError,
+    suggest,
+)
 
 from .frame import WORLD, Frame
-from .operation import DATA, FRAMES, KINDS, Effects, Operation
-from .ownership import may_override, taken
-from .reader import ABSENT, Cell, Read, Reader, Reads, missing, no_path
+from .operation import DATA, FRAMES, KINDS, Cell, Operation, Writes, may_override, overwrite_error
+from .read_recorder import ABSENT, Read, ReadRecorder, Reads, unknown_name_error, unknown_path_error
 
 _GAP = 1 << 32
 _BEFORE_ALL = -1 << 200
@@ -29,7 +35,7 @@ _FEW = 4
 _PLACE = attrgetter("place")
 
 
-class Entry:
+class HistoryEntry:
     """An operation at its place, with what its last run read and wrote; never changed, only exchanged."""
 
     __slots__ = ("operation", "place", "reads", "tag", "writes")
@@ -47,10 +53,10 @@ class Entry:
 class History:
     """Operations, cells and readers; the heart of a model. Not thread-safe by itself."""
 
-    def __init__(self, entries: Iterable[Entry] = ()) -> None:
-        self.entries: dict[str, Entry] = {}
-        self.sequence: list[Entry] = []
-        self.cells: dict[Cell, list[Entry]] = {}
+    def __init__(self, entries: Iterable[HistoryEntry] = ()) -> None:
+        self.entries: dict[str, HistoryEntry] = {}
+        self.sequence: list[HistoryEntry] = []
+        self.cells: dict[Cell, list[HistoryEntry]] = {}
         self.head: dict[str, dict[str, Any]] = {kind: {} for kind in KINDS}
         self.reading: dict[Cell, dict[str, Read]] = {}
         self.listing: dict[str, set[str]] = {kind: set() for kind in KINDS}
@@ -66,12 +72,12 @@ class History:
         with no_collection():
             self._fill(entries)
 
-    def _fill(self, entries: Iterable[Entry]) -> None:
+    def _fill(self, entries: Iterable[HistoryEntry]) -> None:
         """Take over operations that have been applied, in their order."""
         cells, reading, head = self.cells, self.reading, self.head
         for i, given in enumerate(entries):
             # Placed anew: these may come from several models.
-            entry = Entry(given.tag, given.operation, i * _GAP, given.reads, given.writes)
+            entry = HistoryEntry(given.tag, given.operation, i * _GAP, given.reads, given.writes)
             self.entries[entry.tag] = entry
             self.sequence.append(entry)
             for cell, value in entry.writes.items():
@@ -116,7 +122,7 @@ class History:
         tags = [*self.reading.get(cell, ()), *self.listing.get(cell[0], ())]
         return sorted(set(tags), key=lambda t: self.entries[t].place)
 
-    def entry(self, tag: str) -> Entry:
+    def entry(self, tag: str) -> HistoryEntry:
         """Return the entry of a tag.
 
         Raises
@@ -170,7 +176,7 @@ class History:
         old = self.entry(tag)
         _check_operation(operation)
         with self._step():
-            self._exchange(Entry(tag, operation, old.place, old.reads, old.writes))
+            self._exchange(HistoryEntry(tag, operation, old.place, old.reads, old.writes))
             if self._dirty:
                 self._soil(tag)
             else:
@@ -189,11 +195,11 @@ class History:
             raise EditError(f"A tag is a non-empty text, not {tag!r}.")
         _check_operation(operation)
         if tag in self.entries:
-            raise NameTakenError(
+            raise DuplicateNameError(
                 f"The tag {tag!r} is taken; give another one with tag=, or replace the operation."
             )
         with self._step():
-            entry = Entry(tag, operation, place, Reads(), {})
+            entry = HistoryEntry(tag, operation, place, Reads(), {})
             if self._dirty:
                 self._link(entry)
                 self._soil(tag)
@@ -287,18 +293,18 @@ class History:
         for cell in {**old.writes, **new.writes}:
             self._touched(cell, old.writes.get(cell, ABSENT), new.writes.get(cell, ABSENT), new.place)
 
-    def _applied(self, entry: Entry) -> Entry:
+    def _applied(self, entry: HistoryEntry) -> HistoryEntry:
         """Run an operation at its place; return its entry with what it read and wrote."""
         self.runs += 1
         tag = entry.tag
         reads = Reads()
-        reader = Reader(
+        reader = ReadRecorder(
             lambda cell: self.value_at(cell, entry.place), lambda k: self.names_at(k, entry.place), reads
         )
         try:
             effects = entry.operation.apply(reader)
-            if not isinstance(effects, Effects):
-                raise EditError(f"apply() returns kv.Effects, not {type(effects).__name__}.")
+            if not isinstance(effects, Writes):
+                raise EditError(f"apply() returns kv.model.Writes, not {type(effects).__name__}.")
             writes = effects.writes()
         except KineverseError:
             raise
@@ -309,7 +315,7 @@ class History:
                 raise EditError(f"Operation {tag!r} writes {kind} under {name!r}, which is not a name.")
             if kind == FRAMES:
                 self._check_parent(name, value, writes, reads, entry.place)
-        return Entry(tag, entry.operation, entry.place, reads, writes)
+        return HistoryEntry(tag, entry.operation, entry.place, reads, writes)
 
     def _check_parent(
         self, name: str, frame: Frame, writes: Mapping[Cell, Any], reads: Reads, place: int
@@ -330,16 +336,16 @@ class History:
             return
         reads.add((FRAMES, parent), Read.EXISTENCE)
         if self.value_at((FRAMES, parent), place) is ABSENT:
-            error = missing(FRAMES, parent, self.names_at(FRAMES, place))
+            error = unknown_name_error(FRAMES, parent, self.names_at(FRAMES, place))
             raise UnknownNameError(f"The parent of frame '{name}' is missing. {error}")
 
-    def _check_free(self, entry: Entry) -> None:
+    def _check_free(self, entry: HistoryEntry) -> None:
         """Refuse an operation that silently writes over what one before it wrote."""
         for cell in entry.writes:
             writers = self.cells.get(cell)
             # One that comes later may yet be called something else when it is run again.
             if writers and writers[0].place < entry.place and not may_override(entry, cell):
-                raise taken(cell, entry, writers[0].tag)
+                raise overwrite_error(cell, entry, writers[0].tag)
 
     def _check_names(self, failures: dict[str, KineverseError]) -> None:
         """Look for what has two writers of which the second does not know about the first."""
@@ -347,7 +353,7 @@ class History:
             first, *others = self.cells.get(cell, (None,))
             for entry in others:
                 if first is not None and entry is not None and not may_override(entry, cell):
-                    failures.setdefault(entry.tag, taken(cell, entry, first.tag))
+                    failures.setdefault(entry.tag, overwrite_error(cell, entry, first.tag))
 
     def _check_frames(self, failures: dict[str, KineverseError]) -> None:
         """Look for circles, at any place of the sequence; only frames that were written anew close them."""
@@ -364,7 +370,7 @@ class History:
         """
         end = None if place == _BEFORE_ALL else self._next_writer(name, place)
         while True:
-            chain: dict[str, Entry] = {}
+            chain: dict[str, HistoryEntry] = {}
             until = end
             link = name
             while link != WORLD and link not in chain:
@@ -507,7 +513,7 @@ class History:
             self.head[kind][name] = value
         self._events.append((cell, old, value))
 
-    def _link(self, entry: Entry) -> None:
+    def _link(self, entry: HistoryEntry) -> None:
         self.entries[entry.tag] = entry
         if not self.sequence or self.sequence[-1].place < entry.place:
             self.sequence.append(entry)
@@ -528,15 +534,15 @@ class History:
             self.listing[kind].add(entry.tag)
         self._undo.append((self._forget, (entry,)))
 
-    def _unlink(self, entry: Entry) -> None:
+    def _unlink(self, entry: HistoryEntry) -> None:
         self._forget(entry)
         self._undo.append((self._relink, (entry,)))
 
-    def _relink(self, entry: Entry) -> None:
+    def _relink(self, entry: HistoryEntry) -> None:
         self._link(entry)
         self._undo.pop()
 
-    def _forget(self, entry: Entry) -> None:
+    def _forget(self, entry: HistoryEntry) -> None:
         del self.entries[entry.tag]
         del self.sequence[bisect_left(self.sequence, entry.place, key=_PLACE)]
         for cell in entry.writes:
@@ -554,7 +560,7 @@ class History:
         for kind in entry.reads.listings:
             self.listing[kind].discard(entry.tag)
 
-    def _exchange(self, new: Entry) -> None:
+    def _exchange(self, new: HistoryEntry) -> None:
         old = self.entries[new.tag]
         self._unlink(old)
         self._link(new)
@@ -563,13 +569,15 @@ class History:
 
     def _renumber(self) -> None:
         # Entries may be shared with copies and snapshots, so others are put in their place.
-        anew = [Entry(e.tag, e.operation, i * _GAP, e.reads, e.writes) for i, e in enumerate(self.sequence)]
+        anew = [
+            HistoryEntry(e.tag, e.operation, i * _GAP, e.reads, e.writes) for i, e in enumerate(self.sequence)
+        ]
         self._undo.append((self._put_entries, (self.sequence,)))
         self._put_entries(anew)
         self._dirty = [(self.entries[tag].place, tag) for _, tag in self._dirty if tag in self.entries]
         heapq.heapify(self._dirty)
 
-    def _put_entries(self, sequence: list[Entry]) -> None:
+    def _put_entries(self, sequence: list[HistoryEntry]) -> None:
         # The order stays the same, so every sorted list of entries stays sorted.
         self.sequence = sequence
         self.entries = {entry.tag: entry for entry in sequence}
@@ -589,7 +597,7 @@ def as_cell(path: str) -> Cell:
     """
     kind, _, name = str(path).partition("/")
     if kind not in KINDS or not name:
-        raise no_path(path)
+        raise unknown_path_error(path)
     return kind, name
 
 

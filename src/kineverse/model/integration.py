@@ -8,17 +8,23 @@ from __future__ import annotations
 import functools
 import math
 from collections.abc import Callable, Mapping
-from typing import Any, TypeAlias
+from typing import TypeAlias
 
 import numpy as np
 import numpy.typing as npt
 
+from kineverse._checks import finite_number
 from kineverse.compile import compile  # noqa: A004
-from kineverse.errors import ExpressionError, UnknownNameError, ValueRejectedError, given_twice, suggest
-from kineverse.expressions.evaluation import assign
+from kineverse.errors import (
+    ExpressionError,
+    InvalidValueError,
+    UnknownNameError,
+    duplicate_value_error,
+    suggest,
+)
+from kineverse.expressions.evaluation import symbol_values
 from kineverse.expressions.expression import Expression, array
-from kineverse.number import finite_number
-from kineverse.state import State
+from kineverse.state import State, StateLike
 from kineverse.symbols import Symbol
 
 from .rates import Rates
@@ -37,7 +43,7 @@ def integrate(
     coordinates: tuple[Symbol, ...],
     rates: Rates,
     state: State,
-    speeds: Mapping[Any, float],
+    speeds: StateLike,
     dt: float,
 ) -> State:
     """Return the state after ``dt`` seconds at constant speeds.
@@ -61,17 +67,17 @@ def integrate(
     ------
     UnknownNameError
         For a speed that moves nothing here.
-    ValueRejectedError
+    InvalidValueError
         For NaN or an infinite step, or if coordinates run to infinity on the way.
     """
     step = finite_number(dt)
     if step is None:
-        raise ValueRejectedError(f"The time step is a finite number of seconds, not {dt!r}.")
+        raise InvalidValueError(f"The time step is a finite number of seconds, not {dt!r}.")
     dt = step
     if not isinstance(speeds, Mapping):
         raise ExpressionError(f"Speeds are given as a mapping {{name: number}}, not as {speeds!r}.")
     free = {c.derivative(): c for c in coordinates if c not in rates}
-    flow = flow_of(rates) if rates else None
+    flow = make_flow(rates) if rates else None
     wheels = flow.speeds if flow else ()
     by_name = {str(s): s for s in (*free, *wheels)}
     given: dict[Symbol, float] = {}
@@ -82,20 +88,20 @@ def integrate(
                 continue  # it may know more
             raise UnknownNameError(f"Nothing moves with '{key}'. {suggest(str(key), by_name, 'speed')}")
         if speed in given:
-            raise given_twice(speed)
+            raise duplicate_value_error(speed)
         finite = finite_number(value)
         if finite is None:
-            raise ValueRejectedError(f"The speed '{key}' is {value!r}; it must be finite.")
+            raise InvalidValueError(f"The speed '{key}' is {value!r}; it must be finite.")
         given[speed] = finite
     result = {free[v]: state[free[v]] + dt * value for v, value in given.items() if v in free}
     for coordinate, reached in result.items():
         if not math.isfinite(reached):
-            raise ValueRejectedError(f"'{coordinate}' runs to {reached} in {dt:g} s. Take a shorter time.")
+            raise InvalidValueError(f"'{coordinate}' runs to {reached} in {dt:g} s. Take a shorter time.")
     if flow and any(given.get(v) for v in wheels):
         try:
             after = flow.follow(state, given, dt)
         except _StuckError as error:
-            raise ValueRejectedError(
+            raise InvalidValueError(
                 f"{', '.join(map(str, flow.driven))} cannot be followed for {dt:g} s: their rates have no "
                 f"bound near {error.done:.6g} s. Take a shorter time, or look for a pole in their rows."
             ) from None
@@ -146,7 +152,7 @@ class Flow:
         known = {s: value for s in self._inputs if (value := state.given(s)) is not None}
         known.update({v: speeds.get(v, 0.0) for v in self.speeds})
         evaluator = self._function.bind()
-        evaluator.input[:] = assign(self._inputs, State(known))
+        evaluator.input[:] = symbol_values(self._inputs, State(known))
         moving = len(self.driven)
         pace = np.array([speeds.get(s.derivative(), 0.0) if s.has_derivative else 0.0 for s in self.beside])
         start = evaluator.input[: moving + len(self.beside)].copy()
@@ -162,11 +168,11 @@ class Flow:
         fastest = max((abs(speeds.get(v, 0.0)) for v in self.speeds), default=0.0)
         scale = fastest * float(np.abs(gains).sum())
         longest = dt / max(1, math.ceil(abs(dt) * scale / _LONGEST))
-        return _followed(rate, start, dt, longest)[:moving]
+        return _follow_flow(rate, start, dt, longest)[:moving]
 
 
 @functools.lru_cache(maxsize=32)
-def flow_of(rates: Rates) -> Flow:
+def make_flow(rates: Rates) -> Flow:
     """Return the flow of a table; tables are immutable, and filters ask at every step."""
     return Flow(rates)
 
@@ -178,7 +184,7 @@ class _StuckError(Exception):
         self.done = done
 
 
-def _followed(rate: Callable[[Vector], Vector], q: Vector, dt: float, longest: float) -> Vector:
+def _follow_flow(rate: Callable[[Vector], Vector], q: Vector, dt: float, longest: float) -> Vector:
     """Return q after dt, in steps of a length that the estimated error allows."""
     done, step = 0.0, longest
     while abs(done) < abs(dt):

@@ -15,10 +15,10 @@ import numpy as np
 import numpy.typing as npt
 
 from kineverse.errors import ModelError
-from kineverse.expressions.expression import NO_NODES, Expression, make
+from kineverse.expressions.expression import NO_NODES, Expression, from_casadi
 from kineverse.expressions.layout import SX
 from kineverse.expressions.node import Node
-from kineverse.motions import AxisMotion
+from kineverse.spatial import OneAxisTransform
 from kineverse.symbols import Symbol
 
 from .body import Pose
@@ -28,7 +28,7 @@ FrameLookup = Callable[[str], Frame]
 
 
 @dataclass(frozen=True, slots=True)
-class Step:
+class ChainStep:
     """A moving factor, and rotation and position of the place in front of it."""
 
     rotation: SX
@@ -48,7 +48,7 @@ class Placement:
     position: SX | None
     nodes: frozenset[Node]
     offset: npt.NDArray[np.float64]
-    steps: tuple[Step, ...] = ()
+    steps: tuple[ChainStep, ...] = ()
     parent: Placement | None = None
 
     def then(self, frame: Frame) -> Placement:
@@ -60,9 +60,9 @@ class Placement:
                 offset = offset @ factor.matrix
                 continue
             rotation, position = _with_offset(rotation, position, offset)
-            steps.append(Step(rotation, position, nodes, factor))
+            steps.append(ChainStep(rotation, position, nodes, factor))
             nodes = nodes | factor._nodes if factor._nodes else nodes
-            if isinstance(factor, AxisMotion):
+            if isinstance(factor, OneAxisTransform):
                 if factor.turns:
                     rotation = ca.mtimes(rotation, factor.rotation)
                 else:
@@ -81,13 +81,15 @@ class Placement:
     def matrix(self) -> Expression:
         """Return the 4×4 transform."""
         if self.rotation is None:
-            return make(ca.SX(ca.DM(self.offset)), (4, 4), NO_NODES)
+            return from_casadi(ca.SX(ca.DM(self.offset)), (4, 4), NO_NODES)
         rotation, position = self.parts()
-        return make(ca.densify(ca.vertcat(ca.horzcat(rotation, position), _BOTTOM)), (4, 4), self.nodes)
+        return from_casadi(
+            ca.densify(ca.vertcat(ca.horzcat(rotation, position), _BOTTOM)), (4, 4), self.nodes
+        )
 
-    def all_steps(self) -> list[Step]:
+    def all_steps(self) -> list[ChainStep]:
         """Return the moving factors of the whole chain, from the root on."""
-        steps: list[Step] = []
+        steps: list[ChainStep] = []
         placement: Placement | None = self
         while placement is not None:
             steps += reversed(placement.steps)
@@ -147,7 +149,7 @@ def branches(frame: str, relative_to: str, lookup: FrameLookup) -> tuple[list[st
     return base[common:], down[common:]
 
 
-def place(chain: Sequence[str], lookup: FrameLookup, start: Placement = ROOT) -> Placement:
+def compose_chain(chain: Sequence[str], lookup: FrameLookup, start: Placement = ROOT) -> Placement:
     """Compose a chain of frames."""
     placement = start
     for name in chain:
@@ -169,15 +171,15 @@ def place_in_world(name: str, lookup: FrameLookup) -> Placement:
     return placement
 
 
-def relative(frame: str, relative_to: str, lookup: FrameLookup) -> Expression:
+def relative_pose(frame: str, relative_to: str, lookup: FrameLookup) -> Expression:
     """Return relative_to_T_frame in plain coordinates."""
     from kineverse.spatial import inverse
 
     base, down = branches(frame, relative_to, lookup)
-    tip = place(down, lookup).matrix()
+    tip = compose_chain(down, lookup).matrix()
     if not base:
         return tip
-    root = inverse(place(base, lookup).matrix())
+    root = inverse(compose_chain(base, lookup).matrix())
     return root @ tip if down else root
 
 
@@ -190,7 +192,7 @@ class Twist:
     nodes: frozenset[Node]
 
 
-def twists(base: Placement, tip: Placement, heuristic: bool) -> tuple[SX, SX, dict[Symbol, Twist]]:
+def compute_twists(base: Placement, tip: Placement, heuristic: bool) -> tuple[SX, SX, dict[Symbol, Twist]]:
     """Return rotation and position of the tip in the base, and its twist by each speed, in axes of the base.
 
     Both placements are relative to a common ancestor. Every moving factor contributes the twist it makes in
@@ -212,9 +214,9 @@ def twists(base: Placement, tip: Placement, heuristic: bool) -> tuple[SX, SX, di
     return ca.mtimes(turn, rotation), ca.mtimes(turn, position - base_position), found
 
 
-def _add_step(found: dict[Symbol, Twist], step: Step, tip: SX, sign: int, heuristic: bool) -> None:
+def _add_step(found: dict[Symbol, Twist], step: ChainStep, tip: SX, sign: int, heuristic: bool) -> None:
     """Add the twists that a moving factor makes at the tip, against them where the sign is negative."""
-    moves = _axis_twists if isinstance(step.factor, AxisMotion) else _twists
+    moves = _axis_twists if isinstance(step.factor, OneAxisTransform) else _twists
     for key, velocity, omega, entry_nodes in moves(step, tip, heuristic):
         if sign < 0:
             velocity, omega = -velocity, -omega
@@ -227,10 +229,12 @@ def _add_step(found: dict[Symbol, Twist], step: Step, tip: SX, sign: int, heuris
             found[key] = Twist(velocity, omega, nodes)
 
 
-def _axis_twists(step: Step, tip: SX, heuristic: bool) -> Iterator[tuple[Symbol, SX, SX, frozenset[Node]]]:
+def _axis_twists(
+    step: ChainStep, tip: SX, heuristic: bool
+) -> Iterator[tuple[Symbol, SX, SX, frozenset[Node]]]:
     """Yield speed, linear and angular velocity and nodes of a motion about or along a direction."""
     motion = step.factor
-    assert isinstance(motion, AxisMotion)
+    assert isinstance(motion, OneAxisTransform)
     if sum(d != 0 for d in motion.direction) == 1:
         index = next(i for i, d in enumerate(motion.direction) if d)
         unit = step.rotation[:, index]
@@ -245,7 +249,7 @@ def _axis_twists(step: Step, tip: SX, heuristic: bool) -> Iterator[tuple[Symbol,
             yield key, along, ca.SX(3, 1), entry._nodes
 
 
-def _twists(step: Step, tip: SX, heuristic: bool) -> Iterator[tuple[Symbol, SX, SX, frozenset[Node]]]:
+def _twists(step: ChainStep, tip: SX, heuristic: bool) -> Iterator[tuple[Symbol, SX, SX, frozenset[Node]]]:
     """Yield the same of any rigid motion."""
     factor = step.factor
     entries = factor.gradient(heuristic)

@@ -13,7 +13,7 @@ from kineverse.symbols import Symbol, check_symbols
 
 from .diff import Change, Diff
 from .operation import CONSTRAINTS, KINDS
-from .reader import no_path
+from .read_recorder import unknown_path_error
 
 _LOG = logging.getLogger(__name__)
 
@@ -80,7 +80,7 @@ class Listeners:
             raise ExpressionError(f"A listener is called with a diff, and {callback!r} cannot be called.")
         for path in () if paths is None else _names(paths):
             if path and str(path).partition("/")[0] not in KINDS:  # the empty path is that of everything
-                raise no_path(path)
+                raise unknown_path_error(path)
         listener = Listener(
             callback,
             None if paths is None else _names(paths),

@@ -7,22 +7,22 @@ from collections.abc import Callable, Iterable, Iterator
 from contextlib import AbstractContextManager, contextmanager
 from typing import TYPE_CHECKING, Any
 
-from kineverse.collection import no_collection
+from kineverse._gc import no_collection
 from kineverse.errors import EditError, ExpressionError, UnknownAttributeError
 from kineverse.symbols import Symbol
 
 from .diff import Change, Diff
 from .edit import Edit
-from .history import Entry, History
+from .history import History, HistoryEntry
 from .listeners import Listener, Listeners
-from .reader import ABSENT
-from .view import ModelView
+from .model_view import ModelView
+from .read_recorder import ABSENT
 
 if TYPE_CHECKING:
-    from kineverse.formats.loops import Loops
+    from kineverse.formats.loader import LoopTreatment
 
 
-class Opening(AbstractContextManager["Edit"]):
+class EditContext(AbstractContextManager["Edit"]):
     """What :meth:`Model.edit` returns: a new edit is opened whenever a ``with`` block of it begins."""
 
     def __init__(self, begin: Callable[[], AbstractContextManager[Edit]]) -> None:
@@ -58,13 +58,15 @@ class Model(ModelView):
     One thread edits at a time, and readers in other threads wait for it; a :meth:`snapshot` never changes.
     """
 
-    def __init__(self, _entries: Iterable[Entry] | History = (), _version: int = 0) -> None:
+    def __init__(self, _entries: Iterable[HistoryEntry] | History = (), _version: int = 0) -> None:
         if isinstance(_entries, str | os.PathLike):
             raise ExpressionError(
                 f"A model begins empty, with kv.Model(). To load one: kv.load({os.fspath(_entries)!r})."
             )
         if not isinstance(_entries, History):
-            if not isinstance(_entries, list | tuple) or not all(isinstance(one, Entry) for one in _entries):
+            if not isinstance(_entries, list | tuple) or not all(
+                isinstance(one, HistoryEntry) for one in _entries
+            ):
                 raise ExpressionError(
                     "A model begins empty, with kv.Model(), and is not made from a "
                     f"{type(_entries).__name__}. To load one: kv.load(path)."
@@ -91,7 +93,7 @@ class Model(ModelView):
             At the end of the block, if operations cannot be run after the edit: the first ones are listed,
             and all of them are in its ``failures``.
         """
-        return Opening(self._transaction)
+        return EditContext(self._transaction)
 
     @contextmanager
     def _transaction(self) -> Iterator[Edit]:
@@ -146,7 +148,7 @@ class Model(ModelView):
         *,
         root: Any = None,
         strict: bool = False,
-        loops: Loops = "solve",
+        loops: LoopTreatment = "solve",
     ) -> list[str]:
         """Add a file or a shipped model in one edit; returns the tags. See :func:`kineverse.load`."""
         with self.edit() as edit:
@@ -204,7 +206,9 @@ class Model(ModelView):
 class Snapshot(ModelView):
     """A model at one version: everything can be asked, nothing changed. Equal if all values are equal."""
 
-    def __init__(self, head: dict[str, dict[str, Any]], entries: tuple[Entry, ...], version: int) -> None:
+    def __init__(
+        self, head: dict[str, dict[str, Any]], entries: tuple[HistoryEntry, ...], version: int
+    ) -> None:
         self._entries = entries
         super().__init__(head, version)
 
@@ -233,5 +237,7 @@ def _restore(snapshot: Snapshot) -> Model:
     return snapshot.model()
 
 
-def _restore_snapshot(head: dict[str, dict[str, Any]], entries: tuple[Entry, ...], version: int) -> Snapshot:
+def _restore_snapshot(
+    head: dict[str, dict[str, Any]], entries: tuple[HistoryEntry, ...], version: int
+) -> Snapshot:
     return Snapshot(head, entries, version)

@@ -1,30 +1,41 @@
-"""Operations: the steps a model is made of (2022 paper, III-A3 and Eq. 10).
+"""Operations, what they write, and the rules of overwriting.
 
 An operation is a frozen value. Its ``apply`` reads from the model as it is at the operation's place in the
-sequence and returns its :class:`Effects`; what it read is recorded, so it is run again when, and only when,
+sequence and returns its :class:`Writes`; what it read is recorded, so it is run again when, and only when,
 that changes.
 """
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Any, ClassVar
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import MISSING, dataclass, field, fields, replace
+from functools import cache
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
-from kineverse.errors import ValueRejectedError
+from kineverse.errors import (
+    DuplicateNameError,
+    ExpressionError,
+    InvalidValueError,
+    suggest,
+)
 from kineverse.expressions.expression import Expression, ExpressionLike
+from kineverse.model.articulation import Articulation
+from kineverse.model.body import Body
+from kineverse.model.constraint import Constraint
+from kineverse.model.frame import Frame
+from kineverse.model.rate_nodes import to_plain
 from kineverse.symbols import Symbol
 
-from .articulation import Articulation, check_home
-from .body import Body, Pose
-from .constraint import Constraint, ConstraintLike, as_constraint
-from .frame import Frame, TransformLike
-from .keywords import check_keywords
-from .rates import as_entry, plain
+from .articulation import check_home
+from .body import Pose
+from .constraint import ConstraintLike, as_constraint
+from .frame import TransformLike
+from .rates import as_entry
 
 if TYPE_CHECKING:
-    from .reader import Reader
+    from .history import HistoryEntry
+    from .read_recorder import ReadRecorder
 
 FRAMES, BODIES, ARTICULATIONS, CONSTRAINTS, RATES, DATA = KINDS = (
     "frames",
@@ -37,7 +48,7 @@ FRAMES, BODIES, ARTICULATIONS, CONSTRAINTS, RATES, DATA = KINDS = (
 
 
 @dataclass(frozen=True)
-class Effects:
+class Writes:
     """What an operation writes, by name.
 
     Attributes
@@ -66,7 +77,7 @@ class Effects:
     data: Mapping[str, Any] = field(default_factory=dict)
 
     @staticmethod
-    def of(writes: Mapping[tuple[str, str], Any]) -> Effects:
+    def of(writes: Mapping[tuple[str, str], Any]) -> Writes:
         """Return the effects that have these writes, by kind and name."""
         kinds: dict[str, dict[Any, Any]] = {kind: {} for kind in KINDS}
         for (kind, name), value in writes.items():
@@ -77,7 +88,7 @@ class Effects:
                 kinds[kind][name] = (value.parent, value.factors)
             else:
                 kinds[kind][name] = value
-        return Effects(**kinds)
+        return Writes(**kinds)
 
     def writes(self) -> dict[tuple[str, str], Any]:
         """Return all of it in canonical form, by kind and name, in plain coordinates."""
@@ -86,13 +97,14 @@ class Effects:
             value = _as_frame(name, frame)
             if any(isinstance(f, Expression) and f._nodes for f in value.factors):
                 value = Frame(
-                    value.parent, tuple(plain(f) if isinstance(f, Expression) else f for f in value.factors)
+                    value.parent,
+                    tuple(to_plain(f) if isinstance(f, Expression) else f for f in value.factors),
                 )
             result[FRAMES, name] = value
         for name, triple in self.constraints.items():
             c = as_constraint(triple)
             if c.lower._nodes or c.expression._nodes or c.upper._nodes:
-                c = Constraint(plain(c.lower), plain(c.expression), plain(c.upper))
+                c = Constraint(to_plain(c.lower), to_plain(c.expression), to_plain(c.upper))
             result[CONSTRAINTS, name] = c
         for coordinate, row in self.rates.items():
             result[RATES, str(coordinate)] = (coordinate, as_entry(coordinate, row))
@@ -105,7 +117,7 @@ class Effects:
             for name, datum in values.items():
                 _check_value(kind, name, datum)
                 if isinstance(datum, Articulation) and datum.follows is not None and datum.follows._nodes:
-                    datum = replace(datum, follows=plain(datum.follows))
+                    datum = replace(datum, follows=to_plain(datum.follows))
                 result[kind, name] = datum
         return result
 
@@ -113,12 +125,12 @@ class Effects:
 def _as_frame(name: str, frame: Frame | tuple[str, TransformLike | Sequence[TransformLike]]) -> Frame:
     if not isinstance(frame, Frame):
         if not isinstance(frame, (tuple, list)) or len(frame) != 2:
-            raise ValueRejectedError(
+            raise InvalidValueError(
                 f"Frame {name!r} is written as a pair (parent, transform), not as {frame!r}."
             )
         frame = Frame.of(*frame)
     if not isinstance(frame.parent, str):
-        raise ValueRejectedError(
+        raise InvalidValueError(
             f"The parent of frame {name!r} is given by its name, not by {frame.parent!r}."
         )
     if not all(
@@ -133,13 +145,13 @@ _TYPES = {BODIES: Body, ARTICULATIONS: Articulation}
 
 def _check_value(kind: str, name: str, value: object) -> None:
     if kind in _TYPES and not isinstance(value, _TYPES[kind]):
-        raise ValueRejectedError(f"{kind}/{name} is a kv.{_TYPES[kind].__name__}, not {value!r}.")
+        raise InvalidValueError(f"{kind}/{name} is a kv.{_TYPES[kind].__name__}, not {value!r}.")
     if isinstance(value, Articulation):
         check_home(name, value)
     try:
         hash(value)
     except TypeError:
-        raise ValueRejectedError(
+        raise InvalidValueError(
             f"{kind}/{name} can be changed from outside, as it is or contains a list, a dict or an array; "
             "write tuples, frozen dataclasses or expressions instead."
         ) from None
@@ -157,7 +169,7 @@ class Operation(ABC):
 
             def apply(self, model):
                 q = kv.position(self.name)
-                return kv.Effects(
+                return kv.model.Writes(
                     frames={self.name: (self.parent, kv.translation(q, 0, 0))},
                     constraints={f"{self.name}/range": (0, q, 1)},
                 )
@@ -177,7 +189,7 @@ class Operation(ABC):
             return object.__new__(cls)
 
     @abstractmethod
-    def apply(self, model: Reader) -> Effects:
+    def apply(self, model: ReadRecorder) -> Writes:
         """Return what the operation writes, given the model before it.
 
         Must be a pure function of its fields and of what it reads from ``model``.
@@ -189,3 +201,138 @@ class Operation(ABC):
         words = "".join(f" {c.lower()}" if c.isupper() else c for c in kind).strip()
         name = getattr(self, "name", "")
         return f"{words} {name}" if name else words
+
+
+class Keywords(NamedTuple):
+    """The names that a class is made with: those that have to be given, and all."""
+
+    required: frozenset[str]
+    known: tuple[str, ...]
+
+
+def check_keywords(made: type, arguments: tuple[Any, ...], given: dict[str, Any]) -> None:
+    """Look whether an operation that takes keywords only is given those that it takes.
+
+    Raises
+    ------
+    ExpressionError
+        With the keywords, if one is missing or not known, or a value stands without one.
+    """
+    keywords = find_keywords(made)
+    if keywords is None or not (arguments or given):
+        return  # pickle gives nothing, and to everybody else Python says what is missing
+    if not arguments and keywords.required <= given.keys() and given.keys() <= set(keywords.known):
+        return
+    name = made.__name__
+    required = [f"{key}=" for key in keywords.known if key in keywords.required]
+    optional = [f"{key}=" for key in keywords.known if key not in keywords.required]
+    takes = f"It takes {', '.join(required) or 'nothing that has to be given'}"
+    takes += f" and, if wanted, {', '.join(optional)}." if optional else "."
+    if arguments:
+        raise ExpressionError(f"{name} is made with keywords, and {arguments[0]!r} has none. {takes}")
+    for key in given:
+        if key not in keywords.known:
+            raise ExpressionError(
+                f"{name} has no keyword {key!r}. {suggest(key, keywords.known, 'keyword')} {takes}"
+            )
+    missing = [key for key in required if key[:-1] not in given]
+    raise ExpressionError(f"{name} is made without {', '.join(missing)}. {takes}")
+
+
+@cache
+def find_keywords(made: type) -> Keywords | None:
+    """Return the keywords of a dataclass that takes nothing else; None for any other class."""
+    maker = next(base for base in made.__mro__ if "__init__" in vars(base))
+    parameters = vars(maker).get("__dataclass_params__")
+    if parameters is None or not parameters.init:
+        return None
+    own = [field for field in fields(maker) if field.init]
+    if not own or not all(field.kw_only for field in own):
+        return None
+    required = {f.name for f in own if f.default is MISSING and f.default_factory is MISSING}
+    return Keywords(frozenset(required), tuple(field.name for field in own))
+
+
+ExpressionMap = Callable[[Expression], Any]
+
+
+def map_expressions(kind: str, value: Any, f: ExpressionMap) -> Any:
+    """Return a written value with ``f(e)`` in place of each expression; symbols of records stay.
+
+    Parameters
+    ----------
+    kind
+        The kind of data that it is, one of :data:`kineverse.model.operation.KINDS`.
+    value
+        The value in canonical form, see :meth:`kineverse.model.Writes.writes`.
+    f
+        Returns a transform for those of frames, a scalar for those of constraints and rates; among data and
+        in records numbers may take the place of expressions.
+    """
+    if kind == FRAMES:
+        return Frame(value.parent, tuple(f(x) if isinstance(x, Expression) else x for x in value.factors))
+    if kind == CONSTRAINTS:
+        return Constraint(f(value.lower), f(value.expression), f(value.upper))
+    if kind == RATES:
+        coordinate, entry = value
+        if isinstance(entry, Expression):
+            return coordinate, f(entry)
+        return coordinate, tuple((speed, f(factor)) for speed, factor in entry)
+    if kind == ARTICULATIONS:
+        return replace(value, dynamics=_map_nested(value.dynamics, f), follows=_map_nested(value.follows, f))
+    return _map_nested(value, f) if kind == DATA else value
+
+
+def find_expressions(kind: str, value: Any) -> list[Expression]:
+    """Return the expressions of a written value, symbols of records left out."""
+    found: list[Expression] = []
+
+    def note(expression: Expression) -> Expression:
+        found.append(expression)
+        return expression
+
+    map_expressions(kind, value, note)
+    return found
+
+
+def _map_nested(datum: Any, f: ExpressionMap) -> Any:
+    if isinstance(datum, Expression):
+        return f(datum)
+    return tuple(_map_nested(item, f) for item in datum) if isinstance(datum, tuple) else datum
+
+
+_NOUNS = {
+    FRAMES: "a frame",
+    BODIES: "a body of",
+    ARTICULATIONS: "an articulation",
+    CONSTRAINTS: "a constraint",
+    RATES: "a rate of",
+    DATA: "a datum",
+}
+
+
+def may_override(entry: HistoryEntry, cell: Cell) -> bool:
+    """Return whether an operation may write over what is there: data, and what it knows to be there."""
+    kind = cell[0]
+    if kind == CONSTRAINTS:
+        return False
+    return kind == DATA or cell in entry.reads.cells or entry.operation.overrides
+
+
+def overwrite_error(cell: Cell, entry: HistoryEntry, maker: str) -> DuplicateNameError:
+    """Return the error for a name that an operation before has written."""
+    kind, name = cell
+    what = f"{_NOUNS[kind]} '{name}'"
+    if kind == CONSTRAINTS:
+        return DuplicateNameError(
+            f"There is {what} already, made by {maker!r}; choose another name or replace that operation."
+        )
+    attach = "To put it into another parent, attach it; to" if kind == FRAMES else "To"
+    return DuplicateNameError(
+        f"There is {what} already, written by {maker!r}, and {entry.tag!r} would write over it. Choose "
+        f"another name, or replace that operation. {attach} write over it on purpose, pass override=True to "
+        "the method of the edit."
+    )
+
+
+Cell = tuple[str, str]

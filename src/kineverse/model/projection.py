@@ -1,4 +1,4 @@
-"""Moving a state to where equality constraints hold: projection on their manifold.
+"""Projection of a state onto the manifold of equality constraints.
 
 Of the free coordinates q that equalities are about, those are moved for which something does not hold, and
 what shares equalities with these. With rows c(q) = 0 for the equalities and h(q) <= 0 for all other
@@ -13,16 +13,163 @@ of unit length.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
-from kineverse.errors import UnknownNameError, UnsolvedError, suggest
+from kineverse._checks import as_tolerance
+from kineverse.compile import compile  # noqa: A004
+from kineverse.errors import NoSolutionError, UnknownNameError, suggest
+from kineverse.expressions.expression import Expression, array
 from kineverse.state import State
 from kineverse.symbols import Symbol
 
-from .equalities import Array, Equalities
-from .values import as_tolerance
+from .articulation import Articulation
+from .constraint import Constraint
+from .rates import Rates
+
+Array = npt.NDArray[np.float64]
+
+_QUATERNION = ("qx", "qy", "qz", "qw")
+
+
+@dataclass(frozen=True)
+class ResidualRow:
+    """What a constraint asks for: that an expression is zero, or that it is not positive."""
+
+    name: str
+    value: Expression
+    equality: bool
+
+
+class EqualityConstraints:
+    """The equalities of a model and what else its coordinates have to keep, as functions of numbers.
+
+    Parameters
+    ----------
+    constraints
+        All of a model's, plain.
+    rates
+        Its table.
+    articulations
+        Its records, which know quaternions.
+    wanted
+        The names of the equalities that are to hold; None for all.
+
+    Attributes
+    ----------
+    rows
+        The equalities, and behind them other constraints on what they are about, but for limits.
+    count
+        How many equalities there are.
+    symbols, coordinates
+        What the rows are about, and which of it is theirs to move.
+    """
+
+    def __init__(
+        self,
+        constraints: Mapping[str, Constraint],
+        rates: Rates,
+        articulations: Mapping[str, Articulation],
+        wanted: Collection[str] | None = None,
+    ) -> None:
+        self.rates, self.articulations = rates, articulations
+        rows = list(_make_rows(constraints, rates, wanted))
+        self._simple = [row for row in rows if not row.equality and _about_one(row)]
+        equal = [row for row in rows if row.equality]
+        moved = {s for row in equal for s in row.value.symbols if s.has_derivative}
+        self.rows: Sequence[ResidualRow] = equal + [
+            row for row in rows if not row.equality and not _about_one(row) and moved & set(row.value.symbols)
+        ]
+        self.count = len(equal)
+        self.symbols = tuple(
+            sorted({s for row in self.rows for s in row.value.symbols} | moved, key=lambda s: s.sort_key)
+        )
+        self.coordinates = tuple(s for s in self.symbols if s in moved)
+
+    @cached_property
+    def evaluate(self) -> Any:
+        """An evaluator of all rows, shape (m,), and their derivatives by the coordinates, (m, n)."""
+        values = array([row.value for row in self.rows])
+        return compile([values, values.partial(self.coordinates)], self.symbols, tier="interpreter").bind()
+
+    def evaluated(self, at: Array) -> tuple[Array, Array] | None:
+        """Return all rows and their derivatives; None where a closed loop among them does not close."""
+        try:
+            self.evaluate(at)
+        except NoSolutionError:
+            return None
+        values, by_all = self.evaluate.outputs
+        return values.copy(), by_all.copy()
+
+    @cached_property
+    def limits(self) -> tuple[Array, Array]:
+        """Lower and upper limits of the coordinates, ±inf where there are none."""
+        lower, upper = np.full(len(self.coordinates), -np.inf), np.full(len(self.coordinates), np.inf)
+        for row in self._simple:
+            (symbol,) = row.value.symbols
+            if symbol not in self.coordinates:
+                continue
+            k = self.coordinates.index(symbol)
+            slope, offset = _line(row.value) or (1.0, 0.0)
+            end = -offset / slope
+            if slope > 0:
+                upper[k] = min(upper[k], end)
+            else:
+                lower[k] = max(lower[k], end)
+        return lower, upper
+
+    @cached_property
+    def quaternions(self) -> list[list[int]]:
+        """Where the four numbers of each quaternion are among the coordinates."""
+        place = {s: i for i, s in enumerate(self.coordinates)}
+        found = []
+        for record in self.articulations.values():
+            four = [s for s in record.coordinates if s.path.rpartition("/")[2] in _QUATERNION]
+            if len(four) == 4 and all(s in place and s in self.rates for s in four):
+                found.append([place[s] for s in four])
+        return found
+
+
+def is_equality(constraint: Constraint) -> bool:
+    """Return whether a constraint is one on positions whose bounds are the same."""
+    if constraint.order or constraint.lower != constraint.upper:
+        return False
+    return bool(constraint.lower.symbols) or abs(float(constraint.lower)) < np.inf
+
+
+def _make_rows(
+    constraints: Mapping[str, Constraint], rates: Rates, wanted: Collection[str] | None
+) -> Iterator[ResidualRow]:
+    for name, c in constraints.items():
+        if any(s.order for s in c.symbols):
+            continue
+        if is_equality(c):
+            if wanted is None or name in wanted:
+                yield ResidualRow(name, rates.resolve(c.expression - c.lower), True)
+            continue
+        for low, high in ((c.expression, c.upper), (c.lower, c.expression)):
+            difference = rates.resolve(low - high)
+            if difference.symbols and not _is_infinite(low) and not _is_infinite(high):
+                yield ResidualRow(name, difference, False)
+
+
+def _is_infinite(bound: Expression) -> bool:
+    return not bound.symbols and not abs(float(bound)) < np.inf
+
+
+def _line(value: Expression) -> tuple[float, float] | None:
+    return Constraint(value, value, value).line
+
+
+def _about_one(row: ResidualRow) -> bool:
+    """Return whether a row limits a single coordinate."""
+    return len(row.value.symbols) == 1 and _line(row.value) is not None
+
 
 TOLERANCE = 1e-9
 """How far from holding a constraint may be, as in :meth:`kineverse.Model.violations`."""
@@ -35,7 +182,10 @@ _SINGULAR, _AT_BOUND = 1e-9, 1e-9
 
 
 def project(
-    equalities: Equalities, state: State, fixed: Iterable[Symbol | str] = (), tolerance: float = TOLERANCE
+    equalities: EqualityConstraints,
+    state: State,
+    fixed: Iterable[Symbol | str] = (),
+    tolerance: float = TOLERANCE,
 ) -> State:
     """Move coordinates so that equalities hold, and return the state, see :meth:`ModelView.project`."""
     tolerance = as_tolerance(tolerance)
@@ -57,7 +207,7 @@ def project(
     return state.updated(moved) if moved else state
 
 
-def _held(equalities: Equalities, fixed: Iterable[Symbol | str]) -> frozenset[Symbol]:
+def _held(equalities: EqualityConstraints, fixed: Iterable[Symbol | str]) -> frozenset[Symbol]:
     """Return the coordinates that stay, those behind what depends on others among them."""
     dependent = {str(s): e for s, e in equalities.rates.dependent.items()}
     records = equalities.articulations
@@ -82,7 +232,9 @@ def _held(equalities: Equalities, fixed: Iterable[Symbol | str]) -> frozenset[Sy
     return frozenset(found)
 
 
-def _search(equalities: Equalities, at: Array, held: frozenset[Symbol], tolerance: float) -> _Search | None:
+def _search(
+    equalities: EqualityConstraints, at: Array, held: frozenset[Symbol], tolerance: float
+) -> _Search | None:
     """Return what is to be solved: what is broken, with all equalities about the same coordinates."""
     count = equalities.count
     if not count:
@@ -111,7 +263,7 @@ class _Search:
 
     def __init__(
         self,
-        equalities: Equalities,
+        equalities: EqualityConstraints,
         rows: list[int],
         columns: list[int],
         at: Array,
@@ -136,7 +288,7 @@ class _Search:
 
         Raises
         ------
-        UnsolvedError
+        NoSolutionError
             Naming what does not hold, by how much, and what was tried.
         """
         start = self._unit(np.clip(self._at[self._places], self._lower, self._upper))
@@ -268,10 +420,10 @@ class _Search:
         moved = start + generator.uniform(-1, 1, len(start)) * reach
         return self._unit(np.clip(moved, self._lower, self._upper))
 
-    def _unsolved(self, x: Array) -> UnsolvedError:
+    def _unsolved(self, x: Array) -> NoSolutionError:
         there = self._look(x)
         if there is None:
-            return UnsolvedError(
+            return NoSolutionError(
                 "The state cannot be projected: a closed loop that the equalities are about has no solution "
                 "there. Begin where it closes."
             )
@@ -288,7 +440,7 @@ class _Search:
         tried = [f"moved were {_some(moved)}" if moved else "nothing was free to move"]
         tried += [f"at their limits are {_some(stopped)}"] if stopped else []
         tried += [f"fixed were {_some(held)}"] if held else []
-        return UnsolvedError(
+        return NoSolutionError(
             f"The state cannot be projected: at best {listed}{more}, from {_STARTS + 1} starts. "
             f"{'; '.join(tried).capitalize()}. Begin nearer to where it closes, or let more coordinates move."
         )

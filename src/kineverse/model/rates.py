@@ -20,41 +20,45 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, TypeAlias
 
-from kineverse.errors import ModelError, UnknownNameError, ValueRejectedError, suggest
+from kineverse.errors import InvalidValueError, ModelError, UnknownNameError, suggest
 from kineverse.expressions.expression import Expression, ExpressionLike, as_expression
-from kineverse.expressions.leaves import bottom_up, leaves
-from kineverse.expressions.node import Node
-from kineverse.expressions.substitution import apply, compose_gradient, replace_nodes
+from kineverse.expressions.substitution import apply_substitution
 from kineverse.symbols import Symbol
 
 from .display import as_html, as_lines
+from .rate_nodes import (
+    Carried,
+    Dependent,
+    collect_symbols,
+    to_plain,
+)
 
 if TYPE_CHECKING:
-    from kineverse.expressions.substitution import Substitution
+    pass
 
-Row: TypeAlias = tuple[tuple[Symbol, Expression], ...]
-Entry: TypeAlias = Row | Expression
+RateRow: TypeAlias = tuple[tuple[Symbol, Expression], ...]
+RateEntry: TypeAlias = RateRow | Expression
 
 
-def as_entry(coordinate: Symbol, value: Mapping[Symbol, ExpressionLike] | ExpressionLike) -> Entry:
+def as_entry(coordinate: Symbol, value: Mapping[Symbol, ExpressionLike] | ExpressionLike) -> RateEntry:
     """Return a row, or what a dependent coordinate is, in plain coordinates.
 
     Raises
     ------
     ModelError
         If the coordinate is not a position, or a key of the row not a velocity.
-    ValueRejectedError
+    InvalidValueError
         If the expression is no scalar, or is about speeds.
     """
     if isinstance(value, Mapping):
         return as_row(coordinate, value)
     _check_coordinate(coordinate)
-    expression = plain(as_expression(value))
+    expression = to_plain(as_expression(value))
     if expression.shape:
-        raise ValueRejectedError(f"'{coordinate}' is a scalar, and not of shape {expression.shape}.")
+        raise InvalidValueError(f"'{coordinate}' is a scalar, and not of shape {expression.shape}.")
     moving = [str(s) for s in expression.symbols if s.order]
     if moving:
-        raise ValueRejectedError(f"'{coordinate}' depends on positions, and not on {', '.join(moving)}.")
+        raise InvalidValueError(f"'{coordinate}' depends on positions, and not on {', '.join(moving)}.")
     return expression
 
 
@@ -63,7 +67,7 @@ def _check_coordinate(coordinate: Symbol) -> None:
         raise ModelError(f"Only positions have a rate, and '{coordinate}' is none.")
 
 
-def as_row(coordinate: Symbol, row: Mapping[Symbol, ExpressionLike]) -> Row:
+def as_row(coordinate: Symbol, row: Mapping[Symbol, ExpressionLike]) -> RateRow:
     """Return a row in canonical order, carried coordinates put back to plain ones.
 
     Raises
@@ -78,9 +82,9 @@ def as_row(coordinate: Symbol, row: Mapping[Symbol, ExpressionLike]) -> Row:
     for speed, value in row.items():
         if not isinstance(speed, Symbol) or speed.order != 1:
             raise ModelError(f"The rate of '{coordinate}' has velocities as keys, not '{speed}'.")
-        entry = plain(as_expression(value))
+        entry = to_plain(as_expression(value))
         if entry.shape:
-            raise ValueRejectedError(
+            raise InvalidValueError(
                 f"The rate of '{coordinate}' by '{speed}' is a scalar, not {entry.shape}."
             )
         entries.append((speed, entry))
@@ -106,15 +110,17 @@ class Rates(Mapping[Symbol, Mapping[Symbol, Expression]]):
 
     dependent: Mapping[Symbol, Expression]
 
-    def __init__(self, entries: Mapping[Symbol, Entry]) -> None:
+    def __init__(self, entries: Mapping[Symbol, RateEntry]) -> None:
         self._given = dict(entries)
         self._rows: dict[Symbol, dict[Symbol, Expression]] = {}
         self._carried: dict[Symbol, Expression] = {}
         expressions = {x: e for x, e in self._given.items() if isinstance(e, Expression)}
         self.dependent = dict[Symbol, Expression]()
         # Symbols of gradients count, too: what is carried is carried in them.
-        made_of = {x: sorted(all_symbols(e) & expressions.keys(), key=str) for x, e in expressions.items()}
-        for x in _in_order(expressions, made_of.__getitem__, _DEPENDING):
+        made_of = {
+            x: sorted(collect_symbols(e) & expressions.keys(), key=str) for x, e in expressions.items()
+        }
+        for x in _sort_topologically(expressions, made_of.__getitem__, _DEPENDING):
             self.dependent[x] = self.resolve(expressions[x])
         rows = {x: self._expanded(e) for x, e in self._given.items() if not isinstance(e, Expression)}
         paths = {x.path for x in rows}
@@ -122,10 +128,10 @@ class Rates(Mapping[Symbol, Mapping[Symbol, Expression]]):
         def through(x: Symbol) -> list[Symbol]:
             return [v.position for v, _ in rows[x] if v.path in paths and v.position in rows]
 
-        for x in _in_order(rows, through, _CYCLIC):
+        for x in _sort_topologically(rows, through, _CYCLIC):
             self._rows[x] = self._combined(rows[x])
 
-    def _expanded(self, row: Row) -> Row:
+    def _expanded(self, row: RateRow) -> RateRow:
         """Return a row with everything about dependent coordinates put in terms of others."""
         if not self.dependent:
             return row
@@ -147,8 +153,8 @@ class Rates(Mapping[Symbol, Mapping[Symbol, Expression]]):
 
     def resolve(self, expression: Expression) -> Expression:
         """Return a plain expression in coordinates that do not depend on others."""
-        wanted = {s: self.dependent[s] for s in all_symbols(expression) if s in self.dependent}
-        return apply(expression, wanted)
+        wanted = {s: self.dependent[s] for s in collect_symbols(expression) if s in self.dependent}
+        return apply_substitution(expression, wanted)
 
     def row(self, coordinate: Symbol | str) -> Mapping[Symbol, Expression] | None:
         """Return how a coordinate moves with free speeds, in plain coordinates; None if it is free itself."""
@@ -229,7 +235,7 @@ class Rates(Mapping[Symbol, Mapping[Symbol, Expression]]):
                 continue
             found.add(x)
             for value in self._rows[x].values():
-                wanted += [s for s in all_symbols(value) if s in self._rows]
+                wanted += [s for s in collect_symbols(value) if s in self._rows]
         return Rates({x: tuple(self._rows[x].items()) for x in sorted(found, key=lambda s: s.sort_key)})
 
     @cached_property
@@ -252,7 +258,7 @@ class Rates(Mapping[Symbol, Mapping[Symbol, Expression]]):
         found = set(self._rows)
         for row in self._rows.values():
             for speed, value in row.items():
-                found |= {speed, speed.position, *all_symbols(value)}
+                found |= {speed, speed.position, *collect_symbols(value)}
         return frozenset(found)
 
     def carried(self, coordinate: Symbol) -> Expression:
@@ -270,11 +276,11 @@ class Rates(Mapping[Symbol, Mapping[Symbol, Expression]]):
         """Return the expression in carried coordinates; carried twice is carried once."""
         if not self._given:
             return expression
-        expression = plain(expression)
+        expression = to_plain(expression)
         wanted = {
-            s: self.carried(s) for s in all_symbols(expression) if s in self._rows or s in self.dependent
+            s: self.carried(s) for s in collect_symbols(expression) if s in self._rows or s in self.dependent
         }
-        return apply(expression, wanted)
+        return apply_substitution(expression, wanted)
 
     def eliminate(self, expression: Expression) -> Expression:
         """Return the expression with every left-over ẋ replaced by ``Σ R[x][v]·v``."""
@@ -283,9 +289,9 @@ class Rates(Mapping[Symbol, Mapping[Symbol, Expression]]):
             row = self.row(s.position) if s.order == 1 else None
             if row is not None:
                 wanted[s] = sum((self.carry(g) * v for v, g in row.items()), as_expression(0.0))
-        return apply(expression, wanted)
+        return apply_substitution(expression, wanted)
 
-    def __reduce__(self) -> tuple[type[Rates], tuple[dict[Symbol, Entry]]]:
+    def __reduce__(self) -> tuple[type[Rates], tuple[dict[Symbol, RateEntry]]]:
         return Rates, (self._given,)
 
 
@@ -293,7 +299,7 @@ _CYCLIC = "Cyclic rates, which never end in a free speed"
 _DEPENDING = "Coordinates that depend on themselves"
 
 
-def _in_order(
+def _sort_topologically(
     coordinates: Iterable[Symbol], through: Callable[[Symbol], list[Symbol]], problem: str
 ) -> Iterator[Symbol]:
     """Yield coordinates, and before each of them those it leads to; a circle is a problem."""
@@ -319,190 +325,3 @@ def _in_order(
 def _add(row: dict[Symbol, Expression], terms: Mapping[Symbol, Expression]) -> None:
     for speed, term in terms.items():
         row[speed] = row[speed] + term if speed in row else term
-
-
-class Carried(Node):
-    """A coordinate whose gradient is its row."""
-
-    __slots__ = ()
-    kind = "carried"
-
-    @property
-    def rates(self) -> Rates:
-        """The table, closed over what the row is made of."""
-        table: Rates = self.options[0]
-        return table
-
-    @property
-    def coordinate(self) -> Symbol:
-        """The plain coordinate."""
-        (symbol,) = self.arguments
-        assert isinstance(symbol, Symbol)
-        return symbol
-
-    @property
-    def parts(self) -> tuple[Expression, ...]:
-        """What the rows are made of; the coordinate itself is no part."""
-        return tuple(entry for row in self.rates.values() for entry in row.values())
-
-    @property
-    def label(self) -> str:
-        """What errors and printing call it."""
-        return "carried"
-
-    @classmethod
-    def _options_key(cls, options: tuple[Rates, ...]) -> str:
-        return options[0].key.hex()
-
-    def _value(self) -> Expression:
-        return self.coordinate
-
-    def _gradient(self, heuristic: bool) -> Mapping[Symbol, Expression]:
-        return {v: self.rates.carry(g) for v, g in self.rates[self.coordinate].items()}
-
-    def gradient_keys(self, heuristic: bool) -> frozenset[Symbol]:
-        """Return the derivative symbols of the gradient, without building it."""
-        return frozenset(self.rates[self.coordinate])
-
-    def depends_on(self, substitution: Substitution) -> bool:
-        """Return whether a substitution changes the node."""
-        return any(s in self.rates.symbols for s in substitution)
-
-    def substitute(self, substitution: Substitution) -> Expression:
-        """Return what the node becomes under a substitution."""
-        relevant = {s: e for s, e in substitution.items() if s in self.rates.symbols}
-        itself = _expression_of(self)
-        return Composed.of((itself, *relevant.values()), (), tuple(relevant))
-
-
-class Dependent(Node):
-    """A coordinate that depends on others: its value and gradient are those of an expression."""
-
-    __slots__ = ()
-    kind = "dependent"
-
-    @property
-    def coordinate(self) -> Symbol:
-        """The plain coordinate."""
-        symbol: Symbol = self.options[0]
-        return symbol
-
-    @property
-    def label(self) -> str:
-        """The coordinate's name."""
-        return str(self.coordinate)
-
-    @classmethod
-    def _options_key(cls, options: tuple[Symbol, ...]) -> str:
-        return repr(options[0].sort_key)
-
-    def _value(self) -> Expression:
-        return self.arguments[0]
-
-    def _gradient(self, heuristic: bool) -> Mapping[Symbol, Expression]:
-        return self.arguments[0].gradient(heuristic)
-
-    def substitute(self, substitution: Substitution) -> Expression:
-        """Return the expression after a substitution, which is the coordinate of this model no more."""
-        return apply(self.arguments[0], substitution)
-
-
-class Composed(Node):
-    """A carried coordinate after a substitution, unfolded one derivative at a time."""
-
-    __slots__ = ()
-    kind = "composed"
-
-    @property
-    def substitution(self) -> dict[Symbol, Expression]:
-        """What was replaced by what."""
-        return dict(zip(self.options, self.arguments[1:], strict=True))
-
-    @classmethod
-    def _options_key(cls, options: tuple[Symbol, ...]) -> str:
-        return repr([s.sort_key for s in options])
-
-    def _inner(self) -> Node:
-        (node,) = self.arguments[0]._nodes
-        return node
-
-    def _value(self) -> Expression:
-        return apply(self._inner().value, self.substitution)
-
-    def _gradient(self, heuristic: bool) -> Mapping[Symbol, Expression]:
-        return compose_gradient(self._inner().gradient(heuristic), self.substitution, heuristic)
-
-    def gradient_keys(self, heuristic: bool) -> frozenset[Symbol]:
-        """Return the derivative symbols of the gradient, without building it."""
-        return frozenset(self.gradient(heuristic))
-
-    def depends_on(self, substitution: Substitution) -> bool:
-        """Return whether a substitution changes the node."""
-        return super().depends_on(substitution) or self._inner().depends_on(substitution)
-
-    def substitute(self, substitution: Substitution) -> Expression:
-        """Return what the node becomes under a substitution."""
-        return Composed.of((_expression_of(self), *substitution.values()), (), tuple(substitution))
-
-
-def plain(expression: Expression) -> Expression:
-    """Return the expression with carried coordinates put back to plain ones, looking into nodes."""
-    if not expression._nodes:
-        return expression
-    images: dict[Node, Expression] = {}
-    for node in bottom_up(leaves(expression)[1], _parts, images.__contains__):
-        image = _plain_image(node, lambda part: replace_nodes(part, images))
-        if image is not None:
-            images[node] = image
-    return replace_nodes(expression, images)
-
-
-def _parts(node: Node) -> tuple[Expression, ...]:
-    """Return what has to be plain before a node can be."""
-    return () if isinstance(node, Carried | Dependent) else node.arguments
-
-
-def _plain_image(node: Node, plain_part: Callable[[Expression], Expression]) -> Expression | None:
-    """Return what a node becomes, None if it stays what it is."""
-    if isinstance(node, Carried | Dependent):
-        return node.coordinate
-    if isinstance(node, Composed):
-        return _recomposed(node, plain_part)
-    arguments = tuple(map(plain_part, node.arguments))
-    if all(new is old for new, old in zip(arguments, node.arguments, strict=True)):
-        return None
-    return type(node).of(arguments, node.shape, node.options)
-
-
-def _recomposed(node: Composed, plain_part: Callable[[Expression], Expression]) -> Expression | None:
-    """Return a composition over plain replacements, None if they are plain already."""
-    given = node.substitution
-    inner = node.arguments[0]
-    source = inner if isinstance(node._inner(), Carried) else plain_part(inner)
-    replacements = {s: p for s, e in given.items() if (p := plain_part(e)) != s}
-    if source is inner and all(replacements.get(s) is e for s, e in given.items()):
-        return None
-    composed = apply(source, replacements) if replacements else source
-    # What the replacements leave as it is, is a carried coordinate like any other.
-    return plain_part(inner) if composed is source else composed
-
-
-def all_symbols(expression: Expression) -> set[Symbol]:
-    """Return the symbols of values and of given gradients."""
-    symbols, nodes = leaves(expression)
-    found = set(symbols)
-    for node in bottom_up(nodes, _subjects, lambda _: False):
-        found.update(s for part in _subjects(node) for s in leaves(part)[0])
-    return found
-
-
-def _subjects(node: Node) -> tuple[Expression, ...]:
-    """Return what a node is about."""
-    # What was replaced in a composition is inside it, but it is not about that any more.
-    return node.arguments[isinstance(node, Composed) :]
-
-
-def _expression_of(node: Node) -> Expression:
-    from kineverse.expressions.expression import make
-
-    return make(node.sx, node.shape, frozenset((node,)))

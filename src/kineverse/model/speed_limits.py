@@ -1,4 +1,4 @@
-"""What speeds may do: the rows of constraints on them, and what these leave to speeds that move."""
+"""Speed constraints as linear rows and norm bounds, and the speeds that they admit."""
 
 from __future__ import annotations
 
@@ -12,22 +12,61 @@ import casadi as ca
 from kineverse.expressions.expression import Expression, as_expression, binary, unary
 from kineverse.expressions.functions import norm
 from kineverse.expressions.gradient import partial
-from kineverse.expressions.implicit import held
+from kineverse.expressions.implicit import clamp_to_domains
+from kineverse.expressions.nonsmooth import Norm
 from kineverse.symbols import Symbol
 
 from .constraint import Constraint
-from .norm_of_speeds import components_of, directions, inner_radius
 from .rates import Rates
 
+SIDES = 16
+
+
+def find_norm_components(expression: Expression) -> tuple[float, list[Expression]] | None:
+    """Return factor and components of ``factor·norm(components)``, None if it is something else."""
+    if len(expression._nodes) != 1:
+        return None
+    (node,) = expression._nodes
+    if not isinstance(node, Norm):
+        return None
+    factor = ca.jacobian(expression._sx, node.sx)
+    rest = ca.simplify(ca.substitute(expression._sx, node.sx, 0))
+    if not factor.is_constant() or not float(factor) > 0 or not rest.is_zero():
+        return None
+    return float(factor), list(node.arguments[0])
+
+
+def facet_normals(dimensions: int) -> list[tuple[float, ...]]:
+    """Return the normals of a regular polygon, or of its faces turned about to cover a sphere.
+
+    The nearest normal is at most at half a step from any direction in the plane, π/16, and at half a step in
+    latitude and in longitude in space. So the cosine between the two is at least :func:`inscribed_radius`: a
+    polyhedron at that distance from 0 lies inside the unit sphere.
+    """
+    if dimensions == 1:
+        return [(1.0,), (-1.0,)]
+    step = 2 * math.pi / SIDES
+    ring = [(math.cos(a), math.sin(a)) for a in (step * (k + 0.5) for k in range(SIDES))]
+    if dimensions == 2:
+        return list(ring)
+    latitudes = [step * (k + 0.5) for k in range(-SIDES // 4, SIDES // 4)]
+    return [(x * math.cos(b), y * math.cos(b), math.sin(b)) for b in latitudes for x, y in ring]
+
+
+def inscribed_radius(dimensions: int) -> float:
+    """Return the radius of the ball inside the body that has these directions, and whose corners touch 1."""
+    return math.cos(math.pi / SIDES) ** (dimensions - 1)
+
+
 Weights: TypeAlias = Mapping[Symbol, Expression]
-Box: TypeAlias = dict[Symbol, tuple[Expression, Expression]]
+SpeedBox: TypeAlias = dict[Symbol, tuple[Expression, Expression]]
 
 ZERO = as_expression(0.0)
 INFINITE = as_expression(math.inf)
 
 
 @dataclass(frozen=True)
-class Row:
+class SpeedRow:
     """One row ``lower <= Σ weight·speed <= upper``, with the name of the constraint it came from."""
 
     name: str
@@ -37,7 +76,7 @@ class Row:
 
 
 @dataclass(frozen=True)
-class Ball:
+class NormBound:
     """Components ``Σ weight·speed``, whose norm is at most the radius."""
 
     components: tuple[Weights, ...]
@@ -45,7 +84,7 @@ class Ball:
 
 
 @dataclass(frozen=True)
-class Limits:
+class AdmissibleSpeeds:
     """What speeds may do of which some move and the others stand still, which is taken to be allowed.
 
     Attributes
@@ -58,64 +97,71 @@ class Limits:
         Norms, of which rows are the polygon inside.
     """
 
-    box: Box
-    coupled: list[Row]
-    balls: list[Ball]
+    box: SpeedBox
+    coupled: list[SpeedRow]
+    balls: list[NormBound]
 
 
 class SpeedLimits:
     """Rows of the constraints on speeds, collected one by one."""
 
     def __init__(self, rates: Rates) -> None:
-        self.rows: list[Row] = []
+        self.rows: list[SpeedRow] = []
         self._rates = rates
-        self._affine: list[Row] = []
-        self._balls: list[Ball] = []
+        self._affine: list[SpeedRow] = []
+        self._balls: list[NormBound] = []
 
     def add(self, name: str, constraint: Constraint) -> str | None:
         """Append the rows of a constraint of order 1; return why not, if it has none."""
         lower, upper = constraint.lower, constraint.upper
         if any(s.order for s in (*lower.symbols, *upper.symbols)):
             return "its bounds depend on speeds"
-        found = components_of(constraint.expression)
+        found = find_norm_components(constraint.expression)
         if found is not None:
             factor, components = found
-            return self._add_norm(name, _over(lower, factor), components, _over(upper, factor))
+            return self._add_norm(
+                name, _divide_bound(lower, factor), components, _divide_bound(upper, factor)
+            )
         affine = _affine(self._rates.eliminate(constraint.expression))
         if affine is None:
             return "it is neither affine in the speeds nor a norm of speeds"
         weights, offset = affine
-        row = Row(name, weights, less(held(lower), offset), less(held(upper), offset))
+        row = SpeedRow(
+            name,
+            weights,
+            subtract_offset(clamp_to_domains(lower), offset),
+            subtract_offset(clamp_to_domains(upper), offset),
+        )
         self.rows.append(row)
         self._affine.append(row)
         return None
 
-    def of(self, moving: Collection[Symbol]) -> Limits:
+    def of(self, moving: Collection[Symbol]) -> AdmissibleSpeeds:
         """Return the limits of speeds that move while all others stand still."""
-        box: Box = {}
+        box: SpeedBox = {}
         coupled = []
         for row in self._affine:
-            weights = only(row.weights, moving)
+            weights = select_moving(row.weights, moving)
             for speed, weight in weights.items():
                 if not weight.symbols:
                     # Alone it gets that far at most; more would need the help of others.
                     ends = [e if is_infinite(e) else e / weight for e in (row.lower, row.upper)]
-                    _limit(box, speed, *(ends if float(weight) > 0 else reversed(ends)))
+                    _tighten(box, speed, *(ends if float(weight) > 0 else reversed(ends)))
             if len(weights) > 1 or any(w.symbols for w in weights.values()):
-                coupled.append(Row(row.name, weights, row.lower, row.upper))
+                coupled.append(SpeedRow(row.name, weights, row.lower, row.upper))
         balls = []
         for ball in self._balls:
-            components = tuple(only(c, moving) for c in ball.components)
+            components = tuple(select_moving(c, moving) for c in ball.components)
             for component in components:
                 for speed, weight in component.items():
                     if not weight.symbols:
                         end = ball.radius / abs(float(weight))
-                        _limit(box, speed, -end, end)
+                        _tighten(box, speed, -end, end)
             if len({s for c in components for s in c}) > 1 or any(
                 w.symbols for c in components for w in c.values()
             ):
-                balls.append(Ball(components, ball.radius))
-        return Limits(box, coupled, balls)
+                balls.append(NormBound(components, ball.radius))
+        return AdmissibleSpeeds(box, coupled, balls)
 
     def _add_norm(
         self, name: str, lower: Expression, components: list[Expression], upper: Expression
@@ -129,8 +175,8 @@ class SpeedLimits:
         parts = [part for c in components if (part := _affine(self._rates.eliminate(c))) is not None]
         if len(parts) < len(components):
             return "the norm is of something that is not affine in the speeds"
-        inner = held(upper) * inner_radius(len(components))
-        for direction in directions(len(components)):
+        inner = clamp_to_domains(upper) * inscribed_radius(len(components))
+        for direction in facet_normals(len(components)):
             weights: dict[Symbol, Expression] = {}
             offset = ZERO
             for factor, (own, constant) in zip(direction, parts, strict=True):
@@ -138,10 +184,10 @@ class SpeedLimits:
                 for speed, weight in own.items():
                     term = factor * weight
                     weights[speed] = weights[speed] + term if speed in weights else term
-            self.rows.append(Row(name, weights, -INFINITE, less(inner, offset)))
+            self.rows.append(SpeedRow(name, weights, -INFINITE, subtract_offset(inner, offset)))
         offsets = [constant for _, constant in parts if constant != ZERO]
         radius = inner - norm(offsets) if offsets else inner
-        self._balls.append(Ball(tuple(own for own, _ in parts), radius))
+        self._balls.append(NormBound(tuple(own for own, _ in parts), radius))
         return None
 
 
@@ -150,49 +196,49 @@ def is_infinite(bound: Expression) -> bool:
     return not bound.symbols and math.isinf(float(bound))
 
 
-def only(weights: Weights, moving: Collection[Symbol]) -> dict[Symbol, Expression]:
+def select_moving(weights: Weights, moving: Collection[Symbol]) -> dict[Symbol, Expression]:
     """Return the weights of speeds that move and have one."""
     return {s: w for s, w in weights.items() if s in moving and (w.symbols or float(w))}
 
 
-def smaller(a: Expression, b: Expression) -> Expression:
+def raw_min(a: Expression, b: Expression) -> Expression:
     """Return the minimum of two; nobody takes gradients of what rows are compared with."""
     return binary(ca.OP_FMIN, a, b)
 
 
-def larger(a: Expression, b: Expression) -> Expression:
+def raw_max(a: Expression, b: Expression) -> Expression:
     """Return the maximum of two."""
     return binary(ca.OP_FMAX, a, b)
 
 
-def at_least(value: Expression, least: Expression) -> Expression:
+def clamp_below(value: Expression, least: Expression) -> Expression:
     """Return the maximum, or NaN where the value is NaN; that shall show, which CasADi's would hide."""
-    return _instead(value, binary(ca.OP_LT, value, least), least)
+    return _replace_where(value, binary(ca.OP_LT, value, least), least)
 
 
-def at_most(value: Expression, most: Expression) -> Expression:
+def clamp_above(value: Expression, most: Expression) -> Expression:
     """Return the minimum, or NaN where the value is NaN."""
-    return _instead(value, binary(ca.OP_LT, most, value), most)
+    return _replace_where(value, binary(ca.OP_LT, most, value), most)
 
 
-def _instead(value: Expression, beyond: Expression, end: Expression) -> Expression:
+def _replace_where(value: Expression, beyond: Expression, end: Expression) -> Expression:
     kept = binary(ca.OP_IF_ELSE_ZERO, unary(ca.OP_NOT, beyond), value)
     return kept + binary(ca.OP_IF_ELSE_ZERO, beyond, end)
 
 
-def _limit(box: Box, speed: Symbol, low: Expression, high: Expression) -> None:
-    low, high = smaller(low, ZERO), larger(high, ZERO)
+def _tighten(box: SpeedBox, speed: Symbol, low: Expression, high: Expression) -> None:
+    low, high = raw_min(low, ZERO), raw_max(high, ZERO)
     if speed in box:
         other_low, other_high = box[speed]
-        low, high = larger(low, other_low), smaller(high, other_high)
+        low, high = raw_max(low, other_low), raw_min(high, other_high)
     box[speed] = (low, high)
 
 
-def _over(bound: Expression, factor: float) -> Expression:
+def _divide_bound(bound: Expression, factor: float) -> Expression:
     return bound if factor == 1 else bound / factor
 
 
-def less(bound: Expression, offset: Expression) -> Expression:
+def subtract_offset(bound: Expression, offset: Expression) -> Expression:
     """Return a bound less an offset; what is infinite stays a plain infinity."""
     return bound if is_infinite(bound) else bound - offset
 
@@ -204,4 +250,4 @@ def _affine(expression: Expression) -> tuple[dict[Symbol, Expression], Expressio
     if any(s.order for s in slopes.symbols):
         return None
     offset = expression.substitute(dict.fromkeys(speeds, 0.0))
-    return {s: held(slopes[i]) for i, s in enumerate(speeds)}, held(offset)
+    return {s: clamp_to_domains(slopes[i]) for i, s in enumerate(speeds)}, clamp_to_domains(offset)

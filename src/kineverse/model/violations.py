@@ -9,16 +9,16 @@ from typing import Any, NamedTuple
 import casadi as ca
 import numpy as np
 
+from kineverse._checks import as_tolerance
 from kineverse.errors import UnknownNameError
 from kineverse.expressions.expression import Expression, as_expression
+from kineverse.expressions.graph import lower
 from kineverse.expressions.implicit import implicit_nodes
-from kineverse.expressions.lowering import lower
-from kineverse.html_table import html_table
-from kineverse.state import State
+from kineverse.expressions.printing import html_table
+from kineverse.state import State, StateLike, as_state
 from kineverse.symbols import Symbol
 
 from .constraint import Constraint
-from .values import as_state, as_tolerance
 
 
 class Violation(NamedTuple):
@@ -95,7 +95,7 @@ class Checks:
 
 
 def find_violations(
-    checks: Checks, values: Mapping[Any, float], known: Iterable[Symbol], tolerance: float
+    checks: Checks, values: StateLike, known: Iterable[Symbol], tolerance: float
 ) -> Violations:
     """Return the violations at ``values``, see :meth:`ModelView.violations`."""
     tolerance = as_tolerance(tolerance)

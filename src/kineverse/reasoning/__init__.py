@@ -1,19 +1,19 @@
-"""Reasoning about models (layer 5): what locks what, and when."""
+"""Reasoning about models (layer 5): interlocks and their conditions."""
 
-from kineverse.vocabulary import MODULE, unknown_attribute
+from kineverse._synonyms import MODULE_SYNONYMS, unknown_attribute_error
 
-from .boxes import Box, Interval
-from .check import contradictions
-from .finding import interlocks
+from .boxes import Interval, IntervalBox
+from .certify import contradictions
+from .find_interlocks import interlocks
 from .interlock import Hold, Interlock, Interlocks, Undecided
-from .order import opening_order
+from .opening_order import opening_order
 
 __all__ = [
-    "Box",
     "Hold",
     "Interlock",
     "Interlocks",
     "Interval",
+    "IntervalBox",
     "Undecided",
     "contradictions",
     "interlocks",
@@ -22,4 +22,4 @@ __all__ = [
 
 
 def __getattr__(name: str) -> object:
-    raise unknown_attribute("The package kineverse.reasoning", name, __all__, MODULE)
+    raise unknown_attribute_error("The package kineverse.reasoning", name, __all__, MODULE_SYNONYMS)

@@ -1,4 +1,4 @@
-"""Intervals and boxes: where something holds."""
+"""Intervals and boxes of conditions."""
 
 from __future__ import annotations
 
@@ -91,7 +91,7 @@ class Interval:
 EVERYTHING = Interval()
 
 
-class Box(Mapping[Expression, Interval]):
+class IntervalBox(Mapping[Expression, Interval]):
     """A conjunction of conditions: intervals of coordinates, or of sums of several of them; the rest is free.
 
     The empty box, without conditions, is everywhere.
@@ -114,7 +114,7 @@ class Box(Mapping[Expression, Interval]):
         return len(self._sides)
 
     def __eq__(self, other: object) -> bool:
-        return self._sides == other._sides if isinstance(other, Box) else NotImplemented
+        return self._sides == other._sides if isinstance(other, IntervalBox) else NotImplemented
 
     def __hash__(self) -> int:
         return hash(tuple(self._sides.items()))
@@ -125,20 +125,20 @@ class Box(Mapping[Expression, Interval]):
     def __repr__(self) -> str:
         return f"<Box: {self}>"
 
-    def intersection(self, other: Box) -> Box | None:
+    def intersection(self, other: IntervalBox) -> IntervalBox | None:
         """Return what is in both, None if nothing is."""
         sides = dict(self._sides)
         for axis, side in other.items():
             sides[axis] = sides[axis].intersection(side) if axis in sides else side
             if sides[axis].is_empty:
                 return None
-        return Box(sides)
+        return IntervalBox(sides)
 
-    def covers(self, other: Box) -> bool:
+    def covers(self, other: IntervalBox) -> bool:
         """Whether all of the other is in this one."""
         return all(axis in other and side.covers(other[axis]) for axis, side in self._sides.items())
 
-    def without(self, other: Box) -> list[Box]:
+    def without(self, other: IntervalBox) -> list[IntervalBox]:
         """Return what is in this one and not in the other, as boxes that do not overlap."""
         if self.intersection(other) is None:
             return [self]
@@ -148,22 +148,22 @@ class Box(Mapping[Expression, Interval]):
             for beyond in side.outside():
                 part = own.intersection(beyond)
                 if not part.is_empty:
-                    parts.append(Box({**rest, axis: part}))
+                    parts.append(IntervalBox({**rest, axis: part}))
             rest[axis] = own.intersection(side)
         return parts
 
-    def rounded(self) -> Box:
+    def rounded(self) -> IntervalBox:
         """Return it with ends that are floats."""
-        return Box({axis: side.rounded() for axis, side in self._sides.items()})
+        return IntervalBox({axis: side.rounded() for axis, side in self._sides.items()})
 
 
 def axis_name(axis: Expression) -> str:
     """Return what an axis is called: a symbol's name, a sum, or ``angle mod 2π``."""
-    if not isinstance(axis, Symbol) and len(axis.symbols) == 1 and axis == within_a_turn(axis.symbols[0]):
+    if not isinstance(axis, Symbol) and len(axis.symbols) == 1 and axis == wrap_to_turn(axis.symbols[0]):
         return f"{axis.symbols[0]} mod 2π"
     return str(axis)
 
 
-def within_a_turn(angle: Symbol) -> Expression:
+def wrap_to_turn(angle: Symbol) -> Expression:
     """Return an angle less whole turns, in [0, 2π)."""
     return angle - math.tau * floor(angle / math.tau)

@@ -1,4 +1,4 @@
-"""Which configurations there are: within constant limits, and with quaternions of length one."""
+"""Domain of configurations: constant limits and unit quaternions."""
 
 from __future__ import annotations
 
@@ -9,13 +9,13 @@ from functools import cached_property
 
 import numpy as np
 
-from kineverse.bounds.ranges import Range
+from kineverse.intervals.arithmetic import RealInterval
 from kineverse.symbols import Symbol
 
 from .boxes import Interval
 from .polynomial import Monomial, Polynomial
 
-Sphere = tuple[Symbol, ...]
+UnitSphere = tuple[Symbol, ...]
 """Coordinates whose squares add up to one."""
 
 _WHOLE = Interval(-1.0, 1.0, True, True)
@@ -36,14 +36,14 @@ class Domain:
     """
 
     limits: Mapping[Symbol, Interval]
-    spheres: tuple[Sphere, ...] = ()
+    spheres: tuple[UnitSphere, ...] = ()
 
     def of(self, symbol: Symbol) -> Interval:
         """Return where a symbol may be."""
         limit = self.limits.get(symbol, EVERYWHERE)
         return limit.intersection(_WHOLE) if symbol in self._on_sphere else limit
 
-    def sphere(self, symbols: Iterable[Symbol]) -> Sphere | None:
+    def sphere(self, symbols: Iterable[Symbol]) -> UnitSphere | None:
         """Return the quaternion that all of these belong to, None if there is no such one."""
         spheres = {self._on_sphere.get(s) for s in symbols}
         return spheres.pop() if len(spheres) == 1 else None
@@ -56,7 +56,7 @@ class Domain:
                 p = _without_square(p, sphere)
         return p
 
-    def span(self, p: Polynomial) -> Range | None:
+    def span(self, p: Polynomial) -> RealInterval | None:
         """Return the least and greatest value of a quadratic form of a quaternion, None for anything else.
 
         These are the outer eigenvalues of its matrix; a constant is one, too, times the identity.
@@ -75,11 +75,11 @@ class Domain:
         return float(values[0]) - slack, float(values[-1]) + slack
 
     @cached_property
-    def _on_sphere(self) -> dict[Symbol, Sphere]:
+    def _on_sphere(self) -> dict[Symbol, UnitSphere]:
         return {s: sphere for sphere in self.spheres for s in sphere}
 
 
-def _without_square(p: Polynomial, sphere: Sphere) -> Polynomial:
+def _without_square(p: Polynomial, sphere: UnitSphere) -> Polynomial:
     last = sphere[-1]
     total: dict[Monomial, Fraction] = {}
     for monomial, factor in p.terms.items():

@@ -1,4 +1,4 @@
-"""What locks what: records of interlocks, and of what could not be decided."""
+"""Interlocks and undecided constraints, as records."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import Any, Literal, overload
 from kineverse.expressions.expression import Expression
 from kineverse.symbols import Symbol
 
-from .boxes import Box, axis_name
+from .boxes import IntervalBox, axis_name
 
 Hold = Literal["stands still", "cannot increase", "cannot decrease", "stays within", "has no value"]
 
@@ -39,14 +39,14 @@ class Interlock:
     held: Expression
     hold: Hold
     constraints: tuple[str, ...]
-    when: tuple[Box, ...]
+    when: tuple[IntervalBox, ...]
     lower: Expression | None = None
     upper: Expression | None = None
 
     @property
     def is_permanent(self) -> bool:
         """Whether it holds everywhere."""
-        return Box({}) in self.when
+        return IntervalBox({}) in self.when
 
     @property
     def keys(self) -> tuple[Symbol, ...]:
@@ -69,7 +69,7 @@ class Undecided:
 
     constraint: str
     reason: str
-    where: tuple[Box, ...] = (Box({}),)
+    where: tuple[IntervalBox, ...] = (IntervalBox({}),)
 
     def __str__(self) -> str:
         return f"{self.constraint}: unknown, as {self.reason}: {_either(self.where)}"
@@ -152,7 +152,7 @@ def _position(symbol: Symbol) -> Symbol:
     return symbol.position if symbol.order else symbol
 
 
-def _either(boxes: tuple[Box, ...]) -> str:
+def _either(boxes: tuple[IntervalBox, ...]) -> str:
     if len(boxes) == 1:
         return f"when {boxes[0]}" if boxes[0] else "always"
     return "when " + " or ".join(f"({box})" if len(box) > 1 else str(box) for box in boxes)
@@ -164,7 +164,7 @@ def _bound(bound: Expression | None) -> str:
     return f"{float(bound):.12g}"
 
 
-def _box(box: Box) -> dict[str, dict[str, Any]]:
+def _box(box: IntervalBox) -> dict[str, dict[str, Any]]:
     return {
         axis_name(axis): {
             "lower": None if math.isinf(side.lower) else float(side.lower),

@@ -1,4 +1,4 @@
-"""Polynomials with rational coefficients: what arithmetic of symbols and floats is, without rounding."""
+"""Polynomials with rational coefficients."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from kineverse.symbols import Symbol
 from .boxes import Interval, Number
 
 Monomial: TypeAlias = tuple[tuple[Symbol, int], ...]
-Axis: TypeAlias = tuple[tuple[Symbol, Fraction], ...]
+LinearForm: TypeAlias = tuple[tuple[Symbol, Fraction], ...]
 
 _DEGREE_AT_MOST = 8
 _MONOMIALS_AT_MOST = 40
@@ -96,7 +96,7 @@ class Polynomial:
             total[rest] = total.get(rest, Fraction(0)) + factor
         return Polynomial({m: f for m, f in total.items() if f})
 
-    def axis(self) -> tuple[Axis, Fraction]:
+    def axis(self) -> tuple[LinearForm, Fraction]:
         """Return a polynomial of degree 1 as ``scale·axis + offset``: the axis and its scale.
 
         The axis is normalised: its largest weight is ±1, its first is positive.
@@ -113,7 +113,7 @@ class Polynomial:
         return result
 
 
-def axis_expression(axis: Axis) -> Expression:
+def linear_form_expression(axis: LinearForm) -> Expression:
     """Return a symbol, or a sum of several with their weights."""
     total = as_expression(0.0)
     for symbol, weight in axis:
@@ -124,7 +124,7 @@ def axis_expression(axis: Axis) -> Expression:
     return total
 
 
-def value_at(coefficients: list[Fraction], x: Fraction) -> Fraction:
+def evaluate_polynomial(coefficients: list[Fraction], x: Fraction) -> Fraction:
     """Return the value of a polynomial in one symbol."""
     result = Fraction(0)
     for coefficient in reversed(coefficients):
@@ -151,7 +151,7 @@ def roots(coefficients: list[Fraction], within: Interval) -> list[Fraction]:
         chain = _sturm(coefficients)
         bound = 1 + max(abs(c / coefficients[-1]) for c in coefficients[:-1])
         # Always from the same ends, so that a root is the same number whichever interval it is wanted in.
-        found = sorted(_isolated(chain, -bound, bound))
+        found = sorted(_isolate(chain, -bound, bound))
     return [root for root in found if root in within or _is_near_closed_end(root, within)]
 
 
@@ -160,14 +160,14 @@ def _is_near_closed_end(root: Fraction, within: Interval) -> bool:
     return any(closed and are_close(root, end, 1e-12) for end, closed in ends)
 
 
-def _isolated(chain: list[list[Fraction]], low: Fraction, high: Fraction) -> Iterable[Fraction]:
+def _isolate(chain: list[list[Fraction]], low: Fraction, high: Fraction) -> Iterable[Fraction]:
     stack = [(low, high)]
     while stack:
         a, b = stack.pop()
-        count = _changes(chain, a) - _changes(chain, b)  # the roots in (a, b]
+        count = _sign_changes(chain, a) - _sign_changes(chain, b)  # the roots in (a, b]
         if not count:
             continue
-        if not value_at(chain[0], b):
+        if not evaluate_polynomial(chain[0], b):
             yield b
             if count > 1:
                 middle = (a + b) / 2
@@ -217,6 +217,6 @@ def _remainder(a: list[Fraction], b: list[Fraction]) -> list[Fraction]:
     return rest
 
 
-def _changes(chain: list[list[Fraction]], x: Fraction) -> int:
-    signs = [s for s in (value_at(p, x) for p in chain) if s]
+def _sign_changes(chain: list[list[Fraction]], x: Fraction) -> int:
+    signs = [s for s in (evaluate_polynomial(p, x) for p in chain) if s]
     return sum((a > 0) != (b > 0) for a, b in itertools.pairwise(signs))

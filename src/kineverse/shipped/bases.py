@@ -6,7 +6,7 @@ from kineverse.articulations import DifferentialDrive, Joint, OmniBase
 from kineverse.model.frame import WORLD
 
 
-def base_of(model: str, prefix: str | None) -> Joint | None:
+def mobile_base(model: str, prefix: str | None) -> Joint | None:
     """Return the base that carries a shipped robot, None for what stands still.
 
     Parameters

@@ -16,20 +16,21 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
+from kineverse.state import StateLike
 from kineverse.view.camera import Camera
-from kineverse.view.drawing import picture, save
+from kineverse.view.pictures import picture, save_picture
 from kineverse.view.show import show
 
 if TYPE_CHECKING:
-    from kineverse.model.view import ModelView
+    from kineverse.model.model_view import ModelView
     from kineverse.view.viewer import Viewer
 
-__all__ = ["Camera", "picture", "save", "show", "view"]
+__all__ = ["Camera", "picture", "save_picture", "show", "view"]
 
 
 def view(
     model: ModelView,
-    state: Mapping[Any, float] | None = None,
+    state: StateLike | None = None,
     *,
     port: int | None = None,
     label: str | None = None,

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from kineverse.errors import ValueRejectedError
-from kineverse.view.triangles import Floats
+from kineverse.errors import InvalidValueError
+from kineverse.view.triangle_mesh import Floats
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,9 +35,9 @@ class Camera:
     def __post_init__(self) -> None:
         numbers = np.array([*self.position, *self.target, *self.up, self.field_of_view])
         if not np.isfinite(numbers).all() or self.position == self.target:
-            raise ValueRejectedError(f"a camera needs finite numbers and a target ahead of it, got {self}")
+            raise InvalidValueError(f"a camera needs finite numbers and a target ahead of it, got {self}")
         if not 0.0 < self.field_of_view < np.pi:
-            raise ValueRejectedError(f"field_of_view {self.field_of_view} is not between 0 and pi")
+            raise InvalidValueError(f"field_of_view {self.field_of_view} is not between 0 and pi")
 
     @property
     def height(self) -> float:
@@ -57,7 +57,7 @@ class Camera:
         return np.array([right, np.cross(right, ahead), ahead])
 
 
-def framing(
+def fit_camera(
     points: npt.ArrayLike,
     azimuth: float,
     elevation: float,

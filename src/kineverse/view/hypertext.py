@@ -37,7 +37,7 @@ def element(tag: str, *content: str, style: str = "", **attributes: object) -> H
     return Html(f"<{tag}{opened}>{inside}</{tag}>")
 
 
-def joined(*content: str) -> Html:
+def join_html(*content: str) -> Html:
     """Return content one after the other; what is not :class:`Html` is escaped."""
     return Html("".join(text if isinstance(text, Html) else html.escape(text) for text in content))
 
@@ -73,7 +73,7 @@ FONT = "font-size:0.8em;line-height:1.35;overflow-wrap:anywhere;"
 """The font of the panel."""
 
 
-def note(color: str, background: str, *content: str) -> Html:
+def colored_box(color: str, background: str, *content: str) -> Html:
     """Return a coloured box in the font of the panel."""
     colors = f"color:{color};background:{background}"
     return element(

@@ -1,4 +1,4 @@
-"""Mesh files as triangles with colours, read when somebody wants to see them."""
+"""Triangle meshes of mesh files and of any geometry of a body."""
 
 from __future__ import annotations
 
@@ -9,29 +9,35 @@ from typing import Any
 import numpy as np
 
 from kineverse.errors import KineverseError
-from kineverse.geometry.mesh_files import MeshFile, find, metres, parts
-from kineverse.model.body import Mesh
-from kineverse.model.view import ModelView
-from kineverse.view.primitives import placeholder
-from kineverse.view.triangles import Floats, Triangles, creased, join
+from kineverse.geometry.mesh_files import MeshFile, find_mesh_file, load_mesh_parts, unit_length
+from kineverse.model.body import Geometry, Mesh
+from kineverse.model.model_view import ModelView
+from kineverse.view.triangle_mesh import (
+    Floats,
+    TriangleMesh,
+    build_creased_mesh,
+    concatenate_meshes,
+    mesh_placeholder,
+    mesh_primitive,
+)
 
 logger = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, slots=True)
-class Loaded:
+class LoadedMesh:
     """A mesh that was asked for: its surface, or a placeholder and what was wrong."""
 
-    surface: Triangles
+    surface: TriangleMesh
     problem: str = ""
 
 
-_by_reference: dict[tuple[Mesh, str | None], Loaded] = {}
-_by_content: dict[tuple[object, ...], Triangles] = {}
+_by_reference: dict[tuple[Mesh, str | None], LoadedMesh] = {}
+_by_content: dict[tuple[object, ...], TriangleMesh] = {}
 _reported: set[tuple[str, str]] = set()
 
 
-def load(mesh: Mesh) -> Loaded:
+def load_mesh(mesh: Mesh) -> LoadedMesh:
     """Return the triangles of a mesh file, scaled, in the frame of the mesh [m].
 
     Files of equal content are parsed once, whatever name led to them. What cannot be loaded becomes a
@@ -45,30 +51,30 @@ def load(mesh: Mesh) -> Loaded:
     key = mesh, mesh.root
     if key not in _by_reference:
         try:
-            _by_reference[key] = Loaded(_read(mesh))
+            _by_reference[key] = LoadedMesh(_read(mesh))
         except (KineverseError, OSError) as error:
-            _by_reference[key] = _missing(mesh, str(error))
+            _by_reference[key] = _substitute_placeholder(mesh, str(error))
         except Exception as error:  # Parsers of other people's formats raise anything at all.
-            _by_reference[key] = _missing(mesh, f"{type(error).__name__}: {error}")
+            _by_reference[key] = _substitute_placeholder(mesh, f"{type(error).__name__}: {error}")
     return _by_reference[key]
 
 
-def seen_in(model: ModelView) -> list[Mesh]:
+def list_visual_meshes(model: ModelView) -> list[Mesh]:
     """Return the meshes by which a model is seen, each once."""
     shapes = (shape.geometry for body in model.bodies.values() for shape in body.visuals)
     return list(dict.fromkeys(geometry for geometry in shapes if isinstance(geometry, Mesh)))
 
 
-def _missing(mesh: Mesh, problem: str) -> Loaded:
+def _substitute_placeholder(mesh: Mesh, problem: str) -> LoadedMesh:
     first_line = (problem.strip().splitlines() or ["unknown error"])[0]
     if (mesh.uri, mesh.folder) not in _reported:
         _reported.add((mesh.uri, mesh.folder))
         logger.warning("mesh %s is shown as a placeholder: %s", mesh.uri, first_line)
-    return Loaded(placeholder(), first_line)
+    return LoadedMesh(mesh_placeholder(), first_line)
 
 
-def _read(mesh: Mesh) -> Triangles:
-    file = find(mesh)
+def _read(mesh: Mesh) -> TriangleMesh:
+    file = find_mesh_file(mesh)
     # The folder is part of the key because materials and textures lie beside the file.
     source = (file.digest, file.kind, str(file.path.parent))
     if source not in _by_content:
@@ -81,18 +87,18 @@ def _read(mesh: Mesh) -> Triangles:
     return _by_content[scaled]
 
 
-def _parse(file: MeshFile) -> Triangles:
+def _parse(file: MeshFile) -> TriangleMesh:
     """Return the triangles of a file in metres, with the colours it brings."""
-    pieces = [piece for part in parts(file) if len((piece := _piece(part)).faces)]
+    pieces = [piece for part in load_mesh_parts(file) if len((piece := _convert_piece(part)).faces)]
     if not pieces:
         raise OSError(f"{file.path} holds no triangles")
     if any(piece.colors is not None for piece in pieces):
         pieces = [_colored(piece) for piece in pieces]
-    return join(pieces).scaled(metres(file.path))
+    return concatenate_meshes(pieces).scaled(unit_length(file.path))
 
 
-def _piece(mesh: Any) -> Triangles:
-    surface, kept = creased(mesh.vertices, mesh.faces)
+def _convert_piece(mesh: Any) -> TriangleMesh:
+    surface, kept = build_creased_mesh(mesh.vertices, mesh.faces)
     try:
         colors = _face_colors(mesh)
     except Exception:  # A picture that cannot be decoded is no reason not to show the shape.
@@ -106,7 +112,7 @@ def _face_colors(mesh: Any) -> Floats | None:
     visual = mesh.visual
     if visual.kind != "texture":
         return np.asarray(visual.face_colors, dtype=float) / 255.0 if visual.defined else None
-    if visual.uv is not None and _has_picture(visual.material):
+    if visual.uv is not None and _has_texture(visual.material):
         corners = np.asarray(visual.to_color().vertex_colors, dtype=float)
         if corners.shape == (len(mesh.vertices), 4):
             return np.asarray(corners[mesh.faces].mean(axis=1) / 255.0)
@@ -114,15 +120,24 @@ def _face_colors(mesh: Any) -> Floats | None:
     return np.tile(main, (len(mesh.faces), 1))
 
 
-def _has_picture(material: Any) -> bool:
+def _has_texture(material: Any) -> bool:
     names = ("image", "baseColorTexture")
     return any(getattr(material, name, None) is not None for name in names)
 
 
 def _colored(
-    piece: Triangles, fallback: tuple[float, float, float, float] = (0.7, 0.7, 0.72, 1.0)
-) -> Triangles:
+    piece: TriangleMesh, fallback: tuple[float, float, float, float] = (0.7, 0.7, 0.72, 1.0)
+) -> TriangleMesh:
     """Return the piece with colours, so that pieces with and without can be joined."""
     if piece.colors is not None:
         return piece
     return piece.painted(np.tile(fallback, (len(piece.faces), 1)))
+
+
+def mesh_geometry(geometry: Geometry) -> TriangleMesh:
+    """Return the surface of a piece of geometry, in its own frame [m].
+
+    A mesh is read here, and only here; one that cannot be read becomes a marked placeholder (see
+    :mod:`kineverse.view.meshes`), so this never fails for a missing file.
+    """
+    return load_mesh(geometry).surface if isinstance(geometry, Mesh) else mesh_primitive(geometry)

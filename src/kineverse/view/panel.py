@@ -7,18 +7,17 @@ import threading
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
-from kineverse.view.collisions import Collisions
-from kineverse.view.driving import Driving
+from kineverse.view.drive import VelocityDrive
 from kineverse.view.hypertext import Html, HtmlBox, element
-from kineverse.view.orientations import Orientations
-from kineverse.view.ranges import Ranges, offered, step
-from kineverse.view.scene import Scene
-from kineverse.view.violations import missing_meshes, number, report
+from kineverse.view.proximity_panel import ProximityPanel
+from kineverse.view.scene import ViewerScene
+from kineverse.view.sliders import QuaternionAngles, Ranges, choose_slider_range, choose_slider_step
+from kineverse.view.violations import format_missing_meshes, format_significant, format_violations
 
 BEYOND = 0.2
 """How much wider sliders get on demand, as a part of their range, so that limits can be crossed."""
 
-OPEN = 100
+MOST_UNFOLDED = 100
 """With at most so many degrees of freedom all groups are unfolded at first."""
 
 DEGREES = {"rad": ("°", math.degrees(1.0)), "rad/s": ("°/s", math.degrees(1.0))}
@@ -71,11 +70,11 @@ class Panel:
     def __init__(
         self,
         gui: Any,
-        scene: Scene,
-        collisions: Collisions,
+        scene: ViewerScene,
+        collisions: ProximityPanel,
         ranges: Ranges,
-        orientations: Orientations,
-        driving: Driving,
+        orientations: QuaternionAngles,
+        driving: VelocityDrive,
         units: Mapping[str, str],
         values: Mapping[str, float],
         *,
@@ -99,7 +98,7 @@ class Panel:
         self._root = gui.add_folder(None)
         with self._root:
             HtmlBox(gui, element("style", Html(STYLE)))
-            self._status = HtmlBox(gui, report(()))
+            self._status = HtmlBox(gui, format_violations(()))
             collisions.add_folder(gui)
             tabs = gui.add_tab_group()
             with tabs.add_tab("Move"):
@@ -145,7 +144,7 @@ class Panel:
 
     def _update(self, shown: Mapping[str, float], values: Mapping[str, float], driven: Iterable[str]) -> None:
         self._shown = shown
-        for name in self._orientations.in_place(driven):
+        for name in self._orientations.slider_names(driven):
             slider = self._sliders.get(name)
             if slider is not None:
                 if not slider.min <= self._to_shown(name, shown[name]) <= slider.max:
@@ -180,9 +179,9 @@ class Panel:
 
     def _add_sliders(self, values: Mapping[str, float]) -> None:
         groups: dict[str, list[str]] = {}
-        for name in self._orientations.in_place(self._ranges.names):
+        for name in self._orientations.slider_names(self._ranges.names):
             groups.setdefault(name.rpartition("/")[0], []).append(name)
-        few = len(self._ranges.names) <= OPEN
+        few = len(self._ranges.names) <= MOST_UNFOLDED
         for number_, (group, names) in enumerate(groups.items()):
             folder = self._gui.add_folder(group or "model", expand_by_default=few or number_ == 0)
             self._folders[group] = folder
@@ -202,12 +201,12 @@ class Panel:
                     self._label(name, limits[name]),
                     min=low,
                     max=high,
-                    step=step((low, high)),
+                    step=choose_slider_step((low, high)),
                     initial_value=0.0,
-                    hint=f"{name}, from {number(limits[name][0])} to {number(limits[name][1])} "
+                    hint=f"{name}, from {format_significant(limits[name][0])} to {format_significant(limits[name][1])} "
                     f"{self._units[name]}; it goes on until this is 0",
                 )
-                slider.precision = _digits(low, high)
+                slider.precision = _count_digits(low, high)
                 slider.on_update(lambda event, name=name: self._set(driven, name, limits[name], event))
                 self._speeds[name] = slider
 
@@ -226,18 +225,18 @@ class Panel:
             self._label(name, range_),
             min=low,
             max=high,
-            step=step((low, high)),
+            step=choose_slider_step((low, high)),
             initial_value=self._to_shown(name, value),
-            hint=f"{name}, limits {number(lower)} to {number(upper)} {unit}".rstrip(),
+            hint=f"{name}, limits {format_significant(lower)} to {format_significant(upper)} {unit}".rstrip(),
         )
-        slider.precision = _digits(low, high)
+        slider.precision = _count_digits(low, high)
         slider.on_update(lambda event: self._set(self._moved, name, self._limits[name], event))
         return slider
 
     def _label(self, name: str, range_: tuple[float, float], locked: bool = False) -> str:
         """Return the last part of a name with unit and range, such as ``door [rad]   0 to 1.57``."""
         unit = self._unit(name)
-        low, high = (_short(self._to_shown(name, end)) for end in range_)
+        low, high = (_format_short(self._to_shown(name, end)) for end in range_)
         last = name.removesuffix(":velocity").rpartition("/")[2]
         return f"{last}{f' [{unit}]' if unit else ''}   {low} to {high}{' · locked' if locked else ''}"
 
@@ -285,11 +284,11 @@ class Panel:
 
     def _range(self, name: str, value: float) -> tuple[float, float]:
         beyond = BEYOND if self.beyond else 0.0
-        return offered(self._limits[name], value, self._units.get(name, ""), beyond)
+        return choose_slider_range(self._limits[name], value, self._units.get(name, ""), beyond)
 
     def _fit(self, name: str, value: float) -> None:
         """Give a slider the range it should have now."""
-        _stretch(self._sliders[name], *(self._to_shown(name, end) for end in self._range(name, value)))
+        _set_range(self._sliders[name], *(self._to_shown(name, end) for end in self._range(name, value)))
         self._relabel(name)
 
     def _widen(self) -> None:
@@ -307,7 +306,7 @@ class Panel:
                 self._fit(name, self._shown[name])
                 slider.value = self._to_shown(name, self._shown[name])
             for name, slider in self._speeds.items():
-                _stretch(slider, *(self._to_shown(name, limit) for limit in self._driving.limits[name]))
+                _set_range(slider, *(self._to_shown(name, limit) for limit in self._driving.limits[name]))
                 slider.value = self._to_shown(name, self._driving.speeds[name])
                 slider.label = self._label(name, self._driving.limits[name])
 
@@ -318,7 +317,7 @@ class Panel:
         for group, folder in self._folders.items():
             folder.visible = any(shown[name] for name in shown if name.rpartition("/")[0] == group)
 
-    def _add_switches(self, scene: Scene) -> None:
+    def _add_switches(self, scene: ViewerScene) -> None:
         gui = self._gui
         frames = gui.add_checkbox("frames", False, hint="The axes of all frames: x red, y green, z blue.")
         labels = gui.add_checkbox("frame names", False)
@@ -334,21 +333,21 @@ class Panel:
         ground = gui.add_checkbox("floor", True)
         ground.on_update(lambda event: scene.show_ground(event.target.value))
         if scene.problems:
-            HtmlBox(gui, missing_meshes(scene.problems))
+            HtmlBox(gui, format_missing_meshes(scene.problems))
 
 
-def _digits(low: float, high: float) -> int:
+def _count_digits(low: float, high: float) -> int:
     """Return the decimals shown of a value in a range: as many as its steps have."""
-    return max(0, len(f"{step((low, high)):.9f}".rstrip("0").partition(".")[2]))
+    return max(0, len(f"{choose_slider_step((low, high)):.9f}".rstrip("0").partition(".")[2]))
 
 
-def _stretch(slider: Any, low: float, high: float) -> None:
+def _set_range(slider: Any, low: float, high: float) -> None:
     if (slider.min, slider.max) != (low, high):
-        slider.min, slider.max, slider.step = low, high, step((low, high))
-        slider.precision = _digits(low, high)
+        slider.min, slider.max, slider.step = low, high, choose_slider_step((low, high))
+        slider.precision = _count_digits(low, high)
 
 
-def _short(value: float) -> str:
+def _format_short(value: float) -> str:
     """Return a number with two decimals, or as many as a small one needs to have two digits."""
     digits = 2 if abs(value) >= 0.1 or value == 0.0 else 1 - math.floor(math.log10(abs(value)))
     text = f"{value:.{digits}f}" if abs(value) < 1e6 else f"{value:.3g}"

@@ -1,24 +1,59 @@
-"""Where all frames of a model are, from one compiled function."""
+"""Frame poses of a model from one compiled function."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 import kineverse as kv
-from kineverse.errors import UnknownNameError, given_twice, suggest
-from kineverse.model.view import ModelView
-from kineverse.state import State
+from kineverse.errors import UnknownNameError, duplicate_value_error, suggest
+from kineverse.model.model_view import ModelView
+from kineverse.state import State, StateLike
 from kineverse.symbols import parse_symbol_name
-from kineverse.view.triangles import Floats
-
-ROOT = "world"
+from kineverse.view.triangle_mesh import Floats
 
 
-class Poses:
+def to_quaternions(matrices: npt.ArrayLike) -> Floats:
+    """Return (N, 4) unit quaternions, w x y z with w >= 0, of (N, 3, 3) or larger rotation matrices.
+
+    Of the four ways to divide, each of which fails somewhere, the one with the largest divisor is taken
+    (Shepperd 1978).
+    """
+    m = np.asarray(matrices, dtype=float)[:, :3, :3]
+    trace = np.trace(m, axis1=1, axis2=2)
+    diagonal = np.diagonal(m, axis1=1, axis2=2)
+    # Four times the squares of w, x, y, z.
+    squares = np.concatenate([(1.0 + trace)[:, None], 1.0 - trace[:, None] + 2.0 * diagonal], axis=1)
+    products = np.empty((len(m), 4, 4))
+    for k in range(3):
+        i, j = (k + 1) % 3, (k + 2) % 3
+        products[:, 0, k + 1] = products[:, k + 1, 0] = m[:, j, i] - m[:, i, j]
+        products[:, i + 1, j + 1] = products[:, j + 1, i + 1] = m[:, j, i] + m[:, i, j]
+    products[:, range(4), range(4)] = squares
+    row = products[np.arange(len(m)), np.argmax(squares, axis=1)]
+    row = row / np.linalg.norm(row, axis=1, keepdims=True)
+    return np.asarray(row * np.where(row[:, :1] < 0.0, -1.0, 1.0))
+
+
+def roll_pitch_yaw(matrix: npt.ArrayLike) -> Floats:
+    """Return the angles (3,) about fixed x, y, z of a rotation, as URDF writes them [rad].
+
+    At a pitch of a quarter turn, where only a sum of roll and yaw is defined, the roll is 0.
+    """
+    m = np.asarray(matrix, dtype=float)
+    flat = float(np.hypot(m[0, 0], m[1, 0]))
+    pitch = np.arctan2(-m[2, 0], flat)
+    if flat < 1e-9:
+        return np.array([0.0, pitch, np.arctan2(-m[0, 1], m[1, 1])])
+    return np.array([np.arctan2(m[2, 1], m[2, 2]), pitch, np.arctan2(m[1, 0], m[0, 0])])
+
+
+WORLD_FRAME = "world"
+
+
+class FramePoses:
     """The poses of frames in the world, as a function of the values of symbols.
 
     Parameters
@@ -39,11 +74,11 @@ class Poses:
     """
 
     def __init__(self, model: ModelView, names: Iterable[str] | None = None) -> None:
-        everything = (ROOT, *(name for name in model.frames if name != ROOT))
+        everything = (WORLD_FRAME, *(name for name in model.frames if name != WORLD_FRAME))
         self.names = everything if names is None else tuple(names)
         self._index = {name: k for k, name in enumerate(self.names)}
         # The world stands still, and a compiled function without outputs is no use to anyone.
-        self.moving = tuple(name for name in self.names if name != ROOT)
+        self.moving = tuple(name for name in self.names if name != WORLD_FRAME)
         self._function = kv.compile([model.fk(name) for name in self.moving]) if self.moving else None
         self.inputs = tuple(map(str, self._function.inputs)) if self._function else ()
 
@@ -71,7 +106,7 @@ class Poses:
         return self._index[name]
 
 
-def complete(model: ModelView, state: Mapping[Any, float] | None = None) -> dict[str, float]:
+def complete(model: ModelView, state: StateLike | None = None) -> dict[str, float]:
     """Return values of all symbols by name: the given ones, and the default state for the others.
 
     Parameters
@@ -93,7 +128,7 @@ def complete(model: ModelView, state: Mapping[Any, float] | None = None) -> dict
     for key, value in (state or {}).items():
         name = str(key)
         if name in given and not isinstance(state, State):
-            raise given_twice(name)
+            raise duplicate_value_error(name)
         given.add(name)
         if name in known:
             values[name] = float(value)
@@ -104,7 +139,7 @@ def complete(model: ModelView, state: Mapping[Any, float] | None = None) -> dict
     return values
 
 
-def kept(model: ModelView, values: Mapping[str, float]) -> dict[str, float]:
+def keep_known(model: ModelView, values: Mapping[str, float]) -> dict[str, float]:
     """Return those of values by name that a model has symbols for."""
     known = {str(symbol) for symbol in model.symbols}
     return {name: value for name, value in values.items() if name in known}

@@ -9,17 +9,20 @@ from typing import Any
 
 import numpy as np
 
-from kineverse.model.view import ModelView
-from kineverse.view import stage
-from kineverse.view.axes import axis_length
+from kineverse.model.model_view import ModelView
+from kineverse.view import backdrop
+from kineverse.view.auto_camera import (
+    ClientCameras,
+    choose_camera,
+    find_extreme_points,
+    reframe,
+    weigh_drawables,
+)
 from kineverse.view.camera import Camera
-from kineverse.view.client_cameras import ClientCameras
-from kineverse.view.parts import Kind, Part, parts
-from kineverse.view.poses import Poses
-from kineverse.view.rotation import quaternions
-from kineverse.view.surfaces import Surfaces
-from kineverse.view.triangles import Floats, Integers, Triangles
-from kineverse.view.viewpoint import automatic, importance, outermost, reframed
+from kineverse.view.drawables import Drawable, Kind, choose_axis_length, collect_drawables
+from kineverse.view.poses import FramePoses, to_quaternions
+from kineverse.view.rasterizer import TriangleSoup
+from kineverse.view.triangle_mesh import Floats, Integers, TriangleMesh
 
 FIELD_OF_VIEW, ASPECT = 0.8, 1.25
 ROOT = "/model"
@@ -28,7 +31,7 @@ SEE_THROUGH = 0.45
 """How opaque bodies are while what is shown lies inside of them: frames, nearest points."""
 
 
-class Scene:
+class ViewerScene:
     """What the page shows of a model, kept up to date by sending only what moved.
 
     Parameters
@@ -64,17 +67,17 @@ class Scene:
         self._frames_shown, self._labels_shown, self._filter = False, False, ""
         self._visuals_shown, self._collisions_shown, self._ground_shown = True, False, True
         self._decomposed, self._through = False, False
-        stage.set_up(server)
+        backdrop.set_up(server)
         self.refresh(model, values)
 
     def refresh(self, model: ModelView, values: Mapping[str, float]) -> None:
         """Show another model, or this one after an edit; what is switched on stays on."""
         with self._lock:
             self._model = model
-            self._kinematics = Poses(model)
+            self._kinematics = FramePoses(model)
             self.names = self._kinematics.names
             self.poses = self._placed(self._kinematics.at(values), np.eye(4))
-            visuals = parts(model)
+            visuals = collect_drawables(model)
             self.problems = sorted({f"{part.frame}: {part.problem}" for part in visuals if part.problem})
             with self._server.atomic():
                 self._server.scene.remove_by_name(ROOT)
@@ -101,7 +104,7 @@ class Scene:
             self.poses = poses
             if not len(moved):
                 return 0
-            turned = quaternions(poses[moved])
+            turned = to_quaternions(poses[moved])
             with self._server.atomic():
                 for k, wxyz in zip(moved, turned, strict=True):
                     node = self._nodes.get(self.names[k])
@@ -132,7 +135,7 @@ class Scene:
             if axes and wanted:
                 self._axes = self._server.scene.add_batched_axes(
                     "/axes",
-                    quaternions(self.poses[wanted]),
+                    to_quaternions(self.poses[wanted]),
                     self.poses[wanted, :3, 3],
                     axes_length=self.length,
                     axes_radius=0.035 * self.length,
@@ -149,7 +152,7 @@ class Scene:
         with self._lock:
             self._collisions_shown = shown
             if shown and not self._collisions:
-                added = self._add(parts(self._model, "collision", self._decomposed), "collision")
+                added = self._add(collect_drawables(self._model, "collision", self._decomposed), "collision")
                 self._collisions = [node for node, _ in added]
             for node in self._collisions:
                 node.visible = shown
@@ -186,7 +189,7 @@ class Scene:
     def show_ground(self, shown: bool) -> None:
         """Show or hide the floor."""
         self._ground_shown = shown
-        stage.set_floor(self._server, self._floor, self._extent, shown)
+        backdrop.set_floor(self._server, self._floor, self._extent, shown)
 
     def _fade(self) -> None:
         through = self._frames_shown or self._through
@@ -198,12 +201,12 @@ class Scene:
                 # Shadows know no opacity: half transparent bodies would throw black ones into themselves.
                 node.cast_shadow = node.receive_shadow = not through
 
-    def _add(self, items: Iterable[Part], kind: Kind) -> list[tuple[Any, float | None]]:
+    def _add(self, items: Iterable[Drawable], kind: Kind) -> list[tuple[Any, float | None]]:
         """Add shapes below the nodes of their frames; return their nodes and how opaque they are."""
         added = []
         for number, part in enumerate(items):
             frame = self._node(part.frame)
-            for k, (surface, color) in enumerate(_by_color(part)):
+            for k, (surface, color) in enumerate(_split_by_color(part)):
                 opacity = None if color[3] >= 1.0 else color[3]
                 node = self._server.scene.add_mesh_simple(
                     f"{frame.name}/{kind}{number}_{k}",
@@ -228,24 +231,24 @@ class Scene:
                 show_axes=False,
                 visible=frame not in self.unplaced,
                 position=self.poses[k, :3, 3],
-                wxyz=quaternions(self.poses[k : k + 1])[0],
+                wxyz=to_quaternions(self.poses[k : k + 1])[0],
             )
         return self._nodes[frame]
 
     def _move_frames(self) -> None:
         if self._axes is not None:
-            self._axes.batched_wxyzs = quaternions(self.poses[self._shown]).astype(np.float32)
+            self._axes.batched_wxyzs = to_quaternions(self.poses[self._shown]).astype(np.float32)
             self._axes.batched_positions = self.poses[self._shown, :3, 3].astype(np.float32)
         for k, label in zip(self._shown, self._labels, strict=False):
             label.position = self.poses[k, :3, 3]
 
-    def _place_camera(self, visuals: list[Part]) -> None:
+    def _place_camera(self, visuals: list[Drawable]) -> None:
         at = {
             name: pose for name, pose in zip(self.names, self.poses, strict=True) if name not in self.unplaced
         }
         visuals = [part for part in visuals if part.frame in at]
-        surfaces = Surfaces.of(visuals, at)
-        self.length = axis_length(surfaces.corners, at)
+        surfaces = TriangleSoup.of(visuals, at)
+        self.length = choose_axis_length(surfaces.corners, at)
         points = (
             surfaces.corners.reshape(-1, 3)
             if len(surfaces.corners)
@@ -255,14 +258,18 @@ class Scene:
         self._floor, self._extent = float(low[2]), float(np.linalg.norm(high - low))
         camera = self._camera
         if camera is None:
-            camera = automatic(surfaces, importance(self._model, visuals), at, ASPECT, FIELD_OF_VIEW)
-            shown = outermost(points) if len(surfaces.corners) else np.concatenate([points, points + 0.2])
-            self._follow(camera, partial(reframed, camera, shown))
+            camera = choose_camera(surfaces, weigh_drawables(self._model, visuals), at, ASPECT, FIELD_OF_VIEW)
+            shown = (
+                find_extreme_points(points)
+                if len(surfaces.corners)
+                else np.concatenate([points, points + 0.2])
+            )
+            self._follow(camera, partial(reframe, camera, shown))
         start = self._server.initial_camera
         start.position, start.look_at = np.array(camera.position), np.array(camera.target)
         start.fov = camera.field_of_view
         away = np.subtract(camera.position, camera.target)
-        stage.set_lamp(self._server, float(np.arctan2(away[1], away[0])))
+        backdrop.set_lamp(self._server, float(np.arctan2(away[1], away[0])))
 
     def _follow(self, first: Camera, framed: Callable[[float], Camera]) -> None:
         if self._cameras is None:
@@ -271,7 +278,7 @@ class Scene:
             self._cameras.follow(first, framed)
 
 
-def _by_color(part: Part) -> list[tuple[Triangles, tuple[float, ...]]]:
+def _split_by_color(part: Drawable) -> list[tuple[TriangleMesh, tuple[float, ...]]]:
     """Return a surface in pieces of one colour each: the page knows one colour a mesh."""
     surface = part.surface
     if surface.colors is None:
@@ -282,12 +289,12 @@ def _by_color(part: Part) -> list[tuple[Triangles, tuple[float, ...]]]:
     for k in range(len(tones)):
         chosen = np.flatnonzero(which.reshape(-1) == k)
         mean = surface.colors[chosen].mean(axis=0)
-        pieces.append((_piece(surface, chosen), tuple(float(c) for c in mean)))
+        pieces.append((_extract_faces(surface, chosen), tuple(float(c) for c in mean)))
     return pieces
 
 
-def _piece(surface: Triangles, chosen: Integers) -> Triangles:
+def _extract_faces(surface: TriangleMesh, chosen: Integers) -> TriangleMesh:
     used, faces = np.unique(surface.faces[chosen], return_inverse=True)
-    return Triangles(
+    return TriangleMesh(
         surface.vertices[used], faces.reshape(-1, 3), surface.normals[used], closed=surface.closed
     )

@@ -12,8 +12,8 @@ from collections.abc import Callable
 from types import FunctionType
 from typing import Any
 
-from kineverse.errors import KineverseError, MissingExtraError, ValueRejectedError
-from kineverse.installation import install_command
+from kineverse._extras import install_command
+from kineverse.errors import InvalidValueError, KineverseError, MissingDependencyError
 from kineverse.view.access_control import AccessControl
 
 logger = logging.getLogger(__name__)
@@ -48,9 +48,9 @@ def start(port: int | None = None, label: str = "", host: str = HOST) -> Any:
 
     Raises
     ------
-    MissingExtraError
+    MissingDependencyError
         If viser is not installed.
-    ValueRejectedError
+    InvalidValueError
         If the given port is taken or not a port, or if the host is not one of this computer.
     KineverseError
         If this version of viser cannot be kept from answering others.
@@ -59,7 +59,9 @@ def start(port: int | None = None, label: str = "", host: str = HOST) -> Any:
         import viser
         from viser import infra
     except ImportError as error:
-        raise MissingExtraError(f"the page in the browser needs viser: {install_command('view')}") from error
+        raise MissingDependencyError(
+            f"the page in the browser needs viser: {install_command('view')}"
+        ) from error
 
     access = AccessControl.of(host)
     gate = _Gate(access, label)
@@ -187,11 +189,11 @@ def _seeing(function: Any, name: str, thing: Any) -> Any:
 
 def _free_port(host: str, port: int | None) -> int:
     if port is not None and not 0 <= port <= 65535:
-        raise ValueRejectedError(f"{port} is not a port; ports are numbers from 0 (any free one) to 65535")
+        raise InvalidValueError(f"{port} is not a port; ports are numbers from 0 (any free one) to 65535")
     try:
         family, _, _, _, place = socket.getaddrinfo(host, None, type=socket.SOCK_STREAM)[0]
     except OSError as error:
-        raise ValueRejectedError(f"there is no host {host!r}: {error.strerror}") from None
+        raise InvalidValueError(f"there is no host {host!r}: {error.strerror}") from None
     wanted = [PREFERRED_PORT, 0] if port is None else [port]
     for candidate in wanted:
         with socket.socket(family, socket.SOCK_STREAM) as probe:
@@ -200,7 +202,7 @@ def _free_port(host: str, port: int | None) -> int:
                 probe.bind((place[0], candidate, *place[2:]))
             except OSError as error:
                 if error.errno == errno.EADDRNOTAVAIL:
-                    raise ValueRejectedError(f"{host!r} is no address of this computer") from None
+                    raise InvalidValueError(f"{host!r} is no address of this computer") from None
                 continue
             return int(probe.getsockname()[1])
-    raise ValueRejectedError(f"port {port} is taken; leave --port away to get a free one")
+    raise InvalidValueError(f"port {port} is taken; leave --port away to get a free one")

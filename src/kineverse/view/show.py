@@ -4,18 +4,19 @@ from __future__ import annotations
 
 import os
 import sys
-from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
+from kineverse.state import StateLike
+
 if TYPE_CHECKING:
-    from kineverse.model.view import ModelView
+    from kineverse.model.model_view import ModelView
     from kineverse.view.camera import Camera
     from kineverse.view.viewer import Viewer
 
 
 def show(
     model: ModelView,
-    state: Mapping[Any, float] | None = None,
+    state: StateLike | None = None,
     *,
     block: bool | None = None,
     open_browser: bool = True,
@@ -60,11 +61,11 @@ def show(
 
     Raises
     ------
-    MissingExtraError
+    MissingDependencyError
         If viser is not installed.
     UnknownNameError
         If the state names what the model does not have.
-    ValueRejectedError
+    InvalidValueError
         If the model is none, the port is taken or no port, or the host is not one of this computer.
     """
     from kineverse.view.viewer import Viewer

@@ -7,10 +7,10 @@ from contextlib import suppress
 
 from kineverse.errors import KineverseError
 from kineverse.formats.files import read_file
-from kineverse.formats.markup import Element, Visit, parse
-from kineverse.formats.sources import locate_model
+from kineverse.formats.locate import locate_model
+from kineverse.formats.xml_reader import Element, Visit, parse_xml
 from kineverse.model.frame import WORLD
-from kineverse.model.view import ModelView
+from kineverse.model.model_view import ModelView
 
 UNNAMED = "Kineverse"
 
@@ -31,16 +31,16 @@ class _NamedError(Exception):
     """Ends the reading of a file whose name is known."""
 
 
-def title_of(model: ModelView) -> str:
+def choose_title(model: ModelView) -> str:
     """Return the names that are in front of all frames, such as ``kitchen, pr2``, or ``Kineverse``."""
     frames = [name for name in model.frames if name != WORLD]
     prefixes = list(dict.fromkeys(name.partition("/")[0] for name in frames))
     if not frames or not all("/" in name for name in frames):
         return UNNAMED
-    return ", ".join(map(_shortened, prefixes[:MOST])) + (" …" if len(prefixes) > MOST else "")
+    return ", ".join(map(_shorten, prefixes[:MOST])) + (" …" if len(prefixes) > MOST else "")
 
 
-def title_of_file(source: str) -> str:
+def read_title(source: str) -> str:
     """Return the name that a description has in its file, or that of the file.
 
     Parameters
@@ -53,12 +53,12 @@ def title_of_file(source: str) -> str:
         found = locate_model(source)
         if found.shipped or not found.path.name.endswith(SUFFIXES):
             return plain
-        return _shortened(_declared(read_file(found.path), plain) or plain)
+        return _shorten(_read_declared_name(read_file(found.path), plain) or plain)
     except KineverseError:
         return plain
 
 
-def _declared(content: bytes, source: str) -> str:
+def _read_declared_name(content: bytes, source: str) -> str:
     """Return the name that a document of XML gives to what it describes, empty if it gives none."""
     names: list[str] = []
 
@@ -73,9 +73,9 @@ def _declared(content: bytes, source: str) -> str:
         return note
 
     with suppress(_NamedError):
-        parse(content, source, begin=begin)
+        parse_xml(content, source, begin=begin)
     return names[0] if names else ""
 
 
-def _shortened(name: str) -> str:
+def _shorten(name: str) -> str:
     return name if len(name) <= LONGEST else f"{name[: LONGEST - 1]}…"

@@ -7,27 +7,24 @@ import os
 import threading
 import time
 from collections.abc import Iterable, Mapping
-from typing import Any
 
-from kineverse.errors import KineverseError, UnknownNameError, ValueRejectedError, suggest
+from kineverse.errors import InvalidValueError, KineverseError, UnknownNameError, suggest
 from kineverse.model.model import Model
-from kineverse.model.view import ModelView
-from kineverse.state import State
+from kineverse.model.model_view import ModelView
+from kineverse.state import State, StateLike
 from kineverse.view import server as web
+from kineverse.view.animation import RangeAnimation, select_animated
 from kineverse.view.camera import Camera
-from kineverse.view.collisions import Collisions
-from kineverse.view.driving import Driving
+from kineverse.view.drive import VelocityDrive
 from kineverse.view.hypertext import element
-from kineverse.view.motion import Show, played
-from kineverse.view.orientations import Orientations
 from kineverse.view.panel import Panel
-from kineverse.view.poses import complete, kept
-from kineverse.view.ranges import Ranges
-from kineverse.view.scene import Scene
-from kineverse.view.title import title_of
-from kineverse.view.triangles import Floats
-from kineverse.view.units import units
-from kineverse.view.violations import failure, report
+from kineverse.view.poses import complete, keep_known
+from kineverse.view.proximity_panel import ProximityPanel
+from kineverse.view.scene import ViewerScene
+from kineverse.view.sliders import QuaternionAngles, Ranges, infer_units
+from kineverse.view.title import choose_title
+from kineverse.view.triangle_mesh import Floats
+from kineverse.view.violations import format_failure, format_violations
 
 logger = logging.getLogger(__name__)
 
@@ -71,18 +68,18 @@ class Viewer:
 
     Raises
     ------
-    MissingExtraError
+    MissingDependencyError
         If viser is not installed.
     UnknownNameError
         If the state names what the model does not have.
-    ValueRejectedError
+    InvalidValueError
         If the model is none, the port is taken or no port, or the host is not one of this computer.
     """
 
     def __init__(
         self,
         model: ModelView,
-        state: Mapping[Any, float] | None = None,
+        state: StateLike | None = None,
         *,
         port: int | None = None,
         label: str | None = None,
@@ -92,7 +89,7 @@ class Viewer:
     ) -> None:
         if not isinstance(model, ModelView):
             hint = f" Read it first: kv.load({model!r})." if isinstance(model, str | os.PathLike) else ""
-            raise ValueRejectedError(f"A page shows a kineverse.Model, not {_kind(model)}.{hint}")
+            raise InvalidValueError(f"A page shows a kineverse.Model, not {_kind(model)}.{hint}")
         self.model = model
         # What the page is made of stays what it is while the model is edited, and is exchanged as a whole.
         self._shown = _fixed(model)
@@ -103,17 +100,17 @@ class Viewer:
         self._stopping, self._edited = False, False
         self._driven: set[str] = set()
         self._ended = threading.Event()
-        self._show: Show | None = None
+        self._show: RangeAnimation | None = None
         self._drawn = 0.0
-        self._server = web.start(port, label or title_of(model), host)
+        self._server = web.start(port, label or choose_title(model), host)
         try:
             self._server.gui.configure_theme(
                 show_logo=False, show_share_button=False, brand_color=(34, 104, 172)
             )
             self._server.gui.main_panel.dock_right()
             self._server.gui.main_panel.set_width(PANEL)
-            self._scene = Scene(self._server, self._shown, self._values, camera)
-            self.collisions = Collisions(self._server, self._scene, model, self._values)
+            self._scene = ViewerScene(self._server, self._shown, self._values, camera)
+            self.collisions = ProximityPanel(self._server, self._scene, model, self._values)
             self._panel = self._build_panel(degrees)
         except BaseException:
             web.stop(self._server)
@@ -148,7 +145,7 @@ class Viewer:
         """Return where a frame was drawn last, as a 4×4 transform to the world."""
         return self._scene.pose(frame)
 
-    def move(self, values: Mapping[Any, float]) -> None:
+    def move(self, values: StateLike) -> None:
         """Set the values of some symbols, by symbol or name, as if their sliders had been moved.
 
         Raises
@@ -161,13 +158,13 @@ class Viewer:
         model = _fixed(self.model)
         given = {str(symbol): value for symbol, value in values.items()}
         with self._change:
-            moved = complete(model, {**kept(model, self._values), **given})
+            moved = complete(model, {**keep_known(model, self._values), **given})
             # What has been removed from the model goes with the page that was made of it.
             self._values = {**self._values, **moved}
             self._orientations.read(self._values)
             self._ask(str(name) for name in values)
 
-    def drive(self, speeds: Mapping[Any, float]) -> None:
+    def drive(self, speeds: StateLike) -> None:
         """Let the model move at speeds, by symbol or name, until they are 0 or break a constraint.
 
         These are the speeds by which coordinates with rates move, as the wheels of a base do.
@@ -200,7 +197,7 @@ class Viewer:
         """Start or stop moving everything through its range."""
         with self._change:
             start = {**self._values, **self._orientations.angles}
-            self._show = Show(start, self._to_be_played(), time.monotonic()) if running else None
+            self._show = RangeAnimation(start, self._animated_ranges(), time.monotonic()) if running else None
             self._ask()
         self._panel.playing.value = running
 
@@ -266,9 +263,9 @@ class Viewer:
 
     def _build_panel(self, degrees: bool) -> Panel:
         self._ranges = Ranges(self._shown)
-        self._orientations = Orientations(self._shown, self._values)
-        self._driving = Driving(self._shown)
-        self._units = units(self._shown, self._values, self._ranges.names)
+        self._orientations = QuaternionAngles(self._shown, self._values)
+        self._driving = VelocityDrive(self._shown)
+        self._units = infer_units(self._shown, self._values, self._ranges.names)
         self._units.update(dict.fromkeys(self._orientations.angles, "rad"))
         return Panel(
             self._server.gui,
@@ -286,9 +283,9 @@ class Viewer:
             degrees=degrees,
         )
 
-    def _to_be_played(self) -> dict[str, tuple[float, float]]:
+    def _animated_ranges(self) -> dict[str, tuple[float, float]]:
         limits, angles = self._ranges.at(self._values), self._orientations.angles
-        return played(self._shown, limits, angles, self._values, self._units)
+        return select_animated(self._shown, limits, angles, self._values, self._units)
 
     def _moved(self, name: str, value: float) -> None:
         """Take the value of a slider that somebody moved; what is locked stays and its slider goes back."""
@@ -355,10 +352,10 @@ class Viewer:
         model = _fixed(self.model)
         with self._change:
             # Not the values that were to be drawn: somebody may have moved something since.
-            current = complete(model, kept(model, self._values))
+            current = complete(model, keep_known(model, self._values))
             # After yet another edit there may be values of symbols that this model does not have yet.
             self._values = {**self._values, **current} if self._edited else dict(current)
-            self._initial = complete(model, kept(model, self._initial))
+            self._initial = complete(model, keep_known(model, self._initial))
             self._shown = model
             self._show = None
         self._scene.refresh(model, current)
@@ -375,17 +372,17 @@ class Viewer:
             self._scene.update(values)
             self.collisions.watch.update(values, edited)
             if self.unplaced:
-                self._panel.show(failure(f"Not finite, and hidden: {', '.join(self.unplaced)}."))
+                self._panel.show(format_failure(f"Not finite, and hidden: {', '.join(self.unplaced)}."))
                 return
             # A mapping of nothing says nothing, a state of nothing is that of a model that cannot move.
             violated = self._shown.violations(State(values))
-            self._panel.show(report(violated, violated.unchecked))
+            self._panel.show(format_violations(violated, violated.unchecked))
         except KineverseError as error:
-            self._panel.show(failure(str(error)))
+            self._panel.show(format_failure(str(error)))
         except Exception as error:
             # The thread outlives whatever one state of a model does to it, and says so.
             logger.exception("the page could not be updated")
-            self._panel.show(failure(f"{type(error).__name__}: {error}"))
+            self._panel.show(format_failure(f"{type(error).__name__}: {error}"))
 
 
 def _kind(thing: object) -> str:

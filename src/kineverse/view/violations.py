@@ -5,15 +5,15 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from typing import Any
 
-from kineverse.view.hypertext import BREAK, Html, element, note
+from kineverse.view.hypertext import BREAK, Html, colored_box, element
 
-MOST = 12
+MOST_LINES = 12
 """Lines of the panel: more than these are counted, not listed."""
 
 _RED, _LIGHT_RED = "#c92a2a", "#fff5f5"
 
 
-def report(violations: Iterable[Any], unchecked: Iterable[Any] = ()) -> Html:
+def format_violations(violations: Iterable[Any], unchecked: Iterable[Any] = ()) -> Html:
     """Return HTML: that all is well, or each violated constraint with its value, bounds and excess.
 
     Parameters
@@ -27,7 +27,7 @@ def report(violations: Iterable[Any], unchecked: Iterable[Any] = ()) -> Html:
     rest = len(list(unchecked))
     aside = [element("span", f" · {rest} on speeds not checked", style="color:#868e96")] if rest else []
     if not found:
-        return note("#2b8a3e", "#ebfbee", element("b", "All constraints hold."), *aside)
+        return colored_box("#2b8a3e", "#ebfbee", element("b", "All constraints hold."), *aside)
     noun = "constraint" if len(found) == 1 else "constraints"
     lines = [element("b", f"{len(found)} {noun} violated"), *aside]
     lines += [
@@ -35,32 +35,32 @@ def report(violations: Iterable[Any], unchecked: Iterable[Any] = ()) -> Html:
             "div",
             element("b", v.name),
             BREAK,
-            f"{number(v.value)} is not in [{number(v.lower)}, {number(v.upper)}], by {number(v.excess)}",
+            f"{format_significant(v.value)} is not in [{format_significant(v.lower)}, {format_significant(v.upper)}], by {format_significant(v.excess)}",
             class_="kineverse-violation",
             style="margin-top:3px",
         )
-        for v in found[:MOST]
+        for v in found[:MOST_LINES]
     ]
-    if len(found) > MOST:
-        lines.append(element("div", f"and {len(found) - MOST} more"))
-    return note(_RED, _LIGHT_RED, *lines)
+    if len(found) > MOST_LINES:
+        lines.append(element("div", f"and {len(found) - MOST_LINES} more"))
+    return colored_box(_RED, _LIGHT_RED, *lines)
 
 
-def failure(message: str) -> Html:
+def format_failure(message: str) -> Html:
     """Return HTML that says why the state on the page cannot be shown."""
-    return note(_RED, _LIGHT_RED, element("b", "This state cannot be shown."), BREAK, message)
+    return colored_box(_RED, _LIGHT_RED, element("b", "This state cannot be shown."), BREAK, message)
 
 
-def missing_meshes(problems: Sequence[str]) -> Html:
+def format_missing_meshes(problems: Sequence[str]) -> Html:
     """Return HTML that lists what could not be loaded."""
-    lines = [element("div", line, style="margin-top:3px") for line in problems[:MOST]]
-    if len(problems) > MOST:
-        lines.append(element("div", f"and {len(problems) - MOST} more"))
+    lines = [element("div", line, style="margin-top:3px") for line in problems[:MOST_LINES]]
+    if len(problems) > MOST_LINES:
+        lines.append(element("div", f"and {len(problems) - MOST_LINES} more"))
     noun = "mesh" if len(problems) == 1 else "meshes"
-    return note(_RED, _LIGHT_RED, element("b", f"{len(problems)} {noun} could not be loaded"), *lines)
+    return colored_box(_RED, _LIGHT_RED, element("b", f"{len(problems)} {noun} could not be loaded"), *lines)
 
 
-def number(value: float) -> str:
+def format_significant(value: float) -> str:
     """Return a number in at most 4 significant digits, with a minus sign one can see."""
     text = f"{value:.4g}"
     return text.replace("-", "−").replace("inf", "∞")

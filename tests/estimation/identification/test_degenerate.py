@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from part_recordings import recording
+from synthetic_recordings import recording
 
 from kineverse.estimation import identify, pose_covariance
-from kineverse.estimation.identification import refining
-from kineverse.estimation.identification.observations import observations
-from kineverse.estimation.identification.starts import Overview, starts
+from kineverse.estimation.identification import maximum_likelihood
+from kineverse.estimation.identification.initial_guess import MotionStatistics, initial_guesses
+from kineverse.estimation.identification.observations import check_observations
 
 LINE = np.arange(20)[:, None] * [0.0, 0.0, 1.0]
 POSITIONS = {
@@ -39,12 +39,14 @@ def test_everything_stays_finite(where, whole):
     if where.startswith("on a l"):
         assert found.best.family == "prismatic"
     if where == "in one place":
-        assert found.cannot_tell or found.best.family == "rigid"
+        assert found.is_ambiguous or found.best.family == "rigid"
 
 
 @pytest.mark.parametrize("family", ["revolute", "screw"])
 def test_steps_of_three_positions_may_lead_anywhere(family):
     seen = recording("spherical", count=3, position=0.1, orientation=0.02, seed=3)
-    problem = observations(seen.parent, seen.child[:, :3, 3], seen.covariance, seen.covariance)
-    likeliest = refining.likeliest(problem, [*starts(family, Overview(problem))]).solution
-    assert np.isfinite(refining.refined(problem, likeliest).log_evidence)
+    problem = check_observations(seen.parent, seen.child[:, :3, 3], seen.covariance, seen.covariance)
+    likeliest = maximum_likelihood.maximum_likelihood(
+        problem, [*initial_guesses(family, MotionStatistics(problem))]
+    ).solution
+    assert np.isfinite(maximum_likelihood.maximise_marginal_likelihood(problem, likeliest).log_evidence)

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from part_recordings import Array, Recording, angle_between, recording, transform
 from scipy.spatial.transform import Rotation
+from synthetic_recordings import Array, Recording, angle_between, recording, transform
 
-from kineverse.estimation import Found, identify
-from kineverse.estimation.rotations import skew
+from kineverse.estimation import IdentificationResult, identify
+from kineverse.lie import skew
 
 # By how much differences of log evidence may change when frames are moved by half a metre: levers are within a
 # metre of the child's origin, beforehand, and errors of orientations are small to first order only.
@@ -32,10 +32,10 @@ def moved(poses: Array, covariance: Array, frame: Array) -> tuple[Array, Array]:
     return poses @ frame, by @ covariance @ np.swapaxes(by, 1, 2)
 
 
-def elsewhere(seen: Recording, of_parent: Array, of_child: Array) -> Found:
-    parent, covariance_a = moved(seen.parent, seen.covariance, of_parent)
-    child, covariance_b = moved(seen.child, seen.covariance, of_child)
-    return identify(parent, child, covariance_a=covariance_a, covariance_b=covariance_b)
+def elsewhere(seen: Recording, of_parent: Array, of_child: Array) -> IdentificationResult:
+    parent, parent_covariance = moved(seen.parent, seen.covariance, of_parent)
+    child, child_covariance = moved(seen.child, seen.covariance, of_child)
+    return identify(parent, child, parent_covariance=parent_covariance, child_covariance=child_covariance)
 
 
 @pytest.mark.parametrize(("family", "radius"), CASES)

@@ -6,19 +6,19 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from part_recordings import Recording, angle_between, off_axis, recording, transform
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
+from synthetic_recordings import Recording, angle_between, off_axis, recording, transform
 
-from kineverse.estimation import Found, Identifier, identify
-from kineverse.estimation.identification.identify import solutions
-from kineverse.estimation.identification.observations import observations
+from kineverse.estimation import IdentificationResult, Identifier, identify
+from kineverse.estimation.identification.identify import solve_families
+from kineverse.estimation.identification.observations import check_observations
 
 MOVING = ("prismatic", "revolute")
 FAMILIES = ("rigid", "prismatic", "revolute", "planar")
 
 
-def found_in(seen: Recording) -> Found:
+def found_in(seen: Recording) -> IdentificationResult:
     return identify(seen.parent, seen.child, noise=seen.covariance, families=FAMILIES)
 
 
@@ -72,7 +72,7 @@ def test_the_order_of_poses_does_not_matter(seed: int, family: str) -> None:
     np.testing.assert_allclose(before[family].joint_values[order], after[family].joint_values, atol=1e-3)
 
 
-def same_joint(before: Found, after: Found, family: str) -> None:
+def same_joint(before: IdentificationResult, after: IdentificationResult, family: str) -> None:
     for fit in before:
         assert after[fit.family].probability == pytest.approx(fit.probability, abs=0.02)
     one, other = before[family], after[family]
@@ -97,7 +97,9 @@ def test_exchanging_parent_and_child_inverts_the_model(family: str) -> None:
 def test_the_likelihood_is_that_of_all_true_poses_as_unknowns(family: str) -> None:
     seen = seeded(family, 9, count=5)
     covariance = seen.covariance
-    ours = solutions(observations(seen.parent, seen.child, covariance, covariance), [family])[family].solution
+    ours = solve_families(check_observations(seen.parent, seen.child, covariance, covariance), [family])[
+        family
+    ].solution
     deviation = np.sqrt(np.diag(covariance))
 
     def errors(unknown: np.ndarray) -> np.ndarray:

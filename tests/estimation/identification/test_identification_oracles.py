@@ -8,15 +8,15 @@ from collections.abc import Callable
 import numpy as np
 import numpy.typing as npt
 import pytest
-from part_recordings import noisy
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
+from synthetic_recordings import noisy
 
 import kineverse as kv
-from kineverse.estimation import Family, Unknown, identify, pose_covariance
-from kineverse.estimation.identification.native import solver
-from kineverse.experiments.estimation_grid.bound import bound
-from kineverse.experiments.estimation_grid.samples import Cell, draw
+from kineverse.estimation import Family, FamilyParameter, identify, pose_covariance
+from kineverse.estimation.identification.solver import solver
+from kineverse.experiments.estimation_grid.cramer_rao import compute_bound
+from kineverse.experiments.estimation_grid.samples import Cell, draw_samples
 
 Array = npt.NDArray[np.float64]
 
@@ -25,7 +25,7 @@ def garage() -> tuple[Family, dict[str, float], Array]:
     """Return a door that slides up along one edge and in along the other, its length, and joint values."""
     a, length = kv.position("a"), kv.parameter("length", 2.0)
     door = kv.translation(0, 0, length * np.cos(a)) @ kv.rotation_y(a)
-    family = Family("garage", door, {a: (0.0, 1.5)}, {length: Unknown(2.0, 0.5, 0.5, 4.0)})
+    family = Family("garage", door, {a: (0.0, 1.5)}, {length: FamilyParameter(2.0, 0.5, 0.5, 4.0)})
     return family, {"length": 1.4}, np.linspace(0.1, 1.2, 15)
 
 
@@ -40,7 +40,7 @@ def four_bar() -> tuple[Family, dict[str, float], Array]:
     turned = np.arctan2(way[1], way[0]) + bent
     pose = kv.translation(*pin, 0) @ kv.rotation_z(turned) @ kv.translation(0.3, 0.05, 0)
     starts = {x: 0.62, y: 0.04, coupler: 0.75, rocker: 0.55}
-    unknowns = {s: Unknown(start, 0.2) for s, start in starts.items()}
+    unknowns = {s: FamilyParameter(start, 0.2) for s, start in starts.items()}
     truth = {"x": 0.7, "y": 0.0, "coupler": 0.8, "rocker": 0.6}
     return Family("four-bar", pose, {a: (-0.5, 2.6)}, unknowns), truth, np.linspace(0.0, 2.2, 25)
 
@@ -90,7 +90,7 @@ HINGE = Cell("revolute", POSITION, ORIENTATION, count=20, range=math.pi / 2)
 
 def test_a_hinge_is_that_of_maximum_likelihood() -> None:
     """Beside scipy with all true poses as unknowns: 152 of them, and 240 numbers that were seen."""
-    samples = draw(HINGE, 1, np.random.default_rng(1))
+    samples = draw_samples(HINGE, 1, np.random.default_rng(1))
     noise = pose_covariance(POSITION, ORIENTATION)
     scale = np.array([1.0 / POSITION] * 3 + [1.0 / ORIENTATION] * 3)
     for parents, children in zip(samples.seen_parents, samples.seen_children, strict=True):
@@ -164,7 +164,7 @@ def test_a_hinge_is_as_good_as_others_found_maximum_likelihood_to_be() -> None:
     limit of 5 % more holds with 99.9 % for the angle and with 88 % for the distance, if the seed is drawn anew.
     """
     solver.prepare(wait=True)
-    samples = draw(HINGE, 400, np.random.default_rng(1))
+    samples = draw_samples(HINGE, 400, np.random.default_rng(1))
     relative = np.linalg.inv(samples.parents) @ samples.seen_children
     noise = pose_covariance(POSITION, ORIENTATION)
     degrees, metres = [], []
@@ -180,10 +180,10 @@ def test_a_hinge_is_as_good_as_others_found_maximum_likelihood_to_be() -> None:
 def test_a_hinge_between_noisy_poses_is_at_the_bound() -> None:
     """The squares of 300 errors in two directions are known to 6 %, so their root is to 3 %: 5 % is 95 %."""
     solver.prepare(wait=True)
-    samples = draw(HINGE, 300, np.random.default_rng(1))
+    samples = draw_samples(HINGE, 300, np.random.default_rng(1))
     noise = pose_covariance(POSITION, ORIENTATION)
     squares = [
         turned_by(axis, identify(a, b, noise=noise, families=["revolute"]).best.parameters["axis"]) ** 2
         for a, b, axis in zip(samples.seen_parents, samples.seen_children, samples.axis, strict=True)
     ]
-    assert np.mean(squares) < 1.05**2 * np.mean(bound(samples).degrees ** 2)
+    assert np.mean(squares) < 1.05**2 * np.mean(compute_bound(samples).degrees ** 2)

@@ -6,14 +6,14 @@ import math
 
 import numpy as np
 import pytest
-from joint_bounds import direction_bound
-from part_recordings import angle_between, noisy, off_axis, recording
+from cramer_rao_bounds import direction_bound
+from synthetic_recordings import angle_between, noisy, off_axis, recording
 
 from kineverse.estimation import Fit, identify, pose_covariance
-from kineverse.estimation.identification.groups import GROUPS, GroupMotion
-from kineverse.estimation.identification.identify import solutions
-from kineverse.estimation.identification.observations import observations
-from kineverse.estimation.identification.widths import Alone, widths
+from kineverse.estimation.identification.families import JOINT_FAMILIES, GroupMotion
+from kineverse.estimation.identification.identify import solve_families
+from kineverse.estimation.identification.observations import check_observations
+from kineverse.estimation.identification.range_prior import PerObservation, fit_joint_ranges
 
 REPEATS = 40
 
@@ -86,7 +86,7 @@ def test_a_motion_within_the_noise_is_no_motion() -> None:
         assert found["rigid"].probability > 0.5
         short = recording("prismatic", count=80, position=0.03, orientation=0.02, seed=seed, extent=0.004)
         found = identify(short.parent, short.child, noise=short.covariance)
-        assert found.cannot_tell or found.best.family in ("rigid", "prismatic")
+        assert found.is_ambiguous or found.best.family in ("rigid", "prismatic")
         assert not found["prismatic"].told
 
 
@@ -105,8 +105,8 @@ def test_the_evidence_of_rigid_parts_is_an_integral() -> None:
     count, sigma = 7, 0.02
     seen = random.normal(0.3, sigma, (count, 3))
     covariance = sigma**2 * np.eye(3)
-    problem = observations(None, seen, covariance, covariance)
-    found = solutions(problem, ["rigid"])["rigid"].log_evidence
+    problem = check_observations(None, seen, covariance, covariance)
+    found = solve_families(problem, ["rigid"])["rigid"].log_evidence
     grid = np.linspace(0.1, 0.5, 4001)
     expected = 0.0
     for axis in range(3):
@@ -119,8 +119,8 @@ def test_the_evidence_of_rigid_parts_is_an_integral() -> None:
 def test_the_width_of_a_motion_is_integrated_out() -> None:
     random = np.random.default_rng(1)
     values, noise = random.normal(0.0, 0.1, 30), 0.05
-    motion = GroupMotion(GROUPS["prismatic"], 6, np.eye(4), np.eye(4))
-    found = widths(motion, Alone(values[:, None], np.full((30, 1, 1), noise**2), 0.0))
+    motion = GroupMotion(JOINT_FAMILIES["prismatic"], 6, np.eye(4), np.eye(4))
+    found = fit_joint_ranges(motion, PerObservation(values[:, None], np.full((30, 1, 1), noise**2), 0.0))
     assert found.deviations[0] == pytest.approx(0.1, rel=0.4)
     about_the_mean = 30 / (found.deviations[0] ** 2 + noise**2)
     ours = found.log_density + 0.5 * math.log(2 * math.pi / about_the_mean)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from part_recordings import JOINTS, noisy, recording
+from synthetic_recordings import JOINTS, noisy, recording
 
 import kineverse as kv
 from kineverse.estimation import identify, pose_covariance

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 import kineverse as kv
 from kineverse.estimation import (
-    Hypotheses,
+    HypothesisBank,
     ObservedExpression,
     ObservedPose,
     ObservedPosition,
@@ -82,9 +82,9 @@ def test_arrays_of_poses(model, tracker):
     tracker.update_poses(poses, np.array([True, False]))  # what is not seen is not looked at
     with pytest.raises(kv.KineverseError, match="fridge_door_handle' is not finite"):
         tracker.update_poses(poses)
-    with pytest.raises(kv.ShapeError, match=r"\(2, 4, 4\)"):
+    with pytest.raises(kv.errors.ShapeError, match=r"\(2, 4, 4\)"):
         tracker.update_poses(poses[:1])
-    with pytest.raises(kv.ShapeError, match="mask of 2"):
+    with pytest.raises(kv.errors.ShapeError, match="mask of 2"):
         tracker.update_poses(poses, [1, 0])
     with pytest.raises(kv.KineverseError, match="poses alone, which z is not"):
         Tracker(model, [DOOR, ObservedExpression("z", kv.position(DOOR), 1.0)]).update_poses(poses)
@@ -178,15 +178,15 @@ def test_outliers_that_cannot_be():
 
 def test_hypotheses_that_cannot_be(model, tracker):
     with pytest.raises(kv.KineverseError, match="no hypothesis"):
-        Hypotheses({})
+        HypothesisBank({})
     with pytest.raises(kv.KineverseError, match="observe different things"):
-        Hypotheses({"a": tracker, "b": Tracker(model, [DOOR])})
+        HypothesisBank({"a": tracker, "b": Tracker(model, [DOOR])})
     with pytest.raises(kv.KineverseError, match="prior does not fit"):
-        Hypotheses({"a": tracker}, {"b": 1.0})
+        HypothesisBank({"a": tracker}, {"b": 1.0})
     with pytest.raises(kv.KineverseError, match="positive"):
-        Hypotheses({"a": tracker}, {"a": 0.0})
+        HypothesisBank({"a": tracker}, {"a": 0.0})
     with pytest.raises(kv.KineverseError, match="Forgetting"):
-        Hypotheses({"a": tracker}, forgetting=-1.0)
+        HypothesisBank({"a": tracker}, forgetting=-1.0)
 
 
 def test_who_contradicts_the_limits_is_told():

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 from scipy.optimize import least_squares, nnls
 from scipy.spatial.transform import Rotation
-from seeing import Eyes, noisy
+from synthetic_observations import Eyes, noisy
 
 import kineverse as kv
 from kineverse.estimation import ObservedExpression, ObservedPose, Outliers, Tracker, pose_covariance
-from kineverse.estimation.tracking.quadratic import smallest_between
+from kineverse.estimation.tracking.quadratic_program import solve_bounded_qp
 
 
 def slides() -> kv.Model:
@@ -197,7 +197,7 @@ def test_nothing_is_asked_outside_of_limits():
     """The published garage door is arccos(a/l): beyond its limit it says nothing at all."""
     model = kv.Model()
     with model.edit() as edit:
-        edit.apply(kv.GarageDoor(name="g", parent="world", form="published"))
+        edit.apply(kv.articulations.GarageDoor(name="g", parent="world", form="published"))
     eyes = Eyes(model, ["g/door", "g/upper_edge"], 0.1, np.radians(10), seed=1)
     tracker = Tracker(model, [ObservedPose(f, covariance=eyes.covariance) for f in eyes.frames])
     for _ in range(20):
@@ -228,9 +228,9 @@ def test_limits_may_move_with_others():
     model = slides()
     a, b = kv.position("a"), kv.position("b")
     with model.edit() as edit:
-        edit.constrain("a/position", 0, a, kv.limit_table(b, {0.0: 0.2, 1.0: 1.0}))
+        edit.constrain("a/position", 0, a, kv.articulations.tabulated_limit(b, {0.0: 0.2, 1.0: 1.0}))
         edit.constrain("b/position", 0, b, 1)
-        edit.constrain("held", *kv.blocked_unless(b, a < 0.9, upper=0.8))
+        edit.constrain("held", *kv.articulations.position_lock(b, a < 0.9, upper=0.8))
     seen = ObservedExpression("z", kv.array([a, b]), 0.01 * np.eye(2))
     tracker = Tracker(model, [seen], uncertainty={"a": 10.0, "b": 10.0})
     for _ in range(3):
@@ -290,7 +290,7 @@ def test_compiled_and_numpy_do_the_same_to_what_moves_by_others_speeds(place):
     with model.edit() as edit:
         edit.apply(kv.Floating(name="box", parent="world", child="box"))
         edit.apply(kv.Revolute(name="lid", parent="box", child="lid", axis=(0, 1, 0), lower=-1.5, upper=1.5))
-        edit.apply(kv.Ball(name="ball", parent="lid", child="hook"))
+        edit.apply(kv.articulations.Ball(name="ball", parent="lid", child="hook"))
     eyes = Eyes(model, ["box", "lid", "hook"], 0.05, 0.05)
     observed = [ObservedPose(f, covariance=eyes.covariance) for f in eyes.frames]
     noise = dict.fromkeys(model.speeds, 0.001)
@@ -426,7 +426,7 @@ def test_the_least_of_a_quadratic_between_bounds():
         inside = rows @ rng.standard_normal(n)
         low, high = inside - rng.uniform(0, 1, m), inside + rng.uniform(0, 1, m)
         low[rng.random(m) < 0.3] = -np.inf
-        x = smallest_between(np.linalg.inv(A), g, rows, low, high)
+        x = solve_bounded_qp(np.linalg.inv(A), g, rows, low, high)
         assert (rows @ x >= low - 1e-8).all()
         assert (rows @ x <= high + 1e-8).all()
         # Karush, Kuhn and Tucker: the gradient is made of active rows, with the right signs.
@@ -436,7 +436,7 @@ def test_the_least_of_a_quadratic_between_bounds():
         left = nnls(normals.T, gradient)[1] if len(normals) else np.linalg.norm(gradient)
         assert left < 1e-7
     assert (
-        smallest_between(
+        solve_bounded_qp(
             np.eye(1), np.zeros(1), np.ones((2, 1)), np.array([1.0, -np.inf]), np.array([np.inf, 0.0])
         )
         is None

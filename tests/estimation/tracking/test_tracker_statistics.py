@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
-from seeing import Eyes
+from synthetic_observations import Eyes
 
 import kineverse as kv
 from kineverse.estimation import (
-    Hypotheses,
+    HypothesisBank,
     ObservedExpression,
     ObservedPose,
     ObservedPosition,
@@ -98,7 +98,11 @@ def test_wheels_with_noise_on_them():
     """Process noise enters by the rates: a robot that drives knows how far off it may be, sideways too."""
     model = kv.Model()
     with model.edit() as edit:
-        edit.apply(kv.DifferentialDrive(name="base", parent="world", child="base", radius=0.1, track=0.4))
+        edit.apply(
+            kv.articulations.DifferentialDrive(
+                name="base", parent="world", child="base", radius=0.1, track=0.4
+            )
+        )
     wheels, spread, dt = model.speeds, 0.5, 0.1
     start = {"base/x": 0.0, "base/y": 0.0, "base/angle": 0.3}
     rng = np.random.default_rng(0)
@@ -183,7 +187,7 @@ def test_hinge_or_drawer():
             name: Tracker(m, ["part"], process_noise={"q:velocity": 0.05})
             for name, m in (("hinge", hinge), ("drawer", drawer))
         }
-        hypotheses = Hypotheses(trackers)
+        hypotheses = HypothesisBank(trackers)
         eyes = Eyes(model, ["part"])
         for k in range(10):
             probabilities = hypotheses.update(eyes({"q": reach * k / 10}), at=0.1 * k)
@@ -220,7 +224,7 @@ def test_who_has_to_leave_its_limits_to_explain_is_not_believed(is_compiled):
 def test_locked_or_free_and_a_lock_that_opens():
     model = part(kv.Revolute(name="q", parent="world", child="part", axis=(0, 0, 1), lower=0, upper=1.5))
     start = {"start": {"q": 0.0}, "uncertainty": {"q": 0.01}}
-    hypotheses = Hypotheses(
+    hypotheses = HypothesisBank(
         {
             "locked": Tracker(model, ["part"], **start),
             "free": Tracker(model, ["part"], process_noise={"q:velocity": 0.1}, **start),
@@ -238,7 +242,7 @@ def test_locked_or_free_and_a_lock_that_opens():
 def test_a_lock_of_the_model_holds_against_noise_and_commands():
     model = kv.Model()
     with model.edit() as edit:
-        edit.apply(kv.GarageDoor(name="g", parent="world"))
+        edit.apply(kv.articulations.GarageDoor(name="g", parent="world"))
     options = {
         "process_noise": {"g/door:velocity": 0.1, "g/bolt:velocity": 0.1},
         "uncertainty": {"g/door": 0.01, "g/bolt": 0.01},
@@ -273,7 +277,7 @@ def test_points_of_a_body_from_any_side():
 def on_wheels(points):
     model = kv.Model()
     with model.edit() as edit:
-        edit.apply(kv.OmniBase(name="b", parent="world", child="b"))
+        edit.apply(kv.articulations.OmniBase(name="b", parent="world", child="b"))
     seen = [ObservedPosition("b", p, name=n) for n, p in points.items()]
     return model, Tracker(model, seen, uncertainty={"b/x": 1, "b/y": 1})
 

@@ -9,8 +9,8 @@ from typing import Any
 
 from fuzz import programs
 from fuzz.values import NAMES, words
-from kineverse.formats.document.elementary import BINARY, UNARY
-from kineverse.model.traces.question import KINDS as QUESTIONS
+from kineverse.formats.document.node_types import BINARY, UNARY
+from kineverse.model.traces.trace_queries import QUERY_KINDS as QUESTIONS
 
 from .traces import Tracer
 

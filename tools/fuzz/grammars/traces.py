@@ -7,7 +7,7 @@ from random import Random
 from typing import TYPE_CHECKING, Any
 
 from fuzz.values import NAMES
-from kineverse.model.traces.question import KINDS as QUESTIONS
+from kineverse.model.traces.trace_queries import QUERY_KINDS as QUESTIONS
 
 if TYPE_CHECKING:
     from .document import Table

@@ -1,14 +1,14 @@
 """Mechanisms: doors, taps, lifts and lamps, each an operation that writes several frames."""
 
-from .cranks import PedalBin, PistonAndRod
 from .faucet import Faucet
 from .folding_door import FoldingDoor
 from .garage_door import GarageDoor
 from .latched_doors import DoorWithHandle, Latch, Microwave
-from .mechanism import Mechanism, Part
+from .mechanism import Mechanism, MechanismPart
 from .parallelograms import DeskLamp, ScissorLift
 from .ratchet import Ratchet
 from .screw_and_nut import ScrewAndNut
+from .slider_cranks import PedalBin, PistonAndRod
 
 __all__ = [
     "DeskLamp",
@@ -18,8 +18,8 @@ __all__ = [
     "GarageDoor",
     "Latch",
     "Mechanism",
+    "MechanismPart",
     "Microwave",
-    "Part",
     "PedalBin",
     "PistonAndRod",
     "Ratchet",

@@ -9,10 +9,10 @@ from typing import ClassVar
 
 from kineverse.articulations.limits import Limits
 from kineverse.expressions.expression import Expression
-from kineverse.motions import Y, Z, turn
+from kineverse.spatial import Y, Z, rotation_about
 
-from .mechanism import Mechanism, Part
-from .solids import STEEL, rod, shift
+from .mechanism import Mechanism, MechanismPart
+from .simple_bodies import STEEL, rod_shape, shift
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -42,7 +42,7 @@ class Faucet(Mechanism):
 
     Raises
     ------
-    ValueRejectedError
+    InvalidValueError
         For lengths or a flow that are not positive, or ranges that are missing or empty.
     """
 
@@ -73,22 +73,22 @@ class Faucet(Mechanism):
         lower, upper = self.range_of(name, -math.pi, math.pi)
         return (self.q(name) - lower) / (upper - lower)
 
-    def parts(self) -> Mapping[str, Part]:
+    def parts(self) -> Mapping[str, MechanismPart]:
         """Return the tap, its lever and where the water comes out."""
         spout = 0.6 * self.height
         mouth = (-self.reach, 0.0, 0.75 * self.height)
         return {
             "base": self.base(
-                rod((0.0, 0.0, 0.0), (0.0, 0.0, self.height), 0.024, STEEL),
-                rod((0.0, 0.0, spout), mouth, 0.012, STEEL),
+                rod_shape((0.0, 0.0, 0.0), (0.0, 0.0, self.height), 0.024, STEEL),
+                rod_shape((0.0, 0.0, spout), mouth, 0.012, STEEL),
             ),
-            "outlet": Part("base", (shift(*mouth),)),
-            "lever": Part(
+            "outlet": MechanismPart("base", (shift(*mouth),)),
+            "lever": MechanismPart(
                 "base",
-                (shift(z=self.height), turn(Z, self.q("turn")), turn(Y, self.q("lift"))),
+                (shift(z=self.height), rotation_about(Z, self.q("turn")), rotation_about(Y, self.q("lift"))),
                 (
-                    rod((0.0, 0.0, 0.0), (0.0, 0.0, 0.03), 0.022, STEEL),
-                    rod((0.0, 0.0, 0.022), (-0.12, 0.0, 0.035), 0.007, STEEL),
+                    rod_shape((0.0, 0.0, 0.0), (0.0, 0.0, 0.03), 0.022, STEEL),
+                    rod_shape((0.0, 0.0, 0.022), (-0.12, 0.0, 0.035), 0.007, STEEL),
                 ),
             ),
         }

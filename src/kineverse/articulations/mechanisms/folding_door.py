@@ -7,16 +7,16 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, ClassVar, TypeAlias
 
-from kineverse.articulations.joint import checked_number
+from kineverse.articulations.joint import check_joint_number
 from kineverse.articulations.limits import Limits
-from kineverse.errors import ValueRejectedError
+from kineverse.errors import InvalidValueError
 from kineverse.expressions.expression import Expression
 from kineverse.expressions.functions import arctan2, cos, sin, sqrt
 from kineverse.model.body import Pose, Vector3
-from kineverse.motions import Y, turn
+from kineverse.spatial import Y, rotation_about
 
-from .mechanism import Mechanism, Part
-from .solids import PALE, STEEL, WOOD, box, case, rod, shift
+from .mechanism import Mechanism, MechanismPart
+from .simple_bodies import PALE, STEEL, WOOD, box_shape, case, rod_shape, shift
 
 Point: TypeAlias = tuple[float, float]
 
@@ -77,7 +77,7 @@ class FoldingDoor(Mechanism):
 
     Raises
     ------
-    ValueRejectedError
+    InvalidValueError
         For lengths that are not positive, or with which the arm does not reach at some angle; for a spring
         that pushes nothing, or nowhere.
     """
@@ -125,7 +125,7 @@ class FoldingDoor(Mechanism):
         """Return the torque of the spring on q."""
         return {"spring": self.stiffness * (self.q() - self.tipping)}
 
-    def parts(self) -> Mapping[str, Part]:
+    def parts(self) -> Mapping[str, MechanismPart]:
         """Return the cupboard, the panels, the arm and the handle."""
         q = self.q()
         (ax, az), (dx, dz), (ux, uv) = self.top_hinge, self.arm_pivot, self.panel_hinge
@@ -136,19 +136,27 @@ class FoldingDoor(Mechanism):
         # Of f1 = (-sin θ, -cos θ), like e1 of q; the division by c² does not turn it.
         lower = arctan2(v * z - u * x, -u * z - v * x)
         width, height, thickness = self.panel
-        leaf = box((thickness, width, height), (0.0, 0.0, 0.0), WOOD)
+        leaf = box_shape((thickness, width, height), (0.0, 0.0, 0.0), WOOD)
         grip_width, grip_depth, grip_thickness = self.handle_size
-        grip = box((grip_depth, grip_width, grip_thickness), (-grip_depth / 2, 0.0, 0.0), STEEL)
+        grip = box_shape((grip_depth, grip_width, grip_thickness), (-grip_depth / 2, 0.0, 0.0), STEEL)
         side = self.size[1] / 2 - 2 * self.wall
-        bar = rod((0.0, side, 0.0), (0.0, side, self.arm), 0.008, STEEL)
+        bar = rod_shape((0.0, side, 0.0), (0.0, side, self.arm), 0.008, STEEL)
         return {
             "base": self.base(*case(self.size, self.wall, PALE)),
-            "upper_panel": Part("base", (shift(ax, 0, az), turn(Y, q), _on(self.upper_middle)), (leaf,)),
-            "panel_hinge": Part("base", (shift(ax, 0, az), turn(Y, q), _on(self.panel_hinge))),
-            "lower_panel": Part("panel_hinge", (turn(Y, lower - q), _on(self.lower_middle)), (leaf,)),
-            "arm_end": Part("panel_hinge", (turn(Y, lower - q), _on(self.arm_end))),
-            "handle": Part("lower_panel", (_on(self.handle),), (grip,)),
-            "arm": Part("base", (shift(dx, 0, dz), turn(Y, arctan2(bx + x - dx, bz + z - dz))), (bar,)),
+            "upper_panel": MechanismPart(
+                "base", (shift(ax, 0, az), rotation_about(Y, q), _on(self.upper_middle)), (leaf,)
+            ),
+            "panel_hinge": MechanismPart(
+                "base", (shift(ax, 0, az), rotation_about(Y, q), _on(self.panel_hinge))
+            ),
+            "lower_panel": MechanismPart(
+                "panel_hinge", (rotation_about(Y, lower - q), _on(self.lower_middle)), (leaf,)
+            ),
+            "arm_end": MechanismPart("panel_hinge", (rotation_about(Y, lower - q), _on(self.arm_end))),
+            "handle": MechanismPart("lower_panel", (_on(self.handle),), (grip,)),
+            "arm": MechanismPart(
+                "base", (shift(dx, 0, dz), rotation_about(Y, arctan2(bx + x - dx, bz + z - dz))), (bar,)
+            ),
         }
 
     def _arm_end_from(self, bx: Expression, bz: Expression) -> tuple[Expression, Expression]:
@@ -167,8 +175,10 @@ class FoldingDoor(Mechanism):
         except TypeError:
             numbers = ()
         if len(numbers) != count:
-            raise ValueRejectedError(f"{self.its(field)} has {count} numbers, which {given!r} has not.")
-        return tuple(checked_number(n, f"{self.its(field)}, each of it,", positive=positive) for n in numbers)
+            raise InvalidValueError(f"{self.its(field)} has {count} numbers, which {given!r} has not.")
+        return tuple(
+            check_joint_number(n, f"{self.its(field)}, each of it,", positive=positive) for n in numbers
+        )
 
     def _check_reach(self) -> None:
         """Look whether the triangle of B, C and D closes at all angles, and never flattens."""
@@ -177,7 +187,7 @@ class FoldingDoor(Mechanism):
         across, up = (d - a for a, d in zip(self.top_hinge, self.arm_pivot, strict=True))
         for what, length in (("panel hinge", r), ("arm end", c)):
             if not length:
-                raise ValueRejectedError(
+                raise InvalidValueError(
                     f"{self.its(what)} is at (0, 0), which is no place for another hinge."
                 )
         # B is nearest to D, or farthest from it, where the upper panel points along the line from A to D.
@@ -189,7 +199,7 @@ class FoldingDoor(Mechanism):
             z = -u * math.cos(q) + v * math.sin(q) - up
             d = math.hypot(x, z)
             if not abs(c - self.arm) < d < c + self.arm:
-                raise ValueRejectedError(
+                raise InvalidValueError(
                     f"{self.its('arm')}, {self.arm:g}, does not reach at {q:.6g} rad: its pivot is "
                     f"{d:.6g} from the hinge between the panels there, and its other end {c:.6g}."
                 )

@@ -8,14 +8,14 @@ from dataclasses import dataclass
 from typing import ClassVar, Literal
 
 from kineverse.articulations.limits import Limits
-from kineverse.errors import ValueRejectedError
+from kineverse.articulations.locks import BoundedExpression, speed_lock
+from kineverse.errors import InvalidValueError
 from kineverse.expressions.expression import Expression
 from kineverse.expressions.functions import arccos, cos
-from kineverse.locks import Triple, unlocked_while
-from kineverse.motions import X, Y, Z, slide, turn
+from kineverse.spatial import X, Y, Z, rotation_about, translation_along
 
-from .mechanism import Mechanism, Part
-from .solids import DARK, STEEL, WOOD, box, rod, shift
+from .mechanism import Mechanism, MechanismPart
+from .simple_bodies import DARK, STEEL, WOOD, box_shape, rod_shape, shift
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -56,7 +56,7 @@ class GarageDoor(Mechanism):
 
     Raises
     ------
-    ValueRejectedError
+    InvalidValueError
         For lengths that are not positive, a play that is not below the length, or a catch beyond the bolt's
         limits.
     """
@@ -75,9 +75,9 @@ class GarageDoor(Mechanism):
     def __post_init__(self) -> None:
         self.lengths("length", "width", "thickness", "play", "speed")
         if not isinstance(self.form, str) or self.form not in ("regular", "published"):
-            raise ValueRejectedError(f"{self.its('form')} is 'regular' or 'published', not {self.form!r}.")
+            raise InvalidValueError(f"{self.its('form')} is 'regular' or 'published', not {self.form!r}.")
         if not self.play < self.length:
-            raise ValueRejectedError(
+            raise InvalidValueError(
                 f"{self.its('play')} is less than its length {self.length:g}, and not {self.play:g}."
             )
         super().__post_init__()
@@ -96,29 +96,32 @@ class GarageDoor(Mechanism):
             return self.q("door") > self.length - self.play
         return self.q("door") < math.acos(1 - self.play / self.length)
 
-    def locks(self) -> Mapping[str, Triple]:
+    def locks(self) -> Mapping[str, BoundedExpression]:
         """Return the lock, c2 of Eq. 13."""
         raised = self.q("bolt") > self.catch
-        return {"lock": unlocked_while(self.q("door"), raised, at=self.closed, speed=self.speed)}
+        return {"lock": speed_lock(self.q("door"), raised, at=self.closed, speed=self.speed)}
 
-    def parts(self) -> Mapping[str, Part]:
+    def parts(self) -> Mapping[str, MechanismPart]:
         """Return rails, door and bolt."""
         q, length, side = self.q("door"), self.length, self.width / 2 + 0.03
         if self.form == "published":
             height, angle = length - q, arccos(q / length)
         else:
             height, angle = length * (1 - cos(q)), q
-        rails = [box((0.05, 0.05, length), (0.0, y, length / 2), STEEL) for y in (-side, side)]
-        rails += [box((length, 0.05, 0.05), (length / 2, y, length), STEEL) for y in (-side, side)]
-        leaf = box((self.thickness, self.width, length), (0.0, 0.0, length / 2), WOOD)
+        rails = [box_shape((0.05, 0.05, length), (0.0, y, length / 2), STEEL) for y in (-side, side)]
+        rails += [box_shape((length, 0.05, 0.05), (length / 2, y, length), STEEL) for y in (-side, side)]
+        leaf = box_shape((self.thickness, self.width, length), (0.0, 0.0, length / 2), WOOD)
         grip = -self.thickness / 2 - 0.04
         return {
             "base": self.base(*rails),
-            "door": Part("base", (slide(Z, height), turn(Y, angle)), (leaf,)),
-            "upper_edge": Part("door", (shift(z=length),)),
-            "bolt": Part(
+            "door": MechanismPart("base", (translation_along(Z, height), rotation_about(Y, angle)), (leaf,)),
+            "upper_edge": MechanismPart("door", (shift(z=length),)),
+            "bolt": MechanismPart(
                 "door",
-                (shift(grip, 0.0, 0.15 * length), turn(X, self.q("bolt"))),
-                (rod((0.0, 0.0, 0.0), (0.04, 0.0, 0.0), 0.01, DARK), box((0.02, 0.2, 0.02), (0, 0, 0), DARK)),
+                (shift(grip, 0.0, 0.15 * length), rotation_about(X, self.q("bolt"))),
+                (
+                    rod_shape((0.0, 0.0, 0.0), (0.04, 0.0, 0.0), 0.01, DARK),
+                    box_shape((0.02, 0.2, 0.02), (0, 0, 0), DARK),
+                ),
             ),
         }

@@ -7,13 +7,13 @@ from dataclasses import dataclass
 from typing import Any, ClassVar
 
 from kineverse.articulations.limits import Limits
-from kineverse.errors import ValueRejectedError
-from kineverse.locks import Triple, blocked_unless, unlocked_while
+from kineverse.articulations.locks import BoundedExpression, position_lock, speed_lock
+from kineverse.errors import InvalidValueError
 from kineverse.model.body import Rgba, Shape
-from kineverse.motions import X, Z, slide, turn
+from kineverse.spatial import X, Z, rotation_about, translation_along
 
-from .mechanism import Mechanism, Part, number_in
-from .solids import DARK, PALE, RED, STEEL, WOOD, box, case, panel, rod, shift
+from .mechanism import Mechanism, MechanismPart, constant_value
+from .simple_bodies import DARK, PALE, RED, STEEL, WOOD, box_shape, case, panel, rod_shape, shift
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -41,21 +41,23 @@ class HingedDoor(Mechanism):
     def __post_init__(self) -> None:
         self.lengths("width", "height", "thickness")
         super().__post_init__()
-        if number_in(self.door.lower) not in (None, 0.0) or self.door.lower is None:
-            raise ValueRejectedError(f"{self.its('door')} is shut at 0, and not at {self.door.lower!r}.")
+        if constant_value(self.door.lower) not in (None, 0.0) or self.door.lower is None:
+            raise InvalidValueError(f"{self.its('door')} is shut at 0, and not at {self.door.lower!r}.")
 
-    def leaf(self, color: Rgba = WOOD, *shapes: Shape) -> Part:
+    def leaf(self, color: Rgba = WOOD, *shapes: Shape) -> MechanismPart:
         """Return the door."""
-        return Part(
+        return MechanismPart(
             "base",
-            (turn(Z, self.q("door")),),
+            (rotation_about(Z, self.q("door")),),
             (panel(self.width, self.height, self.thickness, color), *shapes),
         )
 
     def posts(self) -> tuple[Shape, Shape]:
         """Return what stands on both sides of it."""
         size = (self.thickness, 0.06, self.height)
-        first, second = (box(size, (0.0, y, self.height / 2), PALE) for y in (-0.035, self.width + 0.035))
+        first, second = (
+            box_shape(size, (0.0, y, self.height / 2), PALE) for y in (-0.035, self.width + 0.035)
+        )
         return first, second
 
 
@@ -86,7 +88,7 @@ class DoorWithHandle(HingedDoor):
 
     Raises
     ------
-    ValueRejectedError
+    InvalidValueError
         For lengths that are not positive, a door that is not shut at 0, a threshold that the handle does not
         reach, or a handle above the door.
     """
@@ -103,7 +105,7 @@ class DoorWithHandle(HingedDoor):
         self.lengths("shut", "speed", "handle_height")
         self.check_within("threshold", self.handle)
         if not self.handle_height < self.height:
-            raise ValueRejectedError(
+            raise InvalidValueError(
                 f"{self.its('handle_height')} is below its height {self.height:g}, and not "
                 f"{self.handle_height:g}."
             )
@@ -113,22 +115,22 @@ class DoorWithHandle(HingedDoor):
         """Those of door and handle."""
         return {self.path("door"): self.door, self.path("handle"): self.handle}
 
-    def locks(self) -> Mapping[str, Triple]:
+    def locks(self) -> Mapping[str, BoundedExpression]:
         """Return the lock."""
         q = self.q("door")
         pressed = self.q("handle") > self.threshold
-        return {"lock": unlocked_while(q, pressed, at=q < self.shut, speed=self.speed, blocks="forward")}
+        return {"lock": speed_lock(q, pressed, at=q < self.shut, speed=self.speed, blocks="forward")}
 
-    def parts(self) -> Mapping[str, Part]:
+    def parts(self) -> Mapping[str, MechanismPart]:
         """Return posts, door and handle."""
         out = 0.05
-        lever = box((0.02, 0.12, 0.02), (0.0, -0.05, 0.0), STEEL)
-        stem = rod((0.0, 0.0, 0.0), (out, 0.0, 0.0), 0.008, STEEL)
+        lever = box_shape((0.02, 0.12, 0.02), (0.0, -0.05, 0.0), STEEL)
+        stem = rod_shape((0.0, 0.0, 0.0), (out, 0.0, 0.0), 0.008, STEEL)
         place = shift(-self.thickness / 2 - out, 0.93 * self.width, self.handle_height)
         return {
             "base": self.base(*self.posts()),
             "door": self.leaf(),
-            "handle": Part("door", (place, turn(X, self.q("handle"))), (lever, stem)),
+            "handle": MechanismPart("door", (place, rotation_about(X, self.q("handle"))), (lever, stem)),
         }
 
 
@@ -136,7 +138,7 @@ class DoorWithHandle(HingedDoor):
 class SprungDoor(HingedDoor):
     """Base of doors that something on a spring holds: shut, they stay so unless it is moved away.
 
-    The lock is a block of the position (:func:`kineverse.blocked_unless`): an open door is free, and so is
+    The lock is a block of the position (:func:`kineverse.articulations.position_lock`): an open door is free, and so is
     shutting it, because the bolt gives way.
 
     Attributes
@@ -150,7 +152,7 @@ class SprungDoor(HingedDoor):
 
     Raises
     ------
-    ValueRejectedError
+    InvalidValueError
         For lengths that are not positive, a door that is not shut at 0, a catch beyond the limits of what is
         sprung, or a spring that does not push it back to 0.
     """
@@ -169,7 +171,7 @@ class SprungDoor(HingedDoor):
         self.check_within("catch", getattr(self, self.sprung))
         self.number("stiffness", positive=True)
         if self.number("rest") > 0:
-            raise ValueRejectedError(
+            raise InvalidValueError(
                 f"{self.its('rest')} is at 0 or before it, where the spring pushes to, and not at "
                 f"{self.rest:g}."
             )
@@ -179,10 +181,10 @@ class SprungDoor(HingedDoor):
         """Those of the door and of what is sprung."""
         return {self.path("door"): self.door, self.path(self.sprung): getattr(self, self.sprung)}
 
-    def locks(self) -> Mapping[str, Triple]:
+    def locks(self) -> Mapping[str, BoundedExpression]:
         """Return what the spring's end does."""
         away = self.q(self.sprung) > self.catch
-        return {"latch": blocked_unless(self.q("door"), away, upper=0.0, margin=self.play)}
+        return {"latch": position_lock(self.q("door"), away, upper=0.0, margin=self.play)}
 
     def known(self) -> tuple[tuple[str, Any], ...]:
         """Return the spring."""
@@ -212,14 +214,16 @@ class Latch(SprungDoor):
     bolt: Limits = Limits(0.0, 0.012, 0.2)
     catch: float = 0.008
 
-    def parts(self) -> Mapping[str, Part]:
+    def parts(self) -> Mapping[str, MechanismPart]:
         """Return posts, door and bolt."""
-        tongue = box((0.4 * self.thickness, 0.04, 0.03), (0.0, -0.01, 0.0), STEEL)
+        tongue = box_shape((0.4 * self.thickness, 0.04, 0.03), (0.0, -0.01, 0.0), STEEL)
         place = shift(0.0, self.width, self.height / 2)
         return {
             "base": self.base(*self.posts()),
             "door": self.leaf(),
-            "bolt": Part("door", (place, slide((0.0, -1.0, 0.0), self.q("bolt"))), (tongue,)),
+            "bolt": MechanismPart(
+                "door", (place, translation_along((0.0, -1.0, 0.0), self.q("bolt"))), (tongue,)
+            ),
         }
 
 
@@ -259,21 +263,23 @@ class Microwave(SprungDoor):
         self.lengths("depth")
         super().__post_init__()
 
-    def parts(self) -> Mapping[str, Part]:
+    def parts(self) -> Mapping[str, MechanismPart]:
         """Return the oven, its door and its button."""
         w, h, t, depth = self.width, self.height, self.thickness, self.depth
         controls = 0.3 * w
         behind = (t / 2 + depth / 2, w / 2, h / 2)
-        grip = rod((-t / 2 - 0.025, 0.92 * w, 0.15 * h), (-t / 2 - 0.025, 0.92 * w, 0.85 * h), 0.008, STEEL)
+        grip = rod_shape(
+            (-t / 2 - 0.025, 0.92 * w, 0.15 * h), (-t / 2 - 0.025, 0.92 * w, 0.85 * h), 0.008, STEEL
+        )
         return {
             "base": self.base(
                 *case((depth, w, h), 0.02, PALE, behind),
-                box((depth + t, controls, h), (depth / 2, w + controls / 2, h / 2), DARK),
+                box_shape((depth + t, controls, h), (depth / 2, w + controls / 2, h / 2), DARK),
             ),
             "door": self.leaf(DARK, grip),
-            "button": Part(
+            "button": MechanismPart(
                 "base",
-                (shift(-t / 2, w + controls / 2, 0.2 * h), slide(X, self.q("button"))),
-                (box((0.02, 0.6 * controls, 0.12 * h), (0.0, 0.0, 0.0), RED),),
+                (shift(-t / 2, w + controls / 2, 0.2 * h), translation_along(X, self.q("button"))),
+                (box_shape((0.02, 0.6 * controls, 0.12 * h), (0.0, 0.0, 0.0), RED),),
             ),
         }

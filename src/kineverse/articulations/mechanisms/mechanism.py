@@ -7,24 +7,24 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, ClassVar, NamedTuple
 
-from kineverse.articulations.joint import Placed, checked_number
+from kineverse.articulations.joint import PlacedOperation, check_joint_number
 from kineverse.articulations.limits import Limits, check_limits
-from kineverse.errors import ValueRejectedError
+from kineverse.errors import InvalidValueError
 from kineverse.expressions.expression import Expression, ExpressionLike, as_expression
 from kineverse.model.articulation import Articulation
 from kineverse.model.body import Shape
 from kineverse.model.constraint import ConstraintLike
 from kineverse.model.frame import TransformLike
-from kineverse.model.operation import Effects
-from kineverse.model.reader import Reader
+from kineverse.model.operation import Writes
+from kineverse.model.read_recorder import ReadRecorder
 from kineverse.symbols import Symbol, position
 
-from .solids import body_of
+from .simple_bodies import solid_body
 
 BASE = "base"
 
 
-class Part(NamedTuple):
+class MechanismPart(NamedTuple):
     """One frame of a mechanism: which other part it is placed in, where, and what is seen of it."""
 
     below: str
@@ -33,7 +33,7 @@ class Part(NamedTuple):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Mechanism(Placed):
+class Mechanism(PlacedOperation):
     """Base of the mechanisms: several frames ``name/…`` that move together by a few coordinates.
 
     ``name/base`` stands still at ``origin`` in the parent; x points away from who uses it, y to the left, z
@@ -42,9 +42,9 @@ class Mechanism(Placed):
 
     Raises
     ------
-    ValueRejectedError
+    InvalidValueError
         For limits that contradict each other, and numbers that cannot be.
-    NameTakenError
+    DuplicateNameError
         For an articulation or a frame that exists.
     """
 
@@ -68,7 +68,7 @@ class Mechanism(Placed):
         """The paths of its coordinates, with their limits."""
 
     @abstractmethod
-    def parts(self) -> Mapping[str, Part]:
+    def parts(self) -> Mapping[str, MechanismPart]:
         """Return its frames by their names below ``name/``, the base first."""
 
     def locks(self) -> Mapping[str, ConstraintLike]:
@@ -91,7 +91,7 @@ class Mechanism(Placed):
         """Return one of its coordinates."""
         return position(self.path(part))
 
-    def apply(self, model: Reader) -> Effects:
+    def apply(self, model: ReadRecorder) -> Writes:
         """Write the frames with their bodies, the limits and locks, and the record."""
         parts = self.parts()
         self.check_names(model, map(self.path, parts))
@@ -100,9 +100,9 @@ class Mechanism(Placed):
             constraints.update(limits.on(path, position(path)))
         constraints.update({self.path(name): lock for name, lock in self.locks().items()})
         coordinates = tuple(map(position, self.limits))
-        return Effects(
+        return Writes(
             frames={self.path(n): (self._below(part), part.place) for n, part in parts.items()},
-            bodies={self.path(n): body_of(part.shapes) for n, part in parts.items() if part.shapes},
+            bodies={self.path(n): solid_body(part.shapes) for n, part in parts.items() if part.shapes},
             constraints=constraints,
             articulations={
                 self.name: Articulation(
@@ -118,22 +118,22 @@ class Mechanism(Placed):
             data={self.path(n): value for n, value in self.data().items()},
         )
 
-    def _below(self, part: Part) -> str:
+    def _below(self, part: MechanismPart) -> str:
         return self.path(part.below) if part.below else self.parent
 
-    def base(self, *shapes: Shape) -> Part:
+    def base(self, *shapes: Shape) -> MechanismPart:
         """Return the part that stands still."""
-        return Part("", (self.origin,), shapes)
+        return MechanismPart("", (self.origin,), shapes)
 
     def number(self, field: str, *, positive: bool = False) -> float:
         """Return a field that is a finite number.
 
         Raises
         ------
-        ValueRejectedError
+        InvalidValueError
             If it is none, or not positive where it has to be.
         """
-        return checked_number(getattr(self, field), self.its(field), positive=positive)
+        return check_joint_number(getattr(self, field), self.its(field), positive=positive)
 
     def its(self, field: str) -> str:
         """Return what errors call a field."""
@@ -144,7 +144,7 @@ class Mechanism(Placed):
 
         Raises
         ------
-        ValueRejectedError
+        InvalidValueError
             If they are missing, no numbers, or beyond what the geometry allows.
         """
         limits = getattr(self, field)
@@ -152,11 +152,11 @@ class Mechanism(Placed):
         ends = []
         for name, end in (("lower", limits.lower), ("upper", limits.upper)):
             if end is None or (isinstance(end, Expression) and end.symbols):
-                raise ValueRejectedError(f"{self.its(field)} has a number as its {name} end, not {end!r}.")
-            ends.append(checked_number(end, f"{self.its(field)}, its {name} end,"))
+                raise InvalidValueError(f"{self.its(field)} has a number as its {name} end, not {end!r}.")
+            ends.append(check_joint_number(end, f"{self.its(field)}, its {name} end,"))
         lower, upper = ends
         if not least <= lower < upper <= most:
-            raise ValueRejectedError(
+            raise InvalidValueError(
                 f"{self.its(field)} is a range within [{least:.6g}, {most:.6g}], not from {lower:g} to "
                 f"{upper:g}."
             )
@@ -167,18 +167,18 @@ class Mechanism(Placed):
 
         Raises
         ------
-        ValueRejectedError
+        InvalidValueError
             If it does not, so the coordinate would never get to the other side of it.
         """
         value = self.number(field)
-        lower, upper = number_in(limits.lower), number_in(limits.upper)
+        lower, upper = constant_value(limits.lower), constant_value(limits.upper)
         if (lower is not None and value <= lower) or (upper is not None and value >= upper):
-            raise ValueRejectedError(
+            raise InvalidValueError(
                 f"{self.its(field)} lies between {limits.lower!r} and {limits.upper!r}, and is not {value:g}."
             )
 
 
-def number_in(bound: ExpressionLike | None) -> float | None:
+def constant_value(bound: ExpressionLike | None) -> float | None:
     """Return a bound that is there and constant, else None."""
     if bound is None:
         return None

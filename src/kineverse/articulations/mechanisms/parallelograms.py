@@ -8,13 +8,13 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 from kineverse.articulations.limits import Limits
-from kineverse.errors import ValueRejectedError
+from kineverse.errors import InvalidValueError
 from kineverse.expressions.functions import cos, sin
 from kineverse.model.body import Pose
-from kineverse.motions import X, Y, Z, slide, turn
+from kineverse.spatial import X, Y, Z, rotation_about, translation_along
 
-from .mechanism import Mechanism, Part
-from .solids import BLUE, DARK, PALE, RED, STEEL, YELLOW, box, rod, shift
+from .mechanism import Mechanism, MechanismPart
+from .simple_bodies import BLUE, DARK, PALE, RED, STEEL, YELLOW, box_shape, rod_shape, shift
 
 MOST_STAGES = 64
 HALF_TURN = Pose((1.0, 0.0, 0.0, 0.0, 0.0, -1.0, 0.0, 0.0, 0.0, 0.0, -1.0, 0.0))  # about x
@@ -47,7 +47,7 @@ class ScissorLift(Mechanism):
 
     Raises
     ------
-    ValueRejectedError
+    InvalidValueError
         For lengths that are not positive, stages that are no such number, or limits beyond flat and upright.
     """
 
@@ -65,7 +65,7 @@ class ScissorLift(Mechanism):
             or not isinstance(self.stages, int)
             or not 1 <= self.stages <= MOST_STAGES
         ):
-            raise ValueRejectedError(
+            raise InvalidValueError(
                 f"{self.its('stages')} are a whole number from 1 to {MOST_STAGES}, not {self.stages!r}."
             )
         self.range_of("angle", 0.0, math.pi / 2)
@@ -76,25 +76,27 @@ class ScissorLift(Mechanism):
         """That of q."""
         return {self.path(): self.angle}
 
-    def parts(self) -> Mapping[str, Part]:
+    def parts(self) -> Mapping[str, MechanismPart]:
         """Return base, arms, slider and platform."""
         q, length, width = self.q(), self.arm, self.width
         rise, reach = length * sin(q), length * cos(q)
         thick = 0.04 * length
         deck = (1.06 * length, width, thick)
-        parts = {"base": self.base(box(deck, (length / 2, 0.0, -1.5 * thick), DARK))}
+        parts = {"base": self.base(box_shape(deck, (length / 2, 0.0, -1.5 * thick), DARK))}
         for i in range(self.stages):
-            middle = (slide(X, reach / 2), slide(Z, (i + 0.5) * rise))
+            middle = (translation_along(X, reach / 2), translation_along(Z, (i + 0.5) * rise))
             for letter, sign, inset, color in (("a", -1, 0.5, BLUE), ("b", 1, 0.4, STEEL)):
                 bars = tuple(
-                    box((length, 0.5 * thick, thick), (0.0, side * inset * width, 0.0), color)
+                    box_shape((length, 0.5 * thick, thick), (0.0, side * inset * width, 0.0), color)
                     for side in (-1, 1)
                 )
-                parts[f"arm_{i + 1}{letter}"] = Part("base", (*middle, turn(Y, sign * q)), bars)
-        axle = rod((0.0, -width / 2, 0.0), (0.0, width / 2, 0.0), 0.6 * thick, RED)
-        parts["slider"] = Part("base", (slide(X, reach),), (axle,))
-        top = box(deck, (length / 2, 0.0, 1.5 * thick), YELLOW)
-        parts["platform"] = Part("base", (slide(Z, self.stages * rise),), (top,))
+                parts[f"arm_{i + 1}{letter}"] = MechanismPart(
+                    "base", (*middle, rotation_about(Y, sign * q)), bars
+                )
+        axle = rod_shape((0.0, -width / 2, 0.0), (0.0, width / 2, 0.0), 0.6 * thick, RED)
+        parts["slider"] = MechanismPart("base", (translation_along(X, reach),), (axle,))
+        top = box_shape(deck, (length / 2, 0.0, 1.5 * thick), YELLOW)
+        parts["platform"] = MechanismPart("base", (translation_along(Z, self.stages * rise),), (top,))
         return parts
 
 
@@ -129,7 +131,7 @@ class DeskLamp(Mechanism):
 
     Raises
     ------
-    ValueRejectedError
+    InvalidValueError
         For lengths that are not positive, or limits at which a parallelogram falls flat.
     """
 
@@ -145,7 +147,7 @@ class DeskLamp(Mechanism):
         self.lengths("lower_arm", "upper_arm", "offset")
         for field in ("lower", "upper"):
             if max(map(abs, self.range_of(field, -math.pi / 2, math.pi / 2))) >= math.pi / 2:
-                raise ValueRejectedError(
+                raise InvalidValueError(
                     f"{self.its(field)} ends before ±π/2, where its parallelogram falls flat."
                 )
         super().__post_init__()
@@ -155,38 +157,38 @@ class DeskLamp(Mechanism):
         """Those of both angles."""
         return {self.path("lower"): self.lower, self.path("upper"): self.upper}
 
-    def parts(self) -> Mapping[str, Part]:
+    def parts(self) -> Mapping[str, MechanismPart]:
         """Return foot, arms, bars, elbow and head."""
         lean, rise = self.q("lower"), self.q("upper")
         first, second, off = self.lower_arm, self.upper_arm, self.offset
         foot = 0.05
-        upright = (rod((0.0, 0.0, 0.0), (0.0, 0.0, first), 0.006, STEEL),)
-        level = (rod((0.0, 0.0, 0.0), (second, 0.0, 0.0), 0.006, STEEL),)
-        up, out = turn(Y, lean), turn(Y, -rise)
+        upright = (rod_shape((0.0, 0.0, 0.0), (0.0, 0.0, first), 0.006, STEEL),)
+        level = (rod_shape((0.0, 0.0, 0.0), (second, 0.0, 0.0), 0.006, STEEL),)
+        up, out = rotation_about(Y, lean), rotation_about(Y, -rise)
         return {
             "base": self.base(
-                rod((0.0, 0.0, -foot), (0.0, 0.0, -foot / 2), 0.1, DARK),
-                box((0.02 + off, 0.02, foot), (off / 2, 0.0, -foot / 4), DARK),
+                rod_shape((0.0, 0.0, -foot), (0.0, 0.0, -foot / 2), 0.1, DARK),
+                box_shape((0.02 + off, 0.02, foot), (off / 2, 0.0, -foot / 4), DARK),
             ),
-            "lower_arm": Part("base", (up,), upright),
-            "lower_bar": Part("base", (shift(off), up), upright),
-            "elbow": Part(
+            "lower_arm": MechanismPart("base", (up,), upright),
+            "lower_bar": MechanismPart("base", (shift(off), up), upright),
+            "elbow": MechanismPart(
                 "lower_arm",
-                (shift(z=first), turn(Y, -lean)),
+                (shift(z=first), rotation_about(Y, -lean)),
                 (
-                    box((0.02 + off, 0.012, 0.02), (off / 2, 0.0, 0.0), RED),
-                    box((0.02, 0.012, 0.02 + off), (0.0, 0.0, off / 2), RED),
+                    box_shape((0.02 + off, 0.012, 0.02), (off / 2, 0.0, 0.0), RED),
+                    box_shape((0.02, 0.012, 0.02 + off), (0.0, 0.0, off / 2), RED),
                 ),
             ),
-            "upper_arm": Part("elbow", (out,), level),
-            "upper_bar": Part("elbow", (shift(z=off), out), level),
-            "head": Part(
+            "upper_arm": MechanismPart("elbow", (out,), level),
+            "upper_bar": MechanismPart("elbow", (shift(z=off), out), level),
+            "head": MechanismPart(
                 "upper_arm",
-                (shift(second), turn(Y, rise)),
+                (shift(second), rotation_about(Y, rise)),
                 (
-                    box((0.02, 0.012, 0.02 + off), (0.0, 0.0, off / 2), RED),
-                    rod((0.0, 0.0, 0.0), (0.0, 0.0, -0.05), 0.05, PALE),
+                    box_shape((0.02, 0.012, 0.02 + off), (0.0, 0.0, off / 2), RED),
+                    rod_shape((0.0, 0.0, 0.0), (0.0, 0.0, -0.05), 0.05, PALE),
                 ),
             ),
-            "light": Part("head", (shift(z=-0.05), HALF_TURN)),
+            "light": MechanismPart("head", (shift(z=-0.05), HALF_TURN)),
         }

@@ -10,13 +10,13 @@ from typing import Any, ClassVar
 import numpy as np
 
 from kineverse.articulations.limits import FREE, Limits
-from kineverse.errors import ValueRejectedError
-from kineverse.locks import unlocked_while
+from kineverse.articulations.locks import speed_lock
+from kineverse.errors import InvalidValueError
 from kineverse.model.constraint import ConstraintLike
-from kineverse.motions import Y, turn
+from kineverse.spatial import Y, rotation_about
 
-from .mechanism import Mechanism, Part
-from .solids import DARK, RED, STEEL, box, rod, shift
+from .mechanism import Mechanism, MechanismPart
+from .simple_bodies import DARK, RED, STEEL, box_shape, rod_shape, shift
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -50,7 +50,7 @@ class Ratchet(Mechanism):
 
     Raises
     ------
-    ValueRejectedError
+    InvalidValueError
         For lengths that are not positive, fewer than three teeth, a speed of 0, or a pawl that cannot be
         lifted beyond its release.
     """
@@ -67,7 +67,7 @@ class Ratchet(Mechanism):
     def __post_init__(self) -> None:
         self.lengths("radius", "thickness", "speed")
         if isinstance(self.teeth, bool) or not isinstance(self.teeth, int) or self.teeth < 3:
-            raise ValueRejectedError(f"{self.its('teeth')} are a whole number from 3, not {self.teeth!r}.")
+            raise InvalidValueError(f"{self.its('teeth')} are a whole number from 3, not {self.teeth!r}.")
         super().__post_init__()
         self.check_within("release", self.lift)
 
@@ -79,18 +79,18 @@ class Ratchet(Mechanism):
     def locks(self) -> Mapping[str, ConstraintLike]:
         """Return what the pawl does."""
         lifted = self.q("pawl") > self.release
-        return {"lock": unlocked_while(self.q("wheel"), lifted, speed=self.speed, blocks="backward")}
+        return {"lock": speed_lock(self.q("wheel"), lifted, speed=self.speed, blocks="backward")}
 
     def known(self) -> tuple[tuple[str, Any], ...]:
         """Return the teeth."""
         return (("teeth", self.teeth), ("pitch", math.tau / self.teeth))
 
-    def parts(self) -> Mapping[str, Part]:
+    def parts(self) -> Mapping[str, MechanismPart]:
         """Return stand, wheel and pawl."""
         half, r = self.thickness / 2, self.radius
         angles = np.linspace(0.0, math.tau, self.teeth, endpoint=False).tolist()
         teeth = [
-            rod(
+            rod_shape(
                 (r * math.sin(a), -half, r * math.cos(a)),
                 (r * math.sin(a), half, r * math.cos(a)),
                 0.06 * r,
@@ -98,11 +98,13 @@ class Ratchet(Mechanism):
             )
             for a in angles
         ]
-        disc = rod((0.0, -half, 0.0), (0.0, half, 0.0), r, STEEL)
-        stand = box((0.4 * r, self.thickness, 2.2 * r), (0.0, 2 * self.thickness, -0.7 * r), DARK)
-        nose = rod((0.0, 0.0, 0.0), (-0.7 * r, 0.0, -0.25 * r), 0.08 * r, RED)
+        disc = rod_shape((0.0, -half, 0.0), (0.0, half, 0.0), r, STEEL)
+        stand = box_shape((0.4 * r, self.thickness, 2.2 * r), (0.0, 2 * self.thickness, -0.7 * r), DARK)
+        nose = rod_shape((0.0, 0.0, 0.0), (-0.7 * r, 0.0, -0.25 * r), 0.08 * r, RED)
         return {
             "base": self.base(stand),
-            "wheel": Part("base", (turn(Y, self.q("wheel")),), (disc, *teeth)),
-            "pawl": Part("base", (shift(0.8 * r, 0.0, 1.25 * r), turn(Y, self.q("pawl"))), (nose,)),
+            "wheel": MechanismPart("base", (rotation_about(Y, self.q("wheel")),), (disc, *teeth)),
+            "pawl": MechanismPart(
+                "base", (shift(0.8 * r, 0.0, 1.25 * r), rotation_about(Y, self.q("pawl"))), (nose,)
+            ),
         }

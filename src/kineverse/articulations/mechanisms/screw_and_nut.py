@@ -7,12 +7,12 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import ClassVar
 
-from kineverse.articulations.limits import Limits, checked_limit
-from kineverse.errors import ValueRejectedError
-from kineverse.motions import Z, slide, turn
+from kineverse.articulations.limits import Limits, check_speed_limit
+from kineverse.errors import InvalidValueError
+from kineverse.spatial import Z, rotation_about, translation_along
 
-from .mechanism import Mechanism, Part
-from .solids import DARK, STEEL, YELLOW, box, rod
+from .mechanism import Mechanism, MechanismPart
+from .simple_bodies import DARK, STEEL, YELLOW, box_shape, rod_shape
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -42,7 +42,7 @@ class ScrewAndNut(Mechanism):
 
     Raises
     ------
-    ValueRejectedError
+    InvalidValueError
         For a pitch of 0, lengths that are not positive, or a negative velocity.
     """
 
@@ -56,8 +56,8 @@ class ScrewAndNut(Mechanism):
     def __post_init__(self) -> None:
         self.lengths("travel", "radius")
         if not self.number("pitch"):
-            raise ValueRejectedError(f"{self.its('pitch')} is 0, so nothing would move the nut.")
-        checked_limit(self.velocity, self.its("velocity"))
+            raise InvalidValueError(f"{self.its('pitch')} is 0, so nothing would move the nut.")
+        check_speed_limit(self.velocity, self.its("velocity"))
         super().__post_init__()
 
     @property
@@ -65,24 +65,24 @@ class ScrewAndNut(Mechanism):
         """That of q."""
         return {self.path(): Limits(0.0, math.tau * self.travel / abs(self.pitch), self.velocity)}
 
-    def parts(self) -> Mapping[str, Part]:
+    def parts(self) -> Mapping[str, MechanismPart]:
         """Return bearings, screw and nut."""
         q, r, end = self.q(), self.radius, 2.5 * self.radius
         start = self.travel if self.pitch > 0 else 0.0
         bearing = (4 * r, 4 * r, r)
         return {
-            "base": self.base(*(box(bearing, (0.0, 0.0, z), DARK) for z in (-end, self.travel + end))),
-            "screw": Part(
+            "base": self.base(*(box_shape(bearing, (0.0, 0.0, z), DARK) for z in (-end, self.travel + end))),
+            "screw": MechanismPart(
                 "base",
-                (turn(Z, q),),
+                (rotation_about(Z, q),),
                 (
-                    rod((0.0, 0.0, -end), (0.0, 0.0, self.travel + end), r, STEEL),
-                    box((3 * r, 0.5 * r, 0.5 * r), (0.0, 0.0, self.travel + 1.6 * end), STEEL),
+                    rod_shape((0.0, 0.0, -end), (0.0, 0.0, self.travel + end), r, STEEL),
+                    box_shape((3 * r, 0.5 * r, 0.5 * r), (0.0, 0.0, self.travel + 1.6 * end), STEEL),
                 ),
             ),
-            "nut": Part(
+            "nut": MechanismPart(
                 "base",
-                (slide(Z, start - self.pitch / math.tau * q),),
-                (box((4 * r, 4 * r, 2 * r), (0, 0, 0), YELLOW),),
+                (translation_along(Z, start - self.pitch / math.tau * q),),
+                (box_shape((4 * r, 4 * r, 2 * r), (0, 0, 0), YELLOW),),
             ),
         }

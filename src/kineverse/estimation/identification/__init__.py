@@ -1,8 +1,8 @@
-"""The model of parts that move, from noisy poses."""
+"""Identification of joints and kinematic graphs from noisy poses."""
 
-from .family import Family, Unknown
-from .fit import Fit, Found
-from .identifier import Identifier
+from .custom_family import Family, FamilyParameter
 from .identify import identify
+from .online import Identifier
+from .result import Fit, IdentificationResult
 
-__all__ = ["Family", "Fit", "Found", "Identifier", "Unknown", "identify"]
+__all__ = ["Family", "FamilyParameter", "Fit", "IdentificationResult", "Identifier", "identify"]

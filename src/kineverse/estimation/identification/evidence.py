@@ -1,6 +1,6 @@
-"""How probable observations are under a family, with all that is unknown about it integrated out.
+"""Marginal likelihood of a joint family (Laplace approximation).
 
-Joint values are drawn from a Gaussian whose width s is that of the motion, see :mod:`.widths`. They
+Joint values are drawn from a Gaussian whose width s is that of the motion, see :mod:`.fit_joint_ranges`. They
 contribute
 
     ∫ N(â_k; a, C_k) N(a; μ, s²) da = N(â_k; μ, s² + C_k)
@@ -19,12 +19,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from .matrices import inverted, log_determinants, times
-from .motion import Member
-from .rigid import Array
-from .sliding import by_point
-from .solving import Solution
-from .widths import Alone, Widths, alone, widths
+from kineverse.estimation.linear_algebra import invert_matrices, multiply_vectors, sum_log_determinants
+from kineverse.lie import Stack
+
+from .ambiguities import sliding_point_twists
+from .motion_model import FamilyMember
+from .optimise import Solution
+from .range_prior import JointRanges, PerObservation, fit_joint_ranges, solve_per_observation
 
 
 @dataclass(frozen=True)
@@ -42,21 +43,21 @@ class Evidence:
     """
 
     log_evidence: float
-    covariance: Array
-    joint_values: Array
-    joint_covariances: Array
+    covariance: Stack
+    joint_values: Stack
+    joint_covariances: Stack
 
     @staticmethod
-    def of(log: float, information: Array, size: int, values: Array, covariances: Array) -> Evidence:
+    def of(log: float, information: Stack, size: int, values: Stack, covariances: Stack) -> Evidence:
         """Return it with the covariance of the first unknowns, which are the parameters."""
-        return Evidence(log, inverted(information)[:size, :size], values, covariances)
+        return Evidence(log, invert_matrices(information)[:size, :size], values, covariances)
 
 
-def evidence(solution: Solution[Member]) -> Evidence:
+def laplace_evidence(solution: Solution[FamilyMember]) -> Evidence:
     """Return the evidence of a family of joints around its most likely member."""
     motion, size = solution.motion, solution.motion.size
-    seen = alone(solution)
-    width = widths(motion, seen) if motion.joints else Widths(np.zeros(0), np.zeros(0), 0.0)
+    seen = solve_per_observation(solution)
+    width = fit_joint_ranges(motion, seen) if motion.joints else JointRanges(np.zeros(0), np.zeros(0), 0.0)
     values, covariances = _together(seen, width)
     information = _information(solution, width, values)
     prior = motion.prior().by_parameters
@@ -68,7 +69,7 @@ def evidence(solution: Solution[Member]) -> Evidence:
     return Evidence.of(log, information, size, values, covariances)
 
 
-def overrated(solution: Solution[Member]) -> float:
+def evidence_excess(solution: Solution[FamilyMember]) -> float:
     """Return by how much the quadratic promises more, as a logarithm, than is there where steps ended early.
 
     Evidence takes the quadratic at its word. Where it has not been followed to its end, what was reached is
@@ -77,12 +78,12 @@ def overrated(solution: Solution[Member]) -> float:
     belief = solution.belief
     if solution.converged or not belief.marginal:
         return 0.0
-    seen = alone(solution)
+    seen = solve_per_observation(solution)
     total = seen.covariances + np.diag(1.0 / belief.precision)
     off = seen.values - belief.mean
-    promised = -0.5 * float(np.sum(off * times(inverted(total), off))) - 0.5 * log_determinants(
-        math.tau * total
-    )
+    promised = -0.5 * float(
+        np.sum(off * multiply_vectors(invert_matrices(total), off))
+    ) - 0.5 * sum_log_determinants(math.tau * total)
     prior = solution.motion.prior().residuals
     reached = -0.5 * (solution.cost - float(prior @ prior)) - 0.5 * solution.residuals.size * math.log(
         math.tau
@@ -90,22 +91,24 @@ def overrated(solution: Solution[Member]) -> float:
     return max(0.0, promised + seen.log_likelihood - reached)
 
 
-def _together(seen: Alone, width: Widths) -> tuple[Array, Array]:
+def _together(seen: PerObservation, width: JointRanges) -> tuple[Stack, Stack]:
     """Return joint values and their covariances if they are also believed within the width."""
     if not len(width.mean):
         return seen.values, seen.covariances
     variance = np.diag(width.deviations**2)
-    shrink = variance @ inverted(seen.covariances + variance)
-    values: Array = width.mean + (shrink @ (seen.values - width.mean)[:, :, None])[:, :, 0]
+    shrink = variance @ invert_matrices(seen.covariances + variance)
+    values: Stack = width.mean + (shrink @ (seen.values - width.mean)[:, :, None])[:, :, 0]
     return values, shrink @ seen.covariances
 
 
-def _information(solution: Solution[Member], width: Widths, values: Array) -> Array:
+def _information(solution: Solution[FamilyMember], width: JointRanges, values: Stack) -> Stack:
     """Return the information about parameters, μ and the point that slides."""
     linear = solution.motion.at(values)
     by_joints = linear.by_joints
     moved = (by_joints * width.deviations**2) @ np.swapaxes(by_joints, 1, 2)
-    weights = inverted(solution.covariance + moved)
-    both = np.concatenate([linear.by_parameters, by_joints, by_point(solution.motion, values)], axis=2)
-    result: Array = (np.swapaxes(both, 1, 2) @ weights @ both).sum(axis=0)
+    weights = invert_matrices(solution.covariance + moved)
+    both = np.concatenate(
+        [linear.by_parameters, by_joints, sliding_point_twists(solution.motion, values)], axis=2
+    )
+    result: Stack = (np.swapaxes(both, 1, 2) @ weights @ both).sum(axis=0)
     return result

@@ -1,4 +1,4 @@
-"""From poses of two parts to the model of what connects them."""
+"""Identification of the joint between two parts."""
 
 from __future__ import annotations
 
@@ -12,24 +12,23 @@ from typing import TypeAlias
 import numpy as np
 import numpy.typing as npt
 
-from kineverse.errors import UnknownNameError, ValueRejectedError, suggest
+from kineverse.errors import InvalidValueError, UnknownNameError, suggest
 from kineverse.estimation.noise import pose_covariance
-from kineverse.estimation.tracking.outliers import Outliers, as_outliers
+from kineverse.estimation.robust import Outliers, as_outliers
+from kineverse.lie import Stack
 
-from .beside import completed
-from .canonical import canonical
-from .family import Family, family_starts
-from .fit import Fit, Found, Offer
-from .lengths import in_metres, in_units, log_density, unit_of
-from .native import solver
-from .observations import Observations, observations
-from .outlying import Rows, log_belief, right_rows
-from .refining import Rated
-from .reporting import fit_of
-from .rigid import Array
-from .solving import Start
-from .starts import Overview, starts
-from .turning import counted, counted_start, log_counting
+from .custom_family import Family, family_starts
+from .gauge import fix_gauge
+from .initial_guess import MotionStatistics, initial_guesses
+from .maximum_likelihood import Scored
+from .observations import Observations, check_observations
+from .optimise import InitialGuess
+from .outlier_rejection import RowIndices, find_inliers, log_inlier_prior
+from .projection import complete_fit
+from .result import Fit, IdentificationResult, LazyFit, build_fit
+from .scale import in_metres, in_units, length_scale, log_density
+from .solver import solver
+from .unwrapping import log_unwrapping_gain, unwrap_screw, unwrap_solution
 
 Families: TypeAlias = "Iterable[str | Family] | Mapping[str | Family, float] | str | Family | None"
 """Families by name or of one's own; a mapping says how probable they are beforehand."""
@@ -64,13 +63,13 @@ def identify(
     a: npt.ArrayLike | None,
     b: npt.ArrayLike,
     *,
-    covariance_a: npt.ArrayLike | None = None,
-    covariance_b: npt.ArrayLike | None = None,
+    parent_covariance: npt.ArrayLike | None = None,
+    child_covariance: npt.ArrayLike | None = None,
     families: Families = None,
     noise: npt.ArrayLike | None = None,
     outliers: Outliers | bool | None = None,
     ordered: bool = False,
-) -> Found:
+) -> IdentificationResult:
     """Return how part b moves against part a, judged by poses of both that were observed with noise.
 
     Parameters
@@ -97,37 +96,39 @@ def identify(
 
     Raises
     ------
-    ShapeError, ValueRejectedError
-        For poses or covariances that are none, see :func:`.observations.observations`.
+    ShapeError, InvalidValueError
+        For poses or covariances that are none, see :func:`.observations.check_observations`.
     UnknownNameError
         For a family that does not exist.
     """
     weights = family_weights(families)
-    of_a, of_b, stated = noise_of(a is not None, covariance_a, covariance_b, noise)
-    seen = observations(a, b, of_a, of_b)
-    sight = sight_of(seen, stated, as_outliers(outliers), ordered)
-    return weighed(sight, explained(sight, weights), weights)
+    of_a, of_b, stated = resolve_noise(a is not None, parent_covariance, child_covariance, noise)
+    seen = check_observations(a, b, of_a, of_b)
+    sight = prepare_data(seen, stated, as_outliers(outliers), ordered)
+    return weigh_families(sight, solve_with_inliers(sight, weights), weights)
 
 
-def noise_of(
+def resolve_noise(
     has_parent: bool,
-    covariance_a: npt.ArrayLike | None,
-    covariance_b: npt.ArrayLike | None,
+    parent_covariance: npt.ArrayLike | None,
+    child_covariance: npt.ArrayLike | None,
     noise: npt.ArrayLike | None,
 ) -> tuple[npt.ArrayLike, npt.ArrayLike, bool]:
     """Return the covariances of parent and child, and whether they were stated at all.
 
     Raises
     ------
-    ValueRejectedError
+    InvalidValueError
         If only one of them is.
     """
-    if noise is not None or (covariance_b is not None and (covariance_a is not None or not has_parent)):
+    if noise is not None or (
+        child_covariance is not None and (parent_covariance is not None or not has_parent)
+    ):
         missing: npt.ArrayLike = np.eye(6) if noise is None else noise
-        of_a, of_b = (missing if c is None else c for c in (covariance_a, covariance_b))
+        of_a, of_b = (missing if c is None else c for c in (parent_covariance, child_covariance))
         return of_a, of_b, True
-    if covariance_a is not None or covariance_b is not None:
-        raise ValueRejectedError(
+    if parent_covariance is not None or child_covariance is not None:
+        raise InvalidValueError(
             "One part has a covariance and the other has none. Give both, or the same for both as noise."
         )
     unknown = pose_covariance(*UNKNOWN_NOISE)
@@ -141,7 +142,7 @@ def family_weights(families: Families) -> dict[str | Family, float]:
     ------
     UnknownNameError
         For a family that does not exist.
-    ValueRejectedError
+    InvalidValueError
         For a weight that is not positive, or if there is no family.
     """
     if families is None:
@@ -150,12 +151,12 @@ def family_weights(families: Families) -> dict[str | Family, float]:
         families = [families]
     given = dict(families) if isinstance(families, Mapping) else dict.fromkeys(families)
     if not given:
-        raise ValueRejectedError("There is no family to try.")
+        raise InvalidValueError("There is no family to try.")
     for name, weight in given.items():
         if isinstance(name, str) and name not in WEIGHTS:
             raise UnknownNameError(f"There is no family {name!r}. {suggest(str(name), WEIGHTS, 'family')}")
         if weight is not None and not (math.isfinite(weight) and weight > 0.0):
-            raise ValueRejectedError(f"The weight of the family {name!r} is positive, not {weight!r}.")
+            raise InvalidValueError(f"The weight of the family {name!r} is positive, not {weight!r}.")
     result: dict[str | Family, float] = {}
     for name, weight in given.items():
         usual = name.weight if isinstance(name, Family) else WEIGHTS[name]
@@ -164,7 +165,7 @@ def family_weights(families: Families) -> dict[str | Family, float]:
 
 
 @dataclass(frozen=True)
-class Sight:
+class IdentificationData:
     """What was seen, as families are compared by it.
 
     Attributes
@@ -189,7 +190,7 @@ class Sight:
 
 
 @dataclass(frozen=True)
-class Explained:
+class FamilySolution:
     """What a family makes of what was seen.
 
     Attributes
@@ -203,84 +204,88 @@ class Explained:
         the others, and that turns were counted.
     """
 
-    known: Rated
-    right: Rows
+    known: Scored
+    right: RowIndices
     count: int
     log_belief: float
 
 
-def sight_of(
+def prepare_data(
     seen: Observations, stated: bool, outliers: Outliers | None, ordered: bool, unit: float | None = None
-) -> Sight:
+) -> IdentificationData:
     """Return observations in a unit of length [m]; the ordinary one of these if None."""
-    unit = unit_of(seen) if unit is None else unit
+    unit = length_scale(seen) if unit is None else unit
     if outliers is not None and outliers != Outliers():
         outliers = replace(outliers, reach=outliers.reach / unit)
-    return Sight(in_units(seen, unit), unit, stated, outliers, ordered)
+    return IdentificationData(in_units(seen, unit), unit, stated, outliers, ordered)
 
 
-def explained(sight: Sight, weights: Mapping[str | Family, float]) -> dict[str | Family, Explained]:
+def solve_with_inliers(
+    sight: IdentificationData, weights: Mapping[str | Family, float]
+) -> dict[str | Family, FamilySolution]:
     """Return what all families make of what was seen."""
     seen, unit, count = sight.seen, sight.unit, len(sight.seen)
-    found = solutions(seen, weights, unit)
+    found = solve_families(seen, weights, unit)
     right = dict.fromkeys(found, np.arange(count))
     if sight.outliers is not None:
 
-        def by(some: Observations, name: str | Family) -> Rated:
-            return solutions(some, [name], unit)[name]
+        def by(some: Observations, name: str | Family) -> Scored:
+            return solve_families(some, [name], unit)[name]
 
-        right = right_rows(seen, found, sight.outliers, sight.stated, by)
+        right = find_inliers(seen, found, sight.outliers, sight.stated, by)
         some = {name: rows for name, rows in right.items() if len(rows) < count}
         found |= {name: by(seen.at(rows), name) for name, rows in some.items()}
     if sight.ordered:
         found = {name: _counted(seen.at(right[name]), known) for name, known in found.items()}
-    return explained_by(sight, found, right, weights)
+    return score_solutions(sight, found, right, weights)
 
 
-def explained_by(
-    sight: Sight,
-    found: Mapping[str | Family, Rated],
-    right: Mapping[str | Family, Rows],
+def score_solutions(
+    sight: IdentificationData,
+    found: Mapping[str | Family, Scored],
+    right: Mapping[str | Family, RowIndices],
     weights: Mapping[str | Family, float],
-) -> dict[str | Family, Explained]:
+) -> dict[str | Family, FamilySolution]:
     """Return what families make of what was seen, from what was found by what is right."""
     seen, outliers, count = sight.seen, sight.outliers, len(sight.seen)
     by = {name: seen if len(rows) == count else seen.at(rows) for name, rows in right.items()}
     beliefs = dict.fromkeys(found, 0.0)
     if outliers is not None:
-        beliefs = {name: log_belief(outliers, count, len(some), seen.rows) for name, some in by.items()}
+        beliefs = {name: log_inlier_prior(outliers, count, len(some), seen.rows) for name, some in by.items()}
     if sight.ordered:
-        beliefs = {name: beliefs[name] + log_counting(known.solution) for name, known in found.items()}
-    known = judged(by, found, {name: math.log(weights[name]) + beliefs[name] for name in found})
-    return {name: Explained(one, right[name], count, beliefs[name]) for name, one in known.items()}
+        beliefs = {name: beliefs[name] + log_unwrapping_gain(known.solution) for name, known in found.items()}
+    known = compare_families(by, found, {name: math.log(weights[name]) + beliefs[name] for name in found})
+    return {name: FamilySolution(one, right[name], count, beliefs[name]) for name, one in known.items()}
 
 
-def _counted(seen: Observations, known: Rated) -> Rated:
+def _counted(seen: Observations, known: Scored) -> Scored:
     """Return what was found, a screw as one that goes round as often as the observations do."""
-    start = counted_start(seen, known.solution)
+    start = unwrap_screw(seen, known.solution)
     return known if start is None else solver.likeliest(seen, [start])
 
 
-def solutions(
+def solve_families(
     seen: Observations, families: Iterable[str | Family], unit: float = 1.0
-) -> dict[str | Family, Rated]:
+) -> dict[str | Family, Scored]:
     """Return the most likely member of each family, for observations in a unit of length [m]."""
     solver.prepare()
-    overview = Overview(seen)
+    overview = MotionStatistics(seen)
     return {name: solver.likeliest(seen, _starts(seen, name, overview, unit)) for name in families}
 
 
-def _starts(seen: Observations, family: str | Family, overview: Overview, unit: float) -> list[Start]:
+def _starts(
+    seen: Observations, family: str | Family, overview: MotionStatistics, unit: float
+) -> list[InitialGuess]:
     if isinstance(family, Family):
-        return [Start(motion, values) for motion, values in family_starts(family, seen, unit)]
-    return list(starts(family, overview))
+        return [InitialGuess(motion, values) for motion, values in family_starts(family, seen, unit)]
+    return list(initial_guesses(family, overview))
 
 
-def judged(
+def compare_families(
     seen: Mapping[str | Family, Observations],
-    found: Mapping[str | Family, Rated],
+    found: Mapping[str | Family, Scored],
     beliefs: Mapping[str | Family, float],
-) -> dict[str | Family, Rated]:
+) -> dict[str | Family, Scored]:
     """Return what was found, and with joint values integrated out what has a chance.
 
     Each family is by observations of its own, and has a belief beforehand, as a logarithm.
@@ -291,15 +296,17 @@ def judged(
     return {**found, **{name: solver.refined(seen[name], found[name].solution) for name in rough}}
 
 
-def _is_rough(known: Rated) -> bool:
+def _is_rough(known: Scored) -> bool:
     """Return whether there are joint values to be integrated out, and they are not."""
     solution = known.solution
     return bool(solution.motion.joints and solution.motion.size) and not solution.belief.marginal
 
 
-def weighed(
-    sight: Sight, found: Mapping[str | Family, Explained], weights: Mapping[str | Family, float]
-) -> Found:
+def weigh_families(
+    sight: IdentificationData,
+    found: Mapping[str | Family, FamilySolution],
+    weights: Mapping[str | Family, float],
+) -> IdentificationResult:
     """Return the fits of all families, weighed by their evidence."""
     beforehand = {name: math.log(weights[name]) + one.log_belief for name, one in found.items()}
     if sight.stated:
@@ -314,16 +321,18 @@ def weighed(
         logs = {name: float(np.logaddexp.reduce(j)) for name, j in joint.items()}
         best = max(logs, key=lambda name: logs[name] + beforehand[name])
         scale = float(_SCALES[int(np.argmax(joint[best]))])
-    total: Array = np.array([logs[name] + beforehand[name] for name in found])
+    total: Stack = np.array([logs[name] + beforehand[name] for name in found])
     probabilities = np.exp(total - np.logaddexp.reduce(total)).tolist()
     offers = []
     for (name, one), p in zip(found.items(), probabilities, strict=True):
         log = logs[name] + one.log_belief + log_density(len(sight.seen), sight.unit)
-        offers.append(Offer(one.known.solution.motion.name, p, partial(_fit, sight, one, scale, log, p)))
-    return Found(tuple(sorted(offers, key=lambda offer: -offer.probability)), scale)
+        offers.append(LazyFit(one.known.solution.motion.name, p, partial(_fit, sight, one, scale, log, p)))
+    return IdentificationResult(tuple(sorted(offers, key=lambda offer: -offer.probability)), scale)
 
 
-def _fit(sight: Sight, one: Explained, scale: float, log_evidence: float, probability: float) -> Fit:
-    solution = canonical(counted(one.known.solution) if sight.ordered else one.known.solution)
-    fit = fit_of(solution, solver.evidence(solution, scale), log_evidence, probability)
-    return in_metres(completed(fit, sight.seen, one.right, scale, ordered=sight.ordered), sight.unit)
+def _fit(
+    sight: IdentificationData, one: FamilySolution, scale: float, log_evidence: float, probability: float
+) -> Fit:
+    solution = fix_gauge(unwrap_solution(one.known.solution) if sight.ordered else one.known.solution)
+    fit = build_fit(solution, solver.evidence(solution, scale), log_evidence, probability)
+    return in_metres(complete_fit(fit, sight.seen, one.right, scale, ordered=sight.ordered), sight.unit)

@@ -1,18 +1,19 @@
-"""Poses of two parts as they were observed, checked."""
+"""Checked observations and tracks of poses with covariances and gaps."""
 
 from __future__ import annotations
 
 import functools
 import math
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
 
-from kineverse.errors import ShapeError, ValueRejectedError
-
-from .rigid import Array, inverse
+from kineverse.errors import InvalidValueError, ShapeError
+from kineverse.lie import Stack, inverse
 
 _RIGID = 1e-4
 # Beyond these a double has not enough digits for what is computed.
@@ -37,10 +38,10 @@ class Observations:
         (N, m, m) with m = 6, or m = 3 if only positions were seen.
     """
 
-    parent: Array
-    child: Array
-    parent_covariance: Array | None
-    child_covariance: Array
+    parent: Stack
+    child: Stack
+    parent_covariance: Stack | None
+    child_covariance: Stack
 
     def __len__(self) -> int:
         return len(self.child)
@@ -51,7 +52,7 @@ class Observations:
         return int(self.child_covariance.shape[-1])
 
     @cached_property
-    def relative(self) -> Array:
+    def relative(self) -> Stack:
         """parent_T_child as observed, (N, 4, 4)."""
         return inverse(self.parent) @ self.child
 
@@ -95,7 +96,7 @@ class Observations:
         return tuple(result)
 
 
-def observations(
+def check_observations(
     parent: npt.ArrayLike | None,
     child: npt.ArrayLike,
     parent_covariance: npt.ArrayLike | None,
@@ -109,7 +110,7 @@ def observations(
     ShapeError
         For arrays of other shapes than (N, 4, 4), or (N, 3) for positions of the child, and for numbers of
         poses that differ.
-    ValueRejectedError
+    InvalidValueError
         For fewer than two poses, NaN, matrices that are not rigid, and covariances that are not positive
         definite.
     """
@@ -120,7 +121,7 @@ def observations(
             f"The poses of the child are an array of shape (N, 4, 4), or (N, 3) for positions, not {b.shape}."
         )
     if len(b) < fewest:
-        raise ValueRejectedError(
+        raise InvalidValueError(
             f"There {'is one pose' if len(b) else 'are no poses'} of the child. How something moves takes "
             "at least two to see."
         )
@@ -155,12 +156,12 @@ def observations(
     return Observations(a, b, of_parent, covariances(given, len(b), rows, "child"))
 
 
-def check_rigid(poses: Array, part: str) -> None:
+def check_rigid(poses: Stack, part: str) -> None:
     """Look whether matrices (N, 4, 4) are rigid transforms.
 
     Raises
     ------
-    ValueRejectedError
+    InvalidValueError
         Naming the first that is not, and by how much.
     """
     _check_finite(poses.reshape(len(poses), -1), part)
@@ -172,18 +173,18 @@ def check_rigid(poses: Array, part: str) -> None:
     if len(wrong):
         k = int(wrong[0])
         how = "mirrors" if mirrored[k] else f"is off by {max(off[k], last[k]):.2g}"
-        raise ValueRejectedError(
+        raise InvalidValueError(
             f"Pose {k} of the {part} is no rigid transform: its matrix {how}. "
             "Quaternions have to be of unit length before they become matrices."
         )
 
 
-def covariances(given: npt.ArrayLike, count: int, rows: int, part: str) -> Array:
+def covariances(given: npt.ArrayLike, count: int, rows: int, part: str) -> Stack:
     """Return covariances (N, m, m) of one for all, or of one for each pose.
 
     Raises
     ------
-    ShapeError, ValueRejectedError
+    ShapeError, InvalidValueError
         If they are something else, or not symmetric and positive definite.
     """
     matrices = _numbers(given, f"The covariance of the {part}")
@@ -205,7 +206,7 @@ def _check_one_covariance(numbers: bytes, rows: int, part: str) -> None:
     _check_covariances(np.frombuffer(numbers).reshape(1, rows, rows), part)
 
 
-def _check_covariances(each: Array, part: str) -> None:
+def _check_covariances(each: Stack, part: str) -> None:
     _check_finite(each.reshape(len(each), -1), part, "Covariance")
     scale = np.sqrt(np.abs(np.einsum("nii->ni", each)))
     scale[scale == 0.0] = 1.0
@@ -216,19 +217,19 @@ def _check_covariances(each: Array, part: str) -> None:
     if len(wrong):
         k = int(wrong[0])
         how = "positive definite" if symmetric[k] else "symmetric"
-        raise ValueRejectedError(
+        raise InvalidValueError(
             f"The covariance of the {part} is not {how} (at pose {k}). "
             "kv.estimation.pose_covariance(position, orientation) makes one of standard deviations."
         )
     least = float(np.sqrt(np.linalg.eigvalsh(each)[:, 0].min(initial=math.inf)))
     if least < _SMALLEST:
-        raise ValueRejectedError(
+        raise InvalidValueError(
             f"The covariance of the {part} says that something is known to {least:.2g} (metres or radians). "
             f"Less than {_SMALLEST:.0g} is not told apart from what numbers lose."
         )
 
 
-def _numbers(given: npt.ArrayLike, what: str) -> Array:
+def _numbers(given: npt.ArrayLike, what: str) -> Stack:
     try:
         if np.iscomplexobj(given):
             raise TypeError
@@ -237,16 +238,144 @@ def _numbers(given: npt.ArrayLike, what: str) -> Array:
         raise ShapeError(f"{what} are no array of numbers.") from None
 
 
-def _check_finite(rows: Array, part: str, what: str = "Pose") -> None:
+def _check_finite(rows: Stack, part: str, what: str = "Pose") -> None:
     wrong = np.flatnonzero(~np.isfinite(rows).all(axis=1))
     if len(wrong):
-        raise ValueRejectedError(
+        raise InvalidValueError(
             f"{what} {int(wrong[0])} of the {part} is not finite. Leave out what was not seen."
         )
     wrong = np.flatnonzero(np.abs(rows).max(axis=1, initial=0.0) > _LARGEST)
     if len(wrong):
         most = float(np.abs(rows[wrong[0]]).max())
-        raise ValueRejectedError(
+        raise InvalidValueError(
             f"{what} {int(wrong[0])} of the {part} has a number of {most:.2g}. None is expected above "
             f"{_LARGEST:.0g}: lengths are in metres, angles in radians."
         )
+
+
+PosesLike: TypeAlias = "npt.ArrayLike | tuple[npt.ArrayLike, npt.ArrayLike]"
+"""Poses (N, 4, 4), or a pair of them and their covariance: (6, 6), or (N, 6, 6) with one for each pose. Where
+points are welcome, positions (N, 3) with (3, 3) or (N, 3, 3)."""
+
+
+@dataclass(frozen=True)
+class PoseTrack:
+    """The poses of one frame over time.
+
+    Attributes
+    ----------
+    poses
+        (N, 4, 4); of a point, with rotations that mean nothing.
+    covariances
+        (N, 6, 6), or (N, 3, 3) of a point; None if they are exact.
+    seen
+        When it was seen, (N,).
+    """
+
+    poses: Stack
+    covariances: Stack | None
+    seen: npt.NDArray[np.bool_]
+
+    @property
+    def is_point(self) -> bool:
+        """Whether only positions were seen."""
+        return self.covariances is not None and self.covariances.shape[-1] == 3
+
+
+def check_tracks(
+    observations: Mapping[str, PosesLike], noise: npt.ArrayLike | None, points: bool = False
+) -> dict[str, PoseTrack]:
+    """Return what was seen, checked.
+
+    Parameters
+    ----------
+    observations
+        By the name of the frame: poses, or pairs of poses and covariance. A pose that is NaN throughout was
+        not seen.
+    noise
+        The covariance of those that come with none.
+    points
+        Whether positions, (N, 3), do as well.
+
+    Raises
+    ------
+    ShapeError, InvalidValueError
+        For poses or covariances that are none, numbers of poses that differ, and a frame without covariance.
+    """
+    if not isinstance(observations, Mapping):
+        raise ShapeError("Observations are a mapping from names of frames to poses of shape (N, 4, 4).")
+    found = {name: _track(name, given, noise, points) for name, given in observations.items()}
+    counts = {name: len(track.poses) for name, track in found.items()}
+    if len(set(counts.values())) > 1:
+        listed = ", ".join(f"{count} of '{name}'" for name, count in counts.items())
+        raise ShapeError(
+            f"There are poses at different numbers of times: {listed}. Where something was not seen, its "
+            "pose is NaN."
+        )
+    return found
+
+
+def _track(name: str, given: Any, noise: npt.ArrayLike | None, points: bool) -> PoseTrack:
+    covariance = noise
+    if isinstance(given, tuple) and len(given) == 2:
+        given, covariance = given
+    try:
+        poses = np.array(given, dtype=np.float64)
+    except (TypeError, ValueError):
+        raise ShapeError(f"The poses of '{name}' are no array of numbers.") from None
+    is_point = points and poses.ndim == 2 and poses.shape[1] == 3
+    if is_point:
+        positions, poses = poses, np.tile(np.eye(4), (len(poses), 1, 1))
+        poses[:, :3, 3] = positions
+        poses[np.isnan(positions).all(axis=1)] = np.nan
+    if poses.ndim != 3 or poses.shape[1:] != (4, 4):
+        also = ", or (N, 3) of a point" if points else ""
+        raise ShapeError(f"The poses of '{name}' are an array of shape (N, 4, 4){also}, not {poses.shape}.")
+    if covariance is None:
+        raise InvalidValueError(
+            f"How well '{name}' is seen is not known, and without that nothing can be judged: give a pair of "
+            "poses and their covariance, or noise=kv.estimation.pose_covariance(position, orientation)."
+        )
+    rows = 3 if is_point else 6
+    if not len(poses):
+        return PoseTrack(poses, np.zeros((0, rows, rows)), np.zeros(0, dtype=bool))
+    seen: npt.NDArray[np.bool_] = np.logical_not(np.isnan(poses).all(axis=(1, 2)))
+    poses[~seen] = np.eye(4)
+    check_rigid(poses, f"frame '{name}'")
+    spread = np.array(covariance, dtype=np.float64)
+    if is_point and spread.shape[-2:] == (6, 6):
+        spread = spread[..., :3, :3]
+    if spread.ndim == 3 and len(spread) == len(seen):
+        spread[~seen] = np.eye(spread.shape[-1])
+    return PoseTrack(poses, covariances(spread, len(poses), rows, f"frame '{name}'"), seen)
+
+
+def exact_track(count: int) -> PoseTrack:
+    """Return the track of the frame in which everything was seen."""
+    return PoseTrack(np.tile(np.eye(4), (count, 1, 1)), None, np.ones(count, dtype=bool))
+
+
+def pair_tracks(parent: PoseTrack, child: PoseTrack, rows: npt.NDArray[Any]) -> Observations:
+    """Return the poses of two frames at some times."""
+    return Observations(
+        parent.poses[rows],
+        child.poses[rows],
+        None if parent.covariances is None else parent.covariances[rows],
+        _given(child)[rows],
+    )
+
+
+def _given(track: PoseTrack) -> Stack:
+    assert track.covariances is not None  # only the observer is exact, and it is no child
+    return track.covariances
+
+
+def concatenate_tracks(parts: Sequence[PoseTrack]) -> PoseTrack:
+    """Return tracks one after the other."""
+    return PoseTrack(
+        np.concatenate([part.poses for part in parts]),
+        None
+        if parts[0].covariances is None
+        else np.concatenate([part.covariances for part in parts if part.covariances is not None]),
+        np.concatenate([part.seen for part in parts]),
+    )

@@ -1,14 +1,15 @@
-"""The state of a model that is known, from noisy observations."""
+"""State estimation of a known model from noisy measurements."""
+
+from kineverse.estimation.robust import Outliers
 
 from .estimate import Estimate
-from .hypotheses import Hypotheses
-from .observed import ObservedExpression, ObservedPose, ObservedPosition
-from .outliers import Outliers
+from .measurements import ObservedExpression, ObservedPose, ObservedPosition
+from .model_bank import HypothesisBank
 from .tracker import Tracker
 
 __all__ = [
     "Estimate",
-    "Hypotheses",
+    "HypothesisBank",
     "ObservedExpression",
     "ObservedPose",
     "ObservedPosition",

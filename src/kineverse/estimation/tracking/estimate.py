@@ -1,4 +1,4 @@
-"""What a tracker says after a step."""
+"""Estimated state, its covariance and confidence."""
 
 from __future__ import annotations
 
@@ -8,14 +8,13 @@ from types import MappingProxyType
 
 import numpy as np
 
-from kineverse.estimation.noise import Array
+from kineverse.lie import Array
 from kineverse.state import State
 from kineverse.symbols import Symbol
 
-from .belief import inverse
-from .filtering import Filter
-from .modes import Modes
-from .outcome import Outcome
+from .gaussian import inverse_spd
+from .gaussian_sum import GaussianSum
+from .step import StepResult, UpdateStep
 
 
 class Estimate:
@@ -38,7 +37,7 @@ class Estimate:
     """
 
     def __init__(
-        self, outcome: Outcome, modes: Modes, filter_: Filter, known: Array, stamp: float | None
+        self, outcome: StepResult, modes: GaussianSum, filter_: UpdateStep, known: Array, stamp: float | None
     ) -> None:
         self._modes, self._belief = modes, modes.best
         self._outcome, self._filter, self._layout, self._known = outcome, filter_, filter_.layout, known
@@ -67,7 +66,7 @@ class Estimate:
         for number, group in enumerate(self._layout.groups):
             if self._belief.standing[number] is not None:
                 block = np.ix_(group.t, group.t)
-                found[block] = inverse(self.covariance[block])
+                found[block] = inverse_spd(self.covariance[block])
         return found
 
     @cached_property
@@ -84,7 +83,7 @@ class Estimate:
         found = np.zeros_like(self._belief.vector)
         for group in self._layout.groups:
             information = self._belief.information[np.ix_(group.t, group.t)]
-            found[group.t] = inverse(information) @ self._belief.vector[group.t]
+            found[group.t] = inverse_spd(information) @ self._belief.vector[group.t]
         return found
 
     @cached_property

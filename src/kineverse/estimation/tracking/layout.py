@@ -1,4 +1,4 @@
-"""Where the numbers of a tracker are: coordinates, tangent, groups, and what one evaluation gives."""
+"""Layout of coordinates, tangent directions and independent groups."""
 
 from __future__ import annotations
 
@@ -10,18 +10,18 @@ from itertools import accumulate, pairwise
 import numpy as np
 
 from kineverse.compile import CompiledFunction, compile  # noqa: A004
-from kineverse.errors import ValueRejectedError
+from kineverse.errors import InvalidValueError
 from kineverse.expressions.expression import Expression, array, as_expression
 from kineverse.model.constraint import Constraint
 from kineverse.symbols import Symbol
 
-from .belief import Indices
-from .chart import Chart, connected
-from .observed import Observation
+from .gaussian import TangentIndices
+from .measurements import MeasurementModel
+from .tangent import TangentSpace, connected_components
 
 
 @dataclass(frozen=True, eq=False)
-class Group:
+class CoordinateGroup:
     """Coordinates that share observations or limits, and nothing with others.
 
     Attributes
@@ -40,14 +40,14 @@ class Group:
 
     coordinates: tuple[Symbol, ...]
     tangent: tuple[Symbol, ...]
-    x: Indices
-    t: Indices
+    x: TangentIndices
+    t: TangentIndices
     seen: tuple[int, ...]
     limits: tuple[int, ...]
-    driven: Indices
+    driven: TangentIndices
 
     @property
-    def own(self) -> Indices:
+    def own(self) -> TangentIndices:
         """Which of its coordinates each direction of its tangent is; -1 if none."""
         speeds = [x.derivative() for x in self.coordinates]
         driven = set(self.driven.tolist())
@@ -82,11 +82,11 @@ class Layout:
         In the order of their first observation.
     """
 
-    chart: Chart
-    observations: tuple[Observation, ...]
+    chart: TangentSpace
+    observations: tuple[MeasurementModel, ...]
     limits: tuple[Constraint, ...]
     known: tuple[Symbol, ...]
-    groups: tuple[Group, ...]
+    groups: tuple[CoordinateGroup, ...]
 
     @cached_property
     def group_of(self) -> tuple[int, ...]:
@@ -117,12 +117,12 @@ class Layout:
     @cached_property
     def seen_slices(self) -> tuple[slice, ...]:
         """Where each observation is in a reading: 4×4 row by row, or a vector."""
-        return _one_after_the_other(16 if one.is_pose else one.size for one in self.observations)
+        return _consecutive_slices(16 if one.is_pose else one.size for one in self.observations)
 
     @cached_property
     def white_slices(self) -> tuple[slice, ...]:
         """Where what whitens each observation is in a reading."""
-        return _one_after_the_other(one.size**2 for one in self.observations)
+        return _consecutive_slices(one.size**2 for one in self.observations)
 
     @cached_property
     def _slices(self) -> tuple[tuple[slice, ...], tuple[slice, ...], tuple[slice, ...]]:
@@ -145,7 +145,10 @@ class Layout:
         parts: list[Expression] = []
         for one, number in zip(self.observations, self.group_of, strict=True):
             value = self.chart.plain(one.value)
-            parts += [_flat(value) if one.is_pose else value, self._slope(one, value, self.groups[number])]
+            parts += [
+                _flatten_pose(value) if one.is_pose else value,
+                self._slope(one, value, self.groups[number]),
+            ]
         for number, limit in enumerate(self.limits):
             group = next(g for g in self.groups if number in g.limits)
             slopes = self.chart.gradient(limit.expression)
@@ -153,7 +156,7 @@ class Layout:
             parts.append(array([limit.expression, limit.lower, limit.upper, *columns]))
         return compile(np.concatenate(parts), self.inputs)
 
-    def _slope(self, one: Observation, value: Expression, group: Group) -> Expression:
+    def _slope(self, one: MeasurementModel, value: Expression, group: CoordinateGroup) -> Expression:
         """Return the derivatives of a value, one column after the other in each row, flat.
 
         Those of a pose are the geometric Jacobian: velocity of the origin and angular velocity.
@@ -172,18 +175,18 @@ class Layout:
         return array(columns).T.reshape(-1)
 
 
-def _one_after_the_other(sizes: Iterable[int]) -> tuple[slice, ...]:
+def _consecutive_slices(sizes: Iterable[int]) -> tuple[slice, ...]:
     ends = [0, *accumulate(sizes)]
     return tuple(slice(a, b) for a, b in pairwise(ends))
 
 
-def _flat(pose: Expression) -> Expression:
+def _flatten_pose(pose: Expression) -> Expression:
     return array([*pose[:3, :3].reshape(9), *pose[:3, 3]])
 
 
-def layout_of(
-    chart: Chart,
-    observations: tuple[Observation, ...],
+def build_layout(
+    chart: TangentSpace,
+    observations: tuple[MeasurementModel, ...],
     limits: tuple[Constraint, ...],
     known: Sequence[Symbol],
 ) -> Layout:
@@ -191,7 +194,7 @@ def layout_of(
 
     Raises
     ------
-    ValueRejectedError
+    InvalidValueError
         If an observation depends on nothing that could be estimated.
     """
     speeds = {x: frozenset(chart.row(x)) for x in chart.coordinates}
@@ -199,7 +202,7 @@ def layout_of(
     for one in observations:
         symbols = [s for s in chart.plain(one.value).symbols if s in speeds]
         if not symbols:
-            raise ValueRejectedError(
+            raise InvalidValueError(
                 f"'{one.label}' does not move with any coordinate that is estimated: nothing can be learnt "
                 "from observing it."
             )
@@ -214,12 +217,12 @@ def layout_of(
         if x in chart.rates
     ]
     groups = []
-    for union in connected([*watched, *limited, *rated]):
+    for union in connected_components([*watched, *limited, *rated]):
         tangent = tuple(v for v in chart.tangent if v in union)
         coordinates = tuple(x for x in chart.coordinates if speeds[x] & union)
         own = {x.derivative() for x in coordinates if x not in chart.by_speeds}
         groups.append(
-            Group(
+            CoordinateGroup(
                 coordinates,
                 tangent,
                 np.array([chart.coordinates.index(x) for x in coordinates]),

@@ -1,4 +1,4 @@
-"""A tracker: where things are, from noisy observations of what a model says about them."""
+"""Recursive state estimation of a model from noisy measurements."""
 
 from __future__ import annotations
 
@@ -10,27 +10,61 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
-from kineverse.errors import UnknownNameError, ValueRejectedError, suggest
-from kineverse.estimation.noise import Array
-from kineverse.state import State
+from kineverse.errors import InvalidValueError, UnknownNameError, suggest
+from kineverse.estimation.robust import Outliers, as_outliers
+from kineverse.lie import Array
+from kineverse.model.rate_nodes import to_plain
+from kineverse.state import State, StateLike
 from kineverse.symbols import Symbol
 
-from .arrangement import arranged
-from .belief import Belief
+from .bindings import native_library
+from .bounds import SpeedLocks, StateBounds, collect_bounds, initial_deviations, initial_point
 from .estimate import Estimate
-from .filtering import Filter
-from .limits import first_deviations, first_place
-from .locks import Locks
-from .modes import Modes
-from .native import native_library
-from .observed import ObservedLike, checked_number, checked_positive, observations
-from .outcome import Outcome
-from .outliers import Outliers, as_outliers
-from .reading import Reading
-from .starts import starts, turning
+from .gaussian import InformationState
+from .gaussian_sum import GaussianSum
+from .layout import Layout, build_layout
+from .measurements import (
+    MeasurementModel,
+    ObservedLike,
+    build_measurement_models,
+    require_number,
+    require_positive,
+)
+from .multi_start import find_periodic_coordinates, spread_starts
+from .residuals import Measurements
+from .step import StepResult, UpdateStep
+from .tangent import build_tangent_space
 
 if TYPE_CHECKING:
-    from kineverse.model.view import ModelView
+    from kineverse.model.model_view import ModelView
+
+
+def arrange_state(
+    model: ModelView, seen: tuple[MeasurementModel, ...], handed: frozenset[Symbol]
+) -> tuple[Layout, StateBounds]:
+    """Return what is estimated, and the limits of that.
+
+    Parameters
+    ----------
+    model, seen
+        What is tracked, and what is observed of it.
+    handed
+        The coordinates that are measured elsewhere.
+
+    Raises
+    ------
+    InvalidValueError
+        If an observation depends on nothing that could be estimated.
+    """
+    rates = model.rates
+    values = [rates.resolve(to_plain(one.value)) for one in seen]
+    chart = build_tangent_space(rates, values, handed, model.default_state())
+    limits = collect_bounds(model, chart, handed)
+    looked_at = {s for value in values for s in value.symbols}
+    looked_at |= {s for c in limits.curved for s in c.symbols}
+    looked_at |= {s for x in chart.coordinates if x in rates for e in rates[x].values() for s in e.symbols}
+    inputs = sorted(looked_at - set(chart.coordinates), key=lambda s: s.sort_key)
+    return build_layout(chart, seen, limits.curved, inputs), limits
 
 
 class Tracker:
@@ -66,27 +100,27 @@ class Tracker:
         model: ModelView,
         observed: Iterable[ObservedLike],
         *,
-        start: Mapping[Any, float] | None = None,
-        uncertainty: Mapping[Any, float] | None = None,
-        process_noise: Mapping[Any, float] | None = None,
+        start: StateLike | None = None,
+        uncertainty: StateLike | None = None,
+        process_noise: StateLike | None = None,
         outliers: Outliers | bool | None = None,
         locks: bool = False,
         known: Symbol | str | Iterable[Symbol | str] = (),
     ) -> None:
         known = (known,) if isinstance(known, str | Symbol) else known
         handed = frozenset(k if isinstance(k, Symbol) else model.symbol(k) for k in known)
-        layout, limits = arranged(model, observations(model, observed), handed)
+        layout, limits = arrange_state(model, build_measurement_models(model, observed), handed)
         self._layout = layout
-        self._filter = Filter(layout, limits, as_outliers(outliers))
+        self._filter = UpdateStep(layout, limits, as_outliers(outliers))
         charted = self._filter.charted
-        self._noise = {charted.speed(k): checked_positive(k, v) for k, v in (process_noise or {}).items()}
+        self._noise = {charted.speed(k): require_positive(k, v) for k, v in (process_noise or {}).items()}
         self._known = np.array([np.nan if s.value is None else s.value for s in layout.known])
-        self._locks = Locks(model, layout, charted) if locks else None
+        self._locks = SpeedLocks(model, layout, charted) if locks else None
         self._stamp: float | None = getattr(start, "stamp", None)
         self._modes = self._first(model, start or {}, uncertainty or {})
-        self._outcome = Outcome(self._modes, 0.0, 0, (), 0)
+        self._outcome = StepResult(self._modes, 0.0, 0, (), 0)
 
-    def _first(self, model: ModelView, start: Mapping[Any, float], uncertainty: Mapping[Any, float]) -> Modes:
+    def _first(self, model: ModelView, start: StateLike, uncertainty: StateLike) -> GaussianSum:
         layout, chart = self._layout, self._layout.chart
         filter_ = self._filter
         state = start if isinstance(start, State) else State(start)
@@ -97,23 +131,23 @@ class Tracker:
             raise UnknownNameError(f"'{strange[0]}' is not estimated. {hint}")
         for key, value in given.items():
             if not math.isfinite(value):
-                raise ValueRejectedError(f"start= of '{key}' is {value!r}; it must be finite.")
-        x = first_place(model, chart, filter_.limits, given)
+                raise InvalidValueError(f"start= of '{key}' is {value!r}; it must be finite.")
+        x = initial_point(model, chart, filter_.limits, given)
         known = np.nan_to_num(self._known)
-        filter_.turns = turning(filter_, x, known)
-        deviations = first_deviations(chart, filter_.limits, filter_.turns)
+        filter_.turns = find_periodic_coordinates(filter_, x, known)
+        deviations = initial_deviations(chart, filter_.limits, filter_.turns)
         names = {str(v): i for i, v in enumerate(chart.tangent)}
         own = [v for v in chart.tangent if v.position in chart.coordinates]
         names.update({str(v.position): chart.tangent.index(v) for v in own})
         for key, value in uncertainty.items():
             if str(key) not in names:
                 raise UnknownNameError(f"'{key}' is not estimated. {suggest(str(key), names, 'coordinate')}")
-            deviations[names[str(key)]] = checked_positive(key, value)
+            deviations[names[str(key)]] = require_positive(key, value)
         filter_.openness.deviations = deviations
-        belief = Belief((len(x), len(deviations), len(layout.groups)))
+        belief = InformationState((len(x), len(deviations), len(layout.groups)))
         belief.x[:] = x
         belief.information[:] = np.diag(deviations**-2.0)
-        return starts(filter_, belief, known)
+        return spread_starts(filter_, belief, known)
 
     # -- what it is about ----------------------------------------------------------------------------------
 
@@ -164,7 +198,7 @@ class Tracker:
     # -- steps ---------------------------------------------------------------------------------------------
 
     def predict(
-        self, dt: float, commands: Mapping[Any, float] | None = None, given: Mapping[Any, float] | None = None
+        self, dt: float, commands: StateLike | None = None, given: StateLike | None = None
     ) -> Estimate:
         """Move on in time, at commanded speeds and with the process noise.
 
@@ -179,32 +213,34 @@ class Tracker:
 
         Raises
         ------
-        ValueRejectedError
+        InvalidValueError
             If time goes backwards or a number is not finite.
         UnknownNameError
             For a speed that moves nothing here.
         """
-        dt = checked_number(dt, "The length of a step")
+        dt = require_number(dt, "The length of a step")
         if not (math.isfinite(dt) and dt >= 0):
-            raise ValueRejectedError(
+            raise InvalidValueError(
                 f"Time goes on: a step of {dt!r} s is none. Steps are finite and not negative."
             )
         speeds = {}
         for key, value in (commands or {}).items():
-            speed = checked_number(value, f"The commanded speed '{key}'")
+            speed = require_number(value, f"The commanded speed '{key}'")
             if not math.isfinite(speed):
-                raise ValueRejectedError(f"The commanded speed '{key}' is {value!r}; it must be finite.")
+                raise InvalidValueError(f"The commanded speed '{key}' is {value!r}; it must be finite.")
             speeds[self._filter.charted.speed(key)] = speed
         self._known, self._modes = self._predicted(dt, speeds, self._values_of_known(given))
         if self._stamp is not None:
             self._stamp += dt
         return self.estimate
 
-    def _predicted(self, dt: float, speeds: Mapping[Symbol, float], known: Array) -> tuple[Array, Modes]:
+    def _predicted(
+        self, dt: float, speeds: Mapping[Symbol, float], known: Array
+    ) -> tuple[Array, GaussianSum]:
         if not speeds and not self._noise:
             return known, self._modes
 
-        def moved(belief: Belief) -> Belief:
+        def moved(belief: InformationState) -> InformationState:
             free = self._locks.free(belief, known) if self._locks else None
             moving, noise = (_only(values, free) for values in (speeds, self._noise))
             return self._filter.predict(belief, known, dt, moving, noise)
@@ -216,8 +252,8 @@ class Tracker:
         seen: Mapping[str, Any],
         *,
         at: float | None = None,
-        commands: Mapping[Any, float] | None = None,
-        given: Mapping[Any, float] | None = None,
+        commands: StateLike | None = None,
+        given: StateLike | None = None,
     ) -> Estimate:
         """Take in what was seen.
 
@@ -235,7 +271,7 @@ class Tracker:
 
         Raises
         ------
-        UnknownNameError, ShapeError, ValueRejectedError
+        UnknownNameError, ShapeError, InvalidValueError
             For what was not seen right, naming it, or if time goes backwards. The belief stays as it was.
         """
         return self._take(self._filter.reader.read(seen), at, commands, given)
@@ -246,8 +282,8 @@ class Tracker:
         seen: npt.ArrayLike | None = None,
         *,
         at: float | None = None,
-        commands: Mapping[Any, float] | None = None,
-        given: Mapping[Any, float] | None = None,
+        commands: StateLike | None = None,
+        given: StateLike | None = None,
     ) -> Estimate:
         """Take in poses as an array (m, 4, 4), in the order of what is observed; see :meth:`update`.
 
@@ -279,10 +315,10 @@ class Tracker:
 
     def _take(
         self,
-        reading: Reading,
+        reading: Measurements,
         at: float | None,
-        commands: Mapping[Any, float] | None,
-        given: Mapping[Any, float] | None,
+        commands: StateLike | None,
+        given: StateLike | None,
     ) -> Estimate:
         native = self._filter.native
         if native is None or not native.are_rigid(reading):
@@ -302,23 +338,23 @@ class Tracker:
         self._modes, self._outcome = outcome.modes, outcome
         return self.estimate
 
-    def _advance(self, at: float | None, commands: Mapping[Any, float] | None) -> None:
+    def _advance(self, at: float | None, commands: StateLike | None) -> None:
         if at is None:
             if commands:
-                raise ValueRejectedError("Commands need the time they lasted: give at=, or call predict.")
+                raise InvalidValueError("Commands need the time they lasted: give at=, or call predict.")
             return
-        at = checked_number(at, "The time of an observation")
+        at = require_number(at, "The time of an observation")
         if not math.isfinite(at):
-            raise ValueRejectedError(f"The time of an observation is a finite number of seconds, not {at!r}.")
+            raise InvalidValueError(f"The time of an observation is a finite number of seconds, not {at!r}.")
         if self._stamp is not None:
             if at < self._stamp:
-                raise ValueRejectedError(
+                raise InvalidValueError(
                     f"Time goes backwards: an observation at {at:g} s after one at {self._stamp:g} s."
                 )
             self.predict(at - self._stamp, commands, None)
         self._stamp = at
 
-    def _values_of_known(self, given: Mapping[Any, float] | None) -> Array:
+    def _values_of_known(self, given: StateLike | None) -> Array:
         known = self._layout.known
         values = self._known.copy()
         if given is not None:
@@ -331,7 +367,7 @@ class Tracker:
                     raise UnknownNameError(f"'{key}' is not known=. {suggest(str(key), names, 'symbol')}")
         missing = [str(s) for s, v in zip(known, values.tolist(), strict=True) if not math.isfinite(v)]
         if missing and (given is not None or known):
-            raise ValueRejectedError(f"There is no finite value of '{missing[0]}'; hand it in as given=.")
+            raise InvalidValueError(f"There is no finite value of '{missing[0]}'; hand it in as given=.")
         return values
 
     def __repr__(self) -> str:

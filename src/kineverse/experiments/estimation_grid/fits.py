@@ -16,10 +16,10 @@ import numpy.typing as npt
 
 from kineverse.errors import KineverseError
 from kineverse.estimation import identify, pose_covariance
-from kineverse.estimation.identification.fit import Fit
-from kineverse.experiments.estimation_grid.bound import Bound, attainable, bound
-from kineverse.experiments.estimation_grid.results import Result
-from kineverse.experiments.estimation_grid.samples import Cell, Joint, Samples, draw
+from kineverse.estimation.identification.result import Fit
+from kineverse.experiments.estimation_grid.cramer_rao import Bound, compute_attainable_bound, compute_bound
+from kineverse.experiments.estimation_grid.results import CellResult
+from kineverse.experiments.estimation_grid.samples import Cell, Joint, JointSamples, draw_samples
 from kineverse.experiments.registry import Progress
 
 Array = npt.NDArray[np.float64]
@@ -36,7 +36,7 @@ RANGES: dict[Joint, tuple[float, ...]] = {
 }
 
 
-def grid() -> list[Cell]:
+def make_grid() -> list[Cell]:
     """Return all cells."""
     return [
         Cell(joint, position, orientation, count, reach)
@@ -45,7 +45,7 @@ def grid() -> list[Cell]:
     ]
 
 
-def quick_grid() -> list[Cell]:
+def make_quick_grid() -> list[Cell]:
     """Return a few cells from all over the grid."""
     return [
         Cell(joint, position, orientation, count, reach)
@@ -57,7 +57,7 @@ def quick_grid() -> list[Cell]:
 
 def fit_all(
     cells: Sequence[Cell], samples: int, progress: Progress, workers: int | None = None
-) -> list[Result]:
+) -> list[CellResult]:
     """Return what came out of cells, in their order.
 
     Parameters
@@ -78,19 +78,19 @@ def fit_all(
     # all end at about the same time.
     order = sorted(range(len(cells)), key=lambda k: -cells[k].count)
     with _workers(workers) as pool:
-        jobs: list[tuple[int, Future[Result]]] = [
+        jobs: list[tuple[int, Future[CellResult]]] = [
             (k, pool.submit(fit_cell, cells[k], samples)) for k in order
         ]
         done = {k: job.result() for k, job in progress(jobs, "estimation-grid", "cell")}
     return [done[k] for k in range(len(cells))]
 
 
-def fit_cell(cell: Cell, count: int) -> Result:
+def fit_cell(cell: Cell, count: int) -> CellResult:
     """Fit so many samples of a cell; the same ones each time."""
-    samples = draw(cell, count, np.random.default_rng(_seed(cell)))
-    limit, reach = bound(samples), attainable(samples)
+    samples = draw_samples(cell, count, np.random.default_rng(_seed(cell)))
+    limit, reach = compute_bound(samples), compute_attainable_bound(samples)
     fits = [_fit(samples, k) for k in range(count)]
-    return Result(
+    return CellResult(
         cell=cell,
         degrees=np.array([_degrees(fit, samples.axis[k]) for k, (fit, _, _) in enumerate(fits)]),
         metres=np.array([_metres(fit, samples, k) for k, (fit, _, _) in enumerate(fits)]),
@@ -105,7 +105,7 @@ def fit_cell(cell: Cell, count: int) -> Result:
     )
 
 
-def _fit(samples: Samples, k: int) -> tuple[Fit | None, str, bool]:
+def _fit(samples: JointSamples, k: int) -> tuple[Fit | None, str, bool]:
     """Return the fit of the true family if there is one, the most probable family, and if that is told."""
     cell = samples.cell
     covariance = pose_covariance(cell.position, cell.orientation)
@@ -113,10 +113,10 @@ def _fit(samples: Samples, k: int) -> tuple[Fit | None, str, bool]:
         found = identify(
             samples.seen_parents[k],
             samples.seen_children[k],
-            covariance_a=covariance,
-            covariance_b=covariance,
+            parent_covariance=covariance,
+            child_covariance=covariance,
         )
-        return found[cell.joint], found.best.family, not found.cannot_tell
+        return found[cell.joint], found.best.family, not found.is_ambiguous
     except KineverseError as error:
         return None, f"refused: {error}", False
 
@@ -129,7 +129,7 @@ def _degrees(fit: Fit | None, axis: Array) -> float:
     return math.degrees(math.atan2(float(np.linalg.norm(np.cross(axis, found))), abs(float(axis @ found))))
 
 
-def _metres(fit: Fit | None, samples: Samples, k: int) -> float:
+def _metres(fit: Fit | None, samples: JointSamples, k: int) -> float:
     """Return how far the axis found is off the true one in the plane across it, at the middle of the way."""
     if fit is None or samples.cell.joint == "prismatic":
         return math.nan

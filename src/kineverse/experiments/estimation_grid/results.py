@@ -25,7 +25,7 @@ FAR_OFF = 6.0
 
 
 @dataclass(frozen=True, eq=False)
-class Result:
+class CellResult:
     """What became of the samples of a cell.
 
     Attributes
@@ -36,9 +36,9 @@ class Result:
         How far the axis found is off in direction and place, (S,); NaN where there is none, as the place of a
         slider.
     bound_degrees, bound_metres
-        The Cramér-Rao bounds of these, (S,), see :func:`.bound.bound`.
+        The Cramér-Rao bounds of these, (S,), see :func:`.cramer_rao.compute_bound`.
     attainable_degrees, attainable_metres
-        What can be attained at best, (S,), see :func:`.bound.attainable`.
+        What can be attained at best, (S,), see :func:`.cramer_rao.compute_attainable_bound`.
     spread
         The relative variance of the sum of squares of ``degrees`` by chance, at what can be attained.
     right
@@ -97,7 +97,7 @@ class Result:
 
 
 @dataclass(frozen=True)
-class Ratios:
+class ErrorRatios:
     """Errors over a bound, in the cells where that is near.
 
     Attributes
@@ -120,7 +120,7 @@ class Ratios:
 
 
 @dataclass(frozen=True)
-class Summary:
+class GridSummary:
     """Several cells together.
 
     Attributes
@@ -145,8 +145,8 @@ class Summary:
 
     cells: int
     fits: int
-    bound: Ratios
-    attainable: Ratios
+    bound: ErrorRatios
+    attainable: ErrorRatios
     over_by_chance: float
     right: float
     right_attainable: float
@@ -155,18 +155,18 @@ class Summary:
     diverged: int
 
 
-def summarise(results: Sequence[Result]) -> Summary:
+def summarize_cells(results: Sequence[CellResult]) -> GridSummary:
     """Return several cells together."""
     telling = [r for r in results if r.bound < TELLING]
-    return Summary(
+    return GridSummary(
         cells=len(results),
         fits=sum(len(r.degrees) for r in results),
         bound=_ratios([(r, r.bound_degrees, r.bound_metres) for r in results]),
         attainable=_ratios([(r, r.attainable_degrees, r.attainable_metres) for r in results]),
         over_by_chance=sum(r.by_chance for r in results if r.attainable < NEAR),
-        right=_part([r.right for r in telling]),
-        right_attainable=_part([r.right for r in results if r.attainable < TELLING]),
-        told=_part([r.told for r in telling]),
+        right=_fraction([r.right for r in telling]),
+        right_attainable=_fraction([r.right for r in results if r.attainable < TELLING]),
+        told=_fraction([r.told for r in telling]),
         told_wrong=sum(int((r.told & ~r.right).sum()) for r in results),
         diverged=sum(r.diverged for r in results),
     )
@@ -177,12 +177,12 @@ def rms(values: Array) -> float:
     return float(np.sqrt(np.mean(values**2)))
 
 
-def _ratios(results: Sequence[tuple[Result, Array, Array]]) -> Ratios:
+def _ratios(results: Sequence[tuple[CellResult, Array, Array]]) -> ErrorRatios:
     near = [entry for entry in results if rms(entry[1]) < NEAR]
     cells = [rms(result.degrees) / rms(degrees) for result, degrees, _ in near]
     directions = [result.degrees / degrees for result, degrees, _ in near]
     places = [result.metres / metres for result, _, metres in near if result.cell.joint == "revolute"]
-    return Ratios(
+    return ErrorRatios(
         near=len(near),
         direction=rms(np.concatenate(directions)) if directions else math.nan,
         place=rms(np.concatenate(places)) if places else math.nan,
@@ -191,5 +191,5 @@ def _ratios(results: Sequence[tuple[Result, Array, Array]]) -> Ratios:
     )
 
 
-def _part(flags: Sequence[Flags]) -> float:
+def _fraction(flags: Sequence[Flags]) -> float:
     return float(np.concatenate(flags).mean()) if flags else math.nan

@@ -7,19 +7,16 @@ whether its covariance is true.
 
 from __future__ import annotations
 
-from kineverse.experiments.options import Options
-from kineverse.experiments.registry import Progress
+from kineverse.experiments.registry import Options, Progress
 from kineverse.experiments.report import Figure, Report
 from kineverse.formats import load
 
 from .accuracy import measure_errors, measure_variants
 from .consistency import measure_consistency
-from .durations import durations, durations_by_size
 from .mechanisms import measure_mechanisms
-from .picture import SIZE, draw
-from .protocol import CONFIGURATIONS, LEVELS, scene_of
-from .results import Results
-from .tables import tables
+from .protocol import CONFIGURATIONS, LEVELS, make_observed_model
+from .report import FIGURE_SIZE, Fig4Results, draw_results, make_tables
+from .timing import time_updates, time_updates_by_size
 
 OPTIONS = ("quick", "model")
 
@@ -33,20 +30,20 @@ def run(progress: Progress, options: Options) -> Report:
     With ``quick`` one seed instead of four, and a tenth of the configurations.
     """
     model = options.model or "kitchen"
-    scene = scene_of(load(model))
+    scene = make_observed_model(load(model))
     seeds = range(1) if options.quick else range(4)
     configurations = CONFIGURATIONS // 10 if options.quick else CONFIGURATIONS
     timed = max(1, TIMED // 10) if options.quick else TIMED
-    results = Results(
+    results = Fig4Results(
         model=model,
         scene=scene,
         seeds=tuple(seeds),
         configurations=configurations,
         errors=measure_errors(scene, seeds, configurations, progress),
         variants=measure_variants(scene, seeds, configurations, progress),
-        by_size=durations_by_size(scene, timed, progress),
+        by_size=time_updates_by_size(scene, timed, progress),
         by_noise=[
-            (noise, durations(scene, noise, timed)) for noise in progress(LEVELS, "fig4: time", "level")
+            (noise, time_updates(scene, noise, timed)) for noise in progress(LEVELS, "fig4: time", "level")
         ],
         consistency=measure_consistency(scene, seeds, configurations, progress),
         mechanisms=measure_mechanisms(configurations // 3, progress),
@@ -54,7 +51,7 @@ def run(progress: Progress, options: Options) -> Report:
     return Report(
         name="fig4",
         title=f"Tracking {len(scene.symbols)} degrees of freedom of '{model}' (2022 paper, Fig. 4)",
-        tables=tables(results),
+        tables=make_tables(results),
         numbers=results.numbers(),
-        figure=Figure(lambda canvas: draw(canvas, results), SIZE),
+        figure=Figure(lambda canvas: draw_results(canvas, results), FIGURE_SIZE),
     )

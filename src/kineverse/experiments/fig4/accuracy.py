@@ -16,11 +16,12 @@ from .protocol import (
     TRAINING,
     Array,
     Directions,
-    Noise,
-    Scene,
-    published_noise,
+    ObservedModel,
+    PoseNoise,
+    add_published_noise,
+    run_proper,
+    run_published,
 )
-from .runs import run_proper, run_published
 
 FILTERS = ("published", "proper")
 """The papers' own, and :class:`kineverse.estimation.Tracker`."""
@@ -45,7 +46,7 @@ class Errors:
         By filter, the mean over all states of (q̂ - q)²/σ²; 1 is right.
     """
 
-    noise: Noise
+    noise: PoseNoise
     by_filter: dict[str, Array]
     nees: dict[str, float]
 
@@ -85,13 +86,15 @@ VARIANTS = (
 
 
 def measure_errors(
-    scene: Scene, seeds: Sequence[int], configurations: int, progress: Progress
+    scene: ObservedModel, seeds: Sequence[int], configurations: int, progress: Progress
 ) -> tuple[Errors, ...]:
     """Return the errors of both filters on the same observations, at the papers' levels."""
     jobs = [(noise, seed) for noise in LEVELS for seed in seeds]
-    found: dict[Noise, dict[str, list[tuple[Array, Array]]]] = {n: {w: [] for w in FILTERS} for n in LEVELS}
+    found: dict[PoseNoise, dict[str, list[tuple[Array, Array]]]] = {
+        n: {w: [] for w in FILTERS} for n in LEVELS
+    }
     for noise, seed in progress(jobs, "fig4: errors", "run"):
-        truth, seen, training = observed(scene, noise, seed, configurations)
+        truth, seen, training = simulate_observations(scene, noise, seed, configurations)
         for who, run in (
             ("published", run_published(scene, seen, training)),
             ("proper", run_proper(scene, seen, noise.on_axes)),
@@ -109,7 +112,7 @@ def measure_errors(
 
 
 def measure_variants(
-    scene: Scene, seeds: Sequence[int], configurations: int, progress: Progress
+    scene: ObservedModel, seeds: Sequence[int], configurations: int, progress: Progress
 ) -> dict[str, list[float]]:
     """Return the mean error of each variant at the papers' levels."""
     found = {}
@@ -118,7 +121,9 @@ def measure_variants(
         for noise in LEVELS:
             errors = []
             for seed in seeds:
-                truth, seen, training = observed(scene, noise, seed, configurations, variant.directions)
+                truth, seen, training = simulate_observations(
+                    scene, noise, seed, configurations, variant.directions
+                )
                 run = run_published(scene, seen, training, variant.steps, variant.spread)
                 errors.append(np.abs(run.q - truth).mean())
             means.append(float(np.mean(errors)))
@@ -126,14 +131,18 @@ def measure_variants(
     return found
 
 
-def observed(
-    scene: Scene, noise: Noise, seed: int, configurations: int, directions: Directions = "published"
+def simulate_observations(
+    scene: ObservedModel,
+    noise: PoseNoise,
+    seed: int,
+    configurations: int,
+    directions: Directions = "published",
 ) -> tuple[Array, Array, Array]:
     """Return the truth (C, n), what is seen of it (25, C, m, 4, 4), and what R is learnt from (400, …)."""
     rng = np.random.default_rng([seed, LEVELS.index(noise)])
     still = scene.poses(scene.configurations(rng, 1))
-    training = published_noise(np.repeat(still, TRAINING, axis=0), noise, rng, directions)
+    training = add_published_noise(np.repeat(still, TRAINING, axis=0), noise, rng, directions)
     truth = scene.configurations(rng, configurations)
     true = scene.poses(truth)
-    seen = [published_noise(true, noise, rng, directions) for _ in range(OBSERVATIONS)]
+    seen = [add_published_noise(true, noise, rng, directions) for _ in range(OBSERVATIONS)]
     return truth, np.stack(seen), training

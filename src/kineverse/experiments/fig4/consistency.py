@@ -18,22 +18,31 @@ import numpy.typing as npt
 
 from kineverse.experiments.registry import Progress
 
-from .protocol import OBSERVATIONS, TRAINING, Array, Noise, Scene, gaussian_noise
-from .runs import Run, run_proper, run_published
+from .protocol import (
+    OBSERVATIONS,
+    TRAINING,
+    Array,
+    FilterRun,
+    ObservedModel,
+    PoseNoise,
+    add_gaussian_noise,
+    run_proper,
+    run_published,
+)
 
 LEVELS = (
-    Noise(0.01, math.radians(1.0)),
-    Noise(0.05, math.radians(5.0)),
-    Noise(0.10, math.radians(10.0)),
+    PoseNoise(0.01, math.radians(1.0)),
+    PoseNoise(0.05, math.radians(5.0)),
+    PoseNoise(0.10, math.radians(10.0)),
 )
-INSIDE = 3.0
+INTERIOR_DEVIATIONS = 3.0
 """A truth is inside when it is so many of the bound's standard deviations away from its limits."""
 
 _STEP = 1e-5
 
 
 @dataclass(frozen=True)
-class Consistency:
+class FilterConsistency:
     """What a filter makes of one level of noise.
 
     Attributes
@@ -76,8 +85,8 @@ class Consistency:
 
 
 def measure_consistency(
-    scene: Scene, seeds: Sequence[int], configurations: int, progress: Progress
-) -> dict[Noise, dict[str, Consistency]]:
+    scene: ObservedModel, seeds: Sequence[int], configurations: int, progress: Progress
+) -> dict[PoseNoise, dict[str, FilterConsistency]]:
     """Return what both filters make of each level."""
     found = {}
     for noise in progress(LEVELS, "fig4: consistency", "level"):
@@ -87,19 +96,21 @@ def measure_consistency(
             still = np.repeat(scene.poses(scene.configurations(rng, 1)), TRAINING, axis=0)
             truth = scene.configurations(rng, configurations)
             true = scene.poses(truth)
-            seen = np.stack([gaussian_noise(true, noise, rng) for _ in range(OBSERVATIONS)])
+            seen = np.stack([add_gaussian_noise(true, noise, rng) for _ in range(OBSERVATIONS)])
             truths.append(truth)
-            training = gaussian_noise(still, noise, rng)
+            training = add_gaussian_noise(still, noise, rng)
             runs.append(
                 {"published": run_published(scene, seen, training), "proper": run_proper(scene, seen, noise)}
             )
         truth = np.concatenate(truths)
         bound = cramer_rao(scene, truth, noise)
-        found[noise] = {who: _judged(scene, truth, bound, [run[who] for run in runs]) for who in runs[0]}
+        found[noise] = {
+            who: _evaluate_consistency(scene, truth, bound, [run[who] for run in runs]) for who in runs[0]
+        }
     return found
 
 
-def cramer_rao(scene: Scene, q: Array, noise: Noise, observations: int = OBSERVATIONS) -> Array:
+def cramer_rao(scene: ObservedModel, q: Array, noise: PoseNoise, observations: int = OBSERVATIONS) -> Array:
     """Return the least variance of each coordinate at configurations (C, n), (C, n)."""
     information = np.zeros((*q.shape, q.shape[1]))
     jacobian = np.stack([_derivative(scene, q, i) for i in range(q.shape[1])], axis=-1)
@@ -110,7 +121,7 @@ def cramer_rao(scene: Scene, q: Array, noise: Noise, observations: int = OBSERVA
     return bound
 
 
-def _derivative(scene: Scene, q: Array, i: int) -> Array:
+def _derivative(scene: ObservedModel, q: Array, i: int) -> Array:
     """Return the twists (C, m, 6) of all frames per unit of a coordinate."""
     ahead, behind = q.copy(), q.copy()
     ahead[:, i] += _STEP
@@ -123,16 +134,18 @@ def _derivative(scene: Scene, q: Array, i: int) -> Array:
     return found
 
 
-def _judged(scene: Scene, truth: Array, bound: Array, runs: list[Run]) -> Consistency:
+def _evaluate_consistency(
+    scene: ObservedModel, truth: Array, bound: Array, runs: list[FilterRun]
+) -> FilterConsistency:
     lower, upper = scene.limits.T
     error = np.concatenate([run.q for run in runs]) - truth
     nees = error**2 / np.concatenate([run.variance for run in runs])
-    inside = np.minimum(truth - lower, upper - truth) >= INSIDE * np.sqrt(bound)
+    inside = np.minimum(truth - lower, upper - truth) >= INTERIOR_DEVIATIONS * np.sqrt(bound)
     kinds = {"shifting": inside & ~scene.turning, "turning": inside & scene.turning}
     dof = sum(run.dof for run in runs)
     # χ² of so many degrees of freedom is as good as Gaussian.
     margin = 1.96 * math.sqrt(2 / dof) if dof else math.nan
-    return Consistency(
+    return FilterConsistency(
         nees_inside=float(nees[inside].mean()),
         nees=float(nees.mean()),
         nis=sum(run.nis for run in runs) / dof if dof else math.nan,

@@ -7,16 +7,26 @@ from dataclasses import dataclass
 import numpy as np
 
 from kineverse.articulations import FoldingDoor, GarageDoor
-from kineverse.errors import ValueRejectedError
-from kineverse.estimation.tracking.published import PublishedFilter
+from kineverse.errors import InvalidValueError
+from kineverse.experiments.fig4.paper_ekf import PaperEkf
 from kineverse.experiments.registry import Progress
 from kineverse.model.frame import WORLD
 from kineverse.model.model import Model
 from kineverse.model.operation import Operation
 
 from .consistency import LEVELS
-from .protocol import DT, OBSERVATIONS, TRAINING, Array, Noise, Scene, gaussian_noise, scene_of
-from .runs import Run, run_proper
+from .protocol import (
+    DT,
+    OBSERVATIONS,
+    TRAINING,
+    Array,
+    FilterRun,
+    ObservedModel,
+    PoseNoise,
+    add_gaussian_noise,
+    make_observed_model,
+    run_proper,
+)
 
 MECHANISMS: dict[str, tuple[Operation, str]] = {
     "folding door": (FoldingDoor(name="door", parent=WORLD), "door"),
@@ -30,7 +40,7 @@ MECHANISMS: dict[str, tuple[Operation, str]] = {
 
 
 @dataclass(frozen=True)
-class Outcome:
+class CoordinateErrors:
     """How a filter followed a coordinate.
 
     Attributes
@@ -50,54 +60,57 @@ class Outcome:
 
 
 @dataclass(frozen=True)
-class Followed:
+class MechanismErrors:
     """How both filters followed a mechanism at one level of noise."""
 
     mechanism: str
-    noise: Noise
-    by_filter: dict[str, Outcome]
+    noise: PoseNoise
+    by_filter: dict[str, CoordinateErrors]
 
 
-def measure_mechanisms(configurations: int, progress: Progress) -> list[Followed]:
+def measure_mechanisms(configurations: int, progress: Progress) -> list[MechanismErrors]:
     """Return how both filters follow each mechanism at each level."""
     jobs = [(name, noise) for name in MECHANISMS for noise in LEVELS]
     return [
-        _followed(name, noise, configurations) for name, noise in progress(jobs, "fig4: mechanisms", "run")
+        _track_mechanism(name, noise, configurations)
+        for name, noise in progress(jobs, "fig4: mechanisms", "run")
     ]
 
 
-def _followed(name: str, noise: Noise, configurations: int) -> Followed:
+def _track_mechanism(name: str, noise: PoseNoise, configurations: int) -> MechanismErrors:
     operation, coordinate = MECHANISMS[name]
     model = Model()
     with model.edit() as edit:
         edit.apply(operation)
-    scene = scene_of(model)
+    scene = make_observed_model(model)
     column = [str(s) for s in scene.symbols].index(coordinate)
     rng = np.random.default_rng([list(MECHANISMS).index(name), LEVELS.index(noise)])
     still = np.repeat(scene.poses(scene.configurations(rng, 1)), TRAINING, axis=0)
     truth = scene.configurations(rng, configurations)
     true = scene.poses(truth)
-    seen = np.stack([gaussian_noise(true, noise, rng) for _ in range(OBSERVATIONS)])
+    seen = np.stack([add_gaussian_noise(true, noise, rng) for _ in range(OBSERVATIONS)])
     runs = {
-        "published": _published(scene, seen, gaussian_noise(still, noise, rng)),
+        "published": _run_published_one_by_one(scene, seen, add_gaussian_noise(still, noise, rng)),
         "proper": run_proper(scene, seen, noise),
     }
-    return Followed(name, noise, {who: _outcome(run, truth, column) for who, run in runs.items()})
+    return MechanismErrors(
+        name, noise, {who: _coordinate_errors(run, truth, column) for who, run in runs.items()}
+    )
 
 
-def _outcome(run: Run, truth: Array, column: int) -> Outcome:
+def _coordinate_errors(run: FilterRun, truth: Array, column: int) -> CoordinateErrors:
     kept = np.isfinite(run.q[:, column])
     lost = 100.0 * float((~kept).sum()) / len(kept)
     if not kept.any():
-        return Outcome(np.nan, np.nan, np.nan, lost)
+        return CoordinateErrors(np.nan, np.nan, np.nan, lost)
     error = np.abs(run.q - truth)[kept, column]
     nees = error**2 / run.variance[kept, column]
-    return Outcome(float(error.mean()), float(error.max()), float(nees.mean()), lost)
+    return CoordinateErrors(float(error.mean()), float(error.max()), float(nees.mean()), lost)
 
 
-def _published(scene: Scene, seen: Array, training: Array) -> Run:
+def _run_published_one_by_one(scene: ObservedModel, seen: Array, training: Array) -> FilterRun:
     """Run the papers' filter on one configuration after the other, as a step of one may lead nowhere."""
-    published = PublishedFilter(scene.model, scene.frames)
+    published = PaperEkf(scene.model, scene.frames)
     published.learn_noise(training)
     q = np.full((seen.shape[1], len(scene.symbols)), np.nan)
     variance = q.copy()
@@ -107,7 +120,7 @@ def _published(scene: Scene, seen: Array, training: Array) -> Run:
             for poses in seen[:, c]:
                 published.predict(DT)
                 published.update(poses)
-        except ValueRejectedError:
+        except InvalidValueError:
             continue
         q[c], variance[c] = published.q, np.diag(published.covariance)
-    return Run(q, variance)
+    return FilterRun(q, variance)

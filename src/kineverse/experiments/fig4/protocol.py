@@ -1,8 +1,9 @@
-"""What both papers do to measure a tracker: what is observed, and with which noise."""
+"""Protocol of the papers: observed frames, noise, and runs of both filters."""
 
 from __future__ import annotations
 
 import math
+from copy import copy
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Literal, TypeAlias
@@ -12,9 +13,10 @@ import numpy.typing as npt
 
 from kineverse.compile import CompiledFunction, compile  # noqa: A004
 from kineverse.errors import ModelError
-from kineverse.estimation.rotations import exponential
-from kineverse.estimation.tracking.published import PublishedFilter
-from kineverse.model.view import ModelView
+from kineverse.estimation import ObservedPose, Tracker, pose_covariance
+from kineverse.experiments.fig4.paper_ekf import SPREAD, STEPS, PaperEkf
+from kineverse.lie import exp_so3
+from kineverse.model.model_view import ModelView
 from kineverse.symbols import Symbol
 
 Array: TypeAlias = npt.NDArray[np.float64]
@@ -31,7 +33,7 @@ SHIFTING_FIRST = 7
 
 
 @dataclass(frozen=True)
-class Noise:
+class PoseNoise:
     """The noise of a pose, its position and its orientation.
 
     Attributes
@@ -44,20 +46,20 @@ class Noise:
     orientation: float
 
     @property
-    def on_axes(self) -> Noise:
+    def on_axes(self) -> PoseNoise:
         """What noise along a random direction is on each of the three axes."""
-        return Noise(self.position / math.sqrt(3), self.orientation / math.sqrt(3))
+        return PoseNoise(self.position / math.sqrt(3), self.orientation / math.sqrt(3))
 
     def __str__(self) -> str:
         return f"{100 * self.position:g} cm, {math.degrees(self.orientation):g}°"
 
 
-LEVELS = tuple(Noise(0.05 * k, math.radians(7.5 * k)) for k in (1, 2, 3, 4))
+LEVELS = tuple(PoseNoise(0.05 * k, math.radians(7.5 * k)) for k in (1, 2, 3, 4))
 """The papers' four levels."""
 
 
 @dataclass(frozen=True)
-class Scene:
+class ObservedModel:
     """A model of which every frame that moves is observed, in the order in which degrees of freedom join.
 
     Attributes
@@ -83,7 +85,7 @@ class Scene:
     @cached_property
     def turning(self) -> npt.NDArray[np.bool_]:
         """Which coordinates turn a frame: their errors are angles, those of the others lengths."""
-        return np.array([any(_turns(self.model, f, s) for f in self.frames) for s in self.symbols])
+        return np.array([any(_is_rotation(self.model, f, s) for f in self.frames) for s in self.symbols])
 
     @cached_property
     def _poses(self) -> CompiledFunction:
@@ -98,13 +100,15 @@ class Scene:
         lower, upper = self.limits.T
         return rng.uniform(lower, upper, (count, len(lower)))
 
-    def first(self, groups: int) -> Scene:
+    def first(self, groups: int) -> ObservedModel:
         """Return the scene of the first groups alone."""
         m, n = self.sizes[groups - 1]
-        return Scene(self.model, self.frames[:m], self.sizes[:groups], self.symbols[:n], self.limits[:n])
+        return ObservedModel(
+            self.model, self.frames[:m], self.sizes[:groups], self.symbols[:n], self.limits[:n]
+        )
 
 
-def scene_of(model: ModelView) -> Scene:
+def make_observed_model(model: ModelView) -> ObservedModel:
     """Return what the papers observe of a model: every frame that moves.
 
     Groups of frames that share coordinates come in the model's order, but the first seven only shift, as in
@@ -119,29 +123,29 @@ def scene_of(model: ModelView) -> Scene:
     if not frames:
         raise ModelError("Nothing moves in this model: there is nothing to track.")
     groups = [
-        (symbols, _frames_of(model, frames, symbols)) for symbols in PublishedFilter(model, frames).groups
+        (symbols, _observed_frames(model, frames, symbols)) for symbols in PaperEkf(model, frames).groups
     ]
-    shifting = [g for g in groups if not any(_turns(model, f, s) for f in g[1] for s in g[0])]
+    shifting = [g for g in groups if not any(_is_rotation(model, f, s) for f in g[1] for s in g[0])]
     first = shifting[:SHIFTING_FIRST]
     ordered = [*first, *(group for group in groups if group not in first)]
     counts = np.cumsum([(len(names), len(symbols)) for symbols, names in ordered], axis=0)
-    found = PublishedFilter(model, [name for _, names in ordered for name in names])
-    return Scene(model, found.frames, tuple(map(tuple, counts.tolist())), found.symbols, found.limits)
+    found = PaperEkf(model, [name for _, names in ordered for name in names])
+    return ObservedModel(model, found.frames, tuple(map(tuple, counts.tolist())), found.symbols, found.limits)
 
 
-def _frames_of(model: ModelView, frames: list[str], symbols: tuple[Symbol, ...]) -> list[str]:
+def _observed_frames(model: ModelView, frames: list[str], symbols: tuple[Symbol, ...]) -> list[str]:
     return [frame for frame in frames if set(model.fk(frame).symbols) & set(symbols)]
 
 
-def _turns(model: ModelView, frame: str, symbol: Symbol) -> bool:
+def _is_rotation(model: ModelView, frame: str, symbol: Symbol) -> bool:
     return symbol in model.fk(frame)[:3, :3].symbols
 
 
 Directions: TypeAlias = Literal["published", "uniform"]
 
 
-def published_noise(
-    poses: Array, noise: Noise, rng: Generator, directions: Directions = "published"
+def add_published_noise(
+    poses: Array, noise: PoseNoise, rng: Generator, directions: Directions = "published"
 ) -> Array:
     """Return poses with the papers' noise: T · translation(a d) · rotation(b about e).
 
@@ -165,16 +169,16 @@ def published_noise(
     shift = _directions(rng, lead, directions) * rng.normal(0, noise.position, (*lead, 1))
     turn = _directions(rng, lead, directions) * rng.normal(0, noise.orientation, (*lead, 1))
     moved[..., :3, 3] += (poses[..., :3, :3] @ shift[..., None])[..., 0]
-    moved[..., :3, :3] = poses[..., :3, :3] @ exponential(turn)
+    moved[..., :3, :3] = poses[..., :3, :3] @ exp_so3(turn)
     return moved
 
 
-def gaussian_noise(poses: Array, noise: Noise, rng: Generator) -> Array:
+def add_gaussian_noise(poses: Array, noise: PoseNoise, rng: Generator) -> Array:
     """Return poses (p + δp, Exp(δθ) R), all six N(0, σ): see :mod:`kineverse.estimation.noise`."""
     lead = poses.shape[:-2]
     moved = poses.copy()
     moved[..., :3, 3] += rng.normal(0, noise.position, (*lead, 3))
-    moved[..., :3, :3] = exponential(rng.normal(0, noise.orientation, (*lead, 3))) @ poses[..., :3, :3]
+    moved[..., :3, :3] = exp_so3(rng.normal(0, noise.orientation, (*lead, 3))) @ poses[..., :3, :3]
     return moved
 
 
@@ -184,3 +188,67 @@ def _directions(rng: Generator, lead: tuple[int, ...], how: Directions) -> Array
         around, up = 2 * around, 2 * up - 1
     across = np.sqrt(1 - up**2)
     return np.stack([np.cos(around) * across, np.sin(around) * across, up], axis=-1)
+
+
+@dataclass(frozen=True)
+class FilterRun:
+    """Where a filter ended with C configurations.
+
+    Attributes
+    ----------
+    q, variance
+        The estimates and what the filter thinks their variances are, (C, n).
+    nis, dof
+        Normalised innovation squared and its degrees of freedom, sums of all updates but the first of each
+        configuration, whose prior is no distribution of truths; 0 if not counted.
+    """
+
+    q: Array
+    variance: Array
+    nis: float = 0.0
+    dof: int = 0
+
+
+def run_published(
+    scene: ObservedModel, seen: Array, training: Array, steps: int = STEPS, spread: float = SPREAD
+) -> FilterRun:
+    """Run the papers' filter on observations (25, C, m, 4, 4), all configurations side by side.
+
+    Parameters
+    ----------
+    scene
+        What is tracked.
+    seen, training
+        The observations, and those of which R is learnt (400, m, 4, 4).
+    steps, spread
+        See :class:`~kineverse.experiments.fig4.paper_ekf.PaperEkf`.
+    """
+    filters = PaperEkf(scene.model, scene.frames, steps, spread, copies=seen.shape[1])
+    filters.learn_noise(training)
+    for poses in seen:
+        filters.predict(DT)
+        filters.update(poses)
+    return FilterRun(filters.q, np.diagonal(filters.covariance, axis1=-2, axis2=-1))
+
+
+def make_tracker(scene: ObservedModel, noise: PoseNoise) -> Tracker:
+    """Return the proper filter for a scene with noise of that much on each axis."""
+    covariance = pose_covariance(noise.position, noise.orientation)
+    return Tracker(scene.model, [ObservedPose(frame, covariance=covariance) for frame in scene.frames])
+
+
+def run_proper(scene: ObservedModel, seen: Array, noise: PoseNoise) -> FilterRun:
+    """Run the proper filter on observations (25, C, m, 4, 4) with noise of that much on each axis."""
+    unused = make_tracker(scene, noise)
+    q, variance, nis, dof = [], [], 0.0, 0
+    for c in range(seen.shape[1]):
+        # Making a tracker looks at the whole model; a copy begins where that one did.
+        tracker = copy(unused)
+        for k, poses in enumerate(seen[:, c]):
+            tracker.predict(DT)
+            estimate = tracker.update_poses(poses)
+            if k > 0:
+                nis, dof = nis + estimate.nis, dof + estimate.dof
+        q.append([estimate.state[s] for s in scene.symbols])
+        variance.append([estimate.deviation[s] ** 2 for s in scene.symbols])
+    return FilterRun(np.array(q), np.array(variance), nis, dof)

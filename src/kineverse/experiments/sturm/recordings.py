@@ -18,7 +18,7 @@ import numpy.typing as npt
 
 from kineverse.errors import FormatError
 from kineverse.estimation.noise import pose_covariance
-from kineverse.estimation.recording import read_recording
+from kineverse.estimation.recordings import read_recording
 
 Array = npt.NDArray[np.float64]
 Label = Literal["revolute", "prismatic"]
@@ -63,7 +63,7 @@ THINNED = 20
 
 
 @dataclass(frozen=True, eq=False)
-class Labelled:
+class LabelledRecording:
     """A recording and its label.
 
     Attributes
@@ -87,7 +87,7 @@ class Labelled:
         return whole if self.poses.ndim == 3 else whole[:3, :3]
 
 
-def labelled_recordings(folder: Path | None) -> Iterator[Labelled]:
+def read_labelled_recordings(folder: Path | None) -> Iterator[LabelledRecording]:
     """Return the recordings in a folder, sorted by name.
 
     Parameters
@@ -108,10 +108,10 @@ def labelled_recordings(folder: Path | None) -> Iterator[Labelled]:
             f"{place}: {what}. This experiment is about recordings of doors and drawers, cabinet_one/001.log "
             f"and so on, from {SOURCE}. Say where they are: --data FOLDER."
         )
-    return (_read(file, file.relative_to(place), label) for file, label in found)
+    return (_read_labelled(file, file.relative_to(place), label) for file, label in found)
 
 
-def _read(file: Path, name: Path, label: Label) -> Labelled:
+def _read_labelled(file: Path, name: Path, label: Label) -> LabelledRecording:
     recording = read_recording(file, COLUMNS.get(name.as_posix()))
     poses = recording.pair().thinned(THINNED).child_poses
-    return Labelled(name.with_suffix("").as_posix(), label, poses)
+    return LabelledRecording(name.with_suffix("").as_posix(), label, poses)

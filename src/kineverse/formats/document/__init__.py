@@ -10,20 +10,19 @@ A document is one JSON object::
 Reading one runs no code and imports no name. In a ``.kv.msgpack`` file the same is packed (:mod:`.wire`).
 """
 
-from .reading import operations_from, operations_unpacked
-from .recorded import Recorded
+from .opaque_operation import OpaqueOperation
+from .reader import from_bytes, read_operations, read_packed_operations, to_bytes
 from .schema import schema
-from .wire import from_bytes, to_bytes
-from .writing import document_hash, document_of, write_document
+from .writer import document_hash, to_json, write_document
 
 __all__ = [
-    "Recorded",
+    "OpaqueOperation",
     "document_hash",
-    "document_of",
     "from_bytes",
-    "operations_from",
-    "operations_unpacked",
+    "read_operations",
+    "read_packed_operations",
     "schema",
     "to_bytes",
+    "to_json",
     "write_document",
 ]

@@ -34,22 +34,21 @@ from kineverse.model.body import (
     Sphere,
 )
 from kineverse.model.constraint import Constraint
-from kineverse.model.edit import AddFrame, Attach, Constrain, SetRate, Write
 from kineverse.model.frame import Frame
-from kineverse.model.operation import Operation
-from kineverse.model.reader import Cell
+from kineverse.model.operation import Cell, Operation
+from kineverse.model.operations import AddFrame, Attach, Constrain, SetData, SetRate
 
-from .checks import RefusedError, exactly, fields, listed, string
-from .graph import Graph
-from .limits import MAX_DEPTH, check_depth
-from .shapes import read_pose, written_pose
-from .values import DATUM_TAGS, Ref, Rename, read_datum, written_datum
+from .bodies import decode_pose, encode_pose
+from .budget import MAX_DEPTH, check_depth
+from .node_graph import NodeGraph
+from .schema import InvalidDocumentError, check_keys, check_length, check_list, check_text
+from .values import DATUM_TAGS, Ref, Rename, decode_datum, encode_datum
 
 TAGS = ("pose", "mapping", "record", "written", "unwritten", *DATUM_TAGS)
 
 
 @dataclass(frozen=True)
-class Record:
+class OpaqueRecord:
     """A value of a dataclass that is not at hand."""
 
     kind: str
@@ -57,122 +56,170 @@ class Record:
 
 
 @dataclass(frozen=True)
-class Written:
+class WrittenReference:
     """A parameter that is among the operation's writes, under ``kind/name``."""
 
     path: str
 
 
 @dataclass(frozen=True)
-class Unwritten:
+class UnsupportedParameter:
     """A parameter that a document has no place for; only its type is known."""
 
     kind: str
 
 
-def _is_operation(kind: object) -> bool:
-    return isinstance(kind, type) and issubclass(kind, Operation)
-
-
 RECORDS: Mapping[str, type] = MappingProxyType(
     {
-        kind.__name__: kind
-        for kind in (
-            *(Limits, Frame, Constraint, Articulation),
-            *(Body, Shape, Inertia, Box, Capsule, Cone, Cylinder, Ellipsoid, Mesh, Sphere),
-            *(AddFrame, Attach, Constrain, SetRate, Write, CloseLoop, LoopConstraint),
-            *(kind for kind in vars(articulations).values() if _is_operation(kind)),
-        )
+        "Limits": Limits,
+        "Frame": Frame,
+        "Constraint": Constraint,
+        "Articulation": Articulation,
+        "Body": Body,
+        "Shape": Shape,
+        "Inertia": Inertia,
+        "Box": Box,
+        "Capsule": Capsule,
+        "Cone": Cone,
+        "Cylinder": Cylinder,
+        "Ellipsoid": Ellipsoid,
+        "Mesh": Mesh,
+        "Sphere": Sphere,
+        "AddFrame": AddFrame,
+        "Attach": Attach,
+        "Constrain": Constrain,
+        "SetRate": SetRate,
+        "Write": SetData,
+        "CloseLoop": CloseLoop,
+        "LoopConstraint": LoopConstraint,
+        "Ackermann": articulations.Ackermann,
+        "Ball": articulations.Ball,
+        "Cam": articulations.Cam,
+        "Continuous": articulations.Continuous,
+        "Cylindrical": articulations.Cylindrical,
+        "DeskLamp": articulations.DeskLamp,
+        "DifferentialDrive": articulations.DifferentialDrive,
+        "DoorWithHandle": articulations.DoorWithHandle,
+        "Faucet": articulations.Faucet,
+        "Fixed": articulations.Fixed,
+        "Floating": articulations.Floating,
+        "FoldingDoor": articulations.FoldingDoor,
+        "GarageDoor": articulations.GarageDoor,
+        "Gearbox": articulations.Gearbox,
+        "Latch": articulations.Latch,
+        "Mecanum": articulations.Mecanum,
+        "Microwave": articulations.Microwave,
+        "OmniBase": articulations.OmniBase,
+        "PedalBin": articulations.PedalBin,
+        "PistonAndRod": articulations.PistonAndRod,
+        "Planar": articulations.Planar,
+        "Prismatic": articulations.Prismatic,
+        "RackAndPinion": articulations.RackAndPinion,
+        "Ratchet": articulations.Ratchet,
+        "Revolute": articulations.Revolute,
+        "ScissorLift": articulations.ScissorLift,
+        "Screw": articulations.Screw,
+        "ScrewAndNut": articulations.ScrewAndNut,
+        "Universal": articulations.Universal,
     }
 )
-"""What operations that ship are made with, by the name under which a document has it; a closed set.
+"""Classes of operations and of their parameters by the frozen names that documents have for them."""
 
-Operations are among it, since :class:`kineverse.Override` is made with one.
-"""
+_KIND_OF = {kind: name for name, kind in RECORDS.items()}
 
 
-def parameters_of(operation: Operation) -> dict[str, Any]:
+def document_kind(kind: type) -> str:
+    """Return the name that documents have for a class: frozen for those that ship, else that of the class."""
+    own: str = getattr(kind, "document_kind", kind.__name__)
+    return _KIND_OF.get(kind, own)
+
+
+def operation_parameters(operation: Operation) -> dict[str, Any]:
     """Return what an operation was made with, by name; empty for one that is no dataclass."""
     if not dataclasses.is_dataclass(operation):
         return {}
     return {f.name: getattr(operation, f.name) for f in dataclasses.fields(operation) if f.init}
 
 
-def expressions_among(parameter: Any, writes: Mapping[Cell, Any]) -> list[Expression]:
-    """Return the expressions that :func:`written_parameter` needs."""
+def expressions_in_parameter(parameter: Any, writes: Mapping[Cell, Any]) -> list[Expression]:
+    """Return the expressions that :func:`encode_parameter` needs."""
     found: list[Expression] = []
 
     def note(expression: Expression) -> int:
         found.append(expression)
         return 0
 
-    written_parameter(parameter, writes, note)
+    encode_parameter(parameter, writes, note)
     return found
 
 
-def written_parameter(value: Any, writes: Mapping[Cell, Any], ref: Ref, depth: int = 0) -> Any:
+def encode_parameter(value: Any, writes: Mapping[Cell, Any], ref: Ref, depth: int = 0) -> Any:
     """Return a parameter as JSON has it, which lies in so many others."""
 
     def inner(item: Any) -> Any:
-        return written_parameter(item, writes, ref, depth + 1)
+        return encode_parameter(item, writes, ref, depth + 1)
 
     if depth > MAX_DEPTH:
-        return {"unwritten": type(value).__name__}
+        return {"unwritten": document_kind(type(value))}
     if value is None or isinstance(value, (bool, int, float, str, Expression)):
         try:
-            return written_datum(value, ref)
+            return encode_datum(value, ref)
         except FormatError:
-            return {"unwritten": type(value).__name__}
+            return {"unwritten": document_kind(type(value))}
     if isinstance(value, (tuple, list)):
         return [inner(item) for item in value]
     if isinstance(value, Pose):
-        return {"pose": written_pose(value)}
-    if isinstance(value, Written):
+        return {"pose": encode_pose(value)}
+    if isinstance(value, WrittenReference):
         return {"written": value.path}
-    if isinstance(value, Unwritten):
+    if isinstance(value, UnsupportedParameter):
         return {"unwritten": value.kind}
     if isinstance(value, Mapping):
         return {"mapping": [[inner(key), inner(item)] for key, item in value.items()]}
     for (kind, name), written in writes.items():
         if written is value:
             return {"written": f"{kind}/{name}"}
-    if isinstance(value, Record):
+    if isinstance(value, OpaqueRecord):
         return {"record": value.kind, "fields": {key: inner(item) for key, item in value.fields}}
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         parts = {
             f.name: inner(getattr(value, f.name)) for f in dataclasses.fields(value) if f.init and f.compare
         }
-        return {"record": type(value).__name__, "fields": parts}
-    return {"unwritten": type(value).__name__}
+        return {"record": document_kind(type(value)), "fields": parts}
+    return {"unwritten": document_kind(type(value))}
 
 
-def made(value: Any, writes: Mapping[str, Any]) -> Any:
+def rebuild_parameter(value: Any, writes: Mapping[str, Any]) -> Any:
     """Return a parameter that was read as what an operation takes.
 
     Parameters
     ----------
     value
-        As :func:`read_parameter` returns it.
+        As :func:`decode_parameter` returns it.
     writes
         What the operation wrote, by ``kind/name``.
     """
     if isinstance(value, tuple):
-        return tuple(made(item, writes) for item in value)
+        return tuple(rebuild_parameter(item, writes) for item in value)
     if isinstance(value, dict):
-        return {made(key, writes): made(item, writes) for key, item in value.items()}
-    if isinstance(value, Written):
+        return {
+            rebuild_parameter(key, writes): rebuild_parameter(item, writes) for key, item in value.items()
+        }
+    if isinstance(value, WrittenReference):
         return writes.get(value.path, value)
-    if isinstance(value, Record) and value.kind in RECORDS:
+    if isinstance(value, OpaqueRecord) and value.kind in RECORDS:
         try:
-            return RECORDS[value.kind](**{name: made(item, writes) for name, item in value.fields})
+            return RECORDS[value.kind](
+                **{name: rebuild_parameter(item, writes) for name, item in value.fields}
+            )
         except (TypeError, KineverseError):  # it is somebody else's class of the same name
             return value
     return value
 
 
-def read_parameter(
+def decode_parameter(
     value: Any,
-    graph: Graph,
+    graph: NodeGraph,
     rename: Rename,
     path: Callable[[str], str],
     written: Collection[str],
@@ -202,35 +249,38 @@ def read_parameter(
     """
 
     def inner(item: Any) -> Any:
-        return read_parameter(item, graph, rename, path, written, depth + 1)
+        return decode_parameter(item, graph, rename, path, written, depth + 1)
 
     check_depth(depth)
     if type(value) is list:
         return tuple(map(inner, value))
     if type(value) is not dict:
-        return read_datum(value, graph, rename)
+        return decode_datum(value, graph, rename)
     tag = next((tag for tag in TAGS if tag in value), None)
     if tag == "pose":
-        return read_pose(fields(value, ("pose",))["pose"])
+        return decode_pose(check_keys(value, ("pose",))["pose"])
     if tag == "mapping":
-        pairs = [exactly(listed(p, "key and value"), 2) for p in listed(fields(value, (tag,))[tag], tag)]
+        pairs = [
+            check_length(check_list(p, "key and value"), 2)
+            for p in check_list(check_keys(value, (tag,))[tag], tag)
+        ]
         try:
             return {inner(key): inner(item) for key, item in pairs}
         except TypeError:
-            raise RefusedError("a mapping has keys that cannot be compared") from None
+            raise InvalidDocumentError("a mapping has keys that cannot be compared") from None
     if tag == "record":
-        given = fields(value, ("record", "fields"))
+        given = check_keys(value, ("record", "fields"))
         if type(given["fields"]) is not dict:
-            raise RefusedError("the fields of a record are an object")
-        parts = tuple((string(key), inner(item)) for key, item in given["fields"].items())
-        return Record(string(given["record"]), parts)
+            raise InvalidDocumentError("the fields of a record are an object")
+        parts = tuple((check_text(key), inner(item)) for key, item in given["fields"].items())
+        return OpaqueRecord(check_text(given["record"]), parts)
     if tag == "written":
-        named = path(string(fields(value, (tag,))[tag]))
+        named = path(check_text(check_keys(value, (tag,))[tag]))
         if named not in written:
-            raise RefusedError(f"{named[:60]!r} is said to be written, and is not")
-        return Written(named)
+            raise InvalidDocumentError(f"{named[:60]!r} is said to be written, and is not")
+        return WrittenReference(named)
     if tag == "unwritten":
-        return Unwritten(string(fields(value, (tag,))[tag]))
+        return UnsupportedParameter(check_text(check_keys(value, (tag,))[tag]))
     if tag is None:
-        raise RefusedError(f"an object among parameters has one of the keys {', '.join(TAGS)}")
-    return read_datum(value, graph, rename)
+        raise InvalidDocumentError(f"an object among parameters has one of the keys {', '.join(TAGS)}")
+    return decode_datum(value, graph, rename)

@@ -1,4 +1,4 @@
-"""Traces of operations as JSON values and back.
+"""Traces of operations as JSON values, and their consistency with reads and writes.
 
 A trace is ``{"questions": [[kind, look, argument, ...], ...], "writes": {...}}``: what was asked, how closely
 the answer was looked at (0 not at all, 1 its symbols, 2 its value), and writes as those of the operation,
@@ -7,32 +7,41 @@ whose expressions contain ``read`` nodes.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import math
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
-from kineverse.expressions.expression import Expression
-from kineverse.model.contents import expressions_in
-from kineverse.model.operation import FRAMES
-from kineverse.model.reader import Cell
-from kineverse.model.traces import Look, Question, Step, Trace
-from kineverse.model.traces.answer import answers_in
-from kineverse.model.traces.question import KINDS, OF_EXPRESSIONS, OF_KIND
+import casadi as ca
 
-from .checks import RefusedError, exactly, listed, whole
-from .graph import Graph
-from .limits import MAX_QUESTIONS
+from kineverse.errors import KineverseError
+from kineverse.expressions.expression import Expression
+from kineverse.expressions.graph import leaves, topological_order
+from kineverse.expressions.implicit import Implicit
+from kineverse.model.frame import WORLD
+from kineverse.model.kinematics import branches
+from kineverse.model.operation import FRAMES, Cell, find_expressions
+from kineverse.model.read_recorder import ABSENT, Read, ReadRecorder, Reads
+from kineverse.model.traces import Access, Query, Trace, TraceStep
+from kineverse.model.traces.placeholder import find_read_nodes
+from kineverse.model.traces.replay import ExpressionPair, writes_agree
+from kineverse.model.traces.trace import run_query, substitute_results
+from kineverse.model.traces.trace_queries import DATA_QUERIES, EXPRESSION_QUERIES, QUERY_KINDS, QueryResult
+
+from .budget import COST_OF_FRAME, COST_OF_NAME, COST_OF_NODE_BELOW, MAX_QUESTIONS, MAX_WORK
+from .node_graph import NodeGraph
+from .schema import InvalidDocumentError, check_integer, check_length, check_list
 from .values import Ref
 
-_KIND_OF = {question: kind for kind, question in OF_KIND.items()}
+_KIND_OF = {question: kind for kind, question in DATA_QUERIES.items()}
 
 
-def expressions_of(trace: Trace) -> list[Expression]:
+def trace_expressions(trace: Trace) -> list[Expression]:
     """Return the expressions of a trace."""
     asked = [a for step in trace.steps for a in step.question.arguments if isinstance(a, Expression)]
-    return asked + [e for (kind, _), value in trace.writes for e in expressions_in(kind, value)]
+    return asked + [e for (kind, _), value in trace.writes for e in find_expressions(kind, value)]
 
 
-def written_questions(trace: Trace, ref: Ref) -> list[list[Any]]:
+def encode_queries(trace: Trace, ref: Ref) -> list[list[Any]]:
     """Return the questions of a trace as JSON has them."""
     return [
         [
@@ -44,7 +53,7 @@ def written_questions(trace: Trace, ref: Ref) -> list[list[Any]]:
     ]
 
 
-def read_questions(value: Any, graph: Graph, cell: Callable[[str, Any], Cell]) -> tuple[Step, ...]:
+def decode_queries(value: Any, graph: NodeGraph, cell: Callable[[str, Any], Cell]) -> tuple[TraceStep, ...]:
     """Return the questions of a trace.
 
     Parameters
@@ -62,22 +71,28 @@ def read_questions(value: Any, graph: Graph, cell: Callable[[str, Any], Cell]) -
         For what is no question.
     """
     steps = []
-    if len(listed(value, "questions")) > MAX_QUESTIONS:
-        raise RefusedError(f"{len(value)} questions, more than {MAX_QUESTIONS}")
+    if len(check_list(value, "questions")) > MAX_QUESTIONS:
+        raise InvalidDocumentError(f"{len(value)} questions, more than {MAX_QUESTIONS}")
     for place, item in enumerate(value):
-        if len(listed(item, "a question")) < 2:
-            raise RefusedError("a question is its kind, how closely it was looked at, and what it is about")
+        if len(check_list(item, "a question")) < 2:
+            raise InvalidDocumentError(
+                "a question is its kind, how closely it was looked at, and what it is about"
+            )
         kind, look, *arguments = item
-        if type(kind) is not str or kind not in KINDS:
-            raise RefusedError(f"a question is one of {', '.join(KINDS)}")
-        exactly(arguments, KINDS[kind].arguments)
-        steps.append(Step(Question(kind, _arguments(kind, arguments, graph, cell)), Look(whole(look, 2))))
+        if type(kind) is not str or kind not in QUERY_KINDS:
+            raise InvalidDocumentError(f"a question is one of {', '.join(QUERY_KINDS)}")
+        check_length(arguments, QUERY_KINDS[kind].arguments)
+        steps.append(
+            TraceStep(
+                Query(kind, _decode_arguments(kind, arguments, graph, cell)), Access(check_integer(look, 2))
+            )
+        )
         for expression in (a for a in steps[-1].question.arguments if isinstance(a, Expression)):
-            check_answers(expression, place)
+            check_read_nodes(expression, place)
     return tuple(steps)
 
 
-def check_answers(expression: Expression, questions: int) -> None:
+def check_read_nodes(expression: Expression, questions: int) -> None:
     """Refuse an expression about answers that are not there.
 
     Raises
@@ -85,13 +100,15 @@ def check_answers(expression: Expression, questions: int) -> None:
     RefusedError
         If one is to a question that comes later, or never.
     """
-    for answer in answers_in(expression):
+    for answer in find_read_nodes(expression):
         if answer.question >= questions:
-            raise RefusedError(f"it is about the answer to question {answer.question}, which is not asked")
+            raise InvalidDocumentError(
+                f"it is about the answer to question {answer.question}, which is not asked"
+            )
 
 
-def _arguments(
-    kind: str, given: list[Any], graph: Graph, cell: Callable[[str, Any], Cell]
+def _decode_arguments(
+    kind: str, given: list[Any], graph: NodeGraph, cell: Callable[[str, Any], Cell]
 ) -> tuple[Any, ...]:
     if kind == "exists":
         return cell(given[0], given[1])
@@ -99,6 +116,162 @@ def _arguments(
         return (cell(given[0], "x")[0],)
     if kind in ("fk", "between"):
         return tuple(cell(FRAMES, name)[1] for name in given)
-    if kind in OF_EXPRESSIONS:
+    if kind in EXPRESSION_QUERIES:
         return tuple(map(graph.expression, given))
     return (cell(FRAMES if kind in ("body", "factors") else _KIND_OF[kind], given[0])[1],)
+
+
+_COST_OF_POSE = 1000
+"""What a frame on the way costs where poses are composed, in about as many products and sums."""
+
+
+class TraceConsistency:
+    """Compares the trace of each operation with what else the document says about it.
+
+    Reads are derived from the questions of a trace, since an operation that is said to read less than it asks
+    for would stay as it is when that changes. What the trace writes is compared with the writes. Comparing is
+    work: what is beyond all that documents contain, a million nodes and more, is taken at its word.
+
+    Parameters
+    ----------
+    graph
+        The expressions of the document.
+    cells
+        What the operations before the present one wrote; it grows.
+    names
+        The names of these, by kind.
+    """
+
+    def __init__(self, graph: NodeGraph, cells: Mapping[Cell, Any], names: Mapping[str, set[str]]) -> None:
+        self._graph, self._cells, self._names = graph, cells, names
+        self._left = MAX_WORK
+
+    def reads_of(self, trace: Trace, writes: tuple[tuple[Cell, Any], ...]) -> Reads:
+        """Return what the questions of a trace read.
+
+        Parameters
+        ----------
+        trace
+            Of the operation that comes next.
+        writes
+            What else is said that it writes.
+
+        Raises
+        ------
+        RefusedError
+            If the trace leads to other writes, or to none.
+        """
+        if [cell for cell, _ in trace.writes] != [cell for cell, _ in writes]:
+            raise InvalidDocumentError("it writes other things than the operation, and one of them is wrong")
+        reads = Reads()
+        try:
+            replies = self._replies(trace, reads)
+            if replies is None or not self._affords(self._cost_of_writes(trace)):
+                return reads
+            again = trace.written(replies).writes()
+        except KineverseError as error:
+            raise InvalidDocumentError(f"it cannot be followed: {error}") from None
+        # Effects name kinds in an order of their own; that of the names of a kind counts.
+        in_order = {cell: again[cell] for cell, _ in writes if cell in again}
+        if len(in_order) < len(again) or not writes_agree(in_order, dict(writes), self._affords_comparing):
+            raise InvalidDocumentError("it leads to other values than the writes, and one of them is wrong")
+        return reads
+
+    def _replies(self, trace: Trace, reads: Reads) -> list[QueryResult] | None:
+        """Note what all questions read; return the answers, or None where these are too much work."""
+        replies: list[QueryResult] | None = []
+        for step in trace.steps:
+            question = step.question
+            if question.kind in EXPRESSION_QUERIES:
+                if replies is None or not self._affords(_size(question)):
+                    replies = None
+                    continue
+                question = substitute_results(question, replies)
+                if not self._affords(_cost(question)):
+                    replies = None
+                    continue
+            elif question.kind == "fk":
+                names = self._way(*question.arguments)
+                if names and (replies is None or not self._affords(_COST_OF_POSE * len(names))):
+                    self._note(names, question.arguments, reads)
+                    replies = None
+                    continue
+            reply = self._ask(question, reads)
+            if replies is not None:
+                replies.append(reply)
+                if not self._affords(sum(_nodes(part) for part in reply.parts)):
+                    replies = None
+        return replies
+
+    def _ask(self, question: Query, reads: Reads) -> QueryResult:
+        """Return the answer to a question, and note what it reads."""
+        return run_query(question, self._reader(reads))
+
+    def _way(self, frame: str, relative_to: str) -> list[str]:
+        """Return the frames between two, from their last common ancestor down; none if there is no way."""
+        try:
+            base, down = branches(frame, relative_to, lambda name: self._cells[FRAMES, name])
+        except (KineverseError, KeyError):
+            return []
+        self._graph.budget.spend(COST_OF_FRAME * (len(base) + len(down)))
+        return [*base, *down]
+
+    def _note(self, names: list[str], ends: Iterable[str], reads: Reads) -> None:
+        """Note what a pose reads without composing it: of long chains they are large."""
+        reader = self._reader(reads)
+        self._graph.budget.spend(2 * COST_OF_FRAME * len(names))
+        for name in names:
+            for factor in reader.frames[name].factors:
+                if isinstance(factor, Expression):
+                    reader.carry(factor)
+        for end in set(ends) - {WORLD}:
+            reads.add((FRAMES, end), Read.EXISTENCE)
+
+    def _reader(self, reads: Reads) -> ReadRecorder:
+        return ReadRecorder(lambda cell: self._cells.get(cell, ABSENT), self._sorted, reads)
+
+    def _sorted(self, kind: str) -> list[str]:
+        self._graph.budget.spend(COST_OF_NAME * len(self._names[kind]))
+        return sorted(self._names[kind])
+
+    def _affords(self, work: int) -> bool:
+        self._left -= work
+        return self._left >= 0
+
+    def _cost_of_writes(self, trace: Trace) -> int:
+        return sum(_nodes(e) for (kind, _), value in trace.writes for e in find_expressions(kind, value))
+
+    def _affords_comparing(self, pairs: list[ExpressionPair]) -> bool:
+        """Whether values and gradients can be compared: implicit functions are written out for that."""
+        work = 0
+        for expression in (e for pair in pairs for e in pair):
+            inner = topological_order(leaves(expression)[1], lambda n: n.parts, lambda _: False)
+            steps = sum(self._graph.work.get(n.function.key, 0) for n in inner if isinstance(n, Implicit))
+            parts = _nodes(expression) + sum(_nodes(part) for node in inner for part in node.parts)
+            work += (steps + parts) * (1 + len(expression.symbols))
+        return self._affords(work)
+
+
+def merge_reads(cells: Mapping[Cell, Read], reads: Reads) -> dict[Cell, Read]:
+    """Return how closely cells were looked at by what is said and what is derived."""
+    result = dict(cells)
+    for cell, how in reads.cells.items():
+        result[cell] = result.get(cell, Read(0)) | how
+    return result
+
+
+def _size(question: Query) -> int:
+    return sum(_nodes(a) for a in question.arguments if isinstance(a, Expression))
+
+
+def _cost(question: Query) -> int:
+    """Return about what it takes to answer a question about expressions: a sweep for each derivative."""
+    first, *others = (a for a in question.arguments if isinstance(a, Expression))
+    sweeps = min(math.prod(first.shape), max((math.prod(a.shape) for a in others), default=1))
+    return _size(question) * max(sweeps, 1)
+
+
+def _nodes(part: Expression | float) -> int:
+    if not isinstance(part, Expression):
+        return 1
+    return int(ca.n_nodes(part._sx)) + COST_OF_NODE_BELOW * len(part._nodes)

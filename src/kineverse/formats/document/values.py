@@ -1,6 +1,6 @@
 """What operations write, as JSON values and back.
 
-A frame is ``{"parent": name, "factors": [...]}``, each factor a pose (its 12 numbers) or the place of an
+A frame is ``{"parent": check_entity_name, "factors": [...]}``, each factor a pose (its 12 numbers) or the place of an
 expression; a constraint the places of ``[lower, expression, upper]``; a rate
 ``[coordinate, [[speed, ref], ...]]``. Data are texts, numbers, true, false, null and lists of these; an
 expression is ``{"expression": ref}``.
@@ -20,20 +20,29 @@ from kineverse.model.body import Pose
 from kineverse.model.constraint import Constraint
 from kineverse.model.frame import WORLD, Frame
 from kineverse.model.operation import ARTICULATIONS, BODIES, CONSTRAINTS, DATA, FRAMES, RATES
-from kineverse.model.rates import Entry, as_entry
+from kineverse.model.rates import RateEntry, as_entry
 from kineverse.symbols import Symbol
 
-from .checks import RefusedError, exactly, fields, listed, name, number, numbers, string
-from .graph import Graph
-from .limits import MAX_DEPTH, check_depth
-from .shapes import (
-    read_body,
-    read_pose,
-    written_body,
-    written_number,
-    written_numbers,
-    written_pose,
-    written_text,
+from .bodies import (
+    decode_body,
+    decode_pose,
+    encode_body,
+    encode_number,
+    encode_numbers,
+    encode_pose,
+    encode_text,
+)
+from .budget import MAX_DEPTH, check_depth
+from .node_graph import NodeGraph
+from .schema import (
+    InvalidDocumentError,
+    check_entity_name,
+    check_keys,
+    check_length,
+    check_list,
+    check_number,
+    check_numbers,
+    check_text,
 )
 
 Ref: TypeAlias = Callable[[Expression], int]
@@ -50,7 +59,7 @@ _INTEGER = re.compile("-?[0-9]{1,3011}")
 # -- writing -------------------------------------------------------------------------------------------------
 
 
-def written(kind: str, value: Any, ref: Ref) -> Any:
+def encode_value(kind: str, value: Any, ref: Ref) -> Any:
     """Return a value as JSON has it.
 
     Raises
@@ -59,7 +68,7 @@ def written(kind: str, value: Any, ref: Ref) -> Any:
         For what a document has no place for.
     """
     if kind == FRAMES:
-        factors = [written_pose(f) if isinstance(f, Pose) else ref(f) for f in value.factors]
+        factors = [encode_pose(f) if isinstance(f, Pose) else ref(f) for f in value.factors]
         return {"parent": value.parent, "factors": factors}
     if kind == CONSTRAINTS:
         return [ref(value.lower), ref(value.expression), ref(value.upper)]
@@ -69,22 +78,22 @@ def written(kind: str, value: Any, ref: Ref) -> Any:
             return [ref(coordinate), ref(row)]
         return [ref(coordinate), [[ref(speed), ref(entry)] for speed, entry in row]]
     if kind == BODIES:
-        return written_body(value)
+        return encode_body(value)
     if kind == ARTICULATIONS:
         record = {
-            "kind": written_text(value.kind),
-            "parent": written_text(value.parent),
-            "child": written_text(value.child),
+            "kind": encode_text(value.kind),
+            "parent": encode_text(value.parent),
+            "child": encode_text(value.child),
             "coordinates": [ref(s) for s in value.coordinates],
-            "home": written_numbers(value.home),
+            "home": encode_numbers(value.home),
             "speeds": [ref(s) for s in value.speeds],
-            "dynamics": [[written_text(item), written_datum(datum, ref)] for item, datum in value.dynamics],
+            "dynamics": [[encode_text(item), encode_datum(datum, ref)] for item, datum in value.dynamics],
         }
         return record if value.follows is None else {**record, "follows": ref(value.follows)}
-    return written_datum(value, ref)
+    return encode_datum(value, ref)
 
 
-def written_datum(value: Any, ref: Ref, depth: int = 0) -> Any:
+def encode_datum(value: Any, ref: Ref, depth: int = 0) -> Any:
     """Return a datum as JSON has it, which lies in so many tuples.
 
     Raises
@@ -100,11 +109,11 @@ def written_datum(value: Any, ref: Ref, depth: int = 0) -> Any:
         return value
     if isinstance(value, float):  # numpy's is one, too
         number = float(value)
-        return number if math.isfinite(number) else {"float": written_number(number)}
+        return number if math.isfinite(number) else {"float": encode_number(number)}
     if type(value) is tuple:
         if depth > MAX_DEPTH:
             raise FormatError(f"it is nested too deeply, in more than {MAX_DEPTH} others")
-        return [written_datum(item, ref, depth + 1) for item in value]
+        return [encode_datum(item, ref, depth + 1) for item in value]
     if isinstance(value, Expression):
         return {"expression": ref(value)}
     raise FormatError(
@@ -116,7 +125,7 @@ def written_datum(value: Any, ref: Ref, depth: int = 0) -> Any:
 # -- reading -------------------------------------------------------------------------------------------------
 
 
-def as_read(kind: str, value: Any, graph: Graph, rename: Rename) -> Any:
+def decode_value(kind: str, value: Any, graph: NodeGraph, rename: Rename) -> Any:
     """Return what JSON has as the value of an operation.
 
     Raises
@@ -124,98 +133,104 @@ def as_read(kind: str, value: Any, graph: Graph, rename: Rename) -> Any:
     RefusedError
         Where it is not what it should be.
     """
-    return _READERS[kind](value, graph, rename)
+    return _DECODERS[kind](value, graph, rename)
 
 
-def frame_name(value: Any, rename: Rename) -> str:
+def decode_frame_name(value: Any, rename: Rename) -> str:
     """Return the name of a frame that may be the world."""
-    given = name(value)
+    given = check_entity_name(value)
     return given if given == WORLD else rename(given)
 
 
-def _read_frame(value: Any, graph: Graph, rename: Rename) -> Frame:
-    given = fields(value, ("parent", "factors"))
+def _decode_frame(value: Any, graph: NodeGraph, rename: Rename) -> Frame:
+    given = check_keys(value, ("parent", "factors"))
     factors: list[Pose | Expression] = []
-    for factor in listed(given["factors"], "factors"):
+    for factor in check_list(given["factors"], "factors"):
         if type(factor) is list:
-            factors.append(read_pose(factor))
+            factors.append(decode_pose(factor))
             continue
         transform = graph.expression(factor)
         if transform.shape != (4, 4):
-            raise RefusedError(f"a factor should be 4×4, not of shape {transform.shape}")
+            raise InvalidDocumentError(f"a factor should be 4×4, not of shape {transform.shape}")
         factors.append(transform)
-    return Frame(frame_name(given["parent"], rename), tuple(factors))
+    return Frame(decode_frame_name(given["parent"], rename), tuple(factors))
 
 
-def _read_constraint(value: Any, graph: Graph, rename: Rename) -> Constraint:
-    return Constraint(*map(graph.scalar, exactly(listed(value, "lower, expression, upper"), 3)))
+def _decode_constraint(value: Any, graph: NodeGraph, rename: Rename) -> Constraint:
+    return Constraint(*map(graph.scalar, check_length(check_list(value, "lower, expression, upper"), 3)))
 
 
-def _read_rate(value: Any, graph: Graph, rename: Rename) -> tuple[Symbol, Entry]:
-    coordinate, entry = exactly(listed(value, "a coordinate, and its row or what it depends on"), 2)
+def _decode_rate(value: Any, graph: NodeGraph, rename: Rename) -> tuple[Symbol, RateEntry]:
+    coordinate, entry = check_length(check_list(value, "a coordinate, and its row or what it depends on"), 2)
     symbol = graph.symbol(coordinate)
     if type(entry) is int:
         return symbol, as_entry(symbol, graph.scalar(entry))
     return symbol, as_entry(symbol, dict(graph.pairs(entry, 1)))
 
 
-def _read_articulation(value: Any, graph: Graph, rename: Rename) -> Articulation:
+def _decode_articulation(value: Any, graph: NodeGraph, rename: Rename) -> Articulation:
     required = ("kind", "parent", "child", "coordinates", "home", "speeds", "dynamics")
-    given = fields(value, required, ("follows",))
-    dynamics = [exactly(listed(d, "name and value"), 2) for d in listed(given["dynamics"], "dynamics")]
-    coordinates = tuple(map(graph.symbol, listed(given["coordinates"], "coordinates")))
-    home = numbers(given["home"])
+    given = check_keys(value, required, ("follows",))
+    dynamics = [
+        check_length(check_list(d, "name and value"), 2) for d in check_list(given["dynamics"], "dynamics")
+    ]
+    coordinates = tuple(map(graph.symbol, check_list(given["coordinates"], "coordinates")))
+    home = check_numbers(given["home"])
     names = [symbol.path.rpartition("/")[2] for symbol in coordinates]
     for k in range(len(names) - 3):
         if names[k : k + 4] == ["qx", "qy", "qz", "qw"] and not any(home[k : k + 4]):
-            raise RefusedError("its home has a quaternion of length zero, at which nothing has a pose")
+            raise InvalidDocumentError(
+                "its home has a quaternion of length zero, at which nothing has a pose"
+            )
     return Articulation(
-        string(given["kind"]),
-        frame_name(given["parent"], rename),
-        frame_name(given["child"], rename),
+        check_text(given["kind"]),
+        decode_frame_name(given["parent"], rename),
+        decode_frame_name(given["child"], rename),
         coordinates,
         home,
-        tuple(graph.symbol(ref, 1) for ref in listed(given["speeds"], "speeds")),
-        tuple((string(item), read_datum(datum, graph, rename)) for item, datum in dynamics),
+        tuple(graph.symbol(ref, 1) for ref in check_list(given["speeds"], "speeds")),
+        tuple((check_text(item), decode_datum(datum, graph, rename)) for item, datum in dynamics),
         graph.scalar(given["follows"]) if "follows" in given else None,
     )
 
 
-def read_datum(value: Any, graph: Graph, rename: Rename, depth: int = 0) -> Any:
+def decode_datum(value: Any, graph: NodeGraph, rename: Rename, depth: int = 0) -> Any:
     """Return a datum that was written, and lies in so many lists."""
     if type(value) is list:
         check_depth(depth)
-        return tuple([read_datum(item, graph, rename, depth + 1) for item in value])
+        return tuple([decode_datum(item, graph, rename, depth + 1) for item in value])
     if type(value) is dict:
-        return _read_tagged(value, graph)
+        return _decode_tagged(value, graph)
     if type(value) is int and value.bit_length() > PLAIN_BITS:
-        raise RefusedError('an integer of more than 64 bits is written {"integer": "its digits"}')
+        raise InvalidDocumentError('an integer of more than 64 bits is written {"integer": "its digits"}')
     if type(value) is str:
-        return string(value)
+        return check_text(value)
     if value is not None and type(value) not in (bool, int, float):
-        raise RefusedError(f"a {type(value).__name__} is no datum")
-    return number(value) if type(value) is float else value
+        raise InvalidDocumentError(f"a {type(value).__name__} is no datum")
+    return check_number(value) if type(value) is float else value
 
 
-def _read_tagged(value: dict[str, Any], graph: Graph) -> Any:
-    given = fields(value, (), DATUM_TAGS)
+def _decode_tagged(value: dict[str, Any], graph: NodeGraph) -> Any:
+    given = check_keys(value, (), DATUM_TAGS)
     if len(given) != 1:
-        raise RefusedError(f"an object among data has one of the keys {', '.join(DATUM_TAGS)}")
+        raise InvalidDocumentError(f"an object among data has one of the keys {', '.join(DATUM_TAGS)}")
     ((tag, inner),) = given.items()
     if tag == "expression":
         return graph.expression(inner)
     if tag == "float" and inner in ("inf", "-inf"):
-        return number(inner)
+        return check_number(inner)
     if tag == "integer" and type(inner) is str and _INTEGER.fullmatch(inner):
         return int(inner)
-    raise RefusedError(f"{tag!r} is the place of an expression, 'inf' or '-inf', or the digits of an integer")
+    raise InvalidDocumentError(
+        f"{tag!r} is the place of an expression, 'inf' or '-inf', or the digits of an integer"
+    )
 
 
-_READERS: dict[str, Callable[[Any, Graph, Rename], Any]] = {
-    FRAMES: _read_frame,
-    BODIES: lambda value, graph, rename: read_body(value),
-    ARTICULATIONS: _read_articulation,
-    CONSTRAINTS: _read_constraint,
-    RATES: _read_rate,
-    DATA: read_datum,
+_DECODERS: dict[str, Callable[[Any, NodeGraph, Rename], Any]] = {
+    FRAMES: _decode_frame,
+    BODIES: lambda value, graph, rename: decode_body(value),
+    ARTICULATIONS: _decode_articulation,
+    CONSTRAINTS: _decode_constraint,
+    RATES: _decode_rate,
+    DATA: decode_datum,
 }

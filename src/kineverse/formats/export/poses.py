@@ -8,17 +8,17 @@ from typing import TypeAlias
 import numpy as np
 import numpy.typing as npt
 
-from kineverse.formats import rpy
-from kineverse.formats.rpy import snap
+from kineverse.formats import poses
+from kineverse.formats.poses import snap
 from kineverse.model.body import Vector3
 
 Matrix: TypeAlias = npt.NDArray[np.float64]
 
-RIGID = 1e-13
+ROTATION_TOLERANCE = 1e-13
 """How far a rotation that is written may be from what was meant, entry by entry."""
 
 
-def angles(pose: Matrix) -> Vector3:
+def rpy_angles(pose: Matrix) -> Vector3:
     """Return roll, pitch and yaw about the fixed axes [rad]; right at a pitch of π/2, too."""
     r = pose[:3, :3].tolist()
     yaw = math.atan2(r[1][0], r[0][0]) if abs(r[1][0]) + abs(r[0][0]) > 1e-12 else 0.0
@@ -28,7 +28,7 @@ def angles(pose: Matrix) -> Vector3:
     return snap(roll), snap(pitch), snap(yaw)
 
 
-def quaternion(pose: Matrix) -> tuple[float, float, float, float]:
+def unit_quaternion(pose: Matrix) -> tuple[float, float, float, float]:
     """Return the unit quaternion (x, y, z, w) of a rotation, w not negative."""
     r = pose[:3, :3]
     products = np.array(
@@ -46,7 +46,7 @@ def quaternion(pose: Matrix) -> tuple[float, float, float, float]:
     return x, y, z, w
 
 
-def deviation(pose: Matrix) -> float:
+def rotation_deviation(pose: Matrix) -> float:
     """Return by how much the rotation that is written differs from the one given: it may not be rigid."""
-    written = rpy.pose_of((0.0, 0.0, 0.0), angles(pose)).matrix
+    written = poses.pose_from_rpy((0.0, 0.0, 0.0), rpy_angles(pose)).matrix
     return float(np.abs(written[:3, :3] - pose[:3, :3]).max())

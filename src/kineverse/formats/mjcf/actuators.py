@@ -1,14 +1,14 @@
-"""Actuators: how strong the joints are that they drive."""
+"""Joint effort limits from MJCF actuators."""
 
 from __future__ import annotations
 
 import math
 from typing import Any
 
-from .engine import mujoco
+from .mujoco_api import mujoco
 
 
-def efforts(spec: Any) -> dict[str, float]:
+def joint_efforts(spec: Any) -> dict[str, float]:
     """Return the largest force [N] or torque [N m] of actuators on each joint, by its name.
 
     A joint with an actuator of unknown strength is not in there: controllers decide that.

@@ -1,4 +1,4 @@
-"""Bodies, joints and sites as MuJoCo compiled them."""
+"""Bodies, joints and sites of a compiled MJCF."""
 
 from __future__ import annotations
 
@@ -8,22 +8,30 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from kineverse.formats.markup import quote
+from kineverse.formats.names import NameFaultHandler, UniqueNames, drop_empty_parts
 from kineverse.formats.poses import IDENTITY, is_identity
+from kineverse.formats.xml_reader import quote
 from kineverse.model.body import Vector3
 
-from .compiling import Compiled, Note
-from .description import SUFFIXES, WORLD, Dynamics, Joint, Kind, Link, Site
-from .engine import mujoco
-from .naming import Mend, Names, plain
-from .shapes import Shapes, pose_at
-from .tree import Node
+from .compile import CompiledMjcf, ElementNote
+from .description import (
+    COORDINATE_SUFFIXES,
+    WORLD,
+    MjcfDynamics,
+    MjcfJoint,
+    MjcfJointType,
+    MjcfLink,
+    MjcfSite,
+)
+from .elements import MjcfElement
+from .mujoco_api import mujoco
+from .shapes import MjcfShapes, mujoco_pose
 
-FREE = "free"
+FREE_JOINT = "free"
 """What the name of the free motion of a mocap body has behind that of the body."""
 
 
-class Bodies:
+class MjcfBodies:
     """The bodies of a model, with their names.
 
     Attributes
@@ -34,7 +42,14 @@ class Bodies:
         By the numbers that they have in the model.
     """
 
-    def __init__(self, compiled: Compiled, shapes: Shapes, source: str, note: Note, mend: Mend) -> None:
+    def __init__(
+        self,
+        compiled: CompiledMjcf,
+        shapes: MjcfShapes,
+        source: str,
+        note: ElementNote,
+        mend: NameFaultHandler,
+    ) -> None:
         self._model, self._source, self._shapes = compiled.model, source, shapes
         self._efforts, self._home = compiled.efforts, compiled.home
         self._custom, self._bound = compiled.prepared.custom, float(compiled.spec.compiler.boundmass)
@@ -49,11 +64,11 @@ class Bodies:
             for number, node in compiled.nodes(spec.joints).items()
         }
         self._site_nodes = compiled.nodes(spec.sites)
-        self._frames = Names(mend, WORLD)
-        self._movers = Names(mend)
+        self._frames = UniqueNames(mend, WORLD)
+        self._movers = UniqueNames(mend)
         self.body_names = self._named_bodies()
         self.joint_names = self._named_joints()
-        joints: dict[int, list[Joint]] = {}
+        joints: dict[int, list[MjcfJoint]] = {}
         for number in range(model.njnt):
             joints.setdefault(int(model.jnt_bodyid[number]), []).append(self._joint(number))
         for number in range(model.nbody):
@@ -61,15 +76,15 @@ class Bodies:
                 joints[number] = [self._handle(number)]
         self.links = tuple(self._link(number, tuple(joints.get(number, ()))) for number in range(model.nbody))
         self.site_names = self._named_sites()
-        self.sites = tuple(self._site(k) for k in range(model.nsite) if not self.is_end(k))
+        self.sites = tuple(self._site(k) for k in range(model.nsite) if not self.is_closure_site(k))
 
-    def is_end(self, site: int) -> bool:
+    def is_closure_site(self, site: int) -> bool:
         """Whether a site is only there to say where its body is tied, which is at its origin."""
         m = self._model
-        pose = pose_at(m.site_pos[site], m.site_quat[site])
-        return plain(m.site(site).name) in self._custom.ends and is_identity(pose)
+        pose = mujoco_pose(m.site_pos[site], m.site_quat[site])
+        return drop_empty_parts(m.site(site).name) in self._custom.ends and is_identity(pose)
 
-    def _where(self, node: Node | None) -> str:
+    def _where(self, node: MjcfElement | None) -> str:
         return self._source if node is None else node.where
 
     def _named_bodies(self) -> list[str]:
@@ -105,9 +120,13 @@ class Bodies:
                 names[number] = self._movers.invent(name, self._where(self._joint_nodes[number]))
         kinds = {int(mujoco().mjtJoint.mjJNT_BALL): "ball", int(mujoco().mjtJoint.mjJNT_FREE): "free"}
         for number in range(m.njnt):
-            kind: Kind = kinds.get(int(m.jnt_type[number]), "hinge")  # type: ignore[assignment]  # as above
+            kind: MjcfJointType = kinds.get(int(m.jnt_type[number]), "hinge")  # type: ignore[assignment]  # as above
             name, where = names[number], self._where(self._joint_nodes[number])
-            clash = [f"{name}/{suffix}" for suffix in SUFFIXES[kind] if f"{name}/{suffix}" in self._movers]
+            clash = [
+                f"{name}/{suffix}"
+                for suffix in COORDINATE_SUFFIXES[kind]
+                if f"{name}/{suffix}" in self._movers
+            ]
             if clash:
                 problem = f"its coordinate would be called {quote(clash[0])} here, as a joint is. Rename one"
                 names[number] = self._movers.replace(f"{name}_joint", where, problem)
@@ -119,48 +138,48 @@ class Bodies:
         nameless: dict[int, int] = {}
         for number in range(m.nsite):
             body, where = int(m.site_bodyid[number]), self._where(self._site_nodes[number])
-            if self.is_end(number):
+            if self.is_closure_site(number):
                 names[number] = self.body_names[body]
             elif m.site(number).name:
-                name = plain(m.site(number).name)
+                name = drop_empty_parts(m.site(number).name)
                 names[number] = self._frames.invent(name, where, f"{name}_site")
             else:
                 count = nameless[body] = nameless.get(body, -1) + 1
                 names[number] = self._frames.invent(f"{self.body_names[body]}/site{count}", where)
         return names
 
-    def _link(self, number: int, joints: tuple[Joint, ...]) -> Link:
+    def _link(self, number: int, joints: tuple[MjcfJoint, ...]) -> MjcfLink:
         m, name = self._model, self.body_names[number]
         body = self._shapes.body(number)
         if name in self._custom.massless and m.body_mass[number] <= self._bound:
             body = replace(body, inertia=None)
-        return Link(
+        return MjcfLink(
             name,
             self.body_names[int(m.body_parentid[number])],
-            pose_at(m.body_pos[number], m.body_quat[number]) if number else IDENTITY,
+            mujoco_pose(m.body_pos[number], m.body_quat[number]) if number else IDENTITY,
             joints,
             body,
             self._where(self._body_nodes[number]),
         )
 
-    def _site(self, number: int) -> Site:
+    def _site(self, number: int) -> MjcfSite:
         m = self._model
-        return Site(
+        return MjcfSite(
             self.site_names[number],
             self.body_names[int(m.site_bodyid[number])],
-            pose_at(m.site_pos[number], m.site_quat[number]),
+            mujoco_pose(m.site_pos[number], m.site_quat[number]),
             self._where(self._site_nodes[number]),
         )
 
-    def _handle(self, number: int) -> Joint:
+    def _handle(self, number: int) -> MjcfJoint:
         """Return the free motion of a mocap body, which users and programs move as they like."""
         where = self._where(self._body_nodes[number])
-        name = self._movers.invent(f"{self.body_names[number]}/{FREE}", where)
-        return Joint(name, "free", self.body_names[number], home=(0.0,) * 6 + (1.0,), where=where)
+        name = self._movers.invent(f"{self.body_names[number]}/{FREE_JOINT}", where)
+        return MjcfJoint(name, "free", self.body_names[number], home=(0.0,) * 6 + (1.0,), where=where)
 
-    def _joint(self, number: int) -> Joint:
+    def _joint(self, number: int) -> MjcfJoint:
         m, kinds = self._model, mujoco().mjtJoint
-        kind: Kind = {
+        kind: MjcfJointType = {
             int(kinds.mjJNT_HINGE): "hinge",
             int(kinds.mjJNT_SLIDE): "slide",
             int(kinds.mjJNT_BALL): "ball",
@@ -170,7 +189,7 @@ class Bodies:
         if m.jnt_limited[number] and kind != "free":
             lower, upper = (v if abs(v) < np.inf else None for v in m.jnt_range[number].tolist())
         address = int(m.jnt_qposadr[number])
-        return Joint(
+        return MjcfJoint(
             name,
             kind,
             self._frames.invent(name, where, f"{name}_joint"),
@@ -185,7 +204,7 @@ class Bodies:
             where,
         )
 
-    def _values(self, number: int, kind: Kind, address: int) -> tuple[float, ...]:
+    def _values(self, number: int, kind: MjcfJointType, address: int) -> tuple[float, ...]:
         """Return the coordinates of a joint at home."""
         m, engine = self._model, mujoco()
         given = m.qpos0 if self._home is None else self._home
@@ -209,7 +228,7 @@ class Bodies:
         mujoco().mju_normalize4(unit)
         return unit
 
-    def _dynamics(self, number: int, kind: Kind) -> Dynamics:
+    def _dynamics(self, number: int, kind: MjcfJointType) -> MjcfDynamics:
         m = self._model
         dof = int(m.jnt_dofadr[number])
         strength = self._efforts.get(m.joint(number).name) if kind in ("hinge", "slide") else None

@@ -1,4 +1,4 @@
-"""Equalities and tendons as MuJoCo compiled them."""
+"""Equalities and tendons of a compiled MJCF."""
 
 from __future__ import annotations
 
@@ -7,18 +7,18 @@ from typing import Literal
 
 import numpy as np
 
-from kineverse.formats.poses import IDENTITY, inverse, product
+from kineverse.formats.names import NameFaultHandler, UniqueNames
+from kineverse.formats.poses import IDENTITY, compose_poses, invert_pose
 from kineverse.model.body import Pose
 
-from .bodies import Bodies
-from .carrying import at_rest
-from .compiling import Compiled, Note
-from .custom import closed_as_said
-from .description import Closure, Coupling, Dynamics, Quartic, Tendon
-from .engine import mujoco
-from .naming import Mend, Names
-from .shapes import pose_at
-from .tree import Node
+from .bodies import MjcfBodies
+from .compile import CompiledMjcf, ElementNote
+from .custom_elements import merge_loop_closures
+from .description import MjcfClosure, MjcfCoupling, MjcfDynamics, MjcfTendon, Quartic
+from .elements import MjcfElement
+from .held_bodies import compute_rest_poses
+from .mujoco_api import mujoco
+from .shapes import mujoco_pose
 
 _CLOSED = 1e-6
 """How far apart ends that are rigidly connected may be [m], [rad]: files have six digits."""
@@ -26,24 +26,26 @@ _CLOSED = 1e-6
 _UNTURNED = (1.0, 0.0, 0.0, 0.0)
 
 
-class Constraints:
+class MjcfConstraints:
     """What couples joints, closes loops and ties lengths."""
 
-    def __init__(self, compiled: Compiled, bodies: Bodies, note: Note, mend: Mend) -> None:
+    def __init__(
+        self, compiled: CompiledMjcf, bodies: MjcfBodies, note: ElementNote, mend: NameFaultHandler
+    ) -> None:
         self._model, self._bodies, self._note = compiled.model, bodies, note
         model = compiled.model
         self._nodes = compiled.nodes(compiled.spec.equalities)
         self._tendon_nodes = compiled.nodes(compiled.spec.tendons)
-        self._rest = at_rest(bodies.links)
-        names = Names(mend)
+        self._rest = compute_rest_poses(bodies.links)
+        names = UniqueNames(mend)
         self._tendon_names = self._named(names, "tendon", model.ntendon, self._tendon_nodes)
-        self._names = self._named(Names(mend), "equality", model.neq, self._nodes)
+        self._names = self._named(UniqueNames(mend), "equality", model.neq, self._nodes)
         found = [self._tendon(number) for number in range(model.ntendon)]
         self.tendons = tuple(tendon for tendon in found if tendon is not None)
         self._known = {tendon.name for tendon in self.tendons}
-        couplings: list[Coupling] = []
-        tendon_couplings: list[Coupling] = []
-        closures: list[Closure] = []
+        couplings: list[MjcfCoupling] = []
+        tendon_couplings: list[MjcfCoupling] = []
+        closures: list[MjcfClosure] = []
         kinds = mujoco().mjtEq
         for number in range(model.neq):
             kind = model.eq_type[number]
@@ -61,10 +63,12 @@ class Constraints:
                 note(self._nodes.get(number), "is left out: no constraint here says it.")
         self.couplings = tuple(couplings)
         said = compiled.prepared.custom.loops
-        self.closures = closed_as_said(tuple(closures), bodies.links, said, note)
+        self.closures = merge_loop_closures(tuple(closures), bodies.links, said, note)
         self.tendon_couplings = tuple(tendon_couplings)
 
-    def _named(self, names: Names, kind: str, count: int, nodes: dict[int, Node | None]) -> list[str]:
+    def _named(
+        self, names: UniqueNames, kind: str, count: int, nodes: dict[int, MjcfElement | None]
+    ) -> list[str]:
         """Return the names of equalities or tendons; those that have none are numbered by their element."""
         result = [""] * count
         own = [getattr(self._model, kind if kind == "tendon" else "equality")(k).name for k in range(count)]
@@ -80,17 +84,17 @@ class Constraints:
                 result[number] = names.invent(f"{tag}{numbers[tag]}", self._where(node))
         return result
 
-    def _where(self, node: Node | None) -> str:
+    def _where(self, node: MjcfElement | None) -> str:
         return "" if node is None else node.where
 
     # -- couplings -------------------------------------------------------------------------------------------
 
-    def _joint_coupling(self, number: int) -> Coupling:
+    def _joint_coupling(self, number: int) -> MjcfCoupling:
         m = self._model
         follower, leader = int(m.eq_obj1id[number]), int(m.eq_obj2id[number])
         rest = [float(m.qpos0[m.jnt_qposadr[joint]]) if joint >= 0 else 0.0 for joint in (follower, leader)]
         names = self._bodies.joint_names
-        return Coupling(
+        return MjcfCoupling(
             self._names[number],
             names[follower],
             names[leader] if leader >= 0 else None,
@@ -100,7 +104,7 @@ class Constraints:
             self._where(self._nodes.get(number)),
         )
 
-    def _tendon_coupling(self, number: int) -> Iterator[Coupling]:
+    def _tendon_coupling(self, number: int) -> Iterator[MjcfCoupling]:
         m = self._model
         follower, leader = int(m.eq_obj1id[number]), int(m.eq_obj2id[number])
         names = self._tendon_names
@@ -109,7 +113,7 @@ class Constraints:
             self._note(self._nodes.get(number), "is left out, as its tendon is.")
             return
         rest = [float(m.tendon_length0[tendon]) if tendon >= 0 else 0.0 for tendon in (follower, leader)]
-        yield Coupling(
+        yield MjcfCoupling(
             self._names[number],
             ends[0],
             ends[1] if leader >= 0 else None,
@@ -125,21 +129,21 @@ class Constraints:
 
     # -- closures --------------------------------------------------------------------------------------------
 
-    def _closure(self, number: int, kind: Literal["connect", "weld"]) -> Iterator[Closure]:
+    def _closure(self, number: int, kind: Literal["connect", "weld"]) -> Iterator[MjcfClosure]:
         m = self._model
         node, data = self._nodes.get(number), m.eq_data[number]
         ends = [int(m.eq_obj1id[number]), int(m.eq_obj2id[number])]
         if m.eq_objtype[number] == mujoco().mjtObj.mjOBJ_SITE:
             bodies = [int(m.site_bodyid[site]) for site in ends]
             names = [self._bodies.site_names[site] for site in ends]
-            poses = [pose_at(m.site_pos[site], m.site_quat[site]) for site in ends]
+            poses = [mujoco_pose(m.site_pos[site], m.site_quat[site]) for site in ends]
             inside = [IDENTITY, IDENTITY]  # the name is that of the site, or of the body where it is
         else:
             bodies, names = ends, [self._bodies.body_names[body] for body in ends]
             if kind == "connect":
-                poses = [pose_at(data[:3], _UNTURNED), pose_at(data[3:6], _UNTURNED)]
+                poses = [mujoco_pose(data[:3], _UNTURNED), mujoco_pose(data[3:6], _UNTURNED)]
             else:
-                poses = [pose_at(data[3:6], data[6:10]), pose_at(data[:3], _UNTURNED)]
+                poses = [mujoco_pose(data[3:6], data[6:10]), mujoco_pose(data[:3], _UNTURNED)]
             inside = poses
         if any(m.body_mocapid[body] >= 0 for body in bodies):
             self._note(node, "is left out: it ties to a mocap body, by which a user drags another.")
@@ -147,17 +151,17 @@ class Constraints:
         where = self._where(node)
         if m.body_weldid[bodies[0]] == m.body_weldid[bodies[1]]:
             first, second = (
-                product(self._rest[self._bodies.body_names[b]], pose)
+                compose_poses(self._rest[self._bodies.body_names[b]], pose)
                 for b, pose in zip(bodies, poses, strict=True)
             )
             if _gap(first, second, kind) <= _CLOSED:
                 self._note(node, "is left out: it ties bodies that are rigidly connected anyway.")
                 return
-        yield Closure(self._names[number], kind, names[0], names[1], inside[0], inside[1], where)
+        yield MjcfClosure(self._names[number], kind, names[0], names[1], inside[0], inside[1], where)
 
     # -- tendons ---------------------------------------------------------------------------------------------
 
-    def _tendon(self, number: int) -> Tendon | None:
+    def _tendon(self, number: int) -> MjcfTendon | None:
         m, kinds = self._model, mujoco().mjtWrap
         node = self._tendon_nodes.get(number)
         first = int(m.tendon_adr[number])
@@ -178,7 +182,7 @@ class Constraints:
         lower = upper = None
         if m.tendon_limited[number]:
             lower, upper = m.tendon_range[number].tolist()
-        return Tendon(
+        return MjcfTendon(
             self._tendon_names[number],
             tuple(terms),
             tuple((divisor, tuple(sites)) for divisor, sites in paths if len(sites) > 1),
@@ -188,7 +192,7 @@ class Constraints:
             self._where(node),
         )
 
-    def _tendon_dynamics(self, number: int) -> Dynamics:
+    def _tendon_dynamics(self, number: int) -> MjcfDynamics:
         m = self._model
         stiffness = float(m.tendon_stiffness[number])
         shortest, longest = m.tendon_lengthspring[number].tolist()
@@ -205,7 +209,7 @@ class Constraints:
 
 def _gap(first: Pose, second: Pose, kind: str) -> float:
     """Return what is left between two ends [m], and for welds between their axes [rad]."""
-    between = product(inverse(first), second).matrix
+    between = compose_poses(invert_pose(first), second).matrix
     gap = float(np.linalg.norm(between[:3, 3]))
     if kind == "weld":
         gap = max(gap, float(np.linalg.norm(between[:3, :3] - np.eye(3))))

@@ -1,4 +1,4 @@
-"""What an MJCF describes as MuJoCo compiled it, before anything symbolic is made of it.
+"""Checked MJCF description: links, sites, couplings, closures and tendons.
 
 Units are [m], [rad], [kg], [s]. Everything has a name, and names of frames are unique. ``where`` is the place
 in the file, for messages. A description is plain immutable data.
@@ -12,8 +12,8 @@ from typing import Literal, TypeAlias
 from kineverse.formats.poses import IDENTITY
 from kineverse.model.body import Body, Pose, Vector3
 
-Kind: TypeAlias = Literal["hinge", "slide", "ball", "free"]
-Dynamics: TypeAlias = tuple[tuple[str, float], ...]
+MjcfJointType: TypeAlias = Literal["hinge", "slide", "ball", "free"]
+MjcfDynamics: TypeAlias = tuple[tuple[str, float], ...]
 Quartic: TypeAlias = tuple[float, float, float, float, float]
 
 _NOTHING = Body()
@@ -21,7 +21,7 @@ _NOTHING = Body()
 WORLD = "world"
 """What the body at the root is called."""
 
-SUFFIXES: dict[Kind, tuple[str, ...]] = {
+COORDINATE_SUFFIXES: dict[MjcfJointType, tuple[str, ...]] = {
     "hinge": (),
     "slide": (),
     "ball": ("qx", "qy", "qz", "qw"),
@@ -31,7 +31,7 @@ SUFFIXES: dict[Kind, tuple[str, ...]] = {
 
 
 @dataclass(frozen=True, slots=True)
-class Joint:
+class MjcfJoint:
     """A joint of a body; several of them move a body one after the other.
 
     ``anchor`` is the point about which it turns and ``axis`` a unit vector, both in the frame of the body.
@@ -44,7 +44,7 @@ class Joint:
     """
 
     name: str
-    kind: Kind
+    kind: MjcfJointType
     frame: str
     axis: Vector3 = (0.0, 0.0, 1.0)
     anchor: Vector3 = (0.0, 0.0, 0.0)
@@ -53,24 +53,24 @@ class Joint:
     upper: float | None = None
     speed: tuple[float, float] | None = None
     home: tuple[float, ...] = ()
-    dynamics: Dynamics = ()
+    dynamics: MjcfDynamics = ()
     where: str = ""
 
 
 @dataclass(frozen=True, slots=True)
-class Link:
+class MjcfLink:
     """A body: where it is in its parent while its joints are at rest, and what moves it."""
 
     name: str
     parent: str
     pose: Pose = IDENTITY
-    joints: tuple[Joint, ...] = ()
+    joints: tuple[MjcfJoint, ...] = ()
     body: Body = _NOTHING
     where: str = ""
 
 
 @dataclass(frozen=True, slots=True)
-class Site:
+class MjcfSite:
     """A frame that moves with a body."""
 
     name: str
@@ -80,7 +80,7 @@ class Site:
 
 
 @dataclass(frozen=True, slots=True)
-class Coupling:
+class MjcfCoupling:
     """One joint or tendon as a polynomial of another: y - y0 = Σ aₖ (x - x0)ᵏ, with y = a0 where none leads.
 
     ``rest`` is y0 and ``leader_rest`` x0.
@@ -96,7 +96,7 @@ class Coupling:
 
 
 @dataclass(frozen=True, slots=True)
-class Closure:
+class MjcfClosure:
     """Two points (``connect``) or two poses (``weld``) that coincide, each in the frame of a link or site.
 
     ``more`` are others of the same loop. ``free`` and ``dependent`` are the joints in it, those
@@ -110,13 +110,13 @@ class Closure:
     in_first: Pose = IDENTITY
     in_second: Pose = IDENTITY
     where: str = ""
-    more: tuple[Closure, ...] = ()
+    more: tuple[MjcfClosure, ...] = ()
     free: tuple[str, ...] = ()
     dependent: tuple[str, ...] | None = None
 
 
 @dataclass(frozen=True, slots=True)
-class Tendon:
+class MjcfTendon:
     """A length [m]: a sum of joint positions, each with its factor; or that of a line through sites.
 
     ``terms`` are joints and factors, ``paths`` divisors of pulleys and the sites of the branch behind.
@@ -127,12 +127,12 @@ class Tendon:
     paths: tuple[tuple[float, tuple[str, ...]], ...] = ()
     lower: float | None = None
     upper: float | None = None
-    dynamics: Dynamics = ()
+    dynamics: MjcfDynamics = ()
     where: str = ""
 
 
 @dataclass(frozen=True, slots=True)
-class Scene:
+class MjcfScene:
     """All of a file.
 
     ``links`` begin with the world, and each comes after its parent. ``remarks`` say what was left out or read
@@ -140,12 +140,12 @@ class Scene:
     where joints are at home.
     """
 
-    links: tuple[Link, ...] = ()
-    sites: tuple[Site, ...] = ()
-    couplings: tuple[Coupling, ...] = ()
-    closures: tuple[Closure, ...] = ()
-    tendons: tuple[Tendon, ...] = ()
-    tendon_couplings: tuple[Coupling, ...] = ()
+    links: tuple[MjcfLink, ...] = ()
+    sites: tuple[MjcfSite, ...] = ()
+    couplings: tuple[MjcfCoupling, ...] = ()
+    closures: tuple[MjcfClosure, ...] = ()
+    tendons: tuple[MjcfTendon, ...] = ()
+    tendon_couplings: tuple[MjcfCoupling, ...] = ()
     source: str = ""
     remarks: tuple[str, ...] = ()
     has_home: bool = False

@@ -1,4 +1,4 @@
-"""Meshes: boxes stand for their files while MuJoCo compiles, and say where each file's own frame is.
+"""MJCF mesh assets, with boxes in their place while MuJoCo compiles.
 
 MuJoCo moves the origin of a mesh to its centre and turns it to its principal axes. What it did to the box,
 undone, is the frame of the file, for any content of the file. A file is read only where it decides something:
@@ -15,15 +15,15 @@ from typing import Any
 import numpy as np
 
 from kineverse.errors import FormatError
-from kineverse.formats import rpy
+from kineverse.formats import poses
 from kineverse.formats.files import read_file
-from kineverse.formats.markup import quote
-from kineverse.formats.poses import product
+from kineverse.formats.poses import compose_poses
+from kineverse.formats.xml_reader import quote
 from kineverse.model.body import Mesh, Pose
 
-from .engine import mujoco
-from .preparing import Prepared
-from .tree import Node, find_below
+from .elements import MjcfElement, find_below_root
+from .mujoco_api import mujoco
+from .preprocess import PreprocessedMjcf
 
 _FORMATS = (".stl", ".obj", ".msh")
 _DIAGONAL = 1e-9
@@ -31,7 +31,7 @@ _UNMOVED = [1.0] * 3, [0.0] * 3, [1.0, 0.0, 0.0, 0.0]
 
 
 @dataclass(frozen=True, slots=True)
-class Asset:
+class MeshAsset:
     """A mesh as the description says it: v' = S Rᵀ (v - p) for the vertices v of the file."""
 
     uri: str
@@ -41,28 +41,33 @@ class Asset:
 
 
 @dataclass(slots=True)
-class Meshes:
+class MjcfMeshes:
     """The meshes of a specification, by name.
 
     ``guessed`` are the bodies whose inertia nobody knows since a file is not there, ``fitted`` the shapes
     whose size nobody knows.
     """
 
-    assets: dict[str, Asset] = field(default_factory=dict)
+    assets: dict[str, MeshAsset] = field(default_factory=dict)
     guessed: list[Any] = field(default_factory=list)
     fitted: list[Any] = field(default_factory=list)
 
 
-class Replacement:
+class MeshReplacement:
     """Puts boxes for files into a specification, and files where they decide something."""
 
     def __init__(
-        self, spec: Any, prepared: Prepared, folder: str, root: str, note: Callable[[Node, str], None]
+        self,
+        spec: Any,
+        prepared: PreprocessedMjcf,
+        folder: str,
+        root: str,
+        note: Callable[[MjcfElement, str], None],
     ) -> None:
         self._spec, self._prepared, self._note = spec, prepared, note
         self._folder, self._root = folder, root
-        self.meshes = Meshes()
-        self._nodes: dict[str, Node] = {}
+        self.meshes = MjcfMeshes()
+        self._nodes: dict[str, MjcfElement] = {}
         self._boxes: dict[str, tuple[Any, list[float], list[int]]] = {}
         for mesh in spec.meshes:
             node = prepared.node(mesh.info)
@@ -70,7 +75,7 @@ class Replacement:
                 continue
             self._nodes[mesh.name] = node
             scale, position, turn = (tuple(map(float, v)) for v in (mesh.scale, mesh.refpos, mesh.refquat))
-            self.meshes.assets[mesh.name] = Asset(prepared.files[node].uri, scale, position, turn)
+            self.meshes.assets[mesh.name] = MeshAsset(prepared.files[node].uri, scale, position, turn)
             mesh.scale, mesh.refpos, mesh.refquat = _UNMOVED
             self._boxes[mesh.name] = mesh, list(mesh.uservert), list(mesh.userface)
 
@@ -137,7 +142,7 @@ class Replacement:
         try:
             if Path(uri).suffix.lower() not in _FORMATS:
                 node.refuse(f"names {quote(uri)}, which is in no format that MuJoCo reads.")
-            return read_file(find_below(node, uri, self._root, self._folder))
+            return read_file(find_below_root(node, uri, self._root, self._folder))
         except FormatError as error:
             reason = str(error).removeprefix(f"{node.where}: ")
             self._note(node, f"is not read, where its triangles decide an inertia or a size: {reason}")
@@ -156,13 +161,13 @@ class Replacement:
         mesh.scale, mesh.refpos, mesh.refquat = asset.scale, asset.position, asset.quaternion
 
 
-def placed(asset: Asset, body_T_mesh: Pose, folder: str, root: str) -> tuple[Mesh, Pose] | None:
+def place_mesh(asset: MeshAsset, body_T_mesh: Pose, folder: str, root: str) -> tuple[Mesh, Pose] | None:
     """Return a mesh and where its file's frame is; None where no scale of the file says it.
 
     With v' = S Rᵀ (v - p), v' = Rᵀ (R S Rᵀ v) - S Rᵀ p, so R S Rᵀ has to be a scale, too.
     """
     w, x, y, z = asset.quaternion
-    turn = rpy.pose_of_quaternion((0.0, 0.0, 0.0), (x, y, z, w)).matrix[:3, :3]
+    turn = poses.pose_from_quaternion((0.0, 0.0, 0.0), (x, y, z, w)).matrix[:3, :3]
     scale = np.diag(asset.scale)
     along = turn @ scale @ turn.T
     if np.abs(along - np.diag(np.diag(along))).max() > _DIAGONAL * np.abs(scale).max():
@@ -171,4 +176,4 @@ def placed(asset: Asset, body_T_mesh: Pose, folder: str, root: str) -> tuple[Mes
     mesh_T_file[:3, :3] = turn.T
     mesh_T_file[:3, 3] = -scale @ turn.T @ asset.position
     a, b, c = np.diag(along).tolist()
-    return Mesh(asset.uri, (a, b, c), folder, root), product(body_T_mesh, Pose.of(mesh_T_file + 0.0))
+    return Mesh(asset.uri, (a, b, c), folder, root), compose_poses(body_T_mesh, Pose.of(mesh_T_file + 0.0))

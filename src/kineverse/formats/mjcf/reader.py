@@ -1,4 +1,4 @@
-"""MJCF files and text to a checked description.
+"""MJCF files and text as checked descriptions.
 
 ``docs/mjcf.md`` lists what becomes what.
 """
@@ -10,28 +10,28 @@ from pathlib import Path
 
 from kineverse.errors import FormatError
 from kineverse.formats.files import read_file
-from kineverse.formats.remarks import Fault, tell
-from kineverse.formats.roots import text_root
+from kineverse.formats.reader_warnings import Fault, warn
+from kineverse.formats.root_folder import find_text_root
 
-from .bodies import Bodies
-from .compiling import compile_document
-from .constraints import Constraints
-from .description import Scene
-from .preparing import Preparation
-from .shapes import Shapes
-from .tree import Node
+from .bodies import MjcfBodies
+from .compile import compile_document
+from .constraints import MjcfConstraints
+from .description import MjcfScene
+from .elements import MjcfElement
+from .preprocess import MjcfPreprocessor
+from .shapes import MjcfShapes
 
 
 def read_mjcf(
     path: str | os.PathLike[str], root: str | os.PathLike[str] | None = None, strict: bool = False
-) -> Scene:
+) -> MjcfScene:
     """Read an MJCF file, with what it includes and attaches; see :func:`parse_mjcf`.
 
     Raises
     ------
     FormatError
         If the file cannot be read or is not a valid MJCF; the message names file, line, element and reason.
-    MissingExtraError
+    MissingDependencyError
         If MuJoCo is not installed.
     """
     path = Path(path)
@@ -44,7 +44,7 @@ def parse_mjcf(
     folder: str = "",
     root: str | os.PathLike[str] | None = None,
     strict: bool = False,
-) -> Scene:
+) -> MjcfScene:
     """Read an MJCF from text.
 
     Parameters
@@ -56,7 +56,7 @@ def parse_mjcf(
     folder
         The folder from which the files it includes and the meshes it names are found.
     root
-        The folder that they do not leave; None for that which :func:`kineverse.formats.roots.root_of` finds.
+        The folder that they do not leave; None for that which :func:`kineverse.formats.root_folder.find_root` finds.
     strict
         Whether mistakes that others read past are refused, rather than remarked on.
 
@@ -64,16 +64,20 @@ def parse_mjcf(
     ------
     FormatError
         If it is not a valid MJCF; the message names source, line, element and reason.
-    MissingExtraError
+    MissingDependencyError
         If MuJoCo is not installed.
     """
     notes = _Notes(source, strict)
-    below = text_root(folder, root)
-    prepared = Preparation(folder, below, notes.add, None if strict else notes.misspelt).run(text, source)
+    below = find_text_root(folder, root)
+    prepared = MjcfPreprocessor(folder, below, notes.add, None if strict else notes.misspelt).run(
+        text, source
+    )
     compiled = compile_document(prepared, source, folder, below, notes.add)
-    bodies = Bodies(compiled, Shapes(compiled, folder, below, notes.add), source, notes.add, notes.mend)
-    found = Constraints(compiled, bodies, notes.add, notes.mend)
-    return Scene(
+    bodies = MjcfBodies(
+        compiled, MjcfShapes(compiled, folder, below, notes.add), source, notes.add, notes.mend
+    )
+    found = MjcfConstraints(compiled, bodies, notes.add, notes.mend)
+    return MjcfScene(
         bodies.links,
         bodies.sites,
         found.couplings,
@@ -93,12 +97,12 @@ class _Notes:
         self._source, self._strict = source, strict
         self.texts: dict[str, None] = {}
 
-    def add(self, node: Node | None, text: str) -> None:
+    def add(self, node: MjcfElement | None, text: str) -> None:
         if node is not None:
             text = f"{node.place if node.source == self._source else node.where} {text}"
         if text not in self.texts:
             self.texts[text] = None
-            tell([f"{self._source}, {text}"])
+            warn([f"{self._source}, {text}"])
 
     def mend(self, where: str, problem: str, taken: str) -> None:
         """Note a mistake at a place, and what is taken instead.
@@ -118,4 +122,4 @@ class _Notes:
 
     def _fault(self, text: str) -> None:
         self.texts[Fault(text)] = None
-        tell([Fault(f"{self._source}, {text}")])
+        warn([Fault(f"{self._source}, {text}")])

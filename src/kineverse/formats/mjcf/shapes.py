@@ -1,12 +1,12 @@
-"""Geoms to shapes that are seen or touched, and inertia."""
+"""Shapes and inertia of MJCF geoms."""
 
 from __future__ import annotations
 
 from typing import Any
 
-from kineverse.formats import rpy
-from kineverse.formats.packages import outside
-from kineverse.formats.poses import inverse, product
+from kineverse.formats import poses
+from kineverse.formats.poses import compose_poses, invert_pose
+from kineverse.formats.resource_paths import find_root_violation
 from kineverse.model.body import (
     Body,
     Box,
@@ -21,9 +21,9 @@ from kineverse.model.body import (
     Sphere,
 )
 
-from .compiling import Compiled, Note
-from .engine import mujoco
-from .meshes import placed
+from .compile import CompiledMjcf, ElementNote
+from .meshes import place_mesh
+from .mujoco_api import mujoco
 
 _SHOWN = range(3)
 """The groups that MuJoCo's viewers show unless they are asked for others."""
@@ -32,7 +32,7 @@ _UNSET = [0.5, 0.5, 0.5, 1.0]
 """The colour of a geom that says none, in place of which its material's is used."""
 
 
-class Shapes:
+class MjcfShapes:
     """Reads the shapes and inertia of bodies.
 
     Parameters
@@ -45,7 +45,7 @@ class Shapes:
         Called with what is left out, and why.
     """
 
-    def __init__(self, compiled: Compiled, folder: str, root: str, note: Note) -> None:
+    def __init__(self, compiled: CompiledMjcf, folder: str, root: str, note: ElementNote) -> None:
         self._model, self._compiled = compiled.model, compiled
         self._folder, self._root = folder, root
         self._nodes, self._say = compiled.nodes(compiled.spec.geoms), note
@@ -74,12 +74,12 @@ class Shapes:
         a, b, c = m.body_inertia[number].tolist()
         if number in self._compiled.guessed or not (mass or a or b or c):
             return None
-        return Inertia(mass, (a, 0.0, 0.0, b, 0.0, c), pose_at(m.body_ipos[number], m.body_iquat[number]))
+        return Inertia(mass, (a, 0.0, 0.0, b, 0.0, c), mujoco_pose(m.body_ipos[number], m.body_iquat[number]))
 
     def _shape(self, geom: int, color: Rgba) -> Shape | None:
         m, kinds = self._model, mujoco().mjtGeom
         name, kind = m.geom(geom).name, m.geom_type[geom]
-        pose = pose_at(m.geom_pos[geom], m.geom_quat[geom])
+        pose = mujoco_pose(m.geom_pos[geom], m.geom_quat[geom])
         if geom in self._compiled.left_out:
             self._note(geom, self._compiled.left_out[geom])
             return None
@@ -94,12 +94,12 @@ class Shapes:
         if asset is None or not asset.uri:
             self._note(geom, "is left out: its triangles are in no file.")
             return None
-        centred = pose_at(m.mesh_pos[mesh], m.mesh_quat[mesh])
-        found = placed(asset, product(pose, inverse(centred)), self._folder, self._root)
+        centred = mujoco_pose(m.mesh_pos[mesh], m.mesh_quat[mesh])
+        found = place_mesh(asset, compose_poses(pose, invert_pose(centred)), self._folder, self._root)
         if found is None:
             self._note(geom, "is left out: its mesh is scaled along other axes than those of its file.")
             return None
-        wrong = outside(asset.uri, self._folder, self._root)
+        wrong = find_root_violation(asset.uri, self._folder, self._root)
         if wrong is not None:
             self._note(geom, f"names {wrong}")
         form, origin = found
@@ -131,8 +131,8 @@ def _primitive(kind: int, size: list[float]) -> Geometry | None:
     return Ellipsoid((x, y, z)) if kind == kinds.mjGEOM_ELLIPSOID else None
 
 
-def pose_at(position: Any, wxyz: Any) -> Pose:
+def mujoco_pose(position: Any, wxyz: Any) -> Pose:
     """Return a pose by MuJoCo's numbers: an offset, and a quaternion with the scalar first."""
     x, y, z = map(float, position)
     w, a, b, c = map(float, wxyz)
-    return rpy.pose_of_quaternion((x, y, z), (a, b, c, w))
+    return poses.pose_from_quaternion((x, y, z), (a, b, c, w))

@@ -1,4 +1,4 @@
-"""Operations of tendons: lengths as data, their ranges and what couples them as constraints."""
+"""Tendon operations: lengths as data, ranges and couplings as constraints."""
 
 from __future__ import annotations
 
@@ -8,14 +8,14 @@ from itertools import pairwise
 from kineverse.expressions.expression import Expression, as_expression
 from kineverse.expressions.functions import norm
 from kineverse.model.constraint import Constraint
-from kineverse.model.operation import Effects, Operation
-from kineverse.model.rates import plain
-from kineverse.model.reader import Reader
+from kineverse.model.operation import Operation, Writes
+from kineverse.model.rate_nodes import to_plain
+from kineverse.model.read_recorder import ReadRecorder
 
 from .description import Quartic
-from .following import polynomial
+from .joint_equalities import quartic_expression
 
-LENGTH = "length"
+LENGTH_KEY = "length"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -47,7 +47,7 @@ class Tendon(Operation):
     upper: float | None = None
     dynamics: tuple[tuple[str, float], ...] = ()
 
-    def apply(self, model: Reader) -> Effects:
+    def apply(self, model: ReadRecorder) -> Writes:
         """Write the length and its range."""
         length = as_expression(0.0)
         for joint, factor in self.terms:
@@ -57,12 +57,13 @@ class Tendon(Operation):
         for divisor, frames in self.paths:
             for near, far in pairwise(frames):
                 length = length + norm(model.fk(far, near)[:3, 3]) / divisor
-        name = f"{self.name}/{LENGTH}"
+        name = f"{self.name}/{LENGTH_KEY}"
         lower = -float("inf") if self.lower is None else self.lower
         upper = float("inf") if self.upper is None else self.upper
         bounded = length.symbols and not (self.lower is None and self.upper is None)
-        return Effects(
-            data={name: plain(length)} | ({f"{self.name}/dynamics": self.dynamics} if self.dynamics else {}),
+        return Writes(
+            data={name: to_plain(length)}
+            | ({f"{self.name}/dynamics": self.dynamics} if self.dynamics else {}),
             constraints={name: Constraint.of(lower, length, upper)} if bounded else {},
         )
 
@@ -90,10 +91,10 @@ class TendonCoupling(Operation):
     rest: float = 0.0
     leader_rest: float = 0.0
 
-    def apply(self, model: Reader) -> Effects:
+    def apply(self, model: ReadRecorder) -> Writes:
         """Write the constraint."""
-        length: Expression = model.data[f"{self.tendon}/{LENGTH}"]
-        other = as_expression(0.0) if self.leader is None else model.data[f"{self.leader}/{LENGTH}"]
-        along = polynomial(self.coefficients, other - self.leader_rest)
+        length: Expression = model.data[f"{self.tendon}/{LENGTH_KEY}"]
+        other = as_expression(0.0) if self.leader is None else model.data[f"{self.leader}/{LENGTH_KEY}"]
+        along = quartic_expression(self.coefficients, other - self.leader_rest)
         residual = length - self.rest - along
-        return Effects(constraints={self.name: Constraint.of(0.0, residual, 0.0)} if residual.symbols else {})
+        return Writes(constraints={self.name: Constraint.of(0.0, residual, 0.0)} if residual.symbols else {})

@@ -1,4 +1,4 @@
-"""``<link>`` elements to what they carry: inertia, shapes to see, shapes to touch.
+"""Inertia, visuals and collision shapes of SDF links.
 
 Shapes and their colours decide nothing about where links are: a shape that cannot be said here, or is not
 said, is left out with a remark.
@@ -8,10 +8,18 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from kineverse.formats.markup import Element, ElementError, child, label
-from kineverse.formats.numerals import numbers as spelt
-from kineverse.formats.packages import outside
-from kineverse.formats.poses import IDENTITY, product
+from kineverse.formats.poses import IDENTITY, compose_poses
+from kineverse.formats.resource_paths import find_root_violation
+from kineverse.formats.xml_reader import Element, ElementError, find_child, label
+from kineverse.formats.xml_values import parse_numbers as spelt
+from kineverse.formats.xml_values import (
+    read_child_number,
+    read_child_numbers,
+    read_child_text,
+    read_child_vector,
+    read_element_pose,
+    read_text,
+)
 from kineverse.model.body import (
     Body,
     Box,
@@ -27,9 +35,7 @@ from kineverse.model.body import (
     Sphere,
 )
 
-from .nodes import Node
-from .placing import relation
-from .values import number, numbers, pose_of, text, text_of, vector
+from .pose_graph import PoseNode, pose_between
 
 _ROUND: dict[str, Callable[[float, float], Geometry]] = {
     "cylinder": Cylinder,
@@ -39,7 +45,7 @@ _ROUND: dict[str, Callable[[float, float], Geometry]] = {
 _UNSCALED = (1.0, 1.0, 1.0)
 
 
-def body_of(link: Node) -> Body:
+def read_sdf_body(link: PoseNode) -> Body:
     """Return what a link carries.
 
     Raises
@@ -65,24 +71,24 @@ def body_of(link: Node) -> Body:
     return Body(tuple(visuals), tuple(collisions), inertia)
 
 
-def _shape(element: Element, link: Node) -> Shape | None:
-    geometry = child(element, "geometry")
+def _shape(element: Element, link: PoseNode) -> Shape | None:
+    geometry = find_child(element, "geometry")
     form = None if geometry is None else _geometry(geometry, element, link)
     if form is None:
         return None
     place = IDENTITY
-    pose = child(element, "pose")
+    pose = find_child(element, "pose")
     if pose is not None:
-        place = pose_of(pose, link.document.remarks)
+        place = read_element_pose(pose, link.document.remarks)
         old = "frame" if link.document.version < (1, 7) else "relative_to"
         reference = pose[1].get(old, "")
         if reference:
-            place = product(relation(link, link.scope.find(reference, pose, element)), place)
+            place = compose_poses(pose_between(link, link.scope.find(reference, pose, element)), place)
     color = _color(element, link) if element[0] == "visual" else None
     return Shape(form, place, element[1].get("name", ""), color)
 
 
-def _geometry(geometry: Element, shape: Element, link: Node) -> Geometry | None:
+def _geometry(geometry: Element, shape: Element, link: PoseNode) -> Geometry | None:
     form = geometry[2][0] if geometry[2] else None
     tag = "empty" if form is None else form[0]
     if form is None or tag == "empty":
@@ -99,17 +105,19 @@ def _geometry(geometry: Element, shape: Element, link: Node) -> Geometry | None:
     if tag != "mesh":
         remarks.add(form, f"cannot be said here; the {label(shape)} is left out.", link.element)
         return None
-    uri = text(form, "uri") or (text(form, "filename") if link.document.version < (1, 3) else "")
+    uri = read_child_text(form, "uri") or (
+        read_child_text(form, "filename") if link.document.version < (1, 3) else ""
+    )
     if not uri:
         raise ElementError(form, "has no <uri>; the specification requires it.")
-    if child(form, "submesh") is not None:
+    if find_child(form, "submesh") is not None:
         remarks.add(form, "names a submesh; all of the mesh is taken.", link.element)
     folder, root = link.document.folder, link.document.root
-    wrong = outside(uri, folder, root)
+    wrong = find_root_violation(uri, folder, root)
     if wrong is not None:
         remarks.add(form, f"names {wrong}", link.element)
     try:
-        scale = vector(form, "scale", _UNSCALED)
+        scale = read_child_vector(form, "scale", _UNSCALED)
     except ElementError as mistake:
         remarks.mend(mistake, "it is not scaled", link.element)
         scale = _UNSCALED
@@ -117,32 +125,32 @@ def _geometry(geometry: Element, shape: Element, link: Node) -> Geometry | None:
 
 
 def _length(form: Element, tag: str) -> float:
-    value = number(form, tag)
+    value = read_child_number(form, tag)
     if value < 0.0:
         raise ElementError(form, f"has a negative {tag}.")
     return value
 
 
 def _lengths(form: Element, tag: str) -> tuple[float, float, float]:
-    x, y, z = vector(form, tag)
+    x, y, z = read_child_vector(form, tag)
     if min(x, y, z) < 0.0:
         raise ElementError(form, f"has a negative {tag}.")
     return x, y, z
 
 
-def _color(visual: Element, link: Node) -> Rgba | None:
-    material = child(visual, "material")
+def _color(visual: Element, link: PoseNode) -> Rgba | None:
+    material = find_child(visual, "material")
     if material is None:
         return None
-    part = child(material, "diffuse") or child(material, "ambient")
-    if part is None or not text_of(part):
+    part = find_child(material, "diffuse") or find_child(material, "ambient")
+    if part is None or not read_text(part):
         return None
-    words = text_of(part).split()
+    words = read_text(part).split()
     try:
-        red, green, blue, alpha = (*spelt(text_of(part), min(len(words), 4) if len(words) > 2 else 4), 1.0)[
+        red, green, blue, alpha = (*spelt(read_text(part), min(len(words), 4) if len(words) > 2 else 4), 1.0)[
             :4
         ]
-        opaque = 1.0 - number(visual, "transparency", 0.0)
+        opaque = 1.0 - read_child_number(visual, "transparency", 0.0)
     except (ValueError, ElementError) as error:
         mistake = error if isinstance(error, ElementError) else ElementError(part, f"{error}.")
         link.document.remarks.mend(mistake, "it is no colour", link.element)
@@ -150,17 +158,17 @@ def _color(visual: Element, link: Node) -> Rgba | None:
     return red, green, blue, alpha * min(max(opaque, 0.0), 1.0)
 
 
-def _inertia(inertial: Element, link: Node) -> Inertia | None:
+def _inertia(inertial: Element, link: PoseNode) -> Inertia | None:
     if inertial[1].get("auto", "").lower() in ("true", "1"):
         link.document.remarks.add(inertial, "is to be computed from shapes; it is left out.", link.element)
         return None
-    mass = number(inertial, "mass", 1.0)
-    pose, tensor = child(inertial, "pose"), child(inertial, "inertia")
-    origin = IDENTITY if pose is None else pose_of(pose, link.document.remarks)
+    mass = read_child_number(inertial, "mass", 1.0)
+    pose, tensor = find_child(inertial, "pose"), find_child(inertial, "inertia")
+    origin = IDENTITY if pose is None else read_element_pose(pose, link.document.remarks)
     if tensor is None:
         return Inertia(mass, (1.0, 0.0, 0.0, 1.0, 0.0, 1.0), origin)
     ixx, ixy, ixz, iyy, iyz, izz = (
-        numbers(tensor, key, 1, (1.0 if key[1] == key[2] else 0.0,))[0]
+        read_child_numbers(tensor, key, 1, (1.0 if key[1] == key[2] else 0.0,))[0]
         for key in ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
     )
     return Inertia(mass, (ixx, ixy, ixz, iyy, iyz, izz), origin)

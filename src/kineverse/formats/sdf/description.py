@@ -1,4 +1,4 @@
-"""What an SDF describes, checked and resolved, before anything symbolic is made of it.
+"""Checked SDF description: links, frames, roots, joints and loops.
 
 Units are [m], [rad], [kg], [s]. Names are paths: ``a::b`` of the file is ``a/b`` here. A description is plain
 immutable data: nothing in it refers to the file any more but line numbers, and no mesh has been opened.
@@ -9,10 +9,10 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Literal, TypeAlias
 
-from kineverse.formats.chains import Following
+from kineverse.formats.mimic import MimicRelation
 from kineverse.model.body import Body, Pose, Vector3
 
-Kind: TypeAlias = Literal[
+SdfJointType: TypeAlias = Literal[
     "fixed",
     "revolute",
     "continuous",
@@ -24,7 +24,7 @@ Kind: TypeAlias = Literal[
     "gearbox",
 ]
 
-AXES: dict[Kind, int] = {
+AXIS_COUNT: dict[SdfJointType, int] = {
     "fixed": 0,
     "revolute": 1,
     "continuous": 1,
@@ -45,7 +45,7 @@ _NOTHING = Body()
 
 
 @dataclass(frozen=True, slots=True)
-class Axis:
+class SdfAxis:
     """One axis of a joint.
 
     ``xyz`` is a unit vector in the joint's frame. ``lower`` and ``upper`` bound the position [rad] or [m],
@@ -61,11 +61,11 @@ class Axis:
     velocity: float | None = None
     dynamics: tuple[tuple[str, float], ...] = ()
     suffix: str = ""
-    following: Following[str] | None = None
+    following: MimicRelation[str] | None = None
 
 
 @dataclass(frozen=True, slots=True)
-class Joint:
+class SdfJoint:
     """A joint between two links, or between a link and the world.
 
     ``in_parent`` and ``in_child`` are where its frame is in both while all positions are zero.
@@ -75,21 +75,21 @@ class Joint:
     """
 
     name: str
-    kind: Kind
+    kind: SdfJointType
     parent: str
     child: str
     in_parent: Pose = _IDENTITY
     in_child: Pose = _IDENTITY
-    axes: tuple[Axis, ...] = ()
+    axes: tuple[SdfAxis, ...] = ()
     pitch: float = 0.0
-    gear: Following[str] | None = None
+    gear: MimicRelation[str] | None = None
     turned: bool = False
     line: int = 0
     source: str = ""
 
 
 @dataclass(frozen=True, slots=True)
-class Link:
+class SdfLink:
     """A link, and where it is in the world while all positions are zero."""
 
     name: str
@@ -101,7 +101,7 @@ class Link:
 
 
 @dataclass(frozen=True, slots=True)
-class Frame:
+class SdfFrame:
     """A frame that moves with a link or stands in the world: one of a ``<frame>`` or of a model."""
 
     name: str
@@ -112,7 +112,7 @@ class Frame:
 
 
 @dataclass(frozen=True, slots=True)
-class Root:
+class SdfRoot:
     """A link that no joint holds: it stands where it is, or moves freely."""
 
     link: str
@@ -120,7 +120,7 @@ class Root:
 
 
 @dataclass(frozen=True, slots=True)
-class Scene:
+class SdfScene:
     """The models of a file.
 
     ``joints`` lead from the ``roots`` outwards, so that a joint comes after what places its parent. ``loops``
@@ -128,10 +128,10 @@ class Scene:
     its author may not have meant; each names its line.
     """
 
-    links: tuple[Link, ...] = ()
-    frames: tuple[Frame, ...] = ()
-    roots: tuple[Root, ...] = ()
-    joints: tuple[Joint, ...] = ()
-    loops: tuple[Joint, ...] = ()
+    links: tuple[SdfLink, ...] = ()
+    frames: tuple[SdfFrame, ...] = ()
+    roots: tuple[SdfRoot, ...] = ()
+    joints: tuple[SdfJoint, ...] = ()
+    loops: tuple[SdfJoint, ...] = ()
     source: str = ""
     remarks: tuple[str, ...] = field(default=())

@@ -1,4 +1,4 @@
-"""A description as operations: one for each root, joint, body and frame, and one for each loop.
+"""SDF descriptions as model operations.
 
 Links and frames become frames, joints degrees of freedom of the same name, below the prefix. A joint whose
 frame is not that of the link below it has a frame of its own in between, with its name.
@@ -11,13 +11,13 @@ from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
 from kineverse.articulations import (
-    AxisJoint,
     Ball,
     Continuous,
     Fixed,
     Floating,
     Gearbox,
     Limits,
+    OneDofJoint,
     Prismatic,
     Revolute,
     Screw,
@@ -25,31 +25,32 @@ from kineverse.articulations import (
 )
 from kineverse.errors import FormatError
 from kineverse.expressions.expression import Expression
-from kineverse.formats.chains import Following
-from kineverse.formats.markup import quote
-from kineverse.formats.poses import IDENTITY, inverse, is_identity
-from kineverse.formats.set_body import SetBody, is_empty
-from kineverse.formats.ways import way_between
-from kineverse.loops.operation import AXES, CloseLoop
-from kineverse.model.edit import AddFrame
+from kineverse.formats.mimic import MimicRelation
+from kineverse.formats.poses import IDENTITY, invert_pose, is_identity
+from kineverse.formats.tree import path_between
+from kineverse.formats.xml_reader import quote
+from kineverse.loops.close_loop import CloseLoop
+from kineverse.loops.equations import AXES
+from kineverse.model.body import is_empty_body
 from kineverse.model.frame import WORLD as MODEL_WORLD
 from kineverse.model.frame import Frame as Placed
 from kineverse.model.operation import Operation
+from kineverse.model.operations import AddFrame, SetBody
 from kineverse.symbols import position, symbol_name
 
-from .description import WORLD, Axis, Joint, Scene
+from .description import WORLD, SdfAxis, SdfJoint, SdfScene
 
-_AXIS_JOINTS: dict[str, type[AxisJoint]] = {
+_AXIS_JOINTS: dict[str, type[OneDofJoint]] = {
     "revolute": Revolute,
     "continuous": Continuous,
     "prismatic": Prismatic,
 }
 _PERPENDICULAR = 1e-6
 
-Named = Callable[[str], str]
+SdfNameMap = Callable[[str], str]
 
 
-def scene_operations(scene: Scene, prefix: str | None = None) -> Iterator[Operation]:
+def sdf_operations(scene: SdfScene, prefix: str | None = None) -> Iterator[Operation]:
     """Yield the operations that build the models of a file, from the roots outwards.
 
     Parameters
@@ -71,7 +72,7 @@ def scene_operations(scene: Scene, prefix: str | None = None) -> Iterator[Operat
         return f"{prefix}/{name}" if prefix else name
 
     _check_names(scene)
-    bodies = {link.name: link.body for link in scene.links if not is_empty(link.body)}
+    bodies = {link.name: link.body for link in scene.links if not is_empty_body(link.body)}
     poses = {link.name: link.pose for link in scene.links}
     for root in scene.roots:
         name = named(root.link)
@@ -93,23 +94,23 @@ def scene_operations(scene: Scene, prefix: str | None = None) -> Iterator[Operat
         yield from _loop(joint, named, _home(joint, above, named))
 
 
-def _tree_joint(joint: Joint, named: Named) -> Iterator[Operation]:
+def _tree_joint(joint: SdfJoint, named: SdfNameMap) -> Iterator[Operation]:
     if is_identity(joint.in_child):
         yield from _motions(joint, named, named(joint.child))
         return
     between, link = named(joint.name), named(joint.child)
     yield from _motions(joint, named, between)
-    yield AddFrame(link, Placed(between, (inverse(joint.in_child),)))
+    yield AddFrame(link, Placed(between, (invert_pose(joint.in_child),)))
 
 
-def _home(loop: Joint, above: Mapping[str, Joint], named: Named) -> tuple[tuple[str, float], ...]:
+def _home(loop: SdfJoint, above: Mapping[str, SdfJoint], named: SdfNameMap) -> tuple[tuple[str, float], ...]:
     """Return where quaternions are that a loop goes by; all other coordinates are 0 there."""
     parents = {link: joint.parent for link, joint in above.items()}
-    inside = [above[link] for link in way_between(loop.parent, loop.child, parents)]
+    inside = [above[link] for link in path_between(loop.parent, loop.child, parents)]
     return tuple((symbol_name(f"{named(joint.name)}/qw", 0), 1.0) for joint in inside if joint.kind == "ball")
 
 
-def _loop(joint: Joint, named: Named, home: tuple[tuple[str, float], ...]) -> Iterator[Operation]:
+def _loop(joint: SdfJoint, named: SdfNameMap, home: tuple[tuple[str, float], ...]) -> Iterator[Operation]:
     """Yield a joint that ends in a frame of its own, and the loop that ties it to the link."""
     name = named(joint.name)
     closed, loop = f"{name}/closed", f"{name}/loop"
@@ -122,7 +123,7 @@ def _loop(joint: Joint, named: Named, home: tuple[tuple[str, float], ...]) -> It
     yield CloseLoop(name=loop, frame=closed, to=name, mask=AXES[:3] if ball else AXES, home=home)
 
 
-def _motions(joint: Joint, named: Named, child: str) -> Iterator[Operation]:
+def _motions(joint: SdfJoint, named: SdfNameMap, child: str) -> Iterator[Operation]:
     """Yield what a joint moves by, from its place in the parent to a frame."""
     name = named(joint.name)
     common: dict[str, Any] = {
@@ -161,7 +162,7 @@ def _motions(joint: Joint, named: Named, child: str) -> Iterator[Operation]:
             yield _AXIS_JOINTS[joint.kind](**common, **given)
 
 
-def _two_axes(joint: Joint, common: dict[str, Any], named: Named) -> Iterator[Operation]:
+def _two_axes(joint: SdfJoint, common: dict[str, Any], named: SdfNameMap) -> Iterator[Operation]:
     """Yield a universal joint, or two hinges in a row where the axes are not such that it is one."""
     first, second = joint.axes
     cosine = math.fsum(a * b for a, b in zip(first.xyz, second.xyz, strict=True))
@@ -183,27 +184,27 @@ def _two_axes(joint: Joint, common: dict[str, Any], named: Named) -> Iterator[Op
     yield Revolute(**own, **_axis(second, named))
 
 
-def _axis(axis: Axis, named: Named) -> dict[str, Any]:
+def _axis(axis: SdfAxis, named: SdfNameMap) -> dict[str, Any]:
     return {
         "axis": axis.xyz,
         "lower": axis.lower,
         "upper": axis.upper,
         "velocity": axis.velocity,
-        "position": None if axis.following is None else _followed(axis.following, named),
+        "position": None if axis.following is None else _mimic_position(axis.following, named),
         "dynamics": axis.dynamics,
     }
 
 
-def _followed(following: Following[str], named: Named) -> Expression:
+def _mimic_position(following: MimicRelation[str], named: SdfNameMap) -> Expression:
     return following.multiplier * position(named(following.leader)) + following.offset
 
 
-def _dynamics(joint: Joint, prefix: str, index: int = 0) -> tuple[tuple[str, float], ...]:
+def _dynamics(joint: SdfJoint, prefix: str, index: int = 0) -> tuple[tuple[str, float], ...]:
     axes = joint.axes[index : index + 1]
     return tuple((prefix + key, value) for axis in axes for key, value in axis.dynamics)
 
 
-def _check_names(scene: Scene) -> None:
+def _check_names(scene: SdfScene) -> None:
     """Raise where two things of the description would have the same name in the model."""
     frames: dict[str, str] = {MODEL_WORLD: "the world"}
     articulations: dict[str, str] = {}

@@ -1,4 +1,4 @@
-"""A tree of links out of joints in any direction: what hangs below what, and which joints close loops.
+"""Spanning tree of the joints of an SDF, and those that close loops.
 
 Everything here is iterative and linear but for the inverse of Ackermann's function.
 """
@@ -8,18 +8,18 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 
-from kineverse.formats.groups import Groups
-from kineverse.formats.markup import quote
+from kineverse.formats.tree import DisjointSets
+from kineverse.formats.xml_reader import quote
 
-from .description import WORLD, Axis, Joint, Link, Root
+from .description import WORLD, SdfAxis, SdfJoint, SdfLink, SdfRoot
 
 
-def span(
-    links: Sequence[Link],
-    joints: Iterable[Joint],
+def build_spanning_tree(
+    links: Sequence[SdfLink],
+    joints: Iterable[SdfJoint],
     standing: Iterable[str],
-    note: Callable[[Joint, str], None],
-) -> tuple[tuple[Root, ...], tuple[Joint, ...], tuple[Joint, ...]]:
+    note: Callable[[SdfJoint, str], None],
+) -> tuple[tuple[SdfRoot, ...], tuple[SdfJoint, ...], tuple[SdfJoint, ...]]:
     """Return the roots, the joints from there outwards, and those that close loops.
 
     Parameters
@@ -31,7 +31,7 @@ def span(
     note
         Called with joints that are left out, and why.
     """
-    whole, rigid = Groups(), Groups()
+    whole, rigid = DisjointSets(), DisjointSets()
     for link in links:
         if link.static:
             whole.unite(WORLD, link.name)
@@ -40,9 +40,9 @@ def span(
     for joint in joints:
         if joint.kind == "fixed":
             rigid.unite(joint.parent, joint.child)
-    at: dict[str, list[Joint]] = {}
+    at: dict[str, list[SdfJoint]] = {}
     held: set[str] = {link.name for link in links if link.static}
-    loops: list[Joint] = []
+    loops: list[SdfJoint] = []
     for joint in joints:
         if whole.unite(joint.parent, joint.child):
             at.setdefault(joint.parent, []).append(joint)
@@ -52,7 +52,7 @@ def span(
             loops.append(joint)
         else:
             note(joint, "is left out: its links are rigidly connected anyway.")
-    roots = [Root(link.name) for link in links if link.static]
+    roots = [SdfRoot(link.name) for link in links if link.static]
     starts = [WORLD, *(root.link for root in roots)]
     ordered = _outwards(starts, at, note)
     reached = {whole.of(WORLD)}
@@ -61,15 +61,15 @@ def span(
         group = whole.of(link.name)
         if group not in reached and link.name not in held:
             reached.add(group)
-            roots.append(Root(link.name, free=group not in fixed))
+            roots.append(SdfRoot(link.name, free=group not in fixed))
             ordered += _outwards([link.name], at, note)
     return tuple(roots), tuple(ordered), tuple(loops)
 
 
 def _outwards(
-    starts: Sequence[str], at: dict[str, list[Joint]], note: Callable[[Joint, str], None]
-) -> list[Joint]:
-    ordered: list[Joint] = []
+    starts: Sequence[str], at: dict[str, list[SdfJoint]], note: Callable[[SdfJoint, str], None]
+) -> list[SdfJoint]:
+    ordered: list[SdfJoint] = []
     seen: set[str] = set(starts)
     ahead = [(start, joint) for start in reversed(starts) for joint in reversed(at.get(start, ()))]
     while ahead:
@@ -82,13 +82,13 @@ def _outwards(
             note(
                 joint, f"leads from {quote(near)} to {quote(far)} here, since that is the way from the root."
             )
-            joint = turned(joint)
+            joint = reverse_joint(joint)
         ordered.append(joint)
         ahead.extend((far, other) for other in reversed(at.get(far, ())))
     return ordered
 
 
-def turned(joint: Joint) -> Joint:
+def reverse_joint(joint: SdfJoint) -> SdfJoint:
     """Return a joint seen from the other end: the same coordinates about opposite axes."""
     return replace(
         joint,
@@ -101,6 +101,6 @@ def turned(joint: Joint) -> Joint:
     )
 
 
-def _opposite(axis: Axis) -> Axis:
+def _opposite(axis: SdfAxis) -> SdfAxis:
     x, y, z = axis.xyz
     return replace(axis, xyz=(0.0 - x, 0.0 - y, 0.0 - z))

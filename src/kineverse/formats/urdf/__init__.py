@@ -1,6 +1,24 @@
 """URDF, the Unified Robot Description Format of ROS."""
 
-from kineverse.formats.urdf.description import Dynamics, Joint, Limits, Link, Mimic, Robot, Safety
+from kineverse.formats.urdf.description import (
+    UrdfDynamics,
+    UrdfJoint,
+    UrdfLimits,
+    UrdfLink,
+    UrdfMimic,
+    UrdfRobot,
+    UrdfSafetyController,
+)
 from kineverse.formats.urdf.reader import parse_urdf, read_urdf
 
-__all__ = ["Dynamics", "Joint", "Limits", "Link", "Mimic", "Robot", "Safety", "parse_urdf", "read_urdf"]
+__all__ = [
+    "UrdfDynamics",
+    "UrdfJoint",
+    "UrdfLimits",
+    "UrdfLink",
+    "UrdfMimic",
+    "UrdfRobot",
+    "UrdfSafetyController",
+    "parse_urdf",
+    "read_urdf",
+]

@@ -1,4 +1,4 @@
-"""``<link>`` elements to links: inertia, shapes to see, shapes to touch.
+"""Inertia, visuals and collision shapes of URDF links.
 
 Specification: http://wiki.ros.org/urdf/XML/link, and urdf.xsd of ros/urdfdom for defaults. Shapes and their
 colours decide nothing about where links are: a shape that cannot be said here, or is not said, is left out
@@ -10,19 +10,24 @@ from __future__ import annotations
 from dataclasses import replace
 from functools import partial
 
-from kineverse.formats.markup import Element, ElementError, child, label, name_of
-from kineverse.formats.packages import outside
-from kineverse.formats.remarks import Remarks
-from kineverse.formats.urdf.attributes import mended, number, pose, vector
-from kineverse.formats.urdf.description import Link
-from kineverse.formats.urdf.materials import Materials
+from kineverse.formats.reader_warnings import ReaderWarnings
+from kineverse.formats.resource_paths import find_root_violation
+from kineverse.formats.urdf.description import UrdfLink
+from kineverse.formats.urdf.materials import UrdfMaterials
+from kineverse.formats.xml_reader import Element, ElementError, find_child, label, read_name
+from kineverse.formats.xml_values import (
+    read_attribute_number,
+    read_attribute_vector,
+    read_or_default,
+    read_origin,
+)
 from kineverse.model.body import Body, Box, Capsule, Cylinder, Geometry, Inertia, Mesh, Shape, Sphere, Vector3
 
 _UNSCALED = (1.0, 1.0, 1.0)
 _NOTHING = Body()
 
 
-class LinkReader:
+class UrdfLinkReader:
     """Reads the links of one document.
 
     Parameters
@@ -34,17 +39,19 @@ class LinkReader:
     remarks
         What is noticed goes here.
     root
-        The folder that meshes do not leave, see :mod:`kineverse.formats.roots`.
+        The folder that meshes do not leave, see :mod:`kineverse.formats.root_folder`.
     """
 
-    def __init__(self, folder: str, version: tuple[int, int], remarks: Remarks, root: str | None = None):
-        self.materials = Materials(remarks)
+    def __init__(
+        self, folder: str, version: tuple[int, int], remarks: ReaderWarnings, root: str | None = None
+    ):
+        self.materials = UrdfMaterials(remarks)
         self._folder, self._root = folder, root
         self._version = version
         self._remarks = remarks
         self._uncoloured: list[tuple[str, int, Element, Element]] = []
 
-    def read(self, element: Element) -> Link:
+    def read(self, element: Element) -> UrdfLink:
         """Return the link an element describes.
 
         Raises
@@ -52,7 +59,7 @@ class LinkReader:
         ElementError
             If something is missing, malformed or without meaning.
         """
-        name = mended(lambda: name_of(element), "", "it gets a name", self._remarks)
+        name = read_or_default(lambda: read_name(element), "", "it gets a name", self._remarks)
         visuals: list[Shape] = []
         collisions: list[Shape] = []
         inertia: Inertia | None = None
@@ -68,16 +75,16 @@ class LinkReader:
                     collisions.append(shape)
             elif tag == "inertial":
                 if inertia is None:
-                    inertia = mended(
+                    inertia = read_or_default(
                         partial(self._inertia, part, element), None, "it is left out", self._remarks, element
                     )
                 else:
                     self._remarks.add(part, "is ignored: another one came first.", element)
         if not visuals and not collisions and inertia is None:
-            return Link(name, _NOTHING, element[3])
-        return Link(name, Body(tuple(visuals), tuple(collisions), inertia), element[3])
+            return UrdfLink(name, _NOTHING, element[3])
+        return UrdfLink(name, Body(tuple(visuals), tuple(collisions), inertia), element[3])
 
-    def colour(self, links: dict[str, Link]) -> None:
+    def colour(self, links: dict[str, UrdfLink]) -> None:
         """Give shapes the materials that were only named before they were defined."""
         for name, index, material, element in self._uncoloured:
             color, texture = self.materials.appearance_at_last(material, element)
@@ -88,7 +95,7 @@ class LinkReader:
 
     def _shape(self, element: Element, link: Element, name: str = "", index: int = -1) -> Shape | None:
         read = partial(self._read_shape, element, link, name, index)
-        return mended(read, None, f"the {label(element)} is left out", self._remarks, link)
+        return read_or_default(read, None, f"the {label(element)} is left out", self._remarks, link)
 
     def _read_shape(self, element: Element, link: Element, name: str, index: int) -> Shape | None:
         """Return a shape; the colour is looked at if an index among the visuals of the link is given."""
@@ -104,7 +111,7 @@ class LinkReader:
         form = self._geometry(geometry, element, link)
         if form is None:
             return None
-        place, own_name = pose(origin, link, self._version, self._remarks), element[1].get("name", "")
+        place, own_name = read_origin(origin, link, self._version, self._remarks), element[1].get("name", "")
         if material is None or index < 0:
             return Shape(form, place, own_name)
         appearance = self.materials.appearance(material, link)
@@ -122,7 +129,7 @@ class LinkReader:
         if tag == "mesh":
             return self._mesh(form, link)
         if tag == "box":
-            x, y, z = vector(form, "size")
+            x, y, z = read_attribute_vector(form, "size")
             if min(x, y, z) < 0.0:
                 raise ElementError(form, "has a negative size.")
             return Box((x, y, z))
@@ -139,7 +146,7 @@ class LinkReader:
         uri = mesh[1].get("filename")
         if not uri:
             raise ElementError(mesh, "has no filename; the specification requires it.")
-        wrong = outside(uri, self._folder, self._root)
+        wrong = find_root_violation(uri, self._folder, self._root)
         if wrong is not None:
             self._remarks.add(mesh, f"names {wrong}", link)
         return Mesh(uri, self._scale(mesh, link), self._folder, self._root)
@@ -150,31 +157,47 @@ class LinkReader:
         if len(words) in (1, 4):
             x, y, z = words * 3 if len(words) == 1 else words[:3]
             taken = (mesh[0], {"scale": f"{x} {y} {z}"}, mesh[2], mesh[3])
-            default = mended(
-                lambda: vector(taken, "scale"), _UNSCALED, "it is not scaled", self._remarks, link
+            default = read_or_default(
+                lambda: read_attribute_vector(taken, "scale"),
+                _UNSCALED,
+                "it is not scaled",
+                self._remarks,
+                link,
             )
         else:
             default = _UNSCALED
         shown = " ".join(f"{factor:g}" for factor in default)
-        return mended(
-            lambda: vector(mesh, "scale", _UNSCALED), default, f"{shown} is taken", self._remarks, link
+        return read_or_default(
+            lambda: read_attribute_vector(mesh, "scale", _UNSCALED),
+            default,
+            f"{shown} is taken",
+            self._remarks,
+            link,
         )
 
     def _inertia(self, inertial: Element, link: Element) -> Inertia:
-        mass_element, tensor = child(inertial, "mass"), child(inertial, "inertia")
-        mass = 0.0 if mass_element is None else number(mass_element, "value", 0.0)
+        mass_element, tensor = find_child(inertial, "mass"), find_child(inertial, "inertia")
+        mass = 0.0 if mass_element is None else read_attribute_number(mass_element, "value", 0.0)
         if mass < 0.0:
             self._remarks.add(inertial, f"has the negative mass {mass!r}, which is kept as it is.", link)
-        origin = pose(child(inertial, "origin"), link, self._version, self._remarks)
+        origin = read_origin(find_child(inertial, "origin"), link, self._version, self._remarks)
         if tensor is None:
             return Inertia(mass, (0.0, 0.0, 0.0, 0.0, 0.0, 0.0), origin)
-        ixx, ixy, ixz = (number(tensor, "ixx", 0.0), number(tensor, "ixy", 0.0), number(tensor, "ixz", 0.0))
-        iyy, iyz, izz = (number(tensor, "iyy", 0.0), number(tensor, "iyz", 0.0), number(tensor, "izz", 0.0))
+        ixx, ixy, ixz = (
+            read_attribute_number(tensor, "ixx", 0.0),
+            read_attribute_number(tensor, "ixy", 0.0),
+            read_attribute_number(tensor, "ixz", 0.0),
+        )
+        iyy, iyz, izz = (
+            read_attribute_number(tensor, "iyy", 0.0),
+            read_attribute_number(tensor, "iyz", 0.0),
+            read_attribute_number(tensor, "izz", 0.0),
+        )
         return Inertia(mass, (ixx, ixy, ixz, iyy, iyz, izz), origin)
 
 
 def _length(form: Element, key: str) -> float:
-    value = number(form, key)
+    value = read_attribute_number(form, key)
     if value < 0.0:
         raise ElementError(form, f"has a negative {key}.")
     return value

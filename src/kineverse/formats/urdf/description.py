@@ -1,4 +1,4 @@
-"""A robot as a URDF describes it, checked and resolved, before anything symbolic is made of it.
+"""Checked URDF description: links, joints, limits and mimic relations.
 
 Units are [m], [rad], [kg], [s]. A description is plain immutable data: nothing in it refers to the file any
 more but line numbers, and no mesh has been opened.
@@ -11,9 +11,11 @@ from typing import Literal, TypeAlias
 
 from kineverse.model.body import Body, Pose, Vector3
 
-Kind: TypeAlias = Literal["fixed", "revolute", "continuous", "prismatic", "planar", "floating", "spherical"]
+UrdfJointType: TypeAlias = Literal[
+    "fixed", "revolute", "continuous", "prismatic", "planar", "floating", "spherical"
+]
 
-FREEDOM: dict[Kind, int] = {
+DOF_BY_TYPE: dict[UrdfJointType, int] = {
     "fixed": 0,
     "revolute": 1,
     "continuous": 1,
@@ -27,7 +29,7 @@ FREEDOM: dict[Kind, int] = {
 ``spherical`` is no word of URDF; MuJoCo reads it.
 """
 
-SPECIFIED = tuple(kind for kind in FREEDOM if kind != "spherical")
+SPECIFIED = tuple(kind for kind in DOF_BY_TYPE if kind != "spherical")
 """The kinds that the specification has."""
 
 _IDENTITY = Pose()
@@ -35,7 +37,7 @@ _NOTHING = Body()
 
 
 @dataclass(frozen=True, slots=True)
-class Limits:
+class UrdfLimits:
     """Bounds of one joint; None is no bound.
 
     ``lower`` and ``upper`` bound the position [rad] or [m], ``velocity`` the magnitude of the speed [rad/s]
@@ -52,11 +54,11 @@ class Limits:
     jerk: float | None = None
 
 
-UNLIMITED = Limits()
+UNLIMITED = UrdfLimits()
 
 
 @dataclass(frozen=True, slots=True)
-class Safety:
+class UrdfSafetyController:
     """What the safety controller of a joint does (ROS wiki, pr2_controller_manager/safety_limits).
 
     It keeps the speed between ``-k_position (q - soft_lower)`` and ``-k_position (q - soft_upper)``, so that
@@ -77,7 +79,7 @@ class Safety:
 
 
 @dataclass(frozen=True, slots=True)
-class Mimic:
+class UrdfMimic:
     """A position that follows another joint: ``multiplier * joint + offset``.
 
     A chain is resolved: ``joint`` is the one at its end that moves by itself, and the factors are composed.
@@ -89,18 +91,18 @@ class Mimic:
 
 
 @dataclass(frozen=True, slots=True)
-class Dynamics:
+class UrdfDynamics:
     """Damping [N s/m] or [N m s/rad] and static friction [N] or [N m] of a joint."""
 
     damping: float = 0.0
     friction: float = 0.0
 
 
-FRICTIONLESS = Dynamics()
+FRICTIONLESS = UrdfDynamics()
 
 
 @dataclass(frozen=True, slots=True)
-class Joint:
+class UrdfJoint:
     """A joint between two links.
 
     ``origin`` is parent_T_joint, the pose of the child link in the parent link at position zero. ``axis`` is
@@ -110,20 +112,20 @@ class Joint:
     """
 
     name: str
-    kind: Kind
+    kind: UrdfJointType
     parent: str
     child: str
     origin: Pose = _IDENTITY
     axis: Vector3 | None = None
-    limits: Limits = UNLIMITED
-    safety: Safety | None = None
-    mimic: Mimic | None = None
-    dynamics: Dynamics = FRICTIONLESS
+    limits: UrdfLimits = UNLIMITED
+    safety: UrdfSafetyController | None = None
+    mimic: UrdfMimic | None = None
+    dynamics: UrdfDynamics = FRICTIONLESS
     line: int = 0
 
 
 @dataclass(frozen=True, slots=True)
-class Link:
+class UrdfLink:
     """A link: a frame, and what is attached to it."""
 
     name: str
@@ -132,7 +134,7 @@ class Link:
 
 
 @dataclass(frozen=True, slots=True)
-class Robot:
+class UrdfRobot:
     """A tree of links and joints.
 
     ``links`` are in the order of the file; ``joints`` lead from the ``root`` outwards, so that a joint comes
@@ -143,8 +145,8 @@ class Robot:
 
     name: str
     root: str
-    links: tuple[Link, ...]
-    joints: tuple[Joint, ...]
+    links: tuple[UrdfLink, ...]
+    joints: tuple[UrdfJoint, ...]
     source: str = ""
     remarks: tuple[str, ...] = ()
     more_roots: tuple[str, ...] = ()
@@ -152,4 +154,4 @@ class Robot:
     @property
     def dof(self) -> int:
         """The number of independent speeds; joints that mimic another have none of their own."""
-        return sum(FREEDOM[joint.kind] for joint in self.joints if joint.mimic is None)
+        return sum(DOF_BY_TYPE[joint.kind] for joint in self.joints if joint.mimic is None)

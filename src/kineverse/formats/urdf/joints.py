@@ -1,4 +1,4 @@
-"""``<joint>`` elements to joints.
+"""URDF joint elements as checked joints.
 
 Specification: http://wiki.ros.org/urdf/XML/joint, and urdf.xsd of ros/urdfdom for defaults. A joint is read
 for what its kind can have: the limits of a fixed joint mean nothing and are not looked at. What other parsers
@@ -11,22 +11,28 @@ import math
 import sys
 
 from kineverse.errors import suggest
-from kineverse.formats.markup import Element, ElementError, abbreviate, name_of
-from kineverse.formats.numerals import LARGEST, unit
-from kineverse.formats.remarks import Remarks
-from kineverse.formats.rpy import snap
-from kineverse.formats.urdf.attributes import mended, number, pose, vector
+from kineverse.formats.poses import snap
+from kineverse.formats.reader_warnings import ReaderWarnings
 from kineverse.formats.urdf.description import (
-    FREEDOM,
+    DOF_BY_TYPE,
     FRICTIONLESS,
     SPECIFIED,
     UNLIMITED,
-    Dynamics,
-    Joint,
-    Kind,
-    Limits,
-    Mimic,
-    Safety,
+    UrdfDynamics,
+    UrdfJoint,
+    UrdfJointType,
+    UrdfLimits,
+    UrdfMimic,
+    UrdfSafetyController,
+)
+from kineverse.formats.xml_reader import Element, ElementError, abbreviate, read_name
+from kineverse.formats.xml_values import (
+    LARGEST,
+    read_attribute_number,
+    read_attribute_vector,
+    read_or_default,
+    read_origin,
+    scale_to_bounds,
 )
 from kineverse.model.body import Vector3
 
@@ -38,7 +44,7 @@ _PARTS = frozenset(
 )
 
 
-def read_joint(element: Element, version: tuple[int, int], remarks: Remarks) -> Joint:
+def read_urdf_joint(element: Element, version: tuple[int, int], remarks: ReaderWarnings) -> UrdfJoint:
     """Return the joint an element describes; what it mimics is not resolved yet.
 
     Raises
@@ -46,12 +52,12 @@ def read_joint(element: Element, version: tuple[int, int], remarks: Remarks) -> 
     ElementError
         If something is missing, malformed or without meaning.
     """
-    name = mended(lambda: name_of(element), "", "it is called by its links", remarks)
+    name = read_or_default(lambda: read_name(element), "", "it is called by its links", remarks)
     kind = _kind(element, remarks)
     parts = _parts(element, remarks)
     parent, child = _link(element, parts, "parent"), _link(element, parts, "child")
     name = name or f"{parent}_{child}"
-    origin = pose(parts.get("origin"), element, version, remarks)
+    origin = read_origin(parts.get("origin"), element, version, remarks)
     line = element[3]
     if kind in ("fixed", "floating", "planar", "spherical"):
         if "mimic" in parts and kind != "fixed":
@@ -62,13 +68,13 @@ def read_joint(element: Element, version: tuple[int, int], remarks: Remarks) -> 
         axis = None
         if kind == "planar":
             axis = _axis(parts.get("axis"), element, remarks, "the plane is that of x and y") or _Z
-        return Joint(name, kind, parent, child, origin, axis, line=line)
+        return UrdfJoint(name, kind, parent, child, origin, axis, line=line)
     axis = _axis(parts.get("axis"), element, remarks, "the joint does not move, it is fixed")
     if axis is None:
-        return Joint(name, "fixed", parent, child, origin, line=line)
+        return UrdfJoint(name, "fixed", parent, child, origin, line=line)
     limit, safety, mimic, dynamics = map(parts.get, ("limit", "safety_controller", "mimic", "dynamics"))
     limits = _limits(limit, kind, element, version, remarks)
-    return Joint(
+    return UrdfJoint(
         name,
         kind,
         parent,
@@ -76,20 +82,22 @@ def read_joint(element: Element, version: tuple[int, int], remarks: Remarks) -> 
         origin,
         axis,
         limits,
-        mended(lambda: _safety(safety, limits), None, "it is left out", remarks, element),
+        read_or_default(lambda: _safety(safety, limits), None, "it is left out", remarks, element),
         None if mimic is None else _mimic(mimic),
-        mended(lambda: _dynamics(dynamics), FRICTIONLESS, "it is left out", remarks, element),
+        read_or_default(lambda: _dynamics(dynamics), FRICTIONLESS, "it is left out", remarks, element),
         line,
     )
 
 
-def _dynamics(dynamics: Element | None) -> Dynamics:
+def _dynamics(dynamics: Element | None) -> UrdfDynamics:
     if dynamics is None:
         return FRICTIONLESS
-    return Dynamics(number(dynamics, "damping", 0.0), number(dynamics, "friction", 0.0))
+    return UrdfDynamics(
+        read_attribute_number(dynamics, "damping", 0.0), read_attribute_number(dynamics, "friction", 0.0)
+    )
 
 
-def _kind(element: Element, remarks: Remarks) -> Kind:
+def _kind(element: Element, remarks: ReaderWarnings) -> UrdfJointType:
     kind = element[1].get("type")
     if kind is None:
         raise ElementError(element, f"has no type; the specification requires one of {', '.join(SPECIFIED)}.")
@@ -97,13 +105,13 @@ def _kind(element: Element, remarks: Remarks) -> Kind:
         mistake = ElementError(
             element, f'type="{abbreviate(kind)}" is no joint type of URDF. {suggest(kind, SPECIFIED, "type")}'
         )
-        if kind not in FREEDOM:
+        if kind not in DOF_BY_TYPE:
             raise mistake
         remarks.mend(mistake, "MuJoCo knows it as a ball joint, which it is here")
     return kind
 
 
-def _parts(element: Element, remarks: Remarks) -> dict[str, Element]:
+def _parts(element: Element, remarks: ReaderWarnings) -> dict[str, Element]:
     """Return the children by tag, of several with one tag the first, as all parsers do."""
     children = element[2]
     parts = {part[0]: part for part in reversed(children)}
@@ -124,13 +132,13 @@ def _link(element: Element, parts: dict[str, Element], role: str) -> str:
     return link
 
 
-def _axis(axis: Element | None, joint: Element, remarks: Remarks, taken: str) -> Vector3 | None:
+def _axis(axis: Element | None, joint: Element, remarks: ReaderWarnings, taken: str) -> Vector3 | None:
     """Return the unit vector of an axis, None if it has no length; the specification's default is x."""
     if axis is None:
         return _X
     if "xyz" not in axis[1]:
         remarks.add(axis, "has no xyz; it is 1 0 0, the default, where others move about nothing.", joint)
-    x, y, z = unit(vector(axis, "xyz", _X, turns=True))
+    x, y, z = scale_to_bounds(read_attribute_vector(axis, "xyz", _X, turns=True))
     length = math.hypot(x, y, z)
     if length < _SHORTEST_AXIS:
         mistake = ElementError(
@@ -144,8 +152,12 @@ def _axis(axis: Element | None, joint: Element, remarks: Remarks, taken: str) ->
 
 
 def _limits(
-    limit: Element | None, kind: Kind, joint: Element, version: tuple[int, int], remarks: Remarks
-) -> Limits:
+    limit: Element | None,
+    kind: UrdfJointType,
+    joint: Element,
+    version: tuple[int, int],
+    remarks: ReaderWarnings,
+) -> UrdfLimits:
     if limit is None:
         if kind != "continuous":
             mistake = ElementError(
@@ -166,14 +178,18 @@ def _limits(
             remarks.add(limit, f"has {key}, which is ignored: it came with URDF 1.2.", joint)
     if values.get("deceleration") is None and "deceleration" not in limit[1]:
         values["deceleration"] = values.get("acceleration")
-    return Limits(_bound(lower), _bound(upper), **{key: _bound(value) for key, value in values.items()})
+    return UrdfLimits(_bound(lower), _bound(upper), **{key: _bound(value) for key, value in values.items()})
 
 
-def _magnitude(limit: Element, key: str, joint: Element, newer: bool, remarks: Remarks) -> float | None:
+def _magnitude(
+    limit: Element, key: str, joint: Element, newer: bool, remarks: ReaderWarnings
+) -> float | None:
     """Return a bound of a magnitude; from URDF 1.2 on it may be left out, and must not be negative."""
     if newer and key not in limit[1]:
         return None
-    value = mended(lambda: number(limit, key), None, "it bounds nothing", remarks, joint)
+    value = read_or_default(
+        lambda: read_attribute_number(limit, key), None, "it bounds nothing", remarks, joint
+    )
     if value is None:
         return None
     if newer and value < 0.0:
@@ -192,7 +208,7 @@ def _bound(value: float | None) -> float | None:
 
 
 def _range(
-    limit: Element, joint: Element, newer: bool, remarks: Remarks
+    limit: Element, joint: Element, newer: bool, remarks: ReaderWarnings
 ) -> tuple[float | None, float | None]:
     """Return the ends of a range, None for one that is open: as Bullet and MuJoCo do, where there is none."""
     said = limit[1]
@@ -222,27 +238,37 @@ def _range(
     return (lower if lower > -math.inf else None), (upper if upper < math.inf else None)
 
 
-def _end(limit: Element, key: str, joint: Element, remarks: Remarks) -> float:
+def _end(limit: Element, key: str, joint: Element, remarks: ReaderWarnings) -> float:
     """Return an end of a range: infinite where there is none, NaN where nobody knows."""
     text = limit[1].get(key, "0").strip()
     if not text:
-        return mended(lambda: number(limit, key), 0.0, "it is 0", remarks, joint)
+        return read_or_default(lambda: read_attribute_number(limit, key), 0.0, "it is 0", remarks, joint)
     try:
         value = float(text) if text.isascii() and "_" not in text else None
     except ValueError:
         value = None
     if value is None or math.isfinite(value):
-        return number(limit, key, 0.0)
-    return mended(lambda: number(limit, key), value, "it bounds nothing", remarks, joint)
+        return read_attribute_number(limit, key, 0.0)
+    return read_or_default(
+        lambda: read_attribute_number(limit, key), value, "it bounds nothing", remarks, joint
+    )
 
 
-def _safety(safety: Element | None, limits: Limits) -> Safety | None:
+def _safety(safety: Element | None, limits: UrdfLimits) -> UrdfSafetyController | None:
     if safety is None:
         return None
-    lower, upper = number(safety, "soft_lower_limit", 0.0), number(safety, "soft_upper_limit", 0.0)
+    lower, upper = (
+        read_attribute_number(safety, "soft_lower_limit", 0.0),
+        read_attribute_number(safety, "soft_upper_limit", 0.0),
+    )
     if lower > upper:
         raise ElementError(safety, f"has soft_lower_limit={lower!r} above soft_upper_limit={upper!r}.")
-    result = Safety(lower, upper, number(safety, "k_position", 0.0), number(safety, "k_velocity"))
+    result = UrdfSafetyController(
+        lower,
+        upper,
+        read_attribute_number(safety, "k_position", 0.0),
+        read_attribute_number(safety, "k_velocity"),
+    )
     if limits.lower is None or limits.upper is None or not result.bounds:
         return result
     if upper < limits.lower or lower > limits.upper:
@@ -254,8 +280,10 @@ def _safety(safety: Element | None, limits: Limits) -> Safety | None:
     return result
 
 
-def _mimic(mimic: Element) -> Mimic:
+def _mimic(mimic: Element) -> UrdfMimic:
     joint = mimic[1].get("joint")
     if not joint:
         raise ElementError(mimic, "does not say which joint.")
-    return Mimic(joint, number(mimic, "multiplier", 1.0), number(mimic, "offset", 0.0))
+    return UrdfMimic(
+        joint, read_attribute_number(mimic, "multiplier", 1.0), read_attribute_number(mimic, "offset", 0.0)
+    )

@@ -1,4 +1,4 @@
-"""Colours and textures, and the names under which a description shares them.
+"""URDF materials: colours and textures, and the names that share them.
 
 A visual's own colour counts for that visual. A material that is only named is looked up among those of the
 robot, then among those that some visual defines.
@@ -8,9 +8,9 @@ from __future__ import annotations
 
 from typing import TypeAlias
 
-from kineverse.formats.markup import Element, ElementError, child, quote
-from kineverse.formats.numerals import numbers
-from kineverse.formats.remarks import Remarks
+from kineverse.formats.reader_warnings import ReaderWarnings
+from kineverse.formats.xml_reader import Element, ElementError, find_child, quote
+from kineverse.formats.xml_values import parse_numbers
 from kineverse.model.body import Rgba
 
 Appearance: TypeAlias = tuple[Rgba | None, str]
@@ -19,10 +19,10 @@ Appearance: TypeAlias = tuple[Rgba | None, str]
 _NONE: Appearance = (None, "")
 
 
-class Materials:
+class UrdfMaterials:
     """The materials of one document, as far as it has been read."""
 
-    def __init__(self, remarks: Remarks):
+    def __init__(self, remarks: ReaderWarnings):
         self._remarks = remarks
         self._shared: dict[str, Appearance] = {}
         self._local: dict[str, Appearance] = {}
@@ -65,23 +65,23 @@ class Materials:
         return found or _NONE
 
     def _read(self, material: Element, owner: Element) -> Appearance:
-        color, texture = child(material, "color"), child(material, "texture")
+        color, texture = find_child(material, "color"), find_child(material, "texture")
         file = "" if texture is None else texture[1].get("filename", "")
         text = None if color is None else color[1].get("rgba")
         if color is None or text is None:
             return (None, file)
         try:
             if len(text.split()) == 3:
-                red, green, blue = numbers(text, 3)
+                red, green, blue = parse_numbers(text, 3)
                 self._remarks.add(color, "has three numbers instead of four; it is taken as opaque.", owner)
                 return ((red, green, blue, 1.0), file)
-            red, green, blue, alpha = numbers(text, 4)
+            red, green, blue, alpha = parse_numbers(text, 4)
         except ValueError as error:
             mistake = ElementError(color, f"rgba={quote(text)} {error}.")
         else:
             return ((red, green, blue, alpha), file)
         try:
-            red, green, blue, alpha = numbers(" ".join(text.split()[:4]), 4)
+            red, green, blue, alpha = parse_numbers(" ".join(text.split()[:4]), 4)
         except ValueError:
             self._remarks.mend(mistake, "it is no colour", owner)
             return (None, file)

@@ -1,4 +1,4 @@
-"""A description as operations: one for each joint, one for each body, one for each pair of soft limits.
+"""URDF descriptions as model operations.
 
 Links become frames and joints degrees of freedom of the same name, below the prefix. The tags are those of
 the things: ``joint pr2/l_elbow_flex_joint``, ``body pr2/l_elbow_flex_link``, ``soft limits ...``.
@@ -7,25 +7,31 @@ the things: ``joint pr2/l_elbow_flex_joint``, ``body pr2/l_elbow_flex_link``, ``
 from __future__ import annotations
 
 from collections.abc import Callable, Container, Iterable, Iterator
-from dataclasses import dataclass
 from typing import Any
 
-from kineverse.articulations import AxisJoint, Ball, Continuous, Fixed, Floating, Planar, Prismatic, Revolute
+from kineverse.articulations import (
+    Ball,
+    Continuous,
+    Fixed,
+    Floating,
+    OneDofJoint,
+    Planar,
+    Prismatic,
+    Revolute,
+)
 from kineverse.articulations import Joint as JointOperation
 from kineverse.errors import FormatError
 from kineverse.expressions.expression import Expression
-from kineverse.formats.markup import quote
-from kineverse.formats.remarks import Fault, tell
-from kineverse.formats.set_body import SetBody, is_empty
-from kineverse.formats.urdf.description import Joint, Link, Robot
-from kineverse.model.body import Pose
-from kineverse.model.edit import AddFrame
+from kineverse.formats.reader_warnings import Fault, warn
+from kineverse.formats.urdf.description import UrdfJoint, UrdfLink, UrdfRobot
+from kineverse.formats.xml_reader import quote
+from kineverse.model.body import Pose, is_empty_body
 from kineverse.model.frame import WORLD, Frame
-from kineverse.model.operation import Effects, Operation
-from kineverse.model.reader import Reader
+from kineverse.model.operation import Operation
+from kineverse.model.operations import AddFrame, SetBody, SoftLimits
 from kineverse.symbols import position
 
-_AXIS_JOINTS: dict[str, type[AxisJoint]] = {
+_AXIS_JOINTS: dict[str, type[OneDofJoint]] = {
     "revolute": Revolute,
     "continuous": Continuous,
     "prismatic": Prismatic,
@@ -38,40 +44,8 @@ _SUFFIXES = {
 _ROOT = Pose()
 
 
-@dataclass(frozen=True)
-class SoftLimits(Operation):
-    """Keeps a joint within the range its safety controller defends, which lies inside its end stops.
-
-    Attributes
-    ----------
-    name
-        Of the articulation; the constraint is called ``name/soft_limits``.
-    q
-        The coordinate, or the expression that stands for it [rad] or [m].
-    lower, upper
-        The soft limits [rad] or [m].
-    """
-
-    name: str
-    q: Expression
-    lower: float
-    upper: float
-
-    def apply(self, model: Reader) -> Effects:
-        """Write the constraint."""
-        if self.name not in model.articulations:
-            model.articulations[self.name]  # raises, with similar names
-        if not self.q.symbols:
-            return Effects()
-        return Effects(constraints={f"{self.name}/soft_limits": (self.lower, self.q, self.upper)})
-
-    def default_tag(self) -> str:
-        """Return ``soft limits`` and the name."""
-        return f"soft limits {self.name}"
-
-
-def robot_operations(
-    robot: Robot, prefix: str | None = None, parent: str = WORLD, strict: bool = False
+def urdf_operations(
+    robot: UrdfRobot, prefix: str | None = None, parent: str = WORLD, strict: bool = False
 ) -> Iterator[Operation]:
     """Yield the operations that build a robot, from its root outwards.
 
@@ -94,7 +68,7 @@ def robot_operations(
     FormatError
         If the root is the world and is to be attached elsewhere; for names, where they are read strictly.
     """
-    links, joints = _names(robot, prefix, strict)
+    links, joints = _assign_names(robot, prefix, strict)
 
     def named(name: str) -> str:
         return f"{prefix}/{links[name]}" if prefix else links[name]
@@ -103,7 +77,7 @@ def robot_operations(
         return f"{prefix}/{joints[name]}" if prefix else joints[name]
 
     root = named(robot.root)
-    bodies = {link.name: link.body for link in robot.links if not is_empty(link.body)}
+    bodies = {link.name: link.body for link in robot.links if not is_empty_body(link.body)}
     if root != WORLD:
         yield AddFrame(root, Frame(parent, (_ROOT,)))
     elif parent != WORLD:
@@ -124,7 +98,7 @@ def robot_operations(
 
 
 def _joint_operations(
-    joint: Joint, named: Callable[[str], str], moved: Callable[[str], str]
+    joint: UrdfJoint, named: Callable[[str], str], moved: Callable[[str], str]
 ) -> Iterator[Operation]:
     name = moved(joint.name)
     common: dict[str, Any] = {
@@ -143,7 +117,7 @@ def _joint_operations(
         assert joint.axis is not None
         yield Planar(**common, axis=joint.axis)
     else:
-        followed = _followed(joint, moved)
+        followed = _mimic_position(joint, moved)
         yield _axis_joint(joint, common, followed)
         safety = joint.safety
         if safety is not None and safety.bounds and joint.kind != "continuous":
@@ -151,7 +125,7 @@ def _joint_operations(
             yield SoftLimits(name, q, safety.soft_lower, safety.soft_upper)
 
 
-def _axis_joint(joint: Joint, common: dict[str, Any], followed: Expression | None) -> JointOperation:
+def _axis_joint(joint: UrdfJoint, common: dict[str, Any], followed: Expression | None) -> JointOperation:
     assert joint.axis is not None
     return _AXIS_JOINTS[joint.kind](
         **common,
@@ -164,14 +138,14 @@ def _axis_joint(joint: Joint, common: dict[str, Any], followed: Expression | Non
     )
 
 
-def _followed(joint: Joint, moved: Callable[[str], str]) -> Expression | None:
+def _mimic_position(joint: UrdfJoint, moved: Callable[[str], str]) -> Expression | None:
     """Return the expression that stands for the position of a joint that mimics another one."""
     if joint.mimic is None:
         return None
     return joint.mimic.multiplier * position(moved(joint.mimic.joint)) + joint.mimic.offset
 
 
-def _dynamics(joint: Joint) -> tuple[tuple[str, float], ...]:
+def _dynamics(joint: UrdfJoint) -> tuple[tuple[str, float], ...]:
     values = {
         "effort": joint.limits.effort,
         "acceleration": joint.limits.acceleration,
@@ -185,7 +159,9 @@ def _dynamics(joint: Joint) -> tuple[tuple[str, float], ...]:
     return tuple((name, value) for name, value in values.items() if value is not None)
 
 
-def _names(robot: Robot, prefix: str | None, strict: bool) -> tuple[dict[str, str], dict[str, str]]:
+def _assign_names(
+    robot: UrdfRobot, prefix: str | None, strict: bool
+) -> tuple[dict[str, str], dict[str, str]]:
     """Return what links and joints are called here, those that cannot have their names with another one.
 
     Raises
@@ -195,7 +171,9 @@ def _names(robot: Robot, prefix: str | None, strict: bool) -> tuple[dict[str, st
     """
     again: dict[str, int] = {}
 
-    def rename(what: str, thing: Link | Joint, problem: str, wanted: str, taken: Container[str]) -> str:
+    def rename(
+        what: str, thing: UrdfLink | UrdfJoint, problem: str, wanted: str, taken: Container[str]
+    ) -> str:
         place = f"<{what} name={quote(thing.name)}>"
         if strict:
             raise FormatError(f"{robot.source}, line {thing.line}, {place}: {problem}. Rename it.")
@@ -204,14 +182,17 @@ def _names(robot: Robot, prefix: str | None, strict: bool) -> tuple[dict[str, st
             k += 1
             name = f"{wanted}_{k}"
         again[wanted] = k
-        tell([Fault(f"{robot.source}, line {thing.line}, {place}: {problem}; it is called {quote(name)}.")])
+        warn([Fault(f"{robot.source}, line {thing.line}, {place}: {problem}; it is called {quote(name)}.")])
         return name
 
-    parts: tuple[tuple[str, Iterable[Link | Joint]], ...] = (("link", robot.links), ("joint", robot.joints))
+    parts: tuple[tuple[str, Iterable[UrdfLink | UrdfJoint]], ...] = (
+        ("link", robot.links),
+        ("joint", robot.joints),
+    )
     found: list[dict[str, str]] = []
     for what, things in parts:
-        plain = {thing.name: _plain(thing.name) for thing in things}
-        known: dict[str, Link | Joint] = {}
+        plain = {thing.name: _strip_slashes(thing.name) for thing in things}
+        known: dict[str, UrdfLink | UrdfJoint] = {}
         every = set(plain.values())
         for thing in things:
             name = plain[thing.name]
@@ -236,13 +217,13 @@ def _names(robot: Robot, prefix: str | None, strict: bool) -> tuple[dict[str, st
         clash = [f"{name}/{s}" for s in _SUFFIXES.get(joint.kind, ()) if f"{name}/{s}" in taken]
         if clash:
             problem = f"its coordinate {quote(clash[0])} has the name of another joint"
-            everywhere = _Prefixes(taken)
+            everywhere = _TakenPrefixes(taken)
             joints[joint.name] = rename("joint", joint, problem, f"{name}_joint", everywhere)
             taken.add(joints[joint.name])
     return links, joints
 
 
-class _Prefixes:
+class _TakenPrefixes:
     """Whether a name is taken, or those of coordinates below it are."""
 
     def __init__(self, taken: set[str]) -> None:
@@ -257,6 +238,6 @@ class _Prefixes:
         return name in self._taken
 
 
-def _plain(name: str) -> str:
+def _strip_slashes(name: str) -> str:
     """Return a name without empty parts: descriptions older than tf2 call links ``/base_link``."""
     return "/".join(filter(None, name.split("/"))) if "/" in name else name

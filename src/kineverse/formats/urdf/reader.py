@@ -1,4 +1,4 @@
-"""URDF files and text to a checked description.
+"""URDF files and text as checked descriptions.
 
 Specification: http://wiki.ros.org/urdf/XML and urdf.xsd of ros/urdfdom; ``docs/urdf.md`` lists where parsers
 disagree and how it is decided here.
@@ -14,14 +14,14 @@ from typing import TypeVar
 
 from kineverse.errors import FormatError
 from kineverse.formats.files import read_file
-from kineverse.formats.markup import Element, ElementError, Visit, label, parse, quote
-from kineverse.formats.remarks import Remarks
-from kineverse.formats.roots import text_root
-from kineverse.formats.urdf.bodies import LinkReader
-from kineverse.formats.urdf.description import Joint, Link, Robot
-from kineverse.formats.urdf.joints import read_joint
-from kineverse.formats.urdf.mimicry import resolve
-from kineverse.formats.urdf.tree import one_parent_each, root_outwards
+from kineverse.formats.reader_warnings import ReaderWarnings
+from kineverse.formats.root_folder import find_text_root
+from kineverse.formats.urdf.bodies import UrdfLinkReader
+from kineverse.formats.urdf.description import UrdfJoint, UrdfLink, UrdfRobot
+from kineverse.formats.urdf.joints import read_urdf_joint
+from kineverse.formats.urdf.mimic import resolve_mimic_joints
+from kineverse.formats.urdf.tree import keep_one_parent, order_from_root
+from kineverse.formats.xml_reader import Element, ElementError, Visit, label, parse_xml, quote
 
 _VERSIONS = {"1.0": (1, 0), "1.1": (1, 1), "1.2": (1, 2)}
 _EXTENSIONS = frozenset(("gazebo", "transmission"))
@@ -34,12 +34,12 @@ _OTHER_FORMATS = {
     "package": "a ROS manifest",
 }
 
-T = TypeVar("T", Link, Joint)
+T = TypeVar("T", UrdfLink, UrdfJoint)
 
 
 def read_urdf(
     path: str | os.PathLike[str], root: str | os.PathLike[str] | None = None, strict: bool = False
-) -> Robot:
+) -> UrdfRobot:
     """Read a URDF file; see :func:`parse_urdf`.
 
     Raises
@@ -57,7 +57,7 @@ def parse_urdf(
     folder: str = "",
     root: str | os.PathLike[str] | None = None,
     strict: bool = False,
-) -> Robot:
+) -> UrdfRobot:
     """Read a URDF from text.
 
     Parameters
@@ -69,7 +69,7 @@ def parse_urdf(
     folder
         The folder from which the meshes it names are found, when somebody asks for them.
     root
-        The folder that they do not leave; None for that which :func:`kineverse.formats.roots.root_of` finds.
+        The folder that they do not leave; None for that which :func:`kineverse.formats.root_folder.find_root` finds.
     strict
         Whether mistakes that others read past are refused, rather than remarked on.
 
@@ -78,19 +78,19 @@ def parse_urdf(
     FormatError
         If it is not a valid URDF; the message names source, line, element and reason.
     """
-    remarks = Remarks(source, strict=strict)
-    document = _Document(folder, text_root(folder, root), remarks)
-    top = parse(text, source, _EXTENSIONS, document.begin, mend=None if strict else remarks.fault)
+    remarks = ReaderWarnings(source, strict=strict)
+    document = _Document(folder, find_text_root(folder, root), remarks)
+    top = parse_xml(text, source, _EXTENSIONS, document.begin, mend=None if strict else remarks.fault)
     hint = document.finish(top)
-    joints = one_parent_each(list(document.joints.values()), remarks)
+    joints = keep_one_parent(list(document.joints.values()), remarks)
     links = tuple(document.links.values())
-    roots, ordered, reached = root_outwards(links, joints, remarks, hint)
+    roots, ordered, reached = order_from_root(links, joints, remarks, hint)
     name = top[1].get("name", "")
-    return Robot(
+    return UrdfRobot(
         name,
         roots[0],
         tuple(reached),
-        tuple(resolve(ordered, remarks)),
+        tuple(resolve_mimic_joints(ordered, remarks)),
         source,
         tuple(remarks.texts),
         roots[1:],
@@ -100,9 +100,9 @@ def parse_urdf(
 class _Document:
     """The links and joints of a document, which are taken up as they come."""
 
-    def __init__(self, folder: str, root: str, remarks: Remarks):
-        self.links: dict[str, Link] = {}
-        self.joints: dict[str, Joint] = {}
+    def __init__(self, folder: str, root: str, remarks: ReaderWarnings):
+        self.links: dict[str, UrdfLink] = {}
+        self.joints: dict[str, UrdfJoint] = {}
         self.remarks = remarks
         self._folder, self._root = folder, root
         self._strangers: list[Element] = []
@@ -115,7 +115,7 @@ class _Document:
         except ElementError as mistake:
             raise self._error(mistake, root) from None
         self._xacro = _xacro_prefix(root)
-        self._reader = LinkReader(self._folder, self._version, self.remarks, self._root)
+        self._reader = UrdfLinkReader(self._folder, self._version, self.remarks, self._root)
         return self._take
 
     def finish(self, root: Element) -> str:
@@ -140,7 +140,7 @@ class _Document:
                 link = self._reader.read(element)
                 _add(self.links, link.name, link, element)
             elif tag == "joint":
-                self._add_joint(read_joint(element, self._version, self.remarks), element)
+                self._add_joint(read_urdf_joint(element, self._version, self.remarks), element)
             elif tag == "material":
                 self._reader.materials.share(element)
             elif tag != "sensor":
@@ -148,7 +148,7 @@ class _Document:
         except ElementError as mistake:
             raise self._error(mistake, element) from None
 
-    def _add_joint(self, joint: Joint, element: Element) -> None:
+    def _add_joint(self, joint: UrdfJoint, element: Element) -> None:
         """Take up a joint; a name that a fixed one has, too, goes to the other, which has a coordinate."""
         other = self.joints.get(joint.name)
         if other is None or "fixed" not in (joint.kind, other.kind):
@@ -181,7 +181,7 @@ def _add(named: dict[str, T], name: str, part: T, element: Element) -> None:
         )
 
 
-def _version(root: Element, remarks: Remarks) -> tuple[int, int]:
+def _version(root: Element, remarks: ReaderWarnings) -> tuple[int, int]:
     """Return the version of the specification that the root element claims, 1.0 if it claims none."""
     if root[0] != "robot":
         guess = f" This is {_OTHER_FORMATS[root[0]]} file." if root[0] in _OTHER_FORMATS else ""
@@ -207,7 +207,9 @@ def _version(root: Element, remarks: Remarks) -> tuple[int, int]:
     return _VERSIONS[taken]
 
 
-def _note_strangers(root: Element, strangers: list[Element], has_joints: bool, remarks: Remarks) -> str:
+def _note_strangers(
+    root: Element, strangers: list[Element], has_joints: bool, remarks: ReaderWarnings
+) -> str:
     """Remark on elements that may have been meant to be part of the robot, and return them as a hint.
 
     Elements that URDF does not know are allowed, and are ignored; but joints of other dialects are how links
@@ -236,7 +238,7 @@ def _note_strangers(root: Element, strangers: list[Element], has_joints: bool, r
     return f" Ignored, since URDF does not know it: {shown}{', ...' if len(suspects) > 4 else ''}."
 
 
-def _check_expanded(element: Element, xacro: str, remarks: Remarks) -> None:
+def _check_expanded(element: Element, xacro: str, remarks: ReaderWarnings) -> None:
     if "${" in element[1].get("name", ""):
         mistake = ElementError(element, f"has a name that xacro was to expand. {EXPAND}")
         remarks.mend(mistake, "it is taken as it is")

@@ -1,4 +1,4 @@
-"""That links and joints form one tree.
+"""Kinematic tree of a URDF: one parent each, joints from the root outwards.
 
 Everything here is iterative and linear, whatever the depth: a chain of 10^5 links is a robot like any other.
 """
@@ -8,14 +8,14 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from kineverse.errors import FormatError, suggest
-from kineverse.formats.markup import quote
-from kineverse.formats.remarks import Remarks
-from kineverse.formats.urdf.description import Joint, Link
+from kineverse.formats.reader_warnings import ReaderWarnings
+from kineverse.formats.urdf.description import UrdfJoint, UrdfLink
+from kineverse.formats.xml_reader import quote
 
 _SHOWN = 8
 
 
-def one_parent_each(joints: Sequence[Joint], remarks: Remarks) -> list[Joint]:
+def keep_one_parent(joints: Sequence[UrdfJoint], remarks: ReaderWarnings) -> list[UrdfJoint]:
     """Return the joints, of several that lead to one link that with the last name, as urdfdom takes it.
 
     Raises
@@ -23,7 +23,7 @@ def one_parent_each(joints: Sequence[Joint], remarks: Remarks) -> list[Joint]:
     FormatError
         If there are such joints, and the description is read strictly.
     """
-    above: dict[str, Joint] = {}
+    above: dict[str, UrdfJoint] = {}
     for joint in joints:
         other = above.setdefault(joint.child, joint)
         if other is joint:
@@ -43,9 +43,9 @@ def one_parent_each(joints: Sequence[Joint], remarks: Remarks) -> list[Joint]:
     return [joint for joint in joints if above[joint.child] is joint]
 
 
-def root_outwards(
-    links: Sequence[Link], joints: Sequence[Joint], remarks: Remarks, hint: str = ""
-) -> tuple[tuple[str, ...], tuple[Joint, ...], list[Link]]:
+def order_from_root(
+    links: Sequence[UrdfLink], joints: Sequence[UrdfJoint], remarks: ReaderWarnings, hint: str = ""
+) -> tuple[tuple[str, ...], tuple[UrdfJoint, ...], list[UrdfLink]]:
     """Return the roots, the joints from there outwards, siblings as in the file, and all links reached.
 
     Parameters
@@ -65,8 +65,8 @@ def root_outwards(
     """
     source = remarks.source
     lines = {link.name: link.line for link in links}
-    joints_below: dict[str, list[Joint]] = {}
-    joint_above: dict[str, Joint] = {}
+    joints_below: dict[str, list[UrdfJoint]] = {}
+    joint_above: dict[str, UrdfJoint] = {}
     for joint in joints:
         for role, name in (("parent", joint.parent), ("child", joint.child)):
             if name not in lines:
@@ -110,9 +110,9 @@ def root_outwards(
     return tuple(root.name for root in roots), tuple(ordered), [k for k in links if k.name in reached]
 
 
-def _outwards(root: str, joints_below: dict[str, list[Joint]]) -> list[Joint]:
+def _outwards(root: str, joints_below: dict[str, list[UrdfJoint]]) -> list[UrdfJoint]:
     """Return the joints below a link, depth first."""
-    ordered: list[Joint] = []
+    ordered: list[UrdfJoint] = []
     ahead = joints_below.get(root, [])[::-1]
     while ahead:
         joint = ahead.pop()
@@ -121,7 +121,7 @@ def _outwards(root: str, joints_below: dict[str, list[Joint]]) -> list[Joint]:
     return ordered
 
 
-def _loop(start: Joint, joint_above: dict[str, Joint]) -> list[Joint]:
+def _loop(start: UrdfJoint, joint_above: dict[str, UrdfJoint]) -> list[UrdfJoint]:
     """Return the joints of the circle that ``start`` is in or below, from the first of the file onwards."""
     joint, passed = start, {start.name}
     while True:
@@ -137,5 +137,5 @@ def _loop(start: Joint, joint_above: dict[str, Joint]) -> list[Joint]:
     return loop[first:] + loop[:first]
 
 
-def _place(source: str, joint: Joint) -> str:
+def _place(source: str, joint: UrdfJoint) -> str:
     return f"{source}, line {joint.line}, <joint name={quote(joint.name)}>"

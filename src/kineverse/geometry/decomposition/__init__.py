@@ -1,28 +1,28 @@
-"""Meshes as unions of convex hulls: made offline by CoACD, kept in the user's cache, measured.
+"""Convex decomposition of meshes: made offline by CoACD, cached, measured.
 
 Distances to convex solids are fast and have a depth; a mug is not convex. :func:`decompose` takes seconds
-to minutes, so nothing calls it by itself: ``kineverse decompose`` does, and :func:`pieces` returns what is
+to minutes, so nothing calls it by itself: ``kineverse decompose`` does, and :func:`find_hulls` returns what is
 there.
 """
 
 from .accuracy import Accuracy
-from .making import Outcome, decompose, decompose_all, pieces
-from .result import Decomposition, Settings
-from .store import Kept, clear, folder, listing
-from .worker import DecompositionError, Limits
+from .convex_decomposition import DecompositionOutcome, decompose, decompose_all, find_hulls
+from .hull_cache import CacheEntry, clear, folder, listing
+from .result import Decomposition, DecompositionSettings
+from .worker import DecompositionError, ResourceLimits
 
 __all__ = [
     "Accuracy",
+    "CacheEntry",
     "Decomposition",
     "DecompositionError",
-    "Kept",
-    "Limits",
-    "Outcome",
-    "Settings",
+    "DecompositionOutcome",
+    "DecompositionSettings",
+    "ResourceLimits",
     "clear",
     "decompose",
     "decompose_all",
+    "find_hulls",
     "folder",
     "listing",
-    "pieces",
 ]

@@ -1,4 +1,4 @@
-"""How well convex hulls stand for a mesh, measured by sampling."""
+"""Accuracy of a convex decomposition, measured by sampling."""
 
 from __future__ import annotations
 
@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from kineverse.geometry.hulls import hull
 from kineverse.geometry.mesh_files import Faces, Floats, Integers
+from kineverse.geometry.shapes import convex_hull
 
 SAMPLES = 4000
 """So many points are looked at on each surface, and so many in each hull, beside all corners."""
@@ -66,10 +66,10 @@ class Polytope:
 
         Raises
         ------
-        ValueRejectedError
+        InvalidValueError
             If they span nothing.
         """
-        convex = hull(points)
+        convex = convex_hull(points)
         corners = np.array(convex.points())
         polygons = (convex.polygons(i) for i in range(convex.num_polygons))
         triangles = np.array([[p[0], p[1], p[2]] for p in polygons], dtype=np.int64)
@@ -96,10 +96,10 @@ class Polytope:
     @property
     def volume(self) -> float:
         """What it encloses [m³]."""
-        return enclosed(self.points, self.triangles)
+        return enclosed_volume(self.points, self.triangles)
 
 
-def measure(mesh: Faces, hulls: list[Polytope]) -> Accuracy:
+def measure_accuracy(mesh: Faces, hulls: list[Polytope]) -> Accuracy:
     """Measure how well hulls stand for a mesh.
 
     Parameters
@@ -111,7 +111,7 @@ def measure(mesh: Faces, hulls: list[Polytope]) -> Accuracy:
     """
     random = np.random.default_rng(0)
     return Accuracy(
-        mesh_volume=abs(enclosed(mesh.vertices, mesh.faces)) if is_closed(mesh.faces) else None,
+        mesh_volume=abs(enclosed_volume(mesh.vertices, mesh.faces)) if is_closed(mesh.faces) else None,
         volume=_union_volume(hulls, random),
         hull_volume=Polytope.of(mesh.vertices).volume,
         excess=_excess(mesh, hulls, random),
@@ -119,7 +119,7 @@ def measure(mesh: Faces, hulls: list[Polytope]) -> Accuracy:
     )
 
 
-def enclosed(vertices: Floats, faces: Integers) -> float:
+def enclosed_volume(vertices: Floats, faces: Integers) -> float:
     """Return the volume that triangles enclose, positive if they are seen counterclockwise [m³]."""
     a, b, c = (vertices[faces[:, k]] - vertices[faces[0, 0]] for k in range(3))
     return float(np.einsum("ij,ij->", a, np.cross(b, c)) / 6.0)
@@ -133,7 +133,7 @@ def is_closed(faces: Integers) -> bool:
 
 
 def _union_volume(hulls: list[Polytope], random: np.random.Generator) -> float:
-    """Return ``Σ V_i · mean of 1/m(x) over x in hull i``, where m(x) counts the hulls that hold x."""
+    """Return ``Σ V_i · mean of 1/m(x) over x in convex_hull i``, where m(x) counts the hulls that hold x."""
     total = 0.0
     for k, polytope in enumerate(hulls):
         inside = _inside(polytope, random)
@@ -172,7 +172,9 @@ def _uncovered(mesh: Faces, hulls: list[Polytope], random: np.random.Generator) 
     points = points[beyond > _NOTHING * np.ptp(mesh.vertices, axis=0).max()]
     if not len(points):
         return 0.0
-    return float(np.min([nearest(polytope.engine, points)[0] for polytope in hulls], axis=0).max())
+    return float(
+        np.min([nearest_surface_points(polytope.engine, points)[0] for polytope in hulls], axis=0).max()
+    )
 
 
 def _excess(mesh: Faces, hulls: list[Polytope], random: np.random.Generator) -> float:
@@ -187,7 +189,7 @@ def _excess(mesh: Faces, hulls: list[Polytope], random: np.random.Generator) -> 
     outermost = np.concatenate(points)
     if not len(outermost):
         return 0.0
-    distances = nearest(_triangles(mesh), outermost)[0]
+    distances = nearest_surface_points(_triangles(mesh), outermost)[0]
     # Beginning with the furthest, so that the first one outside of the mesh is the answer.
     order = np.argsort(-distances, kind="stable")
     order = order[distances[order] > _NOTHING * size]
@@ -225,7 +227,7 @@ def _triangles(mesh: Faces) -> Any:
     return engine
 
 
-def nearest(engine: Any, points: Floats) -> tuple[Floats, Floats]:
+def nearest_surface_points(engine: Any, points: Floats) -> tuple[Floats, Floats]:
     """Return how near points are to what coal computes with, and where it is nearest.
 
     (N, 3) -> (N,), (N, 3) [m]. Inside of a hull the distance is 0, and the place means nothing.

@@ -1,4 +1,4 @@
-"""What a decomposition is asked for, what it is, and both as bytes."""
+"""Decomposition settings and results, and their serialisation."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from dataclasses import asdict, dataclass, field
 
 import numpy as np
 
-from kineverse.errors import FormatError, ValueRejectedError
+from kineverse.errors import FormatError, InvalidValueError
 from kineverse.geometry.mesh_files import Floats
 
 from .accuracy import Accuracy
@@ -26,7 +26,7 @@ _VERSION = 1
 
 
 @dataclass(frozen=True, slots=True)
-class Settings:
+class DecompositionSettings:
     """What a decomposition should be like.
 
     Attributes
@@ -40,7 +40,7 @@ class Settings:
 
     Raises
     ------
-    ValueRejectedError
+    InvalidValueError
         If one of them is not positive.
     """
 
@@ -49,11 +49,11 @@ class Settings:
 
     def __post_init__(self) -> None:
         if self.error is not None and not (math.isfinite(self.error) and self.error > 0.0):
-            raise ValueRejectedError(
+            raise InvalidValueError(
                 f"The error of a decomposition is a positive length [m], not {self.error}."
             )
         if self.max_hulls < 1:
-            raise ValueRejectedError(f"A decomposition has at least one hull, not {self.max_hulls}.")
+            raise InvalidValueError(f"A decomposition has at least one hull, not {self.max_hulls}.")
 
     def allowed(self, size: float) -> float:
         """Return the error that is allowed for a mesh whose box has this longest edge, both [m]."""

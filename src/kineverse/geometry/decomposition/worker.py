@@ -1,4 +1,4 @@
-"""CoACD in a process of its own, with bounds on its time and memory."""
+"""CoACD in a separate process with limits on time and memory."""
 
 from __future__ import annotations
 
@@ -15,17 +15,17 @@ from pathlib import Path
 
 import numpy as np
 
-from kineverse.errors import KineverseError, MissingExtraError
+from kineverse._extras import install_command
+from kineverse.errors import KineverseError, MissingDependencyError
 from kineverse.geometry.mesh_files import Floats
-from kineverse.installation import install_command
 
-from .surface import Surface
+from .mesh_cleanup import CleanMesh
 
 PROGRAM = Path(__file__).with_name("program.py")
 _POLL = 0.05
-_LAST_WORDS = 300
+_MAX_MESSAGE = 300
 # What Python, C++ and the loader of libraries say when there is no memory.
-_OF_MEMORY = (
+_MEMORY_ERRORS = (
     b"MemoryError",
     b"bad_alloc",
     b"annot allocate memory",
@@ -39,7 +39,7 @@ class DecompositionError(KineverseError, RuntimeError):
 
 
 @dataclass(frozen=True, slots=True)
-class Limits:
+class ResourceLimits:
     """What one mesh may cost.
 
     Attributes
@@ -54,7 +54,9 @@ class Limits:
     memory: int = 4 * 2**30
 
 
-def run(surface: Surface, error: float, limits: Limits, stop: threading.Event | None = None) -> list[Floats]:
+def run_coacd(
+    surface: CleanMesh, error: float, limits: ResourceLimits, stop: threading.Event | None = None
+) -> list[Floats]:
     """Return the corners of convex hulls, (n, 3) each [m], as CoACD makes them.
 
     Parameters
@@ -70,13 +72,13 @@ def run(surface: Surface, error: float, limits: Limits, stop: threading.Event | 
 
     Raises
     ------
-    MissingExtraError
+    MissingDependencyError
         If CoACD is not installed.
     DecompositionError
         If it crashes, answers nothing that could be right, exceeds its limits, or is stopped.
     """
     if importlib.util.find_spec("coacd") is None:
-        raise MissingExtraError(f"decomposing meshes needs CoACD: {install_command('decomposition')}")
+        raise MissingDependencyError(f"decomposing meshes needs CoACD: {install_command('decomposition')}")
     with tempfile.TemporaryDirectory(prefix="kineverse-decompose-", ignore_cleanup_errors=True) as folder:
         source, target, said = (Path(folder) / name for name in ("in.npz", "out.npz", "said.txt"))
         np.savez(source, vertices=surface.faces.vertices, faces=surface.faces.faces, parts=surface.parts)
@@ -84,15 +86,15 @@ def run(surface: Surface, error: float, limits: Limits, stop: threading.Event | 
             status = _run(_command(source, target, error, limits), errors.fileno(), limits, stop)
         if status == 0:
             return _answer(target, surface)
-        raise DecompositionError(_why(status, said.read_bytes()[-20_000:]))
+        raise DecompositionError(_explain_failure(status, said.read_bytes()[-20_000:]))
 
 
-def _command(source: Path, target: Path, error: float, limits: Limits) -> list[str]:
+def _command(source: Path, target: Path, error: float, limits: ResourceLimits) -> list[str]:
     # With -P the program's neighbours cannot be imported by accident.
     return [sys.executable, "-P", str(PROGRAM), str(source), str(target), repr(error), str(limits.memory)]
 
 
-def _run(command: list[str], errors: int, limits: Limits, stop: threading.Event | None) -> int:
+def _run(command: list[str], errors: int, limits: ResourceLimits, stop: threading.Event | None) -> int:
     # Its threads make it hardly any faster, and several meshes are decomposed side by side.
     environment = {**os.environ, "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
     end = time.monotonic() + limits.seconds
@@ -115,7 +117,7 @@ def _run(command: list[str], errors: int, limits: Limits, stop: threading.Event 
         return process.wait()
 
 
-def _answer(target: Path, surface: Surface) -> list[Floats]:
+def _answer(target: Path, surface: CleanMesh) -> list[Floats]:
     """Read the hulls, and do not trust them."""
     try:
         with np.load(target, allow_pickle=False) as arrays:
@@ -130,9 +132,9 @@ def _answer(target: Path, surface: Surface) -> list[Floats]:
     return hulls
 
 
-def _why(status: int, said: bytes) -> str:
+def _explain_failure(status: int, said: bytes) -> str:
     lines = said.decode(errors="replace").split("\n")
-    last = next((line.strip() for line in reversed(lines) if line.strip()), "")[:_LAST_WORDS]
+    last = next((line.strip() for line in reversed(lines) if line.strip()), "")[:_MAX_MESSAGE]
     if status < 0:
         try:
             how = f"was ended by {signal.Signals(-status).name}"
@@ -140,7 +142,7 @@ def _why(status: int, said: bytes) -> str:
             how = f"was ended by signal {-status}"
     else:
         how = f"ended with status {status}"
-    if any(sign in said for sign in _OF_MEMORY):
+    if any(sign in said for sign in _MEMORY_ERRORS):
         advice = (
             "It needs more memory than it may have: allow more, simplify the mesh, or allow a larger error."
         )

@@ -5,9 +5,9 @@ writes as expressions of the answers. Whoever has the trace can run the operatio
 without its class.
 """
 
-from .answer import Answer
-from .question import Look, Question
-from .trace import Step, Trace, UntraceableError
-from .tracing import trace
+from .placeholder import ReadNode
+from .recorder import record_trace
+from .trace import Trace, TraceStep, UntraceableError
+from .trace_queries import Access, Query
 
-__all__ = ["Answer", "Look", "Question", "Step", "Trace", "UntraceableError", "trace"]
+__all__ = ["Access", "Query", "ReadNode", "Trace", "TraceStep", "UntraceableError", "record_trace"]

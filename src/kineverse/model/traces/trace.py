@@ -1,4 +1,4 @@
-"""Running an operation again from its trace."""
+"""Trace of an operation, and its evaluation on another model."""
 
 from __future__ import annotations
 
@@ -12,12 +12,11 @@ import casadi as ca
 from kineverse.errors import KineverseError, ModelError
 from kineverse.expressions.expression import Expression, as_expression
 from kineverse.model.constraint import Constraint
-from kineverse.model.contents import mapped
-from kineverse.model.operation import ARTICULATIONS, CONSTRAINTS, DATA, Effects
-from kineverse.model.reader import Cell, Reader
+from kineverse.model.operation import ARTICULATIONS, CONSTRAINTS, DATA, Cell, Writes, map_expressions
+from kineverse.model.read_recorder import ReadRecorder
 
-from .answer import Answer, answers_in, entry_along, filled
-from .question import FAILED, Look, Part, Question, Reply
+from .placeholder import ReadNode, fill_read_nodes, find_read_nodes, follow_gradient_path
+from .trace_queries import FAILED, Access, Query, QueryResult, ResultPart
 
 MAX_ANSWER = 200_000
 """How many nodes an answer may be made of."""
@@ -28,11 +27,11 @@ class UntraceableError(ModelError):
 
 
 @dataclass(frozen=True)
-class Step:
+class TraceStep:
     """A question, and how closely its answer was looked at."""
 
-    question: Question
-    look: Look
+    question: Query
+    look: Access
 
 
 @dataclass(frozen=True)
@@ -44,13 +43,13 @@ class Trace:
     steps
         The questions in the order in which they were asked; one may be about the answers before it.
     writes
-        What is written, by cell, with :class:`.answer.Answer` nodes where answers belong.
+        What is written, by cell, with :class:`.placeholder.ReadNode` nodes where answers belong.
     """
 
-    steps: tuple[Step, ...]
+    steps: tuple[TraceStep, ...]
     writes: tuple[tuple[Cell, Any], ...]
 
-    def run(self, model: Reader, before: Reader) -> Effects:
+    def run(self, model: ReadRecorder, before: ReadRecorder) -> Writes:
         """Return what the operation writes, given a model.
 
         Parameters
@@ -67,11 +66,11 @@ class Trace:
         UnknownNameError
             If something that it asked for does not exist any more.
         """
-        old: list[Reply] = []
-        new: list[Reply] = []
+        old: list[QueryResult] = []
+        new: list[QueryResult] = []
         for step in self.steps:
-            then = _answered(in_terms_of(step.question, old), before)
-            now = _answered(in_terms_of(step.question, new), model)
+            then = _ask(substitute_results(step.question, old), before)
+            now = _ask(substitute_results(step.question, new), model)
             if isinstance(now, KineverseError) and not isinstance(then, KineverseError):
                 raise now
             old.append(_reply(then))
@@ -86,13 +85,13 @@ class Trace:
                 )
         return self.written(new)
 
-    def written(self, replies: Sequence[Reply]) -> Effects:
+    def written(self, replies: Sequence[QueryResult]) -> Writes:
         """Return what the operation writes, given the answers to its questions."""
         put = _into(replies)
 
         def put_datum(expression: Expression) -> Expression | float:
             # What is made of numbers alone is a number again.
-            parts = [replies[a.question].parts[a.part] for a in answers_in(expression)]
+            parts = [replies[a.question].parts[a.part] for a in find_read_nodes(expression)]
             result = put(expression)
             of_numbers = bool(parts) and all(isinstance(part, float) for part in parts)
             is_number = of_numbers and not result.shape and result.is_constant
@@ -104,74 +103,72 @@ class Trace:
             return number
 
         written = {
-            (kind, name): mapped(kind, value, put_datum if kind in (DATA, ARTICULATIONS) else put)
+            (kind, name): map_expressions(kind, value, put_datum if kind in (DATA, ARTICULATIONS) else put)
             for (kind, name), value in self.writes
         }
         for (kind, _), value in written.items():
             if kind == CONSTRAINTS:
                 Constraint.of(value.lower, value.expression, value.upper)  # raises where there is no range
-        return Effects.of(written)
+        return Writes.of(written)
 
 
-def _check_size(reply: Reply) -> None:
+def _check_size(reply: QueryResult) -> None:
     """Refuse what has no end: each of some dozen substitutions in one another doubles what there is."""
     if sum(ca.n_nodes(part._sx) for part in reply.parts if isinstance(part, Expression)) > MAX_ANSWER:
         raise UntraceableError(f"an answer on the way to it is made of more than {MAX_ANSWER:,} nodes.")
 
 
-def replied(question: Question, model: Reader) -> Reply:
-    """Return the answer to a question, :data:`.question.FAILED` where asking is an error."""
-    return _reply(_answered(question, model))
+def run_query(question: Query, model: ReadRecorder) -> QueryResult:
+    """Return the answer to a question, :data:`.trace_queries.FAILED` where asking is an error."""
+    return _reply(_ask(question, model))
 
 
-def _answered(question: Question, model: Reader) -> Reply | KineverseError:
+def _ask(question: Query, model: ReadRecorder) -> QueryResult | KineverseError:
     try:
         return question.ask(model)
     except KineverseError as error:
         return error
 
 
-def _reply(answered: Reply | KineverseError) -> Reply:
-    return Reply(FAILED, ()) if isinstance(answered, KineverseError) else answered
+def _reply(answered: QueryResult | KineverseError) -> QueryResult:
+    return QueryResult(FAILED, ()) if isinstance(answered, KineverseError) else answered
 
 
-def _like(reply: Reply, before: Reply) -> Reply:
+def _like(reply: QueryResult, before: QueryResult) -> QueryResult:
     """Return a reply with a whole number as a number, if that was one that is not whole."""
-    is_whole = type(reply.rest) is int and isinstance(before.rest, Part)
-    return Reply(before.rest, (float(reply.rest),)) if is_whole else reply
+    is_whole = type(reply.rest) is int and isinstance(before.rest, ResultPart)
+    return QueryResult(before.rest, (float(reply.rest),)) if is_whole else reply
 
 
-def in_terms_of(question: Question, replies: Sequence[Reply]) -> Question:
+def substitute_results(question: Query, replies: Sequence[QueryResult]) -> Query:
     """Return a question with earlier answers put into it."""
     if not any(isinstance(a, Expression) for a in question.arguments):
         return question
     put = _into(replies)
-    return Question(
-        question.kind, tuple(put(a) if isinstance(a, Expression) else a for a in question.arguments)
-    )
+    return Query(question.kind, tuple(put(a) if isinstance(a, Expression) else a for a in question.arguments))
 
 
-def _into(replies: Sequence[Reply]) -> Callable[[Expression], Expression]:
-    def place(answer: Answer) -> Expression:
+def _into(replies: Sequence[QueryResult]) -> Callable[[Expression], Expression]:
+    def place(answer: ReadNode) -> Expression:
         parts = replies[answer.question].parts
         part = as_expression(parts[answer.part]) if answer.part < len(parts) else None
         if part is None or part.shape != answer.shape:
             raise UntraceableError("it needs more than there is now.")
-        return entry_along(part, answer.path)
+        return follow_gradient_path(part, answer.path)
 
-    return lambda expression: filled(expression, place)
+    return lambda expression: fill_read_nodes(expression, place)
 
 
-def _difference(look: Look, old: Reply, new: Reply) -> str | None:
+def _difference(look: Access, old: QueryResult, new: QueryResult) -> str | None:
     if old.rest != new.rest or len(old.parts) != len(new.parts):
         return "the names and kinds"
     for one, other in zip(old.parts, new.parts, strict=True):
         a, b = as_expression(one), as_expression(other)
         if a.shape != b.shape:
             return "the shape"
-        if look >= Look.VALUE and a != b:
+        if look >= Access.VALUE and a != b:
             return "the value"
-        if look >= Look.SYMBOLS and _symbols(a) != _symbols(b):
+        if look >= Access.SYMBOLS and _symbols(a) != _symbols(b):
             return "the symbols"
     return None
 

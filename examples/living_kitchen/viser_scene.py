@@ -1,0 +1,206 @@
+"""The scene that lives, on a page: nodes that are moved, and marks that are drawn anew."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from kineverse.view import backdrop
+from kineverse.view.drawables import Drawable, Rgba
+from kineverse.view.poses import to_quaternions
+from kineverse.view.triangle_mesh import Floats
+
+from . import marker_meshes as marks
+from .placed_model import shaded
+from .scene import BESIDE, CAMERA, Scenery
+from .unknown_mechanisms import BASE, PART
+
+ROOT = "/living"
+
+EXTENT = 12.0
+"""How large the scene is [m]."""
+
+FIELD_OF_VIEW = 0.86
+"""Of the camera [rad]: beside the controls a page is about as high as it is wide."""
+
+HIDDEN = 1e-4
+"""The scale of a marker that is not seen."""
+
+MOVED = 2e-4
+"""What has moved by less need not be sent [m], [rad]."""
+
+WORDS = {"the truth": (0.4, 0.0, 2.75), "what is believed": (0.4, 0.0, 2.75)}
+
+
+class Stagehand:
+    """Shows a scenery on a viser server, and sends what has changed.
+
+    Parameters
+    ----------
+    server
+        A viser server.
+    scenery
+        What is shown.
+    """
+
+    def __init__(self, server: Any, scenery: Scenery) -> None:
+        self._server, self._scenery = server, scenery
+        backdrop.set_up(server)
+        backdrop.set_floor(server, 0.0, EXTENT, True)
+        away = np.subtract(CAMERA.position, CAMERA.target)
+        backdrop.set_lamp(server, float(np.arctan2(away[1], away[0])))
+        start = server.initial_camera
+        start.position, start.look_at = np.array(CAMERA.position), np.array(CAMERA.target)
+        start.fov = FIELD_OF_VIEW
+        for number, (text, at) in enumerate(WORDS.items()):
+            place = np.asarray(at) + (BESIDE[:3, 3] if number else 0.0)
+            server.scene.add_label(f"{ROOT}/words{number}", text, position=place)
+        self._nodes: dict[str, Any] = {}
+        self._meshes: dict[str, list[tuple[Any, Drawable]]] = {}
+        self._poses: dict[str, Floats] = {}
+        self._colors: dict[str, Rgba] = {}
+        with server.atomic():
+            self._add(scenery.truth.parts)
+            # No shadows on paper: they are much of the work of a browser without a graphics card.
+            self._add(scenery.believed.parts, shadows=False)
+            self._add_marks()
+            self._add_stranger()
+        self.update()
+
+    def _add(self, parts: list[Drawable], shadows: bool = True) -> None:
+        poses = self._scenery.poses()
+        for number, part in enumerate(parts):
+            key = part.frame
+            if key not in self._nodes:
+                # Slashes would make viser nest the nodes.
+                name = f"{ROOT}/{key.replace('/', '∕')}"
+                self._nodes[key] = self._server.scene.add_frame(name, show_axes=False)
+                if key in poses:
+                    self._place(key, poses[key])
+            red, green, blue, alpha = part.color
+            mesh = self._server.scene.add_mesh_simple(
+                f"{self._nodes[key].name}/{number}",
+                part.surface.vertices,
+                part.surface.faces,
+                color=_bytes((red, green, blue)),
+                opacity=None if alpha >= 1.0 else alpha,
+                side="front" if part.surface.closed else "double",
+                cast_shadow=shadows,
+                # In a scene this large the shadow of a thing on itself is a pattern of stripes.
+                receive_shadow=False,
+            )
+            self._meshes.setdefault(key, []).append((mesh, part))
+
+    def _add_stranger(self) -> None:
+        scenery = self._scenery
+        self._thoughts = -1
+        self._shown_stranger = scenery.known_stranger
+        self._add(scenery.stranger.parts)
+        self._add(scenery.learned.parts, shadows=False)
+
+    def _add_marks(self) -> None:
+        scene, life = self._server.scene, self._scenery.life
+        count = len(life.following.frames) + len(life.poses)
+        self._markers = scene.add_batched_axes(
+            f"{ROOT}/markers",
+            np.tile([1.0, 0.0, 0.0, 0.0], (count, 1)),
+            np.zeros((count, 3)),
+            batched_scales=np.ones(count),
+            axes_length=marks.MARKER,
+            axes_radius=marks.THICK / 2,
+        )
+        nowhere = np.zeros((1, 2, 3), dtype=np.float32)
+        self._bars, *self._lines = (
+            scene.add_line_segments(f"{ROOT}/{name}", nowhere, _bytes(color), thickness=2.0 * radius)
+            for name, color, radius in (
+                ("bars", marks.BARS, marks.BAR),
+                ("axis0", marks.AXIS, marks.LINE),
+                ("axis1", marks.AXIS, marks.LINE),
+            )
+        )
+        self._cloud = scene.add_point_cloud(
+            f"{ROOT}/cloud", nowhere[0], _bytes(marks.CLOUD), point_size=0.025, point_shape="circle"
+        )
+        self._tubes = [
+            scene.add_mesh_simple(
+                f"{ROOT}/tube{number}",
+                nowhere[0],
+                np.zeros((1, 3), dtype=np.uint32),
+                color=_bytes(marks.TUBE),
+                opacity=0.35,
+                side="double",
+                cast_shadow=False,
+                receive_shadow=False,
+            )
+            for number in range(2)
+        ]
+
+    def _segments(self) -> Floats:
+        """Return the ways of markers as lines (n, 2, 3)."""
+        ways = self._scenery.bars()
+        return np.stack([ways[:, :-1], ways[:, 1:]], axis=2).reshape(-1, 2, 3)
+
+    def update(self) -> None:
+        """Show everything as it is now."""
+        scenery = self._scenery
+        with self._server.atomic():
+            if scenery.known_stranger is not self._shown_stranger:
+                self._remove_stranger()
+                self._add_stranger()
+            for key, pose in scenery.poses().items():
+                if key in self._nodes and np.abs(pose - self._poses.get(key, np.inf)).max() > MOVED:
+                    self._place(key, pose)
+            for key, tone in scenery.colors().items():
+                if key in self._meshes and self._colors.get(key) != tone:
+                    self._colors[key] = tone
+                    for mesh, part in self._meshes[key]:
+                        mesh.color = _bytes(shaded(tone, part.color)[:3])
+            self._update_markers()
+            self._bars.points = self._segments().astype(np.float32)
+            if len(scenery.life.learner.thoughts) != self._thoughts:
+                self._thoughts = len(scenery.life.learner.thoughts)
+                self._draw_learned()
+
+    def _place(self, key: str, pose: Floats) -> None:
+        self._poses[key] = pose
+        node = self._nodes[key]
+        node.position, node.wxyz = pose[:3, 3], to_quaternions(pose[None])[0]
+
+    def _update_markers(self) -> None:
+        life = self._scenery.life
+        poses = np.concatenate([life.seen.poses, life.stranger_seen.poses])
+        there = np.concatenate([life.seen.there, life.stranger_seen.there])
+        self._markers.batched_positions = poses[:, :3, 3].astype(np.float32)
+        self._markers.batched_wxyzs = to_quaternions(poses).astype(np.float32)
+        self._markers.batched_scales = np.where(there, 1.0, HIDDEN).astype(np.float32)
+
+    def _draw_learned(self) -> None:
+        """Draw what was thought last, which changes seldom."""
+        scenery = self._scenery
+        cloud, axis = scenery.cloud(), scenery.axis()
+        self._nodes[scenery.learned.key(PART)].visible = scenery.life.learner.model is not None
+        self._cloud.visible = bool(len(cloud))
+        self._cloud.points = cloud.astype(np.float32)
+        for mark in (*self._lines, *self._tubes):
+            mark.visible = axis is not None
+        if axis is None:
+            return
+        for shown, line in zip(self._lines, axis.lines, strict=True):
+            shown.points = line[None].astype(np.float32)
+        for shown, tube in zip(self._tubes, axis.tubes, strict=True):
+            shown.vertices, shown.faces = tube.vertices.astype(np.float32), tube.faces.astype(np.uint32)
+
+    def _remove_stranger(self) -> None:
+        scenery = self._scenery
+        for figure in (scenery.stranger, scenery.learned):
+            for frame in (BASE, PART):
+                key = figure.key(frame)
+                self._nodes.pop(key).remove()
+                for table in (self._meshes, self._poses, self._colors):
+                    table.pop(key, None)
+
+
+def _bytes(color: tuple[float, float, float]) -> tuple[int, int, int]:
+    red, green, blue = (round(255 * c) for c in color)
+    return red, green, blue

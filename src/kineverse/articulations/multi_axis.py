@@ -1,0 +1,269 @@
+"""Joints with several axes: planar, universal, ball, floating."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from kineverse.errors import InvalidValueError
+from kineverse.expressions.expression import Expression, array
+from kineverse.expressions.functions import norm
+from kineverse.model.body import AxisLike, Pose
+from kineverse.model.constraint import Constraint
+from kineverse.model.operation import Writes
+from kineverse.model.read_recorder import ReadRecorder
+from kineverse.spatial import quaternion, rotation_z, round_exact, translation
+from kineverse.symbols import Symbol, position, velocity
+
+from .joint import Joint, check_axis, check_joint_number
+from .limits import FREE, Limits, check_limits, check_speed_limit, limit_constraints
+from .single_axis import rotation_factors, unit_axis
+
+# How far from perpendicular axes may be: the cosine between them.
+_PERPENDICULAR = 1e-6
+
+
+@dataclass(frozen=True, kw_only=True)
+class Planar(Joint):
+    """Motion in a plane: parent_T_child = origin · A · translation(x, y, 0) · rotation_z(θ) · Aᵀ.
+
+    The columns of A are two directions in the plane and its normal, the axis. Coordinates are ``name/x``,
+    ``name/y`` [m] and ``name/angle`` [rad], all free. For the axis z, A is the identity; for another axis n,
+    A is the smallest rotation that turns z into n (about z × n), and a half turn about x for -z.
+
+    Attributes
+    ----------
+    axis
+        The normal of the plane in the joint's frame.
+    lower, upper
+        Limits of x and y alike [m]; None leaves that side open.
+    velocity
+        Limit of the speeds of x and y alike [m/s]; None for no limit.
+    """
+
+    axis: AxisLike = (0.0, 0.0, 1.0)
+    lower: float | None = None
+    upper: float | None = None
+    velocity: float | None = None
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        object.__setattr__(self, "axis", check_axis(self.axis, self.name))
+
+    def apply(self, model: ReadRecorder) -> Writes:
+        """Write the child frame and the limits."""
+        x, y, angle = (position(f"{self.name}/{c}") for c in ("x", "y", "angle"))
+        turn = rotation_from_z(self.axis)
+        motion = (Pose.of(turn), translation(x, y, 0), rotation_z(angle), Pose.of(turn.T))
+        constraints: dict[str, Constraint] = {}
+        for q in (x, y):
+            constraints.update(limit_constraints(str(q), q, self.lower, self.upper, self.velocity))
+        coordinates = (x, y, angle)
+        return Writes(
+            frames={self.child: (self.parent, (self.origin, *motion))},
+            constraints=constraints,
+            articulations={
+                self.name: self.record(
+                    coordinates, (0.0, 0.0, 0.0), tuple(c.derivative() for c in coordinates)
+                )
+            },
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
+class Universal(Joint):
+    """A Cardan joint: parent_T_child = origin · rotation(first, α) · rotation(second, β).
+
+    Coordinates ``name/first``, α, and ``name/second``, β [rad]. The first axis stands still in the parent,
+    the second in the child.
+
+    Attributes
+    ----------
+    first, second
+        The axes in the joint's frame at rest, perpendicular to each other.
+    first_limits, second_limits
+        Limits of α and of β.
+
+    Raises
+    ------
+    InvalidValueError
+        For axes that are not perpendicular, with the angle between them.
+    DuplicateNameError
+        For an articulation or a frame that exists.
+    """
+
+    first: AxisLike = (1.0, 0.0, 0.0)
+    second: AxisLike = (0.0, 1.0, 0.0)
+    first_limits: Limits = FREE
+    second_limits: Limits = FREE
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        for what in ("first", "second"):
+            object.__setattr__(self, what, check_axis(getattr(self, what), self.name))
+            check_limits(
+                getattr(self, f"{what}_limits"), f"'{what}_limits' of the universal joint '{self.name}'"
+            )
+        cosine = float(np.dot(unit_axis(self.first), unit_axis(self.second)))
+        if abs(cosine) > _PERPENDICULAR:
+            angle = math.acos(max(-1.0, min(cosine, 1.0)))
+            raise InvalidValueError(
+                f"The axes of the universal joint '{self.name}' are perpendicular, and not {angle:.6g} rad "
+                "apart."
+            )
+
+    def apply(self, model: ReadRecorder) -> Writes:
+        """Write the child frame and the limits."""
+        self.check_free(model)
+        angles = a, b = position(f"{self.name}/first"), position(f"{self.name}/second")
+        motion = (*rotation_factors(self.first, a), *rotation_factors(self.second, b))
+        return Writes(
+            frames={self.child: (self.parent, (self.origin, *motion))},
+            constraints={
+                **dict(self.first_limits.on(f"{self.name}/first", a)),
+                **dict(self.second_limits.on(f"{self.name}/second", b)),
+            },
+            articulations={self.name: self.record(angles, (0.0, 0.0), (a.derivative(), b.derivative()))},
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
+class Ball(Joint):
+    """A ball in a socket: parent_T_child = origin · rotation(quaternion).
+
+    Four coordinates ``name/qx|qy|qz|qw`` and three speeds, the angular velocity ω of the child in its own
+    axes, ``name/wx|wy|wz`` [rad/s], with q̇ = ½ q ⊗ (ω, 0) as for :class:`Floating`.
+
+    Limits are written so that they are smooth at rest. With the quaternion q = (v, w), its part p = v·a along
+    the axis and its part v - pa across it:
+
+    - the axis leaves its direction at rest by an angle γ with 1 - cos γ = 2|v - pa|²/|q|², which the cone
+      bounds by 1 - cos(cone);
+    - the turn τ that remains about the axis has tan(τ/2) = p/w, so |τ| <= twist is
+      (p² cos²(twist/2) - w² sin²(twist/2))/|q|² <= 0.
+
+    Both grow with the square of the angle near rest, so a row in speeds that keeps them to first order lets a
+    step of Δt pass them by (|ω|Δt)²/2 at most.
+
+    Attributes
+    ----------
+    axis
+        The child's axis that cone and twist are about, in the joint's frame at rest.
+    cone
+        The largest angle between the axis and its direction at rest, in (0, π] [rad]; None for no limit.
+    twist
+        The largest turn about the axis, either way, in (0, π] [rad]; None for no limit.
+    velocity
+        Limit of |ω|, whatever its direction [rad/s]; None for no limit.
+
+    Raises
+    ------
+    InvalidValueError
+        For a cone or a twist outside (0, π], or a negative limit of the speed.
+    DuplicateNameError
+        For an articulation or a frame that exists.
+    """
+
+    axis: AxisLike = (0.0, 0.0, 1.0)
+    cone: float | None = None
+    twist: float | None = None
+    velocity: float | None = None
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        object.__setattr__(self, "axis", check_axis(self.axis, self.name))
+        for what in ("cone", "twist"):
+            angle = getattr(self, what)
+            text = f"The {what} of the ball joint '{self.name}'"
+            if angle is not None and not 0 < check_joint_number(angle, text) <= math.pi:
+                raise InvalidValueError(f"{text} lies in (0, π] rad, and is not {angle!r}.")
+        check_speed_limit(self.velocity, f"The velocity limit of the ball joint '{self.name}'")
+
+    def apply(self, model: ReadRecorder) -> Writes:
+        """Write the child frame, the rates of the quaternion and the limits."""
+        self.check_free(model)
+        q, omega, rows = orientation(self.name)
+        whole = array(q)
+        along = np.array(unit_axis(self.axis))
+        p, w = whole[:3] @ along, q[3]
+        across = np.cross(whole[:3], along)
+        size = whole @ whole
+        constraints = {}
+        if self.cone is not None:
+            bound = 2 * math.sin(self.cone / 2) ** 2
+            constraints[f"{self.name}/cone"] = Constraint.of(-math.inf, 2 * (across @ across) / size, bound)
+        if self.twist is not None:
+            c, s = math.cos(self.twist / 2), math.sin(self.twist / 2)
+            excess = ((c * p) ** 2 - (s * w) ** 2) / size
+            constraints[f"{self.name}/twist"] = Constraint.of(-math.inf, excess, 0)
+        most = check_speed_limit(self.velocity, "")
+        if most is not None:
+            constraints[f"{self.name}/velocity"] = Constraint.of(0, norm(array(omega)), most)
+        return Writes(
+            frames={self.child: (self.parent, (self.origin, quaternion(*q)))},
+            constraints=constraints,
+            rates=rows,
+            articulations={self.name: self.record(q, (0.0, 0.0, 0.0, 1.0), omega)},
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
+class Floating(Joint):
+    """Free motion: parent_T_child = origin · translation(x, y, z) · rotation(quaternion).
+
+    Seven coordinates ``name/x|y|z`` [m] and ``name/qx|qy|qz|qw``, six speeds: the velocities of x, y, z
+    [m/s], and the angular velocity ω of the child in its own axes, ``name/wx|wy|wz`` [rad/s]. The quaternion
+    moves by q̇ = ½ q ⊗ (ω, 0), which keeps its length; a quaternion of another length is normalised where it
+    is used.
+    """
+
+    def apply(self, model: ReadRecorder) -> Writes:
+        """Write the child frame and the rates of the quaternion."""
+        xyz = tuple(position(f"{self.name}/{c}") for c in "xyz")
+        q, omega, rows = orientation(self.name)
+        speeds = (*(c.derivative() for c in xyz), *omega)
+        return Writes(
+            frames={self.child: (self.parent, (self.origin, translation(*xyz), quaternion(*q)))},
+            rates=rows,
+            articulations={self.name: self.record((*xyz, *q), (0, 0, 0, 0, 0, 0, 1.0), speeds)},
+        )
+
+
+class Orientation(NamedTuple):
+    """A quaternion (x, y, z, w), the angular velocity in the child's axes, and q̇ = ½ q ⊗ (ω, 0) by rows."""
+
+    coordinates: tuple[Symbol, ...]
+    speeds: tuple[Symbol, ...]
+    rates: Mapping[Symbol, Mapping[Symbol, Expression]]
+
+
+def orientation(name: str) -> Orientation:
+    """Return the coordinates and speeds of a quaternion below a name."""
+    x, y, z, w = q = tuple(position(f"{name}/q{c}") for c in "xyzw")
+    wx, wy, wz = omega = tuple(velocity(f"{name}/w{c}") for c in "xyz")
+    rows = {
+        x: {wx: w / 2, wy: -z / 2, wz: y / 2},
+        y: {wx: z / 2, wy: w / 2, wz: -x / 2},
+        z: {wx: -y / 2, wy: x / 2, wz: w / 2},
+        w: {wx: -x / 2, wy: -y / 2, wz: -z / 2},
+    }
+    return Orientation(q, omega, rows)
+
+
+def rotation_from_z(axis: AxisLike) -> np.ndarray[tuple[int, int], np.dtype[np.float64]]:
+    """Return the smallest rotation that turns z into the axis, 4×4."""
+    n = np.array(unit_axis(axis))
+    turn = np.eye(4)
+    if n[2] < 0 and not n[:2].any():
+        turn[1, 1] = turn[2, 2] = -1.0
+        return turn
+    v = np.array([-n[1], n[0], 0.0])  # z × n
+    k = np.array([[0, -v[2], v[1]], [v[2], 0, -v[0]], [-v[1], v[0], 0]])
+    # 1 / (1 + cos) of the angle; near a half turn by its sine, because nothing is left of the sum.
+    factor = 1 / (1 + n[2]) if n[2] > 0 else (1 - n[2]) / (v @ v)
+    turn[:3, :3] = round_exact(np.eye(3) + k + k @ k * factor)
+    return turn

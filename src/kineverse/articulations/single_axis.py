@@ -1,0 +1,155 @@
+"""Joints with one axis: revolute, continuous, prismatic, screw, cylindrical."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from kineverse.errors import InvalidValueError
+from kineverse.expressions.expression import Expression
+from kineverse.model.body import AxisLike, Pose
+from kineverse.model.operation import Writes
+from kineverse.model.read_recorder import ReadRecorder
+from kineverse.spatial import X, Y, Z, normalize, rotation_about, round_exact, translation_along
+from kineverse.symbols import position
+
+from .joint import Joint, OneDofJoint, check_axis, check_joint_number
+from .limits import FREE, Limits, check_limits
+
+
+@dataclass(frozen=True, kw_only=True)
+class Revolute(OneDofJoint):
+    """A hinge: parent_T_child = origin · rotation(axis, q), q in [rad]."""
+
+    def motion(self, q: Expression) -> tuple[Pose | Expression, ...]:
+        """Return joint_T_child as factors."""
+        return rotation_factors(self.axis, q)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Continuous(Revolute):
+    """A hinge without end stops, q in [rad]; usually without position limits."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Prismatic(OneDofJoint):
+    """A slider: parent_T_child = origin · translation(axis · q), q in [m]."""
+
+    def motion(self, q: Expression) -> tuple[Pose | Expression, ...]:
+        """Return joint_T_child as factors."""
+        return (translation_along(unit_axis(self.axis), q),)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Screw(OneDofJoint):
+    """A thread: parent_T_child = origin · translation(axis · p q/2π) · rotation(axis, q), q in [rad].
+
+    Attributes
+    ----------
+    pitch
+        How far it moves in one revolution, p [m]: along the axis for a right-handed thread, which is
+        positive, and against it for a left-handed one, which is negative.
+
+    Raises
+    ------
+    InvalidValueError
+        For a pitch of 0 or NaN.
+    DuplicateNameError
+        For an articulation or a frame that exists.
+    """
+
+    pitch: float
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not check_joint_number(self.pitch, f"The pitch of the screw '{self.name}'"):
+            raise InvalidValueError(
+                f"The pitch of the screw '{self.name}' is 0, so it does not move along its axis; "
+                "that is a kv.Revolute."
+            )
+
+    def motion(self, q: Expression) -> tuple[Pose | Expression, ...]:
+        """Return joint_T_child as factors."""
+        return translation_along(unit_axis(self.axis), self.pitch / math.tau * q), *rotation_factors(
+            self.axis, q
+        )
+
+    def apply(self, model: ReadRecorder) -> Writes:
+        """Write the child frame and the limits."""
+        self.check_free(model)
+        return super().apply(model)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Cylindrical(Joint):
+    """A rod in a sleeve: parent_T_child = origin · translation(axis · s) · rotation(axis, φ).
+
+    Coordinates ``name/slide``, s [m], and ``name/turn``, φ [rad], independent of each other.
+
+    Attributes
+    ----------
+    axis
+        Direction in the joint's frame, of any length but zero.
+    slide, turn
+        Limits of s and of φ.
+
+    Raises
+    ------
+    DuplicateNameError
+        For an articulation or a frame that exists.
+    """
+
+    axis: AxisLike = (1.0, 0.0, 0.0)
+    slide: Limits = FREE
+    turn: Limits = FREE
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        object.__setattr__(self, "axis", check_axis(self.axis, self.name))
+        for what in ("slide", "turn"):
+            check_limits(getattr(self, what), f"'{what}' of the cylindrical joint '{self.name}'")
+
+    def apply(self, model: ReadRecorder) -> Writes:
+        """Write the child frame and the limits."""
+        self.check_free(model)
+        s, angle = position(f"{self.name}/slide"), position(f"{self.name}/turn")
+        motion = (translation_along(unit_axis(self.axis), s), *rotation_factors(self.axis, angle))
+        return Writes(
+            frames={self.child: (self.parent, (self.origin, *motion))},
+            constraints={
+                **dict(self.slide.on(f"{self.name}/slide", s)),
+                **dict(self.turn.on(f"{self.name}/turn", angle)),
+            },
+            articulations={
+                self.name: self.record((s, angle), (0.0, 0.0), (s.derivative(), angle.derivative()))
+            },
+        )
+
+
+def unit_axis(axis: AxisLike) -> tuple[float, float, float]:
+    """Return the axis at length one."""
+    numbers = normalize(axis)
+    assert numbers is not None  # joints check their axis when they are made
+    x, y, z = numbers
+    return x, y, z
+
+
+def rotation_factors(axis: AxisLike, q: Expression) -> tuple[Pose | Expression, ...]:
+    """Return the rotation about any axis as constants around one about x, y or z.
+
+    Such factors keep the Jacobian constant in q and the chain short: A · rotation_z(q) · Aᵀ with A's last
+    column the axis.
+    """
+    x, y, z = unit_axis(axis)
+    for component, about in ((x, X), (y, Y), (z, Z)):
+        if abs(component) == 1.0 and (x, y, z).count(0.0) == 2:
+            return (rotation_about(about, q if component > 0 else -q),)
+    to_axis = np.eye(4)
+    a = np.array([x, y, z])
+    helper = np.eye(3)[np.argmin(np.abs(a))]
+    first = np.cross(helper, a)
+    first /= np.linalg.norm(first)
+    to_axis[:3, :3] = round_exact(np.column_stack([first, np.cross(a, first), a]))
+    return Pose.of(to_axis), rotation_about(Z, q), Pose.of(to_axis.T)

@@ -1,0 +1,219 @@
+"""Transmissions: gearbox, rack and pinion, cam."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from dataclasses import dataclass
+
+import numpy as np
+
+from kineverse.errors import InvalidValueError, KineverseError, UnknownNameError
+from kineverse.expressions.expression import Expression
+from kineverse.expressions.piecewise import spline
+from kineverse.model.body import Pose
+from kineverse.model.operation import Writes
+from kineverse.model.read_recorder import ReadRecorder
+from kineverse.spatial import translation_along
+
+from .joint import OneAxisMotion, check_joint_number, check_position_expression
+from .single_axis import rotation_factors, unit_axis
+
+
+@dataclass(frozen=True, kw_only=True)
+class Transmission(OneAxisMotion):
+    """Base of the joints whose number q is a function of a driver d, and no coordinate of its own.
+
+    Limits of q and of its speed are constraints on that function of the driver. Couplings may drive
+    couplings: what the driver's position is, is read from the model, so a train of gears follows when the
+    first of them is exchanged.
+
+    Attributes
+    ----------
+    driver
+        Name of an articulation whose position is one number, or an expression of positions [rad].
+
+    Raises
+    ------
+    UnknownNameError
+        For a driver that does not exist, with similar names.
+    InvalidValueError
+        For a driver without a position or with several coordinates, or one that nothing moves.
+    DuplicateNameError
+        For an articulation or a frame that exists.
+    """
+
+    driver: str | Expression
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if isinstance(self.driver, str):
+            return
+        if not isinstance(self.driver, Expression):
+            raise InvalidValueError(
+                f"{self._its_driver} is the name of an articulation or an expression, not {self.driver!r}."
+            )
+        if not check_position_expression(self.driver, self._its_driver).symbols:
+            raise InvalidValueError(f"{self._its_driver} is constant: {self.driver!r}.")
+
+    @abstractmethod
+    def transmit(self, driver: Expression) -> Expression:
+        """Return q where the driver is at d."""
+
+    def apply(self, model: ReadRecorder) -> Writes:
+        """Write the child frame and the limits."""
+        self.check_free(model)
+        return self.moved_by(self.transmit(self._driver_in(model)))
+
+    @property
+    def _its_driver(self) -> str:
+        return f"The driver of the {self.noun} '{self.name}'"
+
+    def _driver_in(self, model: ReadRecorder) -> Expression:
+        if isinstance(self.driver, Expression):
+            return self.driver
+        try:
+            record = model.articulations[self.driver]
+        except UnknownNameError as error:
+            raise UnknownNameError(f"{self._its_driver} is missing. {error}") from None
+        if record.position is None:
+            names = ", ".join(f"'{s}'" for s in record.coordinates)
+            has = (
+                f"{len(record.coordinates)} coordinates, {names}; give one of them, as "
+                f"driver=kv.position('{record.coordinates[0]}')"
+                if names
+                else "no position"
+            )
+            raise InvalidValueError(f"{self._its_driver}, '{self.driver}', has {has}.")
+        return record.position
+
+
+@dataclass(frozen=True, kw_only=True)
+class Gearbox(Transmission):
+    """A gear or a belt: parent_T_child = origin · rotation(axis, q) with q = ratio · d + offset [rad].
+
+    Attributes
+    ----------
+    ratio
+        Turns of the child for one of the driver; negative where they turn against each other.
+    offset
+        q where the driver is at 0 [rad].
+
+    Raises
+    ------
+    InvalidValueError
+        For a ratio of 0 or NaN.
+    """
+
+    ratio: float
+    offset: float = 0.0
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not check_joint_number(self.ratio, f"The ratio of the gearbox '{self.name}'"):
+            raise InvalidValueError(f"The ratio of the gearbox '{self.name}' is 0, so nothing would turn.")
+        check_joint_number(self.offset, f"The offset of the gearbox '{self.name}'")
+
+    def transmit(self, driver: Expression) -> Expression:
+        """Return the child's angle [rad]."""
+        return self.ratio * driver + self.offset
+
+    def motion(self, q: Expression) -> tuple[Pose | Expression, ...]:
+        """Return joint_T_child as factors."""
+        return rotation_factors(self.axis, q)
+
+
+@dataclass(frozen=True, kw_only=True)
+class RackAndPinion(Transmission):
+    """A rack that a pinion moves: parent_T_child = origin · translation(axis · q), q = radius · d + offset.
+
+    Attributes
+    ----------
+    radius
+        Of the pinion's pitch circle [m]. Which way the rack goes is said by its axis.
+    offset
+        q where the driver is at 0 [m].
+
+    Raises
+    ------
+    InvalidValueError
+        For a radius that is not positive.
+    """
+
+    radius: float
+    offset: float = 0.0
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_joint_number(self.radius, f"The radius of the rack and pinion '{self.name}'", positive=True)
+        check_joint_number(self.offset, f"The offset of the rack and pinion '{self.name}'")
+
+    def transmit(self, driver: Expression) -> Expression:
+        """Return how far the rack is [m]."""
+        return self.radius * driver + self.offset
+
+    def motion(self, q: Expression) -> tuple[Pose | Expression, ...]:
+        """Return joint_T_child as factors."""
+        return (translation_along(unit_axis(self.axis), q),)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Cam(Transmission):
+    """A follower on a cam: parent_T_child = origin · translation(axis · q), q = profile(d) [m].
+
+    Where it turns, it is origin · rotation(axis, q), q = profile(d) [rad]. The profile is a cubic spline
+    through points, see :func:`kineverse.spline`: twice continuously differentiable, so the follower's
+    acceleration has no jumps.
+
+    Attributes
+    ----------
+    angles
+        Angles of the cam that increase [rad].
+    values
+        Where the follower is there [m], or [rad] if it turns.
+    periodic
+        Whether the profile goes round: the last angle is the first one after a revolution, with the same
+        value. Otherwise the follower rests before the first angle and after the last.
+    turns
+        Whether the follower turns about the axis rather than slides along it.
+
+    Raises
+    ------
+    InvalidValueError
+        For angles that do not increase, as many values as there are not angles, NaN, or a periodic profile
+        that does not end where it begins.
+    """
+
+    angles: tuple[float, ...]
+    values: tuple[float, ...]
+    periodic: bool = True
+    turns: bool = False
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        for what in ("angles", "values"):
+            given = getattr(self, what)
+            try:
+                object.__setattr__(self, what, tuple(given))
+            except (KineverseError, TypeError):
+                raise InvalidValueError(
+                    f"The {what} of the cam '{self.name}' are numbers, not {given!r}."
+                ) from None
+        for what in ("periodic", "turns"):
+            if not isinstance(getattr(self, what), (bool, np.bool_)):
+                raise InvalidValueError(
+                    f"'{what}' of the cam '{self.name}' is True or False, not {getattr(self, what)!r}."
+                )
+        try:
+            spline(0.0, self.angles, self.values, self.periodic)
+        except InvalidValueError as error:
+            raise InvalidValueError(f"The profile of the cam '{self.name}' is none. {error}") from None
+        for what in ("angles", "values"):
+            object.__setattr__(self, what, tuple(map(float, getattr(self, what))))
+
+    def transmit(self, driver: Expression) -> Expression:
+        """Return where the follower is [m] or [rad]."""
+        return spline(driver, self.angles, self.values, self.periodic)
+
+    def motion(self, q: Expression) -> tuple[Pose | Expression, ...]:
+        """Return joint_T_child as factors."""
+        return rotation_factors(self.axis, q) if self.turns else (translation_along(unit_axis(self.axis), q),)

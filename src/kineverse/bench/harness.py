@@ -1,0 +1,320 @@
+"""Benchmark harness: settings, equality check, interleaved timing, installed peers, fresh processes.
+
+Times drift by a factor of two on machines that others use as well, so what counts is how contenders do beside
+each other, round by round.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import importlib
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from time import perf_counter
+from types import MappingProxyType
+from typing import Any, TypeAlias
+
+import numpy as np
+import numpy.typing as npt
+
+from kineverse._extras import install_command
+from kineverse._gc import no_collection
+from kineverse.errors import KineverseError
+
+from .result import Measurement
+
+Progress: TypeAlias = Callable[[Iterable[Any], str, str], Iterable[Any]]
+
+
+def _no_progress(items: Iterable[Any], what: str, unit: str) -> Iterable[Any]:
+    return items
+
+
+@dataclass(frozen=True, slots=True)
+class BenchmarkSettings:
+    """How much is measured, and on which robot.
+
+    Attributes
+    ----------
+    robot
+        The name or file of the robot; a PR2 that is found here if None, see :func:`.workloads.find_robot`.
+    frame
+        The frame whose pose and Jacobian are computed; a gripper if None.
+    rounds
+        How many times everybody takes a turn.
+    processes
+        The same where every turn is a fresh process.
+    configurations
+        How many configurations single calls go through in one turn.
+    steps
+        Through how many states, at most, things move among others.
+    rows
+        How many configurations a batch has.
+    operations
+        How many operations and constraints the large models have.
+    boxes
+        Among how many boxes, at most, an arm is moved.
+    progress
+        Wraps what is worked on, like :func:`kineverse.cli.output.show_progress`.
+    """
+
+    robot: str | None = None
+    frame: str | None = None
+    rounds: int = 25
+    processes: int = 9
+    configurations: int = 1000
+    steps: int = 200
+    rows: int = 100_000
+    operations: int = 10_000
+    boxes: int = 3000
+    progress: Progress = _no_progress
+
+
+QUICK = BenchmarkSettings(rounds=5, processes=3, steps=20, operations=1_000)
+"""Enough to see an order of magnitude."""
+
+
+Array: TypeAlias = npt.NDArray[np.float64]
+
+EQUALITY_TOLERANCE = 1e-9
+"""How far poses and Jacobians may be apart [m], [rad]."""
+
+
+class DisagreementError(KineverseError, ArithmeticError):
+    """Those who are compared do not compute the same, so their times mean nothing."""
+
+
+def check_equal(
+    what: str, results: Sequence[tuple[str, Sequence[Array]]], tolerance: float = EQUALITY_TOLERANCE
+) -> None:
+    """Compare the arrays that contenders computed with those of the first one.
+
+    Parameters
+    ----------
+    what
+        The benchmark, for the message.
+    results
+        Names, each with arrays.
+    tolerance
+        How far their numbers may be apart.
+
+    Raises
+    ------
+    DisagreementError
+        If an array has another shape, or numbers that are further off or not finite.
+    """
+    (first, wanted), *others = results
+    if not all(np.isfinite(array).all() for array in wanted):
+        raise DisagreementError(f"Benchmark {what!r}: {first!r} computed what is not finite.")
+    for name, found in others:
+        shapes = [np.shape(array) for array in wanted], [np.shape(array) for array in found]
+        if shapes[0] != shapes[1]:
+            raise DisagreementError(
+                f"Benchmark {what!r}: {name!r} gave arrays of shapes {shapes[1]}, {first!r} {shapes[0]}."
+            )
+        for k, (ours, theirs) in enumerate(zip(wanted, found, strict=True)):
+            error = float(np.max(np.abs(np.asarray(theirs) - ours), initial=0.0))
+            # Written so that NaN is refused as well.
+            if not error <= tolerance:
+                raise DisagreementError(
+                    f"Benchmark {what!r}: {name!r} and {first!r} differ by {error:.3g} in result {k}, "
+                    f"more than {tolerance:g}. Their times cannot be compared."
+                )
+
+
+@dataclass(frozen=True, slots=True)
+class Contender:
+    """Someone who does the work.
+
+    Attributes
+    ----------
+    name
+        Who, and how.
+    sample
+        Does the work and returns what it took, in ``unit``.
+    results
+        Returns the arrays that the work gives, which must be equal to those of the others; None if there is
+        nothing to compare.
+    unit
+        ``s`` for times, or what is counted.
+    """
+
+    name: str
+    sample: Callable[[], float]
+    results: Callable[[], Sequence[Array]] | None = None
+    unit: str = "s"
+
+
+def time_calls(
+    run: Callable[..., object], count: int = 1, prepare: Callable[[], Any] | None = None
+) -> Callable[[], float]:
+    """Return a sample: the time [s] that each of ``count`` pieces of work takes in ``run``.
+
+    Parameters
+    ----------
+    run
+        Does all of them.
+    count
+        How many that are.
+    prepare
+        Called before, outside of the time; ``run`` is given what it returns.
+    """
+
+    def sample() -> float:
+        arguments = () if prepare is None else (prepare(),)
+        start = perf_counter()
+        run(*arguments)
+        return (perf_counter() - start) / count
+
+    return sample
+
+
+def time_contenders(
+    what: str, contenders: Sequence[Contender], rounds: int, progress: Progress
+) -> dict[str, Measurement]:
+    """Check that contenders compute the same, then measure them in turns; return measurements by name.
+
+    Parameters
+    ----------
+    what
+        The benchmark.
+    contenders
+        Who takes part.
+    rounds
+        How many times everybody takes a turn; another one before does not count.
+    progress
+        See :class:`.harness.BenchmarkSettings`.
+
+    Raises
+    ------
+    DisagreementError
+        If they do not compute the same.
+    """
+    results = [(c.name, c.results()) for c in contenders if c.results is not None]
+    if results:
+        check_equal(what, results)
+    samples: dict[str, list[float]] = {c.name: [] for c in contenders}
+    for contender in contenders:
+        contender.sample()
+    for number in progress(range(rounds), what, "round"):
+        # Nobody always comes after the same neighbour, who may leave caches warm or the processor hot.
+        first = number % len(contenders)
+        for contender in (*contenders[first:], *contenders[:first]):
+            # The collector would charge everybody's garbage to whoever happens to run.
+            with no_collection():
+                samples[contender.name].append(contender.sample())
+    return {c.name: Measurement(c.name, c.unit, tuple(samples[c.name])) for c in contenders}
+
+
+DISTRIBUTIONS: Mapping[str, str] = MappingProxyType(
+    {"pinocchio": "pin", "ripl_articulation": "ripl-articulation"}
+)
+"""What brings a module that is called otherwise."""
+
+IN_THE_EXTRA = ("pinocchio", "mujoco", "pybullet")
+"""The modules that the extra ``bench`` brings."""
+
+
+@dataclass(slots=True)
+class Contenders:
+    """Who takes part in a race, and who is missing.
+
+    Attributes
+    ----------
+    contenders
+        Who takes part.
+    missing
+        A line for everybody else.
+    """
+
+    contenders: list[Contender] = field(default_factory=list)
+    missing: list[str] = field(default_factory=list)
+
+    def admit(self, module: str, contenders: Callable[[], Iterable[Contender]]) -> None:
+        """Add the contenders of a peer, or the line that says that it is missing."""
+        if has_peer(module):
+            self.contenders += contenders()
+        else:
+            self.missing.append(install_advice(module))
+
+
+def has_peer(module: str) -> bool:
+    """Whether a peer can be imported."""
+    try:
+        with _silence_stderr() if module == "pybullet" else contextlib.nullcontext():
+            peer = importlib.import_module(module)
+    except ImportError:
+        return False
+    if module == "mujoco" and peer.get_mju_user_warning() is None:
+        peer.set_mju_user_warning(_ignore_warning)
+    return True
+
+
+def _ignore_warning(warning: str) -> None:
+    """Take a warning of MuJoCo, which would leave it in a file in the current folder."""
+
+
+def install_advice(module: str) -> str:
+    """Return how to get a peer."""
+    distribution = DISTRIBUTIONS.get(module, module)
+    if module in IN_THE_EXTRA:
+        called = "" if distribution == module else f" (the package {distribution!r})"
+        return f"{module} is not installed: {install_command('bench')} brings it{called}"
+    return f"{module} is not installed: it is the package {distribution!r}"
+
+
+@contextlib.contextmanager
+def _silence_stderr() -> Iterator[None]:
+    """Keep what C code prints off standard error: Bullet greets whoever imports it."""
+    sys.stderr.flush()
+    kept, nowhere = os.dup(2), os.open(os.devnull, os.O_WRONLY)
+    os.dup2(nowhere, 2)
+    try:
+        yield
+    finally:
+        os.dup2(kept, 2)
+        os.close(kept)
+        os.close(nowhere)
+
+
+PROGRAMS = Path(__file__).parent / "programs"
+
+
+class ProgramError(KineverseError, RuntimeError):
+    """What was to be measured in a process of its own did not get to its end."""
+
+
+def run_program(name: str, *arguments: str, cache: str | None = None) -> dict[str, Any]:
+    """Run one of the programs in a fresh process; return what it says.
+
+    Parameters
+    ----------
+    name
+        The program's file, without suffix.
+    arguments
+        What it is given.
+    cache
+        Where compiled code is kept; where it always is if None.
+
+    Raises
+    ------
+    ProgramError
+        If it fails, with what it said last.
+    """
+    environment = dict(os.environ)
+    if cache is not None:
+        environment["KINEVERSE_CACHE_DIR"] = cache
+    # With -P the program's neighbours cannot be imported by accident.
+    command = [sys.executable, "-P", str(PROGRAMS / f"{name}.py"), *arguments]
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
+    try:
+        said: dict[str, Any] = json.loads(done.stdout)
+    except ValueError:
+        last = (done.stderr.strip() or "it said nothing").splitlines()[-1]
+        raise ProgramError(f"The program {name!r} ended with status {done.returncode}: {last}") from None
+    return said

@@ -1,0 +1,123 @@
+"""Pairs within a distance, as Bullet finds them."""
+
+from __future__ import annotations
+
+import itertools
+from typing import Any
+
+import numpy as np
+
+from kineverse.bench.clutter import BOX_SIZE, CAPSULE_SIZE, CENTRE, LINK_LENGTH, LINKS, RADIUS, Clutter
+from kineverse.bench.harness import Array
+from kineverse.view.poses import to_quaternions
+
+from .clutter_search import PairDistances
+
+_LINKS_PER_BODY = 100
+"""How many boxes are in one body: those of Bullet have a bounded number of links."""
+
+
+class BulletSearch:
+    """Bullet: getClosestPoints of the arm and of one body that has all boxes as links."""
+
+    def __init__(self, crowd: Clutter) -> None:
+        import pybullet
+
+        self._bullet: Any = pybullet
+        self._client = pybullet.connect(pybullet.DIRECT)
+        shapes = [_create_link_shape(pybullet, crowd, link, self._client) for link in range(LINKS)]
+        links = [[0.0, 0.0, LINK_LENGTH if link else 0.0] for link in range(LINKS)]
+        axes = [list(crowd.axis(link)) for link in range(LINKS)]
+        self._arm = _create_body(pybullet, shapes, links, None, axes, self._client)
+        boxes = [
+            pybullet.createCollisionShape(
+                pybullet.GEOM_BOX, halfExtents=(size / 2).tolist(), physicsClientId=self._client
+            )
+            for size in crowd.sizes
+        ]
+        self._bodies = create_static_bodies(pybullet, boxes, crowd.poses, self._client)
+        self._joints = list(range(LINKS))
+        self.found: list[Any] = []
+
+    def put(self, angles: Array) -> None:
+        """Move what moves."""
+        rows = angles[:, None].tolist()
+        self._bullet.resetJointStatesMultiDof(
+            self._arm, self._joints, targetValues=rows, physicsClientId=self._client
+        )
+
+    def find(self) -> object:
+        """Find what is near."""
+        ask, arm, client = self._bullet.getClosestPoints, self._arm, self._client
+        self.found = [ask(arm, body, RADIUS, physicsClientId=client) for body in self._bodies]
+        return self.found
+
+    def distances(self) -> PairDistances:
+        """Return what was found."""
+        for contact in itertools.chain(*self.found):
+            yield f"link{contact[3]}", f"box{self._bodies[contact[2]] + contact[4]}", contact[8]
+
+    def __del__(self) -> None:
+        self._bullet.disconnect(self._client)
+
+
+def create_static_bodies(pybullet: Any, shapes: list[int], poses: Array, client: int) -> dict[int, int]:
+    """Make bodies of shapes that stand at poses, (N, 3, 4) or larger, each shape a link.
+
+    Returns
+    -------
+    By the number of the body, which shape its first link is.
+    """
+    bodies = {}
+    for first in range(0, len(shapes), _LINKS_PER_BODY):
+        some = slice(first, first + _LINKS_PER_BODY)
+        positions, turns = poses[some, :3, 3].tolist(), xyzw_quaternions(poses[some])
+        bodies[_create_body(pybullet, shapes[some], positions, turns, None, client)] = first
+    return bodies
+
+
+def _create_link_shape(pybullet: Any, crowd: Clutter, link: int, client: int) -> int:
+    kind = crowd.kind(link)
+    at = {"collisionFramePosition": list(CENTRE), "physicsClientId": client}
+    if kind == "box":
+        half = [edge / 2 for edge in BOX_SIZE]
+        return int(pybullet.createCollisionShape(pybullet.GEOM_BOX, halfExtents=half, **at))
+    if kind == "capsule":
+        radius, length = CAPSULE_SIZE
+        return int(pybullet.createCollisionShape(pybullet.GEOM_CAPSULE, radius=radius, height=length, **at))
+    return int(pybullet.createCollisionShape(pybullet.GEOM_MESH, vertices=crowd.corners[link].tolist(), **at))
+
+
+def _create_body(
+    pybullet: Any,
+    shapes: list[int],
+    positions: list[list[float]],
+    quaternions: list[list[float]] | None,
+    axes: list[list[int]] | None,
+    client: int,
+) -> int:
+    """Make a chain of links that turn about axes, or links that stand if there are none."""
+    count, nothing, upright = len(shapes), [0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]
+    fixed, turning = pybullet.JOINT_FIXED, pybullet.JOINT_REVOLUTE
+    return int(
+        pybullet.createMultiBody(
+            baseMass=0,
+            linkMasses=[0.0 if axes is None else 1.0] * count,
+            linkCollisionShapeIndices=shapes,
+            linkVisualShapeIndices=[-1] * count,
+            linkPositions=positions,
+            linkOrientations=quaternions or [upright] * count,
+            linkInertialFramePositions=[nothing] * count,
+            linkInertialFrameOrientations=[upright] * count,
+            linkParentIndices=[0] * count if axes is None else list(range(count)),
+            linkJointTypes=[fixed if axes is None else turning] * count,
+            linkJointAxis=axes or [[0, 0, 1]] * count,
+            physicsClientId=client,
+        )
+    )
+
+
+def xyzw_quaternions(poses: Array) -> list[list[float]]:
+    """Return (x, y, z, w) of (N, 3, 4) or larger poses."""
+    found: list[list[float]] = np.roll(to_quaternions(poses), -1, axis=1).tolist()
+    return found

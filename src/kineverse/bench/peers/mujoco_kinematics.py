@@ -1,0 +1,69 @@
+"""Forward kinematics and Jacobians of the robot in MuJoCo."""
+
+from __future__ import annotations
+
+from typing import Any
+from xml.etree import ElementTree
+
+import mujoco
+import numpy as np
+
+from kineverse.bench.harness import Array
+from kineverse.bench.workloads import BenchmarkRobot, strip_shapes
+
+
+class MujocoRobot:
+    """A robot in MuJoCo, with all of its links and without its shapes.
+
+    Parameters
+    ----------
+    robot
+        Whose file is read.
+
+    Attributes
+    ----------
+    model, data
+        MuJoCo's.
+    body
+        The number of the frame.
+    jacobian
+        Where :meth:`pose_and_jacobian` has the Jacobian of all joints written, shape (6, nv).
+    """
+
+    def __init__(self, robot: BenchmarkRobot) -> None:
+        self.model: Any = mujoco.MjModel.from_xml_string(make_robot_mjcf(robot))
+        self.data: Any = mujoco.MjData(self.model)
+        self.body: int = self.model.body(robot.frame).id
+        self.jacobian = np.zeros((6, self.model.nv))
+        self.columns: list[int] = [int(self.model.joint(s.path).dofadr[0]) for s in robot.chain]
+
+    def rows(self, positions: dict[str, Array]) -> list[Array]:
+        """Return configurations in the order of MuJoCo's joints."""
+        columns = [positions[self.model.joint(k).name] for k in range(self.model.njnt)]
+        return list(np.ascontiguousarray(np.column_stack(columns)))
+
+    def pose_and_jacobian(self, row: Array) -> tuple[Array, Array]:
+        """Return the frame's pose (4, 4) and world-aligned Jacobian (6, n), columns in Kineverse's order."""
+        self.data.qpos[:] = row
+        mujoco.mj_kinematics(self.model, self.data)
+        mujoco.mj_comPos(self.model, self.data)
+        mujoco.mj_jacBody(self.model, self.data, self.jacobian[:3], self.jacobian[3:], self.body)
+        return self.pose(self.body), self.jacobian[:, self.columns]
+
+    def pose(self, body: int) -> Array:
+        """Return where a body is, shape (4, 4)."""
+        pose = np.eye(4)
+        pose[:3, :3] = self.data.xmat[body].reshape(3, 3)
+        pose[:3, 3] = self.data.xpos[body]
+        return pose
+
+
+def make_robot_mjcf(robot: BenchmarkRobot) -> str:
+    """Return the robot's file as MuJoCo takes it.
+
+    It wants meshes that exist, merges links that do not move, and refuses moving ones without inertia.
+    """
+    root = ElementTree.fromstring(strip_shapes(robot.file))
+    options = {"fusestatic": "false", "balanceinertia": "true", "boundmass": "1e-6", "boundinertia": "1e-9"}
+    ElementTree.SubElement(ElementTree.SubElement(root, "mujoco"), "compiler", options)
+    return ElementTree.tostring(root, encoding="unicode")

@@ -1,0 +1,159 @@
+"""Pairs within a distance of a robot in a room: MuJoCo, Bullet."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from kineverse.bench.clutter import RADIUS
+from kineverse.bench.harness import Array
+from kineverse.geometry import Scene
+from kineverse.geometry.shapes import Solid
+from kineverse.model.body import Box, Capsule, Cylinder, Ellipsoid, Sphere
+from kineverse.view.poses import to_quaternions
+
+from .bullet import create_static_bodies, xyzw_quaternions
+from .clutter_search import UNIT_BOX_CORNERS, MujocoSearch, PairDistances, format_mjcf_numbers, make_mjcf
+
+
+class RobotSurroundings:
+    """The pieces of a scene: those of a robot, and those of the room, which stand.
+
+    Parameters
+    ----------
+    scene
+        A scene.
+    values
+        Of its inputs, at which the room stands.
+    robot
+        What the names of the robot's bodies begin with.
+    """
+
+    def __init__(self, scene: Scene, values: Array, robot: str) -> None:
+        self._scene, self._world = scene, scene._world
+        scene.update(values)
+        self._world.ready()
+        self.names = [piece.body for piece in self._world.pieces]
+        self.robot = [k for k, name in enumerate(self.names) if name.startswith(robot)]
+        self.others = [k for k, name in enumerate(self.names) if not name.startswith(robot)]
+
+    def update(self, values: Array) -> Array:
+        """Move the robot, and return the (N, 3, 4) poses of its pieces."""
+        self._scene.update(values)
+        return self.poses(self.robot)
+
+    def poses(self, pieces: list[int]) -> Array:
+        """Return (N, 3, 4) poses of some pieces."""
+        return self._world.table.poses[pieces]
+
+    def solid(self, piece: int) -> Solid:
+        """Return what a piece is."""
+        return self._world.solid(piece)
+
+
+class MujocoRobotSearch(MujocoSearch):
+    """MuJoCo's own search, in which each piece of the robot is a free body; see :class:`.MujocoSearch`."""
+
+    def __init__(self, room: RobotSurroundings) -> None:
+        self._room = room
+        assets, world = [], []
+        for k, pose in zip(room.others, room.poses(room.others), strict=True):
+            asset, geom = _mjcf_geom(k, room.solid(k))
+            assets.append(asset)
+            at = f'pos="{format_mjcf_numbers(pose[:, 3])}" xyaxes="{format_mjcf_numbers(pose[:, :2].T)}"'
+            world.append(f'<geom {geom} {at} contype="0" conaffinity="1"/>')
+        for k in room.robot:
+            asset, geom = _mjcf_geom(k, room.solid(k))
+            assets.append(asset)
+            inertia = '<inertial pos="0 0 0" mass="1" diaginertia="1 1 1"/>'
+            mask = f'margin="{RADIUS}" contype="1" conaffinity="0"'
+            world.append(f"<body><freejoint/>{inertia}<geom {geom} {mask}/></body>")
+        self._start(make_mjcf(assets, world))
+        self.names = [room.names[int(name)] for name in self.names]
+
+    def put(self, angles: Array) -> None:
+        """Move what moves."""
+        poses = self._room.update(angles)
+        self.data.qpos.reshape(-1, 7)[:] = np.hstack([poses[:, :, 3], to_quaternions(poses)])
+        self._mujoco.mj_kinematics(self.model, self.data)
+
+
+def _mjcf_geom(number: int, solid: Solid) -> tuple[str, str]:
+    """Return the asset and the attributes of a piece in MJCF."""
+    shape, name = solid.surface, f'name="{number}"'
+    if isinstance(shape, Sphere):
+        return "", f'{name} type="sphere" size="{shape.radius!r}"'
+    if isinstance(shape, Ellipsoid):
+        return "", f'{name} type="ellipsoid" size="{format_mjcf_numbers(shape.radii)}"'
+    if isinstance(shape, Capsule | Cylinder):
+        kind = type(shape).__name__.lower()
+        return "", f'{name} type="{kind}" size="{shape.radius!r} {shape.length / 2!r}"'
+    asset = f'<mesh {name} vertex="{format_mjcf_numbers(_solid_corners(solid))}" inertia="shell" maxhullvert="-1"/>'
+    return asset, f'{name} type="mesh" mesh="{number}"'
+
+
+def _solid_corners(solid: Solid) -> Array:
+    """Return the corners of a box or hull, (N, 3)."""
+    if isinstance(solid.surface, Box):
+        return UNIT_BOX_CORNERS * solid.surface.size
+    assert solid.core is not None
+    return np.unique(solid.core.corners.T, axis=0)
+
+
+class BulletRobotSearch:
+    """Bullet: getClosestPoints of each piece of the robot and of bodies that have all others as links."""
+
+    def __init__(self, room: RobotSurroundings) -> None:
+        import pybullet
+
+        self._bullet: Any = pybullet
+        self._room = room
+        self._client = client = pybullet.connect(pybullet.DIRECT)
+        shapes = [self._shape(room.solid(k)) for k in room.others]
+        self._bodies = create_static_bodies(pybullet, shapes, room.poses(room.others), client)
+        self._robot = {
+            pybullet.createMultiBody(1.0, self._shape(room.solid(k)), physicsClientId=client): k
+            for k in room.robot
+        }
+        self.found: list[tuple[int, int, Any]] = []
+
+    def put(self, angles: Array) -> None:
+        """Move what moves."""
+        poses, place = self._room.update(angles), self._bullet.resetBasePositionAndOrientation
+        for body, at, turn in zip(self._robot, poses[:, :, 3].tolist(), xyzw_quaternions(poses), strict=True):
+            place(body, at, turn, physicsClientId=self._client)
+
+    def find(self) -> object:
+        """Find what is near."""
+        ask, client = self._bullet.getClosestPoints, self._client
+        self.found = [
+            (piece, first, ask(one, other, RADIUS, physicsClientId=client))
+            for one, piece in self._robot.items()
+            for other, first in self._bodies.items()
+        ]
+        return self.found
+
+    def distances(self) -> PairDistances:
+        """Return what was found."""
+        names, others = self._room.names, self._room.others
+        for piece, first, contacts in self.found:
+            for contact in contacts:
+                yield names[piece], names[others[first + contact[4]]], contact[8]
+
+    def _shape(self, solid: Solid) -> int:
+        bullet, shape = self._bullet, solid.surface
+        sizes: dict[str, Any]
+        if isinstance(shape, Box):
+            kind, sizes = bullet.GEOM_BOX, {"halfExtents": [edge / 2 for edge in shape.size]}
+        elif isinstance(shape, Sphere):
+            kind, sizes = bullet.GEOM_SPHERE, {"radius": shape.radius}
+        elif isinstance(shape, Capsule | Cylinder):
+            kind = bullet.GEOM_CAPSULE if isinstance(shape, Capsule) else bullet.GEOM_CYLINDER
+            sizes = {"radius": shape.radius, "height": shape.length}
+        else:
+            kind, sizes = bullet.GEOM_MESH, {"vertices": _solid_corners(solid).tolist()}
+        return int(bullet.createCollisionShape(kind, physicsClientId=self._client, **sizes))
+
+    def __del__(self) -> None:
+        self._bullet.disconnect(self._client)

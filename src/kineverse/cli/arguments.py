@@ -1,0 +1,228 @@
+"""Options and values of the command line: model sources, ``--set NAME=VALUE``, units, limits."""
+
+from __future__ import annotations
+
+import argparse
+import math
+import re
+import sys
+from collections.abc import Iterable, Mapping
+from typing import TYPE_CHECKING
+
+from kineverse.errors import DuplicateNameError, InvalidValueError
+from kineverse.expressions.printing import format_number
+
+if TYPE_CHECKING:
+    import kineverse as kv
+
+_NUMBER_PATTERN = r"(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][-+]?[0-9]+)?"
+_VALUE_PATTERN = re.compile(
+    rf"(?P<sign>[-+]?)\s*(?:(?P<number>{_NUMBER_PATTERN})?\s*(?:(?P<times>\*?)\s*(?P<pi>pi|π))?)"
+    rf"\s*(?:/\s*(?P<divisor>{_NUMBER_PATTERN}))?\s*(?P<unit>deg|°|rad|mm|cm|m)?"
+)
+
+UNITS = {
+    None: 1.0,
+    "rad": 1.0,
+    "deg": math.pi / 180.0,
+    "°": math.pi / 180.0,
+    "m": 1.0,
+    "cm": 0.01,
+    "mm": 0.001,
+}
+LENGTHS = (None, "m", "cm", "mm")
+
+
+def add_set_option(parser: argparse.ArgumentParser) -> None:
+    """Add ``--set`` to a command."""
+    parser.add_argument(
+        "--set",
+        metavar="NAME=VALUE",
+        action="append",
+        default=[],
+        dest="assignments",
+        help="a position in rad or m: 0.3, pi/2, 30deg, 12cm; may be given several times",
+    )
+
+
+def parse_assignments(texts: Iterable[str]) -> dict[str, float]:
+    """Return values by name from texts like ``kitchen/fridge_door=30deg``.
+
+    Raises
+    ------
+    InvalidValueError
+        If a text is no assignment, or the value no finite number.
+    DuplicateNameError
+        If there are two values for a name.
+    """
+    values: dict[str, float] = {}
+    for text in texts:
+        # A value has no equals sign in it; a name may.
+        name, equals, value = text.rpartition("=")
+        if not equals or not name.strip():
+            raise InvalidValueError(f"--set {text!r}: write NAME=VALUE, such as kitchen/fridge_door=0.3")
+        if name.strip() in values:
+            raise DuplicateNameError(f"--set {name.strip()} is given twice.")
+        values[name.strip()] = parse_value(value)
+    return values
+
+
+def has_unit(text: str) -> bool:
+    """Whether a value says what it is measured in; parts of pi are angles."""
+    return unit_kind(text) is not None
+
+
+def unit_kind(text: str) -> str | None:
+    """Return ``rad`` or ``m``, whichever a value is measured in; None if it does not say."""
+    match = _VALUE_PATTERN.fullmatch(text.rpartition("=")[2].strip())
+    if match is None or not (match["unit"] or match["pi"]):
+        return None
+    return "m" if match["unit"] in LENGTHS[1:] else "rad"
+
+
+def parse_length(text: str) -> float:
+    """Return the number [m] of a text such as ``0.05``, ``5cm``, ``2 mm``.
+
+    Raises
+    ------
+    InvalidValueError
+        If it is none, not finite, or an angle.
+    """
+    match = _VALUE_PATTERN.fullmatch(text.strip())
+    if match is None or match["unit"] not in LENGTHS or match["pi"]:
+        raise InvalidValueError(f"{text.strip()!r} is not a length; write a number of m (0.05), or 5cm, 2mm")
+    return parse_value(text)
+
+
+def parse_value(text: str) -> float:
+    """Return the number [rad] or [m] of a text such as ``0.3``, ``-pi/2``, ``1.5pi``, ``30deg``, ``12 cm``.
+
+    Raises
+    ------
+    InvalidValueError
+        If it is none, or not finite.
+    """
+    match = _VALUE_PATTERN.fullmatch(text.strip())
+    if match is None or not (match["number"] or match["pi"]) or (match["times"] and not match["number"]):
+        raise InvalidValueError(
+            f"{text.strip()!r} is not a value; write a finite number of rad or m (0.3, 1e-2), "
+            "parts of pi (pi/2, -0.5*pi), or a unit (30deg, 12cm, 5mm)"
+        )
+    value = float(match["number"] or 1.0) * (math.pi if match["pi"] else 1.0)
+    divisor = float(match["divisor"] or 1.0)
+    if divisor == 0.0:
+        raise InvalidValueError(f"{text.strip()!r} divides by zero")
+    value = value / divisor * UNITS[match["unit"]] * (-1.0 if match["sign"] == "-" else 1.0)
+    if not math.isfinite(value):
+        raise InvalidValueError(f"{text.strip()!r} is not finite")
+    return value
+
+
+def add_model_options(
+    parser: argparse.ArgumentParser, strict: str = "refuse what is otherwise read with a remark"
+) -> None:
+    """Declare ``--root``, ``--loops`` and ``--strict``, which means ``strict``."""
+    parser.add_argument(
+        "--root",
+        metavar="FOLDER",
+        help="the folder below which it may open files, meshes and included ones (its package or repository)",
+    )
+    parser.add_argument(
+        "--loops",
+        choices=("solve", "constraint", "refuse"),
+        default="solve",
+        help="what becomes of closed loops: solved where that can be done (the default), all kept as "
+        "equality constraints, or refused where one cannot be solved",
+    )
+    parser.add_argument("--strict", action="store_true", help=strict)
+
+
+def load_model(arguments: argparse.Namespace, source: str, prefix: str | None = None) -> kv.Model:
+    """Load a model as the options say.
+
+    Raises
+    ------
+    KineverseError
+        If it cannot be loaded.
+    """
+    import kineverse as kv
+
+    return kv.load(source, prefix, root=arguments.root, strict=arguments.strict, loops=arguments.loops)
+
+
+ALTERNATIVE_UNITS = {"rad": ("deg",), "m": ("cm", "mm")}
+"""What people think in instead of radians and metres."""
+
+
+def find_limit_notes(model: kv.Model, values: Mapping[str, float], texts: Iterable[str]) -> list[str]:
+    """Return a line for everything that is violated, and for angles of more than a turn that have no unit.
+
+    Parameters
+    ----------
+    model
+        The model.
+    values
+        Of all its symbols, by name [rad], [m].
+    texts
+        What was given as ``--set``.
+    """
+    import kineverse as kv
+    from kineverse.view.sliders import infer_units
+
+    given = {text.rpartition("=")[0].strip(): text for text in texts}
+    kinds = infer_units(model, values, given) if given else {}
+    said, lines = set(), []
+    for name, text in given.items():
+        lower, upper = map(float, model.limits(model.symbol(name)))
+        kind, value = kinds[name], values[name]
+        if unit_kind(text) not in (None, kind) and kind:
+            sort, wrong = "an angle" if kind == "rad" else "a length", text.rpartition("=")[2].strip()
+            lines.append(
+                f"{name} is {sort}, and {wrong} is none: it is taken for {format_number(value, 6)} {kind}"
+            )
+        turns = kind == "rad" and abs(value) > math.tau and not has_unit(text)
+        if lower <= value <= upper and not turns:
+            continue
+        said.add(name)
+        what = f"{name} = {format_number(value, 6)} {kind}".rstrip()
+        if lower <= value <= upper:
+            what += f" is {format_number(value / math.tau, 3)} turns"
+        else:
+            what += f" is beyond its limits [{format_number(lower)}, {format_number(upper)}]"
+        lines.append(what + _suggest_unit(text, kind, lower, upper))
+    for violation in model.violations(kv.State(values)):
+        about = [str(symbol) for symbol in model.constraints[violation.name].expression.symbols]
+        if len(about) == 1 and about[0] in said:
+            continue
+        lines.append(
+            f"{violation.name} is violated: {format_number(violation.value)} is not in "
+            f"[{format_number(violation.lower)}, {format_number(violation.upper)}]"
+        )
+    return lines
+
+
+def print_notes(lines: Iterable[str]) -> None:
+    """Print remarks on standard error."""
+    for line in lines:
+        print(f"kineverse: note: {line}", file=sys.stderr)
+
+
+def _suggest_unit(text: str, kind: str, lower: float, upper: float) -> str:
+    """Return what the same number means in a smaller unit, if it is within the limits in that."""
+    if has_unit(text):
+        return ""
+    name, _, number = text.rpartition("=")
+    value = float(number) if _is_plain_number(number) else math.nan
+    for unit in ALTERNATIVE_UNITS.get(kind, ()):
+        if lower <= value * UNITS[unit] <= upper:
+            long = "degrees" if unit == "deg" else unit
+            return f"; in {long} it is --set {name.strip()}={number.strip()}{unit}"
+    return ""
+
+
+def _is_plain_number(text: str) -> bool:
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True

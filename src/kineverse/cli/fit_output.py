@@ -1,0 +1,278 @@
+"""Identified joint as text, as JSON and as a model."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import numpy.typing as npt
+
+from kineverse.cli.output import format_table
+from kineverse.errors import InvalidValueError
+from kineverse.estimation.identification.found_operations import joint_operation
+from kineverse.expressions.printing import format_number
+from kineverse.gallery import shapes
+from kineverse.model.body import Body
+from kineverse.model.frame import WORLD
+from kineverse.model.model import Model
+from kineverse.model.operation import Operation
+from kineverse.model.operations import SetBody
+from kineverse.spatial import translation
+
+if TYPE_CHECKING:
+    from kineverse.cli.fit import LearnedJoint, ObservationNoise
+    from kineverse.estimation import Fit, IdentificationResult
+    from kineverse.estimation.recordings import RecordedPair
+
+_LEAST_PROBABILITY = 1e-4
+"""Less probable families are counted, not listed."""
+
+_MOST_LISTED = 10
+"""Of more poses that do not fit only the first are listed."""
+
+
+def format_fit(source: str, pair: RecordedPair, learned: LearnedJoint) -> str:
+    """Return what was found: the joint, how sure that is, and what else it could be."""
+    found, best, count = learned.found, learned.fit, len(pair.child_poses)
+    said = f"{best.family}, {_format_percent(best.probability)}"
+    if found.is_ambiguous:
+        said = f"{found}\nThe most probable one: {said}"
+    what = "poses" if pair.child_poses.ndim == 3 else "positions"
+    lines = [
+        f"{pair.child} in {pair.parent}: {count} {what} ({source})",
+        *_format_subset(learned.judged, count),
+        f"noise: {_format_noise(learned.noise)}",
+        "",
+        said,
+        *(f"  {name:10}{value}" for name, value in _format_parameters(best)),
+        *_format_outliers(best.outliers, count, what),
+        *_revolution_warning(best, pair),
+        "",
+        *_format_ranking(found),
+    ]
+    return "\n".join(lines)
+
+
+def fit_to_json(pair: RecordedPair, learned: LearnedJoint) -> dict[str, Any]:
+    """Return everything that was found, as plain values."""
+    found, noise = learned.found, learned.noise
+    return {
+        "parent": pair.parent,
+        "child": pair.child,
+        "count": len(pair.child_poses),
+        "judged": learned.judged,
+        "orientations": pair.child_poses.ndim == 3,
+        "noise": {"position": noise.position, "orientation": noise.orientation, "given": noise.given},
+        "told": not found.is_ambiguous,
+        "family": found.best.family,
+        "says": str(found),
+        "outliers": list(learned.fit.outliers),
+        "fits": [_fit_to_json(fit) for fit in (learned.fit, *found.fits[1:])],
+    }
+
+
+def _format_subset(judged: int, count: int) -> list[str]:
+    if judged == count:
+        return []
+    return [f"judged by {judged} of them, as errors of neighbours are alike (--thin {count} takes all)"]
+
+
+def _format_noise(noise: ObservationNoise) -> str:
+    angle = (
+        "" if noise.orientation is None else f" and {format_number(math.degrees(noise.orientation), 3)} deg"
+    )
+    how = "as given" if noise.given else "estimated"
+    return f"{format_number(1e3 * noise.position, 3)} mm{angle}, {how}"
+
+
+def _format_parameters(fit: Fit) -> list[tuple[str, str]]:
+    """Return the parameters of a joint in words, with standard deviations."""
+    parts = []
+    for name in ("axis", "normal"):
+        if name in fit.parameters:
+            spread = _standard_deviation(fit, "axis.x", "axis.y")
+            parts.append(
+                (name, f"{_format_vector(fit, name)}   ± {format_number(math.degrees(spread), 2)} deg")
+            )
+    for name in ("point", "centre"):
+        if name in fit.parameters:
+            spread = _standard_deviation(fit, "point.x", "point.y", "point.z")
+            parts.append((name, f"{_format_vector(fit, name)} m   ± {format_number(1e3 * spread, 2)} mm"))
+    if "pitch" in fit.parameters:
+        pitch, spread = 1e3 * float(fit.parameters["pitch"]), 1e3 * fit.deviation("pitch")
+        parts.append(("pitch", f"{format_number(pitch)} mm per revolution   ± {format_number(spread, 2)} mm"))
+    for low, high, spread, turns in joint_ranges(fit):
+        scale, unit = (math.degrees(1.0), "deg") if turns else (1e3, "mm")
+        ends = f"{format_number(scale * low)} … {format_number(scale * high)} {unit}"
+        parts.append(("seen", f"{ends}   ± {format_number(scale * spread, 2)} {unit} at each end"))
+    left = f"{format_number(1e3 * fit.rms[0], 3)} mm"
+    if fit.residuals.shape[1] > 3:
+        left += f", {format_number(math.degrees(fit.rms[1]), 3)} deg"
+    return [*parts, ("left over", f"{left} rms")]
+
+
+def _format_outliers(outliers: Sequence[int], count: int, what: str) -> list[str]:
+    """Return which poses do not fit at all, from 0, in words."""
+    if not outliers:
+        return []
+    numbers = ", ".join(map(str, outliers[:_MOST_LISTED]))
+    more = ", …" if len(outliers) > _MOST_LISTED else ""
+    do = "does" if len(outliers) == 1 else "do"
+    return [f"  {len(outliers)} of {count} {what} {do} not fit: {numbers}{more} (counted from 0)"]
+
+
+def _revolution_warning(fit: Fit, pair: RecordedPair) -> list[str]:
+    """Return that turns may have been counted wrongly."""
+    from kineverse.cli.fit import MAX_ROTATION_STEP
+
+    if not pair.timed or fit.turned < MAX_ROTATION_STEP:
+        return []
+    most = format_number(math.degrees(fit.turned), 3)
+    return [f"  from one to the next it turns by up to {most} deg: it may be more turns, or fewer"]
+
+
+def joint_ranges(fit: Fit) -> list[tuple[float, float, float, bool]]:
+    """Return of each joint value the least and the largest seen, their deviation, and if it is an angle."""
+    found = []
+    for k, component in enumerate(fit.motion.freedom.joints):
+        values, deviations = fit.joint_values[fit.right, k], fit.deviations[fit.right, k]
+        ends = [int(np.argmin(values)), int(np.argmax(values))]
+        spread = float(deviations[ends].max())
+        found.append((float(values[ends[0]]), float(values[ends[1]]), spread, component >= 3))
+    return found
+
+
+def _format_ranking(found: IdentificationResult) -> list[str]:
+    shown = [fit for fit in found.fits if fit.probability >= _LEAST_PROBABILITY]
+    rows: list[tuple[str, ...]] = []
+    for fit in shown:
+        angle = format_number(math.degrees(fit.rms[1]), 3) if fit.residuals.shape[1] > 3 else "-"
+        position = format_number(1e3 * fit.rms[0], 3)
+        rows.append(
+            (
+                fit.family,
+                _format_percent(fit.probability),
+                format_number(fit.log_evidence, 6),
+                position,
+                angle,
+                fit.reason,
+            )
+        )
+    head: tuple[str, ...] = ("joint", "probability", "log evidence", "left [mm]", "left [deg]", "not known")
+    if not any(fit.reason for fit in shown):
+        head, rows = head[:-1], [row[:-1] for row in rows]
+    lines = [format_table(head, rows, "<>>>>")]
+    rest = [fit.family for fit in found.fits if fit.probability < _LEAST_PROBABILITY]
+    return [*lines, f"not: {', '.join(rest)}"] if rest else lines
+
+
+def _fit_to_json(fit: Fit) -> dict[str, Any]:
+    return {
+        "family": fit.family,
+        "probability": fit.probability,
+        "log_evidence": fit.log_evidence,
+        "told": fit.told,
+        "reason": fit.reason,
+        "parameters": {name: np.asarray(value).tolist() for name, value in fit.parameters.items()},
+        "deviations": {name: fit.deviation(name) for name in fit.coordinates},
+        "frame": fit.frame.tolist(),
+        "ranges": [
+            {"lower": low, "upper": high, "deviation": spread, "unit": "rad" if turns else "m"}
+            for low, high, spread, turns in joint_ranges(fit)
+        ],
+        "rms": {"position": fit.rms[0], "orientation": fit.rms[1] if fit.residuals.shape[1] > 3 else None},
+    }
+
+
+def _standard_deviation(fit: Fit, *coordinates: str) -> float:
+    """Return the root of the sum of variances of those coordinates that there are."""
+    return math.hypot(*(fit.deviation(name) for name in coordinates if name in fit.coordinates))
+
+
+def _format_vector(fit: Fit, name: str) -> str:
+    return " ".join(f"{x:.4f}" for x in np.asarray(fit.parameters[name]))
+
+
+def _format_percent(probability: float) -> str:
+    """Return a probability in percent, and no 100 where something else is possible."""
+    percent = 100.0 * probability
+    return f"{min(percent, 99.99):.4g} %" if probability < 1.0 else "100 %"
+
+
+Array = npt.NDArray[np.float64]
+
+MOST_DOTS = 60
+"""At most so many of the poses that were seen are in the model."""
+
+
+def make_joint_model(pair: RecordedPair, fit: Fit) -> Model:
+    """Return a model with the joint and, to be looked at, its axis, the part on it, and where it was seen.
+
+    Where only positions were seen, the part's axes are those of its parent at joint value 0.
+
+    Raises
+    ------
+    InvalidValueError
+        For a part that moves freely: there is no joint.
+    """
+    if fit.family == "free" and fit.motion.rows == 3:
+        raise InvalidValueError(
+            f"'{pair.child}' moves freely: there is no joint to write. Without --document."
+        )
+    model = Model()
+    seen = pair.relative[:, :3, 3] if pair.relative.ndim == 3 else pair.relative
+    size = max(float(np.ptp(seen, axis=0).max()), 0.01)
+    with model.edit() as edit:
+        if pair.parent != WORLD:
+            edit.add_frame(pair.parent, WORLD, translation(0, 0, 0))
+        edit.apply(make_joint_operation(fit, pair.parent, pair.child), tag=pair.child)
+        edit.apply(SetBody(pair.parent, Body(_parent_shapes(fit, seen, size))))
+        edit.apply(SetBody(pair.child, Body(_child_shapes(fit, seen, size))))
+    return model
+
+
+def make_joint_operation(fit: Fit, parent: str, child: str) -> Operation:
+    """Return the joint as an operation, also where only positions were seen, see :func:`make_joint_model`."""
+    if fit.motion.rows == 6:
+        return fit.operation(name=child, parent=parent, child=child)
+    right = fit.motion.right.copy()
+    right[:3, :3] = fit.motion.left[:3, :3].T
+    limits = [(float(low), float(high)) for low, high in fit.range]
+    return joint_operation(replace(fit.motion, right=right), limits, child, parent, child)
+
+
+def _parent_shapes(fit: Fit, seen: Array, size: float) -> shapes.Shapes:
+    """Return the axis, and dots where the part was seen, in the parent's frame."""
+    chosen = np.unique(np.linspace(0, len(seen) - 1, MOST_DOTS).round().astype(int))
+    made: shapes.Shapes = ()
+    for point in seen[chosen]:
+        made += shapes.sphere(0.008 * size, point, shapes.ORANGE)
+    if "axis" in fit.parameters:
+        axis = np.asarray(fit.parameters["axis"])
+        middle = _closest_point_on_axis(fit, seen.mean(axis=0))
+        made += shapes.rod(middle - 0.5 * size * axis, middle + 0.5 * size * axis, 0.012 * size, shapes.RED)
+    return made
+
+
+def _child_shapes(fit: Fit, seen: Array, size: float) -> shapes.Shapes:
+    """Return the part, and an arm to the axis if it turns about one, in the part's frame."""
+    made = shapes.box(np.full(3, 0.06 * size), color=shapes.BLUE)
+    if "point" in fit.parameters:
+        reference = np.asarray(fit.parameters["reference"])
+        rotation = reference[:3, :3] if fit.motion.rows == 6 else np.eye(3)
+        arm = rotation.T @ (_closest_point_on_axis(fit, reference[:3, 3]) - reference[:3, 3])
+        if np.linalg.norm(arm) > 0.01 * size:
+            made += shapes.rod(np.zeros(3), arm, 0.012 * size, shapes.BLUE)
+    return made
+
+
+def _closest_point_on_axis(fit: Fit, place: Array) -> Array:
+    """Return the point on the axis nearest to a place; the place itself for what has no point."""
+    if "point" not in fit.parameters:
+        return place
+    axis, point = np.asarray(fit.parameters["axis"]), np.asarray(fit.parameters["point"])
+    foot: Array = point + (axis @ (place - point)) * axis
+    return foot

@@ -1,0 +1,69 @@
+"""Thread pool over the rows of a batch."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+
+# A thread takes this many pieces on average, so that one that was held up leaves its rest to the others.
+_PIECES = 4
+
+_threads: ThreadPoolExecutor | None = None
+
+
+def cores() -> int:
+    """Return how many cores this process may use."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
+def parallel_rows(work: Callable[[int, int], object], rows: int, smallest: int, align: int = 8) -> None:
+    """Call ``work(first, end)`` for pieces that make up all rows, in several threads if there are enough.
+
+    Parameters
+    ----------
+    work
+        What is done; it has to release the GIL to gain anything.
+    rows
+        How many rows there are.
+    smallest
+        Fewer rows than this are not worth a thread.
+    align
+        Pieces begin at multiples of this.
+    """
+    threads = min(cores(), rows // max(smallest, 1))
+    if threads < 2:
+        if rows:
+            work(0, rows)
+        return
+    piece = max(-(-rows // (threads * _PIECES)), smallest)
+    piece = -(-piece // align) * align
+    starts = iter(range(0, rows, piece))
+
+    def take() -> None:
+        # Going on with a range is atomic; every thread takes the next piece when it is done with one.
+        for first in starts:
+            work(first, min(first + piece, rows))
+
+    helpers = [_pool().submit(take) for _ in range(threads - 1)]
+    take()
+    for helper in helpers:
+        helper.result()
+
+
+def _pool() -> ThreadPoolExecutor:
+    global _threads
+    if _threads is None:
+        _threads = ThreadPoolExecutor(max(cores() - 1, 1), thread_name_prefix="kineverse-batch")
+    return _threads
+
+
+def _forked() -> None:
+    global _threads
+    _threads = None
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_forked)

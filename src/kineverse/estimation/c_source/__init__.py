@@ -1,0 +1,1 @@
+"""C source of the compiled kernels of estimation."""

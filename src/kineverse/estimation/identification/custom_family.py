@@ -1,0 +1,237 @@
+"""Joint families defined by a user's expression."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from itertools import product
+from typing import NamedTuple, Self
+
+import numpy as np
+
+from kineverse.compile import CompiledFunction
+from kineverse.compile import compile as compiled
+from kineverse.errors import InvalidValueError, ShapeError, UnknownNameError
+from kineverse.expressions.expression import Expression
+from kineverse.lie import Stack, log_so3
+from kineverse.symbols import Symbol
+
+from .families import REACH
+from .motion_model import LinearisedPoses, ParameterPrior
+from .observations import Observations
+
+# Joint values that are tried for each observation, for each joint alone, and members that are tried besides.
+_TRIED = 41
+_MEMBERS = 8
+# What is believed of the mean of a joint value beforehand [m] or [rad].
+_MEAN_SPREAD = 3.0
+
+
+class FamilyParameter(NamedTuple):
+    """What is known of a parameter beforehand.
+
+    Attributes
+    ----------
+    start
+        Its most probable value.
+    deviation
+        How far it may well be off that, its standard deviation.
+    lower, upper
+        What it cannot pass.
+    """
+
+    start: float
+    deviation: float
+    lower: float = -math.inf
+    upper: float = math.inf
+
+
+@dataclass(frozen=True, eq=False)
+class Family:
+    """A family of motions that is said by an expression.
+
+    Attributes
+    ----------
+    name
+        As in ``found["garage"]``.
+    transform
+        The pose of the child in the parent, (4, 4), of joints and parameters.
+    joints
+        The symbols that have a value of their own in each observation, and the range in which they are
+        looked for.
+    parameters
+        The symbols that have one unknown value, and what is known of it: an :class:`FamilyParameter` or its first two
+        numbers.
+    weight
+        How probable the family is beforehand, beside 1 for a hinge.
+
+    Raises
+    ------
+    ShapeError, UnknownNameError, InvalidValueError
+        For what is no transform, symbols that are neither joints nor parameters, deviations that are not
+        positive, and empty ranges.
+    """
+
+    name: str
+    transform: Expression
+    joints: Mapping[Symbol, tuple[float, float]]
+    parameters: Mapping[Symbol, FamilyParameter | tuple[float, float]] = field(default_factory=dict)
+    weight: float = 1.0
+
+    def __post_init__(self) -> None:
+        if np.shape(self.transform) != (4, 4):
+            raise ShapeError(f"The transform of the family '{self.name}' is a 4×4 expression.")
+        known = {*self.joints, *self.parameters}
+        others = sorted(str(s) for s in self.transform.symbols if s not in known)
+        if others:
+            raise UnknownNameError(
+                f"The transform of the family '{self.name}' depends on {', '.join(others)}, and that is "
+                "neither a joint nor a parameter of it."
+            )
+        object.__setattr__(self, "parameters", {s: FamilyParameter(*u) for s, u in self.parameters.items()})
+        for symbol, (low, high) in self.joints.items():
+            if not (math.isfinite(low) and math.isfinite(high) and low < high):
+                raise InvalidValueError(f"The range of the joint '{symbol}' is empty: {low} to {high}.")
+        for symbol, unknown in self.unknowns.items():
+            if not (unknown.deviation > 0.0 and unknown.lower <= unknown.start <= unknown.upper):
+                raise InvalidValueError(
+                    f"The parameter '{symbol}' has a positive deviation, and a start within its bounds; not "
+                    f"{unknown}."
+                )
+
+    @property
+    def unknowns(self) -> Mapping[Symbol, FamilyParameter]:
+        """What is known of the parameters."""
+        return self.parameters  # type: ignore[return-value]
+
+    @cached_property
+    def function(self) -> CompiledFunction:
+        """The transform and its derivatives by parameters and joints, of joints and parameters."""
+        joints, parameters = list(self.joints), list(self.parameters)
+        outputs = [self.transform]
+        outputs += [self.transform.partial(symbols) for symbols in (parameters, joints) if symbols]
+        return compiled(outputs, [*joints, *parameters])
+
+
+@dataclass(frozen=True, eq=False)
+class FamilyMotion:
+    """A member of a family of one's own; lengths of poses are in a unit [m], see :mod:`.lengths`."""
+
+    family: Family
+    rows: int
+    parameters: Stack
+    unit: float = 1.0
+
+    @property
+    def name(self) -> str:
+        """That of the family."""
+        return self.family.name
+
+    @property
+    def size(self) -> int:
+        """Number of parameters."""
+        return len(self.parameters)
+
+    @property
+    def joints(self) -> int:
+        """Number of joint values."""
+        return len(self.family.joints)
+
+    @property
+    def kinds(self) -> tuple[int, ...]:
+        """Each joint value has a width of its own."""
+        return tuple(range(self.joints))
+
+    def at(self, values: Stack) -> LinearisedPoses:
+        """Return the poses at joint values (N, k)."""
+        count, rows = len(values), self.rows
+        inputs = np.concatenate([values, np.tile(self.parameters, (count, 1))], axis=1)
+        poses, *derivatives = (np.array(a) for a in self.family.function.batch(inputs))
+        for lengths in (poses, *derivatives):
+            lengths[:, :3, 3] /= self.unit
+        blocks = iter(derivatives)
+        by_parameters = _twists(poses, next(blocks))[:, :rows] if self.size else np.zeros((count, rows, 0))
+        by_joints = _twists(poses, next(blocks))[:, :rows] if self.joints else np.zeros((count, rows, 0))
+        return LinearisedPoses(poses, by_parameters, by_joints)
+
+    def moved(self, step: Stack) -> Self:
+        """Return the member that a step leads to, kept within the bounds of the parameters."""
+        bounds = np.array([(u.lower, u.upper) for u in self.family.unknowns.values()]).reshape(-1, 2)
+        return replace(self, parameters=np.clip(self.parameters + step, bounds[:, 0], bounds[:, 1]))
+
+    def bounded(self, values: Stack, step: Stack) -> Stack:
+        """Return joint values after a step, within the range in which they are looked for."""
+        ranges = np.array([*self.family.joints.values()]).reshape(-1, 2)
+        most = 0.25 * (ranges[:, 1] - ranges[:, 0])
+        return np.asarray(np.clip(values + np.clip(step, -most, most), ranges[:, 0], ranges[:, 1]))
+
+    def prior(self) -> ParameterPrior:
+        """Return that parameters are near their starts."""
+        start, deviation = self._beliefs()
+        return ParameterPrior((self.parameters - start) / deviation, np.diag(1.0 / deviation))
+
+    def beforehand(self, mean: Stack) -> tuple[float, Stack]:
+        """Return the density of parameters and of the mean joint values, and what keeps them finite.
+
+        The joints of :mod:`.groups` have a mean pose besides, with the density 1. Here it is part of the
+        parameters, so what a pose within reach would have is left out.
+        """
+        _, deviation = self._beliefs()
+        off = self.prior().residuals
+        log = -0.5 * float(off @ off) - float(np.sum(np.log(math.sqrt(math.tau) * deviation)))
+        log += 1.5 * math.log(math.tau * REACH**2) + (math.log(8.0 * math.pi**2) if self.rows == 6 else 0.0)
+        log -= self.joints * math.log(math.sqrt(math.tau) * _MEAN_SPREAD)
+        return log, np.concatenate([np.zeros(self.size), np.full(self.joints, _MEAN_SPREAD**-2)])
+
+    def named(self) -> dict[str, Stack | float]:
+        """Return the parameters by name."""
+        return dict(zip(self.coordinates(), self.parameters.tolist(), strict=True))
+
+    def coordinates(self) -> tuple[str, ...]:
+        """Return the names of the parameters."""
+        return tuple(str(s) for s in self.family.parameters)
+
+    def expression(self, joints: Sequence[Expression]) -> Expression:
+        """Return the pose of the child in the parent by other symbols for the joint values."""
+        values = dict(zip(self.family.parameters, self.parameters.tolist(), strict=True))
+        return self.family.transform.substitute(
+            {**dict(zip(self.family.joints, joints, strict=True)), **values}
+        )
+
+    def _beliefs(self) -> tuple[Stack, Stack]:
+        unknowns = self.family.unknowns.values()
+        return np.array([u.start for u in unknowns]), np.array([u.deviation for u in unknowns])
+
+
+def family_starts(family: Family, seen: Observations, unit: float) -> Iterator[tuple[FamilyMotion, Stack]]:
+    """Yield members of a family, at its start and around, with the joint values that come nearest."""
+    motion = FamilyMotion(family, seen.rows, np.array([u.start for u in family.unknowns.values()]), unit)
+    # Always the same ones, so that the same poses give the same answer.
+    random = np.random.default_rng(0)
+    _, deviation = motion._beliefs()
+    for k in range(_MEMBERS if motion.size else 1):
+        member = motion.moved(random.normal(0.0, deviation)) if k else motion
+        yield member, _nearest(member, seen)
+
+
+def _nearest(motion: FamilyMotion, seen: Observations) -> Stack:
+    each = max(3, round(_TRIED ** (1.0 / max(1, motion.joints)) * (1 if motion.joints < 2 else 3)))
+    ranges = motion.family.joints.values()
+    tried = np.array([*product(*(np.linspace(low, high, each) for low, high in ranges))])
+    poses = motion.at(tried.reshape(-1, motion.joints)).pose
+    apart = np.sum((seen.relative[:, None, :3, 3] - poses[None, :, :3, 3]) ** 2, axis=-1)
+    if seen.rows == 6:
+        turns = np.swapaxes(seen.relative[:, None, :3, :3], -1, -2) @ poses[None, :, :3, :3]
+        lever = float(np.mean(np.einsum("nii->ni", seen.child_covariance)[:, :3]))
+        angle = float(np.mean(np.einsum("nii->ni", seen.child_covariance)[:, 3:]))
+        apart = apart + lever / angle * np.sum(log_so3(turns) ** 2, axis=-1)
+    return np.asarray(tried.reshape(-1, motion.joints)[np.argmin(apart, axis=1)])
+
+
+def _twists(poses: Stack, derivatives: Stack) -> Stack:
+    """Return twists of the child in the parent's axes, (N, 6, n), from derivatives (N, 4, 4, n)."""
+    turning = np.einsum("nijk,nlj->nilk", derivatives[:, :3, :3], poses[:, :3, :3])
+    omega = np.stack([turning[:, 2, 1], turning[:, 0, 2], turning[:, 1, 0]], axis=1)
+    return np.concatenate([derivatives[:, :3, 3], omega], axis=1)

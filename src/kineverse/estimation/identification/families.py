@@ -1,0 +1,344 @@
+"""Joint families as subgroups of SE(3) between parent and child.
+
+    parent_T_child = L · g(a) · R,        g(a) = translation(v(a)) · Exp(ω(a))
+
+A joint value is one of the six components of (v, ω), and the subgroup is said by which of them there are; for
+a screw v_z is the pitch times ω_z besides. So a hinge turns about the z axis of L, and a slider moves along
+it. Of the twelve parameters of L and R those stay that are no gauge: what commutes with the subgroup can be
+moved from L to R, and what is in it is a shift of joint values.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from types import MappingProxyType
+from typing import Self
+
+import numpy as np
+
+from kineverse.lie import Stack, exp_so3, orthonormalize, right_jacobian, skew, transform
+
+from .bindings import evaluate_poses, fits_kernel, library
+from .motion_model import LinearisedPoses, ParameterPrior
+
+VX, VY, VZ, WX, WY, WZ = range(6)
+
+
+@dataclass(frozen=True, slots=True)
+class Parametrisation:
+    """Which components are joint values and parameters.
+
+    Attributes
+    ----------
+    joints
+        Components of (v, ω) that are joint values.
+    left
+        Components of the twist that moves L, in L.
+    right
+        Components of the twist that moves R, in front of it.
+    """
+
+    joints: tuple[int, ...]
+    left: tuple[int, ...]
+    right: tuple[int, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class JointFamily:
+    """A family of joints.
+
+    Attributes
+    ----------
+    name
+        As in ``found["revolute"]``.
+    poses
+        Its freedom if poses of the child are seen.
+    positions
+        Its freedom if only positions are: how the child is turned is no parameter then.
+    pitch
+        Whether it moves along z by a pitch [m/rad] as it turns.
+    reach
+        How many components of the child's place in the joint's frame are a lever: beforehand they are
+        believed to be within reach.
+    slides
+        How many directions it slides in and turns besides, so that it matters whose slides they are, see
+        :mod:`.sliding`.
+    """
+
+    name: str
+    poses: Parametrisation
+    positions: Parametrisation
+    pitch: bool = False
+    reach: int = 0
+    slides: int = 0
+
+    def freedom(self, rows: int) -> Parametrisation:
+        """Return the freedom for poses (6) or positions (3)."""
+        return self.poses if rows == 6 else self.positions
+
+
+_LINE = (VX, VY, WX, WY)
+JOINT_FAMILIES: Mapping[str, JointFamily] = MappingProxyType(
+    {
+        group.name: group
+        for group in (
+            JointFamily(
+                "rigid",
+                Parametrisation((), (), (VX, VY, VZ, WX, WY, WZ)),
+                Parametrisation((), (), (VX, VY, VZ)),
+            ),
+            JointFamily(
+                "prismatic",
+                Parametrisation((VZ,), (WX, WY), (VX, VY, WX, WY, WZ)),
+                Parametrisation((VZ,), (WX, WY), (VX, VY)),
+            ),
+            JointFamily(
+                "revolute",
+                Parametrisation((WZ,), _LINE, (VX, VY, VZ, WX, WY)),
+                Parametrisation((WZ,), _LINE, (VX, VZ)),
+                reach=2,
+            ),
+            JointFamily(
+                "screw",
+                Parametrisation((WZ,), _LINE, (VX, VY, VZ, WX, WY)),
+                Parametrisation((WZ,), _LINE, (VX, VZ)),
+                pitch=True,
+                reach=2,
+            ),
+            JointFamily(
+                "cylindrical",
+                Parametrisation((VZ, WZ), _LINE, (VX, VY, WX, WY)),
+                Parametrisation((VZ, WZ), _LINE, (VX,)),
+                reach=2,
+            ),
+            JointFamily(
+                "spherical",
+                Parametrisation((WX, WY, WZ), (VX, VY, VZ), (VX, VY, VZ)),
+                Parametrisation((WY, WZ), (VX, VY, VZ), (VX,)),
+                reach=3,
+            ),
+            JointFamily(
+                "planar",
+                Parametrisation((VX, VY, WZ), (WX, WY), (VZ, WX, WY)),
+                Parametrisation((VX, VY), (WX, WY), (VZ,)),
+                slides=2,
+            ),
+            JointFamily(
+                "free",
+                Parametrisation((VX, VY, VZ, WX, WY, WZ), (), ()),
+                Parametrisation((VX, VY, VZ), (), ()),
+                slides=3,
+            ),
+        )
+    }
+)
+"""The families by name. ``rigid`` has no joint values, and ``free`` has nothing else."""
+
+PITCHES = 0.1
+"""The standard deviation of a pitch, beforehand [m/rad]."""
+
+REACH = 1.0
+"""The standard deviation of each component of a lever, beforehand [m]."""
+
+
+@dataclass(frozen=True, slots=True)
+class GroupMotion:
+    """A member of a group, see the module.
+
+    Attributes
+    ----------
+    group
+        The family.
+    rows
+        6, or 3 for positions only.
+    left, right
+        L and R, 4×4.
+    pitch
+        [m/rad]; 0 for what has none.
+    """
+
+    group: JointFamily
+    rows: int
+    left: Stack
+    right: Stack
+    pitch: float = 0.0
+
+    @property
+    def freedom(self) -> Parametrisation:
+        """Which components are joint values and parameters."""
+        return self.group.freedom(self.rows)
+
+    @property
+    def size(self) -> int:
+        """Number of parameters."""
+        freedom = self.freedom
+        return len(freedom.left) + len(freedom.right) + self.group.pitch
+
+    @property
+    def joints(self) -> int:
+        """Number of joint values."""
+        return len(self.freedom.joints)
+
+    @property
+    def slides(self) -> int:
+        """Number of components of the sliding point that are unknown, see :mod:`.sliding`."""
+        return self.group.slides if self.rows == 6 else 0
+
+    @property
+    def is_plain(self) -> bool:
+        """Whether it is what its group says and nothing else, so that C knows all of it."""
+        return type(self) is GroupMotion and fits_kernel(self.group, self.rows)
+
+    def at(self, values: Stack, native: bool = True) -> LinearisedPoses:
+        """Return the poses at joint values (N, k); it is done in C where it can be and ``native`` is true."""
+        if native and library.is_native and self.is_plain:
+            return evaluate_poses(self, values)
+        freedom = self.freedom
+        twist = np.zeros((len(values), 6))
+        twist[:, freedom.joints] = values
+        if self.group.pitch:
+            twist[:, VZ] += self.pitch * twist[:, WZ]
+        turn, slide = exp_so3(twist[:, 3:]), twist[:, :3]
+        l_R, r_p = self.left[:3, :3], self.right[:3, 3]
+        parent_R_joint = l_R @ turn
+        lever = parent_R_joint @ r_p
+        way = slide @ l_R.T
+        parent_T_child = transform(parent_R_joint @ self.right[:3, :3], self.left[:3, 3] + way + lever)
+        moved = _columns(parent_R_joint, lever)
+        blocks = [_columns(np.broadcast_to(l_R, turn.shape), way + lever)[:, :, freedom.left]]
+        blocks.append(moved[:, :, freedom.right])
+        if self.group.pitch:
+            along = np.zeros((len(values), 6, 1))
+            along[:, :3, 0] = l_R[:, 2] * twist[:, WZ, None]
+            blocks.append(along)
+        by_joints = self._by_joints(moved, twist)[:, :, freedom.joints]
+        rows = self.rows
+        return LinearisedPoses(parent_T_child, np.concatenate(blocks, axis=2)[:, :rows], by_joints[:, :rows])
+
+    def _by_joints(self, moved: Stack, twist: Stack) -> Stack:
+        result = np.empty_like(moved)
+        # Slides come before the turn, so they are along the axes of L.
+        result[:, :3, :3] = self.left[:3, :3]
+        result[:, 3:, :3] = 0.0
+        joints = self.freedom.joints
+        if WX in joints or WY in joints:
+            result[:, :, 3:] = moved[:, :, 3:] @ right_jacobian(twist[:, 3:])
+        else:
+            result[:, :, 3:] = moved[:, :, 3:]
+        if self.group.pitch:
+            result[:, :3, WZ] += self.pitch * self.left[:3, 2]
+        return result
+
+    def moved(self, step: Stack) -> Self:
+        """Return the member that a step in the parameters leads to."""
+        freedom = self.freedom
+        left, right = np.zeros(6), np.zeros(6)
+        ends = len(freedom.left), len(freedom.left) + len(freedom.right)
+        left[list(freedom.left)] = step[: ends[0]]
+        right[list(freedom.right)] = step[ends[0] : ends[1]]
+        l_T_l = transform(exp_so3(left[3:]), left[:3])
+        r_T_r = transform(exp_so3(right[3:]), right[:3])
+        pitch = self.pitch + (float(step[-1]) if self.group.pitch else 0.0)
+        # Rotations that are multiplied without end would drift.
+        left_moved, right_moved = orthonormalize(self.left @ l_T_l), orthonormalize(r_T_r @ self.right)
+        return replace(self, left=left_moved, right=right_moved, pitch=pitch)
+
+    def bounded(self, values: Stack, step: Stack) -> Stack:
+        """Return joint values after a step: at most half a radian at once."""
+        turning = [j >= WX for j in self.freedom.joints]
+        step = step.copy()
+        step[:, turning] = np.clip(step[:, turning], -0.5, 0.5)
+        result: Stack = values + step
+        return result
+
+    @property
+    def name(self) -> str:
+        """That of the group."""
+        return self.group.name
+
+    @property
+    def kinds(self) -> tuple[int, ...]:
+        """Slides share a width, and so do turns."""
+        return tuple(int(j >= WX) for j in self.freedom.joints)
+
+    def beforehand(self, mean: Stack) -> tuple[float, Stack]:
+        """Return the density of what the family has beyond a mean pose, and what keeps it finite.
+
+        A lever is within reach, and a direction anywhere on half the sphere, as an axis has no sign. The mean
+        pose has the density 1 / (m³ rad³) everywhere, which is no density but is the same for all.
+        """
+        freedom, reach = self.freedom, self.group.reach
+        log = 0.0
+        if WX in freedom.left:
+            log -= math.log(math.tau)
+        if VX in freedom.left and VY in freedom.left and reach:
+            lever = self.right[:reach, 3] / REACH
+            log -= 0.5 * float(lever @ lever) + 0.5 * reach * math.log(math.tau * REACH**2)
+        if self.slides:
+            place = self.right[: self.slides, 3] / REACH
+            log -= 0.5 * float(place @ place) + 0.5 * self.slides * math.log(math.tau * REACH**2)
+        if self.group.pitch:
+            log -= 0.5 * (self.pitch / PITCHES) ** 2 + 0.5 * math.log(math.tau * PITCHES**2)
+        # The volume of mean poses per unit of the parameters that move it.
+        linear = self.at(mean[None, :])
+        right = slice(len(freedom.left), len(freedom.left) + len(freedom.right))
+        matrix = np.concatenate([linear.by_parameters[0, :, right], linear.by_joints[0]], axis=1)
+        # A lever of nothing has no volume at all; the size of an atom is as good.
+        log += float(np.sum(np.log(np.maximum(np.linalg.svd(matrix, compute_uv=False), 1e-10))))
+        # As wide as half a sphere is, and with its density: a direction that nothing tells stays finite. So
+        # does the middle of a turn, which moves nothing where the lever is nothing.
+        precision = np.zeros(self.size + self.joints + self.slides)
+        precision[: len(freedom.left)] = [j >= WX for j in freedom.left]
+        precision[self.size : self.size + self.joints] = [j >= WX for j in freedom.joints]
+        precision[self.size + self.joints :] = REACH**-2
+        return log, precision
+
+    def named(self) -> dict[str, Stack | float]:
+        """Return what a member of a family is, by name."""
+        name = self.name
+        result: dict[str, Stack | float] = {}
+        axis, point = self.left[:3, 2].copy(), self.left[:3, 3].copy()
+        if name == "planar":
+            result["normal"] = axis
+        elif name == "spherical":
+            result["centre"] = point
+        elif name not in ("rigid", "free"):
+            result["axis"] = axis
+            if name != "prismatic":
+                result["point"] = point
+        if self.group.pitch:
+            result["pitch"] = math.tau * self.pitch
+        result["reference"] = self.left @ self.right
+        return result
+
+    def coordinates(self) -> tuple[str, ...]:
+        """Return the names of the parameters, in their order."""
+        letters = "xyz"
+        left = [f"point.{letters[j]}" if j < WX else f"axis.{letters[j - WX]}" for j in self.freedom.left]
+        right = [f"child.{letters[j]}" if j < WX else f"child.r{letters[j - WX]}" for j in self.freedom.right]
+        return (*left, *right, *(["pitch"] if self.group.pitch else []))
+
+    def prior(self) -> ParameterPrior:
+        """Return that levers are within reach, and pitches ordinary."""
+        reach, freedom = self.group.reach, self.freedom
+        r_p = self.right[:3, 3]
+        moves = np.concatenate([np.eye(3), -skew(r_p)], axis=1)[:reach, freedom.right]
+        derivatives = np.zeros((reach, self.size))
+        start = len(freedom.left)
+        derivatives[:, start : start + len(freedom.right)] = moves
+        if not self.group.pitch:
+            return ParameterPrior(r_p[:reach] / REACH, derivatives / REACH)
+        steep = np.zeros((1, self.size))
+        steep[0, -1] = 1.0 / PITCHES
+        residuals = np.append(r_p[:reach] / REACH, self.pitch / PITCHES)
+        return ParameterPrior(residuals, np.concatenate([derivatives / REACH, steep]))
+
+
+def _columns(parent_R_frame: Stack, lever: Stack) -> Stack:
+    """Return twists of the child, about its origin, per unit twist of a frame that carries it by a lever."""
+    result = np.zeros((len(lever), 6, 6))
+    result[:, :3, :3] = result[:, 3:, 3:] = parent_R_frame
+    result[:, :3, 3:] = -skew(lever) @ parent_R_frame
+    return result

@@ -1,0 +1,204 @@
+"""Operations that write identified joints.
+
+A joint of :mod:`kineverse.articulations` carries its child frame on the axis. A part that was observed has
+its frame somewhere else, so the joints here have a mount: joint_T_child = motion(q) · mount.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from kineverse.articulations import (
+    Ball,
+    Cylindrical,
+    Fixed,
+    Floating,
+    Joint,
+    Limits,
+    Planar,
+    Prismatic,
+    Revolute,
+    Screw,
+)
+from kineverse.lie import Stack, mean_rotation
+from kineverse.model.body import Pose
+from kineverse.model.constraint import Constraint
+from kineverse.model.operation import Operation, Writes
+from kineverse.model.read_recorder import ReadRecorder
+from kineverse.spatial import translation
+from kineverse.symbols import position
+
+from .custom_family import FamilyMotion
+from .families import GroupMotion
+from .motion_model import FamilyMember
+
+_Z = (0.0, 0.0, 1.0)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Mounted(Joint):
+    """Base of joints whose child frame is not on the axis.
+
+    Attributes
+    ----------
+    mount
+        joint_T_child at coordinate 0.
+    """
+
+    mount: Pose = Pose()
+
+    @property
+    def kind(self) -> str:
+        """The kind of the joint, as without a mount."""
+        return re.sub("^mounted", "", super().kind)
+
+    def apply(self, model: ReadRecorder) -> Writes:
+        """Write the child frame and what the joint writes."""
+        effects = super().apply(model)  # type: ignore[safe-super]
+        parent, factors = effects.frames[self.child]  # type: ignore[misc]
+        frames = {**effects.frames, self.child: (parent, (*factors, self.mount))}  # type: ignore[misc]
+        return replace(effects, frames=frames)
+
+
+@dataclass(frozen=True, kw_only=True)
+class MountedRevolute(Mounted, Revolute):
+    """A hinge and a part on it: parent_T_child = origin · rotation(axis, q) · mount."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class MountedScrew(Mounted, Screw):
+    """A thread and a part on it: parent_T_child = origin · screw(axis, q) · mount."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class MountedCylindrical(Mounted, Cylindrical):
+    """A rod in a sleeve and a part on it: parent_T_child = origin · cylindrical(axis, s, φ) · mount."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class MountedBall(Mounted, Ball):
+    """A ball in a socket and a part on it: parent_T_child = origin · rotation(quaternion) · mount."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class SlidingPoint(Joint):
+    """A point in a plane, or anywhere: parent_T_child = origin · translation(x, y, z).
+
+    Coordinates are ``name/x``, ``name/y`` and, anywhere, ``name/z`` [m].
+
+    Attributes
+    ----------
+    ranges
+        The limits of each.
+    """
+
+    ranges: tuple[tuple[float, float], ...]
+
+    def apply(self, model: ReadRecorder) -> Writes:
+        """Write the child frame and the limits."""
+        self.check_free(model)
+        names = [f"{self.name}/{axis}" for axis, _ in zip("xyz", self.ranges, strict=False)]
+        q = tuple(position(name) for name in names)
+        constraints: dict[str, Constraint] = {}
+        for name, coordinate, (low, high) in zip(names, q, self.ranges, strict=True):
+            constraints.update(Limits(low, high).on(name, coordinate))
+        home = tuple(0.5 * (low + high) for low, high in self.ranges)
+        place = translation(*q, *([0.0] * (3 - len(q))))
+        return Writes(
+            frames={self.child: (self.parent, (self.origin, place))},
+            constraints=constraints,
+            articulations={self.name: self.record(q, home, tuple(c.derivative() for c in q))},
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
+class FamilyJoint(Joint):
+    """A joint of a family of one's own: parent_T_child = origin · transform.
+
+    Its coordinate is ``name``; of several, each is called like the joint of the family, below the name.
+
+    Attributes
+    ----------
+    motion
+        The member of the family.
+    ranges
+        The limits of its joint values.
+    """
+
+    motion: FamilyMotion
+    ranges: tuple[tuple[float, float], ...]
+
+    def apply(self, model: ReadRecorder) -> Writes:
+        """Write the child frame and the limits."""
+        self.check_free(model)
+        names = family_coordinates(self.motion, self.name)
+        q = tuple(position(name) for name in names)
+        home = tuple(0.5 * (low + high) for low, high in self.ranges)
+        constraints: dict[str, Constraint] = {}
+        for name, coordinate, (low, high) in zip(names, q, self.ranges, strict=True):
+            constraints.update(Limits(low, high).on(name, coordinate))
+        return Writes(
+            frames={self.child: (self.parent, (self.origin, self.motion.expression(q)))},
+            constraints=constraints,
+            articulations={self.name: self.record(q, home, tuple(c.derivative() for c in q))},
+        )
+
+
+def family_coordinates(motion: FamilyMotion, name: str) -> tuple[str, ...]:
+    """Return the coordinates of a joint of a family of one's own, in the order of its joint values."""
+    symbols = list(motion.family.joints)
+    return (name,) if len(symbols) == 1 else tuple(f"{name}/{s}" for s in symbols)
+
+
+def joint_operation(
+    motion: FamilyMember, limits: Sequence[tuple[float, float]], name: str, parent: str, child: str
+) -> Operation:
+    """Return a member of a family as an operation, with limits for its joint values."""
+    names: dict[str, Any] = {"name": name, "parent": parent, "child": child}
+    if isinstance(motion, FamilyMotion):
+        return FamilyJoint(**names, motion=motion, ranges=tuple(limits))
+    if not isinstance(motion, GroupMotion):
+        raise TypeError(f"A {type(motion).__name__} is no joint.")
+    family = motion.name
+    if motion.rows == 3 and family in ("planar", "free"):
+        place = motion.left.copy()
+        place[:3, 3] += place[:3, :3] @ motion.right[:3, 3]
+        return SlidingPoint(**names, origin=rigid_pose(place), ranges=tuple(limits))
+    origin, mount = rigid_pose(motion.left), rigid_pose(motion.right)
+    whole = rigid_pose(motion.left @ motion.right)
+    # A direction of L in the child, where nothing turns.
+    x, y, z = (float(c) for c in motion.right[2, :3])
+    axis = x, y, z
+    if family == "rigid":
+        return Fixed(**names, origin=whole)
+    if family == "prismatic":
+        (low, high), *_ = limits
+        return Prismatic(**names, origin=whole, axis=axis, lower=low, upper=high)
+    if family == "revolute":
+        (low, high), *_ = limits
+        return MountedRevolute(**names, origin=origin, mount=mount, axis=_Z, lower=low, upper=high)
+    if family == "screw":
+        (low, high), *_ = limits
+        pitch = 2.0 * np.pi * motion.pitch
+        return MountedScrew(**names, origin=origin, mount=mount, axis=_Z, lower=low, upper=high, pitch=pitch)
+    if family == "cylindrical":
+        slide, turn = (Limits(low, high) for low, high in limits)
+        return MountedCylindrical(**names, origin=origin, mount=mount, axis=_Z, slide=slide, turn=turn)
+    if family == "spherical":
+        return MountedBall(**names, origin=origin, mount=mount)
+    if family == "planar":
+        most = max(max(-low, high) for low, high in limits[:2])
+        return Planar(**names, origin=whole, axis=axis, lower=-most, upper=most)
+    return Floating(**names, origin=whole)
+
+
+def rigid_pose(matrix: Stack) -> Pose:
+    """Return a pose whose rotation is one to the last digits, after all steps that made it."""
+    exact = matrix.copy()
+    exact[:3, :3] = mean_rotation(matrix[None, :3, :3])
+    return Pose.of(exact)

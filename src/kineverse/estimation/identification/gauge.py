@@ -1,0 +1,74 @@
+"""Gauge fixing of motion parameters."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from kineverse.lie import Stack, exp_so3, orthonormalize, rotation_along_z, transform
+
+from .families import VZ, WZ, GroupMotion
+from .motion_model import FamilyMember
+from .optimise import Solution
+
+
+def fix_gauge(solution: Solution[FamilyMember]) -> Solution[FamilyMember]:
+    """Return the same motion with the axis towards its largest component and joint values around 0.
+
+    The origin of the joint's frame is the point of the axis that is nearest to the child at 0; on a slider it
+    is the child's origin.
+    """
+    motion = solution.motion
+    if not isinstance(motion, GroupMotion):
+        return solution
+    name = motion.group.name
+    if name in ("rigid", "free", "spherical"):
+        return solution
+    values = np.concatenate([solution.values, solution.belief.mean[None]])
+    shift = solution.values.mean(axis=0)
+    if name == "planar":
+        shift[2:] = 0.0  # turns and slides do not commute
+    middle = np.zeros(6)
+    middle[list(motion.freedom.joints)] = shift
+    middle[VZ] += motion.pitch * middle[WZ]
+    # What goes on from an earlier solution multiplies rotations without end, and they drift.
+    left, right = orthonormalize(motion.left), orthonormalize(motion.right)
+    motion = replace(motion, left=left @ transform(exp_so3(middle[3:]), middle[:3]), right=right)
+    values = values - shift
+    motion = _origin(motion)
+    axis = motion.left[:3, 2]
+    flip = bool(axis[np.argmax(np.abs(axis))] < 0.0)
+    if motion.rows == 6:
+        motion, values = _axes(motion, values, flip)
+    elif flip:
+        motion, values = _gauged(motion, values, np.diag([1.0, -1.0, -1.0]))
+    belief = replace(solution.belief, mean=values[-1])
+    values = values[:-1]
+    return replace(solution, motion=motion, values=values, belief=belief, linear=motion.at(values))
+
+
+def _origin(motion: GroupMotion) -> GroupMotion:
+    """Move the joint's origin to the point nearest to the child that the family leaves open."""
+    place = motion.right[:3, 3]
+    free = (1, 1, 1) if motion.group.name == "prismatic" else (0, 0, 1)
+    way = place * free
+    to, back = np.eye(4), np.eye(4)
+    to[:3, 3], back[:3, 3] = way, -way
+    return replace(motion, left=motion.left @ to, right=back @ motion.right)
+
+
+def _axes(motion: GroupMotion, values: Stack, flip: bool) -> tuple[GroupMotion, Stack]:
+    """Turn the joint's frame about its axis to the one that only depends on the axis."""
+    wanted = rotation_along_z(-motion.left[:3, 2] if flip else motion.left[:3, 2])
+    return _gauged(motion, values, motion.left[:3, :3].T @ wanted)
+
+
+def _gauged(motion: GroupMotion, values: Stack, turn: Stack) -> tuple[GroupMotion, Stack]:
+    change = transform(turn, np.zeros(3))
+    joints = list(motion.freedom.joints)
+    twist = np.zeros((len(values), 6))
+    twist[:, joints] = values
+    twist[:, :3], twist[:, 3:] = twist[:, :3] @ turn, twist[:, 3:] @ turn
+    left, right = motion.left @ change, change.T @ motion.right
+    return replace(motion, left=left, right=right), twist[:, joints]

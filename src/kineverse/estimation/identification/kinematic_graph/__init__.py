@@ -1,0 +1,1 @@
+"""Kinematic graph of many parts (Sturm et al. 2011)."""

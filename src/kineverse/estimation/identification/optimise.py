@@ -1,0 +1,336 @@
+"""Levenberg-Marquardt with Schur complement over parameters, joint values and parent poses.
+
+With the true poses Â_k of the parent as unknowns too, the errors of an observation, in the axes of Â_k, are
+
+    e_A = (Â⁻¹A),      e_B = (Â⁻¹B) against H(θ, a)
+
+and to first order a step (ε, δθ, δa) leaves e_A - ε and e_B - M ε - J_θ δθ - J_a δa, where M carries ε over
+the lever between the parts. Eliminating ε leaves e_B - M e_A with the covariance S = Σ_B + M Σ_A Mᵀ;
+eliminating δa by its Schur complement leaves a system in θ alone. As Â_k is moved after every step, the
+linearisation is that at the estimate, and what is found is the maximum of the full likelihood, with all true
+poses as unknowns.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Generic, NamedTuple, Self, TypeVar
+
+import numpy as np
+
+from kineverse.estimation.linear_algebra import invert_matrices, multiply_vectors, sum_log_determinants
+from kineverse.lie import Stack, exp_so3, log_so3, skew, transform
+
+from .motion_model import FamilyMember, LinearisedPoses, MotionModel, ParameterPrior
+from .observations import Observations
+
+M = TypeVar("M", bound=MotionModel)
+M_co = TypeVar("M_co", bound=MotionModel, covariant=True)
+
+STEPS = 40
+# Of each of several starts, before the best of them goes on.
+FIRST_STEPS = 2
+# What one more step would reduce the cost by: a hundredth of a standard deviation is as near as widths are
+# known. Steps promise less by a factor each time, which is known after two of them.
+CLOSE = 1e-4
+_DIFFERENCE = 1e-5
+
+
+@dataclass(frozen=True)
+class JointValuePrior:
+    """What is believed of joint values beforehand: independent Gaussians.
+
+    Attributes
+    ----------
+    mean, precision
+        For each joint value, (k,).
+    marginal
+        Whether joint values are integrated out: the cost then has log |S + J_a P⁻¹ J_aᵀ| of each observation
+        too. Without, directions are preferred in which little is seen, as soon as the noise is as large as
+        the motion.
+    """
+
+    mean: Stack
+    precision: Stack
+    marginal: bool = False
+
+    @staticmethod
+    def vague(joints: int) -> JointValuePrior:
+        """Return the belief that keeps joint values finite where nothing tells them, and nothing else."""
+        return JointValuePrior(np.zeros(joints), np.full(joints, 1e-4))
+
+
+class InitialGuess(NamedTuple):
+    """A member of a family and joint values (N, k)."""
+
+    motion: FamilyMember
+    values: Stack
+
+
+@dataclass(frozen=True)
+class Solution(Generic[M_co]):
+    """What maximises the likelihood, and the quadratic around it.
+
+    Attributes
+    ----------
+    motion
+        The member of the family.
+    values
+        The joint values, (N, k).
+    cost
+        Twice the negative logarithm of likelihood and prior, without constants.
+    residuals
+        Of the child's pose in the parent, in the parent's axes, (N, m): what neither the motion nor the
+        parent's errors explain to first order, with covariance ``covariance``.
+    covariance
+        S, (N, m, m).
+    linear
+        Derivatives at the solution.
+    parent
+        The most likely true poses of the parent, (N, 4, 4).
+    belief
+        What was believed of joint values.
+    converged
+        Whether steps became small; else the best that was found.
+    """
+
+    motion: M_co
+    values: Stack
+    cost: float
+    residuals: Stack
+    covariance: Stack
+    linear: LinearisedPoses
+    parent: Stack
+    belief: JointValuePrior
+    converged: bool
+
+    def scaled(self, factor: float) -> Self:
+        """Return the solution for noise whose standard deviations are larger by a factor."""
+        return replace(self, covariance=factor**2 * self.covariance, cost=self.cost / factor**2)
+
+
+@dataclass(frozen=True)
+class _Point(Generic[M_co]):
+    """A place in the space of all unknowns, linearised."""
+
+    motion: M_co
+    values: Stack
+    parent: Stack
+    linear: LinearisedPoses
+    prior: ParameterPrior
+    own: Stack
+    residuals: Stack
+    lever: Stack
+    parent_covariance: Stack | None
+    weights: Stack
+    covariance: Stack
+    cost: float
+
+
+def levenberg_marquardt(
+    seen: Observations,
+    motion: M,
+    values: Stack,
+    parent: Stack | None = None,
+    belief: JointValuePrior | None = None,
+    steps: int = STEPS,
+) -> Solution[M]:
+    """Return the most likely member of a family, from a start.
+
+    Parameters
+    ----------
+    seen
+        What was observed.
+    motion, values
+        Where to start: a member, and joint values (N, k).
+    parent
+        True poses of the parent to start from, (N, 4, 4); those observed if None.
+    belief
+        What is believed of joint values; next to nothing if None.
+    steps
+        After so many the best so far is returned.
+    """
+    belief = belief or JointValuePrior.vague(motion.joints)
+    point = _point(seen, motion, values, seen.parent if parent is None else parent, belief)
+    damping, converged, before = 0.0, False, 0.0
+    for _ in range(steps):
+        reduced = _step(seen, point, damping, belief)
+        if reduced is None:
+            damping = max(10.0 * damping, 1e-6)
+            if damping > 1e8:
+                break
+            continue
+        trial, gain = reduced
+        if trial.cost <= point.cost + 1e-12 * abs(point.cost):
+            converged = gain < CLOSE or gain * gain < CLOSE * before
+            point, damping, before = trial, 0.1 * damping if damping > 1e-6 else 0.0, gain
+            if converged:
+                break
+        else:
+            if gain < CLOSE:
+                converged = True
+                break
+            damping = max(10.0 * damping, 1e-4)
+            if damping > 1e8:
+                break
+    return Solution(
+        point.motion,
+        point.values,
+        point.cost,
+        point.residuals,
+        point.covariance,
+        point.linear,
+        point.parent,
+        belief,
+        converged,
+    )
+
+
+def solve_from_best_start(seen: Observations, starts: Sequence[InitialGuess]) -> Solution[FamilyMember]:
+    """Return the most likely member of a family, from the best of several starts after few steps."""
+    if len(starts) == 1:
+        return levenberg_marquardt(seen, *starts[0])
+    begun = [levenberg_marquardt(seen, *start, steps=FIRST_STEPS) for start in starts]
+    best = min(begun, key=lambda solution: solution.cost)
+    return best if best.converged else levenberg_marquardt(seen, best.motion, best.values, best.parent)
+
+
+def _point(seen: Observations, motion: M, values: Stack, parent: Stack, belief: JointValuePrior) -> _Point[M]:
+    linear = motion.at(values)
+    prior = motion.prior()
+    rows = seen.rows
+    p_R_w = np.swapaxes(parent[:, :3, :3], 1, 2)
+    by_child = linear.pose[:, :3, :3]
+    offset = (p_R_w @ (seen.child[:, :3, 3] - parent[:, :3, 3])[:, :, None])[:, :, 0]
+    error = offset - linear.pose[:, :3, 3]
+    if rows == 6:
+        turned = log_so3(p_R_w @ seen.child[:, :3, :3] @ np.swapaxes(by_child, 1, 2))
+        error = np.concatenate([error, turned], axis=1)
+    covariance = _turned(seen.child_covariance, p_R_w)
+    cost = _squared(error, covariance)
+    own, of_parent = np.zeros((len(seen), 6)), None
+    lever = _lever(linear.pose[:, :3, 3], rows)
+    residuals = error
+    if seen.parent_covariance is not None:
+        moved = (p_R_w @ (seen.parent[:, :3, 3] - parent[:, :3, 3])[:, :, None])[:, :, 0]
+        own = np.concatenate([moved, log_so3(p_R_w @ seen.parent[:, :3, :3])], axis=1)
+        of_parent = _turned(seen.parent_covariance, p_R_w)
+        cost += _squared(own, of_parent)
+        residuals = error - multiply_vectors(lever, own)
+        covariance = covariance + lever @ of_parent @ np.swapaxes(lever, 1, 2)
+    weights = invert_matrices(covariance)
+    cost += float(prior.residuals @ prior.residuals)
+    cost += float(np.sum(belief.precision * (values - belief.mean) ** 2))
+    if belief.marginal:
+        cost += _spread(covariance, linear, belief)
+    return _Point(
+        motion, values, parent, linear, prior, own, residuals, lever, of_parent, weights, covariance, cost
+    )
+
+
+def _step(
+    seen: Observations, point: _Point[M], damping: float, belief: JointValuePrior
+) -> tuple[_Point[M], float] | None:
+    """Return where a step leads, and by how much it promises to reduce the cost; None if there is no step."""
+    by_parameters, by_joints = point.linear.by_parameters, point.linear.by_joints
+    projected = point.weights
+    moving = by_joints.shape[2] > 0
+    if moving:
+        pulled = belief.precision * (belief.mean - point.values)
+        weighted = np.swapaxes(by_joints, 1, 2) @ point.weights
+        curvature = weighted @ by_joints
+        diagonal = np.einsum("nii->ni", curvature)
+        diagonal += belief.precision + damping * diagonal
+        slope = multiply_vectors(weighted, point.residuals) + pulled
+        inverse = invert_matrices(curvature)
+        projected = point.weights - np.swapaxes(weighted, 1, 2) @ inverse @ weighted
+    rotated = np.swapaxes(by_parameters, 1, 2) @ projected
+    prior = point.prior
+    normal = np.einsum("nir,nrj->ij", rotated, by_parameters) + prior.by_parameters.T @ prior.by_parameters
+    right = np.einsum("nir,nr->i", rotated, point.residuals) - prior.by_parameters.T @ prior.residuals
+    if moving:
+        # What the prior of joint values adds, carried to the parameters.
+        pull = multiply_vectors(inverse, pulled)
+        right -= np.einsum("nrj,nrk,nk->j", by_parameters, np.swapaxes(weighted, 1, 2), pull)
+        if belief.marginal:
+            right -= 0.5 * _widening(point, inverse @ weighted, belief)
+    normal[np.diag_indices_from(normal)] *= 1.0 + damping
+    try:
+        step = np.linalg.solve(normal, right) if len(right) else right
+    except np.linalg.LinAlgError:
+        return None
+    gain = float(step @ right)
+    left = (by_parameters @ step) if len(step) else np.zeros_like(point.residuals)
+    values = point.values
+    if moving:
+        back = slope - multiply_vectors(weighted, left)
+        change = multiply_vectors(inverse, back)
+        gain += float(np.sum(slope * multiply_vectors(inverse, slope)))
+        left = left + multiply_vectors(by_joints, change)
+        values = point.motion.bounded(values, change)
+    parent = point.parent
+    if point.parent_covariance is not None:
+        rest = point.weights @ (point.residuals - left)[:, :, None]
+        blame = point.parent_covariance @ np.swapaxes(point.lever, 1, 2) @ rest
+        error = point.own + blame[:, :, 0]
+        parent = parent @ transform(exp_so3(error[:, 3:]), error[:, :3])
+        gain += float(np.sum(error**2 / np.einsum("nii->ni", point.parent_covariance)))
+    if not (np.isfinite(step).all() and np.isfinite(values).all() and np.isfinite(parent).all()):
+        return None
+    try:
+        trial = _point(seen, point.motion.moved(step), values, parent, belief)
+    except np.linalg.LinAlgError:  # so far away that the lever is all there is
+        return None
+    return (trial, gain) if np.isfinite(trial.cost) else None
+
+
+def _spread(covariance: Stack, linear: LinearisedPoses, belief: JointValuePrior) -> float:
+    """Return the sum of log |S + J_a P⁻¹ J_aᵀ|."""
+    by_joints = linear.by_joints
+    return sum_log_determinants(covariance + (by_joints / belief.precision) @ np.swapaxes(by_joints, 1, 2))
+
+
+def _widening(point: _Point[M], gains: Stack, belief: JointValuePrior) -> Stack:
+    """Return the derivatives of the spread by each parameter, with joint values following."""
+    size = point.motion.size
+    result = np.zeros(size)
+    before = _spread(point.covariance, point.linear, belief)
+    own = point.covariance - _carried(point.lever, point.parent_covariance)
+    for i in range(size):
+        step = np.zeros(size)
+        step[i] = _DIFFERENCE
+        values = point.values - _DIFFERENCE * multiply_vectors(gains, point.linear.by_parameters[:, :, i])
+        linear = point.motion.moved(step).at(values)
+        lever = _lever(linear.pose[:, :3, 3], point.residuals.shape[1])
+        covariance = own + _carried(lever, point.parent_covariance)
+        result[i] = (_spread(covariance, linear, belief) - before) / _DIFFERENCE
+    return result
+
+
+def _carried(lever: Stack, covariance: Stack | None) -> Stack | float:
+    """Return M Σ_A Mᵀ."""
+    return 0.0 if covariance is None else lever @ covariance @ np.swapaxes(lever, 1, 2)
+
+
+def _lever(offset: Stack, rows: int) -> Stack:
+    """Return M: how the child moves with an error of the parent."""
+    result = np.zeros((len(offset), rows, 6))
+    result[:, :, :rows] = np.eye(rows)
+    result[:, :3, 3:] = -skew(offset)
+    return result
+
+
+def _turned(covariance: Stack, rotation: Stack) -> Stack:
+    """Return covariances in other axes."""
+    turned = np.empty_like(covariance) if covariance.flags.writeable else np.empty(covariance.shape)
+    back = np.swapaxes(rotation, 1, 2)
+    for i in range(0, covariance.shape[1], 3):
+        for j in range(0, covariance.shape[2], 3):
+            turned[:, i : i + 3, j : j + 3] = rotation @ covariance[:, i : i + 3, j : j + 3] @ back
+    return turned
+
+
+def _squared(errors: Stack, covariance: Stack) -> float:
+    solved = np.linalg.solve(covariance, errors[:, :, None])
+    return float(np.sum(errors * solved[:, :, 0]))

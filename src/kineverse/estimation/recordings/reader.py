@@ -1,0 +1,294 @@
+"""Reader of pose tables (CSV and the like)."""
+
+from __future__ import annotations
+
+import csv
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from kineverse.errors import FormatError
+from kineverse.estimation.recordings.columns import SAYS, WITHOUT_NAMES, Columns, PartColumns, parse_columns
+from kineverse.estimation.recordings.recording import Indices, RecordedTrack, Recording
+from kineverse.formats.files import read_file
+from kineverse.formats.xml_values import LARGEST
+
+COMMENT = "#"
+
+
+@dataclass(frozen=True)
+class TextTable:
+    """The cells of a file.
+
+    Attributes
+    ----------
+    source
+        What the file is called in messages.
+    head
+        The names of the columns, None if the file begins with numbers.
+    lines
+        The number of each row's line, counted from 1.
+    cells
+        The texts of each row, as many in each.
+    """
+
+    source: str
+    head: tuple[str, ...] | None
+    lines: tuple[int, ...]
+    cells: tuple[tuple[str, ...], ...]
+
+
+def read_rows(path: Path) -> TextTable:
+    """Read a table whose cells are separated by commas, semicolons, tabs or spaces.
+
+    Empty lines are skipped, and those that begin with ``#``. The first other line is the head if a cell of it
+    is no number. It also tells the separator: a semicolon if it has one, else a comma, else a tab in a head,
+    else spaces.
+
+    Raises
+    ------
+    FormatError
+        If there is no such file, it is no text, it is empty, or a row has more or fewer cells than others.
+    """
+    source = str(path)
+    found = [
+        (line, text)
+        for line, text in enumerate(_text(path, source).splitlines(), start=1)
+        if text.strip() and not text.lstrip().startswith(COMMENT)
+    ]
+    if not found:
+        raise FormatError(f"{source}: the file is empty; a row for each pose is expected.")
+    separator = next((mark for mark in ";,\t" if mark in found[0][1]), None)
+    if separator == "\t" and all(map(spells_number, found[0][1].split())):
+        separator = None  # columns of numbers, aligned by tabs and spaces
+    first = _cells(found[0][1], separator)
+    has_head = not all(map(spells_number, filter(None, first)))
+    split = [(line, _cells(text, separator)) for line, text in found]
+    for line, cells in split:
+        if len(cells) != len(first):
+            raise FormatError(
+                f"{source}, line {line}: {_counted(len(cells))}, where line {found[0][0]} has {len(first)}."
+            )
+    body = split[1:] if has_head else split
+    if not body:
+        raise FormatError(f"{source}: there are names of columns, but no row below them.")
+    head = tuple(first) if has_head else None
+    return TextTable(source, head, tuple(line for line, _ in body), tuple(tuple(cells) for _, cells in body))
+
+
+def spells_number(text: str) -> bool:
+    """Return whether a text is a number, NaN and infinities included."""
+    # Python also reads digits grouped by underscores.
+    if "_" in text:
+        return False
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True
+
+
+def _text(path: Path, source: str) -> str:
+    data = read_file(path)
+    if b"\0" in data:
+        raise FormatError(f"{source}: this is no text, or not in UTF-8; poses are read from a table in text.")
+    try:
+        return data.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        line = data.count(b"\n", 0, error.start) + 1
+        raise FormatError(
+            f"{source}, line {line}: this is no text in UTF-8; poses are read from a table in text."
+        ) from None
+
+
+def _cells(text: str, separator: str | None) -> list[str]:
+    if separator is None:
+        return text.split()
+    return [cell.strip() for cell in next(csv.reader([text], delimiter=separator, skipinitialspace=True))]
+
+
+def _counted(count: int) -> str:
+    return f"{count} cell{'' if count == 1 else 's'}"
+
+
+Array = npt.NDArray[np.float64]
+
+OFF_UNIT = 0.01
+"""How far the length of a quaternion may be from one, so that two digits are enough."""
+
+
+def read_recording(path: str | os.PathLike[str], columns: str | Sequence[str] | None = None) -> Recording:
+    """Read a table of poses.
+
+    A head names the columns: ``time``, ``part``, ``x``, ``y``, ``z``, and an orientation, a quaternion
+    ``qx``, ``qy``, ``qz``, ``qw``, or ``roll``, ``pitch``, ``yaw`` about fixed axes, or a rotation vector
+    ``rx``, ``ry``, ``rz``; in [m], [rad] and [s] unless a unit follows as in ``x [mm]``. There is a part in
+    each row, or all of them, and then columns are called ``door.x``. Empty cells mean that a part was not
+    seen. Without a head, three columns are positions and seven are positions and quaternions.
+
+    Parameters
+    ----------
+    path
+        Text with cells separated by commas, semicolons, tabs or spaces; ``#`` begins a comment.
+    columns
+        What the columns are, in place of the head or where there is none; ``-`` leaves one out. Names, or a
+        text of names with commas between them.
+
+    Raises
+    ------
+    FormatError
+        If it cannot be read so, or has a number that cannot be: NaN, a quaternion that is not of unit length,
+        a time that is not later than the one before it. The message names the line.
+    """
+    table = read_rows(Path(path))
+    named = columns.split(",") if isinstance(columns, str) else columns
+    given = _columns(table, None if named is None else [name.strip() for name in named])
+    tracks = {
+        part or name: _track(table, given, where, rows)
+        for part, where in given.parts.items()
+        for name, rows in _rows_by_part(table, given, where).items()
+    }
+    empty = [name for name, track in tracks.items() if not len(track)]
+    if len(empty) == len(tracks):
+        raise FormatError(f"{table.source}: nothing was seen in any row.")
+    return Recording(table.source, {k: t for k, t in tracks.items() if len(t)}, given.ignored)
+
+
+def _columns(table: TextTable, named: Sequence[str] | None) -> Columns:
+    count = len(table.cells[0])
+    if named is not None:
+        if len(named) != count:
+            raise FormatError(
+                f"{table.source} has {count} columns, and {len(named)} names were given for them: "
+                f"{','.join(named)}. A column that is not wanted is called '-'."
+            )
+        return parse_columns(named, "The names of the columns")
+    if table.head is not None:
+        return parse_columns(table.head, f"{table.source}, line 1" if table.lines[0] == 2 else table.source)
+    if count not in WITHOUT_NAMES:
+        raise FormatError(
+            f"{table.source}: {count} columns without names. 3 are taken for {WITHOUT_NAMES[3]} and 7 for "
+            f"{WITHOUT_NAMES[7]}; otherwise say what they are (--columns). {SAYS}"
+        )
+    return parse_columns(WITHOUT_NAMES[count].split(","), table.source)
+
+
+def _rows_by_part(table: TextTable, columns: Columns, where: PartColumns) -> dict[str, Indices]:
+    """Return the rows in which something was seen, by the name of the part in the row."""
+    seen: dict[str, list[int]] = {}
+    for row, cells in enumerate(table.cells):
+        name = cells[columns.part] if columns.part is not None else ""
+        if columns.part is not None and not name:
+            raise FormatError(f"{table.source}, line {table.lines[row]}: the name of the part is missing.")
+        filled = [bool(cells[k]) for k in (*where.position, *where.orientation)]
+        if any(filled) and not all(filled):
+            lacking = [k for k in (*where.position, *where.orientation) if not cells[k]]
+            raise FormatError(
+                f"{table.source}, line {table.lines[row]}: {columns.names[lacking[0]]} is missing; all "
+                "cells of a part that was not seen are left empty."
+            )
+        rows = seen.setdefault(name, [])
+        if all(filled):
+            rows.append(row)
+    return {name: np.array(rows, dtype=np.intp) for name, rows in seen.items()}
+
+
+def _track(table: TextTable, columns: Columns, where: PartColumns, rows: Indices) -> RecordedTrack:
+    lines = np.array(table.lines, dtype=np.intp)[rows]
+    poses = _numbers(table, columns, where.position, rows)
+    if where.form:
+        whole = np.tile(np.eye(4), (len(rows), 1, 1))
+        whole[:, :3, :3] = _rotations(table, columns, where, rows)
+        whole[:, :3, 3] = poses
+        poses = whole
+    times = None
+    if columns.time is not None:
+        times = _numbers(table, columns, (columns.time,), rows)[:, 0]
+        _check_order(table, times, lines)
+    return RecordedTrack(poses, rows, lines, times)
+
+
+def _numbers(table: TextTable, columns: Columns, places: Sequence[int], rows: Indices) -> Array:
+    """Return the cells of some columns as numbers, (N, len(places))."""
+    texts = [[table.cells[row][k] for k in places] for row in rows]
+    try:
+        numbers = np.array(texts, dtype=np.float64).reshape(len(rows), len(places))
+        good = np.abs(numbers) <= LARGEST  # NaN is not
+        good &= np.array(["_" not in text for row in texts for text in row], dtype=bool).reshape(good.shape)
+    except ValueError:
+        good = np.array([[spells_number(text) for text in row] for row in texts])
+    if not good.all():
+        row, k = np.argwhere(~good)[0]
+        text, name = texts[row][k], columns.names[places[k]]
+        hint = " A decimal point is expected." if "," in text else ""
+        hint = " Leave all cells of a part empty that was not seen." if text.lower() == "nan" else hint
+        raise FormatError(
+            f"{table.source}, line {table.lines[rows[row]]}: {name} is '{text[:40]}', which is no finite "
+            f"number.{hint}"
+        )
+    scaled: Array = numbers * np.array([columns.factors.get(k, 1.0) for k in places])
+    return scaled
+
+
+def _rotations(table: TextTable, columns: Columns, where: PartColumns, rows: Indices) -> Array:
+    """Return (N, 3, 3)."""
+    numbers = _numbers(table, columns, where.orientation, rows)
+    if where.form == "quaternion":
+        lengths = np.linalg.norm(numbers, axis=1)
+        off = np.abs(lengths - 1.0)
+        if off.size and off.max() > OFF_UNIT:
+            worst = int(np.argmax(off > OFF_UNIT))
+            raise FormatError(
+                f"{table.source}, line {table.lines[rows[worst]]}: the quaternion has the length "
+                f"{lengths[worst]:.4g}, which is off by {off[worst]:.2g}; {int((off > OFF_UNIT).sum())} of "
+                f"{len(off)} are not of unit length."
+            )
+        return _rotations_from_quaternions(numbers / lengths[:, None])
+    if where.form == "rpy":
+        roll, pitch, yaw = (_axis_rotations(axis, numbers[:, axis]) for axis in range(3))
+        return np.asarray(yaw @ pitch @ roll)
+    angles = np.linalg.norm(numbers, axis=1)
+    half = 0.5 * angles
+    # sin(φ/2)/φ, which is 1/2 where nothing turns.
+    scale = 0.5 * np.sinc(half / np.pi)
+    return _rotations_from_quaternions(np.column_stack([numbers * scale[:, None], np.cos(half)]))
+
+
+def _rotations_from_quaternions(q: Array) -> Array:
+    x, y, z, w = q.T
+    return np.stack(
+        [
+            np.stack([1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)], axis=-1),
+            np.stack([2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)], axis=-1),
+            np.stack([2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)], axis=-1),
+        ],
+        axis=-2,
+    )
+
+
+def _axis_rotations(axis: int, angles: Array) -> Array:
+    """Return the rotations about x, y or z, (N, 3, 3)."""
+    after, last = (axis + 1) % 3, (axis + 2) % 3
+    turned = np.zeros((len(angles), 3, 3))
+    turned[:, axis, axis] = 1.0
+    turned[:, after, after] = turned[:, last, last] = np.cos(angles)
+    turned[:, last, after] = np.sin(angles)
+    turned[:, after, last] = -np.sin(angles)
+    return turned
+
+
+def _check_order(table: TextTable, times: Array, lines: Indices) -> None:
+    """Look whether each time is later than the one before it."""
+    wrong = np.flatnonzero(np.diff(times) <= 0.0)
+    if not wrong.size:
+        return
+    k = int(wrong[0])
+    how = "the same time as" if times[k + 1] == times[k] else "earlier than"
+    raise FormatError(
+        f"{table.source}, line {lines[k + 1]}: {times[k + 1]:.10g} s is {how} line {lines[k]} of the same "
+        f"part ({times[k]:.10g} s). Rows are expected in the order of their times."
+    )

@@ -1,0 +1,153 @@
+"""Cramér-Rao bound of joint parameters, by finite differences of the observations.
+
+Unknown are the axis, the child's pose at zero, and for each observation the joint value and the parent's
+true pose. Seen are both poses, twelve numbers with independent errors. Their derivatives by all unknowns give
+the Fisher information; joint values and parents' poses are eliminated one observation at a time. Nothing here
+comes from the estimator.
+
+A motion that is short beside the noise is not known so well by anyone. What tells the axis is the spread s²
+of the joint values, and these are known themselves with a variance c² only; of the spread s⁴/(s² + c²) is
+left, as in any regression with errors in both variables. :func:`compute_attainable_bound` is the bound with the joint
+values drawn together by that. For a slider with equal noise all around it is exactly that of joint values
+drawn from a Gaussian; as N grows the maximum of the likelihood reaches it, and not the other one.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import numpy.typing as npt
+
+from kineverse.experiments.estimation_grid.samples import Cell, JointSamples, joint_motions
+from kineverse.lie import exp_so3
+
+Array = npt.NDArray[np.float64]
+
+STEP = 1e-5
+"""Of the central differences [m], [rad]: their error is its square."""
+
+UNKNOWNS_PER_OBSERVATION = 7
+"""Unknowns of an observation: the parent's pose, and the joint value, last."""
+
+
+@dataclass(frozen=True, eq=False)
+class Bound:
+    """The least covariances of what is estimated of each sample.
+
+    Attributes
+    ----------
+    direction
+        Of the axis' direction, in two directions across it, (S, 2, 2) [rad²].
+    point
+        Of the place of the axis across it, at the middle of the child's way, (S, 2, 2) [m²]; NaN for sliders.
+    """
+
+    direction: Array
+    point: Array
+
+    @property
+    def degrees(self) -> Array:
+        """The least root mean square of the angle between the true axis and an estimate, (S,) [deg]."""
+        return np.asarray(np.degrees(np.sqrt(np.trace(self.direction, axis1=1, axis2=2))))
+
+    @property
+    def metres(self) -> Array:
+        """The least root mean square of the distance of the axes, (S,) [m]; NaN for sliders."""
+        return np.asarray(np.sqrt(np.trace(self.point, axis1=1, axis2=2)))
+
+
+def compute_bound(samples: JointSamples) -> Bound:
+    """Return the Cramér-Rao bound of samples."""
+    cell = samples.cell
+    shared = 8 if cell.joint == "prismatic" else 10
+    weighed = _derivatives(samples, shared, range(shared + UNKNOWNS_PER_OBSERVATION))
+    # The joint's zero is a matter of choice: without a loss the first joint value is taken as known.
+    weighed[:, 0, :, -1] = 0.0
+    of_shared, of_own = weighed[..., :shared], weighed[..., shared:]
+    information = _transpose(of_shared) @ of_shared
+    mixed = _transpose(of_own) @ of_shared
+    own = _transpose(of_own) @ of_own
+    own[:, 0, -1, -1] = 1.0
+    left = (information - _transpose(mixed) @ np.linalg.solve(own, mixed)).sum(axis=1)
+    covariance = np.linalg.inv(left)
+    nowhere = np.full((len(covariance), 2, 2), math.nan)
+    return Bound(covariance[:, :2, :2], covariance[:, 2:4, 2:4] if cell.joint == "revolute" else nowhere)
+
+
+def compute_attainable_bound(samples: JointSamples) -> Bound:
+    """Return the bound with joint values as near to each other as they can be told apart, see the module."""
+    shared = 8 if samples.cell.joint == "prismatic" else 10
+    own = _derivatives(samples, shared, range(shared, shared + UNKNOWNS_PER_OBSERVATION))
+    variance = np.linalg.inv(_transpose(own) @ own)[..., -1, -1]
+    values = samples.joint_values
+    middle, spread = values.mean(axis=1, keepdims=True), values.var(axis=1, keepdims=True)
+    left = np.sqrt(spread / (spread + variance))
+    return compute_bound(replace(samples, joint_values=middle + left * (values - middle)))
+
+
+def orthonormal_complement(axis: Array) -> Array:
+    """Return two directions across each axis (S, 3), and each other, (S, 3, 2)."""
+    least = np.eye(3)[np.argmin(np.abs(axis), axis=1)]
+    first = np.cross(axis, least)
+    first /= np.linalg.norm(first, axis=1, keepdims=True)
+    return np.stack([first, np.cross(axis, first)], axis=-1)
+
+
+def _derivatives(samples: JointSamples, shared: int, unknowns: Sequence[int]) -> Array:
+    """Return the derivatives of what is seen by some unknowns, in standard deviations: (S, N, 12, n)."""
+    found = np.stack([_difference(samples, shared, k) for k in unknowns], axis=-1)
+    weighed: Array = found / _deviations(samples.cell)[:, None]
+    return weighed
+
+
+def _difference(samples: JointSamples, shared: int, k: int) -> Array:
+    """Return the derivatives of what is seen by the unknown k, (S, N, 12)."""
+    there, back = (_observation_errors(samples, shared, k, sign * STEP) for sign in (1.0, -1.0))
+    found: Array = (there - back) / (2.0 * STEP)
+    return found
+
+
+def _observation_errors(samples: JointSamples, shared: int, k: int, step: float) -> Array:
+    """Return how far both poses are from the true ones if the unknown k is off by a step, (S, N, 12)."""
+    change = np.zeros(shared + UNKNOWNS_PER_OBSERVATION)
+    change[k] = step
+    sides = orthonormal_complement(samples.axis)
+    axis = samples.axis + sides @ change[:2]
+    axis /= np.linalg.norm(axis, axis=1, keepdims=True)
+    point = samples.point + (sides @ change[2:4] if shared == 10 else 0.0)
+    zero = _perturb_poses(samples.zero, change[shared - 6 : shared])
+    parents = _perturb_poses(samples.parents, change[shared : shared + 6])
+    joint = samples.cell.joint
+    children = parents @ joint_motions(joint, axis, point, samples.joint_values + change[-1]) @ zero[:, None]
+    truth = joint_motions(joint, samples.axis, samples.point, samples.joint_values) @ samples.zero[:, None]
+    return np.concatenate(
+        [_pose_errors(parents, samples.parents), _pose_errors(children, samples.parents @ truth)], axis=-1
+    )
+
+
+def _perturb_poses(poses: Array, change: Array) -> Array:
+    moved = poses.copy()
+    moved[..., :3, 3] += change[:3]
+    moved[..., :3, :3] = exp_so3(change[3:]) @ moved[..., :3, :3]
+    return moved
+
+
+def _pose_errors(poses: Array, others: Array) -> Array:
+    """Return by what small errors poses are off others, (..., 6) [m], [rad]."""
+    turned = poses[..., :3, :3] @ _transpose(others[..., :3, :3])
+    # Of a small rotation; its third order does not matter to a derivative.
+    angles = 0.5 * np.stack(
+        [turned[..., k - 1, k - 2] - turned[..., k - 2, k - 1] for k in range(3)], axis=-1
+    )
+    return np.concatenate([poses[..., :3, 3] - others[..., :3, 3], angles], axis=-1)
+
+
+def _deviations(cell: Cell) -> Array:
+    return np.array(([cell.position] * 3 + [cell.orientation] * 3) * 2)
+
+
+def _transpose(matrices: Array) -> Array:
+    return np.swapaxes(matrices, -1, -2)

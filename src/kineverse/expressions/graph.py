@@ -1,0 +1,189 @@
+"""Traversal of expression graphs: leaves, lowering to CasADi, structural hash, pickling.
+
+Both use CasADi's own serialisation, which is exact to the last bit. It is for pickling between like versions
+only, documents have their own form.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from typing import TYPE_CHECKING, Any
+
+import casadi as ca
+
+from . import layout
+from .expression import NODES, SYMBOLS, Expression, from_casadi
+from .layout import SX, ArrayShape
+
+if TYPE_CHECKING:
+    from kineverse.symbols import Symbol
+
+    from .node import Node
+
+
+def leaves(expression: Expression) -> tuple[tuple[Symbol, ...], tuple[Node, ...]]:
+    """Return the symbols and the nodes that occur in the graph itself, each in canonical order."""
+    if expression._leaves is None:
+        if expression._sx.is_constant():
+            expression._leaves = (), ()
+            return expression._leaves
+        symbols: list[Symbol] = []
+        nodes: set[Node] = set()
+        for element in ca.symvar(expression._sx):
+            name = element.element_hash()
+            symbol = SYMBOLS.get(name)
+            if symbol is not None:
+                symbols.append(symbol)
+            else:
+                nodes.add(NODES[name])
+        symbols.sort(key=lambda s: s.sort_key)
+        expression._leaves = tuple(symbols), tuple(sorted(nodes, key=lambda n: n.key))
+    return expression._leaves
+
+
+def free_symbols(expression: Expression) -> tuple[Symbol, ...]:
+    """Return the symbols that the value depends on, looking into nodes; sorted."""
+    symbols, nodes = leaves(expression)
+    if not nodes:
+        return symbols
+    found = set(symbols).union(*(node.symbols for node in nodes))
+    return tuple(sorted(found, key=lambda s: s.sort_key))
+
+
+def node_symbols(node: Node) -> frozenset[Symbol]:
+    """Return the symbols that the value of a node depends on, looking into nodes."""
+    found: set[Symbol] = set()
+    for inner in topological_order((node,), lambda n: (n.value,), lambda n: n._symbols is not None):
+        found.update(leaves(inner.value)[0])
+        for leaf in leaves(inner.value)[1]:
+            found.update(leaf._symbols or ())
+    return frozenset(found)
+
+
+def gradient_keys(expression: Expression, heuristic: bool = True) -> frozenset[Symbol]:
+    """Return the keys that D(e) can have, without differentiating anything."""
+    symbols, nodes = leaves(expression)
+    keys = {s.derivative() for s in symbols if s.has_derivative}
+    for node in topological_order(
+        nodes, lambda n: n.differentiated(heuristic), lambda n: heuristic in n._keys
+    ):
+        node._keys[heuristic] = node.gradient_keys(heuristic)
+    return frozenset(keys.union(*(node._keys[heuristic] for node in nodes)))
+
+
+def topological_order(
+    nodes: Iterable[Node],
+    parts: Callable[[Node], Iterable[Expression]],
+    done: Callable[[Node], bool],
+) -> Iterator[Node]:
+    """Yield the nodes, and before each of them those in its ``parts``, none twice and none that is ``done``.
+
+    What is defined by recursion over nodes is computed along this order instead: a minimum over a thousand
+    distances is a thousand nodes deep, and a node that occurs twice is not worth twice the work.
+    """
+    seen: set[Node] = set()
+    stack: list[tuple[Node, bool]] = [(node, False) for node in nodes]
+    while stack:
+        node, complete = stack.pop()
+        if complete:
+            yield node
+        elif node not in seen and not done(node):
+            seen.add(node)
+            stack.append((node, True))
+            stack.extend((inner, False) for part in parts(node) for inner in leaves(part)[1])
+
+
+def expand_nodes(expression: Expression) -> SX:
+    """Return the ``SX`` with every node replaced by its value."""
+    if not expression._nodes:
+        return expression._sx
+    if expression._lowered is None:
+        for node in topological_order(leaves(expression)[1], lambda n: (n.value,), _is_lowered):
+            _lower(node.value)
+        _lower(expression)
+    return expression._lowered
+
+
+def _is_lowered(node: Node) -> bool:
+    return not node.value._nodes or node.value._lowered is not None
+
+
+def _lower(expression: Expression) -> None:
+    _, nodes = leaves(expression)
+    if nodes:
+        values = [ca.densify(expand_nodes(n.value)) for n in nodes]
+        (expression._lowered,) = ca.substitute([expression._sx], [n.sx for n in nodes], values)
+    else:
+        expression._lowered = expression._sx
+
+
+def dense_column(expression: Expression) -> SX:
+    """Return an expression as one dense column of its elements in C order."""
+    return ca.densify(layout.column(expand_nodes(expression), expression.shape))
+
+
+def lower(expressions: Sequence[Expression]) -> list[SX]:
+    """Return each expression as one dense column of its elements in C order, common parts shared."""
+    columns = [dense_column(e) for e in expressions]
+    if not columns:
+        return []
+    return [ca.densify(c) for c in ca.vertsplit(ca.cse(ca.vertcat(*columns)), _offsets(columns))]
+
+
+def _offsets(columns: list[SX]) -> list[int]:
+    offsets = [0]
+    for column in columns:
+        offsets.append(offsets[-1] + column.numel())
+    return offsets
+
+
+_STOREY = 16
+
+
+def structural_hash(expression: Expression) -> bytes:
+    """Return a digest of shape, leaves and graph; equal for equal structure, in every process."""
+    if expression._key is None:
+        symbols, nodes = leaves(expression)
+        digest = hashlib.blake2b(
+            repr((expression._shape, [s.sort_key for s in symbols])).encode(), digest_size=16
+        )
+        for node in nodes:
+            digest.update(node.key)
+        sx = expression._sx
+        if not sx.is_dense():
+            sx = ca.densify(sx)
+        if not sx.is_constant() and not sx.is_symbolic():
+            sx = ca.cse(sx)  # whether equal parts are shared is no difference
+        digest.update(sx.serialize().encode())
+        expression._key = digest.digest()
+    return expression._key
+
+
+def pack(expression: Expression) -> tuple[Any, ...]:
+    """Return what :func:`unpack` needs, all of it picklable."""
+    symbols, nodes = leaves(expression)
+    function = _casadi_function(expression._sx, [*(s._sx for s in symbols), *(n.sx for n in nodes)])
+    return _pickling_order(nodes), symbols, nodes, expression._shape, function.serialize()
+
+
+def _pickling_order(nodes: tuple[Node, ...]) -> tuple[Node, ...]:
+    """Return nodes on the way down, lowest first: pickled in this order, none of them is deep any more."""
+    if all(node.depth <= _STOREY for node in nodes):
+        return ()
+    below = topological_order(nodes, lambda n: n.arguments, lambda n: False)
+    return tuple(node for node in below if node.depth % _STOREY == 0)
+
+
+def unpack(
+    _: tuple[Any, ...], symbols: tuple[Any, ...], nodes: tuple[Any, ...], shape: ArrayShape, graph: str
+) -> Expression:
+    """Rebuild an expression from :func:`pack`."""
+    leaf = [*(s._sx for s in symbols), *(n.sx for n in nodes)]
+    sx = ca.Function.deserialize(graph)(ca.vertcat(*map(ca.vec, leaf)) if leaf else ca.SX(0, 1))
+    return from_casadi(sx, tuple(shape), frozenset(nodes))
+
+
+def _casadi_function(sx: SX, leaf: list[SX]) -> Any:
+    stacked = ca.vertcat(*map(ca.vec, leaf)) if leaf else ca.SX(0, 1)
+    return ca.Function("e", [stacked], [sx])

@@ -1,0 +1,167 @@
+"""Canonical JSON text of a document, its hash, and its binary form (msgpack).
+
+A document is written in one way only. Its hash is SHA-256 over that text, in UTF-8, without the hash itself
+and without line breaks. Who lays the JSON out anew does not change what it says: then the hash is made of
+what was read. The order of names (of frames in what an operation writes, say) is part of the content.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from typing import Any
+
+from kineverse._extras import install_command
+from kineverse.errors import MissingDependencyError
+from kineverse.model.operation import KINDS
+
+from .budget import MAX_LISTS
+from .schema import InvalidDocumentError
+
+HASH = "sha256"
+_LEAD, _TAIL = f',\n"{HASH}":"', '"}\n'
+_DIGITS = 64
+
+# The members that the format names, in the order in which they are written, whichever object they are in.
+_ORDER = (
+    *("format", "version", "nodes", "operations"),
+    *("tag", "kind", "parameters", "reads", "existence", "value", "listing", "questions", "writes"),
+    *("trace", "frozen", *KINDS, "record", "fields"),
+    *("parent", "child", "factors", "coordinates", "home", "speeds", "dynamics", "follows"),
+    *("visuals", "collisions", "inertia", "mass", "tensor", "geometry", "origin", "name", "color", "texture"),
+    *("size", "radius", "length", "radii", "uri", "scale", "folder"),
+)
+_RANK = {name: i for i, name in enumerate(_ORDER)}
+# Their members are names that somebody gave.
+_NAMED = frozenset(("parameters", "fields", *KINDS))
+_WITHOUT_OBJECTS = frozenset(("nodes", "factors"))
+
+dump_json = json.JSONEncoder(ensure_ascii=False, allow_nan=False, separators=(",", ":")).encode
+
+
+def append_hash(body: str) -> str:
+    """Return the text of a document, given all of it but the hash and the closing brace."""
+    return f"{body}{_LEAD}{_digest(body.encode())}{_TAIL}"
+
+
+def read_hash(text: str) -> str:
+    """Return the hash that stands in a text that was written here."""
+    return text[-len(_TAIL) - _DIGITS : -len(_TAIL)]
+
+
+def check_hash(claim: Any, content: bytes, given: dict[str, Any]) -> None:
+    """Check the hash of a document.
+
+    Parameters
+    ----------
+    claim
+        What stands in the document.
+    content
+        All of its text, or nothing if it was none.
+    given
+        What was read from it, an object.
+
+    Raises
+    ------
+    RefusedError
+        If its content is not what it was when the hash was made.
+    """
+    if type(claim) is not str or len(claim) != _DIGITS or set(claim) - set("0123456789abcdef"):
+        raise InvalidDocumentError(f"{HASH!r} is {_DIGITS} digits from 0 to f")
+    end = f"{_LEAD}{claim}{_TAIL}".encode()
+    if content.endswith(end) and _digest(content[: -len(end)]) == claim:
+        return
+    rest = {key: value for key, value in given.items() if key != HASH}
+    try:
+        same = claim in (_digest_of(rest), _digest_of(_order_members(rest)))
+    except (TypeError, ValueError):
+        raise InvalidDocumentError("it contains what JSON has no place for") from None
+    if not same:
+        raise InvalidDocumentError(
+            f"its content is not what {HASH!r} says; it was changed or damaged since it was written. Get it "
+            f"anew, or, if the change is meant, delete the member {HASH!r}: it comes again when the model "
+            "is saved, for instance by 'kineverse convert'"
+        )
+
+
+def _digest(body: bytes) -> str:
+    digest = hashlib.sha256(body.replace(b"\n", b""))
+    digest.update(b"}")
+    return digest.hexdigest()
+
+
+def _digest_of(tree: Any) -> str:
+    return hashlib.sha256(dump_json(tree).encode("utf-8", "surrogatepass")).hexdigest()
+
+
+def _order_members(value: Any) -> Any:
+    """Return a value of JSON with the members that the format names in the order of the writer."""
+    if type(value) is list:
+        return [_order_members(item) for item in value]
+    if type(value) is not dict:
+        return value
+    result = {}
+    for key in sorted(value, key=lambda key: _RANK.get(key, len(_RANK))):
+        if key in _NAMED:
+            result[key] = _order_named(value[key])
+        else:
+            result[key] = value[key] if key in _WITHOUT_OBJECTS else _order_members(value[key])
+    return result
+
+
+def _order_named(value: Any) -> Any:
+    return {key: _order_members(item) for key, item in value.items()} if type(value) is dict else value
+
+
+# The first bytes of lists and maps; they also occur inside of numbers and texts, so this counts too many.
+_LISTS = bytes((*range(0x80, 0xA0), 0xDC, 0xDD, 0xDE, 0xDF))
+
+
+def pack_document(text: str) -> bytes:
+    """Return the text of a document as msgpack.
+
+    Raises
+    ------
+    MissingDependencyError
+        If the package for it is not installed.
+    """
+    data: bytes = _msgpack().encode(json.loads(text))
+    return data
+
+
+def unpack_document(data: bytes) -> Any:
+    """Return the tree of a packed document.
+
+    Raises
+    ------
+    RefusedError
+        If it is no msgpack, has too many parts, or is not packed as it should be.
+    MissingDependencyError
+        If the package for it is not installed.
+    """
+    msgpack = _msgpack()
+    if len(data) - len(data.translate(None, _LISTS)) > MAX_LISTS:
+        raise InvalidDocumentError(
+            f"it may have more than {MAX_LISTS:,} lists and maps, the most a document has"
+        )
+    try:
+        tree = msgpack.decode(data)
+    except (ValueError, OverflowError) as error:
+        raise InvalidDocumentError(f"it is not msgpack: {error}") from None
+    # A key that occurs twice is lost when it is read, so there is less then.
+    if not isinstance(tree, dict) or msgpack.encode(tree) != data:
+        raise InvalidDocumentError(
+            "it is no map, or has a key twice, or numbers and lengths are not in their shortest form, or "
+            "numbers that are not whole have less than 64 bits"
+        )
+    return tree
+
+
+def _msgpack() -> Any:
+    try:
+        import msgspec.msgpack
+    except ImportError as error:
+        raise MissingDependencyError(
+            f"Documents as msgpack need msgspec: {install_command('exchange')}"
+        ) from error
+    return msgspec.msgpack

@@ -1,0 +1,196 @@
+"""Expressions of a document by their place in its node table."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from typing import Any
+
+import casadi as ca
+
+from kineverse.expressions import layout
+from kineverse.expressions.expression import NO_NODES, Expression, from_casadi
+from kineverse.expressions.node import Node
+from kineverse.model.rate_nodes import Composed
+from kineverse.symbols import Symbol
+
+from .budget import (
+    COST_OF_ELEMENT,
+    COST_OF_NODE_BELOW,
+    COST_OF_SCALAR,
+    MAX_COMPOSITIONS,
+    MAX_DIMENSIONS,
+    MAX_ELEMENTS,
+    MAX_LENGTH,
+    MAX_NESTING,
+    Budget,
+)
+from .schema import InvalidDocumentError, check_integer, check_length, check_list, describe_value
+
+
+class NodeGraph:
+    """The expressions of a document, by their place in its table.
+
+    Parameters
+    ----------
+    prefix
+        Put in front of the paths of all symbols, with a slash.
+
+    Attributes
+    ----------
+    sx, shapes, depths
+        Of every node: its graph, its shape, and how many nodes with a gradient of their own are inside one
+        another there.
+    has_answers
+        Whether there are ``read`` nodes, which belong into traces.
+    budget
+        What all of them may cost.
+    work
+        What implicit functions cost when they are written out, by their key.
+    """
+
+    def __init__(self, prefix: str | None) -> None:
+        self.before = f"{prefix}/" if prefix else ""
+        self.has_answers = False
+        self.budget = Budget()
+        self.work: dict[bytes, int] = {}
+        self.sx: list[Any] = []
+        self.shapes: list[layout.ArrayShape] = []
+        self.depths: list[int] = []
+        self._expressions: list[Expression | None] = []
+        self._owners: dict[int, Node] = {}
+        self._below: dict[Node, int] = {}
+        self._compositions: dict[Node, int] = {}
+
+    # -- what is there -------------------------------------------------------------------------------------
+
+    def expression(self, ref: Any) -> Expression:
+        """Return the expression at a place of the table."""
+        place = self.at(ref)
+        known = self._expressions[place]
+        if known is None:
+            sx, nodes = self.sx[place], NO_NODES
+            # Whoever asks for its symbols, or compares it, follows all of it.
+            self.budget.spend(ca.n_nodes(sx))
+            if self.depths[place]:
+                owners = self._owners
+                found = (owners.get(e.element_hash()) for e in ca.symvar(sx))
+                nodes = frozenset(node for node in found if node is not None)
+                self.budget.spend(COST_OF_NODE_BELOW * self._count(nodes))
+            known = self._expressions[place] = from_casadi(sx, self.shapes[place], nodes)
+        return known
+
+    def scalar(self, ref: Any) -> Expression:
+        """Return the scalar at a place of the table."""
+        return self.expression(self.scalar_at(ref))
+
+    def symbol(self, ref: Any, least: int = 0) -> Symbol:
+        """Return the symbol at a place of the table, of order ``least`` or more."""
+        found = self._expressions[self.at(ref)]
+        if not isinstance(found, Symbol) or found.order < least:
+            what = "the derivative of a symbol" if least else "a symbol"
+            raise InvalidDocumentError(f"node {ref} should be {what}")
+        return found
+
+    def pairs(self, value: Any, least: int) -> list[tuple[Symbol, Expression]]:
+        """Return pairs of symbol and expression, every symbol once."""
+        result = {}
+        for item in check_list(value, "pairs"):
+            key, entry = check_length(check_list(item, "a pair"), 2)
+            symbol = self.symbol(key, least)
+            if symbol in result:
+                raise InvalidDocumentError(f"'{symbol}' is given twice")
+            result[symbol] = self.expression(entry)
+        return list(result.items())
+
+    def owner(self, expression: Expression) -> Node | None:
+        """Return the node that a scalar expression is, None if it is anything else."""
+        return None if expression.shape else self._owners.get(expression._sx.element_hash())
+
+    def at(self, ref: Any) -> int:
+        """Return the place of an earlier node."""
+        if type(ref) is not int or not 0 <= ref < len(self.sx):
+            raise InvalidDocumentError(f"{describe_value(ref)} is not the place of an earlier node")
+        return ref
+
+    def scalar_at(self, ref: Any) -> int:
+        """Return the place of an earlier node that is a scalar."""
+        place = self.at(ref)
+        if self.shapes[place]:
+            raise InvalidDocumentError(f"node {place} should be a scalar, and has shape {self.shapes[place]}")
+        return place
+
+    def shape(self, given: Any) -> layout.ArrayShape:
+        """Return a shape, before anything has it."""
+        if len(check_list(given, "a shape")) > MAX_DIMENSIONS:
+            raise InvalidDocumentError(f"more than {MAX_DIMENSIONS} dimensions")
+        shape = tuple(check_integer(length, MAX_LENGTH) for length in given)
+        # CasADi keeps a number for each column, even where there are no rows.
+        lengths = math.prod(length for length in shape if length)
+        if lengths > (MAX_LENGTH if math.prod(shape) else MAX_ELEMENTS):
+            raise InvalidDocumentError(f"the shape {shape} is too large")
+        self.budget.spend(math.prod(shape))
+        return shape
+
+    # -- what comes ----------------------------------------------------------------------------------------
+
+    def add(
+        self, sx: Any, shape: layout.ArrayShape, depth: int, expression: Expression | None = None
+    ) -> None:
+        """Add a node."""
+        self.sx.append(sx)
+        self.shapes.append(shape)
+        self.depths.append(depth)
+        self._expressions.append(expression)
+
+    def add_alike(self, kind: type[Node], refs: list[Any], options: tuple[Any, ...] = ()) -> None:
+        """Add a node with a gradient of its own, whose arguments and itself are of one shape."""
+        shapes = {self.shapes[self.at(ref)] for ref in refs}
+        if len(shapes) != 1:
+            raise InvalidDocumentError("all parts should be of one shape")
+        self.add_opaque(kind, refs, shapes.pop(), options)
+
+    def add_opaque(
+        self,
+        kind: type[Node],
+        refs: list[Any],
+        shape: layout.ArrayShape,
+        options: tuple[Any, ...],
+        inside: Iterable[Any] = (),
+    ) -> None:
+        """Add a node with a gradient of its own, in whose options there may be other nodes still."""
+        # Asked before it is made: what makes the node follows it down already.
+        parts = [self.at(ref) for ref in (*refs, *inside)]
+        depth = 1 + max((self.depths[part] for part in parts), default=0)
+        if depth > MAX_NESTING:
+            raise InvalidDocumentError(
+                f"more than {MAX_NESTING} nodes with a gradient of their own inside one another"
+            )
+        self.check_elements(shape, len(refs))
+        below = NO_NODES.union(*(self.expression(part)._nodes for part in parts if self.depths[part]))
+        compositions = max(map(self._compositions.__getitem__, below), default=0) + (kind is Composed)
+        if compositions > MAX_COMPOSITIONS:
+            raise InvalidDocumentError(f"more than {MAX_COMPOSITIONS} compositions of compositions")
+        made = kind.of(tuple(self.expression(ref) for ref in refs), shape, options)
+        self.keep(made, depth, 1 + self._count(below), compositions)
+
+    def keep(self, expression: Expression, depth: int, below: int = 1, compositions: int = 0) -> None:
+        """Add what is a node with a gradient of its own, made of so many, with so many in one another."""
+        (node,) = expression._nodes
+        self._owners.update(dict.fromkeys(node.elements, node))
+        self._below[node] = below
+        self._compositions[node] = compositions
+        self.add(expression._sx, node.shape, depth, expression)
+
+    def check_elements(self, shape: layout.ArrayShape, arguments: int = 1) -> None:
+        """Refuse a node with a gradient of its own that has too many elements in so many arguments."""
+        size = math.prod(shape) * max(arguments, 1)
+        if size > MAX_ELEMENTS:
+            raise InvalidDocumentError(
+                f"{size} elements are more than {MAX_ELEMENTS}, the most that a node like this has"
+            )
+        self.budget.spend((COST_OF_ELEMENT if shape else COST_OF_SCALAR) * size)
+
+    def _count(self, nodes: Iterable[Node]) -> int:
+        """Return how many nodes there are in and below these, or a little more."""
+        return min(sum(map(self._below.__getitem__, nodes)), len(self._below))

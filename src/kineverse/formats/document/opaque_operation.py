@@ -1,0 +1,145 @@
+"""Operation of a document, without the class that wrote it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any
+
+from kineverse.errors import KineverseError, ModelError, UnknownNameError
+from kineverse.model.operation import Cell, Operation, Writes
+from kineverse.model.read_recorder import ABSENT, Read, ReadRecorder, Reads
+from kineverse.model.traces import Trace
+
+from .parameters import rebuild_parameter
+
+
+@dataclass(frozen=True)
+class OpaqueOperation(Operation):
+    """An operation from a document.
+
+    While what it reads is what the original read, it writes what the original wrote, to the last bit. When
+    that changes, it is run again by its trace; if it has none, it is *frozen*, and such a change is refused.
+    Then, or when the change is one that the original decided by, replace it by an operation of its class, in
+    the same edit.
+
+    Attributes
+    ----------
+    kind
+        Name of the class that wrote this originally.
+    given
+        What that was made with, by name, see :attr:`parameters`.
+    reads
+        The cells (kind, name) that were looked at, and how closely.
+    listings
+        Kinds of which all names were listed, with these.
+    writes
+        What it writes, by cell, in order.
+    trace
+        What it computes from what it reads.
+    frozen
+        Why there is no trace though it read values; empty if there is one, or no need for one.
+    seen
+        What the cells contained.
+    scope
+        What all names of the document begin with.
+    overrides
+        Whether it writes over what operations before it in the document wrote.
+    """
+
+    kind: str
+    given: Mapping[str, Any] = field(default_factory=dict, hash=False)
+    reads: tuple[tuple[Cell, Read], ...] = ()
+    listings: tuple[tuple[str, tuple[str, ...]], ...] = ()
+    writes: tuple[tuple[Cell, Any], ...] = field(default=(), repr=False)
+    trace: Trace | None = field(default=None, repr=False)
+    frozen: str = ""
+    seen: Mapping[Cell, Any] = field(default_factory=dict, repr=False, compare=False)
+    scope: str = ""
+    overrides: bool = field(default=False, repr=False, compare=False)  # type: ignore[misc]
+
+    @property
+    def parameters(self) -> dict[str, Any]:
+        """What the original was made with, by name: ``kv.CloseLoop(**operation.parameters)`` makes it anew.
+
+        Names in it are as they were saved, without a prefix that the document was loaded under.
+        """
+        writes = {f"{kind}/{name}": value for (kind, name), value in self.writes}
+        return {name: rebuild_parameter(value, writes) for name, value in self.given.items()}
+
+    def apply(self, model: ReadRecorder) -> Writes:
+        """Write what the original wrote, or would write now.
+
+        Raises
+        ------
+        UnknownNameError
+            If something it was made from does not exist any more.
+        ModelError
+            If something it was made from has changed in a way that it cannot follow.
+        """
+        model = self._in_scope(model)
+        changed = self._changed(model)
+        if not changed:
+            return self._effects
+        error: KineverseError = ModelError(f"{self.frozen or 'it looked whether it is there'}.")
+        if self.trace is not None:
+            try:
+                return self.trace.run(model, self._before(model))
+            except KineverseError as problem:
+                error = problem
+        kind = UnknownNameError if isinstance(error, UnknownNameError) else ModelError
+        raise kind(
+            f"{changed[0]} has changed, and this {self.kind} was made from it: {error} It comes from a "
+            "document, without its code; in the same edit, remove it, or replace it by a "
+            f"{self.kind}(...) made anew.{self._hint}"
+        ) from None
+
+    @property
+    def _hint(self) -> str:
+        if not self.given or not self.scope:
+            return ""
+        return f" Its parameters say from what, in names that lack '{self.scope}'."
+
+    def _in_scope(self, model: ReadRecorder) -> ReadRecorder:
+        """Return the reader without the names of others, if the document has a prefix of its own."""
+        if not self.scope:
+            return model
+        return ReadRecorder(
+            model._value_at,
+            lambda kind: [name for name in model._names_at(kind) if name.startswith(self.scope)],
+            model._reads,
+        )
+
+    def _changed(self, model: ReadRecorder) -> list[str]:
+        """Look at what the original looked at, and return what is different."""
+        changed = []
+        for kind, names in self.listings:
+            model._reads.listings.add(kind)
+            if tuple(model._names_at(kind)) != names:
+                changed.append(f"the list of all {kind}")
+        for cell, how in self.reads:
+            model._reads.add(cell, how)
+            now, then = model._value_at(cell), self.seen.get(cell, ABSENT)
+            if now is then:
+                continue
+            if then is ABSENT or now is ABSENT or (how & Read.VALUE and now != then):
+                changed.append("/".join(cell))
+        return changed
+
+    def _before(self, model: ReadRecorder) -> ReadRecorder:
+        """Return a reader of what the original read; what it did not read cannot have mattered to it."""
+        listings = dict(self.listings)
+        return ReadRecorder(
+            lambda cell: self.seen[cell] if cell in self.seen else model._value_at(cell),
+            lambda kind: list(listings[kind]) if kind in listings else model._names_at(kind),
+            Reads(),
+        )
+
+    @cached_property
+    def _effects(self) -> Writes:
+        return Writes.of(dict(self.writes))
+
+    def default_tag(self) -> str:
+        """Return the kind and the first name it writes."""
+        return f"{self.kind} {self.writes[0][0][1]}" if self.writes else self.kind

@@ -1,0 +1,249 @@
+"""Search of the file that belongs to the name of a model."""
+
+from __future__ import annotations
+
+import difflib
+import os
+import sysconfig
+from collections import Counter
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from itertools import islice
+from pathlib import Path
+
+from kineverse import shipped
+from kineverse.errors import FormatError, UnknownNameError, suggest
+
+SUFFIXES = (".urdf", ".sdf", ".world", ".xml", ".mjcf", ".kv.json", ".kv.msgpack")
+MODEL_PATH = "KINEVERSE_MODEL_PATH"
+_DEPTH = 6
+_LISTED = 6
+_LONGEST = 200
+
+
+GALLERY = "articulations"
+"""The folder, which is none, whose models are the scenes of :mod:`kineverse.gallery`."""
+
+
+@dataclass(frozen=True, slots=True)
+class Source:
+    """A file, and the name it ships under if it does; or a scene of the gallery, which has no file."""
+
+    path: Path
+    shipped: str | None = None
+    scene: bool = False
+    folder: Path | None = field(default=None, compare=False)
+    """The folder of models in which it was found by its name."""
+
+
+def shipped_models() -> tuple[str, ...]:
+    """Return the names of the models that come with the package."""
+    return tuple(sorted(file.stem for file in shipped.FOLDER.glob("*.urdf")))
+
+
+def locate_model(name: str | os.PathLike[str]) -> Source:
+    """Return the file of a model given by path or by name.
+
+    A shipped model is found under its name everywhere, and so is a scene of the gallery,
+    ``articulations/screw``; a file of that name is ``./kitchen``. Then a path to a file is taken as it is.
+    Any other name is looked for below the folders of ``KINEVERSE_MODEL_PATH``, then in installed packages
+    that carry robots; the first place that has it counts, and there the file closest to the top. It may have
+    folders in front (``urdf_obj/kitchen``) to tell files of the same name apart, and its suffix may be left
+    out.
+
+    Raises
+    ------
+    UnknownNameError
+        If there is none, with similar names, what was searched and how to get more; or if there are several.
+    """
+    if not isinstance(name, (str, os.PathLike)):
+        hint = (
+            " Bytes are read by kv.formats.from_bytes."
+            if isinstance(name, (bytes, bytearray, memoryview))
+            else ""
+        )
+        raise FormatError(
+            "A model is loaded by its name or from the path of a file, "
+            f"not from {_shown(repr(name))[1:-1]}.{hint}"
+        )
+    text = os.fspath(name)
+    if text in shipped_models():
+        return Source(shipped.FOLDER / f"{text}.urdf", text)
+    gallery, _, scene = text.partition("/")
+    if gallery == GALLERY and scene in _scenes():
+        return Source(Path(text), scene, scene=True)
+    if text.lstrip().startswith("<"):
+        raise UnknownNameError(
+            "This looks like the text of a description, where the name or path of a model is expected. "
+            "Write it to a file; 'kineverse.formats.urdf.parse_urdf' reads text."
+        )
+    if text.lstrip().startswith("{"):
+        raise UnknownNameError(
+            "This looks like the text of a document, where the name or path of a model is expected. "
+            "Write it to a file, model.kv.json."
+        )
+    path = _expanded(text)
+    if _is(path, Path.is_file):
+        return Source(path.resolve())
+    explicit = path.is_absolute() or text.startswith(".") or text.endswith(SUFFIXES)
+    if explicit and not _is(path, Path.is_dir) and _is(path, os.path.lexists):
+        raise FormatError(
+            f"{_shown(text)} is no regular file, but a pipe, a device, or a link that leads nowhere."
+        )
+    if path.is_absolute() or text.startswith("."):
+        raise UnknownNameError(f"There is no file {_shown(text)}.{_beside(path)}")
+    searched: list[str] = []
+    seen: list[str] = []
+    for place, folder in model_folders():
+        files = [p.relative_to(folder).as_posix() for p in _files(folder)]
+        found = [f for f in files if _is_called(f, text)]
+        if found:
+            return Source((folder / _only(found, text, folder)).resolve(), folder=folder)
+        searched.append(f"{place} ({folder})")
+        seen += files
+    if gallery == GALLERY:
+        raise UnknownNameError(_no_scene(scene))
+    raise UnknownNameError(
+        f"There is no model {_shown(text)}.{_beside(path) if text else ''} {_similar(text, seen)} "
+        f"Searched after the shipped ones: {'; '.join(searched) or 'nothing else'}.{_missing_places()} "
+        f"Give the path of a file, or add its folder to the environment variable {MODEL_PATH}"
+        f"{_more_robots(searched)}."
+    )
+
+
+def _scenes() -> tuple[str, ...]:
+    from kineverse import gallery  # when it is asked for
+
+    return gallery.names()
+
+
+def _no_scene(name: str) -> str:
+    scenes = _scenes()
+    if not name:
+        return (
+            f"'{GALLERY}' is many models, one for each articulation: {', '.join(scenes)}. "
+            f"Load one as '{GALLERY}/{scenes[0]}'."
+        )
+    found = _alike(name, [])
+    meant = f"Did you mean {' or '.join(map(repr, found))}?" if found else f"Available: {', '.join(scenes)}."
+    return f"There is no model {_shown(f'{GALLERY}/{name}')}. {meant}"
+
+
+def model_folders() -> Iterator[tuple[str, Path]]:
+    """Yield the folders in which names are looked for, with what each is."""
+    for entry in os.environ.get(MODEL_PATH, "").split(os.pathsep):
+        if entry and Path(entry).is_dir():
+            yield MODEL_PATH, Path(entry)
+    site = Path(sysconfig.get_paths()["purelib"])
+    for package in ("cmeel.prefix/share/example-robot-data/robots", "example_robot_data/robots"):
+        if (site / package).is_dir():
+            yield "example-robot-data", site / package
+    cache = Path(os.environ.get("ROBOT_DESCRIPTIONS_CACHE", "~/.cache/robot_descriptions")).expanduser()
+    if cache.is_dir():
+        yield "robot_descriptions", cache
+
+
+def _files(folder: Path, depth: int = _DEPTH) -> Iterator[Path]:
+    base = len(folder.parts)
+    for root, folders, files in os.walk(folder):
+        if len(Path(root).parts) - base >= depth:
+            folders.clear()
+        folders[:] = sorted(f for f in folders if not f.startswith("."))
+        for file in sorted(files):
+            if file.endswith(SUFFIXES):
+                yield Path(root, file)
+
+
+def _is_called(file: str, name: str) -> bool:
+    return any(f"/{file}".endswith(f"/{name}{suffix}") for suffix in ("", *SUFFIXES))
+
+
+def _only(found: list[str], name: str, folder: Path) -> str:
+    """Return the file closest to the top, if there is one such file."""
+    top = min(f.count("/") for f in found)
+    found = sorted(f for f in found if f.count("/") == top)
+    if len(found) > 1:
+        more = f" and {len(found) - _LISTED} more" if len(found) > _LISTED else ""
+        choices = ", ".join(map(repr, found[:_LISTED]))
+        raise UnknownNameError(
+            f"{name!r} is ambiguous in {folder}: {choices}{more}. Give one of these paths."
+        )
+    return found[0]
+
+
+def _similar(name: str, files: list[str]) -> str:
+    found = _alike(name, files)
+    if not found:
+        return f"Models that ship: {', '.join(shipped_models())}."
+    return f"Did you mean {' or '.join(map(repr, found))}?"
+
+
+def _alike(name: str, files: list[str]) -> list[str]:
+    """Return what could have been meant and can be typed: spelt alike, or with the name in its path."""
+    wanted = name.casefold().strip("/ ")
+    paths = sorted({_stem(f) for f in files})
+    ends = Counter(_end(p) for p in paths)
+    # Where the last part is enough to find it, the folders in front are not shown.
+    shown = {p: _end(p) if ends[_end(p)] == 1 else p for p in paths} | {s: s for s in shipped_models()}
+    shown |= {f"{GALLERY}/{scene}": f"{GALLERY}/{scene}" for scene in _scenes()}
+    alike = difflib.get_close_matches(wanted, {_end(p).casefold() for p in shown}, n=_LISTED, cutoff=0.7)
+    close = [n for end in alike for p, n in shown.items() if _end(p).casefold() == end]
+    within = [n for p, n in shown.items() if wanted in p.casefold()]
+    found = list(dict.fromkeys(close + sorted(within, key=lambda n: (len(n), n))))[:_LISTED]
+    return found if wanted else []
+
+
+def _end(path: str) -> str:
+    return path.rsplit("/", 1)[-1]
+
+
+def _stem(file: str) -> str:
+    return next((file.removesuffix(s) for s in SUFFIXES if file.endswith(s)), file)
+
+
+def _missing_places() -> str:
+    missing = [e for e in os.environ.get(MODEL_PATH, "").split(os.pathsep) if e and not Path(e).is_dir()]
+    return f" {MODEL_PATH} names folders that do not exist: {', '.join(missing)}." if missing else ""
+
+
+def _more_robots(searched: list[str]) -> str:
+    ways = (
+        ("example-robot-data", "install robots with 'pip install example-robot-data'"),
+        (
+            "robot_descriptions",
+            "fetch one with 'robot_descriptions pull NAME' (pip install robot_descriptions)",
+        ),
+    )
+    left = [way for place, way in ways if not any(entry.startswith(place) for entry in searched)]
+    return "".join(f", or {way}" for way in left)
+
+
+def _beside(path: Path) -> str:
+    """Return what is at a path that is no file, or next to it."""
+    if _is(path, Path.is_dir):
+        inside = [p.relative_to(path).as_posix() for p in islice(_files(path, 2), _LISTED)]
+        return f" It is a folder; models in it: {', '.join(inside) or 'none'}."
+    if not path.name.endswith(SUFFIXES):
+        return ""
+    if not _is(path.parent, Path.is_dir):
+        return f" The folder {_shown(str(path.parent))} does not exist."
+    beside = [p.name for p in _files(path.parent, 0)]
+    return f" {suggest(path.name, beside, 'model file in its folder')}"
+
+
+def _expanded(text: str) -> Path:
+    try:
+        return Path(text).expanduser()
+    except RuntimeError:  # "~name", and nobody has that name
+        return Path(text)
+
+
+def _is(path: Path, kind: Callable[[Path], bool]) -> bool:
+    try:
+        return kind(path)
+    except OSError:  # too long for a name, or not for us to see
+        return False
+
+
+def _shown(text: str) -> str:
+    return repr(text) if len(text) <= _LONGEST else f"{text[:_LONGEST]!r}..."

@@ -1,0 +1,411 @@
+"""Resolution of package://, model:// and file URIs to paths below the root folder.
+
+Nothing here opens a file it finds, and nothing searches the whole disk: the places are few, listed in
+:func:`locate_resource`, and the two kinds of folders that are searched in depth are searched within ``MAX_DEPTH`` and
+``MAX_FOLDERS``. Below which folder a description may open files is said in :mod:`.roots`.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import sys
+from collections import deque
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, field, replace
+from functools import lru_cache
+from pathlib import Path
+from urllib.parse import unquote, urlsplit
+
+from kineverse.errors import FormatError
+from kineverse.formats.root_folder import (
+    NOWHERE,
+    Folder,
+    declared_roots,
+    is_below,
+    is_common,
+    outside_root_error,
+)
+from kineverse.formats.xml_reader import quote
+from kineverse.model.body import Body, Mesh, Shape
+
+from .reader_warnings import warn
+
+MAX_DEPTH = 4
+"""How deep below a folder of a workspace variable packages are looked for."""
+
+MAX_FOLDERS = 20_000
+"""How many folders below one such folder are visited at most."""
+
+_WORKSPACES = ("KINEVERSE_PACKAGE_PATH", "ROS_PACKAGE_PATH")
+_PREFIXES = ("AMENT_PREFIX_PATH", "COLCON_PREFIX_PATH", "CMAKE_PREFIX_PATH")
+_MODELS = ("GZ_SIM_RESOURCE_PATH", "IGN_GAZEBO_RESOURCE_PATH", "GAZEBO_MODEL_PATH", "SDF_PATH")
+_MANIFESTS = ("package.xml", "manifest.xml")
+_MARKS = (*_MANIFESTS, "model.config", "model.sdf")
+_IGNORED = ("CATKIN_IGNORE", "COLCON_IGNORE", "AMENT_IGNORE")
+_LISTED = 3
+
+
+def locate_mesh(mesh: Mesh) -> Path:
+    """Return the path of the file of a mesh, within the root of its description; see :func:`locate_resource`."""
+    return locate_resource(mesh.uri, mesh.folder, root=mesh.root)
+
+
+def locate_resource(
+    uri: str, folder: Folder = "", search: Sequence[Folder] = (), root: str | None = None
+) -> Path:
+    """Return the path of the file that a description names.
+
+    ``package://name/rest`` and ``model://name/rest`` are the file ``rest`` of the first folder for ``name``
+    that has it, among
+
+    1. the folders of ``search``: each is the package, or holds it;
+    2. those of ``KINEVERSE_PACKAGE_PATH`` and ``ROS_PACKAGE_PATH``: each is the package, or holds it at most
+       ``MAX_DEPTH`` deep;
+    3. ``share/name`` below those of ``AMENT_PREFIX_PATH``, ``COLCON_PREFIX_PATH`` and ``CMAKE_PREFIX_PATH``;
+       models of ``GZ_SIM_RESOURCE_PATH``, ``IGN_GAZEBO_RESOURCE_PATH``, ``GAZEBO_MODEL_PATH``, ``SDF_PATH``;
+    4. ``folder`` and those above it: each is the package, or holds it;
+    5. packages of robots that are installed for this Python (example-robot-data, the cache of
+       robot_descriptions).
+
+    A folder is the package ``name`` if it is called so or has a ``package.xml`` with that name. Other paths
+    are relative to ``folder``, then to the folders of ``search``.
+
+    With a root, paths have to lie below it, below ``search``, or below a folder that one of these variables
+    or ``KINEVERSE_ROOT`` names. Of the folders above a description in the root, those outside of the root
+    count if they have a manifest, or if they are neither the home folder nor above it.
+
+    Parameters
+    ----------
+    uri
+        What the description says.
+    folder
+        The folder of the description.
+    search
+        Folders to try first.
+    root
+        The folder that the description must not leave, as :func:`.root_folder.find_root` returns it; None for none.
+
+    Raises
+    ------
+    FormatError
+        If there is no such file (the message lists where it was looked for and which variable to set), if the
+        path leaves its package or the root, or if it is to be fetched from a network.
+    """
+    scheme, colon, rest = uri.partition("://")
+    if not colon:
+        return _locate_plain(uri, uri, folder, search, root)
+    scheme = scheme.lower()
+    if scheme in ("package", "model"):
+        return _locate_packaged(uri, rest, folder, search, root)
+    if scheme == "file":
+        return _locate_file(uri, folder, search, root)
+    raise FormatError(
+        f"{quote(uri)}: {scheme}:// is not fetched. Download the file and name it by package:// or a path."
+    )
+
+
+def model_paths() -> Iterator[tuple[str, Path]]:
+    """Yield the folders of models that environment variables name, each with its variable."""
+    for variable in _MODELS:
+        for place in os.environ.get(variable, "").split(os.pathsep):
+            if place:
+                yield variable, Path(place).absolute()
+
+
+@dataclass
+class _Trail:
+    """Where a package was looked for, for the message when it is not there."""
+
+    places: list[str] = field(default_factory=list)
+    without_file: list[Path] = field(default_factory=list)
+    outside: bool = False
+    """Whether there is such a folder, and the description may not take it for a package."""
+    trusted: bool = True
+    """Whether the user has named the place that is looked at, rather than the description."""
+
+
+def _locate_packaged(uri: str, rest: str, folder: Folder, search: Sequence[Folder], root: str | None) -> Path:
+    name, _, inside = rest.partition("/")
+    if not name or name in (".", "..") or "\\" in name:
+        raise FormatError(f"{quote(uri)}: names no package; expected package://name/path/in/the/package.")
+    # The literal path comes first: a file may well be called "50%25.stl".
+    insides = [_inside(uri, text) for text in dict.fromkeys((inside, unquote(inside)))]
+    for fresh in (False, True):
+        if fresh:
+            # A package may have been made since its workspace was last listed.
+            _packages_below.cache_clear()
+            _manifest_name.cache_clear()
+        trail = _Trail()
+        for package in _folders_of(name, Path(folder), search, trail, root):
+            for parts in insides:
+                path = package.joinpath(*parts)
+                if not os.path.isfile(path):
+                    continue
+                if trail.trusted or root is None or _stays(path, root, package):
+                    return path
+                raise outside_root_error(uri, root)
+            trail.without_file.append(package)
+    if trail.outside and root is not None and not trail.without_file:
+        raise outside_root_error(uri, root)
+    raise FormatError(_not_found_message(uri, name, inside, trail))
+
+
+def _stays(path: Path, root: str, package: Path | None = None) -> bool:
+    """Return whether the real path of a file is in the root, in its package, or where a variable points."""
+    real = os.path.realpath(path)
+    places = (root, *declared_roots(), *declared_folders(), *([os.path.realpath(package)] if package else ()))
+    return any(is_below(real, place) for place in places if place)
+
+
+def find_root_violation(uri: str, folder: Folder, root: str | None) -> FormatError | None:
+    """Return the error for a path or a package that leads out of the root; None for others."""
+    scheme, colon, rest = uri.partition("://")
+    if root is None:
+        return None
+    if colon and scheme.lower() != "file":
+        return _outside_package(uri, folder, root) if scheme.lower() in ("package", "model") else None
+    if root == NOWHERE and not colon and not os.path.isabs(uri):
+        return None  # whoever gave the text knows that it lies nowhere
+    path = (
+        Path(folder).absolute() / unquote(rest.removeprefix("localhost"))
+        if colon
+        else Path(folder).absolute() / uri
+    )
+    return None if "\0" in uri or _stays(path, root) else outside_root_error(uri, root)
+
+
+def _outside_package(uri: str, folder: Folder, root: str) -> FormatError | None:
+    """Return the error for a package that is only found from a folder outside of the root."""
+    if root == NOWHERE or _may_lie_in(os.path.realpath(folder), root):
+        return None
+    for bound in (root, None):
+        try:
+            locate_resource(uri, folder, root=bound)
+        except FormatError:
+            if bound is None:
+                return None  # it is nowhere
+        else:
+            break
+    return None if bound is not None else outside_root_error(uri, root)
+
+
+def _may_lie_in(real: str, root: str) -> bool:
+    """Return whether a folder is in the root, or in one that a variable declares."""
+    return any(is_below(real, place) for place in (root, *declared_roots(), *declared_folders()))
+
+
+def declared_folders() -> Iterator[str]:
+    """Yield the real paths of the folders that hold packages and models, as environment variables say."""
+    for variables, inside in ((_WORKSPACES, ""), (_PREFIXES, "share"), (_MODELS, "")):
+        for variable in variables:
+            for place in os.environ.get(variable, "").split(os.pathsep):
+                if place:
+                    yield os.path.realpath(os.path.join(place, inside))
+
+
+def _inside(uri: str, text: str) -> list[str]:
+    """Return the parts of a path in a package, which has to stay in there."""
+    parts = [part for part in re.split(r"[/\\]", text) if part not in ("", ".")]
+    depth = 0
+    for part in parts:
+        depth += -1 if part == ".." else 1
+        if depth < 0 or Path(part).drive:
+            raise FormatError(
+                f"{quote(uri)}: leads out of its package, which is refused. Name the other package."
+            )
+    return parts
+
+
+def _not_found_message(uri: str, name: str, inside: str, trail: _Trail) -> str:
+    """Return what is missing on the first line, then where it was looked for, a place a line."""
+    if trail.without_file:
+        places = [str(path) for path in dict.fromkeys(trail.without_file)]
+        return f"{quote(uri)}: package {quote(name)} has no file {quote(inside)}. It is at:{_lines(places)}"
+    return (
+        f"{quote(uri)}: there is no package {quote(name)}. "
+        "Set KINEVERSE_PACKAGE_PATH or ROS_PACKAGE_PATH to the folder that holds it. "
+        f"Looked in:{_lines(list(dict.fromkeys(trail.places)))}"
+    )
+
+
+def _lines(places: Sequence[str]) -> str:
+    more = [f"and {len(places) - _LISTED + 1} more"] if len(places) > _LISTED else []
+    return "".join(f"\n  {place}" for place in [*places[: _LISTED - len(more)], *more])
+
+
+def _folders_of(
+    name: str, folder: Path, search: Sequence[Folder], trail: _Trail, root: str | None
+) -> Iterator[Path]:
+    """Yield the folders that are the package, in the order in which they count."""
+    trail.places.append(f"{folder.absolute()} and the folders above it")
+    for place in search:
+        trail.places.append(str(place))
+        yield from _at_or_in(Path(place), name)
+    for variable in _WORKSPACES:
+        for place in _paths_in(variable, trail):
+            yield from _packages_below(place).get(name, ())
+    for variable in _PREFIXES:
+        for place in _paths_in(variable, trail):
+            yield from _existing((place / "share" / name, place / name / "share" / name))
+    for variable in _MODELS:
+        for place in _paths_in(variable, trail):
+            yield from _at_or_in(place, name)
+    here = folder.absolute()
+    trail.trusted = False
+    for place in (here, *here.parents):
+        for package in _at_or_in(place, name):
+            if root is None or counts_as_package(package, here, root):
+                yield package
+            else:
+                trail.outside = True
+    trail.trusted = True
+    for place in _installed():
+        trail.places.append(str(place))
+        yield from _at_or_in(place, name)
+
+
+def counts_as_package(package: Path, folder: Path, root: str) -> bool:
+    """Return whether a description may take a folder for a package; it has found it above its own folder.
+
+    Otherwise ``package://etc/passwd`` were a file of the package ``etc``. A document says itself in which
+    folder its meshes lie, so a folder counts for what is above it only where files may be opened anyway.
+    """
+    real, here = os.path.realpath(package), os.path.realpath(folder)
+    if is_below(real, root):
+        return True
+    if not _may_lie_in(here, root):
+        return False
+    if any(os.path.isfile(os.path.join(real, mark)) for mark in _MARKS):
+        return True
+    above = real if is_below(here, real) else os.path.dirname(real)
+    return is_below(here, root) and not is_common(above)
+
+
+def _paths_in(variable: str, trail: _Trail) -> Iterator[Path]:
+    for place in os.environ.get(variable, "").split(os.pathsep):
+        if place:
+            trail.places.append(f"{place} (${variable})")
+            yield Path(place).absolute()
+
+
+def _at_or_in(place: Path, name: str) -> Iterator[Path]:
+    """Yield ``place`` if it is the package, and the package directly inside of it."""
+    if place.name == name or _manifest_name(place) == name:
+        yield place
+    yield from _existing((place / name,))
+
+
+def _existing(places: Iterable[Path]) -> Iterator[Path]:
+    for place in places:
+        if os.path.isdir(place):  # which is no for a name that is too long, and no error
+            yield place
+
+
+@lru_cache(maxsize=4096)
+def _manifest_name(folder: Path) -> str | None:
+    """Return the name a folder's ROS manifest gives it, or None."""
+    try:
+        with (folder / "package.xml").open(encoding="utf-8", errors="replace") as manifest:
+            match = re.search(r"<name>\s*([^<\s]+)\s*</name>", manifest.read(1 << 16))
+    except OSError:
+        return None
+    return match[1] if match else None
+
+
+@lru_cache(maxsize=64)
+def _packages_below(top: Path) -> dict[str, tuple[Path, ...]]:
+    """Return the packages at and below a folder, by the names they go by."""
+    found: dict[str, tuple[Path, ...]] = {}
+    ahead = deque([(top, 0)])
+    for _ in range(MAX_FOLDERS):
+        if not ahead:
+            break
+        folder, depth = ahead.popleft()
+        try:
+            entries = {entry.name: entry.is_dir() for entry in os.scandir(folder)}
+        except OSError:
+            continue
+        is_package = any(manifest in entries for manifest in _MANIFESTS)
+        # A folder without manifest counts where it lies directly in a workspace: somebody copied it there.
+        if is_package or depth <= 1:
+            for name in {folder.name, _manifest_name(folder) or folder.name}:
+                found[name] = (*found.get(name, ()), folder)
+        if is_package or depth == MAX_DEPTH or not entries.keys().isdisjoint(_IGNORED):
+            continue
+        below = sorted(name for name, is_folder in entries.items() if is_folder and not name.startswith("."))
+        ahead.extend((folder / name, depth + 1) for name in below)
+    return found
+
+
+def _installed() -> Iterator[Path]:
+    """Yield folders of this Python that hold packages of robots; nothing is imported for it."""
+    for entry in dict.fromkeys(sys.path):
+        share = Path(entry) / "cmeel.prefix" / "share"
+        if entry and share.is_dir():
+            yield share
+    cache = os.environ.get("ROBOT_DESCRIPTIONS_CACHE") or os.path.expanduser("~/.cache/robot_descriptions")
+    try:
+        repositories = sorted(entry.path for entry in os.scandir(cache) if entry.is_dir())
+    except OSError:
+        return
+    yield Path(cache)
+    yield from map(Path, repositories)
+
+
+def _locate_file(uri: str, folder: Folder, search: Sequence[Folder], root: str | None) -> Path:
+    parts = urlsplit(uri)
+    if parts.netloc not in ("", "localhost"):
+        raise FormatError(
+            f"{quote(uri)}: file:// takes an absolute path, with three slashes: file:///folder/file. "
+            "For a path relative to the description, leave file:// out."
+        )
+    literal = uri.partition("://")[2].removeprefix("localhost")
+    path = literal if os.path.isfile(literal) else unquote(literal)
+    return _locate_plain(uri, path, folder, search, root)
+
+
+def _locate_plain(uri: str, text: str, folder: Folder, search: Sequence[Folder], root: str | None) -> Path:
+    path = Path(text)
+    tried = [Path(folder).absolute() / path, *(Path(place).absolute() / path for place in search)]
+    left = False
+    for candidate in tried:
+        # What is outside is not even looked at.
+        if root is not None and candidate is tried[0] and "\0" not in text and not _stays(candidate, root):
+            left = True
+        elif os.path.isfile(candidate):  # which is no for a name that is too long, and no error
+            return candidate
+    if left and root is not None:
+        raise outside_root_error(uri, root)
+    where = [str(candidate) for candidate in dict.fromkeys(tried)]
+    hint = "" if path.is_absolute() else " Paths are relative to the folder of the description."
+    raise FormatError(f"{quote(text)}: there is no such file.{hint} Looked for:{_lines(where)}")
+
+
+def restrict_meshes(body: Body, root: str, where: str) -> Body:
+    """Return a body whose meshes do not leave a root; those that would are remarked on.
+
+    Parameters
+    ----------
+    body
+        As the document says it.
+    root
+        The folder, as :func:`.root_folder.find_root` returns it.
+    where
+        The document and the body, for remarks.
+    """
+
+    def shape(given: Shape) -> Shape:
+        mesh = given.geometry
+        if not isinstance(mesh, Mesh):
+            return given
+        wrong = find_root_violation(mesh.uri, mesh.folder, root)
+        if wrong is not None:
+            warn([f"{where}: names the mesh {wrong}"])
+        return replace(given, geometry=replace(mesh, root=root))
+
+    if not any(isinstance(given.geometry, Mesh) for given in (*body.visuals, *body.collisions)):
+        return body
+    return replace(
+        body, visuals=tuple(map(shape, body.visuals)), collisions=tuple(map(shape, body.collisions))
+    )

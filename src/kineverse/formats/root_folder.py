@@ -1,0 +1,113 @@
+"""Root folder below which the files that a description names may be opened.
+
+A description is somebody else's: what it includes, and the meshes it names by path, are opened below its
+*root* only. Real paths count, so a link does not lead out.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TypeAlias
+
+from kineverse.errors import FormatError
+from kineverse.formats.xml_reader import quote
+
+Folder: TypeAlias = "str | os.PathLike[str]"
+
+ROOT = "KINEVERSE_ROOT"
+"""The environment variable with folders whose files may be opened by any description."""
+
+NOWHERE = ""
+"""The root of text that lies in no folder: no path leads below it."""
+
+_REPOSITORY = (".git", ".hg")
+_PACKAGE = ("package.xml", "manifest.xml", "model.config")
+_PYTHON = "__init__.py"
+
+
+def find_root(folder: Folder, root: Folder | None = None, models: Folder | None = None) -> str:
+    """Return the real path of the root for a description that lies in a folder.
+
+    Parameters
+    ----------
+    folder
+        The folder of the description.
+    root
+        The root that is asked for. None for the innermost folder of ``KINEVERSE_ROOT`` that holds ``folder``,
+        else the repository or package around it, else ``models``, else ``folder`` itself.
+    models
+        The folder of models in which the description was found by its name.
+
+    Raises
+    ------
+    FormatError
+        If the root that is asked for is no folder.
+    """
+    if root is not None:
+        try:
+            given = os.fsdecode(root)
+        except TypeError:
+            given = ""
+        # An empty one is a variable that is not set, rather than the current folder.
+        if not given or not os.path.isdir(os.path.expanduser(given)):
+            shown = given if isinstance(root, os.PathLike) else root
+            raise FormatError(f"root={shown!r} is no folder; give one below which files may be opened.")
+        return os.path.realpath(os.path.expanduser(given))
+    here = os.path.realpath(folder)
+    declared = [place for place in declared_roots() if is_below(here, place)]
+    if declared:
+        return max(declared, key=len)
+    return _enclosing(here) or (os.path.realpath(models) if models else here)
+
+
+def find_text_root(folder: Folder, root: Folder | None = None) -> str:
+    """Return the root of a description's text, which may lie in no folder: then no path leads below it."""
+    return find_root(folder, root) if os.fspath(folder) or root is not None else NOWHERE
+
+
+def declared_roots() -> Iterator[str]:
+    """Yield the real paths of the folders of ``KINEVERSE_ROOT``."""
+    for place in os.environ.get(ROOT, "").split(os.pathsep):
+        if place:
+            yield os.path.realpath(os.path.expanduser(place))
+
+
+def is_below(path: str, folder: str) -> bool:
+    """Return whether a path is a folder, or in it; both are real paths. Nothing is below ``NOWHERE``."""
+    if not folder:
+        return False
+    return path == folder or path.startswith(folder if folder.endswith(os.sep) else folder + os.sep)
+
+
+def is_common(folder: str) -> bool:
+    """Return whether a real path is too common a folder to be that of one project: home, and all above it."""
+    return os.path.dirname(folder) == folder or is_below(os.path.realpath(os.path.expanduser("~")), folder)
+
+
+def outside_root_error(uri: str, root: str) -> FormatError:
+    """Return the error for a file outside of a root: it names the root, and how to give a wider one."""
+    what = f"the root {root}" if root else "the text, which lies in no folder and so has no root"
+    return FormatError(
+        f"{quote(uri)}: leads out of {what}, and so is not opened. Give a wider root, if you trust the file: "
+        f"kv.load(..., root=FOLDER), --root FOLDER or the environment variable {ROOT}."
+    )
+
+
+def _enclosing(folder: str) -> str:
+    """Return the nearest repository around a folder, else the nearest package; empty if there is none."""
+    package, path = "", folder
+    while not is_common(path):
+        if any(os.path.lexists(os.path.join(path, name)) for name in _REPOSITORY):
+            return path
+        if not package and any(os.path.isfile(os.path.join(path, name)) for name in _PACKAGE):
+            package = path
+        if (not package or path == os.path.dirname(package)) and _is_python(path):
+            package = path  # that of the outermost folder: those below it are its parts
+        path = os.path.dirname(path)
+    return package
+
+
+def _is_python(folder: str) -> bool:
+    return (Path(folder) / _PYTHON).is_file()

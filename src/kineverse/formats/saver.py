@@ -1,0 +1,190 @@
+"""Saving of models, in the format that the file name's ending says."""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import os
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from kineverse._checks import real_number
+from kineverse.errors import FormatError, InvalidValueError
+from kineverse.formats.description import FrameDeviation, WrittenFile
+from kineverse.formats.files import replace_file
+from kineverse.formats.reader_warnings import warn
+from kineverse.model.model_view import ModelView
+
+ENDINGS = (".kv.json", ".kv.msgpack", ".urdf", ".xml", ".mjcf")
+
+
+@dataclass(frozen=True, slots=True)
+class Saved:
+    """What has become of a model that was saved.
+
+    Attributes
+    ----------
+    path
+        Of the file.
+    remarks
+        What the file says other than the model, or not at all, though nothing was refused.
+    left_out
+        Constraints, and articulations whose speeds are tied to others', that the format cannot say, each with
+        the reason. All frames are where they should be without them.
+    errors
+        By how much frames are off at most [m], [rad], where that was tolerated: certain bounds over all
+        values of coordinates within their limits. Frames that are not in here are exact.
+    """
+
+    path: Path
+    remarks: tuple[str, ...] = ()
+    errors: Mapping[str, FrameDeviation] = field(default_factory=dict)
+    left_out: Mapping[str, str] = field(default_factory=dict)
+
+    @property
+    def error(self) -> FrameDeviation:
+        """The largest of the errors."""
+        found = self.errors.values()
+        return FrameDeviation(
+            max((e.position for e in found), default=0.0), max((e.angle for e in found), default=0.0)
+        )
+
+
+def save(
+    model: ModelView,
+    path: str | os.PathLike[str],
+    *,
+    tolerance: float | None = None,
+    leave_out: Iterable[str] = (),
+    strict: bool = False,
+) -> Saved:
+    """Write a model to a file, whose ending says what it becomes.
+
+    The file is there whole or not at all; if it cannot be written, it is what it was before. URDF and MJCF
+    are read again first, MJCF by MuJoCo where it is installed. Meshes that MuJoCo cannot read are converted,
+    into a folder beside the file.
+
+    Parameters
+    ----------
+    model
+        The model.
+    path
+        A name that ends in ``.kv.json`` for a document, which says all of the model, ``.kv.msgpack`` for the
+        same in msgpack, ``.urdf`` for URDF, or ``.xml`` or ``.mjcf`` for MJCF.
+    tolerance
+        How far any frame may be from where it should be, in position [m] and in angle [rad], wherever
+        coordinates are within their limits. Then motions by curves are approximated. None for none.
+    leave_out
+        Names of constraints that URDF or MJCF need not say, and of articulations that have speeds other than
+        those of their coordinates, which it need not say either.
+    strict
+        Whether constraints, and ties between speeds, that URDF or MJCF cannot say are refused. Otherwise they
+        are left out, with a remark. Motions that it cannot say are always refused.
+
+    Raises
+    ------
+    FormatError
+        If the name has another ending, the file cannot be written, what would be written cannot be read
+        again, or naming everything that the format cannot say, with the reason.
+    UnknownNameError
+        If something that is to be left out does not exist.
+    InvalidValueError
+        For a tolerance that is no positive number.
+    """
+    target = _target(path)
+    _check(target)
+    if target.name.endswith((".kv.json", ".kv.msgpack")):
+        if tuple(leave_out) or tolerance is not None:
+            what = "nothing can be left out" if tolerance is None else "it has no tolerance"
+            raise FormatError(f"{target.name}: a document says all of a model exactly, so {what}.")
+        from .document import write_document
+
+        write_document(model, target)
+        return Saved(target)
+    written = _written(model, target, leave_out, _checked(tolerance), strict)
+    _put(target, written)
+    warn(f"{target.name}: {remark}" for remark in written.remarks)
+    return Saved(target, written.remarks, written.errors, dict(written.left_out))
+
+
+def _put(target: Path, written: WrittenFile) -> None:
+    """Write a file and those that belong to it: all of them, or none."""
+    new = [path for path in written.beside if not path.exists()]
+    folders = [folder for folder in dict.fromkeys(path.parent for path in new) if not folder.exists()]
+    try:
+        for folder in folders:
+            folder.mkdir()
+        for path in new:
+            replace_file(path, written.beside[path])
+        replace_file(target, written.content)
+    except (FormatError, OSError) as error:
+        for path in new:
+            path.unlink(missing_ok=True)
+        for folder in folders:
+            with contextlib.suppress(OSError):
+                folder.rmdir()
+        if isinstance(error, OSError):
+            raise FormatError(f"{error.filename} cannot be made: {error.strerror}.") from None
+        raise
+
+
+def _check(target: Path) -> None:
+    """Look at the name of a file before anything is made, which may take a while.
+
+    Raises
+    ------
+    FormatError
+        If nothing is written that ends like this, or there is no such folder.
+    """
+    if not target.name.endswith(ENDINGS):
+        raise FormatError(
+            f"{target}: a model is saved to a name that ends in {', '.join(ENDINGS[:-1])} or {ENDINGS[-1]}, "
+            f"as in {target.stem + ENDINGS[0]!r}."
+        )
+    if target.is_dir():
+        raise FormatError(
+            f"{target} is a folder; name a file in it, such as {target / f'model{ENDINGS[0]}'}."
+        )
+    if not target.parent.is_dir():
+        raise FormatError(f"{target} cannot be written: the folder {target.parent} does not exist.")
+
+
+def _checked(tolerance: object) -> float | None:
+    try:
+        if tolerance is None or 0 < real_number(tolerance) < math.inf:
+            return None if tolerance is None else real_number(tolerance)
+    except (TypeError, ValueError, OverflowError):
+        pass
+    raise InvalidValueError(f"A tolerance is a positive number [m] and [rad], or None, not {tolerance!r}.")
+
+
+def _written(
+    model: ModelView, target: Path, leave_out: Iterable[str], tolerance: float | None, strict: bool
+) -> WrittenFile:
+    try:
+        if target.name.endswith(".urdf"):
+            from .urdf.writer import to_urdf
+
+            return to_urdf(model, target, leave_out, tolerance, strict)
+        from .mjcf.writer import to_mjcf
+
+        return to_mjcf(model, target, leave_out, tolerance, strict)
+    except FormatError as error:
+        raise _named(target, error) from None
+
+
+def _named(target: Path, error: FormatError) -> FormatError:
+    """Return an error with the name of the file in front, once."""
+    text = str(error)
+    return (
+        error if text.startswith(f"{target.name} ") else FormatError(f"{target.name} is not written. {text}")
+    )
+
+
+def _target(path: Any) -> Path:
+    try:
+        return Path(os.fsdecode(path)).expanduser()
+    except (TypeError, RuntimeError):  # "~name", and nobody has that name
+        raise FormatError(f"A model is saved to the path of a file, not to {path!r}.") from None

@@ -1,0 +1,174 @@
+"""Checks of a loaded model: limits, loops, poses, inertias, mesh files."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from math import isfinite, isnan
+
+import numpy as np
+
+from kineverse.errors import KineverseError
+from kineverse.expressions.printing import format_number
+from kineverse.formats.resource_paths import locate_mesh
+from kineverse.loops.record import find_loops
+from kineverse.model.body import Inertia, Mesh
+from kineverse.model.model_view import ModelView
+from kineverse.model.sampling import StateSamples
+from kineverse.state import State
+
+SAMPLED_STATES = 32
+"""In how many random states within the limits it is tried whether poses are finite and loops close."""
+
+INERTIA_TOLERANCE = 1e-3
+"""By how much, relative to the largest, moments of inertia may miss the triangle inequality.
+
+Files have them in few digits, and of a thin plate the largest is just the sum of the others.
+"""
+
+LEAST_INERTIA = 1e-12
+"""Moments of inertia below this are none [kg m²]: a grain of sand has more."""
+
+
+@dataclass(frozen=True, slots=True)
+class ModelProblem:
+    """Something that is wrong: with what ``kind`` of thing, ``where`` (its name), and what (``text``)."""
+
+    kind: str
+    where: str
+    text: str
+
+
+def find_problems(model: ModelView, meshes: bool = True) -> Iterator[ModelProblem]:
+    """Yield what is wrong with a model.
+
+    Parameters
+    ----------
+    model
+        The model.
+    meshes
+        Whether to look for the files of meshes.
+    """
+    yield from _find_limit_problems(model)
+    samples = StateSamples(model, count=SAMPLED_STATES)
+    allowed = _states_within_limits(model, samples)
+    yield from _find_open_loops(model, samples, allowed)
+    yield from _find_pose_problems(model, samples, allowed)
+    for name, body in model.bodies.items():
+        if body.inertia is not None:
+            for text in find_inertia_errors(body.inertia):
+                yield ModelProblem("inertia", name, text)
+    if meshes:
+        yield from _find_missing_meshes(model)
+
+
+def _find_limit_problems(model: ModelView) -> Iterator[ModelProblem]:
+    """Yield the constraints that do not hold at the default state, and those that cannot hold there."""
+    state = model.default_state()
+    crossed = set()
+    varying = {name: c for name, c in model.constraints.items() if c.lower.symbols or c.upper.symbols}
+    ends = StateSamples(model, count=0).values([e for c in varying.values() for e in (c.lower, c.upper)])
+    for name, lower, upper in zip(varying, ends[::2], ends[1::2], strict=True):
+        if lower[0] > upper[0]:
+            crossed.add(name)
+            bounds = f"lower {format_number(float(lower[0]))}, upper {format_number(float(upper[0]))}"
+            yield ModelProblem("limit", name, f"leaves no value at the default state: {bounds}")
+    for violation in model.violations(state):
+        if violation.name in crossed or violation.name not in model.constraints:  # loops have their own say
+            continue
+        if isnan(violation.value):
+            yield ModelProblem("limit", violation.name, "is about what is not finite at the default state")
+            continue
+        bounds = f"{format_number(violation.value)} is not in [{format_number(violation.lower)}, {format_number(violation.upper)}]"
+        yield ModelProblem("limit", violation.name, f"is broken at the default state: {bounds}")
+
+
+def _states_within_limits(model: ModelView, samples: StateSamples) -> list[int]:
+    """Return which of the sampled states break no constraint; the default state counts in any case."""
+    symbols = model.symbols
+    found = [0]
+    for k in range(1, samples.size) if symbols else ():
+        state = State({symbol: samples.of(symbol)[k] for symbol in symbols})
+        # What cannot be evaluated is not broken: it is what is looked for.
+        if all(isnan(violation.excess) for violation in model.violations(state)):
+            found.append(k)
+    return found
+
+
+def _find_open_loops(model: ModelView, samples: StateSamples, allowed: list[int]) -> Iterator[ModelProblem]:
+    rates = model.rates
+    values = samples.values([rates.carry(symbol) for symbol in rates.dependent])
+    open_at = {
+        str(symbol): np.isnan(column[allowed]).tolist()
+        for symbol, column in zip(rates.dependent, values, strict=True)
+        if np.isnan(column[allowed]).any()
+    }
+    for loop in find_loops(model):
+        bad = [open_at[follower] for follower in loop.dependent if follower in open_at]
+        if bad:
+            yield ModelProblem(
+                "loop",
+                loop.name,
+                f"does not close {_format_states([any(states) for states in zip(*bad, strict=True)])}",
+            )
+
+
+def _find_pose_problems(
+    model: ModelView, samples: StateSamples, allowed: list[int]
+) -> Iterator[ModelProblem]:
+    names = list(model.frames)
+    for name, poses in zip(names, samples.values([model.fk(name) for name in names]), strict=True):
+        bad = [not np.isfinite(poses[k]).all() for k in allowed]
+        if any(bad):
+            yield ModelProblem("pose", name, f"is not finite {_format_states(bad)}")
+
+
+def _format_states(bad: Sequence[bool]) -> str:
+    """Return at which of the states that are allowed something is wrong; the first is the default state."""
+    if bad[0]:
+        return "at the default state"
+    return f"in {sum(bad)} of {len(bad)} states within the limits"
+
+
+def find_inertia_errors(inertia: Inertia) -> Iterator[str]:
+    """Yield why no body has this inertia."""
+    ixx, ixy, ixz, iyy, iyz, izz = inertia.tensor
+    if not isfinite(inertia.mass) or inertia.mass < 0.0:
+        yield f"a mass of {format_number(inertia.mass)} kg"
+    if not all(map(isfinite, inertia.tensor)):
+        yield "moments of inertia that are not finite"
+        return
+    moments = np.linalg.eigvalsh([[ixx, ixy, ixz], [ixy, iyy, iyz], [ixz, iyz, izz]])
+    if abs(moments).max() < LEAST_INERTIA:
+        return
+    moments[abs(moments) < 1e-9 * abs(moments).max()] = 0.0
+    least, middle, most = moments.tolist()
+    shown = f"principal moments {format_number(least)}, {format_number(middle)}, {format_number(most)} kg m²"
+    if least < -INERTIA_TOLERANCE * max(most, 0.0):
+        yield f"{shown}, one of which is negative"
+    elif most - least - middle > INERTIA_TOLERANCE * most:
+        yield f"{shown}: the largest exceeds the sum of the others"
+    elif inertia.mass == 0.0 and most > 0.0:
+        yield f"{shown} without any mass"
+
+
+def _first_line(error: Exception) -> str:
+    first = (str(error).splitlines() or [type(error).__name__])[0]
+    return first.removesuffix(" Looked in:").removesuffix(" Looked for:").removesuffix(" It is at:")
+
+
+def _find_missing_meshes(model: ModelView) -> Iterator[ModelProblem]:
+    missing: dict[Mesh, str] = {}
+    found: set[Mesh] = set()
+    for name, body in model.bodies.items():
+        shapes = [shape.geometry for shape in (*body.visuals, *body.collisions)]
+        for mesh in dict.fromkeys(g for g in shapes if isinstance(g, Mesh)):
+            if mesh not in found and mesh not in missing:
+                try:
+                    locate_mesh(mesh)
+                    found.add(mesh)
+                except (KineverseError, OSError) as error:
+                    # Where it was looked for is long, and for all meshes the same.
+                    missing[mesh] = _first_line(error)
+            if mesh in missing:
+                yield ModelProblem("mesh", name, missing[mesh])

@@ -1,0 +1,340 @@
+"""Hardened XML reader: elements with line numbers, limits on depth and size.
+
+An element is a plain tuple ``(tag, attributes, children, line)``: a file of 10^5 links becomes as many tuples
+in linear time. Document types, and with them all declarations of entities, are refused, so nothing expands
+and nothing is fetched. Nesting and size are bounded. Text between elements is dropped, and that inside of an
+element, too, unless it is asked for.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from typing import NoReturn, TypeAlias
+from xml.parsers import expat
+
+from kineverse.errors import FormatError
+
+from .files import MAX_BYTES
+
+MAX_DEPTH = 200
+"""The deepest nesting of elements that is read. A URDF needs 5, however long its kinematic chains are."""
+
+Element: TypeAlias = "tuple[str, dict[str, str], list[Element], int]"
+"""Tag, attributes, children, line."""
+
+_CHUNK_BYTES = 1 << 12
+
+TEXT = ""
+"""The attribute that has the text of an element without children: no attribute of XML has an empty name."""
+
+Visit: TypeAlias = Callable[[Element], None]
+Begin: TypeAlias = Callable[[Element], Visit]
+XmlFaultHandler: TypeAlias = Callable[[int, str], None]
+"""Takes the line of what is no XML but can be read, and how it is."""
+
+
+class ElementError(Exception):
+    """What is wrong with an element, on its way to the reader that knows the file; no user ever sees it."""
+
+    def __init__(self, element: Element, message: str):
+        super().__init__(message)
+        self.element = element
+        self.message = message
+
+
+def parse_xml(
+    data: str | bytes,
+    source: str,
+    skipped: frozenset[str] = frozenset(),
+    begin: Begin | None = None,
+    texts: bool = False,
+    depth: int = MAX_DEPTH,
+    mend: XmlFaultHandler | None = None,
+) -> Element:
+    """Parse a document and return its root element.
+
+    Parameters
+    ----------
+    data
+        The document. Bytes are decoded as XML says (byte order mark, declaration, else UTF-8).
+    source
+        The name of the document in error messages.
+    skipped
+        Children of the root with these tags are passed over.
+    begin
+        Called with the root as soon as it opens; what it returns is called with each child of the root as
+        soon as that is complete. The children are then not kept: a long document takes no more memory than
+        its longest part.
+    texts
+        Whether to keep the text of elements that have any, as their attribute ``TEXT``.
+    depth
+        The deepest nesting of elements.
+    mend
+        Called with what is read although XML forbids it, since the parsers of robots do: what comes before
+        the declaration, a declaration that is misspelt, comments with two hyphens. Without it, that is
+        refused.
+
+    Raises
+    ------
+    FormatError
+        If the text is not well-formed XML, declares a document type or entities, nests deeper than
+        ``depth`` or is larger than ``MAX_BYTES``.
+    """
+    if len(data) > MAX_BYTES:
+        raise FormatError(f"{source}: larger than {MAX_BYTES} bytes, the most that is read of one document.")
+    encoding = None
+    if mend is not None:
+        text, (data, encoding) = data, _declared(data, mend)
+        data = _commented(data, mend)
+        if isinstance(text, str) and not isinstance(data, str):
+            encoding = "utf-8"
+    parser = expat.ParserCreate(encoding)
+    document: list[Element] = []
+    open_lists = [document]
+    skipped_depth = 0
+    visit: Visit | None = None
+    pieces: list[str] = []
+
+    def start_root(tag: str, attributes: dict[str, str]) -> None:
+        nonlocal visit
+        parser.StartElementHandler = start
+        start(tag, attributes)
+        if begin is not None:
+            visit = begin(document[0])
+            parser.EndElementHandler = end_visiting
+
+    # These run for every element of the file: they do nothing that could wait.
+    def start(tag: str, attributes: dict[str, str]) -> None:
+        if tag in skipped and len(open_lists) == 2:
+            parser.StartElementHandler, parser.EndElementHandler = start_skipped, end_skipped
+            return
+        children: list[Element] = []
+        open_lists[-1].append((tag, attributes, children, parser.CurrentLineNumber))
+        open_lists.append(children)
+        pieces.clear()
+        if len(open_lists) > depth:
+            refuse_depth(tag)
+
+    def end(tag: str) -> None:
+        open_lists.pop()
+
+    def end_with_text(tag: str) -> None:
+        children = open_lists.pop()
+        if pieces and not children:
+            open_lists[-1][-1][1][TEXT] = "".join(pieces)
+        pieces.clear()
+
+    def end_visiting(tag: str) -> None:
+        open_lists.pop()
+        if len(open_lists) == 2:
+            visit(open_lists[1].pop())  # type: ignore[misc]  # set before this can be called
+
+    def start_skipped(tag: str, attributes: dict[str, str]) -> None:
+        nonlocal skipped_depth
+        skipped_depth += 1
+        if skipped_depth > depth:
+            refuse_depth(tag)
+
+    def end_skipped(tag: str) -> None:
+        nonlocal skipped_depth
+        if skipped_depth:
+            skipped_depth -= 1
+        else:
+            parser.StartElementHandler = start
+            parser.EndElementHandler = end if visit is None else end_visiting
+
+    def refuse_depth(tag: str) -> NoReturn:
+        raise FormatError(
+            f"{source}, line {parser.CurrentLineNumber}, <{abbreviate(tag)}>: elements are nested more than "
+            f"{depth} deep; no robot description needs that."
+        )
+
+    def refuse_doctype(name: str, *_: object) -> None:
+        raise FormatError(
+            f"{source}, line {parser.CurrentLineNumber}, <!DOCTYPE {abbreviate(name)}>: document types and "
+            "entities are refused, since they can expand without bound or read other files. Remove the "
+            "declaration and write out what its entities stand for."
+        )
+
+    parser.StartElementHandler, parser.EndElementHandler = start_root, end_with_text if texts else end
+    if texts:
+        parser.buffer_text = True
+        parser.CharacterDataHandler = pieces.append
+    parser.StartDoctypeDeclHandler = refuse_doctype
+    try:
+        parser.Parse(data, True)
+    except expat.ExpatError as error:
+        raise FormatError(_describe(error, source, document, len(open_lists) - 1)) from None
+    except (ValueError, LookupError) as error:
+        if document or isinstance(error, FormatError):
+            raise
+        # An encoding that expat cannot have, or a str with lone surrogates.
+        raise FormatError(f"{source}, line 1: cannot be decoded: {error}. Save it as UTF-8.") from None
+    return document[0]
+
+
+def read_root_tag(data: bytes) -> str:
+    """Return the tag of the root element; empty where no element is found."""
+    text, encoding = _declared(data, lambda *_: None)
+    parser = expat.ParserCreate(encoding)
+    found: list[str] = []
+
+    def start(tag: str, _: dict[str, str]) -> None:
+        found.append(tag)
+        parser.StartElementHandler = None
+
+    parser.StartElementHandler = start
+    parser.StartDoctypeDeclHandler = lambda *_: found.append("")
+    try:
+        for begin in range(0, len(text), _CHUNK_BYTES):
+            parser.Parse(text[begin : begin + _CHUNK_BYTES])
+            if found:
+                break
+    except (expat.ExpatError, ValueError, LookupError):
+        pass  # whoever reads all of it says what is wrong
+    return found[0] if found else ""
+
+
+_DECLARED = re.compile(rb"\s*(?:<!--(?:(?!-->).)*-->\s*)*<\?xml\s[^<>]*\?>", re.DOTALL)
+_GOOD = re.compile(rb"<\?xml\s+version\s*=\s*[\"']1\.\d[\"']")
+_ENCODING = re.compile(rb"encoding\s*=\s*[\"']([\w.-]{1,40})[\"']")
+_NOT_A_BREAK = re.compile(rb"[^\n]")
+_BYTE_ORDER_MARK = b"\xef\xbb\xbf"
+
+
+def _bytes(data: str | bytes) -> bytes:
+    try:
+        return data.encode() if isinstance(data, str) else data
+    except UnicodeEncodeError:  # which the parser says in its words
+        return b""
+
+
+def _declared(data: str | bytes, mend: XmlFaultHandler) -> tuple[str | bytes, str | None]:
+    """Return a document without a declaration that is not where, or what, it should be, and its encoding."""
+    content = _bytes(data[: 1 << 16]).removeprefix(_BYTE_ORDER_MARK)
+    good = _GOOD.match(content)
+    if good and not _DECLARED.match(content, content.find(b">", good.end()) + 1):
+        return data, None
+    found, end, encoding = _DECLARED.match(content), 0, None
+    while found is not None:
+        said = _ENCODING.search(content[end : found.end()])
+        encoding = encoding or (said[1].decode() if said else None)
+        end = found.end()
+        found = _DECLARED.match(content, end)
+    if not end:
+        return data, None
+    line = content[:end].count(b"\n") + 1
+    mend(
+        line, "<?xml ...?>: is not the first of the file, or misspelt, which XML forbids; it is passed over."
+    )
+    rest = _bytes(data).removeprefix(_BYTE_ORDER_MARK)
+    blank = _NOT_A_BREAK.sub(b" ", rest[:end]) + rest[end:]
+    return blank, encoding
+
+
+def _commented(data: str | bytes, mend: XmlFaultHandler) -> str | bytes:
+    """Return a document with blanks for comments that have two hyphens inside."""
+    content = _bytes(data)
+    pieces: list[bytes] = []
+    start, at, literal = 0, 0, content.find(b"<![CDATA[")
+    line, counted = 1, 0
+    while (at := content.find(b"<!--", at)) >= 0:
+        if 0 <= literal < at:
+            end = content.find(b"]]>", literal)
+            if end < 0:
+                break
+            at, literal = max(at, end), content.find(b"<![CDATA[", end)
+            continue
+        end = content.find(b"-->", at + 4)
+        if end < 0:
+            break
+        inside = content[at + 4 : end]
+        if b"--" in inside or inside.endswith(b"-"):
+            line, counted = line + content.count(b"\n", counted, at), at
+            mend(line, "<!-- ... -->: has '--' inside, which XML forbids; it is a comment all the same.")
+            pieces += [content[start:at], _NOT_A_BREAK.sub(b" ", content[at : end + 3])]
+            start = end + 3
+        at = end + 3
+    return b"".join([*pieces, content[start:]]) if pieces else data
+
+
+def read_name(element: Element) -> str:
+    """Return the name of an element, which must have one."""
+    name = element[1].get("name")
+    if not name:
+        raise ElementError(
+            element, "has no name; names are required." if name is None else "has an empty name."
+        )
+    return name
+
+
+def find_child(element: Element, tag: str) -> Element | None:
+    """Return the first child with that tag, or None."""
+    for candidate in element[2]:
+        if candidate[0] == tag:
+            return candidate
+    return None
+
+
+def label(element: Element) -> str:
+    """Return an element as its opening tag, with its name if it has one, for messages."""
+    tag, attributes, _, _ = element
+    name = attributes.get("name")
+    return f"<{abbreviate(tag)}>" if name is None else f"<{abbreviate(tag)} name={quote(name)}>"
+
+
+def quote(text: str) -> str:
+    """Return a name in quotes, for messages."""
+    return f'"{abbreviate(text)}"'
+
+
+def abbreviate(text: str, limit: int = 80) -> str:
+    """Return text for a message: on one line, printable and bounded."""
+    if not text[:limit].isprintable():
+        text = text[:limit].encode("unicode_escape").decode("ascii")  # ten times as long, perhaps
+    return text if len(text) <= limit else text[: limit - 1] + "…"
+
+
+_CODES = expat.errors.codes
+_CUT_OFF = {_CODES[m] for m in (expat.errors.XML_ERROR_NO_ELEMENTS, expat.errors.XML_ERROR_UNCLOSED_TOKEN)}
+_DECLARATION = {_CODES[m] for m in (expat.errors.XML_ERROR_XML_DECL, expat.errors.XML_ERROR_MISPLACED_XML_PI)}
+_HINTS = {
+    _CODES[
+        expat.errors.XML_ERROR_XML_DECL
+    ]: 'The first line must read <?xml version="1.0"?>, or be left out.',
+    _CODES[expat.errors.XML_ERROR_MISPLACED_XML_PI]: (
+        "Nothing, not even an empty line, may come before <?xml ...?>: remove what does."
+    ),
+    _CODES[expat.errors.XML_ERROR_UNDEFINED_ENTITY]: (
+        "Only &lt; &gt; &amp; &quot; &apos; and character numbers are known."
+    ),
+    _CODES[
+        expat.errors.XML_ERROR_INVALID_TOKEN
+    ]: "A character is where none can be; & and < are written &amp; and &lt;.",
+    _CODES[expat.errors.XML_ERROR_TAG_MISMATCH]: "The closing tag is not that of the element.",
+    _CODES[expat.errors.XML_ERROR_DUPLICATE_ATTRIBUTE]: "Keep one of the two attributes.",
+    _CODES[
+        expat.errors.XML_ERROR_JUNK_AFTER_DOC_ELEMENT
+    ]: "Remove what comes after the end of the root element.",
+    _CODES[expat.errors.XML_ERROR_UNKNOWN_ENCODING]: "Save the file as UTF-8.",
+}
+
+
+def _describe(error: expat.ExpatError, source: str, document: list[Element], depth: int) -> str:
+    """Return the message for text that is not XML: the line, the open element, the reason, what to do."""
+    innermost: Element | None = None
+    children = document
+    for _ in range(depth):
+        innermost = children[-1]
+        children = innermost[2]
+    if innermost is not None:
+        inside = f", in {label(innermost)} of line {innermost[3]}"
+    else:
+        inside = "" if document else ", <?xml ...?>" if error.code in _DECLARATION else ", before any element"
+    if error.code in _CUT_OFF:
+        hint = "The text is cut off."
+    else:
+        hint = _HINTS.get(error.code, "" if document else "Is this XML at all?")
+    where = f"{source}, line {error.lineno}, column {error.offset + 1}{inside}"
+    return f"{where}: not well-formed XML: {expat.ErrorString(error.code)}. {hint}".rstrip()

@@ -1,0 +1,326 @@
+"""Values of XML attributes and elements: names, numbers, vectors, truth values, poses.
+
+Those that come several at a time are coordinates, and no larger than ``LARGEST``: products of larger ones
+overflow, and a pose would not be finite. A single one may be a limit, and 1.8e308 says that there is none.
+
+Descriptions repeat themselves ("0 0 0" by the hundred), so the results are remembered.
+
+Every function raises :class:`ElementError` for what is missing or malformed; the reader adds file and line.
+
+Every function raises :class:`ElementError` for what is missing or malformed; the reader adds file and line.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from functools import lru_cache
+from typing import TypeVar
+
+from kineverse.formats import poses
+from kineverse.formats.reader_warnings import ReaderWarnings
+from kineverse.formats.xml_reader import TEXT, Element, ElementError, find_child, quote
+from kineverse.model.body import Pose, Vector3
+
+from .xml_reader import abbreviate
+
+LARGEST = 1e50
+"""The largest magnitude of what poses are made of: coordinates, positions, and factors between positions."""
+
+SMALLEST = 1e-50
+"""The smallest factor between positions but 0: by a smaller one, limits of a follower are out of reach."""
+
+_MAX_LENGTH = 1000
+
+
+@lru_cache(maxsize=8192)
+def parse_number(text: str) -> float:
+    """Return the one finite number that the text spells.
+
+    Raises
+    ------
+    ValueError
+        With the reason, if the text is anything else.
+    """
+    return _parse_words(text, 1)[0]
+
+
+@lru_cache(maxsize=8192)
+def parse_directions(text: str, count: int) -> tuple[float, ...]:
+    """Return ``count`` numbers of which no pose gets large: angles, or those of an axis or a quaternion.
+
+    Raises
+    ------
+    ValueError
+        With the reason, if the text is anything else.
+    """
+    return _parse_words(text, count)
+
+
+def scale_to_bounds(values: tuple[float, ...]) -> tuple[float, ...]:
+    """Return a vector, made shorter where its length would overflow."""
+    largest = max(map(abs, values))
+    return values if largest <= LARGEST else tuple(value / largest for value in values)
+
+
+@lru_cache(maxsize=8192)
+def parse_numbers(text: str, count: int) -> tuple[float, ...]:
+    """Return the ``count`` coordinates that the text spells, separated by white space.
+
+    Raises
+    ------
+    ValueError
+        With the reason, if the text is anything else.
+    """
+    values = _parse_words(text, count)
+    if values and max(map(abs, values)) > LARGEST:
+        raise ValueError(f"has a number beyond {LARGEST:g}, where {_expected(count)}")
+    return values
+
+
+def _parse_words(text: str, count: int) -> tuple[float, ...]:
+    if len(text) > _MAX_LENGTH:
+        raise ValueError(f"is {len(text)} characters long, where {_expected(count)}")
+    words = text.split()
+    if len(words) != count:
+        found = {0: "is empty", 1: "is one word"}.get(len(words), f"has {len(words)} words")
+        raise ValueError(f"{found}, where {_expected(count)}{_hint(text)}")
+    return tuple([_parse_word(word, count) for word in words])
+
+
+def _parse_word(word: str, count: int) -> float:
+    # Python reads more than a description may say: digits grouped by underscores and those of other scripts.
+    if "_" in word or not word.isascii():
+        raise ValueError(f"has '{abbreviate(word)}', where {_expected(count)}")
+    try:
+        value = float.fromhex(word) if "0x" in word[:3].lower() else float(word)
+    except OverflowError:
+        value = math.inf
+    except ValueError:
+        raise ValueError(f"has '{abbreviate(word)}', where {_expected(count)}{_hint(word)}") from None
+    if not math.isfinite(value):
+        raise ValueError(f"has '{word}', where {_expected(count)}; leave a limit out if there is none")
+    return value
+
+
+def _expected(count: int) -> str:
+    return "a finite number is expected" if count == 1 else f"{count} finite numbers are expected"
+
+
+def _hint(text: str) -> str:
+    if "${" in text or "$(" in text:
+        return "; this is xacro, expand it first: xacro robot.urdf.xacro > robot.urdf"
+    if "," in text:
+        return "; numbers are separated by spaces and have a decimal point"
+    return ""
+
+
+T = TypeVar("T")
+
+_ZERO = (0.0, 0.0, 0.0)
+_IDENTITY = Pose()
+
+
+def read_attribute_number(element: Element, key: str, default: float | None = None) -> float:
+    """Return a number; without a default, the attribute is required."""
+    text = element[1].get(key)
+    if text is None:
+        return _require_default(element, key, default)
+    try:
+        return parse_number(text)
+    except ValueError as error:
+        raise ElementError(element, f'{key}="{abbreviate(text)}" {error}.') from None
+
+
+def read_attribute_vector(
+    element: Element, key: str, default: Vector3 | None = None, turns: bool = False
+) -> Vector3:
+    """Return three numbers, coordinates or what only turns; without a default, the attribute is required."""
+    text = element[1].get(key)
+    if text is None:
+        return _require_default(element, key, default)
+    try:
+        if turns:
+            return parse_directions(text, 3)  # type: ignore[return-value]  # as many as asked for
+        return parse_numbers(text, 3)  # type: ignore[return-value]  # as many as asked for
+    except ValueError as error:
+        raise ElementError(element, f'{key}="{abbreviate(text)}" {error}.') from None
+
+
+def read_or_default(
+    read: Callable[[], T], default: T, taken: str, remarks: ReaderWarnings, owner: Element | None = None
+) -> T:
+    """Return what is read, or a default with a remark: for what moves nothing if it is wrong.
+
+    Raises
+    ------
+    ElementError
+        Where the document is read strictly.
+    """
+    try:
+        return read()
+    except ElementError as mistake:
+        remarks.mend(mistake, taken, owner)
+        return default
+
+
+def _require_default(element: Element, key: str, default: T | None) -> T:
+    if default is None:
+        raise ElementError(element, f"has no {key}; the specification requires it.")
+    return default
+
+
+def read_origin(
+    origin: Element | None, owner: Element, version: tuple[int, int], remarks: ReaderWarnings
+) -> Pose:
+    """Return the pose an ``<origin>`` gives; identity without one.
+
+    URDF 1.1 brought ``quat_xyzw`` as another way to say ``rpy``; in a file of version 1.0 it is ignored.
+    """
+    if origin is None:
+        return _IDENTITY
+    xyz = _read_origin_vector(origin, "xyz", owner, remarks)
+    quaternion = origin[1].get("quat_xyzw")
+    if quaternion is not None and version < (1, 1):
+        remarks.add(
+            origin,
+            'has quat_xyzw, which is ignored: it came with URDF 1.1. Write <robot version="1.1" ...>.',
+            owner,
+        )
+        quaternion = None
+    if quaternion is not None and "rpy" in origin[1]:
+        mistake = ElementError(origin, "has both rpy and quat_xyzw; keep one of them.")
+        remarks.mend(mistake, "rpy is what counts", owner)
+        quaternion = None
+    if quaternion is None:
+        return poses.pose_from_rpy(xyz, _read_origin_vector(origin, "rpy", owner, remarks))
+    try:
+        xyzw = scale_to_bounds(parse_directions(quaternion, 4))
+    except ValueError as error:
+        mistake = ElementError(origin, f'quat_xyzw="{abbreviate(quaternion)}" {error}.')
+        remarks.mend(mistake, "nothing is turned", owner)
+        return poses.pose_from_rpy(xyz, _ZERO)
+    if not poses.is_valid_quaternion(xyzw):
+        mistake = ElementError(
+            origin, f'quat_xyzw="{abbreviate(quaternion)}" has length zero, and so is no rotation.'
+        )
+        remarks.mend(mistake, "nothing is turned", owner)
+    return poses.pose_from_quaternion(xyz, xyzw)
+
+
+def _read_origin_vector(origin: Element, key: str, owner: Element, remarks: ReaderWarnings) -> Vector3:
+    """Return three numbers of an origin, zeros where they are left out, or empty."""
+    if not origin[1].get(key, "0").strip():
+        return read_or_default(
+            lambda: read_attribute_vector(origin, key), _ZERO, "zeros are taken", remarks, owner
+        )
+    return read_attribute_vector(origin, key, _ZERO, turns=key == "rpy")
+
+
+_BOOLEANS = {"true": True, "1": True, "false": False, "0": False}
+_INFINITE = {"inf": math.inf, "+inf": math.inf, "-inf": -math.inf}
+_UNBOUNDED = 1e16
+"""Limits from this magnitude on bound nothing: older versions wrote so."""
+
+
+def read_text(element: Element) -> str:
+    """Return the text inside an element, without space around it."""
+    return element[1].get(TEXT, "").strip()
+
+
+def read_child_text(element: Element, tag: str) -> str:
+    """Return the text of a child, which is empty where there is none."""
+    part = find_child(element, tag)
+    return "" if part is None else read_text(part)
+
+
+def read_child_bool(element: Element, tag: str, default: bool = False) -> bool:
+    """Return a truth value: true, false, 1 or 0."""
+    part = find_child(element, tag)
+    return default if part is None else _parse_bool(part, read_text(part), default)
+
+
+def read_attribute_bool(element: Element, key: str) -> bool:
+    """Return a truth value that is an attribute, False where it is left out."""
+    return _parse_bool(element, element[1].get(key, ""), False)
+
+
+def _parse_bool(element: Element, said: str, default: bool) -> bool:
+    if not said:
+        return default
+    if said.lower() not in _BOOLEANS:
+        raise ElementError(element, f"says {quote(said)}, where true or false is expected.")
+    return _BOOLEANS[said.lower()]
+
+
+def read_child_number(element: Element, tag: str, default: float | None = None) -> float:
+    """Return a finite number; without a default, the child is required."""
+    return read_child_numbers(element, tag, 1, None if default is None else (default,))[0]
+
+
+def read_child_numbers(
+    element: Element, tag: str, count: int, default: tuple[float, ...] | None = None
+) -> tuple[float, ...]:
+    """Return several finite numbers; without a default, the child is required."""
+    part = find_child(element, tag)
+    if part is None:
+        if default is None:
+            raise ElementError(element, f"has no <{tag}>; the specification requires it.")
+        return default
+    return read_numbers(part, count)
+
+
+def read_child_vector(element: Element, tag: str, default: Vector3 | None = None) -> Vector3:
+    """Return three finite numbers; without a default, the child is required."""
+    x, y, z = read_child_numbers(element, tag, 3, default)
+    return x, y, z
+
+
+def read_numbers(element: Element, count: int) -> tuple[float, ...]:
+    """Return the finite numbers that an element spells."""
+    said = read_text(element)
+    try:
+        return (parse_number(said),) if count == 1 else parse_numbers(said, count)
+    except ValueError as error:
+        raise ElementError(element, f"says {quote(said)}: it {error}.") from None
+
+
+def read_child_limit(element: Element, tag: str) -> float | None:
+    """Return a limit, None where there is none: left out, infinite, or of magnitude 1e16 and more."""
+    part = find_child(element, tag)
+    if part is None or read_text(part).lower() in _INFINITE:
+        return None
+    (value,) = read_numbers(part, 1)
+    return None if abs(value) >= _UNBOUNDED else value
+
+
+def read_axis_direction(axis: Element) -> Vector3:
+    """Return the unit vector of an ``<axis>``; the specification's default is z."""
+    x, y, z = read_child_vector(axis, "xyz", (0.0, 0.0, 1.0))
+    length = math.hypot(x, y, z)
+    if length < 1e-9:
+        raise ElementError(axis, f"has the direction {x:g} {y:g} {z:g}, which has length zero.")
+    return (poses.snap(x / length), poses.snap(y / length), poses.snap(z / length))
+
+
+def read_element_pose(element: Element, remarks: ReaderWarnings) -> Pose:
+    """Return what a ``<pose>`` says, in whichever of the formats of SDF 1.9."""
+    layout = element[1].get("rotation_format", "euler_rpy")
+    degrees = read_attribute_bool(element, "degrees")
+    if layout not in ("euler_rpy", "quat_xyzw"):
+        raise ElementError(
+            element, f"has rotation_format={quote(layout)}; euler_rpy and quat_xyzw are the ones there are."
+        )
+    if not read_text(element):
+        return Pose()
+    if layout == "quat_xyzw":
+        if degrees:
+            raise ElementError(element, "is a quaternion in degrees; quaternions have no unit.")
+        x, y, z, *xyzw = read_numbers(element, 7)
+        if not poses.is_valid_quaternion(tuple(xyzw)):
+            said = abbreviate(read_text(element))
+            mistake = ElementError(element, f"says {said}: it has length zero, and so is no rotation.")
+            remarks.mend(mistake, "nothing is turned")
+        return poses.pose_from_quaternion((x, y, z), tuple(xyzw))
+    x, y, z, *angles = read_numbers(element, 6)
+    return poses.pose_from_rpy((x, y, z), tuple(math.radians(a) if degrees else a for a in angles))

@@ -1,0 +1,321 @@
+"""C text: broad phase, and the ordered search that comes after :mod:`.narrowphase_c`."""
+
+from .broadphase import MEMORY_SLOTS
+
+SWEEP = r"""
+#include <math.h>
+#include <stdint.h>
+#include <stdlib.h>
+#include <string.h>
+
+/* A pair that was measured: the travel of both at that time, and what came out. */
+typedef struct {
+  int64_t pair; /* 0 for none */
+  double travel_i, travel_j, distance, witness[9];
+} Memory;
+
+typedef struct {
+  int64_t count, moving, bodies, axis;
+  const int32_t *body;
+  const uint8_t *allowed, *active;
+  const double *centre, *half, *radius;
+  double *poses, *travel, *place, *low, *high, *bounds;
+  int32_t *order;
+  double *sorted_boxes;
+  const double *const *corners;
+  const int64_t *corner_count;
+  const double *edges, *radii, *round, *tip;
+  Memory *memory;
+  const double *boxes;
+  const int32_t *leaves;
+  int64_t leaf_count;
+} Table;
+
+#define MEMORY_BITS @BITS@
+#define EXPORT __attribute__((visibility("default")))
+
+/* Where a pair is remembered, unless another one has taken its place. */
+static inline Memory *memory_of(const Table *t, int64_t i, int64_t j) {
+  return t->memory + ((uint64_t)(t->count * i + j + 1) * 0x9E3779B97F4A7C15u >> (64 - MEMORY_BITS));
+}
+
+/* Whether a pair is remembered, and neither has moved since. */
+static inline int is_known(const Memory *m, const Table *t, int64_t i, int64_t j) {
+  return m->pair == t->count * i + j + 1 && m->travel_i == t->travel[i] && m->travel_j == t->travel[j];
+}
+
+static inline double square(double x) { return x * x; }
+
+/* fmax is a call, for the sake of NaN, and there is none here. */
+static inline double larger(double x, double y) { return x > y ? x : y; }
+
+/* Both in [m], and what is returned, as in sweep.py. */
+#define FURTHEST 1e12
+#define LONGEST_TRAVEL 1e4
+#define PLACED -1
+#define GONE_TOO_FAR -2
+
+EXPORT int64_t place(Table *t, const double *fresh) {
+  int64_t outcome = PLACED;
+  for (int64_t k = 0; k < 12 * t->moving; k++)
+    if (!(fabs(fresh[k]) <= FURTHEST)) return k / 12; /* NaN is not either */
+  for (int64_t k = 0; k < t->moving; k++) {
+    const double *new = fresh + 12 * k, *c = t->centre + 3 * k, *h = t->half + 3 * k;
+    double *old = t->poses + 12 * k, turned = 0.0, shifted = 0.0;
+    for (int r = 0; r < 3; r++) {
+      const double *row = new + 4 * r;
+      const double at = row[0] * c[0] + row[1] * c[1] + row[2] * c[2] + row[3];
+      const double extent = fabs(row[0]) * h[0] + fabs(row[1]) * h[1] + fabs(row[2]) * h[2];
+      shifted += square(at - t->place[3 * k + r]);
+      t->place[3 * k + r] = at;
+      t->low[3 * k + r] = at - extent;
+      t->high[3 * k + r] = at + extent;
+      for (int i = 0; i < 3; i++) turned += square(row[i] - old[4 * r + i]);
+      for (int i = 0; i < 4; i++) old[4 * r + i] = row[i];
+    }
+    t->travel[k] += sqrt(shifted) + t->radius[k] * sqrt(turned / 2);
+    if (t->travel[k] > LONGEST_TRAVEL) outcome = GONE_TOO_FAR;
+  }
+  return outcome;
+}
+
+/* The distance of the sphere of one piece from the box of another; -inf from inside of it. */
+static double box_to_sphere(const Table *t, int64_t box, int64_t sphere, const double *between) {
+  const double *pose = t->poses + 12 * box, *half = t->half + 3 * box;
+  double outside = 0.0;
+  for (int i = 0; i < 3; i++) {
+    const double inside = pose[i] * between[0] + pose[4 + i] * between[1] + pose[8 + i] * between[2];
+    const double beyond = fabs(inside) - half[i];
+    if (beyond > 0.0) outside += beyond * beyond;
+  }
+  return outside > 0.0 ? sqrt(outside) - t->radius[sphere] : -INFINITY;
+}
+
+static double lower_bound(const Table *t, int64_t i, int64_t j) {
+  const double *a = t->place + 3 * i, *b = t->place + 3 * j;
+  const double between[3] = {b[0] - a[0], b[1] - a[1], b[2] - a[2]};
+  const double back[3] = {-between[0], -between[1], -between[2]};
+  double bound = sqrt(square(between[0]) + square(between[1]) + square(between[2]));
+  bound = bound - t->radius[i] - t->radius[j];
+  bound = larger(bound, box_to_sphere(t, i, j, between));
+  return larger(bound, box_to_sphere(t, j, i, back));
+}
+
+/* Sorts pieces by where they begin; they nearly are, as things move little between two questions. */
+static void sort(const Table *t, int32_t *order, int64_t n) {
+  for (int64_t k = 1; k < n; k++) {
+    const int32_t piece = order[k];
+    const double low = t->low[3 * piece + t->axis];
+    int64_t at = k;
+    for (; at > 0 && t->low[3 * order[at - 1] + t->axis] > low; at--) order[at] = order[at - 1];
+    order[at] = piece;
+  }
+}
+
+typedef struct {
+  double reach;
+  int32_t *pairs;
+  double *lows;
+  int64_t room, found;
+} Answer;
+
+static inline double square_gap(const double *low, const double *high, const double *from, const double *to) {
+  double gap = 0.0;
+  for (int r = 0; r < 3; r++) gap += square(larger(larger(low[r] - to[r], from[r] - high[r]), 0.0));
+  return gap;
+}
+
+/* Two pieces whose boxes are near each other. */
+static void consider(const Table *t, int64_t one, int64_t other, Answer *answer) {
+  if (!t->allowed[t->bodies * t->body[one] + t->body[other]] || !t->active[other]) return;
+  const double reach = answer->reach;
+  const int64_t i = one < other ? one : other, j = one < other ? other : one;
+  double known = -INFINITY;
+  if (t->bounds && t->bounds[t->count * i + j] != 0.0) {
+    known = t->bounds[t->count * i + j] - (t->travel[i] + t->travel[j]);
+    if (known > reach) return;
+  }
+  const Memory *memory = memory_of(t, i, j);
+  const double low = is_known(memory, t, i, j) ? memory->distance : larger(lower_bound(t, i, j), known);
+  if (low > reach) return;
+  if (answer->found < answer->room) {
+    answer->pairs[2 * answer->found] = (int32_t)i;
+    answer->pairs[2 * answer->found + 1] = (int32_t)j;
+    answer->lows[answer->found] = low;
+  }
+  answer->found++;
+}
+
+/* Considers the pairs of a piece with what stands, going down a tree of boxes; see standing.py. */
+static void considered_standing(const Table *t, int64_t one, Answer *answer) {
+  const double *low = t->low + 3 * one, *high = t->high + 3 * one, reach = answer->reach;
+  int64_t waiting[64] = {0};
+  int depth = 1;
+  while (depth) {
+    const int64_t node = waiting[--depth];
+    const double *box = t->boxes + 6 * node;
+    if (square_gap(low, high, box, box + 3) > reach * reach) continue;
+    if (node < t->leaf_count - 1) {
+      waiting[depth++] = 2 * node + 1;
+      waiting[depth++] = 2 * node + 2;
+      continue;
+    }
+    const int32_t *leaf = t->leaves + 4 * (node - t->leaf_count + 1);
+    for (int k = 0; k < 4 && leaf[k] >= 0; k++)
+      if (square_gap(low, high, t->low + 3 * leaf[k], t->high + 3 * leaf[k]) <= reach * reach)
+        consider(t, one, leaf[k], answer);
+  }
+}
+
+/* Writes the square gaps between the box of one of the moving pieces, in their order, and those of others. */
+static void square_gaps(const Table *t, int64_t one, int64_t first, int64_t end) {
+  const int64_t n = t->moving;
+  const double *low = t->sorted_boxes, *high = low + 3 * n;
+  double *gap = t->sorted_boxes + 6 * n;
+  const double a[3] = {low[one], low[n + one], low[2 * n + one]};
+  const double b[3] = {high[one], high[n + one], high[2 * n + one]};
+  for (int64_t k = first; k < end; k++)
+    gap[k] = square(larger(larger(a[0] - high[k], low[k] - b[0]), 0.0)) +
+             square(larger(larger(a[1] - high[n + k], low[n + k] - b[1]), 0.0)) +
+             square(larger(larger(a[2] - high[2 * n + k], low[2 * n + k] - b[2]), 0.0));
+}
+
+/* Returns how many pairs there are; only the first `room` of them are written. Of two moving pieces, the one
+   that begins first finds the other. Two that stand still are of no interest. */
+EXPORT int64_t near(Table *t, double reach, int32_t *pairs, double *lows, int64_t room) {
+  sort(t, t->order, t->moving);
+  Answer answer = {reach, pairs, lows, room, 0};
+  const int64_t n = t->moving;
+  double *low = t->sorted_boxes, *high = low + 3 * n, *gap = low + 6 * n;
+  for (int64_t k = 0; k < n; k++)
+    for (int r = 0; r < 3; r++) {
+      low[r * n + k] = t->low[3 * t->order[k] + r];
+      high[r * n + k] = t->high[3 * t->order[k] + r];
+    }
+  for (int64_t k = 0; k < n; k++) {
+    const int32_t one = t->order[k];
+    if (!t->active[one]) continue;
+    int64_t end = k + 1;
+    while (end < n && low[t->axis * n + end] <= high[t->axis * n + k] + reach) end++;
+    square_gaps(t, k, k + 1, end);
+    for (int64_t m = k + 1; m < end; m++)
+      if (gap[m] <= reach * reach) consider(t, one, t->order[m], &answer);
+    if (n < t->count) considered_standing(t, one, &answer);
+  }
+  return answer.found;
+}
+""".replace("@BITS@", str(MEMORY_SLOTS.bit_length() - 1))
+
+
+SEARCH = r"""
+typedef struct {
+  double distance;
+  int64_t bodies;
+  int32_t i, j, at;
+} Found;
+
+static inline int comes_before(const Found *a, const Found *b) {
+  if (a->distance != b->distance) return a->distance < b->distance;
+  if (a->bodies != b->bodies) return a->bodies < b->bodies;
+  return a->i != b->i ? a->i < b->i : a->j < b->j;
+}
+
+/* So many are sorted by insertion, before runs of them are merged. */
+#define RUN 8
+
+/* Sorts by merging runs of growing length; `spare` has as much room. Returns where the result is. */
+static Found *sorted(Found *found, Found *spare, int64_t n) {
+  for (int64_t k = 1; k < n; k++) {
+    const Found one = found[k];
+    int64_t at = k;
+    for (; at % RUN && comes_before(&one, found + at - 1); at--) found[at] = found[at - 1];
+    found[at] = one;
+  }
+  for (int64_t width = RUN; width < n; width *= 2) {
+    for (int64_t start = 0; start < n; start += 2 * width) {
+      const int64_t middle = start + width < n ? start + width : n;
+      const int64_t end = middle + width < n ? middle + width : n;
+      int64_t a = start, b = middle, k = start;
+      while (a < middle && b < end)
+        spare[k++] = comes_before(found + b, found + a) ? found[b++] : found[a++];
+      while (a < middle) spare[k++] = found[a++];
+      while (b < end) spare[k++] = found[b++];
+    }
+    Found *other = found;
+    found = spare;
+    spare = other;
+  }
+  return found;
+}
+
+/* Writes which pairs are the nearest ones of their bodies and within a radius, nearest first; `order` has
+   room for all. Returns how many, -1 if there is no memory. */
+EXPORT int64_t rank(
+    const Table *t, const int32_t *pairs, int64_t n, const double *distances, double radius, int64_t *order) {
+  int64_t count = 0, kept = 0, slots = 2;
+  while (slots < 2 * n) slots *= 2;
+  Found *memory = malloc((2 * n + 1) * sizeof(Found)), *found = memory;
+  int64_t *known = calloc(slots, sizeof(int64_t)); /* bodies that were there, and 1 */
+  if (!found || !known) {
+    free(memory);
+    free(known);
+    return -1;
+  }
+  for (int64_t k = 0; k < n; k++)
+    if (distances[k] <= radius) {
+      const int32_t i = pairs[2 * k], j = pairs[2 * k + 1], a = t->body[i], b = t->body[j];
+      const int64_t bodies = a < b ? t->bodies * a + b : t->bodies * b + a;
+      found[count++] = (Found){distances[k], bodies, i, j, (int32_t)k};
+    }
+  found = sorted(found, found + n, count);
+  for (int64_t k = 0; k < count; k++) {
+    const int64_t bodies = found[k].bodies + 1;
+    uint64_t slot = (uint64_t)bodies * 0x9E3779B97F4A7C15u >> 20 & (slots - 1);
+    while (known[slot] && known[slot] != bodies) slot = (slot + 1) & (slots - 1);
+    if (!known[slot]) order[kept++] = found[k].at;
+    known[slot] = bodies;
+  }
+  free(memory);
+  free(known);
+  return kept;
+}
+
+/* Writes pairs in an order, that body first which is before the other in the model. */
+EXPORT void gather(
+    const Table *t, const int32_t *pairs, const double *distances, const double *witnesses,
+    const int64_t *order, int64_t n, int32_t *pieces, int32_t *bodies, double *distance, double *witness) {
+  for (int64_t k = 0; k < n; k++) {
+    const int32_t *pair = pairs + 2 * order[k];
+    const double *points = witnesses + 9 * order[k];
+    const int turn = t->body[pair[0]] > t->body[pair[1]];
+    distance[k] = distances[order[k]];
+    for (int r = 0; r < 2; r++) {
+      pieces[2 * k + r] = pair[r ^ turn];
+      bodies[2 * k + r] = t->body[pair[r ^ turn]];
+    }
+    for (int r = 0; r < 3; r++) {
+      witness[9 * k + r] = points[3 * turn + r];
+      witness[9 * k + 3 + r] = points[3 * !turn + r];
+      witness[9 * k + 6 + r] = turn ? -points[6 + r] : points[6 + r];
+    }
+  }
+}
+
+/* All of it: what may be within `reach`, measured, ranked, and the nearest pairs of their bodies in order.
+   Returns how many pairs were measured, and writes how many are `kept`: -1 if some are left to coal, or if
+   there is no room. */
+EXPORT int64_t search(
+    Table *t, double reach, double radius, int64_t room, int32_t *pairs, double *lows, double *distances,
+    double *witnesses, int64_t *order, int64_t *kept, int32_t *pieces, int32_t *bodies, double *distance,
+    double *witness) {
+  const int64_t found = near(t, reach, pairs, lows, room);
+  *kept = -1;
+  if (found > room) return found;
+  measure(t, pairs, found, radius, distances, witnesses);
+  for (int64_t k = 0; k < found; k++)
+    if (isnan(distances[k])) return found;
+  *kept = rank(t, pairs, found, distances, radius, order);
+  if (*kept > 0) gather(t, pairs, distances, witnesses, order, *kept, pieces, bodies, distance, witness);
+  return found;
+}
+"""

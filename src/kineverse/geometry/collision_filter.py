@@ -1,0 +1,174 @@
+"""Collision filter: the pairs of bodies that are checked.
+
+Not looked at are bodies that are rigidly connected, bodies joined by one articulation, and what rules except.
+Rules are data: a model keeps them under the name :data:`RULES`, for whoever makes a scene of it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from kineverse.errors import InvalidValueError, UnknownNameError, suggest
+from kineverse.loops.record import find_loops
+from kineverse.model.body import Pose
+from kineverse.model.frame import WORLD, Frame
+from kineverse.model.model_view import ModelView
+
+from .broadphase import Flags
+from .objects import matches_pattern
+
+RULES = "geometry/rules"
+"""Where a model keeps its rules; what it includes below a prefix has them below that prefix."""
+
+_FREE_SPEEDS = 6
+_WILDCARDS = "*?["
+
+
+class Rule(NamedTuple):
+    """Whether pairs of bodies are looked at; the last rule that is about a pair decides.
+
+    Attributes
+    ----------
+    a, b
+        Names of bodies, or patterns in which ``*`` is any text, also across slashes.
+    check
+        Whether to look at such pairs. True brings back what is adjacent, or excepted by an earlier rule.
+    why
+        For people.
+    """
+
+    a: str
+    b: str = "*"
+    check: bool = False
+    why: str = ""
+
+
+def parse_rules(entries: Any) -> tuple[Rule, ...]:
+    """Return rules from what a model or document keeps of them.
+
+    Raises
+    ------
+    InvalidValueError
+        If an entry is no ``(a, b, check, why)``.
+    """
+    if isinstance(entries, str | Rule) or not isinstance(entries, Iterable):
+        raise InvalidValueError(f"Rules are a sequence of kv.geometry.Rule, not {entries!r}.")
+    rules = []
+    for entry in entries:
+        try:
+            rule = Rule(*entry)
+        except TypeError:
+            rule = Rule("")
+        texts = all(isinstance(x, str) for x in (rule.a, rule.b, rule.why))
+        if not (rule.a and texts and isinstance(rule.check, bool | np.bool_)):
+            raise InvalidValueError(f"A rule is (a, b, check, why), as kv.geometry.Rule, not {entry!r}.")
+        rules.append(Rule(rule.a, rule.b, bool(rule.check), rule.why))
+    return tuple(rules)
+
+
+def read_rules(model: ModelView) -> tuple[Rule, ...]:
+    """Return the rules that a model keeps: those of what it includes, about bodies there, and then its own.
+
+    Raises
+    ------
+    InvalidValueError
+        If an entry is no ``(a, b, check, why)``.
+    """
+    found: list[Rule] = []
+    for name, entries in model.data.items():
+        if name.endswith(f"/{RULES}"):
+            prefix = name.removesuffix(RULES)
+            found += [rule._replace(a=prefix + rule.a, b=prefix + rule.b) for rule in parse_rules(entries)]
+    return (*found, *parse_rules(model.data.get(RULES, ())))
+
+
+def rules_as_data(rules: Iterable[Rule]) -> tuple[tuple[str, str, bool, str], ...]:
+    """Return rules as a model can keep them: ``edit.write(RULES, rules_as_data(rules))``."""
+    return tuple((rule.a, rule.b, rule.check, rule.why) for rule in parse_rules(rules))
+
+
+def check_frame_names(what: str, names: Iterable[str], model: ModelView) -> None:
+    """Raise an error for a name that no frame has, given for ``what``; patterns may match nothing."""
+    frames = model.frames
+    for name in dict.fromkeys(names):
+        if not any(sign in name for sign in _WILDCARDS) and name not in frames and name != WORLD:
+            raise UnknownNameError(f"{what} '{name}', which is no frame. {suggest(name, frames, 'frame')}")
+
+
+def allowed_pairs(model: ModelView, bodies: Sequence[str], rules: Sequence[Rule]) -> Flags:
+    """Return (B, B) flags, 1 for pairs that are looked at."""
+    table = 1 - adjacent_pairs(model, bodies)
+    place = {name: k for k, name in enumerate(bodies)}
+    meant: dict[str, list[int]] = {}
+    for rule in rules:
+        ones, others = (_matching_bodies(name, place, meant) for name in (rule.a, rule.b))
+        if len(ones) == len(others) == 1:  # of which there may be one for each pair
+            table[ones[0], others[0]] = table[others[0], ones[0]] = rule.check
+        else:
+            table[np.ix_(ones, others)] = table[np.ix_(others, ones)] = rule.check
+    np.fill_diagonal(table, 0)
+    return np.ascontiguousarray(table)
+
+
+def _matching_bodies(name: str, place: Mapping[str, int], meant: dict[str, list[int]]) -> list[int]:
+    """Return the bodies that a name or pattern means, and remember it."""
+    if name not in meant:
+        is_pattern = any(sign in name for sign in _WILDCARDS)
+        some = place if is_pattern else (name,) if name in place else ()
+        meant[name] = [place[body] for body in some if matches_pattern(body, (name,))]
+    return meant[name]
+
+
+def adjacent_pairs(model: ModelView, bodies: Sequence[str]) -> Flags:
+    """Return (B, B) flags, 1 for pairs that are rigidly connected or joined by one articulation.
+
+    What hangs on something that does not move at all is joined only to the body that it hangs on: a door to
+    its cupboard, and not to the wall. What moves freely, with six speeds, is joined to nothing. The ends of a
+    loop are joined where it is closed.
+    """
+    frames = dict(model.frames)
+    groups = {name: _rigid_group(name, frames) for name in bodies}
+    numbers = {group: k for k, group in enumerate(dict.fromkeys(groups.values()))}
+    number = np.array([numbers[groups[name]] for name in bodies], dtype=int)
+    table: Flags = (number[:, None] == number[None, :]).astype(np.uint8)
+    place = {name: k for k, name in enumerate(bodies)}
+
+    def those_at(frame: str) -> npt.NDArray[np.bool_]:
+        group = _rigid_group(frame, frames)
+        if group == WORLD:
+            return np.asarray(np.arange(len(bodies)) == _carrier(frame, frames, place))
+        return np.asarray(number == numbers.get(group, -1))
+
+    for one, other in _joined_frames(model, frames, numbers):
+        members, joined = those_at(one), those_at(other)
+        table[np.outer(members, joined) | np.outer(joined, members)] = 1
+    return table
+
+
+def _joined_frames(
+    model: ModelView, frames: Mapping[str, Frame], groups: Iterable[str]
+) -> Iterator[tuple[str, str]]:
+    """Yield pairs of frames that an articulation joins: groups and their parents, and the ends of loops."""
+    for group in groups:
+        if group != WORLD and len(model.speeds_of(group, frames[group].parent)) < _FREE_SPEEDS:
+            yield group, frames[group].parent
+    for loop in find_loops(model):
+        yield from loop.ends
+
+
+def _rigid_group(name: str, frames: Mapping[str, Frame]) -> str:
+    """Return the frame with which one is rigidly connected and that moves in its parent; or the world."""
+    while name != WORLD and all(isinstance(factor, Pose) for factor in frames[name].factors):
+        name = frames[name].parent
+    return name
+
+
+def _carrier(name: str, frames: Mapping[str, Frame], place: Mapping[str, int]) -> int:
+    """Return the number of the nearest body at or above a frame that does not move; -1 if there is none."""
+    while name not in place and name != WORLD:
+        name = frames[name].parent
+    return place.get(name, -1)

@@ -1,0 +1,230 @@
+"""Convex decomposition of a mesh, by way of the cache."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor, as_completed
+from dataclasses import dataclass
+
+import numpy as np
+
+from kineverse.errors import FormatError, InvalidValueError, KineverseError, MissingDependencyError
+from kineverse.geometry.mesh_files import Floats
+from kineverse.model.body import Mesh
+
+from . import hull_cache
+from .accuracy import Polytope, measure_accuracy, nearest_surface_points
+from .mesh_cleanup import CleanMesh, clean_mesh
+from .result import Decomposition, DecompositionSettings
+from .worker import DecompositionError, ResourceLimits, run_coacd
+
+# A hull that stands out of another by less than this part of its size is inside of it.
+_INSIDE = 1e-9
+
+
+def clean_hulls(hulls: list[Floats], whole: Polytope) -> list[Polytope]:
+    """Return the hulls of sets of points, without those that span nothing and those inside of another one.
+
+    What stands out of the hull of the whole mesh is taken back onto it: where CoACD has wrapped a surface, it
+    is a little larger all around.
+    """
+    found = []
+    for points in hulls:
+        try:
+            found.append(Polytope.of(_project_inside(points, whole)))
+        except InvalidValueError:  # A splinter: a cut has come upon a point or an edge.
+            continue
+    found.sort(key=lambda polytope: -polytope.volume)
+    kept: list[Polytope] = []
+    for polytope in found:
+        room = _INSIDE * np.ptp(polytope.points, axis=0).max()
+        if not any((larger.outside(polytope.points) <= room).all() for larger in kept):
+            kept.append(polytope)
+    return kept
+
+
+def _project_inside(points: Floats, whole: Polytope) -> Floats:
+    points = points.copy()
+    beyond = whole.outside(points) > 0.0
+    points[beyond] = nearest_surface_points(whole.engine, points[beyond])[1]
+    return points
+
+
+def reduce_hulls(hulls: list[Polytope], count: int) -> list[Polytope]:
+    """Join hulls until there are at most so many: always the two whose common hull adds least volume."""
+    hulls = list(hulls)
+    joined = (
+        {(i, j): _join_hulls(hulls[i], hulls[j]) for j in range(len(hulls)) for i in range(j)}
+        if len(hulls) > count
+        else {}
+    )
+    alive = dict(enumerate(hulls))
+    while len(alive) > count:
+        (i, j), (_, one) = min(joined.items(), key=lambda item: (item[1][0], item[0]))
+        new = max(alive) + 1
+        del alive[i], alive[j]
+        joined = {pair: value for pair, value in joined.items() if not {i, j} & set(pair)}
+        joined |= {(k, new): _join_hulls(other, one) for k, other in alive.items()}
+        alive[new] = one
+    return list(alive.values())
+
+
+def _join_hulls(one: Polytope, other: Polytope) -> tuple[float, Polytope]:
+    """Return the volume that joining two hulls adds [m³], and what they become."""
+    both = Polytope.of(np.concatenate([one.points, other.points]))
+    return both.volume - one.volume - other.volume, both
+
+
+DEFAULTS, LIMITS = DecompositionSettings(), ResourceLimits()
+
+
+@dataclass(frozen=True, slots=True)
+class DecompositionOutcome:
+    """What became of one mesh: a decomposition, from the cache or not, or an error."""
+
+    mesh: Mesh
+    decomposition: Decomposition | None = None
+    error: KineverseError | None = None
+    cached: bool = False
+
+
+def find_hulls(mesh: Mesh, settings: DecompositionSettings | None = None) -> tuple[Floats, ...] | None:
+    """Return the convex pieces of a mesh if they are in the cache, else None.
+
+    Parameters
+    ----------
+    mesh
+        A mesh; its scale is applied.
+    settings
+        What it was decomposed with; if None, the latest of its decompositions is taken.
+
+    Returns
+    -------
+    The corners of each hull, (n, 3) in the frame of the mesh [m], read-only. The order is always the same.
+
+    Raises
+    ------
+    FormatError, InvalidValueError, MissingDependencyError
+        If the mesh cannot be read, or there can be no decomposition of it.
+    """
+    surface = clean_mesh(mesh)
+    found = hull_cache.find_entry(surface.digest, settings.key(surface.size) if settings else None)
+    return found.hulls if found else None
+
+
+def decompose(
+    mesh: Mesh,
+    settings: DecompositionSettings = DEFAULTS,
+    limits: ResourceLimits = LIMITS,
+    force: bool = False,
+    stop: threading.Event | None = None,
+) -> DecompositionOutcome:
+    """Return a mesh as a union of convex hulls, from the cache or made now, which takes seconds to minutes.
+
+    The same mesh and settings give the same hulls.
+
+    Parameters
+    ----------
+    mesh
+        A mesh; its scale is applied.
+    settings
+        What is asked for.
+    limits
+        What it may cost.
+    force
+        Whether it is made anew though it is in the cache.
+    stop
+        Ends it, when set, with a :class:`DecompositionError`.
+
+    Raises
+    ------
+    FormatError, InvalidValueError
+        If the mesh cannot be read, is flat, or of an impossible size; the message names the file.
+    MissingDependencyError
+        If CoACD, coal or trimesh is not installed.
+    DecompositionError
+        If CoACD fails, or exceeds its limits.
+    """
+    surface = clean_mesh(mesh)
+    digest, key = surface.digest, settings.key(surface.size)
+    found = None if force else hull_cache.find_entry(digest, key)
+    if found is not None:
+        return DecompositionOutcome(mesh, found, cached=True)
+    try:
+        made = _decompose_surface(surface, settings, limits, stop)
+    except DecompositionError as error:
+        raise DecompositionError(f"{surface.name}: {error}") from error
+    hull_cache.add_entry(digest, key, made)
+    return DecompositionOutcome(mesh, made)
+
+
+def decompose_all(
+    meshes: Sequence[Mesh],
+    settings: DecompositionSettings = DEFAULTS,
+    limits: ResourceLimits = LIMITS,
+    force: bool = False,
+    jobs: int = 1,
+) -> Iterator[DecompositionOutcome]:
+    """Yield what becomes of each mesh, as soon as it is known; one that is wrong does not stop the others.
+
+    Parameters
+    ----------
+    meshes, settings, limits, force
+        See :func:`decompose`.
+    jobs
+        So many are decomposed at the same time, each on one core.
+
+    Raises
+    ------
+    MissingDependencyError
+        If CoACD, coal or trimesh is not installed.
+    """
+    stop = threading.Event()
+
+    def one(mesh: Mesh) -> DecompositionOutcome:
+        try:
+            return decompose(mesh, settings, limits, force, stop)
+        except MissingDependencyError:
+            raise
+        except KineverseError as error:
+            return DecompositionOutcome(mesh, error=error)
+        except OSError as error:
+            return DecompositionOutcome(mesh, error=FormatError(f"{mesh.uri}: {error}"))
+
+    with ThreadPoolExecutor(jobs, thread_name_prefix="kineverse-decompose") as pool:
+        waiting = [pool.submit(one, mesh) for mesh in meshes]
+        try:
+            for future in as_completed(waiting):
+                yield future.result()
+        finally:
+            # Whoever does not want the rest, or presses Ctrl-C, does not wait for it.
+            stop.set()
+            pool.shutdown(wait=False, cancel_futures=True)
+
+
+def _decompose_surface(
+    surface: CleanMesh, settings: DecompositionSettings, limits: ResourceLimits, stop: threading.Event | None
+) -> Decomposition:
+    start = time.perf_counter()
+    error = settings.allowed(surface.size)
+    found = clean_hulls(run_coacd(surface, error, limits, stop), Polytope.of(surface.faces.vertices))
+    hulls = reduce_hulls(found, settings.max_hulls)
+    if not hulls:
+        raise DecompositionError("CoACD found no hull.")
+    accuracy = measure_accuracy(surface.faces, hulls)
+    corners = [np.ascontiguousarray(polytope.points) for polytope in hulls]
+    for array in corners:
+        array.flags.writeable = False
+    seconds = time.perf_counter() - start
+    return Decomposition(
+        tuple(corners),
+        surface.name,
+        error,
+        settings.max_hulls,
+        accuracy,
+        seconds,
+        time.time(),
+        surface.remarks,
+    )

@@ -1,0 +1,108 @@
+"""Signed distances as expressions.
+
+With the nearest points fixed in their bodies, at a_p and b_p, and the normal n from a to b in the world,
+
+    d = nᵀ (world_T_b b_p - world_T_a a_p)
+
+has at the state where these were found the value and, for all coordinates, the derivatives of the signed
+distance: how the points slide along the surfaces and how n turns has no part in them (envelope theorem). In
+penetration d is negative and n is the same, so nothing happens to the gradient at contact.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+
+import numpy as np
+
+from kineverse.expressions import Expression, array
+from kineverse.model.model_view import ModelView
+from kineverse.symbols import Symbol, parameter
+
+from .mesh_files import Floats
+from .results import DistanceResult
+
+_ROWS = ("point_a", "point_b", "normal")
+
+
+@dataclass(frozen=True, eq=False)
+class PairDistance:
+    """The distance of two bodies as an expression of the coordinates that move them.
+
+    Attributes
+    ----------
+    a, b
+        The bodies.
+    expression
+        The signed distance [m], a scalar; exact with its gradient where the parameters are up to date.
+    parameters
+        (3, 3) symbols: the nearest point of a in a, that of b in b, and the normal in the world. Their own
+        values are those at the state where this was made.
+    """
+
+    a: str
+    b: str
+    expression: Expression
+    parameters: tuple[tuple[Symbol, ...], ...]
+
+    def values(self, closest: DistanceResult, world_T_a: Floats, world_T_b: Floats) -> dict[Symbol, float]:
+        """Return values of the parameters, for a state.
+
+        Parameters
+        ----------
+        closest
+            How near the two bodies are.
+        world_T_a, world_T_b
+            (4, 4) where they are then.
+        """
+        rows = _parameter_rows(closest, world_T_a, world_T_b)
+        return {
+            symbol: float(value)
+            for symbols, row in zip(self.parameters, rows, strict=True)
+            for symbol, value in zip(symbols, row, strict=True)
+        }
+
+
+DistanceParameters = tuple[tuple[Symbol, ...], ...]
+
+
+def distance_parameters(
+    model: ModelView, closest: DistanceResult, world_T_a: Floats, world_T_b: Floats
+) -> DistanceParameters:
+    """Return symbols for the nearest points and the normal of two bodies.
+
+    Those that the model has already, of a scene before or from its document; others have their values now.
+    """
+    known = {symbol.path: symbol for symbol in model.symbols}
+
+    def of(path: str, value: float) -> Symbol:
+        return known[path] if path in known else parameter(path, value)
+
+    path = f"distance/{_escape_to(closest.a)}/to/{_escape_to(closest.b)}"
+    return tuple(
+        tuple(of(f"{path}/{name}/{axis}", float(value)) for axis, value in zip("xyz", row, strict=True))
+        for name, row in zip(_ROWS, _parameter_rows(closest, world_T_a, world_T_b), strict=True)
+    )
+
+
+def distance_expression(model: ModelView, a: str, b: str, parameters: DistanceParameters) -> PairDistance:
+    """Return the distance of two bodies as an expression of a model's coordinates."""
+    point_a, point_b, normal = (array(list(row)) for row in parameters)
+    world_T_a, world_T_b = model.fk(a), model.fk(b)
+    world_a = world_T_a[:3, :3] @ point_a + world_T_a[:3, 3]
+    world_b = world_T_b[:3, :3] @ point_b + world_T_b[:3, 3]
+    return PairDistance(a, b, normal @ (world_b - world_a), parameters)
+
+
+def _escape_to(body: str) -> str:
+    """Return a name without a part ``to``, which stands between two names; no two become the same."""
+    return re.sub(r"(^|/)(to_*)(?=/|$)", r"\1\2_", body)
+
+
+def _parameter_rows(
+    closest: DistanceResult, world_T_a: Floats, world_T_b: Floats
+) -> tuple[Floats, Floats, Floats]:
+    point_a = world_T_a[:3, :3].T @ (closest.point_a - world_T_a[:3, 3])
+    point_b = world_T_b[:3, :3].T @ (closest.point_b - world_T_b[:3, 3])
+    return np.asarray(point_a), np.asarray(point_b), closest.normal

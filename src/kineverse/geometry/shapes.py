@@ -1,0 +1,372 @@
+"""Collision shapes: primitives, convex hulls and triangle meshes as coal computes with them."""
+
+from __future__ import annotations
+
+import math
+import threading
+from dataclasses import dataclass, field, replace
+from functools import lru_cache
+from typing import Any, TypeAlias
+
+import numpy as np
+
+from kineverse._extras import install_command
+from kineverse.errors import InvalidValueError, MissingDependencyError
+from kineverse.model.body import Box, Capsule, Cone, Cylinder, Ellipsoid, Geometry, Mesh, Sphere
+
+from .mesh_files import Faces, Floats, Integers, MeshFile, find_mesh_file, read_faces
+
+SMALLEST_MESH, LARGEST_MESH = 1e-6, 1e6
+"""A mesh smaller or larger than this is a mistake in its unit or scale [m]."""
+
+THICKNESS = 2e-5
+"""What is thinner than this is made so thick: 20 µm, or 1e-5 of its size if that is more [m]."""
+
+
+def convex_hull(points: Floats) -> Any:
+    """Return the convex hull of (N, 3) points [m] as a ``coal.Convex``.
+
+    Hulls without volume make the algorithms fail, so a flat one, as of a pane of glass, is given
+    :data:`THICKNESS`, half of it on each side.
+
+    Raises
+    ------
+    InvalidValueError
+        If the points are too close together or too far apart, lie on a line, or are not finite.
+    """
+    import coal
+
+    solid = thicken_flat(points)
+    vector = coal.StdVec_Vec3s()
+    for point in solid:
+        vector.append(point)
+    try:
+        return coal.Convex.convexHull(vector, True, "Qt")
+    except Exception as error:  # What qhull says is pages long.
+        raise InvalidValueError("qhull finds no convex hull of its points.") from error
+
+
+def thicken_flat(points: Floats) -> Floats:
+    """Return the points, or if they are flat, twice as many that are not; see :func:`convex_hull`."""
+    check_extent(points)
+    unique = np.unique(points, axis=0)
+    centred = unique - unique.mean(axis=0)
+    axes = np.linalg.svd(centred, full_matrices=False)[2] if len(unique) > 2 else np.eye(3)
+    size, width, thickness = np.ptp(centred @ axes.T, axis=0).tolist() if len(axes) == 3 else (0.0, 0.0, 0.0)
+    least = max(THICKNESS, 1e-5 * size)
+    if len(unique) < 3 or width < least:
+        raise InvalidValueError("all its points lie on a line, so that there is nothing to touch.")
+    if thickness >= least:
+        return unique
+    normal = axes[2] * (least / 2)
+    return np.concatenate([unique - normal, unique + normal])
+
+
+def check_extent(points: Floats) -> None:
+    """Raise an error for points that no mesh can have meant [m]."""
+    if not np.isfinite(points).all():
+        raise InvalidValueError("its points are not finite.")
+    extent = float(np.ptp(points, axis=0).max()) if len(points) else 0.0
+    if not SMALLEST_MESH <= extent <= LARGEST_MESH:
+        raise InvalidValueError(
+            f"its extent is {extent:g} m, and meshes from {SMALLEST_MESH:g} m to {LARGEST_MESH:g} m are taken. "
+            "Is its scale right?"
+        )
+    if np.abs(points).max() > LARGEST_MESH:
+        raise InvalidValueError(
+            f"it lies further than {LARGEST_MESH:g} m from its origin. Is its scale right?"
+        )
+
+
+Primitive: TypeAlias = Box | Sphere | Cylinder | Capsule | Cone | Ellipsoid
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Hull:
+    """A convex polytope: the points x with ``normals @ x <= offsets``; (F, 3) and (F,) [m]."""
+
+    normals: Floats
+    offsets: Floats
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Core:
+    """What a solid is made of for our own measuring, see :mod:`.support_source`.
+
+    It is the hull of corners; or the sum of a box, an ellipsoid, and a ball, about the origin; or a cone.
+
+    Attributes
+    ----------
+    half
+        (3,) half the edges of the box [m].
+    radius
+        Of the ball [m].
+    radii
+        (3,) of the ellipsoid, which is a disc if the last is 0 [m].
+    corners
+        (3, n) in the frame of the solid [m], n a multiple of 8, for which the first one is repeated; n = 0
+        for what is no hull.
+    tip
+        Of a cone, which is the hull of the tip at (0, 0, tip) and the ellipsoid, a disc, at (0, 0, -tip); 0
+        for everything else [m].
+    """
+
+    half: Floats
+    radius: float = 0.0
+    radii: Floats = field(default_factory=lambda: np.zeros(3))
+    corners: Floats = field(default_factory=lambda: np.empty((3, 0)))
+    tip: float = 0.0
+
+    @staticmethod
+    def hull(points: Floats) -> Core:
+        """Return the hull of (n, 3) corners."""
+        missing = -len(points) % 8
+        corners = np.ascontiguousarray(np.vstack([points, *missing * [points[:1]]]).T)
+        return Core(np.zeros(3), corners=corners)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Solid:
+    """A shape that distances can be computed to. Equal geometries have the same solid; it never changes.
+
+    Attributes
+    ----------
+    engine
+        What coal computes with. coal keeps pointers only, so the solid must outlive what is made of it.
+    surface
+        What it is, for rays: a primitive, a hull, or triangles.
+    centre, half
+        The box around it in its own frame: (3,) and (3,) half edges [m].
+    radius
+        Of the sphere about ``centre`` that holds it [m].
+    stand_in
+        The same shape as coal should see it beside a cylinder; None if that is ``engine``.
+    core
+        The same shape for our own measuring; None if it is not made like that.
+    """
+
+    engine: Any
+    surface: Primitive | Hull | Faces
+    centre: Floats
+    half: Floats
+    radius: float
+    stand_in: Any = None
+    core: Core | None = None
+
+    @property
+    def is_convex(self) -> bool:
+        """Whether it has an inside and a depth: everything but triangles."""
+        return not isinstance(self.surface, Faces)
+
+
+_by_content: dict[tuple[object, ...], Solid] = {}
+_making = threading.Lock()
+
+
+def solid_from_geometry(geometry: Geometry, triangles: bool = False) -> Solid:
+    """Return the solid of a geometry.
+
+    Parameters
+    ----------
+    geometry
+        A primitive or a mesh; a scale with negative factors mirrors a mesh.
+    triangles
+        Whether a mesh is kept as it is, a surface without an inside, rather than as its convex hull.
+
+    Raises
+    ------
+    MissingDependencyError
+        If coal or trimesh is not installed.
+    FormatError, OSError
+        If a mesh cannot be found or read.
+    InvalidValueError
+        If sizes are not positive numbers, or a mesh is degenerate or of an impossible size.
+    """
+    import_coal()
+    if not isinstance(geometry, Mesh):
+        return _primitive_solid(geometry)
+    scale = tuple(map(float, geometry.scale))
+    if not all(math.isfinite(factor) and factor for factor in scale):
+        raise InvalidValueError(f"its scale is {scale}: factors are finite and not 0.")
+    file = find_mesh_file(geometry)
+    key = (file.digest, file.kind, scale, triangles)
+    with _making:
+        if key not in _by_content:
+            _by_content[key] = _from_file(file, np.array(scale), triangles)
+        return _by_content[key]
+
+
+def solid_from_points(points: Floats) -> Solid:
+    """Return the solid that is the convex hull of (n, 3) points [m].
+
+    Raises
+    ------
+    MissingDependencyError
+        If coal is not installed.
+    InvalidValueError
+        If they span nothing.
+    """
+    import_coal()
+    key = ("hull", points.tobytes())
+    with _making:
+        if key not in _by_content:
+            _by_content[key] = _hull_solid(points)
+        return _by_content[key]
+
+
+@lru_cache(maxsize=4096)
+def scale_solid(solid: Solid, factor: float) -> Solid:
+    """Return a convex solid times a factor; what was given for its radius is kept to."""
+    if isinstance(solid.surface, Hull):
+        assert solid.core is not None
+        made = _hull_solid(factor * solid.core.corners.T)
+    else:
+        assert not isinstance(solid.surface, Faces)
+        made = _of_primitive(_scale_primitive(solid.surface, factor))
+    return replace(made, radius=factor * solid.radius)
+
+
+def import_coal() -> Any:
+    """Return coal; raises MissingDependencyError if it is not installed."""
+    try:
+        import coal
+    except ImportError as error:
+        raise MissingDependencyError(f"distances need coal: {install_command('geometry')}") from error
+    return coal
+
+
+def _from_file(file: MeshFile, scale: Floats, triangles: bool) -> Solid:
+    mesh = read_faces(file)
+    vertices = mesh.vertices * scale
+    if not triangles:
+        return _hull_solid(vertices[np.unique(mesh.faces)])
+    check_extent(vertices)
+    return _triangle_solid(vertices, mesh.faces[:, ::-1] if np.prod(scale) < 0 else mesh.faces)
+
+
+def _hull_solid(points: Floats) -> Solid:
+    convex = convex_hull(points)
+    corners = np.array(convex.points())
+    low, high = corners.min(axis=0), corners.max(axis=0)
+    surface = Hull(np.array(convex.normals()), -np.array(convex.offsets()).reshape(-1))
+    return _solid_around(convex, surface, (low + high) / 2, (high - low) / 2, corners, Core.hull(corners))
+
+
+def _triangle_solid(vertices: Floats, faces: Integers) -> Solid:
+    faces = _with_area(vertices, faces)
+    bvh = import_coal().BVHModelOBBRSS()
+    bvh.beginModel(len(faces), len(vertices))
+    bvh.addVertices(vertices)
+    bvh.addTriangles(np.ascontiguousarray(faces))
+    bvh.endModel()
+    used = vertices[np.unique(faces)]
+    low, high = used.min(axis=0), used.max(axis=0)
+    return _solid_around(bvh, Faces(vertices, faces), (low + high) / 2, (high - low) / 2, used)
+
+
+def _with_area(vertices: Floats, faces: Integers) -> Integers:
+    """Leave out triangles that are lines or points: for coal such a one touches everything."""
+    a, b, c = np.moveaxis(vertices[faces], 1, 0)
+    longest = np.max([((p - q) ** 2).sum(axis=1) for p, q in ((a, b), (b, c), (c, a))], axis=0)
+    there = np.linalg.norm(np.cross(b - a, c - a), axis=1) > 1e-14 * longest
+    if not there.any():
+        raise InvalidValueError("all its triangles are lines or points, so that there is nothing to touch.")
+    kept: Integers = faces[there]
+    return kept
+
+
+def _solid_around(
+    engine: Any,
+    surface: Hull | Faces,
+    centre: Floats,
+    half: Floats,
+    points: Floats,
+    core: Core | None = None,
+) -> Solid:
+    engine.computeLocalAABB()
+    radius = float(np.linalg.norm(points - centre, axis=1).max())
+    return Solid(engine, surface, centre, half, radius, core=core)
+
+
+@lru_cache(maxsize=65536)
+def _primitive_solid(geometry: Primitive) -> Solid:
+    sizes = _sizes(geometry)
+    if not all(math.isfinite(size) and size > 0.0 for size in sizes):
+        raise InvalidValueError(f"{geometry} has sizes that are not positive numbers [m].")
+    if not all(SMALLEST_SIZE <= size <= LARGEST_SIZE for size in sizes):
+        raise InvalidValueError(
+            f"{geometry} has sizes beyond {SMALLEST_SIZE:g} m to {LARGEST_SIZE:g} m, which cannot be right."
+        )
+    return _of_primitive(geometry)
+
+
+def _of_primitive(geometry: Primitive) -> Solid:
+    coal = import_coal()
+    stand_in = core = None
+    x, y, z = (*_sizes(geometry), 0.0, 0.0)[:3]
+    if isinstance(geometry, Box):
+        engine, half = coal.Box(x, y, z), (x / 2, y / 2, z / 2)
+        radius = math.hypot(*half)
+        core = Core(np.array(half))
+    elif isinstance(geometry, Sphere):
+        engine, half, radius = coal.Sphere(x), (x, x, x), x
+        # coal looks only at the wall when the centre of a sphere is inside a cylinder, and not at its ends.
+        stand_in = coal.Capsule(x, 0.0)
+        stand_in.computeLocalAABB()
+        core = Core(np.zeros(3), x)
+    elif isinstance(geometry, Ellipsoid):
+        engine, half, radius = coal.Ellipsoid(x, y, z), (x, y, z), max(x, y, z)
+        core = Core(np.zeros(3), radii=np.array([x, y, z]))
+    elif isinstance(geometry, Capsule):
+        engine, half, radius = coal.Capsule(x, y), (x, x, x + y / 2), x + y / 2
+        core = Core(np.array([0.0, 0.0, y / 2]), x)
+    elif isinstance(geometry, Cylinder):
+        engine, half, radius = coal.Cylinder(x, y), (x, x, y / 2), math.hypot(x, y / 2)
+        core = Core(np.array([0.0, 0.0, y / 2]), radii=np.array([x, x, 0.0]))
+    else:
+        engine, half, radius = coal.Cone(x, y), (x, x, y / 2), math.hypot(x, y / 2)
+        core = Core(np.zeros(3), radii=np.array([x, x, 0.0]), tip=y / 2)
+    engine.computeLocalAABB()
+    return Solid(engine, geometry, np.zeros(3), np.array(half), radius, stand_in, core)
+
+
+SMALLEST_SIZE, LARGEST_SIZE = 1e-7, 1e6
+"""Beyond these sizes a primitive is taken for a mistake [m]."""
+
+
+def _scale_primitive(geometry: Primitive, factor: float) -> Primitive:
+    sizes = [factor * size for size in _sizes(geometry)]
+    if isinstance(geometry, Box | Ellipsoid):
+        x, y, z = sizes
+        return type(geometry)((x, y, z))
+    return type(geometry)(*sizes)
+
+
+def _sizes(geometry: Primitive) -> tuple[float, ...]:
+    try:
+        if isinstance(geometry, Box | Ellipsoid):
+            x, y, z = geometry.size if isinstance(geometry, Box) else geometry.radii
+            return (float(x), float(y), float(z))
+        if isinstance(geometry, Sphere):
+            return (float(geometry.radius),)
+        if isinstance(geometry, Cylinder | Capsule | Cone):
+            return (float(geometry.radius), float(geometry.length))
+    except (TypeError, ValueError) as error:
+        raise InvalidValueError(f"{geometry} has sizes that are not positive numbers [m].") from error
+    raise InvalidValueError(f"{geometry!r} is no geometry that a body can have.")
+
+
+def solid_surface(solid: Solid) -> Faces | Primitive:
+    """Return the surface of a solid: the primitive that it is, or triangles, seen from outside."""
+    return _hull_faces(solid.engine) if isinstance(solid.surface, Hull) else solid.surface
+
+
+def _hull_faces(convex: Any) -> Faces:
+    """Return the triangles of a ``coal.Convex``, counter-clockwise seen from outside."""
+    vertices = np.array(convex.points())
+    triangles = [convex.polygons(k) for k in range(convex.num_polygons)]
+    faces = np.array([[triangle[0], triangle[1], triangle[2]] for triangle in triangles], dtype=np.int64)
+    a, b, c = np.moveaxis(vertices[faces], 1, 0)
+    inward = np.einsum("ij,ij->i", np.cross(b - a, c - a), np.array(convex.normals())) < 0.0
+    faces[inward] = faces[inward][:, ::-1]
+    return Faces(vertices, faces)

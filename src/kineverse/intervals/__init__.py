@@ -1,0 +1,1 @@
+"""Guaranteed ranges of expressions by interval arithmetic."""

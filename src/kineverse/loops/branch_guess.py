@@ -1,0 +1,339 @@
+"""Initial guess of the dependent coordinates, fitted to samples of one branch.
+
+Over inputs within limits they are Chebyshev polynomials, over whole turns Fourier series; over several inputs
+products of these, and over many inputs only those whose degrees add up to no more than the degree. They need
+not be exact, Newton's method makes them so; but from every point of the domain it has to arrive at this
+branch, and that is tried out before a seed is used.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from kineverse.errors import NoSolutionError
+from kineverse.expressions.expression import Expression, array
+from kineverse.expressions.functions import cos, sin
+from kineverse.symbols import Symbol
+
+from .branches import continue_solution
+from .equations import Array, Equations
+
+FEW = 3
+"""Up to how many inputs all products are used, and samples lie on a grid."""
+
+MARGIN = 0.2
+"""How much further than its limits a loop is continued on each side: of their distance, and at least [m] or
+[rad]. Estimates and controllers overstep limits."""
+
+
+@dataclass(frozen=True)
+class InputDomain:
+    """The domain of one input: limits, or a whole turn.
+
+    Attributes
+    ----------
+    lower, upper
+        [m] or [rad].
+    whole
+        Whether it is an angle that goes round.
+    """
+
+    lower: float
+    upper: float
+    whole: bool = False
+
+    def wider(self, below: float = 1.0, above: float = 1.0) -> InputDomain:
+        """Return limits with parts of a margin around them; whole turns have none."""
+        if self.whole:
+            return self
+        margin = MARGIN * max(self.upper - self.lower, 1.0)
+        return InputDomain(self.lower - below * margin, self.upper + above * margin)
+
+    def samples(self, count: int) -> Array:
+        """Return points at which fits are well behaved, in order."""
+        parts = np.arange(count) + (0.0 if self.whole else 0.5)
+        return self.spread(parts / count)
+
+    def spread(self, parts: Array) -> Array:
+        """Return points for numbers in [0, 1): dense where fits need it."""
+        width = self.upper - self.lower
+        if self.whole:
+            return self.lower + width * parts
+        return (self.lower + self.upper) / 2 - width / 2 * np.cos(parts * np.pi)
+
+    def orders(self, degree: int) -> list[int]:
+        """Return the degree of each of the basis functions up to one."""
+        if self.whole:
+            return [(i + 1) // 2 for i in range(2 * degree + 1)]
+        return [0] if self.upper == self.lower else list(range(degree + 1))
+
+    def numbers(self, u: Array, degree: int) -> Array:
+        """Return the basis functions at points, shape (N, size)."""
+        if self.whole:
+            parts = [np.ones_like(u)]
+            for k in range(1, degree + 1):
+                parts += [np.cos(k * u), np.sin(k * u)]
+            return np.column_stack(parts)
+        if self.upper == self.lower:
+            return np.ones((len(u), 1))
+        t = np.clip((2 * u - self.lower - self.upper) / (self.upper - self.lower), -1, 1)
+        return np.polynomial.chebyshev.chebvander(t, degree).astype(np.float64)
+
+    def functions(self, u: Symbol, degree: int) -> list[Expression]:
+        """Return the same as expressions."""
+        one = array(1.0)
+        if self.upper == self.lower:
+            return [one]
+        if self.whole:
+            c, s = cos(u), sin(u)
+            result, (ck, sk) = [one], (c, s)
+            for _ in range(degree):
+                result += [ck, sk]
+                ck, sk = ck * c - sk * s, sk * c + ck * s
+            return result
+        t = (2 * u - self.lower - self.upper) / (self.upper - self.lower)
+        result = [one, t]
+        while len(result) <= degree:
+            result.append(2 * t * result[-1] - result[-2])
+        return result[: degree + 1]
+
+
+@dataclass(frozen=True)
+class BranchGuess:
+    """A fitted guess: Σ coefficients · products of basis functions, and what grows with every turn.
+
+    Attributes
+    ----------
+    intervals
+        The domain of each input, shape (k,).
+    degree
+        Of the basis functions in each of them.
+    coefficients
+        One column for each unknown, shape (P, n).
+    winding
+        How unknowns grow with inputs that go round, shape (k, n).
+    """
+
+    intervals: tuple[InputDomain, ...]
+    degree: int
+    coefficients: Array
+    winding: Array
+
+    @staticmethod
+    def fit(
+        intervals: Sequence[InputDomain], degree: int, inputs: Array, solutions: Array, winding: Array
+    ) -> BranchGuess:
+        """Fit a seed to solutions (N, n) at inputs (N, k)."""
+        basis = _evaluate_products(inputs, intervals, degree)
+        coefficients = np.linalg.lstsq(basis, solutions - inputs @ winding, rcond=None)[0].astype(np.float64)
+        # What is far below the error of the fit is noise, and costs as much as any other term.
+        coefficients[np.abs(coefficients) < 1e-14 * np.abs(coefficients).max(initial=0.0)] = 0.0
+        return BranchGuess(tuple(intervals), degree, coefficients, winding)
+
+    def at(self, inputs: Array) -> Array:
+        """Return the guesses at inputs (N, k), shape (N, n)."""
+        basis = _evaluate_products(inputs, self.intervals, self.degree)
+        return basis @ self.coefficients + inputs @ self.winding
+
+    @property
+    def terms(self) -> int:
+        """The number of terms that are summed."""
+        return int(np.count_nonzero(self.coefficients))
+
+    def expression(self, inputs: Sequence[Symbol]) -> Expression:
+        """Return the guesses as an expression of shape (n,)."""
+        bases = [i.functions(u, self.degree) for i, u in zip(self.intervals, inputs, strict=True)]
+        products = []
+        for which in list_products(self.intervals, self.degree):
+            product = array(1.0)
+            for basis, i in zip(bases, which, strict=True):
+                product = product * basis[i]
+            products.append(product)
+        guesses = []
+        for column, grows in zip(self.coefficients.T, self.winding.T, strict=True):
+            guess = array(0.0)
+            for c, product in zip(column.tolist(), products, strict=True):
+                guess = guess + c * product if c else guess
+            for rate, u in zip(grows.tolist(), inputs, strict=True):
+                guess = guess + rate * u if rate else guess
+            guesses.append(guess)
+        return array(guesses)
+
+
+def _evaluate_products(inputs: Array, intervals: Sequence[InputDomain], degree: int) -> Array:
+    """Return the products of basis functions at points, shape (N, P)."""
+    which = list_products(intervals, degree)
+    result = np.ones((len(inputs), len(which)))
+    for column, interval, i in zip(inputs.T, intervals, np.array(which, dtype=int).T, strict=True):
+        result *= interval.numbers(column, degree)[:, i]
+    return result
+
+
+def list_products(intervals: Sequence[InputDomain], degree: int) -> list[tuple[int, ...]]:
+    """Return which basis function of each input each product is made of."""
+    most = degree if len(intervals) > FEW else degree * len(intervals)
+    found: list[tuple[tuple[int, ...], int]] = [((), 0)]
+    for interval in intervals:
+        orders = interval.orders(degree)
+        found = [
+            ((*which, i), total + order)
+            for which, total in found
+            for i, order in enumerate(orders)
+            if total + order <= most
+        ]
+    return [which for which, _ in found]
+
+
+_SAMPLES = {1: 65, 2: 17, 3: 9}
+_SCATTERED = 400
+_TRIED = 200
+_MOST_CORNERED = 8
+_SHOWN = 6
+
+
+class BranchSamples:
+    """One branch of solutions all over the domain, which contains the limits.
+
+    Attributes
+    ----------
+    inputs, solutions
+        Where fits look, (N, k) and (N, n).
+    tried, wanted
+        Where seeds are tried out.
+    winding
+        How unknowns grow with whole turns, (k, n).
+    condition, worst
+        See :class:`SolvedLoop`; within the limits.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        equations: Equations,
+        limits: Sequence[InputDomain],
+        intervals: Sequence[InputDomain],
+        x: Array,
+        u: Array,
+        angles: npt.NDArray[np.bool_],
+    ) -> None:
+        self.name, self.equations, self.intervals = name, equations, intervals
+        self._given = u[len(intervals) :]
+        self._angles = angles
+        k = len(intervals)
+        generator = np.random.default_rng(1)
+        lower = np.array([i.lower for i in intervals])
+        upper = np.array([i.upper for i in intervals])
+        home = np.clip(u[:k], lower, upper)
+        x = self._followed(x, u[:k], home)
+        if k <= FEW:
+            grid = _grid([i.samples(_SAMPLES.get(k, 1)) for i in intervals])
+        else:  # a grid would have more points than anybody waits for
+            parts = generator.uniform(size=(_SCATTERED, k))
+            grid = np.column_stack([i.spread(p) for i, p in zip(intervals, parts.T, strict=True)])
+        corners = np.vstack([_corners(limits, generator), _corners(intervals, generator)])
+        tried = np.vstack([corners, generator.uniform(lower, upper, (_TRIED, k))])
+        everywhere = np.vstack([home, grid, tried])
+        solutions = self._everywhere(x, everywhere)
+        self.inputs, self.solutions = everywhere[: len(grid) + 1], solutions[: len(grid) + 1]
+        self.tried, self.wanted = everywhere[len(grid) + 1 :], solutions[len(grid) + 1 :]
+        self.winding = self._winding(x, home)
+        inside = np.ones(len(everywhere), dtype=bool)
+        for column, limit in zip(everywhere.T, limits, strict=True):
+            inside &= (column >= limit.lower) & (column <= limit.upper)
+        values = np.array(
+            [self._singular_values(q, s) for q, s in zip(everywhere[inside], solutions[inside], strict=True)]
+        )
+        ratios = values[:, -1] / np.maximum(values[:, 0], 1e-30)
+        self.condition = float(ratios.min())
+        self.worst = everywhere[inside][int(ratios.argmin())]
+
+    def all_inputs(self, q: Array) -> Array:
+        """Return free coordinates with the parameters behind them."""
+        return np.concatenate([q, self._given])
+
+    def turns_over(self, rows: Sequence[int]) -> bool:
+        """Whether det ∂r/∂x of these rows is zero somewhere in between: it has two signs."""
+        points = zip((*self.inputs, *self.tried), (*self.solutions, *self.wanted), strict=True)
+        matrices = (self.equations(x, self.all_inputs(q))[1][list(rows)] for q, x in points)
+        return len({float(np.linalg.slogdet(matrix)[0]) for matrix in matrices}) > 1
+
+    def _followed(self, x: Array, start: Array, end: Array) -> Array:
+        reached = continue_solution(self.equations, x, self.all_inputs(start), self.all_inputs(end))
+        if reached.part < 1.0:
+            there = start + reached.part * (end - start)
+            at, to = (
+                format_point(self.equations.inputs, there),
+                format_point(self.equations.inputs, end, named=False),
+            )
+            raise NoSolutionError(
+                f"Loop '{self.name}' does not close on the way to {to}: it ends, or is singular, at {at}. "
+                "Narrow the limits, or the loop's within={...}, so that it closes everywhere."
+            )
+        return reached.solution
+
+    def _everywhere(self, x: Array, points: Array) -> Array:
+        """Return the solutions at points, each followed from the nearest one that is known."""
+        scale = np.array([max(i.upper - i.lower, 1e-12) for i in self.intervals])
+        solutions = np.zeros((len(points), len(x)))
+        solutions[0] = self._followed(x, points[0], points[0])
+        left = np.arange(1, len(points))
+        nearest = np.zeros(len(points), dtype=int)
+        distance = np.abs((points - points[0]) / scale).max(axis=1, initial=0.0)
+        while len(left):
+            position = int(distance[left].argmin())
+            i, left = left[position], np.delete(left, position)
+            solutions[i] = self._followed(solutions[nearest[i]], points[nearest[i]], points[i])
+            closer = np.abs((points - points[i]) / scale).max(axis=1, initial=0.0)
+            better = closer < distance
+            nearest[better], distance[better] = i, closer[better]
+        return solutions
+
+    def _winding(self, x: Array, home: Array) -> Array:
+        """Return how much the unknowns grow in a whole turn of each input that goes round, per radian."""
+        winding = np.zeros((len(home), len(x)))
+        for k, interval in enumerate(self.intervals):
+            if not interval.whole:
+                continue
+            end = home.copy()
+            end[k] += 2 * np.pi
+            grown = (self._followed(x, home, end) - x) / (2 * np.pi)
+            whole = np.abs(grown - np.round(grown)) < 1e-6
+            if not np.all(whole | ~self._angles):
+                raise NoSolutionError(
+                    f"Loop '{self.name}' is on another branch after a turn of '{self.equations.inputs[k]}': "
+                    "it goes through a singular configuration. Limit that coordinate."
+                )
+            # A length may grow, as a nut on a screw does; what rounding leaves of 0 would be no period.
+            lengths = np.where(np.abs(grown) < 1e-9, 0.0, grown)
+            winding[k] = np.where(self._angles, np.round(grown), lengths)
+        return winding
+
+    def _singular_values(self, q: Array, x: Array) -> Array:
+        by_x = self.equations(x, self.all_inputs(q))[1]
+        return np.linalg.svd(by_x, compute_uv=False).astype(np.float64)
+
+
+def format_point(symbols: Sequence[Symbol], values: Array, named: bool = True) -> str:
+    """Return where some inputs are, the first few of them, for a message."""
+    pairs = list(zip(symbols, values.tolist(), strict=False))
+    shown = ", ".join(f"{s} = {v:.6g}" if named else f"{v:.6g}" for s, v in pairs[:_SHOWN])
+    return shown + (", ..." if len(pairs) > _SHOWN else "")
+
+
+def _corners(intervals: Sequence[InputDomain], generator: np.random.Generator) -> Array:
+    """Return the corners of a box, or some of them if there are many."""
+    ends = np.array([(i.lower, i.upper) for i in intervals]).reshape(-1, 2)
+    if len(ends) <= _MOST_CORNERED:
+        return _grid(list(ends))
+    which = generator.integers(0, 2, (1 << _MOST_CORNERED, len(ends)))
+    return np.take_along_axis(ends, which.T, axis=1).T
+
+
+def _grid(axes: Sequence[Array]) -> Array:
+    points = list(itertools.product(*axes))
+    return np.array(points).reshape(len(points), len(axes))

@@ -1,0 +1,318 @@
+"""Operations that close a loop: by dependent coordinates or by equality constraints."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass
+from typing import Any, ClassVar, TypeVar
+
+from kineverse._checks import real_number
+from kineverse.errors import DuplicateNameError, InvalidValueError, ModelError, NoSolutionError
+from kineverse.expressions.expression import Expression, array
+from kineverse.expressions.functions import norm
+from kineverse.model.constraint import Constraint
+from kineverse.model.frame import WORLD
+from kineverse.model.operation import Operation, Writes
+from kineverse.model.read_recorder import ReadRecorder
+from kineverse.symbols import Symbol
+
+from .equations import AXES, as_ends, as_mask, residual_rows, upright_signs
+from .record import make_constrained_record, make_loop_record
+from .solve_branch import SolvedLoop, solve_loop
+
+__all__ = ["AXES", "CloseLoop"]
+
+_Item = TypeVar("_Item", bound=tuple[Any, ...])
+
+
+@dataclass(frozen=True, kw_only=True)
+class CloseLoop(Operation):
+    """Two frames coincide: the coordinates of the loop between them follow the free ones.
+
+    With ``to_T_frame = (R, p)``, the residual consists of the elements of p [m] and of the axis of R times
+    the sine of its angle, ½(R - Rᵀ)^∨ [rad], that ``mask`` names, in axes of ``to``. Where they are zero, the
+    dependent coordinates x are a function of the free ones u,
+
+        r(x(u), u) = 0,   ∂x/∂u = -(∂r/∂x)⁻¹ ∂r/∂u,
+
+    and everything that the model hands out is about u alone. Which solution it is follows from u, by a guess
+    that was fitted to one branch within the limits; outside of what closes, evaluation is an error.
+
+    Attributes
+    ----------
+    name
+        Of the loop.
+    frame, to
+        The frames, which must be connected by other operations already.
+    more
+        Further pairs (frame, to) that coincide in the same way, for loops that determine their coordinates
+        only together, as the three arms of a delta robot do.
+    mask
+        What coincides, names out of ``x y z rx ry rz``: a pin ``("x", "y", "z")``, which is the default.
+    dependent
+        The coordinates that follow, by name; by default the last ones along both chains that can.
+    home
+        Pairs of coordinate and value, near which the loop closes at first; by default at rest, or the limit
+        next to it.
+    branch
+        Which solution there: 0 is the nearest to ``home``, 1 the next.
+    within
+        Triples of free coordinate, lower and upper limit, in which the loop is used, which become the
+        constraints ``name/coordinate``; by default the coordinate's own position limits. An angle without
+        any goes round.
+
+    Raises
+    ------
+    NoSolutionError
+        If the loop does not close, or not within the limits, with what is left between its ends, or where it
+        stops; if there is no such branch.
+    InvalidValueError
+        If mask, coordinates or limits do not fit.
+    ModelError
+        If the frames are connected rigidly.
+    """
+
+    traceable: ClassVar[bool] = False
+
+    name: str
+    frame: str
+    to: str = WORLD
+    mask: tuple[str, ...] = ("x", "y", "z")
+    more: tuple[tuple[str, str], ...] = ()
+    dependent: tuple[str, ...] | None = None
+    home: tuple[tuple[str, float], ...] = ()
+    branch: int = 0
+    within: tuple[tuple[str, float, float], ...] = ()
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "mask", as_mask(self.mask, self.name))
+        object.__setattr__(self, "more", as_ends(self.more, self.name))
+        if isinstance(self.dependent, list):
+            object.__setattr__(self, "dependent", tuple(self.dependent))
+        if isinstance(self.branch, bool) or not isinstance(self.branch, int):
+            raise InvalidValueError(
+                f"The branch of loop '{self.name}' is a number from 0, not {self.branch!r}."
+            )
+        if isinstance(self.dependent, str):
+            object.__setattr__(self, "dependent", (self.dependent,))
+        try:
+            home = self.home.items() if isinstance(self.home, Mapping) else self.home
+            object.__setattr__(self, "home", tuple((str(k), real_number(v)) for k, v in home))
+            within: Iterable[Any] = self.within
+            if isinstance(self.within, Mapping):
+                within = [(k, a, b) for k, (a, b) in self.within.items()]
+            ranges = tuple((str(k), real_number(a), real_number(b)) for k, a, b in within)
+            object.__setattr__(self, "within", ranges)
+        except (TypeError, ValueError, OverflowError):
+            raise InvalidValueError(
+                f"Loop '{self.name}' takes home={{name: value}} and within={{name: (lower, upper)}}, "
+                f"not home={self.home!r} and within={self.within!r}."
+            ) from None
+        for k, v in self.home:
+            if not math.isfinite(v):
+                raise InvalidValueError(f"Loop '{self.name}' cannot begin at {k} = {v}.")
+        for k, a, b in self.within:
+            if not a <= b:
+                raise InvalidValueError(
+                    f"Loop '{self.name}' cannot be used within {a} <= {k} <= {b}: no value lies there."
+                )
+
+    def default_tag(self) -> str:
+        """Return ``loop`` and the name."""
+        return f"loop {self.name}"
+
+    def apply(self, model: ReadRecorder) -> Writes:
+        """Write what the dependent coordinates are."""
+        if self.name in model.articulations:
+            raise DuplicateNameError(
+                f"There is an articulation '{self.name}' already; give loop '{self.name}' another name."
+            )
+        residual = array([row for frame, to in self._ends for row in self._rows(model, frame, to)])
+        signs = [
+            sign
+            for frame, to in self._ends
+            for sign in upright_signs(model.resolve(model.fk(frame, to)), self.mask)
+        ]
+        moving = {s for s in residual.symbols if s.has_derivative}
+        on_the_way = [s for frame, to in self._ends for s in model.coordinates_between(frame, to)]
+        coordinates = list(dict.fromkeys([s for s in on_the_way if s in moving] + sorted(moving, key=str)))
+        # What has speeds of its own does not follow, so it is the first to be free.
+        coordinates.sort(key=lambda s: model.carry(s) is s)
+        by_name = {str(s): s for s in coordinates}
+        limits = {s: found for s in coordinates if (found := self._limits(model, s)) is not None}
+        limits.update({by_name[n]: (a, b) for n, a, b in self._known(self.within, by_name)})
+        home = {s: s.value or 0.0 for s in residual.symbols}
+        for s in coordinates:
+            a, b = limits.get(s, (-math.inf, math.inf))
+            home[s] = min(max(self._rest(model, s), a), b)
+        home.update({by_name[n]: v for n, v in self._known(self.home, by_name)})
+        closed = solve_loop(
+            self.name,
+            residual,
+            coordinates,
+            home,
+            limits,
+            dependent=None
+            if self.dependent is None
+            else [by_name[n] for (n,) in self._known([(n,) for n in self.dependent], by_name)],
+            branch=self.branch,
+            upright=array(signs) if signs else None,
+        )
+        self._check(model, closed)
+        solution = closed.function.of(closed.function.inputs)
+        return Writes(
+            constraints={f"{self.name}/{k}": (a, by_name[k], b) for k, a, b in self.within},
+            rates={x: solution[i] for i, x in enumerate(closed.dependent)},
+            articulations={self.name: make_loop_record(self._ends, self.mask, closed)},
+        )
+
+    def _check(self, model: ReadRecorder, closed: SolvedLoop) -> None:
+        """Look whether what follows is free to do so, and what has limits here is free."""
+        for s in closed.dependent:
+            if model.carry(s) is not s:
+                raise InvalidValueError(
+                    f"Loop '{self.name}' cannot make '{s}' follow: it is moved by speeds of its own. "
+                    "Say what follows, with dependent=(...)."
+                )
+        for name, _, _ in self.within:
+            if name in map(str, closed.dependent):
+                raise InvalidValueError(
+                    f"Loop '{self.name}' has within={{...}} for what is free, and '{name}' follows "
+                    f"{', '.join(map(str, closed.free)) or 'nothing'}."
+                )
+
+    @property
+    def _ends(self) -> tuple[tuple[str, str], ...]:
+        return ((self.frame, self.to), *self.more)
+
+    def _rows(self, model: ReadRecorder, frame: str, to: str) -> list[Expression]:
+        """Return the rows of the mask that are not zero anyway."""
+        pose = model.resolve(model.fk(frame, to))
+        if not any(s.has_derivative for s in pose.symbols):
+            raise ModelError(f"Loop '{self.name}' cannot move: '{frame}' and '{to}' are rigidly connected.")
+        kept = []
+        for axis, row in residual_rows(pose, self.mask).items():
+            if row.symbols:
+                kept.append(row)
+            elif abs(float(row)) > 1e-9:
+                raise NoSolutionError(
+                    f"Loop '{self.name}' does not close: '{frame}' and '{to}' are {float(row):.6g} apart "
+                    f"along '{axis}', whatever moves."
+                )
+        if not kept:
+            raise ModelError(
+                f"Loop '{self.name}' is closed already: nothing of '{frame}' that its mask names moves."
+            )
+        return kept
+
+    def _limits(self, model: ReadRecorder, symbol: Symbol) -> tuple[float, float] | None:
+        """Return the position limits that the joint of a coordinate wrote, if they are numbers."""
+        constraint = model.constraints.get(f"{symbol.path}/position")
+        if constraint is None or constraint.expression is not symbol:
+            return None
+        if constraint.lower.symbols or constraint.upper.symbols:
+            return None
+        return float(constraint.lower), float(constraint.upper)
+
+    def _rest(self, model: ReadRecorder, symbol: Symbol) -> float:
+        """Return where the joint of a coordinate is at rest: 1 for a quaternion's scalar part, else 0."""
+        joint = symbol.path.rpartition("/")[0]
+        record = model.articulations.get(joint) if joint else None
+        if record is None or symbol not in record.coordinates:
+            return 0.0
+        return float(record.home[record.coordinates.index(symbol)])
+
+    def _known(self, items: Iterable[_Item], by_name: Mapping[str, Symbol]) -> Iterator[_Item]:
+        for item in items:
+            if item[0] not in by_name:
+                raise InvalidValueError(
+                    f"Loop '{self.name}' is not about '{item[0]}', only about {', '.join(by_name)}."
+                )
+            yield item
+
+
+APART = 1e-9
+"""What a row may be that nothing changes [m], [rad]."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class LoopConstraint(Operation):
+    """Two frames should coincide: an equality constraint for each row of what is left between them.
+
+    For loops that :class:`~kineverse.CloseLoop` cannot turn into a function of the free coordinates. All
+    coordinates stay free; :meth:`kineverse.Model.violations` and velocity rows see the closure, and
+    :meth:`kineverse.Model.project` moves a state to where it holds.
+
+    The constraints are ``0 <= row <= 0``, with the rows of :class:`~kineverse.CloseLoop`: elements of the
+    position p [m] and of ½(R - Rᵀ)^∨ [rad] in axes of ``to``. They are called ``name/x``, ``name/ry`` and so
+    on, ``name/1/x`` for the second pair of frames. Where turns count, ``name/upright`` is a number that is
+    positive unless the frames are half a turn apart. A row that nothing moves has no constraint if it is
+    zero; otherwise ``name/apart`` is the distance of all rows from zero, which is never 0 then.
+
+    Attributes
+    ----------
+    name
+        Of the closure.
+    frame, to
+        The frames, which must be connected by other operations already.
+    mask
+        What coincides, names out of ``x y z rx ry rz``.
+    more
+        Further pairs (frame, to) that coincide in the same way.
+
+    Raises
+    ------
+    ModelError
+        If the frames are connected rigidly: nothing moves what is between them.
+    DuplicateNameError
+        If there is an articulation of that name.
+    """
+
+    name: str
+    frame: str
+    to: str = WORLD
+    mask: tuple[str, ...] = ("x", "y", "z")
+    more: tuple[tuple[str, str], ...] = ()
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "mask", as_mask(self.mask, self.name))
+        object.__setattr__(self, "more", as_ends(self.more, self.name))
+
+    def default_tag(self) -> str:
+        """Return ``loop`` and the name, as of a loop that is solved."""
+        return f"loop {self.name}"
+
+    def apply(self, model: ReadRecorder) -> Writes:
+        """Write the constraints."""
+        if self.name in model.articulations:
+            raise DuplicateNameError(
+                f"There is an articulation '{self.name}' already; give loop '{self.name}' another name."
+            )
+        constraints: dict[str, Constraint] = {}
+        ends = ((self.frame, self.to), *self.more)
+        for k, (frame, to) in enumerate(ends):
+            constraints |= self._between(model, frame, to, f"{self.name}/{k}" if k else self.name)
+        return Writes(
+            constraints=constraints,
+            articulations={self.name: make_constrained_record(ends, self.mask, tuple(constraints))},
+        )
+
+    def _between(self, model: ReadRecorder, frame: str, to: str, name: str) -> dict[str, Constraint]:
+        pose = model.fk(frame, to)
+        rows = residual_rows(pose, self.mask)
+        # Each by itself, so that a trace knows what is decided by: whether anything moves it.
+        alone = {axis: model.resolve(row) for axis, row in rows.items()}
+        moving = [axis for axis, row in alone.items() if row.symbols] if pose.symbols else []
+        if not moving:
+            raise ModelError(
+                f"Loop '{self.name}' cannot move: nothing changes what its mask names between '{frame}' and "
+                f"'{to}'."
+            )
+        found = {f"{name}/{axis}": Constraint.of(0.0, rows[axis], 0.0) for axis in moving}
+        if any(abs(float(row)) > APART for axis, row in alone.items() if axis not in moving):
+            found[f"{name}/apart"] = Constraint.of(0.0, norm(array(list(rows.values()))), 0.0)
+        for k, sign in enumerate(upright_signs(pose, self.mask)):
+            if model.resolve(sign).symbols:
+                found[f"{name}/upright{k or ''}"] = Constraint.of(0.0, sign, math.inf)
+        return found

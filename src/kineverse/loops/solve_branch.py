@@ -1,0 +1,367 @@
+"""Implicit function of one solution branch of a loop."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from kineverse.compile import compile  # noqa: A004
+from kineverse.errors import InvalidValueError, NoSolutionError
+from kineverse.expressions.expression import Expression
+from kineverse.expressions.implicit import ImplicitFunction
+from kineverse.symbols import Symbol
+
+from .branch_guess import BranchGuess, BranchSamples, InputDomain, format_point, list_products
+from .branches import continue_solution, find_branches, find_nearest_closed
+from .equations import CLOSURE_TOLERANCE, Array, Equations, WorkBudget, find_periodic
+
+RANK = 1e-7
+"""What a singular value is, relative to the largest, below which a direction counts as free."""
+
+_SMALL = 1e-3
+"""The size of bars [m] down to which derivatives can be told from rounding."""
+
+_DEGREES = (2, 3, 4, 6, 8, 10, 12, 16, 20, 24, 32)
+_MORE_STEPS = 4
+_STEPS = (1, 2, 3, 4, 5, 6, 8, 10)
+
+_PARTS = (1.0, 0.6, 0.3, 0.1, 0.03)
+"""Parts of the margin that are tried, largest first, where all of it is too much."""
+
+_BEFORE_MEETING, _BEFORE_ENDING = 0.9, 1 - 1e-4
+"""Which part of the way through the margin counts, up to where branches meet or loops below end."""
+
+
+@dataclass(frozen=True)
+class SolvedLoop:
+    """A loop that was closed.
+
+    Attributes
+    ----------
+    function
+        The unknowns as a function of the inputs.
+    free, dependent
+        The coordinates that move by themselves, and those that follow.
+    mobility
+        How many coordinates are free in the configurations that were looked at.
+    branches, branch
+        How many solutions there are at home, and which of them this is, 0 the nearest to the guess.
+    condition
+        The smallest singular value of ∂r/∂x over the largest one, where it is worst; 0 is singular.
+    worst
+        The free coordinates there.
+    """
+
+    function: ImplicitFunction
+    free: tuple[Symbol, ...]
+    dependent: tuple[Symbol, ...]
+    mobility: int
+    branches: int
+    branch: int
+    condition: float
+    worst: tuple[float, ...]
+
+
+def solve_loop(
+    name: str,
+    residual: Expression,
+    coordinates: Sequence[Symbol],
+    home: Mapping[Symbol, float],
+    limits: Mapping[Symbol, tuple[float, float]],
+    *,
+    dependent: Sequence[Symbol] | None = None,
+    branch: int = 0,
+    upright: Expression | None = None,
+) -> SolvedLoop:
+    """Close a loop.
+
+    Parameters
+    ----------
+    name
+        What errors call it.
+    residual
+        Of shape (m,); all of it is zero where the loop is closed [m], [rad].
+    coordinates
+        Those of the residual, the first to be free first.
+    home
+        A configuration near the one to begin with, which need not be closed; and the values of parameters.
+    limits
+        Of coordinates that have some. Free coordinates have them, or are angles that go round.
+    dependent
+        The coordinates that follow; chosen if None.
+    branch
+        Which solution at home, 0 the one nearest to ``home``.
+    upright
+        Numbers that are positive in a solution that counts: rows about the sine of an angle are zero where it
+        is half a turn, too.
+
+    Raises
+    ------
+    NoSolutionError
+        If it does not close at home, or not within all of the limits; if there is no such branch; if finding
+        out takes too much work.
+    InvalidValueError
+        If the choice of coordinates does not fit the mobility, or limits are missing.
+    """
+    parameters = tuple(s for s in residual.symbols if not s.has_derivative)
+    values = np.array([home[s] for s in coordinates])
+    given = np.array([home[s] for s in parameters])
+    effort = WorkBudget(name)
+    unknown = Equations(residual, coordinates, parameters, effort)
+    if not np.isfinite(unknown.gap(values, given)):
+        at = format_point(coordinates, values)
+        raise NoSolutionError(f"Loop '{name}' is not defined at {at}. Begin elsewhere, with home={{...}}.")
+    start, gap = find_nearest_closed(unknown, values, given)
+    if gap > CLOSURE_TOLERANCE:
+        raise NoSolutionError(f"Loop '{name}' does not close: at best {gap:.6g} is left between its ends.")
+    rank = _rank(unknown, start, given)
+    if not rank:
+        raise InvalidValueError(f"Loop '{name}' is closed whatever its coordinates are.")
+    followers = _followers(name, unknown, start, given, rank, dependent)
+    free = tuple(s for s in coordinates if s not in followers)
+    inputs = (*free, *parameters)
+    equations = Equations(residual, followers, inputs, effort)
+
+    u = np.array([home[s] for s in inputs])
+    x = np.array([home[s] for s in followers])
+    angles, goes_round = find_periodic(equations, x, u)
+    spans = np.array([max(map(abs, limits.get(s, (np.pi,)))) for s in followers])
+    reach = np.where(angles, np.pi, np.where(np.isfinite(spans), spans, np.pi) + 1.0)
+    stands = None if upright is None else compile(upright, [*followers, *inputs], tier="interpreter")
+    found, gap = find_branches(equations, x, u, angles, reach, stands)
+    where = format_point(free, u[: len(free)]) or "all configurations"
+    if not found:
+        raise NoSolutionError(
+            f"Loop '{name}' does not close at {where}: {gap:.6g} is left between its ends. "
+            "Begin where it does, with home={...}."
+        )
+    if not 0 <= branch < len(found):
+        raise NoSolutionError(
+            f"Loop '{name}' has {len(found)} branches at {where}, numbered from 0, and none is {branch}."
+        )
+    intervals = [
+        _interval(name, s, limits.get(s), bool(turns)) for s, turns in zip(free, goes_round, strict=False)
+    ]
+    sampled, seed, steps, rows = _fit_guess(name, equations, intervals, found[branch], u, angles)
+    if parameters:
+        # The seed knows one value of them only; from there it is further to others.
+        steps += _MORE_STEPS
+    domain = (*map(_domain, seed.intervals), *((-np.inf, np.inf) for _ in parameters))
+    function = ImplicitFunction(name, followers, inputs, residual, rows, seed.expression(free), steps, domain)
+    return SolvedLoop(
+        function, free, followers, len(coordinates) - rank, len(found), branch,
+        sampled.condition, tuple(sampled.worst.tolist()),
+    )  # fmt: skip
+
+
+def _rank(equations: Equations, x: Array, given: Array) -> int:
+    """Return the rank of ∂r/∂q in general: the largest near a closed configuration, which may be singular."""
+    generator = np.random.default_rng(0)
+    most = 0
+    for scale in (0.0, 0.0, 1e-3, 1e-2, 0.05, 0.1, 0.2):
+        near, gap = equations.close(x + scale * generator.uniform(-1, 1, len(x)), given, 60)
+        if gap < CLOSURE_TOLERANCE:
+            values = np.linalg.svd(equations(near, given)[1], compute_uv=False)
+            most = max(most, int((values > RANK * max(values.max(initial=0.0), _SMALL)).sum()))
+    return most
+
+
+def _followers(
+    name: str,
+    equations: Equations,
+    x: Array,
+    given: Array,
+    rank: int,
+    dependent: Sequence[Symbol] | None,
+) -> tuple[Symbol, ...]:
+    """Return the coordinates that follow: those given, or the last ones that can."""
+    by_q = equations(x, given)[1]
+    coordinates = equations.unknowns
+    if dependent is not None:
+        strange = [str(s) for s in dependent if s not in coordinates]
+        if strange:
+            raise InvalidValueError(
+                f"Loop '{name}' is about {', '.join(map(str, coordinates))}, not about {', '.join(strange)}."
+            )
+        if len(set(dependent)) != rank:
+            raise InvalidValueError(
+                f"Loop '{name}' makes {rank} of {len(coordinates)} coordinates follow the others "
+                f"(its mobility is {len(coordinates) - rank}), and {len(set(dependent))} are given."
+            )
+        return tuple(s for s in coordinates if s in set(dependent))
+    chosen: list[int] = []
+    largest = float(np.linalg.norm(by_q, 2))
+    # First such that all can be told apart well, then, if need be, whatever is not singular.
+    for enough in (0.02, RANK):
+        for i in reversed(range(len(coordinates))):
+            if i in chosen or len(chosen) == rank:
+                continue
+            values = np.linalg.svd(by_q[:, [*chosen, i]], compute_uv=False)
+            if values[-1] > enough * largest:
+                chosen.append(i)
+    if len(chosen) < rank:
+        raise InvalidValueError(
+            f"Loop '{name}' is singular where it begins. Begin elsewhere, with home={{...}}, or say which "
+            "coordinates are dependent."
+        )
+    return tuple(coordinates[i] for i in sorted(chosen))
+
+
+def _interval(name: str, symbol: Symbol, limits: tuple[float, float] | None, angle: bool) -> InputDomain:
+    lower, upper = limits if limits is not None else (-np.inf, np.inf)
+    if angle and not upper - lower < 2 * np.pi:
+        return InputDomain(-np.pi, np.pi, whole=True)
+    if not (np.isfinite(lower) and np.isfinite(upper)):
+        raise InvalidValueError(
+            f"Loop '{name}' has to know how far '{symbol}' goes: give it limits, or the loop within={{...}}."
+        )
+    return InputDomain(float(lower), float(upper))
+
+
+def _domain(interval: InputDomain) -> tuple[float, float]:
+    """Return where an input may be; rounding at the edge is no reason to refuse it."""
+    if interval.whole:
+        return -np.inf, np.inf
+    slack = 1e-9 * max(1.0, interval.upper - interval.lower)
+    return interval.lower - slack, interval.upper + slack
+
+
+def _fit_guess(
+    name: str,
+    equations: Equations,
+    limits: Sequence[InputDomain],
+    x: Array,
+    u: Array,
+    angles: npt.NDArray[np.bool_],
+) -> tuple[BranchSamples, BranchGuess, int, tuple[int, ...]]:
+    """Return what was sampled, and the seed for it with its steps and rows.
+
+    It is good for more than the limits, by as much of the margin around them as the branch can be followed.
+    """
+
+    def fitted(intervals: Sequence[InputDomain]) -> tuple[BranchSamples, BranchGuess, int, tuple[int, ...]]:
+        samples = BranchSamples(name, equations, limits, intervals, x, u, angles)
+        return samples, *_choose_guess(name, samples)
+
+    if all(i.whole for i in limits):
+        return fitted(limits)
+    reaches = _reaches(equations, limits, x, u)
+    alone: tuple[BranchSamples, BranchGuess, int, tuple[int, ...]] | None = None
+    for part in _PARTS:
+        wider = [i.wider(part * r[0], part * r[1]) for i, r in zip(limits, reaches, strict=True)]
+        try:
+            return fitted(wider)
+        except NoSolutionError:
+            # If it cannot be closed within the limits, no margin is narrow enough: that is told at once.
+            alone = alone or fitted(limits)
+    assert alone is not None
+    return alone
+
+
+def _reaches(
+    equations: Equations, limits: Sequence[InputDomain], x: Array, u: Array
+) -> list[tuple[float, float]]:
+    """Return in which parts of the margin below and above each limit the branch goes on, others at home."""
+    home = u.copy()
+    home[: len(limits)] = [min(max(v, i.lower), i.upper) for v, i in zip(u, limits, strict=False)]
+    x = continue_solution(equations, x, u, home).solution
+    reaches = []
+    for k, (limit, wide) in enumerate(zip(limits, [i.wider() for i in limits], strict=True)):
+        parts = []
+        for edge, end in ((limit.lower, wide.lower), (limit.upper, wide.upper)):
+            there, beyond = home.copy(), home.copy()
+            there[k], beyond[k] = edge, end
+            at_edge = continue_solution(equations, x, home, there).solution
+            way = continue_solution(equations, at_edge, there, beyond)
+            part = way.part
+            if part < 1.0:
+                # Branches meet at a dead centre. What this loop is built on ends without one.
+                stop = there + part * (beyond - there)
+                meet = _regularity(equations, way.solution, stop) < 0.5 * _regularity(
+                    equations, at_edge, there
+                )
+                part *= _BEFORE_MEETING if meet else _BEFORE_ENDING
+            parts.append(part)
+        reaches.append((parts[0], parts[1]))
+    return reaches
+
+
+def _regularity(equations: Equations, x: Array, u: Array) -> float:
+    """Return the smallest singular value of ∂r/∂x over the largest."""
+    values = np.linalg.svd(equations(x, u)[1], compute_uv=False)
+    return float(values[-1] / max(values[0], 1e-30))
+
+
+def _choose_guess(name: str, samples: BranchSamples) -> tuple[BranchGuess, int, tuple[int, ...]]:
+    """Return the cheapest seed and number of steps that always lead to the branch, and the rows used."""
+    rows = _rows(samples)
+    n = len(samples.equations.unknowns)
+    if samples.turns_over(rows):
+        raise _too_close(name, samples)
+    best: tuple[float, BranchGuess, int] | None = None
+    count = len(samples.inputs)
+    for degree in _DEGREES:
+        if len(list_products(samples.intervals, degree)) > count:
+            break
+        seed = BranchGuess.fit(samples.intervals, degree, samples.inputs, samples.solutions, samples.winding)
+        steps = _steps(samples, seed, rows)
+        if steps is None:
+            continue
+        cost = seed.terms + steps * (20 * n + n**3)
+        if best is None or cost < best[0]:
+            best = cost, seed, steps
+    if best is None:
+        raise _too_close(name, samples)
+    return best[1], best[2], rows
+
+
+def _too_close(name: str, samples: BranchSamples) -> NoSolutionError:
+    at = format_point(samples.equations.inputs, samples.worst)
+    return NoSolutionError(
+        f"Loop '{name}' is singular, or too close to it, near {at} (condition {samples.condition:.2g}) for "
+        "Newton's method to be sure of its branch. Narrow the limits, or the loop's within={...}."
+    )
+
+
+def _rows(samples: BranchSamples) -> tuple[int, ...]:
+    """Return as many equations as there are unknowns, the best ones where it matters most."""
+    equations = samples.equations
+    n = len(equations.unknowns)
+    every = max(1, len(samples.inputs) // 40)
+    matrices = [
+        equations(x, samples.all_inputs(q))[1]
+        for q, x in zip(samples.inputs[::every], samples.solutions[::every], strict=True)
+    ]
+    m = matrices[0].shape[0]
+    if m == n:
+        return tuple(range(n))
+    best, chosen = -1.0, tuple(range(n))
+    for rows in itertools.islice(itertools.combinations(range(m), n), 5000):
+        worst = min(np.linalg.svd(matrix[list(rows)], compute_uv=False)[-1] for matrix in matrices)
+        if worst > best * 1.01:
+            best, chosen = worst, rows
+    return chosen
+
+
+def _steps(samples: BranchSamples, seed: BranchGuess, rows: tuple[int, ...]) -> int | None:
+    """Return how many Newton steps lead from the seed to the branch everywhere; None if some never arrive."""
+    needed = 0
+    chosen = list(rows)
+    for q, x, wanted in zip(samples.tried, seed.at(samples.tried), samples.wanted, strict=True):
+        u = samples.all_inputs(q)
+        for step in range(_STEPS[-1] + 1):  # noqa: B007 - how many it took
+            residual, by_x, _ = samples.equations(x, u)
+            if np.linalg.norm(residual) < 1e-12 and np.abs(x - wanted).max(initial=0.0) < 1e-5:
+                break
+            try:
+                x = x - np.linalg.solve(by_x[chosen], residual[chosen])
+            except np.linalg.LinAlgError:
+                return None
+        else:
+            return None
+        needed = max(needed, step)
+    return next(s for s in _STEPS if s >= needed)

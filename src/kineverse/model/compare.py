@@ -1,0 +1,444 @@
+"""Comparison of two models by operations, by values and by distance of values."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, fields, is_dataclass
+from functools import cached_property, reduce
+from math import inf, isnan
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from kineverse.expressions.expression import Expression, as_expression
+from kineverse.model.articulation import Articulation
+from kineverse.model.history import History
+
+from .body import Mesh, Pose
+from .diff import Change, Diff, find_moved_tags
+from .frame import Frame
+from .history import HistoryEntry
+from .model import Model, Snapshot
+from .operation import KINDS, RATES
+from .sampling import StateSamples
+
+Array = npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class Delta:
+    """One part of a value that differs.
+
+    Attributes
+    ----------
+    what
+        The part, as one would write it: ``parent``, ``upper``, ``visuals[0].geometry.size``; empty if it is
+        the value itself.
+    before, after
+        What the part was and is; None where there is nothing.
+    distance
+        How far apart they are. Numbers above one: relative to the larger; transforms: the distance of the
+        origins [m]. Expressions: the largest over all sampled states. Infinite where it is no matter of
+        numbers, 0 if only the way differs in which the same is written.
+    angle
+        Between transforms, the angle of the rotation from one to the other [rad]; 0 for the rest.
+    at_default
+        Distance and angle at the default state.
+    """
+
+    what: str
+    before: Any
+    after: Any
+    distance: float = inf
+    angle: float = 0.0
+    at_default: tuple[float, float] = (inf, 0.0)
+
+    def is_within(self, tolerance: float) -> bool:
+        """Return whether distance and angle are at most so large; never at 0: there, writing counts."""
+        return tolerance > 0.0 and max(self.distance, self.angle) <= tolerance
+
+
+def measure_deltas(changes: Sequence[Change], samples: StateSamples) -> list[tuple[Delta, ...]]:
+    """Return, for each change, the parts that differ; none for a value that is new or gone.
+
+    Where a mesh file lies is no difference, only what it is called; nor how a path leads to the same file.
+    """
+    parts = [_parts(change) for change in changes]
+    pairs = [(a, b) for found in parts for _, a, b in found if _is_symbolic(a, b)]
+    measured = iter(_measure_distance(pairs, samples))
+    return [
+        tuple(
+            Delta(what, a, b, *(next(measured) if _is_symbolic(a, b) else _measured(a, b)))
+            for what, a, b in found
+        )
+        for found in parts
+    ]
+
+
+# -- finding -----------------------------------------------------------------------------------------------
+
+
+def _parts(change: Change) -> list[tuple[str, Any, Any]]:
+    if change.before is None or change.after is None:
+        return []
+    if change.kind == RATES:  # each a pair of the coordinate and what moves it
+        return list(_walk("", change.before[1], change.after[1]))
+    return list(_walk("", change.before, change.after))
+
+
+def _walk(what: str, a: Any, b: Any) -> Iterator[tuple[str, Any, Any]]:
+    """Yield the innermost parts of two values that differ, with where they are."""
+    if a is b or (_is_number(a) and _is_number(b) and isnan(a) and isnan(b)):
+        return
+    if type(a) is not type(b) or isinstance(a, (Expression, Pose)):
+        if not _equal(a, b):
+            yield what, _number(a), _number(b)
+    elif isinstance(a, Frame):
+        if a.parent != b.parent:
+            yield "parent", a.parent, b.parent
+        if a.factors != b.factors:
+            yield "transform", transform_of(a), transform_of(b)
+    elif is_dataclass(a) and not isinstance(a, type):
+        alike: tuple[str, ...] = ()
+        if isinstance(a, Mesh):
+            alike = ("folder", "root", "uri") if _file(a) == _file(b) else ("folder", "root")
+        for field in fields(a):
+            if field.name not in alike:
+                name = f"{what}.{field.name}" if what else field.name
+                yield from _walk(name, getattr(a, field.name), getattr(b, field.name))
+    elif isinstance(a, tuple) and (a or b) and _are_named(a) and _are_named(b):
+        one, other = ({str(name): value for name, value in pairs} for pairs in (a, b))
+        for name in dict.fromkeys((*one, *other)):
+            yield from _walk(f"{what}[{name}]" if what else name, one.get(name), other.get(name))
+    elif isinstance(a, tuple) and not _are_numbers(a):
+        for i in range(max(len(a), len(b))):
+            yield from _walk(f"{what}[{i}]", *(side[i] if i < len(side) else None for side in (a, b)))
+    elif not _equal(a, b):
+        yield what, a, b
+
+
+def _file(mesh: Mesh) -> str:
+    """Return the file of a mesh as far as it can be told without looking for it."""
+    return mesh.uri if "://" in mesh.uri else os.path.normpath(os.path.join(mesh.folder, mesh.uri))
+
+
+def _equal(a: Any, b: Any) -> bool:
+    return bool(a == b)
+
+
+def _are_named(value: Any) -> bool:
+    """Return whether it is a table, or nothing: pairs whose first half is a name, each once."""
+    if not all(isinstance(pair, tuple) and len(pair) == 2 for pair in value):
+        return False
+    names = [str(name) for name, _ in value if isinstance(name, (str, Expression))]
+    return len(set(names)) == len(value)
+
+
+def _are_numbers(value: Any) -> bool:
+    return isinstance(value, tuple) and bool(value) and all(map(_is_number, value))
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, (int, float)) and not isinstance(value, bool)
+
+
+def _number(value: Any) -> Any:
+    """Return a constant scalar as a number."""
+    is_scalar = isinstance(value, Expression) and not value.shape
+    return float(value) if is_scalar and value.is_constant else value
+
+
+def _is_symbolic(a: Any, b: Any) -> bool:
+    """Return whether two parts are expressions of one shape, or an expression and a number."""
+    if not (isinstance(a, Expression) or isinstance(b, Expression)):
+        return False
+    if not all(isinstance(v, (Expression, Pose)) or _is_number(v) for v in (a, b)):
+        return False
+    return _shape(a) == _shape(b)
+
+
+def _shape(value: Any) -> tuple[int, ...]:
+    if isinstance(value, Expression):
+        return value.shape
+    return (4, 4) if isinstance(value, Pose) else ()
+
+
+def transform_of(frame: Frame) -> Pose | Expression:
+    """Return parent_T_frame as numbers if it is constant, else as an expression."""
+    if not all(isinstance(factor, Pose) for factor in frame.factors):
+        return frame.transform
+    if len(frame.factors) == 1 and isinstance(frame.factors[0], Pose):
+        return frame.factors[0]
+    product: Array = reduce(
+        np.matmul, [factor.matrix for factor in frame.factors if isinstance(factor, Pose)], np.eye(4)
+    )
+    return Pose.of(product)
+
+
+# -- measuring ---------------------------------------------------------------------------------------------
+
+
+def _measured(a: Any, b: Any) -> tuple[float, float, tuple[float, float]]:
+    """Return distance and angle, at worst and at the default state, of what no symbol is in."""
+    if isinstance(a, Pose) and isinstance(b, Pose):
+        distance, angle = (float(x[0]) for x in measure_pose_distances(a.matrix[None], b.matrix[None]))
+        return distance, angle, (distance, angle)
+    if (_is_number(a) and _is_number(b)) or (_are_numbers(a) and _are_numbers(b) and len(a) == len(b)):
+        distance = float(_measure_number_distance(np.array([a], dtype=float), np.array([b], dtype=float))[0])
+        return distance, 0.0, (distance, 0.0)
+    return inf, 0.0, (inf, 0.0)
+
+
+def _measure_distance(
+    pairs: Sequence[tuple[Any, Any]], samples: StateSamples
+) -> Iterator[tuple[float, float, tuple[float, float]]]:
+    """Yield distance and angle, at worst and at the default state, for each pair of expressions."""
+    sides = [(as_expression(_matrix(a)), as_expression(_matrix(b))) for a, b in pairs]
+    trends = [_trends(a, b) for a, b in sides]
+    everything = [e for (a, b), trend in zip(sides, trends, strict=True) for e in (a, b, *trend)]
+    numbers = iter(samples.values(everything))
+    for (a, _), trend in zip(sides, trends, strict=True):
+        one, other = next(numbers), next(numbers)
+        angles: Array = np.zeros(len(one))
+        if a.shape == (4, 4):
+            distances, angles = measure_pose_distances(one, other)
+        else:
+            distances = _measure_number_distance(one, other)
+        for _ in trend[::2]:
+            # Gradients may have been overridden: values alone do not say whether expressions are the same.
+            distances = np.maximum(distances, _measure_number_distance(next(numbers), next(numbers)))
+        yield (
+            float(distances.max()),
+            float(angles.max()),
+            (float(distances[0]), float(angles[0])),
+        )
+
+
+def _matrix(value: Any) -> Any:
+    return value.matrix if isinstance(value, Pose) else value
+
+
+def _trends(a: Expression, b: Expression) -> list[Expression]:
+    """Return the gradients of two expressions, key by key one after the other, if they need a comparison."""
+    if not (a._nodes or b._nodes):
+        return []
+    one, other = a.gradient(), b.gradient()
+    nothing = as_expression(np.zeros(a.shape))
+    keys = sorted({*one, *other}, key=lambda symbol: symbol.sort_key)
+    return [side.get(key, nothing) for key in keys for side in (one, other)]
+
+
+def _measure_number_distance(a: Array, b: Array) -> Array:
+    """Return the largest difference in each row, relative where numbers are above one."""
+    with np.errstate(invalid="ignore", over="ignore"):
+        off = np.abs(a - b) / np.maximum(1.0, np.maximum(np.abs(a), np.abs(b)))
+    off[(a == b) | (np.isnan(a) & np.isnan(b))] = 0.0
+    off[np.isnan(off)] = inf
+    found: Array = off.reshape(len(a), -1).max(axis=1, initial=0.0)
+    return found
+
+
+def measure_pose_distances(a: Array, b: Array) -> tuple[Array, Array]:
+    """Return distances of origins [m] and angles of rotations [rad] between poses (N, 4, 4)."""
+    both = np.isnan(a).any(axis=(1, 2)) & np.isnan(b).any(axis=(1, 2))
+    with np.errstate(invalid="ignore"):
+        distances = np.linalg.norm(a[:, :3, 3] - b[:, :3, 3], axis=1)
+        # The chord on the sphere of rotations is exact for small angles, where the trace of RᵀR is not.
+        chords = np.linalg.norm(a[:, :3, :3] - b[:, :3, :3], axis=(1, 2)) / np.sqrt(8.0)
+        angles = 2.0 * np.arcsin(np.minimum(chords, 1.0))
+    return tuple(  # type: ignore[return-value]
+        np.where(both, 0.0, np.where(np.isnan(part), inf, part)) for part in (distances, angles)
+    )
+
+
+def compare_models(before: Model | Snapshot, after: Model | Snapshot) -> Diff:
+    """Return what leads from one model to another: what a commit would report that did it.
+
+    Values are compared structurally, name by name. Operations are compared by tag and by what they write, so
+    those of a document are those that it was made from. The tags in ``moved`` are as few as possible: the
+    others come in the same order on both sides.
+
+    Parameters
+    ----------
+    before, after
+        The models; they need not have a history in common.
+    """
+    old, new = _snapshot(before), _snapshot(after)
+    entries = {entry.tag: entry for entry in old._entries}
+    later = {entry.tag: entry for entry in new._entries}
+    common = [tag for tag in entries if tag in later]
+    return Diff(
+        version=new.version,
+        changes=tuple(_changes(old, new)),
+        added=tuple(tag for tag in later if tag not in entries),
+        removed=tuple(tag for tag in entries if tag not in later),
+        replaced=tuple(tag for tag in common if _writes_differ(entries[tag], later[tag])),
+        moved=find_moved_tags(common, list(later), entries),
+    )
+
+
+def _snapshot(model: Model | Snapshot) -> Snapshot:
+    return model.snapshot() if isinstance(model, Model) else model
+
+
+def _changes(old: Snapshot, new: Snapshot) -> Iterator[Change]:
+    """Yield the changes kind by kind: what is gone or different in the old order, what is new in the new."""
+    for kind in KINDS:
+        before, after = old._ordered(kind), new._ordered(kind)
+        for name, value in before.items():
+            if name not in after:
+                yield Change(kind, name, value, None)
+            elif after[name] is not value and after[name] != value:
+                yield Change(kind, name, value, after[name])
+        for name, value in after.items():
+            if name not in before:
+                yield Change(kind, name, None, value)
+
+
+def _writes_differ(one: HistoryEntry, other: HistoryEntry) -> bool:
+    return one is not other and one.writes != other.writes
+
+
+SIGNS = {"+": "added", "-": "removed", "~": "changed"}
+
+
+@dataclass(frozen=True)
+class ValueDifference:
+    """A value that counts as different: ``sign`` is one of ``+ - ~``, ``parts`` what of a changed one is."""
+
+    change: Change
+    parts: tuple[Delta, ...] = ()
+
+    @property
+    def sign(self) -> str:
+        """How it differs."""
+        if self.change.before is None:
+            return "+"
+        return "-" if self.change.after is None else "~"
+
+
+class ModelComparison:
+    """What two models differ in, by more than a tolerance.
+
+    Attributes
+    ----------
+    before, after
+        The models.
+    diff
+        All that differs structurally.
+    differences
+        Of the values in it, those that count.
+    alike
+        The paths of the others: the same but for rounding, or for how it is written.
+    """
+
+    def __init__(self, before: Model, after: Model, tolerance: float, operations: str = "auto") -> None:
+        self.before, self.after, self.tolerance = before, after, tolerance
+        self.diff: Diff = compare_models(before, after)
+        self.differences: list[ValueDifference] = []
+        self.alike: list[str] = []
+        self._asked = operations
+        samples = StateSamples(before, after)
+        parts = measure_deltas(self.diff.changes, samples)
+        elsewhere = self._reparented(samples)
+        for change, found in zip(self.diff.changes, parts, strict=True):
+            if change.path in elsewhere:
+                found = (found[0], elsewhere[change.path])
+            counting = tuple(delta for delta in found if not delta.is_within(tolerance))
+            alone = (change.before is None or change.after is None) and not self._says_nothing(change)
+            if counting or alone:
+                self.differences.append(ValueDifference(change, counting))
+            else:
+                self.alike.append(change.path)
+
+    def _reparented(self, samples: StateSamples) -> dict[str, Delta]:
+        """Return how far apart frames are in the world that have another parent, as theirs says nothing."""
+        changes = [
+            c
+            for c in self.diff.changes
+            if isinstance(c.before, Frame)
+            and isinstance(c.after, Frame)
+            and c.before.parent != c.after.parent
+        ]
+        poses = samples.values([model.fk(c.name) for c in changes for model in (self.before, self.after)])
+        found = {}
+        for change, one, other in zip(changes, poses[::2], poses[1::2], strict=True):
+            distances, angles = measure_pose_distances(one, other)
+            found[change.path] = Delta(
+                "place",
+                change.before.parent,
+                change.after.parent,
+                float(distances.max()),
+                float(angles.max()),
+                (float(distances[0]), float(angles[0])),
+            )
+        return found
+
+    def _says_nothing(self, change: Change) -> bool:
+        """Return whether it is the record of a fixed joint between frames that both have."""
+        record = change.after if change.before is None else change.before
+        return (
+            isinstance(record, Articulation)
+            and record.kind == "fixed"
+            and record.child in self.before.frames
+            and record.child in self.after.frames
+        )
+
+    @property
+    def equal(self) -> bool:
+        """Whether nothing that counts differs."""
+        return not (self.differences or any(self.operations.values()))
+
+    def of(self, kind: str) -> list[ValueDifference]:
+        """Return the differences of one kind of data."""
+        return [found for found in self.differences if found.change.kind == kind]
+
+    @cached_property
+    def operations(self) -> dict[str, tuple[str, ...]]:
+        """The tags of operations by sign: ``>`` for those that moved. Empty if they are not compared."""
+        if not self.operations_compared:
+            return {}
+        diff = self.diff
+        return {
+            "-": diff.removed,
+            "~": tuple(filter(self._counts, diff.replaced)),
+            "+": diff.added,
+            ">": diff.moved,
+        }
+
+    @cached_property
+    def operations_compared(self) -> bool:
+        """Whether operations are compared: as asked for, or if most of them have a counterpart.
+
+        Descriptions in different formats become different operations, and that is no difference in the robot.
+        """
+        if self._asked != "auto":
+            return self._asked == "yes"
+        tags, others = set(self.before.history.tags), set(self.after.history.tags)
+        return 2 * len(tags & others) >= max(len(tags), len(others))
+
+    def _counts(self, tag: str) -> bool:
+        """Return whether an operation that writes otherwise does so by more than rounding."""
+        old, new = (model.history.entry(tag).writes for model in (self.before, self.after))
+        different = [cell for cell in {*old, *new} if old.get(cell) != new.get(cell)]
+        return any(
+            path in self._counting or not _is_last(self.after.history, tag, path)
+            for path in (f"{kind}/{name}" for kind, name in different)
+        )
+
+    @cached_property
+    def _counting(self) -> frozenset[str]:
+        return frozenset(found.change.path for found in self.differences)
+
+    @property
+    def counts(self) -> dict[str, int]:
+        """How many values were added, removed and changed."""
+        signs = [found.sign for found in self.differences]
+        return {word: signs.count(sign) for sign, word in SIGNS.items()}
+
+
+def _is_last(history: History, tag: str, path: str) -> bool:
+    """Return whether what an operation writes there is what the model has."""
+    return history.writers(path)[-1:] in ([tag], [])

@@ -1,0 +1,190 @@
+"""Operations that write one value: frame, body, constraint, rate, home, data."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+from kineverse.expressions.expression import Expression
+from kineverse.model.body import Body
+from kineverse.model.constraint import Constraint
+from kineverse.model.frame import WORLD, Frame
+from kineverse.model.operation import Operation, Writes
+from kineverse.model.rates import RateRow
+from kineverse.model.read_recorder import ReadRecorder
+from kineverse.symbols import Symbol
+
+if TYPE_CHECKING:
+    pass
+
+
+@dataclass(frozen=True)
+class SetBody(Operation):
+    """Gives a frame its body: what of it is seen and touched, and its inertia."""
+
+    name: str
+    body: Body
+
+    def apply(self, model: ReadRecorder) -> Writes:
+        """Write the body."""
+        if self.name != WORLD and self.name not in model.frames:
+            model.frames[self.name]  # raises, with similar names
+        return Writes(bodies={self.name: self.body})
+
+    def default_tag(self) -> str:
+        """Return ``body`` and the name of the frame."""
+        return f"body {self.name}"
+
+
+@dataclass(frozen=True)
+class SetHome(Operation):
+    """Gives the coordinates of an articulation the values they have at home [m], [rad]."""
+
+    name: str
+    home: tuple[float, ...]
+
+    def apply(self, model: ReadRecorder) -> Writes:
+        """Write the record of the articulation anew."""
+        return Writes(articulations={self.name: replace(model.articulations[self.name], home=self.home)})
+
+    def default_tag(self) -> str:
+        """Return ``home`` and the name of the articulation."""
+        return f"home {self.name}"
+
+
+@dataclass(frozen=True)
+class AddFrame(Operation):
+    """Places a frame in its parent, with what it carries."""
+
+    name: str
+    frame: Frame
+    body: Body | None = None
+
+    def apply(self, model: ReadRecorder) -> Writes:
+        """Write the frame, and its body if there is one."""
+        bodies = {} if self.body is None else {self.name: self.body}
+        return Writes(frames={self.name: self.frame}, bodies=bodies)
+
+    def default_tag(self) -> str:
+        """Return ``frame`` and the name."""
+        return f"frame {self.name}"
+
+
+@dataclass(frozen=True)
+class Constrain(Operation):
+    """Adds a constraint."""
+
+    name: str
+    constraint: Constraint
+
+    def apply(self, model: ReadRecorder) -> Writes:
+        """Write the constraint."""
+        return Writes(constraints={self.name: self.constraint})
+
+    def default_tag(self) -> str:
+        """Return ``constraint`` and the name."""
+        return f"constraint {self.name}"
+
+
+@dataclass(frozen=True)
+class SetRate(Operation):
+    """Says how a coordinate moves with speeds."""
+
+    coordinate: Symbol
+    row: RateRow
+
+    def apply(self, model: ReadRecorder) -> Writes:
+        """Write the row."""
+        return Writes(rates={self.coordinate: dict(self.row)})
+
+    def default_tag(self) -> str:
+        """Return ``rate`` and the coordinate."""
+        return f"rate {self.coordinate}"
+
+
+@dataclass(frozen=True)
+class SetData(Operation):
+    """Stores data."""
+
+    name: str
+    value: Any
+
+    def apply(self, model: ReadRecorder) -> Writes:
+        """Write the value."""
+        return Writes(data={self.name: self.value})
+
+    def default_tag(self) -> str:
+        """Return ``data`` and the name."""
+        return f"data {self.name}"
+
+
+@dataclass(frozen=True)
+class Attach(Operation):
+    """Puts an existing frame, with everything below it, into another parent."""
+
+    name: str
+    frame: Frame
+
+    def apply(self, model: ReadRecorder) -> Writes:
+        """Write the frame anew."""
+        if self.name not in model.frames:
+            model.frames[self.name]  # raises, with similar names
+        return Writes(frames={self.name: self.frame})
+
+    def default_tag(self) -> str:
+        """Return ``attach``, the frame and its new parent."""
+        return f"attach {self.name} to {self.frame.parent}"
+
+
+@dataclass(frozen=True)
+class Override(Operation):
+    """Applies an operation that may write over what operations before it wrote."""
+
+    overrides = True
+
+    operation: Operation
+
+    @property
+    def traceable(self) -> bool:  # type: ignore[override]
+        """Whether what the operation computes can be written down as expressions of what it reads."""
+        return self.operation.traceable
+
+    def apply(self, model: ReadRecorder) -> Writes:
+        """Write what the operation writes."""
+        return self.operation.apply(model)
+
+    def default_tag(self) -> str:
+        """Return ``override`` and the tag of the operation, which what it writes over may have."""
+        return f"override {self.operation.default_tag()}"
+
+
+@dataclass(frozen=True)
+class SoftLimits(Operation):
+    """Keeps a joint within the range its safety controller defends, which lies inside its end stops.
+
+    Attributes
+    ----------
+    name
+        Of the articulation; the constraint is called ``name/soft_limits``.
+    q
+        The coordinate, or the expression that stands for it [rad] or [m].
+    lower, upper
+        The soft limits [rad] or [m].
+    """
+
+    name: str
+    q: Expression
+    lower: float
+    upper: float
+
+    def apply(self, model: ReadRecorder) -> Writes:
+        """Write the constraint."""
+        if self.name not in model.articulations:
+            model.articulations[self.name]  # raises, with similar names
+        if not self.q.symbols:
+            return Writes()
+        return Writes(constraints={f"{self.name}/soft_limits": (self.lower, self.q, self.upper)})
+
+    def default_tag(self) -> str:
+        """Return ``soft limits`` and the name."""
+        return f"soft limits {self.name}"

@@ -1,0 +1,229 @@
+"""View of the model before an operation, with recorded reads."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from enum import IntFlag
+from typing import TYPE_CHECKING, Any, Generic, TypeVar
+
+from kineverse.errors import KineverseError, UnknownNameError, suggest
+from kineverse.expressions.expression import Expression
+from kineverse.symbols import Symbol
+
+from .articulation import Articulation
+from .body import Body
+from .constraint import Constraint
+from .frame import WORLD, Frame
+from .kinematics import branches, relative_pose
+from .operation import ARTICULATIONS, BODIES, CONSTRAINTS, DATA, FRAMES, KINDS, RATES
+from .rate_nodes import collect_symbols, to_plain
+from .rates import RateEntry, Rates
+
+if TYPE_CHECKING:
+    from .operation import Cell
+
+V = TypeVar("V")
+ABSENT: Any = object()
+_MANY = 100
+
+
+class Read(IntFlag):
+    """How closely something was looked at."""
+
+    EXISTENCE = 1
+    VALUE = 2
+
+
+class Reads:
+    """The recorded reads of one run: cells with how closely they were read, and listings by kind.
+
+    What is found out about the run from them, its trace, is kept here, and gone with the next run.
+    """
+
+    __slots__ = ("cells", "listings", "trace")
+
+    def __init__(self) -> None:
+        self.cells: dict[Cell, Read] = {}
+        self.listings: set[str] = set()
+        self.trace: object = None
+
+    def add(self, cell: Cell, how: Read) -> None:
+        """Remember a look at a cell."""
+        known = self.cells.get(cell)
+        self.cells[cell] = how if known is None else known | how
+
+
+class ReadRecorder:
+    """The model before an operation: the same names as on :class:`~kineverse.Model`, every read recorded.
+
+    Expressions are in plain coordinates, save those of :meth:`fk` and :meth:`carry`.
+    """
+
+    def __init__(
+        self, value_at: Callable[[Cell], Any], names_at: Callable[[str], list[str]], reads: Reads
+    ) -> None:
+        self._value_at = value_at
+        self._names_at = names_at
+        self._reads = reads
+
+    # Made when asked for: most operations read little, and some read nothing at all.
+
+    @property
+    def frames(self) -> Mapping[str, Frame]:
+        """Frames by name."""
+        return self.by_kind(FRAMES)
+
+    @property
+    def bodies(self) -> Mapping[str, Body]:
+        """Bodies by the frame they belong to."""
+        return self.by_kind(BODIES)
+
+    @property
+    def articulations(self) -> Mapping[str, Articulation]:
+        """Articulations by name."""
+        return self.by_kind(ARTICULATIONS)
+
+    @property
+    def constraints(self) -> Mapping[str, Constraint]:
+        """Constraints by name."""
+        return self.by_kind(CONSTRAINTS)
+
+    @property
+    def data(self) -> Mapping[str, Any]:
+        """All other data by name."""
+        return self.by_kind(DATA)
+
+    def by_kind(self, kind: str) -> Mapping[str, Any]:
+        """Return one kind of data by name."""
+        return _RecordedMapping(kind, self._value_at, self._names_at, self._reads)
+
+    def fk(self, frame: str, relative_to: str = WORLD) -> Expression:
+        """Return relative_to_T_frame, 4×4, coordinates carried by the rates that hold here."""
+        recorded = self.frames.__getitem__
+        try:
+            # Frames above the last common ancestor are walked but do not matter, so they are not remembered.
+            base, down = branches(frame, relative_to, self._peek)
+        except (KineverseError, KeyError):
+            base, down = branches(frame, relative_to, recorded)
+        for name in (*base, *down):
+            recorded(name)
+        for end in {frame, relative_to} - {WORLD}:
+            self._reads.add((FRAMES, end), Read.EXISTENCE)
+        return self.carry(relative_pose(frame, relative_to, self._peek))
+
+    def _peek(self, name: str) -> Frame:
+        value: Frame = self._value_at((FRAMES, name))
+        if value is ABSENT:
+            raise KeyError(name)
+        return value
+
+    def coordinates_between(self, frame: str, relative_to: str = WORLD) -> tuple[Symbol, ...]:
+        """Return the coordinates that move a frame relative to another: from the last common ancestor down.
+
+        Those on the way to ``frame`` come first. In place of one that depends on others are these.
+        """
+        base, down = branches(frame, relative_to, self.frames.__getitem__)
+        found: dict[Symbol, None] = {}
+        for name in (*down, *base):
+            for factor in self._peek(name).factors:
+                if isinstance(factor, Expression):
+                    for symbol in factor.symbols:
+                        behind = self.resolve(symbol).symbols if symbol.has_derivative else ()
+                        found.update(dict.fromkeys(s for s in behind if s.has_derivative))
+        return tuple(found)
+
+    def resolve(self, expression: Expression) -> Expression:
+        """Return an expression in plain coordinates that do not depend on others."""
+        expression = to_plain(expression)
+        return self._rates_for(expression).resolve(expression)
+
+    def carry(self, expression: Expression) -> Expression:
+        """Return an expression with its coordinates carried by the rates that hold here."""
+        return self._rates_for(expression).carry(expression)
+
+    def _rates_for(self, expression: Expression) -> Rates:
+        entries: dict[Symbol, RateEntry] = {}
+        wanted = list(collect_symbols(expression))
+        while wanted:
+            x = wanted.pop()
+            if x.order or x in entries or not x.has_derivative:
+                continue
+            cell = (RATES, str(x))
+            self._reads.add(cell, Read.VALUE)
+            found = self._value_at(cell)
+            if found is not ABSENT:
+                entry = entries[x] = found[1]
+                if isinstance(entry, Expression):
+                    wanted += collect_symbols(entry)
+                    continue
+                for speed, value in entry:
+                    wanted += [speed.position, *collect_symbols(value)]
+        return Rates(entries)
+
+
+class _RecordedMapping(Mapping[str, V], Generic[V]):
+    """One kind of data by name; reading is recorded."""
+
+    def __init__(
+        self, kind: str, value_at: Callable[[Cell], Any], names_at: Callable[[str], list[str]], reads: Reads
+    ) -> None:
+        self._kind = kind
+        self._value_at = value_at
+        self._names_at = names_at
+        self._reads = reads
+
+    def __getitem__(self, name: str) -> V:
+        cell = (self._kind, name)
+        self._reads.add(cell, Read.VALUE)
+        value = self._value_at(cell)
+        if value is ABSENT:
+            raise unknown_name_error(self._kind, name, self._names_at(self._kind))
+        result: V = value
+        return result
+
+    def get(self, name: str, default: Any = None) -> Any:
+        self._reads.add((self._kind, name), Read.VALUE)
+        value = self._value_at((self._kind, name))
+        return default if value is ABSENT else value
+
+    def __contains__(self, name: object) -> bool:
+        if not isinstance(name, str):
+            return False
+        self._reads.add((self._kind, name), Read.EXISTENCE)
+        return self._value_at((self._kind, name)) is not ABSENT
+
+    def __iter__(self) -> Iterator[str]:
+        self._reads.listings.add(self._kind)
+        return iter(self._names_at(self._kind))
+
+    def __len__(self) -> int:
+        self._reads.listings.add(self._kind)
+        return len(self._names_at(self._kind))
+
+
+def unknown_path_error(path: object) -> UnknownNameError:
+    """Return the error for what is no path into a model."""
+    return UnknownNameError(
+        f"{path!r} is not a path into a model; it begins with one of {', '.join(KINDS)}, then '/'."
+    )
+
+
+def unknown_name_error(kind: str, name: str, available: Any) -> UnknownNameError:
+    """Return the error for something that is not there."""
+    noun = {BODIES: "body", RATES: "rate", DATA: "datum"}.get(kind, kind[:-1])
+    if not isinstance(name, str):
+        return UnknownNameError(f"A {noun} is asked for by its name, a text, not by {name!r}.")
+    names = list(available)
+    if kind == FRAMES:
+        if name == WORLD:
+            return UnknownNameError(
+                f"The frame '{WORLD}' is the root of all others, and is not listed among them."
+            )
+        names.append(WORLD)
+    if len(names) > _MANY:
+        # An edit may miss thousands of things at once, and comparing letters with every name takes long.
+        start, end = name[: len(name) // 2 + 1], name[-len(name) // 2 :]
+        names = [n for n in names if n.startswith(start) or n.endswith(end)][:_MANY]
+        if not names:
+            return UnknownNameError(f"There is no {noun} {name!r}, and none of a similar name.")
+    return UnknownNameError(f"There is no {noun} {name!r}. {suggest(name, names, noun)}")

@@ -1,0 +1,93 @@
+"""Random states of models within limits, and values of expressions there."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import cached_property
+from zlib import crc32
+
+import casadi as ca
+import numpy as np
+import numpy.typing as npt
+
+from kineverse.expressions.expression import SYMBOLS, Expression
+from kineverse.expressions.graph import lower
+from kineverse.symbols import Symbol
+
+from .model_view import ModelView
+
+Array = npt.NDArray[np.float64]
+
+REACH = np.pi
+"""How far from its default value a symbol without limits goes [rad], [m] and their rates."""
+
+
+class StateSamples:
+    """States of one or several models: the default state first, then random ones within limits.
+
+    What a symbol is worth follows from its name alone, so models that share names are looked at in the same
+    states. Of several models, the first that knows a symbol says where it may go. Limits of single symbols
+    are kept, other constraints not necessarily.
+
+    Parameters
+    ----------
+    models
+        The models.
+    count
+        How many states there are beside the default one.
+    seed
+        Another one gives other random states.
+    """
+
+    def __init__(self, *models: ModelView, count: int = 16, seed: int = 0) -> None:
+        self.size = count + 1
+        self._models = models
+        self._seed = seed
+        self._columns: dict[Symbol, Array] = {}
+
+    @cached_property
+    def _known(self) -> dict[Symbol, tuple[ModelView, float]]:
+        """Where each symbol comes from, and its default value."""
+        found: dict[Symbol, tuple[ModelView, float]] = {}
+        for model in self._models:
+            for symbol, value in model.default_state().items():
+                found.setdefault(symbol, (model, value))
+        return found
+
+    def of(self, symbol: Symbol) -> Array:
+        """Return the values of a symbol, one for each state."""
+        if symbol not in self._columns:
+            self._columns[symbol] = self._drawn(symbol)
+        return self._columns[symbol]
+
+    def _drawn(self, symbol: Symbol) -> Array:
+        if symbol.value is not None:
+            return np.full(self.size, symbol.value)
+        model, default = self._known.get(symbol.position) or (None, 0.0)
+        if symbol.order:
+            default = 0.0
+        owner = model or (self._models[0] if self._models else None)
+        low, high = owner.limits(symbol) if owner is not None else (-np.inf, np.inf)
+        low = low if np.isfinite(low) else min(default, high) - REACH
+        high = high if np.isfinite(high) else max(default, low) + REACH
+        chance = np.random.default_rng([self._seed, crc32(str(symbol).encode(errors="replace"))])
+        values = low + (high - low) * chance.random(self.size)
+        values[0] = default
+        return values
+
+    def values(self, expressions: Sequence[Expression]) -> list[Array]:
+        """Return, for each expression, an array (states, *shape); NaN where a closed loop does not close."""
+        if not expressions:
+            return []
+        stacked = ca.vertcat(*lower(expressions))
+        # Not from each expression: in a long chain, nearly every pose is about nearly every joint.
+        symbols = [SYMBOLS[leaf.element_hash()] for leaf in ca.symvar(stacked)]
+        vector = ca.vertcat(*(symbol._sx for symbol in symbols)) if symbols else ca.SX(0, 1)
+        function = ca.Function("samples", [vector], [stacked])
+        if symbols:
+            numbers = np.array(function(np.array([self.of(symbol) for symbol in symbols]))).T
+        else:
+            numbers = np.tile(np.array(function(ca.DM(0, 1))).T, (self.size, 1))
+        ends = np.cumsum([e.size for e in expressions])[:-1]
+        parts = np.split(numbers, ends, axis=1)
+        return [part.reshape(self.size, *e.shape) for part, e in zip(parts, expressions, strict=True)]

@@ -1,0 +1,442 @@
+"""Read-only data and symbolic kinematics of a model."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import ItemsView, Iterator, Mapping, Sequence, ValuesView
+from typing import TYPE_CHECKING, Any, Literal
+
+import casadi as ca
+import numpy as np
+
+from kineverse._synonyms import EDIT_METHODS, MODEL_SYNONYMS, unknown_attribute_error
+from kineverse.errors import UnknownAttributeError, UnknownNameError
+from kineverse.expressions.expression import NO_NODES, Expression, as_expression, from_casadi
+from kineverse.spatial import OneAxisTransform
+from kineverse.symbols import Symbol, check_symbols
+
+from . import kinematics
+from .articulation import Articulation
+from .body import Body
+from .constraint import Constraint
+from .display import as_html, as_lines
+from .frame import WORLD, Frame
+from .operation import ARTICULATIONS, BODIES, CONSTRAINTS, DATA, FRAMES, RATES, Cell
+from .projection import EqualityConstraints
+from .rates import Rates
+from .read_recorder import ABSENT, unknown_name_error
+from .relevance import Relevance, SymbolIndex
+from .violations import Checks
+
+
+class NamedMapping(Mapping[str, Any]):
+    """One kind of a model's data by name, live; a wrong name lists the right ones."""
+
+    def __init__(self, view: SymbolicView, kind: str, present: Any) -> None:
+        self._view = view
+        self._kind = kind
+        self._present = present
+
+    def _values(self) -> dict[str, Any]:
+        self._view._settle()
+        return self._view._head[self._kind]
+
+    def __getitem__(self, name: str) -> Any:
+        with self._view._lock:
+            values = self._values()
+            try:
+                value = values[name]
+            except (KeyError, TypeError):
+                raise unknown_name_error(self._kind, name, values) from None
+            return value if self._present is None else self._present(name, value)
+
+    def __iter__(self) -> Iterator[str]:
+        with self._view._lock:
+            self._view._settle()
+            return iter(list(self._view._ordered(self._kind)))
+
+    def items(self) -> ItemsView[str, Any]:
+        """Return names and values as they are now."""
+        with self._view._lock:
+            return {name: self[name] for name in self}.items()
+
+    def values(self) -> ValuesView[Any]:
+        """Return the values as they are now."""
+        with self._view._lock:
+            return {name: self[name] for name in self}.values()
+
+    def __len__(self) -> int:
+        with self._view._lock:
+            return len(self._values())
+
+    def __contains__(self, name: object) -> bool:
+        with self._view._lock:
+            return name in self._values()
+
+    def __str__(self) -> str:
+        with self._view._lock:
+            return as_lines(self._title, self.items(), len(self))
+
+    def _repr_html_(self) -> str:
+        with self._view._lock:
+            return as_html(self._title, self.items(), len(self))
+
+    @property
+    def _title(self) -> str:
+        return f"{len(self)} {self._kind}"
+
+    def __repr__(self) -> str:
+        names = list(self)
+        shown = ", ".join(names[:8])
+        return f"<{len(names)} {self._kind}: {shown}{', ...' if len(names) > 8 else ''}>"
+
+
+JacobianForm = Literal["world_aligned", "world", "body"]
+
+
+class SymbolicView:
+    """What a model is made of, as data and expressions. Base of what answers with numbers as well."""
+
+    def __init__(self, head: dict[str, dict[str, Any]], version: int) -> None:
+        self._head = head
+        self._version = version
+        self._lock = threading.RLock()
+        self._forget_index({})
+        self._forget_all()
+
+    if not TYPE_CHECKING:  # a type checker says so on its own
+
+        def __getattr__(self, name):
+            if name in EDIT_METHODS:
+                raise UnknownAttributeError(
+                    f"A model is changed in an edit: write `with model.edit() as edit:`, and in the block "
+                    f"edit.{name}(...)."
+                )
+            raise unknown_attribute_error("A model", name, dir(self), MODEL_SYNONYMS)
+
+    def _forget_index(self, dependent: Mapping[Symbol, Expression]) -> None:
+        self._dependent = dependent
+        self._relevance = Relevance(dependent)
+        self._index = SymbolIndex()
+        self._pending: list[tuple[Cell, Any, Any]] = []
+        self._is_indexed = False
+
+    def _forget_all(self) -> None:
+        self._rates: Rates | None = None
+        self._poses: dict[tuple[str, str], Expression] = {}
+        self._jacobians: dict[Any, Expression] = {}
+        self._carried_constraints: dict[str, Constraint] = {}
+        self._all_symbols: tuple[Symbol, ...] | None = None
+        self._checks: Checks | None = None
+        self._equalities: EqualityConstraints | None = None
+
+    def _changed(self, changes: Sequence[tuple[Cell, Any, Any]]) -> None:
+        """Drop what no longer holds."""
+        kinds = {cell[0] for cell, _, _ in changes}
+        if self._is_indexed:
+            self._pending += changes
+        self._all_symbols = None
+        if RATES in kinds:
+            self._rates = None
+            self._carried_constraints.clear()
+            self._poses.clear()
+            self._jacobians.clear()
+        if FRAMES in kinds:
+            self._poses.clear()
+            self._jacobians.clear()
+        if kinds & {CONSTRAINTS, RATES, ARTICULATIONS}:
+            self._equalities = None
+        if CONSTRAINTS in kinds or RATES in kinds:
+            self._checks = None
+            for (kind, name), _, _ in changes:
+                if kind == CONSTRAINTS:
+                    self._carried_constraints.pop(name, None)
+
+    def _settle(self) -> None:
+        """Bring an edit in progress up to date before it is read; there is none here."""
+
+    def _ordered(self, kind: str) -> dict[str, Any]:
+        """Return the values of a kind in the order in which operations write them."""
+        return self._head[kind]
+
+    def _catch_up(self) -> None:
+        self._settle()
+        if self.rates.dependent != self._dependent:
+            self._forget_index(self.rates.dependent)
+        pending, self._pending = self._pending, []
+        if not self._is_indexed:
+            pending = [
+                ((kind, name), ABSENT, value)
+                for kind in (FRAMES, CONSTRAINTS)
+                for name, value in self._head[kind].items()
+            ]
+            self._is_indexed = True
+        for (kind, name), before, after in pending:
+            if kind not in (FRAMES, CONSTRAINTS):
+                continue
+            if before is not ABSENT:
+                self._index.add(before, -1)
+                if kind == CONSTRAINTS:
+                    self._relevance.remove(name, before)
+            if after is not ABSENT:
+                self._index.add(after, 1)
+                if kind == CONSTRAINTS:
+                    self._relevance.add(name, after)
+
+    # -- data ----------------------------------------------------------------------------------------------
+
+    @property
+    def version(self) -> int:
+        """Counts committed edits."""
+        return self._version
+
+    @property
+    def frames(self) -> Mapping[str, Frame]:
+        """Frames by name; the world itself is not among them. Transforms are in plain coordinates."""
+        return self._named(FRAMES)
+
+    @property
+    def bodies(self) -> Mapping[str, Body]:
+        """Bodies by the name of the frame they are attached to."""
+        return self._named(BODIES)
+
+    @property
+    def articulations(self) -> Mapping[str, Articulation]:
+        """Records of articulations by name."""
+        return self._named(ARTICULATIONS)
+
+    @property
+    def data(self) -> Mapping[str, Any]:
+        """Whatever else operations wrote, by name."""
+        return self._named(DATA)
+
+    @property
+    def constraints(self) -> Mapping[str, Constraint]:
+        """Constraints by name, coordinates carried by their rates."""
+        return NamedMapping(self, CONSTRAINTS, self._carried)
+
+    def _named(self, kind: str) -> Mapping[str, Any]:
+        return NamedMapping(self, kind, None)
+
+    def _carried(self, name: str, constraint: Constraint) -> Constraint:
+        rates = self.rates
+        if rates.is_empty:
+            return constraint
+        known = self._carried_constraints.get(name)
+        if known is None:
+            known = Constraint(
+                rates.carry(constraint.lower),
+                rates.carry(constraint.expression),
+                rates.carry(constraint.upper),
+            )
+            self._carried_constraints[name] = known
+        return known
+
+    def _followed(self, constraint: Constraint) -> Constraint:
+        """Return a constraint in terms of what does not depend on anything, speeds included."""
+        rates = self.rates
+        if not any(s.position in rates.dependent for s in constraint.symbols):
+            return constraint
+        parts = (constraint.lower, constraint.expression, constraint.upper)
+        return Constraint(*(rates.eliminate(rates.carry(part)) for part in parts))
+
+    @property
+    def rates(self) -> Rates:
+        """The rate table, see :mod:`kineverse.model.rates`."""
+        with self._lock:
+            self._settle()
+            if self._rates is None:
+                self._rates = Rates(dict(self._head[RATES].values()))
+            return self._rates
+
+    @property
+    def symbols(self) -> tuple[Symbol, ...]:
+        """The coordinates and parameters of all frames and constraints, sorted: what a configuration is.
+
+        A coordinate of which only the speed occurs is among them, unless that speed is one of those that move
+        other coordinates: the wheels of a base, the angular velocity of a ball joint.
+        """
+        with self._lock:
+            self._settle()
+            if self._all_symbols is None or self._pending:
+                self._catch_up()
+                mentioned = self._index.sorted()
+                found = {s for s in mentioned if s.order == 0}
+                wheels: set[Symbol] = set()
+                for coordinate, row in self.rates.items():
+                    found.add(coordinate)
+                    found.update(s for value in row.values() for s in value.symbols if s.order == 0)
+                    wheels.update(speed.position for speed in row)
+                # What only has its speed limited is somewhere, too; a wheel that drives others need not be.
+                found.update({s.position for s in mentioned if s.order} - wheels)
+                for itself in self.rates.dependent.values():
+                    found.update(itself.symbols)
+                found -= self.rates.dependent.keys()
+                self._all_symbols = tuple(sorted(found, key=lambda s: s.sort_key))
+            return self._all_symbols
+
+    @property
+    def degrees_of_freedom(self) -> tuple[Symbol, ...]:
+        """The coordinates among :attr:`symbols`; no parameters."""
+        return tuple(s for s in self.symbols if s.has_derivative)
+
+    @property
+    def speeds(self) -> tuple[Symbol, ...]:
+        """The free speeds that move the coordinates, sorted."""
+        with self._lock:
+            rates = self.rates
+            found: set[Symbol] = set()
+            for coordinate in self.degrees_of_freedom:
+                found.update(rates[coordinate] if coordinate in rates else (coordinate.derivative(),))
+            return tuple(sorted(found, key=lambda s: s.sort_key))
+
+    # -- kinematics ----------------------------------------------------------------------------------------
+
+    def fk(self, frame: str, relative_to: str = WORLD) -> Expression:
+        """Return relative_to_T_frame, a 4×4 expression [m], [rad]; coordinates are carried by their rates.
+
+        Raises
+        ------
+        UnknownNameError
+            If a frame does not exist, with similar names.
+        """
+        with self._lock:
+            self._settle()
+            known = self._poses.get((frame, relative_to))
+            if known is None:
+                if relative_to == WORLD:
+                    known = kinematics.place_in_world(frame, self._frame).matrix()
+                else:
+                    known = kinematics.relative_pose(frame, relative_to, self._frame)
+                known = self._poses[frame, relative_to] = self.rates.carry(known)
+            return known
+
+    def jacobian(
+        self,
+        frame: str,
+        relative_to: str = WORLD,
+        form: JacobianForm = "world_aligned",
+        symbols: Sequence[Symbol] | None = None,
+        heuristic: bool = False,
+    ) -> Expression:
+        """Return the geometric Jacobian of a frame, 6×n: linear rows [m] first, then angular rows [rad].
+
+        Parameters
+        ----------
+        frame, relative_to
+            What moves and with respect to what.
+        form
+            ``world_aligned``: velocity of the frame's origin in axes of ``relative_to``; ``world``: the
+            spatial twist there; ``body``: in the frame itself.
+        symbols
+            One column for each: positions or their velocities. By default the speeds that move the frame,
+            sorted (:meth:`speeds_of`).
+        heuristic
+            Whether heuristic gradient entries count; a Jacobian is about facts, so by default they do not.
+        """
+        if form not in ("world_aligned", "world", "body"):
+            raise UnknownNameError(
+                f"There is no form {form!r}; forms are 'world_aligned', 'world' and 'body'."
+            )
+        key = (
+            frame,
+            relative_to,
+            form,
+            None if symbols is None else tuple(check_symbols(symbols)),
+            heuristic,
+        )
+        with self._lock:
+            self._settle()
+            known = self._jacobians.get(key)
+            if known is None:
+                known = self._jacobians[key] = self._jacobian(*key)
+            return known
+
+    def _jacobian(
+        self, frame: str, relative_to: str, form: str, symbols: tuple[Symbol, ...] | None, heuristic: bool
+    ) -> Expression:
+        rates = self.rates
+        if relative_to == WORLD:
+            base, tip = kinematics.ROOT, kinematics.place_in_world(frame, self._frame)
+        else:
+            to_base, to_tip = kinematics.branches(frame, relative_to, self._frame)
+            base, tip = (
+                kinematics.compose_chain(to_base, self._frame),
+                kinematics.compose_chain(to_tip, self._frame),
+            )
+        rotation, position, columns = kinematics.compute_twists(base, tip, heuristic)
+        tip_nodes = tip.nodes | base.nodes
+        by_speed: dict[Symbol, Expression] = {}
+        for key, twist in columns.items():
+            v, w = twist.linear, twist.angular
+            if form == "world":
+                v = v + ca.cross(position, w)
+            elif form == "body":
+                v, w = ca.mtimes(rotation.T, v), ca.mtimes(rotation.T, w)
+            column = rates.carry(from_casadi(ca.densify(ca.vertcat(v, w)), (6,), twist.nodes | tip_nodes))
+            row = rates.row(key.position) if key.order == 1 else None
+            for speed, rate in row.items() if row is not None else ((key, as_expression(1.0)),):
+                term = column if row is None else column * rates.carry(rate)
+                by_speed[speed] = by_speed[speed] + term if speed in by_speed else term
+        if symbols is None:
+            chosen = sorted(by_speed, key=lambda s: s.sort_key)
+        else:
+            chosen = [s.derivative() if s.order == 0 and s.has_derivative else s for s in symbols]
+        zero = as_expression(np.zeros(6))
+        parts = [by_speed.get(s, zero) for s in chosen]
+        nodes = NO_NODES.union(*(p._nodes for p in parts))
+        sx = ca.horzcat(*(p._sx for p in parts)) if parts else ca.SX(6, 0)
+        return from_casadi(ca.densify(sx), (6, len(parts)), nodes)
+
+    def speeds_of(self, frame: str, relative_to: str = WORLD) -> tuple[Symbol, ...]:
+        """Return the free speeds that move a frame, sorted: the columns of :meth:`jacobian`."""
+        with self._lock:
+            self._settle()
+            base, down = kinematics.branches(frame, relative_to, self._frame)
+            found: set[Symbol] = set()
+            for name in (*base, *down):
+                for factor in self._frame(name).factors:
+                    if isinstance(factor, OneAxisTransform):
+                        found.update(factor.amount.gradient(False))
+                    elif isinstance(factor, Expression):
+                        found.update(factor.gradient(False))
+            rates = self.rates
+            free: set[Symbol] = set()
+            for key in found:
+                row = rates.row(key.position) if key.order == 1 else None
+                free.update((key,) if row is None else row)
+            return tuple(sorted(free, key=lambda s: s.sort_key))
+
+    def symbols_of(self, frame: str, relative_to: str = WORLD) -> tuple[Symbol, ...]:
+        """Return the symbols of a pose in the order of the chain, from ``relative_to`` to ``frame``.
+
+        They are those of :meth:`fk`, parameters included: joints come as one meets them on the way, the
+        coordinates of one joint in its own order, and instead of what follows others, as a mimic joint or a
+        closed loop does, what it follows. Give them to :func:`kineverse.compile` as inputs for vectors in
+        this order, rather than sorted by name.
+
+        Raises
+        ------
+        UnknownNameError
+            If a frame does not exist, with similar names.
+        """
+        with self._lock:
+            self._settle()
+            base, down = kinematics.branches(frame, relative_to, self._frame)
+            dependent = self.rates.dependent
+            records = self._head[ARTICULATIONS].values()
+            own = {s: place for record in records for place, s in enumerate(record.coordinates)}
+            found: dict[Symbol, None] = {}
+            for name in (*base[::-1], *down):
+                for factor in self._frame(name).factors:
+                    if isinstance(factor, Expression):
+                        for s in sorted(factor.symbols, key=lambda s: (own.get(s, len(own)), s.sort_key)):
+                            found |= dict.fromkeys(dependent[s].symbols if s in dependent else (s,))
+            return tuple(found)
+
+    def _frame(self, name: str) -> Frame:
+        try:
+            frame: Frame = self._head[FRAMES][name]
+        except (KeyError, TypeError):
+            raise unknown_name_error(FRAMES, name, self._head[FRAMES]) from None
+        return frame

@@ -1,0 +1,166 @@
+"""Recording of an operation as expressions of what it reads."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping
+from itertools import count
+from typing import Any
+
+from kineverse.errors import KineverseError
+from kineverse.expressions.expression import Expression, as_expression
+from kineverse.model.operation import Cell, Operation, map_expressions
+from kineverse.model.read_recorder import ReadRecorder
+
+from .placeholder import ReadNode, fill_read_nodes, find_read_nodes
+from .replay import replay_agrees, writes_agree
+from .trace import Trace, TraceStep, UntraceableError, substitute_results
+from .trace_queries import FAILED, Access, Query, QueryResult, TracingReader
+
+_SERIAL = count(1)
+
+
+def record_trace(operation: Operation, model: ReadRecorder, writes: Mapping[Cell, Any]) -> Trace:
+    """Return what an operation computes.
+
+    Parameters
+    ----------
+    operation
+        An operation that was applied.
+    model
+        The model before it.
+    writes
+        What it wrote. What its trace writes is compared with it, and then with what the code does where
+        answers are others, as code may look at what it is given in ways that no one notices.
+
+    Raises
+    ------
+    UntraceableError
+        If its code cannot do without the values that it read.
+    """
+    if not operation.traceable:
+        raise UntraceableError("what it computes follows from numbers that it reads")
+    reader = _RecordingReader(model)
+    try:
+        return _run_traced(operation, reader, writes)
+    except UntraceableError as error:
+        if not reader.gave_numbers:
+            raise
+        try:  # much code needs its numbers and yet only computes with poses
+            return _run_traced(operation, _RecordingReader(model, plain_numbers=True), writes)
+        except UntraceableError:
+            raise error from None
+
+
+def _run_traced(operation: Operation, reader: _RecordingReader, writes: Mapping[Cell, Any]) -> Trace:
+    try:
+        effects = operation.apply(reader)
+        reader.done = True
+        traced = tuple(
+            (cell, map_expressions(cell[0], value, _detach)) for cell, value in effects.writes().items()
+        )
+        again = reader.trace(traced).written(reader.replies).writes()
+    except UntraceableError:
+        raise
+    except Exception as error:  # it is anybody's code, and was written for other values
+        first = str(error).partition("\n")[0]
+        raise UntraceableError(f"its code needs values: {type(error).__name__}: {first[:200]}") from error
+    if not writes_agree(again, writes):
+        raise UntraceableError("it decides by what it reads in a way that leaves no trace")
+
+    def is_followed(free: Collection[int]) -> bool:
+        return replay_agrees(reader.trace(traced), operation, reader.model, reader.replies, free)
+
+    free = [i for i, step in enumerate(reader.steps()) if step.look is Access.NOT]
+    if not is_followed(free):
+        for place in free:
+            if not is_followed([place]):
+                reader.decided_by(place)
+        if not is_followed([i for i in free if reader.steps()[i].look is Access.NOT]):
+            raise UntraceableError("it decides by what it reads in a way that leaves no trace")
+    result = reader.trace(traced)
+    if all(step.look is Access.VALUE for step in result.steps):
+        raise UntraceableError("it looks at all the values that it reads")
+    return result
+
+
+class _RecordingReader(TracingReader):
+    """The model before an operation, with answers in place of expressions, every question written down.
+
+    With ``plain_numbers``, data and records have numbers where they have, all of which count as looked at.
+    """
+
+    def __init__(self, model: ReadRecorder, plain_numbers: bool = False) -> None:
+        super().__init__(model)
+        self.serial = next(_SERIAL)
+        self.replies: list[QueryResult] = []
+        self._plain_numbers = plain_numbers
+        self._places: dict[object, int] = {}
+        self._questions: list[Query] = []
+        self._looks: list[Access] = []
+
+    @property
+    def gave_numbers(self) -> bool:
+        """Whether there are numbers among the answers."""
+        return any(isinstance(part, float) for reply in self.replies for part in reply.parts)
+
+    def trace(self, writes: tuple[tuple[Cell, Any], ...]) -> Trace:
+        """Return what was asked, with what is written."""
+        return Trace(self.steps(), writes)
+
+    def steps(self) -> tuple[TraceStep, ...]:
+        """Return what was asked."""
+        return tuple(TraceStep(_apart(q), look) for q, look in zip(self._questions, self._looks, strict=True))
+
+    def look(self, question: int, how: Access) -> None:
+        if not self.done:
+            self._looks[question] = max(self._looks[question], how)
+
+    def decided_by(self, question: int) -> None:
+        """Note that the value of an answer matters."""
+        self._looks[question] = Access.VALUE
+
+    def settled(self, expression: Expression) -> Expression:
+        return fill_read_nodes(expression, lambda answer: answer.value)
+
+    def ask(self, kind: str, *arguments: Any) -> Any:
+        question = Query(kind, arguments)
+        place = self._places.get(question.key)
+        if place is None:
+            place = self._ask(question)
+        rest, parts = self.replies[place]
+        if rest is FAILED:
+            question.ask(self.model)
+        if self._plain_numbers and any(isinstance(part, float) for part in parts):
+            self.look(place, Access.VALUE)
+        return question.answer(rest, [self._given(place, i, part) for i, part in enumerate(parts)])
+
+    def _ask(self, question: Query) -> int:
+        try:
+            reply = substitute_results(question, self.replies).ask(self.model)
+        except KineverseError:
+            if any(isinstance(a, Expression) for a in question.arguments):
+                raise
+            reply = QueryResult(FAILED, ())
+        place = self._places[question.key] = len(self.replies)
+        self.replies.append(reply)
+        self._questions.append(question)
+        self._looks.append(Access.NOT)
+        return place
+
+    def _given(self, question: int, place: int, part: Expression | float) -> Expression | float:
+        if self._plain_numbers and isinstance(part, float):
+            return part
+        return ReadNode.standing_for(as_expression(part), self, question, place)
+
+
+def _detach(expression: Expression) -> Expression:
+    """Return an expression whose places stand for nothing any more, and are the same in every process."""
+    result = fill_read_nodes(expression, lambda a: ReadNode.empty(a.shape, a.question, a.part, a.path))
+    if any(answer.arguments for answer in find_read_nodes(result)):
+        raise UntraceableError("what it read is inside of an implicit function")
+    return result
+
+
+def _apart(question: Query) -> Query:
+    arguments = (_detach(a) if isinstance(a, Expression) else a for a in question.arguments)
+    return Query(question.kind, tuple(arguments))

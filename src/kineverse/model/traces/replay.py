@@ -1,0 +1,217 @@
+"""Replay of a trace on synthetic inputs, and comparison of what operations write.
+
+Code may look at what it is given in ways that no one notices, as ``isinstance`` does. So it is run once more
+on answers of other types: constants in place of what moves, symbols and whole numbers in place of numbers.
+Where it then does what the trace does not, it decides by that answer.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import replace
+from functools import partial
+from typing import Any
+
+import casadi as ca
+import numpy as np
+
+from kineverse.errors import KineverseError
+from kineverse.expressions.expression import Expression, as_expression
+from kineverse.expressions.graph import leaves, lower
+from kineverse.model.operation import (
+    ARTICULATIONS,
+    DATA,
+    FRAMES,
+    Cell,
+    Operation,
+    find_expressions,
+    map_expressions,
+)
+from kineverse.model.read_recorder import ReadRecorder
+from kineverse.spatial import translation
+from kineverse.symbols import Symbol, position
+
+from .trace import Trace, UntraceableError, substitute_results
+from .trace_queries import EXPRESSION_QUERIES, FAILED, Query, QueryResult, TracingReader
+
+_SAMPLES = 3
+_SEED = 20220
+
+ExpressionPair = tuple[Expression, Expression]
+
+
+def writes_agree(
+    one: Mapping[Cell, Any],
+    other: Mapping[Cell, Any],
+    affordable: Callable[[list[ExpressionPair]], bool] = lambda _: True,
+) -> bool:
+    """Return whether the same is written, in the same order, expressions compared by a few values.
+
+    A number and a constant expression are the same. What is not structurally equal, and not ``affordable``,
+    is not compared.
+    """
+    if list(one) != list(other):
+        return False
+    pairs: list[ExpressionPair] = []
+    for cell in one:
+        found = _pairs(cell[0], one[cell], other[cell])
+        if found is None:
+            return False
+        pairs += found
+    different = [(a, b) for a, b in pairs if a is not b and a != b]
+    return not affordable(different) or _close(different)
+
+
+def _pairs(kind: str, a: Any, b: Any) -> list[ExpressionPair] | None:
+    """Return the expressions at the same places of two values; None if something else differs."""
+    if a is b:
+        return []
+    if kind == FRAMES:
+        return [(a.transform, b.transform)] if a.parent == b.parent else None
+    a, b = _without_numbers(kind, a), _without_numbers(kind, b)
+    one, other = find_expressions(kind, a), find_expressions(kind, b)
+    if len(one) != len(other) or map_expressions(kind, a, _nothing) != map_expressions(kind, b, _nothing):
+        return None
+    return list(zip(one, other, strict=True))
+
+
+def _nothing(_: Expression) -> float:
+    return 0.0
+
+
+def _without_numbers(kind: str, value: Any) -> Any:
+    """Return a written value with expressions in place of its numbers."""
+    if kind == ARTICULATIONS:
+        return replace(value, dynamics=_without_numbers(DATA, value.dynamics))
+    if kind != DATA:
+        return value
+    if isinstance(value, tuple):
+        return tuple(_without_numbers(DATA, item) for item in value)
+    is_number = isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value)
+    return as_expression(value) if is_number else value
+
+
+def _close(pairs: list[ExpressionPair]) -> bool:
+    """Return whether expressions and their gradients agree at a few states."""
+    values: list[ExpressionPair] = []
+    for a, b in pairs:
+        if a.shape != b.shape:
+            return False
+        values.append((a, b))
+        for heuristic in (True, False):
+            x, y = a.gradient(heuristic), b.gradient(heuristic)
+            if set(x) != set(y):
+                return False
+            values += [(x[key], y[key]) for key in x]
+    if not values:
+        return True
+    flat = [e for pair in values for e in pair]
+    symbols = sorted({s for e in flat for s in e.symbols}, key=lambda s: s.sort_key)
+    inputs = ca.vertcat(*(s._sx for s in symbols)) if symbols else ca.SX(0, 1)
+    columns = lower(flat)
+    both = ca.Function("both", [inputs], [ca.vertcat(*columns[::2]), ca.vertcat(*columns[1::2])])
+    random = np.random.default_rng(_SEED)
+    for _ in range(_SAMPLES):
+        left, right = both(random.uniform(-1, 1, len(symbols)))
+        if not np.allclose(np.array(left), np.array(right), 1e-9, 1e-12, equal_nan=True):
+            return False
+    return True
+
+
+_STRANGER = "∂/stranger"
+_PERTURBATION_SEED = 20221
+
+Perturbation = Callable[[Query, int, "Expression | float"], "Expression | float"]
+
+
+def replay_agrees(
+    trace: Trace,
+    operation: Operation,
+    model: ReadRecorder,
+    replies: Sequence[QueryResult],
+    free: Collection[int],
+) -> bool:
+    """Return whether a trace does what the code does where the answers to these questions are others."""
+    for change in (_perturb_value, partial(_perturb_motion, symbol=_symbol_of(trace))):
+        others: list[QueryResult] = []
+        try:
+            for place, (step, reply) in enumerate(zip(trace.steps, replies, strict=True)):
+                if step.question.kind in EXPRESSION_QUERIES:
+                    others.append(substitute_results(step.question, others).ask(model))
+                else:
+                    others.append(_perturb(change, step.question, reply) if place in free else reply)
+            traced = trace.written(others).writes()
+        except KineverseError:
+            continue  # nobody follows such a change
+        reader = _ReplayReader(model, trace, others)
+        try:
+            effects = operation.apply(reader)
+            reader.done = True
+            written = effects.writes()
+        except UntraceableError:
+            return False
+        except Exception:  # it is anybody's code, and such answers may be none for it
+            continue
+        if not writes_agree(traced, written):
+            return False
+    return True
+
+
+def _perturb(change: Perturbation, question: Query, reply: QueryResult) -> QueryResult:
+    return QueryResult(reply.rest, tuple(change(question, i, part) for i, part in enumerate(reply.parts)))
+
+
+def _perturb_value(question: Query, place: int, part: Expression | float) -> Expression | float:
+    """Return another number in place of a number, and a constant for what moves."""
+    if isinstance(part, float):
+        return math.floor(part) + 2 if question.kind == "datum" else 1.25 * part + 0.5
+    if question.kind == "constraint" and place == 1:
+        return 2 * part  # what is limited is never constant
+    random = np.random.default_rng(_PERTURBATION_SEED)
+    try:
+        value = part({s: random.uniform(0.1, 0.9) for s in part.symbols if s.value is None})
+    except KineverseError:
+        return part
+    if not np.isfinite(value).all():
+        return part
+    return as_expression(value if part.shape else 1.25 * value + 0.5)
+
+
+def _perturb_motion(
+    question: Query, place: int, part: Expression | float, symbol: Symbol
+) -> Expression | float:
+    """Return something that is, or is made of, nothing but one symbol."""
+    symbol = symbol if isinstance(part, float) or not part.symbols else part.symbols[0]
+    if isinstance(part, float) or not part.shape:
+        return symbol
+    if part.shape == (3, 4):
+        return translation(symbol, symbol, symbol)[:3]
+    return part + symbol
+
+
+def _symbol_of(trace: Trace) -> Symbol:
+    """Return a symbol that the code uses itself, as it may compare what it reads with that."""
+    written = (e for (kind, _), value in trace.writes for e in find_expressions(kind, value))
+    symbols = (s for e in written for s in leaves(e)[0] if not s.order and s.has_derivative)
+    return next(symbols, position(_STRANGER))
+
+
+class _ReplayReader(TracingReader):
+    """A model that answers the questions of a trace in its own way, and no others."""
+
+    def __init__(self, model: ReadRecorder, trace: Trace, replies: Sequence[QueryResult]) -> None:
+        super().__init__(model)
+        self._replies = {
+            substitute_results(step.question, replies).key: reply
+            for step, reply in zip(trace.steps, replies, strict=True)
+        }
+
+    def ask(self, kind: str, *arguments: Any) -> Any:
+        question = Query(kind, arguments)
+        reply = self._replies.get(question.key)
+        if reply is None:
+            raise UntraceableError("it asks for other things then")
+        if reply.rest is FAILED:
+            question.ask(self.model)
+        return question.answer(reply.rest, reply.parts)

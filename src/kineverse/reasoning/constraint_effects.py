@@ -1,0 +1,350 @@
+"""Effects of one constraint: blocked speeds, kept positions, and the regions where."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, field
+
+from kineverse.expressions.expression import Expression, as_expression
+from kineverse.expressions.gradient import partial
+from kineverse.expressions.substitution import apply_substitution
+from kineverse.intervals.graph import SATURATED, Term, TermGraph, reachable_terms
+from kineverse.model.constraint import Constraint
+from kineverse.symbols import Symbol
+
+from .bound_expressions import express_bound
+from .boxes import Interval, IntervalBox
+from .case_split import Case, Unanswered, Unclear, distinguish
+from .domain import Domain
+from .interlock import Hold
+from .regions import Region, merge_boxes
+
+
+@dataclass
+class SpeedEffect:
+    """Where what is held cannot increase (``up``) or decrease, and where it even must do the opposite."""
+
+    held: Expression
+    up: Region = field(default_factory=Region)
+    down: Region = field(default_factory=Region)
+    up_beyond: Region = field(default_factory=Region)
+    down_beyond: Region = field(default_factory=Region)
+
+
+def find_speed_effect(
+    constraint: Constraint,
+    follow: Mapping[Symbol, Expression],
+    given: Mapping[Symbol, float],
+    domain: Domain,
+    unknown: list[tuple[str, IntervalBox]],
+) -> SpeedEffect:
+    """Return what a constraint of order 1 or higher stops, in plain coordinates; note what is unknown.
+
+    ``follow`` says by what coordinates are told that follow others.
+    """
+    terms = TermGraph(given)
+    held, weight, offset = _alone(constraint)
+    ends = (constraint.lower, constraint.upper, offset, weight)
+    lower, upper, rest, factor = (terms.of(apply_substitution(part, follow)) for part in ends)
+    above, below = terms.minus(upper, rest), terms.minus(rest, lower)
+    blocked = SpeedEffect(held)
+    whole = terms.of(held) if not isinstance(held, Symbol) else None
+    start = Case((factor, above, below, *([] if whole is None else [whole])), domain)
+    sides = [(above, below, blocked.up, blocked.up_beyond), (below, above, blocked.down, blocked.down_beyond)]
+    if whole is not None and start.value(whole).range[0] >= -1e-300:
+        # A norm cannot be less than 0 in the first place: if it has no room, everything stands.
+        _collect(start, factor, sides[0], unknown)
+        blocked.down = blocked.up
+        return blocked
+    for side in sides:
+        _collect(start, factor, side, unknown)
+    return blocked
+
+
+def _alone(constraint: Constraint) -> tuple[Expression, Expression, Expression]:
+    """Return (held, weight, offset): the constrained expression is ``weight·held + offset``.
+
+    A single speed, if the expression is affine in one; otherwise the expression itself.
+    """
+    expression = constraint.expression
+    if isinstance(expression, Symbol):
+        return expression, as_expression(1.0), as_expression(0.0)
+    moving = [s for s in expression.symbols if s.order == constraint.order]
+    if len(moving) == 1:
+        weight = partial(expression, moving)[0]
+        if moving[0] not in weight.symbols:
+            return moving[0], weight, expression.substitute({moving[0]: 0.0})
+    return expression, as_expression(1.0), as_expression(0.0)
+
+
+def _collect(
+    start: Case,
+    factor: Term,
+    side: tuple[Term, Term, Region, Region],
+    unknown: list[tuple[str, IntervalBox]],
+) -> None:
+    room, other, where, beyond = side
+
+    def ask(case: Case) -> int | str | Unclear:
+        turned = case.sign(factor)
+        if turned is None:
+            return Unclear((*case.doubts((factor,)), factor))
+        if turned == 0:
+            return 1
+        wanted = room if turned > 0 else other
+        value = case.value(wanted)
+        sign = case.sign(wanted)
+        if sign is not None:
+            return sign
+        if value.void:
+            return "a bound is not a number"
+        surely = 0 if value.range[1] <= 0 and not value.doubtful else None
+        return Unclear((*case.doubts((wanted,)), wanted), surely)
+
+    for case, answer in distinguish(start, ask):
+        if isinstance(answer, Unanswered):
+            unknown.append((_ramp(case, (room, other)) or answer.reason, case.box()))
+        elif isinstance(answer, str):
+            unknown.append((answer, case.box()))
+        elif isinstance(answer, int) and answer <= 0:
+            telling = not case.is_at_equality((factor, room if case.sign(factor) == 1 else other))
+            where.add(case.box(), telling)
+            if answer < 0:
+                beyond.add(case.box(), telling)
+
+
+def _ramp(case: Case, terms: tuple[Term, ...]) -> str | None:
+    """Return the reason if a smooth step is under way."""
+    for term in reachable_terms(terms):
+        if term.op == "less" and len(term.deciders) == 2 and case.value(term).range == (0.0, 1.0):
+            return (
+                f"a comparison of contrast {term.data:g} is on its ramp, {2 * SATURATED / term.data:g} wide"
+            )
+    return None
+
+
+_SAME = 1e-9
+
+
+@dataclass(frozen=True)
+class PositionEffect:
+    """How something is kept, where; ``range`` if that is by numbers."""
+
+    held: Expression
+    hold: Hold
+    where: tuple[IntervalBox, ...]
+    lower: Expression | None
+    upper: Expression | None
+    range: tuple[float, float] | None
+
+
+@dataclass(frozen=True)
+class _Query:
+    """What is common to all questions about one constraint."""
+
+    terms: TermGraph
+    domain: Domain
+    names: Mapping[int, Symbol]
+    unknown: list[tuple[str, IntervalBox]]
+
+
+@dataclass(frozen=True)
+class _Leaf:
+    box: IntervalBox
+    hold: Hold
+    lower: Expression
+    upper: Expression
+    tighter: tuple[bool, bool]
+    telling: bool
+
+
+def find_position_effects(
+    constraint: Constraint,
+    follow: Mapping[Symbol, Expression],
+    given: Mapping[Symbol, float],
+    domain: Domain,
+    unknown: list[tuple[str, IntervalBox]],
+) -> list[PositionEffect]:
+    """Return how a constraint of order 0 keeps what it is about, in plain coordinates.
+
+    ``follow`` says by what coordinates are told that follow others.
+    """
+    terms = TermGraph(given)
+    asked = _Query(terms, domain, {terms.of(e).index: s for s, e in follow.items()}, unknown)
+    expression = terms.of(constraint.expression)
+    lower, upper = (terms.of(apply_substitution(end, follow)) for end in (constraint.lower, constraint.upper))
+    form = Case((expression,), domain).value(expression).polynomial
+    moves = bool(constraint.lower.symbols or constraint.upper.symbols)
+    found: list[PositionEffect] = []
+    if form is not None and form.degree == 1 and all(s.has_derivative for s in form.symbols):
+        for symbol in sorted(form.symbols, key=lambda s: s.sort_key):
+            weight = form.terms[((symbol, 1),)]
+            rest = as_expression(float(form.offset))
+            for monomial, factor in form.terms.items():
+                if monomial and monomial[0][0] != symbol:
+                    rest = rest + float(factor) * monomial[0][0]
+            other, scale = terms.of(apply_substitution(rest, follow)), terms.constant(float(weight))
+            low, high = (terms.over(terms.minus(end, other), scale) for end in (lower, upper))
+            if weight < 0:
+                low, high = high, low
+            found += _find_effects(asked, symbol, low, high)
+    elif moves:
+        found += _find_effects(asked, constraint.expression, lower, upper)
+    elif len(constraint.expression.symbols) > 1:
+        found += _joint_limit_effects(
+            asked, constraint, terms.of(apply_substitution(constraint.expression, follow))
+        )
+    return found
+
+
+def _joint_limit_effects(asked: _Query, constraint: Constraint, expression: Term) -> list[PositionEffect]:
+    """Return what a limit by numbers does to coordinates that are not just added.
+
+    It does nothing where it holds everywhere; and nothing worth telling where it is the limit of one
+    orientation, as a cone is, and leaves it room.
+    """
+    low, high = float(constraint.lower), float(constraint.upper)
+    value = Case((expression,), asked.domain).value(expression)
+    least, most = value.range
+    if not value.doubtful:
+        if low <= least and most <= high:
+            return []
+        if most < low or high < least:
+            return [
+                PositionEffect(constraint.expression, "has no value", (IntervalBox({}),), None, None, None)
+            ]
+    p = value.polynomial
+    sphere = asked.domain.sphere(value.live)
+    if p is not None and asked.domain.span(p) is not None:
+        # All values between the least and the most occur, so there is room where the limit leaves some.
+        if min(high, most) - max(low, least) > _SAME:
+            return []
+        reason = f"it leaves next to no room to the orientation of {_list_names(sphere)}"
+    elif sphere is not None:
+        reason = f"it limits the orientation of {_list_names(sphere)} by more than products of two of these"
+    else:
+        reason = "it limits several coordinates at once, and they are not just added"
+    asked.unknown.append((reason, IntervalBox({})))
+    return []
+
+
+def _list_names(symbols: Iterable[Symbol] | None) -> str:
+    return ", ".join(str(s) for s in symbols or ())
+
+
+def _find_effects(asked: _Query, held: Expression, low: Term, high: Term) -> list[PositionEffect]:
+    limit = asked.domain.of(held) if isinstance(held, Symbol) else Interval()
+    leaves = list(_leaves(asked, low, high, limit))
+    free = _free_range(leaves, limit)
+    groups: dict[tuple[Hold, Expression, Expression], list[_Leaf]] = {}
+    for leaf in leaves:
+        if leaf.hold != "stays within" or _is_narrower(leaf, free):
+            groups.setdefault((leaf.hold, leaf.lower, leaf.upper), []).append(leaf)
+    empty = _merge_leaves([leaf for leaf in leaves if leaf.hold == "has no value"])
+    found = [PositionEffect(held, "has no value", empty, None, None, None)] if empty else []
+    _join_points(groups)
+    for (hold, lower, upper), group in groups.items():
+        where = _merge_leaves(group)
+        if hold == "has no value" or not where:
+            continue
+        # A side that never matters is told as the limit it is.
+        if not any(leaf.tighter[0] for leaf in group) and not math.isinf(limit.lower):
+            lower = as_expression(float(limit.lower))
+        if not any(leaf.tighter[1] for leaf in group) and not math.isinf(limit.upper):
+            upper = as_expression(float(limit.upper))
+        fixed = None if lower.symbols or upper.symbols else (float(lower), float(upper))
+        found.append(PositionEffect(held, hold, where, lower, upper, fixed))
+    return found
+
+
+def _merge_leaves(leaves: list[_Leaf]) -> tuple[IntervalBox, ...]:
+    return merge_boxes([leaf.box for leaf in leaves], [leaf.box for leaf in leaves if leaf.telling])
+
+
+def _join_points(groups: dict[tuple[Hold, Expression, Expression], list[_Leaf]]) -> None:
+    """Put what holds at single values into the group of bounds that are the same there."""
+    for (hold, lower, upper), leaves in list(groups.items()):
+        for leaf in [] if hold != "stays within" else list(leaves):
+            at = {
+                s: float(i.lower) for s, i in leaf.box.items() if isinstance(s, Symbol) and i.lower == i.upper
+            }
+            for other in groups if at else ():
+                bounds = zip((lower, upper), other[1:], strict=True)
+                if other[0] == hold and other[1:] != (lower, upper) and all(_agree(*b, at) for b in bounds):
+                    leaves.remove(leaf)
+                    groups[other].append(leaf)
+                    break
+
+
+def _agree(bound: Expression, other: Expression, at: dict[Symbol, float]) -> bool:
+    there = other.substitute({s: x for s, x in at.items() if s in other.symbols})
+    if bound.symbols or there.symbols:
+        return bound == there
+    a, b = float(bound), float(there)
+    return a == b or abs(a - b) <= _SAME * max(1.0, abs(a))
+
+
+def _leaves(asked: _Query, low: Term, high: Term, limit: Interval) -> Iterator[_Leaf]:
+    terms = asked.terms
+    compared = {"room": terms.minus(high, low)}
+    if not math.isinf(limit.lower):
+        end = terms.constant(float(limit.lower))
+        compared |= {"high above": terms.minus(high, end), "low above": terms.minus(low, end)}
+    if not math.isinf(limit.upper):
+        end = terms.constant(float(limit.upper))
+        compared |= {"high below": terms.minus(end, high), "low below": terms.minus(end, low)}
+    bounds = (low, high)
+
+    def ask(case: Case) -> dict[str, int] | str | Unclear:
+        if any(case.value(bound).void for bound in bounds):
+            return "a bound is not a number"
+        inner = case.doubts(bounds)
+        if inner:
+            return Unclear(tuple(inner))
+        signs = {}
+        for name, term in compared.items():
+            sign = case.sign(term)
+            if sign is None:
+                return Unclear((*case.doubts((term,)), term))
+            signs[name] = sign
+        return signs
+
+    start = Case((*bounds, *compared.values()), asked.domain)
+    for case, answer in distinguish(start, ask):
+        if not isinstance(answer, dict):
+            asked.unknown.append(
+                (answer.reason if isinstance(answer, Unanswered) else str(answer), case.box())
+            )
+            continue
+        lower, upper = (express_bound(case, bound, asked.names) for bound in bounds)
+        tighter = (answer.get("low above", 1) > 0, answer.get("high below", 1) > 0)
+        rooms = [answer[n] for n in ("room", "high above", "low below") if n in answer]
+        hold: Hold = "stays within"
+        if min(rooms) < 0:
+            hold = "has no value"
+        elif min(rooms) == 0:
+            if answer.get("high above") == 0:
+                upper = lower = as_expression(float(limit.lower))
+            elif answer.get("low below") == 0:
+                upper = lower = as_expression(float(limit.upper))
+            hold = "stands still" if not lower.symbols else "stays within"
+            if lower.symbols:
+                upper = lower
+        yield _Leaf(case.box(), hold, lower, upper, tighter, not case.is_at_equality((low, high)))
+
+
+def _free_range(leaves: list[_Leaf], limit: Interval) -> tuple[float, float]:
+    """Return what range is no restriction: the limits, else the most that the constraint leaves."""
+    lows = [-math.inf if leaf.lower.symbols else float(leaf.lower) for leaf in leaves]
+    highs = [math.inf if leaf.upper.symbols else float(leaf.upper) for leaf in leaves]
+    low, high = float(limit.lower), float(limit.upper)
+    return (
+        min(lows, default=low) if math.isinf(low) else low,
+        max(highs, default=high) if math.isinf(high) else high,
+    )
+
+
+def _is_narrower(leaf: _Leaf, free: tuple[float, float]) -> bool:
+    low = leaf.tighter[0] and (bool(leaf.lower.symbols) or float(leaf.lower) > free[0])
+    return low or (leaf.tighter[1] and (bool(leaf.upper.symbols) or float(leaf.upper) < free[1]))

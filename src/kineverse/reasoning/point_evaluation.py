@@ -1,0 +1,60 @@
+"""Evaluation of expressions and conditions at points, compiled once for CasADi's interpreter."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from functools import lru_cache
+
+from kineverse.compile import CompiledFunction, compile  # noqa: A004
+from kineverse.errors import NoSolutionError
+from kineverse.expressions.expression import Expression
+from kineverse.model.model_view import ModelView
+from kineverse.symbols import Symbol
+
+from .boxes import IntervalBox
+
+_ROUNDING = 1e-9
+
+
+def value_at(expression: Expression, point: Mapping[Symbol, float]) -> float:
+    """Return the value of a scalar at a point, which may say more than it needs."""
+    function = _function(expression)
+    return float(function({symbol: point[symbol] for symbol in function.inputs}))
+
+
+def is_inside(box: IntervalBox, point: Mapping[Symbol, float]) -> bool:
+    """Return whether the conditions of a box hold at a point."""
+    return all(value_at(axis, point) in side for axis, side in box.items())
+
+
+def default_point(model: ModelView) -> dict[Symbol, float]:
+    """Return the default state, with what follows where it is."""
+    point = dict(model.default_state())
+    settle_point(model, point)
+    return point
+
+
+def settle_point(model: ModelView, point: dict[Symbol, float]) -> bool:
+    """Make a point one that the model can be at, and return whether that is possible.
+
+    Coordinates whose rates keep their length, as those of a quaternion, get length one. What follows other
+    coordinates is put where these are.
+    """
+    rates = model.rates
+    for speeds in {frozenset(rates[x]) for x in rates}:
+        group = [x for x in rates if rates[x].keys() == speeds]
+        growths = (sum(point[x] * value_at(rates[x][v], point) for x in group) for v in speeds)
+        size = math.hypot(*(point[x] for x in group))
+        if size and all(abs(growth) <= _ROUNDING * size**2 for growth in growths):
+            point.update({x: point[x] / size for x in group})
+    try:
+        point.update({x: value_at(e, point) for x, e in rates.dependent.items()})
+    except NoSolutionError:
+        return False
+    return True
+
+
+@lru_cache(1024)
+def _function(expression: Expression) -> CompiledFunction:
+    return compile(expression, tier="interpreter")

@@ -1,0 +1,154 @@
+"""Automatic choice of a camera, and its framing for each browser window."""
+
+from __future__ import annotations
+
+import logging
+import threading
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from kineverse.model.model_view import ModelView
+from kineverse.view.camera import Camera, fit_camera
+from kineverse.view.drawables import Drawable
+from kineverse.view.rasterizer import Projection, TriangleSoup, rasterize
+from kineverse.view.triangle_mesh import Floats
+
+ELEVATION = 0.42
+
+FRONT = 0.62
+"""The direction preferred when all are as good: before the model and a little to its left [rad]."""
+
+TRIALS = 12
+
+TRIAL_HEIGHT = 80
+"""Pixels along the height of the trial pictures: enough to see a handle, small enough to make a dozen."""
+
+MOVING_WEIGHT = 4.0
+"""How much more a part that moves is worth seeing than one that does not."""
+
+
+def weigh_drawables(model: ModelView, items: Sequence[Drawable]) -> Floats:
+    """Return how much each part is worth seeing: what moves counts more."""
+    moves = {frame: bool(model.fk(frame).symbols) for frame in {part.frame for part in items}}
+    return np.array([MOVING_WEIGHT if moves[part.frame] else 1.0 for part in items])
+
+
+def choose_camera(
+    scene: TriangleSoup,
+    weights: npt.NDArray[np.float64],
+    poses: Mapping[str, Floats],
+    aspect: float,
+    field_of_view: float = 0.6,
+) -> Camera:
+    """Return the camera from which a scene is best seen.
+
+    Parameters
+    ----------
+    scene
+        The triangles.
+    weights
+        How much each of its parts is worth seeing.
+    poses
+        The poses of the frames, looked at if there are no triangles.
+    aspect
+        Width of the picture divided by its height.
+    field_of_view
+        Vertical, full angle [rad].
+    """
+    if not len(scene.corners):
+        origins = np.array([pose[:3, 3] for pose in poses.values()])
+        return fit_camera(np.concatenate([origins, origins + 0.2]), FRONT, ELEVATION, aspect, field_of_view)
+    points = scene.corners.reshape(-1, 3)
+    extreme, corners = find_extreme_points(points), scene.corners.astype(np.float32)
+    trials = []
+    for k in range(TRIALS):
+        azimuth = FRONT + 2 * np.pi * k / TRIALS
+        camera = fit_camera(extreme, azimuth, ELEVATION, aspect, field_of_view)
+        projection = Projection.of(camera, max(int(TRIAL_HEIGHT * aspect), 8), TRIAL_HEIGHT)
+        seen, _ = rasterize(projection, corners, scene.closed)
+        area = np.bincount(scene.source[seen[seen >= 0]], minlength=len(weights))
+        # The logarithm makes many parts in view worth more than one large wall; the cosine breaks ties.
+        score = float(weights @ np.log1p(area)) * (1.0 + 0.06 * np.cos(azimuth - FRONT))
+        trials.append((score, -k))
+    azimuth = FRONT - 2 * np.pi * max(trials)[1] / TRIALS
+    return fit_camera(points, azimuth, ELEVATION, aspect, field_of_view)
+
+
+def reframe(camera: Camera, points: Floats, aspect: float) -> Camera:
+    """Return the nearest camera of the same direction that sees points (N, 3), for another aspect."""
+    away = np.subtract(camera.position, camera.target)
+    azimuth = float(np.arctan2(away[1], away[0]))
+    elevation = float(np.arctan2(away[2], np.hypot(away[0], away[1])))
+    return fit_camera(points, azimuth, elevation, aspect, camera.field_of_view)
+
+
+def find_extreme_points(points: Floats) -> Floats:
+    """Return those of many points that lie farthest out in some hundred directions."""
+    k = np.arange(128)
+    z, angle = 1.0 - (2.0 * k + 1.0) / len(k), 2.399963 * k
+    flat = np.sqrt(1.0 - z * z)
+    directions = np.stack([flat * np.cos(angle), flat * np.sin(angle), z], axis=1).astype(np.float32)
+    farthest = np.argmax(directions @ points.astype(np.float32).T, axis=1)
+    return np.asarray(points[np.unique(farthest)])
+
+
+logger = logging.getLogger(__name__)
+
+CAMERA_TOLERANCE = 1e-3
+"""Poses of cameras that differ by less are the same, as a part of the distance to what is looked at."""
+
+
+class ClientCameras:
+    """Places the cameras of all browsers that show a page, for the shape of each window.
+
+    Parameters
+    ----------
+    server
+        A viser server.
+    first
+        Where the server puts the cameras of new browsers.
+    framed
+        Returns the camera for an aspect, the width of a picture divided by its height.
+    """
+
+    def __init__(self, server: Any, first: Camera, framed: Callable[[float], Camera]) -> None:
+        self._lock = threading.Lock()
+        self._first, self._framed = first, framed
+        self._placed: dict[int, Camera] = {}
+        server.on_client_connect(self._meet)
+        server.on_client_disconnect(lambda client: self._placed.pop(client.client_id, None))
+
+    def follow(self, first: Camera, framed: Callable[[float], Camera]) -> None:
+        """Frame something else from now on."""
+        with self._lock:
+            self._first, self._framed = first, framed
+
+    def _meet(self, client: Any) -> None:
+        client.camera.on_update(self._place)
+        self._place(client.camera)
+
+    def _place(self, camera: Any) -> None:
+        """Move a camera to where it sees everything, if nobody has moved it from where it was put."""
+        try:
+            with self._lock:
+                if not camera.image_height or not camera.image_width:
+                    return
+                client = camera.client
+                wanted = self._framed(camera.image_width / camera.image_height)
+                ours = (self._first, self._placed.get(client.client_id, self._first))
+                if any(_is_at(camera, place) for place in ours) and not _is_at(camera, wanted):
+                    self._placed[client.client_id] = wanted
+                    with client.atomic():
+                        camera.position = np.array(wanted.position)
+                        camera.look_at = np.array(wanted.target)
+        except Exception:
+            # The browser may be going away; whoever looks can still move the camera.
+            logger.debug("a camera could not be placed", exc_info=True)
+
+
+def _is_at(camera: Any, place: Camera) -> bool:
+    off = np.abs(np.concatenate([camera.position - place.position, camera.look_at - place.target])).max()
+    return bool(off < CAMERA_TOLERANCE * np.linalg.norm(np.subtract(place.position, place.target)))

@@ -1,0 +1,274 @@
+"""Light, shadow, floor and background of pictures and of the page."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from kineverse.view.rasterizer import Projection, rasterize
+from kineverse.view.triangle_mesh import Floats, Integers, Singles, dot_rows
+
+SHADOW_PIXELS = 1024
+
+KEY_LIGHT = np.array([1.0, 0.965, 0.91]) * 1.6
+SKY_LIGHT = np.array([0.86, 0.92, 1.0]) * 0.80
+GROUND_LIGHT = np.array([0.84, 0.80, 0.75]) * 0.50
+
+WHITE_LEVEL = 1.75
+"""The light that is shown as pure white."""
+
+
+@dataclass(frozen=True, slots=True)
+class DirectionalLight:
+    """A lamp infinitely far away, and what it sees: its depth picture is the shadow.
+
+    Attributes
+    ----------
+    toward
+        (3,) unit vector to the lamp, in the world.
+    """
+
+    toward: Floats
+    projection: Projection
+    depth: npt.NDArray[np.float32]
+    bias: float
+
+    @staticmethod
+    def over(corners: Floats, azimuth: float, elevation: float) -> DirectionalLight:
+        """Return the lamp that stands in a direction [rad] over (T, 3, 3) triangles [m]."""
+        toward = np.array(
+            [np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)]
+        )
+        right = np.array([-np.sin(azimuth), np.cos(azimuth), 0.0])
+        axes = np.array([right, np.cross(toward, right), -toward])
+        points = corners.reshape(-1, 3)
+        low, high = (points @ axes.T).min(axis=0), (points @ axes.T).max(axis=0)
+        spread = max(float((high - low)[:2].max()), 1e-3)
+        focal = 0.98 * SHADOW_PIXELS / spread
+        origin = ((low + high) / 2) @ axes
+        projection = Projection(origin, axes, SHADOW_PIXELS, SHADOW_PIXELS, focal, parallel=True)
+        _, depth = rasterize(projection, corners)
+        return DirectionalLight(toward, projection, depth, bias=2.5 * spread / SHADOW_PIXELS)
+
+    def reaches(self, points: Singles, normals: Singles, pixel: Integers) -> Singles:
+        """Return (N,) how much of the lamp is seen from points, in [0, 1].
+
+        Each pixel of the picture looks at slightly different places of the shadow, so that the pixels that
+        make up one of the final picture average to a soft border.
+        """
+        steep = np.clip(1.0 - normals @ self.toward.astype(np.float32), 0.0, 1.0)
+        offset = (np.float32(self.bias) * (np.float32(0.5) + np.float32(2.0) * steep))[:, None]
+        xy, near = self.projection.pixels(self.projection.local(points + normals * offset))
+        lit = np.zeros(len(points), dtype=np.float32)
+        for dx, dy in _shadow_samples():
+            x = (xy[:, 0] + dx[pixel % _SHADOW_SAMPLES]).astype(np.int32)
+            y = (xy[:, 1] + dy[pixel % _SHADOW_SAMPLES]).astype(np.int32)
+            # The outermost pixels of the map are empty by construction: outside is as lit as they are.
+            index = np.clip(y, 0, SHADOW_PIXELS - 1) * SHADOW_PIXELS + np.clip(x, 0, SHADOW_PIXELS - 1)
+            lit += self.depth[index] <= near
+        return np.asarray(lit / np.float32(3.0))
+
+
+_SHADOW_SAMPLES = 61
+"""Number of different scatters: prime, so that no line of pixels repeats them in step."""
+
+
+@lru_cache(maxsize=1)
+def _shadow_samples() -> list[tuple[Singles, Singles]]:
+    """Return three rings of places around a pixel of the shadow, by golden angles: no pattern shows."""
+    angle = 2.399963 * np.arange(_SHADOW_SAMPLES)
+    return [
+        ((ring * np.cos(angle + turn)).astype(np.float32), (ring * np.sin(angle + turn)).astype(np.float32))
+        for ring, turn in ((0.7, 0.0), (1.9, 2.1), (2.9, 4.2))
+    ]
+
+
+def shade(colors: Singles, normals: Singles, lamp: DirectionalLight, lit: Singles) -> Singles:
+    """Return the light (N, 3) that comes from matt surfaces, linear.
+
+    Parameters
+    ----------
+    colors
+        (N, 3) reflectance, linear.
+    normals
+        (N, 3) unit normals toward the camera.
+    lamp
+        The lamp.
+    lit
+        (N,) how much of the lamp reaches the surface.
+
+    Notes
+    -----
+    Lambert's law for the lamp; between sky and ground by the height of the normal (a hemisphere light).
+    """
+    facing = np.clip(normals @ lamp.toward.astype(np.float32), 0.0, None) * lit
+    up = np.float32(0.5) + np.float32(0.5) * normals[:, 2]
+    light = np.empty_like(colors)
+    for k in range(3):
+        key, sky, ground = np.float32(KEY_LIGHT[k]), np.float32(SKY_LIGHT[k]), np.float32(GROUND_LIGHT[k])
+        light[:, k] = colors[:, k] * (facing * key + (ground + (sky - ground) * up))
+    return light
+
+
+def to_linear(srgb: Floats) -> Floats:
+    """Return light from display values in [0, 1]."""
+    return np.asarray(np.clip(srgb, 0.0, 1.0) ** 2.2)
+
+
+def to_display(light: Singles) -> Singles:
+    """Return display values in [0, 1], with a soft shoulder so that bright white keeps its shape."""
+    curved = light * (1.0 + light / WHITE_LEVEL**2) / (1.0 + light)
+    return np.asarray(_GAMMA[np.clip(curved * 4095.0, 0.0, 4095.0).astype(np.int16)])
+
+
+_GAMMA = ((np.arange(4096) / 4095.0) ** (1 / 2.2)).astype(np.float32)
+
+
+OUTLINE, CREASE = 0.42, 0.25
+"""How much darker the border of a part, and a sharp edge inside of it, is drawn."""
+
+CREASE_COSINE = 0.75
+"""Cosine of the angle from which on an edge is drawn."""
+
+
+DEPTH_STEP = 0.02
+"""How far, as a part of the distance, a surface has to lie behind another to be set off by a line."""
+
+
+def compute_outlines(
+    group: Integers, normals: Singles, near: Singles, covered: Integers, projection: Projection
+) -> Singles:
+    """Return (N,) factors that darken the outlines of parts and their sharp edges.
+
+    Parameters
+    ----------
+    group
+        (N,) what is seen at each covered pixel: shapes of one frame and colour are one thing.
+    normals
+        (N, 3) the normal there.
+    near
+        (height·width,) the nearness of all pixels.
+    covered
+        (N,) the pixels, as y·width + x.
+    projection
+        The grid of pixels.
+    """
+    size = projection.width * projection.height
+    part = np.full(size, -1, dtype=np.int32)
+    part[covered] = group
+    limit = np.float32(DEPTH_STEP)
+    facing = np.zeros((size, 3), dtype=np.float32)
+    facing[covered] = normals
+    darker = np.zeros(size, dtype=np.float32)
+    for step in (1, projection.width):
+        # The last pixel of a row is compared with the first of the next: a speck at the rim nobody sees.
+        other = part[:-step] != part[step:]
+        with np.errstate(invalid="ignore"):  # Where nothing is seen, the nearness is infinitely small.
+            gap = np.abs(near[:-step] - near[step:])
+            other |= gap > limit * np.maximum(near[:-step], near[step:])
+        crease = ~other & (dot_rows(facing[:-step], facing[step:]) < CREASE_COSINE) & (part[:-step] >= 0)
+        np.maximum(darker[:-step], np.float32(OUTLINE) * other, out=darker[:-step])
+        np.maximum(darker[:-step], np.float32(CREASE) * crease, out=darker[:-step])
+    return np.asarray(np.float32(1.0) - darker[covered])
+
+
+def draw_ground(
+    image: Singles, empty: Integers, corners: Floats, projection: Projection, lamp: DirectionalLight
+) -> None:
+    """Draw the floor under a scene: its shadow, and a grid that fades into the background.
+
+    Parameters
+    ----------
+    image
+        (height·width, 3) display values, changed in place.
+    empty
+        The pixels where nothing of the scene is seen.
+    corners
+        (T, 3, 3) triangles of the scene [m]; the floor lies under the lowest of them.
+    projection, lamp
+        Camera and light. The lines of the grid are 1 m apart, 0.1 m under things smaller than that.
+    """
+    low, high = corners.reshape(-1, 3).min(axis=0), corners.reshape(-1, 3).max(axis=0)
+    drop = np.float32(low[2] - projection.origin[2])
+    rays = projection.rays(empty)
+    down = np.flatnonzero(rays[:, 2] < -1e-6)
+    if drop >= 0 or not len(down):
+        return
+    rays, pixel = rays[down], empty[down]
+    floor = rays * (drop / rays[:, 2])[:, None]
+    radius = 0.5 * float(np.linalg.norm((high - low)[:2])) + 0.3
+    middle = ((low + high) / 2 - projection.origin).astype(np.float32)
+    away = np.hypot(floor[:, 0] - middle[0], floor[:, 1] - middle[1]) / np.float32(radius)
+    near = np.flatnonzero(away < 1.9)
+    floor, pixel = floor[near], pixel[near]
+    fade = np.clip(np.float32(1.9) - away[near], 0.0, 1.0)
+    fade *= fade * (np.float32(3.0) - np.float32(2.0) * fade)
+    depth = np.sqrt(dot_rows(floor, floor))
+    floor += projection.origin.astype(np.float32)
+    up = np.broadcast_to(np.array([0.0, 0.0, 1.0], dtype=np.float32), floor.shape)
+    lit = lamp.reaches(floor, up, pixel)
+    cell = np.float32(1.0 if radius > 0.8 else 0.1)
+    u, v = (np.abs((floor[:, k] / cell + np.float32(0.5)) % 1.0 - np.float32(0.5)) for k in (0, 1))
+    line = np.clip(1.5 - np.minimum(u, v) * cell * np.float32(projection.focal) / depth, 0.0, 1.0)
+    tone = (1.0 - 0.30 * (1.0 - lit) * fade) * (1.0 - 0.09 * line * fade) * (1.0 + 0.02 * fade)
+    image[pixel] = np.clip(image[pixel] * tone.astype(np.float32)[:, None], 0.0, 1.0)
+
+
+BELOW, ABOVE = (240, 243, 246), (196, 207, 219)
+"""The background, from the lower to the upper edge."""
+
+
+def set_up(server: Any) -> None:
+    """Light the page: a lamp with a shadow from above the left shoulder, and a sky without one.
+
+    viser's own lights wash out white furniture; these are those of :mod:`kineverse.view.backdrop`. There is no
+    picture of surroundings to light the scene by, because a computer without a graphics card takes many
+    seconds to prepare one.
+    """
+    scene = server.scene
+    scene.configure_default_lights(enabled=False)
+    scene.configure_environment_map(hdri=None)
+    scene.add_light_hemisphere(
+        "/light/sky", sky_color=(226, 236, 255), ground_color=(206, 196, 184), intensity=2.1
+    )
+    scene.add_light_directional(
+        "/light/fill", color=(235, 240, 255), intensity=0.35, position=(-4.0, -3.0, 5.0)
+    )
+    rows = np.linspace(0.0, 1.0, 128)[:, None, None] ** 0.7
+    gradient = np.array(ABOVE) + (np.array(BELOW) - np.array(ABOVE)) * rows
+    scene.set_background_image(np.repeat(gradient, 8, axis=1).astype(np.uint8), format="png")
+
+
+def set_lamp(server: Any, azimuth: float) -> None:
+    """Put the lamp a little to the side of a camera that looks from a direction around z [rad]."""
+    angle = azimuth + 0.6
+    server.scene.add_light_directional(
+        "/light/key",
+        color=(255, 247, 236),
+        intensity=2.3,
+        cast_shadow=True,
+        position=(4.0 * np.cos(angle), 4.0 * np.sin(angle), 6.0),
+    )
+
+
+def set_floor(server: Any, height: float, extent: float, shown: bool) -> None:
+    """Put a floor with lines 1 m apart at a height under a scene of an extent [m]; it takes shadows."""
+    server.scene.add_grid(
+        "/floor",
+        infinite_grid=True,
+        cell_size=0.25,
+        cell_thickness=0.5,
+        cell_color=(214, 220, 227),
+        section_size=1.0,
+        section_thickness=0.8,
+        section_color=(187, 195, 205),
+        fade_distance=max(6.0 * extent, 6.0),
+        fade_strength=2.5,
+        shadow_opacity=0.2,
+        position=(0.0, 0.0, height),
+        visible=shown,
+    )

@@ -1,0 +1,207 @@
+"""Drawable parts of a model: visual shapes, collision hulls and frame axes."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from typing import Literal
+
+import numpy as np
+
+from kineverse.errors import KineverseError
+from kineverse.geometry import decomposition
+from kineverse.geometry.exclusions import is_installed
+from kineverse.geometry.mesh_files import Faces
+from kineverse.geometry.objects import collision_shapes
+from kineverse.geometry.shapes import Solid, solid_from_geometry, solid_from_points, solid_surface
+from kineverse.model.body import Body, Box, Mesh, Shape
+from kineverse.model.model_view import ModelView
+from kineverse.view.meshes import LoadedMesh, load_mesh, mesh_geometry
+from kineverse.view.triangle_mesh import Floats, TriangleMesh, build_creased_mesh
+
+
+def load_hull(mesh: Mesh) -> LoadedMesh:
+    """Return the hull of a mesh that distances are computed to, and what is wrong if there is none [m].
+
+    Without the extra ``geometry``, or where a mesh has no hull, that is the mesh itself, or its placeholder.
+    """
+    return _load_hull(mesh, mesh.root)
+
+
+@lru_cache(maxsize=4096)
+def _load_hull(mesh: Mesh, root: str | None) -> LoadedMesh:
+    """Return the hull of a mesh; what may be opened is no part of what makes two meshes equal."""
+    as_seen = load_mesh(mesh)
+    if as_seen.problem or not is_installed():
+        return as_seen
+    try:
+        return LoadedMesh(_mesh_hull(solid_from_geometry(mesh)))
+    except (KineverseError, OSError) as error:
+        return LoadedMesh(as_seen.surface, f"no distances: {error}")
+
+
+def load_hulls(mesh: Mesh) -> list[LoadedMesh]:
+    """Return the hulls that ``kineverse decompose`` made of a mesh, or :func:`load_hull` if it did not."""
+    if is_installed():
+        with suppress(KineverseError, OSError):
+            hulls = decomposition.find_hulls(mesh)
+            if hulls is not None:
+                return [LoadedMesh(_mesh_hull(solid_from_points(points))) for points in hulls]
+    return [load_hull(mesh)]
+
+
+def _mesh_hull(solid: Solid) -> TriangleMesh:
+    surface = solid_surface(solid)
+    assert isinstance(surface, Faces)  # no primitive is made of a mesh
+    return build_creased_mesh(surface.vertices, surface.faces)[0]
+
+
+Kind = Literal["visual", "collision"]
+Rgba = tuple[float, float, float, float]
+
+MISSING: Rgba = (0.91, 0.12, 0.55, 1.0)
+"""The colour of what could not be loaded: one that no kitchen has."""
+
+COLLISION: Rgba = (0.95, 0.55, 0.15, 0.35)
+
+STAND_IN: Rgba = (0.25, 0.62, 0.66, 0.35)
+"""The colour of what stands for the collision shapes of a body that has none."""
+
+HULL_SHADES = (1.0, 0.7, 0.85, 0.55)
+"""How bright the hulls of one mesh are, in turns."""
+
+UNPAINTED: tuple[Rgba, ...] = (
+    (0.72, 0.74, 0.77, 1.0),
+    (0.58, 0.66, 0.75, 1.0),
+    (0.80, 0.74, 0.64, 1.0),
+    (0.63, 0.71, 0.62, 1.0),
+    (0.76, 0.66, 0.66, 1.0),
+)
+"""Colours of bodies that have none: muted, and different enough to tell neighbours apart."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Drawable:
+    """One shape of one body.
+
+    Attributes
+    ----------
+    frame
+        The frame it moves with.
+    surface
+        Its triangles in that frame [m].
+    color
+        Red, green, blue, alpha in [0, 1]; colours that the surface brings count more, as in RViz.
+    kind
+        Whether it is there to be seen or to be touched.
+    problem
+        What could not be loaded, and why; empty if nothing.
+    placeholder
+        Whether the surface only marks the place of what could not be loaded.
+    """
+
+    frame: str
+    surface: TriangleMesh
+    color: Rgba
+    kind: Kind
+    problem: str = ""
+    placeholder: bool = False
+
+
+def collect_drawables(model: ModelView, kind: Kind = "visual", decomposed: bool = False) -> list[Drawable]:
+    """Return everything a model has to show, in the order of its bodies.
+
+    Parameters
+    ----------
+    model
+        The model.
+    kind
+        ``"visual"``: what is meant to be seen; of a model where nothing is, the collision shapes.
+        ``"collision"``: what is meant to be touched, or of a body without it, what is seen; meshes as the
+        hulls that distances are computed to.
+    decomposed
+        Whether meshes to be touched are the hulls that they were decomposed into, as far as they were.
+    """
+    found: list[Drawable] = []
+    bare = kind == "visual" and not any(body.visuals for body in model.bodies.values())
+    for number, (frame, body) in enumerate(model.bodies.items()):
+        if kind == "collision":
+            color = COLLISION if body.collisions else STAND_IN
+            for shape in collision_shapes(body):
+                found += _build_collision_drawables(frame, shape, color, decomposed)
+            continue
+        fallback = UNPAINTED[number % len(UNPAINTED)]
+        shapes = body.collisions if bare else body.visuals
+        found += _fall_back_to_collisions(
+            [_build_drawable(frame, shape, "visual", fallback) for shape in shapes], body, fallback
+        )
+    return found
+
+
+def _fall_back_to_collisions(visuals: list[Drawable], body: Body, color: Rgba) -> list[Drawable]:
+    """Return the visual parts of a body, or its collision shapes if no visual one could be loaded.
+
+    Descriptions are often passed on with the small collision meshes only; those show a robot well enough.
+    """
+    if not visuals or not all(part.placeholder for part in visuals):
+        return visuals
+    frame, problem = visuals[0].frame, visuals[0].problem
+    touched = [_build_drawable(frame, shape, "visual", color) for shape in body.collisions]
+    touched = [part for part in touched if not part.placeholder]
+    return [replace(touched[0], problem=problem), *touched[1:]] if touched else visuals
+
+
+def _build_drawable(frame: str, shape: Shape, kind: Kind, fallback: Rgba) -> Drawable:
+    surface, problem, color = mesh_geometry(shape.geometry), "", shape.color or fallback
+    if isinstance(shape.geometry, Mesh):
+        problem = load_mesh(shape.geometry).problem
+    if problem:
+        color = MISSING
+    return Drawable(frame, surface.moved(shape.origin.matrix), color, kind, problem, bool(problem))
+
+
+def _build_collision_drawables(frame: str, shape: Shape, color: Rgba, decomposed: bool) -> list[Drawable]:
+    if not isinstance(shape.geometry, Mesh):
+        loaded = [LoadedMesh(mesh_geometry(shape.geometry))]
+    else:
+        loaded = load_hulls(shape.geometry) if decomposed else [load_hull(shape.geometry)]
+    found = []
+    for number, (surface, problem) in enumerate((one.surface, one.problem) for one in loaded):
+        own = MISSING if problem else _shade_hull(color, number)
+        placed = surface.without_colors().moved(shape.origin.matrix)
+        found.append(Drawable(frame, placed, own, "collision", problem, bool(problem)))
+    return found
+
+
+def _shade_hull(color: Rgba, number: int) -> Rgba:
+    """Return a colour that tells a hull from its neighbours; that of the first is the colour itself."""
+    red, green, blue, alpha = color
+    factor = HULL_SHADES[number % len(HULL_SHADES)]
+    return (factor * red, factor * green, factor * blue, alpha)
+
+
+AXIS_COLORS = ((0.86, 0.16, 0.16, 1.0), (0.13, 0.62, 0.20, 1.0), (0.16, 0.33, 0.88, 1.0))
+
+
+def choose_axis_length(corners: Floats, poses: Mapping[str, Floats]) -> float:
+    """Return a length for axes that suits the size of a scene, in [0.02, 0.5] [m]."""
+    origins = np.array([pose[:3, 3] for pose in poses.values()]).reshape(-1, 3)
+    points = np.concatenate([corners.reshape(-1, 3), origins])
+    spread = float(np.linalg.norm(points.max(axis=0) - points.min(axis=0))) if len(points) else 1.0
+    return float(np.clip(0.05 * spread, 0.02, 0.5))
+
+
+def create_axes(model: ModelView, corners: Floats, poses: Mapping[str, Floats]) -> list[Drawable]:
+    """Return the axes of the world and all frames of a model, three bars each."""
+    length = choose_axis_length(corners, poses)
+    width = 0.07 * length
+    bars = []
+    for axis, color in enumerate(AXIS_COLORS):
+        size = np.full(3, width)
+        size[axis] = length
+        shift = np.eye(4)
+        shift[axis, 3] = length / 2
+        bars.append((mesh_geometry(Box((size[0], size[1], size[2]))).moved(shift), color))
+    return [Drawable(name, surface, color, "visual") for name in poses for surface, color in bars]

@@ -1,0 +1,272 @@
+"""Pictures of a model without a browser, and PNG files."""
+
+from __future__ import annotations
+
+import struct
+import zlib
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from kineverse.errors import FormatError, InvalidValueError, ShapeError
+from kineverse.model.model_view import ModelView
+from kineverse.state import StateLike
+from kineverse.view.auto_camera import choose_camera, weigh_drawables
+from kineverse.view.backdrop import (
+    DirectionalLight,
+    compute_outlines,
+    draw_ground,
+    shade,
+    to_display,
+    to_linear,
+)
+from kineverse.view.camera import Camera
+from kineverse.view.drawables import Drawable, collect_drawables, create_axes
+from kineverse.view.poses import FramePoses, complete
+from kineverse.view.proximity import ProximityMarkers, ProximityQuery, create_marker_drawables
+from kineverse.view.rasterizer import Projection, TriangleSoup, rasterize
+from kineverse.view.triangle_mesh import Floats, Integers, Singles, dot_rows
+
+
+def write_png(path: str | Path, pixels: npt.NDArray[np.uint8]) -> None:
+    """Write an image of (height, width, 3) or (height, width, 4) bytes to a PNG file.
+
+    Raises
+    ------
+    ShapeError
+        If the array is not an image of 8 bits a channel.
+    FormatError
+        If the name says that it is a file of another kind, see :func:`check_png_name`.
+    """
+    check_png_name(path)
+    Path(path).write_bytes(encode_png(pixels))
+
+
+def check_png_name(path: str | Path) -> None:
+    """Look whether a file may be called so: it ends in .png, or says nothing about its kind.
+
+    Raises
+    ------
+    FormatError
+        If it ends in something else.
+    """
+    suffix = Path(path).suffix
+    if suffix.lower() not in ("", ".png"):
+        raise FormatError(f"Pictures are written as .png, not {suffix}: '{Path(path).with_suffix('.png')}'.")
+
+
+def encode_png(pixels: npt.NDArray[np.uint8]) -> bytes:
+    """Return the bytes of a PNG file (ISO/IEC 15948: colour type 2 or 6, no interlace)."""
+    image = np.asarray(pixels)
+    if image.ndim != 3 or image.shape[2] not in (3, 4) or image.dtype != np.uint8 or not image.size:
+        raise ShapeError(f"an image is (height, width, 3 or 4) of uint8, not {image.shape} of {image.dtype}")
+    height, width, channels = image.shape
+    header = struct.pack(">IIBBBBB", width, height, 8, 2 if channels == 3 else 6, 0, 0, 0)
+    # Each row as its difference to the row above (filter 2): pictures of rooms shrink to a third by it.
+    rows = image.reshape(height, width * channels)
+    lines = np.empty((height, 1 + width * channels), dtype=np.uint8)
+    lines[:, 0] = 2
+    lines[0, 1:] = rows[0]
+    lines[1:, 1:] = rows[1:] - rows[:-1]
+    body = zlib.compress(lines.tobytes(), 6)
+    chunks = _chunk(b"IHDR", header) + _chunk(b"IDAT", body) + _chunk(b"IEND", b"")
+    return b"\x89PNG\r\n\x1a\n" + chunks
+
+
+def _chunk(kind: bytes, body: bytes) -> bytes:
+    return struct.pack(">I", len(body)) + kind + body + struct.pack(">I", zlib.crc32(kind + body))
+
+
+SAMPLES = 2
+"""Pixels computed along each edge of one that is shown."""
+
+BACKGROUND_COLORS = (np.array([0.93, 0.945, 0.96]), np.array([0.70, 0.745, 0.80]))
+"""Display colours of the background below and above."""
+
+ARROW = 0.07
+"""The length of an arrow where bodies touch, as a part of the height of the picture."""
+
+LARGEST = 64_000_000
+"""Most pixels of one picture, computed ones included."""
+
+
+def picture(
+    model: ModelView,
+    state: StateLike | None = None,
+    size: tuple[int, int] = (960, 720),
+    camera: Camera | None = None,
+    frames: bool = False,
+    collisions: bool = False,
+    near: float | None = None,
+    decomposed: bool = False,
+) -> npt.NDArray[np.uint8]:
+    """Return a picture of a model as (height, width, 3) bytes.
+
+    Parameters
+    ----------
+    model
+        What to draw.
+    state
+        Values by symbol or name [m], [rad]; the default state for the others.
+    size
+        Width and height in pixels.
+    camera
+        Where to stand; None for a place from which the model, and as much as possible of what moves, is seen.
+    frames
+        Whether to draw the axes of all frames (x red, y green, z blue), also through the bodies.
+    collisions
+        Whether to draw the collision shapes instead of the visual ones; of a body without any, hulls of what
+        is seen of it.
+    near
+        Within what distance to draw lines between bodies that are near to each other [m], green to red by the
+        distance, with arrows where they touch; through the bodies. None for no lines.
+    decomposed
+        Whether collision shapes and lines are those of the hulls that meshes were decomposed into.
+
+    Raises
+    ------
+    MissingDependencyError
+        If lines are wanted and the extra ``geometry`` is not installed.
+    UnknownNameError
+        If the state names a symbol that the model does not have.
+    InvalidValueError
+        If the size is not that of a picture.
+    """
+    width, height = size
+    if width < 1 or height < 1 or width * height * SAMPLES**2 > LARGEST:
+        raise InvalidValueError(f"a picture of {width} x {height} pixels cannot be made")
+    poses, values = FramePoses(model), complete(model, state)
+    at = dict(zip(poses.names, poses.at(values), strict=True))
+    found = None if near is None else ProximityQuery(model, decomposed).at(values, near)
+    items = collect_drawables(model, "collision" if collisions else "visual", decomposed)
+    scene = TriangleSoup.of(items, at)
+    if camera is None:
+        camera = choose_camera(scene, weigh_drawables(model, items), at, width / height)
+    over: list[Drawable] = []
+    if frames or not len(scene.corners):
+        over += create_axes(model, scene.corners, at)
+    if found is not None:
+        length = ARROW * camera.height
+        over += create_marker_drawables(ProximityMarkers.of(found, length), length)
+    return _draw(scene, TriangleSoup.of(over, at), size, camera)
+
+
+def draw_picture(
+    items: Sequence[Drawable],
+    poses: Mapping[str, Floats],
+    size: tuple[int, int],
+    camera: Camera,
+    over: Sequence[Drawable] = (),
+) -> npt.NDArray[np.uint8]:
+    """Return a picture of any parts as (height, width, 3) bytes.
+
+    Parameters
+    ----------
+    items
+        What to draw, on a floor.
+    poses
+        Where the frames of all parts are, 4×4.
+    size
+        Width and height in pixels.
+    camera
+        Where to stand.
+    over
+        What is drawn over that, also where it is behind.
+    """
+    return _draw(TriangleSoup.of(items, poses), TriangleSoup.of(over, poses), size, camera)
+
+
+def _draw(
+    scene: TriangleSoup, over: TriangleSoup, size: tuple[int, int], camera: Camera
+) -> npt.NDArray[np.uint8]:
+    projection = Projection.of(camera, size[0] * SAMPLES, size[1] * SAMPLES)
+    image = _render(scene, projection, camera)
+    _overlay(image, over, projection)
+    return _downsample(image, SAMPLES)
+
+
+def save_picture(path: str | Path, model: ModelView, state: StateLike | None = None, **options: Any) -> None:
+    """Write :func:`picture` of a model, with the same options, to a PNG file."""
+    write_png(path, picture(model, state, **options))
+
+
+def _render(scene: TriangleSoup, projection: Projection, camera: Camera) -> Singles:
+    """Return (height, width, 3) display values of a scene on its ground."""
+    image = _background(projection)
+    if len(scene.corners):
+        seen, near = rasterize(projection, scene.corners, scene.closed, scene.colors[:, 3])
+        away = np.subtract(camera.position, camera.target)
+        lamp = DirectionalLight.over(scene.corners, float(np.arctan2(away[1], away[0])) + 0.6, 0.85)
+        covered = np.flatnonzero(seen >= 0)
+        if len(covered):
+            triangle = seen[covered]
+            points, normals = _surface_points(scene, projection, covered, triangle)
+            colors = to_linear(scene.colors[:, :3]).astype(np.float32)[triangle]
+            display = to_display(shade(colors, normals, lamp, lamp.reaches(points, normals, covered)))
+            display *= compute_outlines(scene.group[triangle], normals, near, covered, projection)[:, None]
+            image[covered] = display
+        draw_ground(image, np.flatnonzero(seen < 0), scene.corners, projection, lamp)
+    return image.reshape(projection.height, projection.width, 3)
+
+
+def _background(projection: Projection) -> Singles:
+    rows = np.linspace(1.0, 0.0, projection.height)[:, None]
+    below, above = BACKGROUND_COLORS
+    column = (below + (above - below) * rows**1.5).astype(np.float32)
+    return np.repeat(column, projection.width, axis=0)
+
+
+def _surface_points(
+    scene: TriangleSoup, projection: Projection, pixel: Integers, triangle: Integers
+) -> tuple[Singles, Singles]:
+    """Return the points (N, 3) and normals (N, 3), toward the camera, that pixels look at."""
+    rays = projection.rays(pixel)
+    # Seen from the camera all coordinates are small, and single precision is good for a hair.
+    a = scene.corners[:, 0] - projection.origin
+    u, v = scene.corners[:, 1] - scene.corners[:, 0], scene.corners[:, 2] - scene.corners[:, 0]
+    flat = np.cross(u, v)
+    square = np.maximum(dot_rows(flat, flat), 1e-300)
+    reach = dot_rows(flat, a)
+    # A ray r meets the plane n·p = d at p = r d / (n·r); planes through the camera are never seen.
+    edge_on = np.abs(reach) < 1e-12 * np.sqrt(square)
+    planes = np.where(edge_on[:, None], 0.0, flat / np.where(edge_on, 1.0, reach)[:, None])
+    along = dot_rows(rays, _to_single(planes)[triangle])
+    points = rays / np.where(along == 0.0, np.float32(1.0), along)[:, None]
+    # Barycentric coordinates are linear in the point: w_b = (v x n)·(p - a) / n², w_c = (n x u)·(p - a) / n².
+    to_b, to_c = np.cross(v, flat) / square[:, None], np.cross(flat, u) / square[:, None]
+    b = dot_rows(_to_single(to_b)[triangle], points) - _to_single(dot_rows(to_b, a))[triangle]
+    c = dot_rows(_to_single(to_c)[triangle], points) - _to_single(dot_rows(to_c, a))[triangle]
+    b, c = np.clip(b, 0.0, 1.0)[:, None], np.clip(c, 0.0, 1.0)[:, None]
+    n = _to_single(scene.normals)
+    normals = n[triangle, 0]
+    normals += (n[:, 1] - n[:, 0])[triangle] * b
+    normals += (n[:, 2] - n[:, 0])[triangle] * c
+    normals /= np.sqrt(np.maximum(dot_rows(normals, normals), 1e-12))[:, None]
+    # An open surface seen from behind is lit like one seen from the front.
+    normals *= np.where(dot_rows(normals, rays) > 0.0, np.float32(-1.0), np.float32(1.0))[:, None]
+    return np.asarray(points + _to_single(projection.origin), dtype=np.float32), normals
+
+
+def _to_single(values: Floats) -> Singles:
+    return values.astype(np.float32)
+
+
+def _downsample(image: Singles, samples: int) -> npt.NDArray[np.uint8]:
+    """Return the mean of samples × samples pixels as bytes."""
+    total = sum(image[i::samples, j::samples] for i in range(samples) for j in range(samples))
+    return np.asarray(np.round(total * (255.0 / samples**2)), dtype=np.uint8)
+
+
+def _overlay(image: Singles, scene: TriangleSoup, projection: Projection) -> None:
+    """Draw axes over everything, faintly shaded, so that frames inside of bodies are seen too."""
+    if not len(scene.corners):
+        return
+    seen, _ = rasterize(projection, scene.corners, scene.closed, scene.colors[:, 3])
+    pixel = np.flatnonzero(seen >= 0)
+    flat = image.reshape(-1, 3)
+    facing = np.abs(scene.normals[seen[pixel], 0] @ projection.axes[2])
+    color = scene.colors[seen[pixel], :3] * (0.75 + 0.25 * facing)[:, None]
+    flat[pixel] = 0.1 * flat[pixel] + 0.9 * color

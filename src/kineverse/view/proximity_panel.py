@@ -1,0 +1,339 @@
+"""Proximity controls, report and markers on the page."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from kineverse._extras import install_command
+from kineverse.errors import InvalidValueError
+from kineverse.geometry import DistanceResult
+from kineverse.geometry.exclusions import is_installed
+from kineverse.geometry.shapes import import_coal
+from kineverse.model.model_view import ModelView
+from kineverse.view.hypertext import BREAK, FONT, Html, HtmlBox, element, join_html
+from kineverse.view.proximity import (
+    BALL,
+    CONTACT,
+    HEAD,
+    RADIUS,
+    SHAFT,
+    TIP,
+    ProximityMarkers,
+    ProximityRequest,
+    ProximityResult,
+    ProximityStatus,
+    ProximityWorker,
+    distance_color,
+    format_millimetres,
+)
+from kineverse.view.scene import ViewerScene
+from kineverse.view.violations import format_significant
+
+LINES = 12
+"""Lines of the list: more than these are counted, not listed."""
+
+EXCLUDED_LINES = 5
+"""Bodies, and shapes of them, that are left out and named with the reason; more are counted."""
+
+TOUCHING = 5e-6
+"""What is less deep than this is said to touch, not to be 0.00 mm deep [m]."""
+
+_GREY = "#868e96"
+
+
+def format_proximity(found: ProximityResult, problems: Mapping[str, str]) -> Html:
+    """Return HTML: how many pairs are near, the nearest of them with their distances, what is left out."""
+    lines = [element("b", _summary(found))]
+    lines += [_line(pair, distance_color(pair.distance, found.radius)) for pair in found.pairs[:LINES]]
+    lines += _more(found.found - LINES)
+    if found.ignored:
+        lines.append(_heading("Near, but not looked at"))
+        lines += [_line(pair, None, why) for pair, why in found.ignored[:LINES]]
+        lines += _more(len(found.ignored) - LINES)
+    lines += _excluded_lines(problems)
+    pairs = f"{found.looked_at} pairs are looked at, {found.unchecked_pairs} are not"
+    lines.append(element("div", pairs, style=f"color:{_GREY};margin-top:5px"))
+    return wrap_report(*lines)
+
+
+def format_proximity_failure(message: str) -> Html:
+    """Return HTML that says why there are no distances."""
+    return wrap_report(element("b", "There are no distances now.", style="color:#c92a2a"), BREAK, message)
+
+
+def wrap_report(*content: str) -> Html:
+    """Return content in the font of the panel."""
+    return element("div", *content, class_="kineverse-near", style=f"{FONT}padding:2px 9px 8px")
+
+
+def _summary(found: ProximityResult) -> str:
+    if not found.found:
+        return f"No pair is within {format_significant(found.radius)} m."
+    near = f"{found.found} pair{'' if found.found == 1 else 's'} within {format_significant(found.radius)} m"
+    if not found.touching:
+        return f"{near}, none touches"
+    return f"{near}, {found.touching} touch{'es' if found.touching == 1 else ''}"
+
+
+def _line(pair: DistanceResult, rgb: tuple[float, float, float] | None, why: str = "") -> Html:
+    shade = _GREY if rgb is None else f"rgb({','.join(str(round(255 * c)) for c in rgb)})"
+    distance = format_millimetres(pair.distance)
+    if pair.touches:
+        distance = f"{format_millimetres(-pair.distance)} deep" if pair.distance < -TOUCHING else "touching"
+    aside = join_html(" ", element("span", why, style=f"color:{_GREY}")) if why else ""
+    return element(
+        "div",
+        element("span", "●", style=f"color:{shade}"),
+        element("span", f"{pair.a} – {pair.b}", aside, style="flex:1"),
+        element("span", distance, style="white-space:nowrap"),
+        style="display:flex;gap:6px;margin-top:2px",
+    )
+
+
+def _heading(text: str) -> Html:
+    return element("div", element("b", text), style="margin-top:5px")
+
+
+def _more(count: int) -> list[Html]:
+    return [element("div", f"and {count} more", style=f"color:{_GREY}")] if count > 0 else []
+
+
+def _excluded_lines(problems: Mapping[str, str]) -> list[Html]:
+    if not problems:
+        return []
+    lines = [element("div", f"{name}: {why}") for name, why in list(problems.items())[:EXCLUDED_LINES]]
+    return [_heading("No distances to"), *lines, *_more(len(problems) - EXCLUDED_LINES)]
+
+
+LARGEST_RADIUS = 0.5
+"""The largest radius that is offered [m]."""
+
+LONGEST_ARROW = 0.2
+"""Length of an arrow on the page at most [m]: contacts are about hands, also in a large kitchen."""
+
+LABELS = 8
+"""Depths that are written beside their arrows; more would cover what they are about."""
+
+WAITING = wrap_report(element("b", "Reading shapes …"))
+
+
+class ProximityPanel:
+    """What touches, and what nearly does.
+
+    Parameters
+    ----------
+    server
+        A viser server.
+    scene
+        What the marks are drawn in.
+    model, values
+        The model, and the values of all symbols at first, by name [m], [rad].
+    """
+
+    def __init__(
+        self, server: Any, scene: ViewerScene, model: ModelView, values: Mapping[str, float]
+    ) -> None:
+        self._server, self._scene = server, scene
+        self._report: HtmlBox | None = None
+        self._folder: Any = None
+        self._shapes: Any = None
+        self._controls: tuple[Any, ...] = ()
+        self._drawn: dict[str, Any] = {}
+        self.seen = ProximityStatus()
+        # Programs, controls and the thread that looks all write to a folder that edits of the model replace.
+        self._lock = threading.RLock()
+        self.watch = ProximityWorker(model, values, self._show)
+
+    def add_folder(self, gui: Any) -> None:
+        """Add the controls to a panel; what is switched on stays on."""
+        with self._lock:
+            self._add_controls(gui, self.watch.wanted)
+            self._tell()
+
+    def forget_folder(self) -> None:
+        """Take note that the folder is about to be removed with its panel."""
+        with self._lock:
+            self._report, self._shapes, self._controls = None, None, ()
+
+    def show_near(
+        self, radius: float | None = RADIUS, *, containing: str = "", ignored: bool = False
+    ) -> None:
+        """Show which bodies are near to each other, as the controls do.
+
+        Parameters
+        ----------
+        radius
+            Within what distance [m]; None to show nothing.
+        containing
+            Only pairs of which a name contains this.
+        ignored
+            Also pairs that are joined by an articulation, or excepted by rules.
+
+        Raises
+        ------
+        InvalidValueError
+            If the radius is negative or NaN.
+        MissingDependencyError
+            If the extra ``geometry`` is not installed.
+        """
+        if radius is None:
+            self._set(replace(self.watch.wanted, on=False))
+            return
+        if not 0.0 <= radius < float("inf"):
+            raise InvalidValueError(f"A radius is a distance from 0 on [m], not {radius!r}.")
+        import_coal()
+        self._set(ProximityRequest(True, float(radius), containing, ignored, self.watch.wanted.decomposed))
+
+    def show_shapes(self, shown: bool = True) -> None:
+        """Show or hide the collision shapes, half transparent."""
+        with self._lock:
+            self._scene.show_collisions(shown)
+            if self._shapes is not None:
+                self._shapes.value = shown
+
+    def show_decomposed(self, shown: bool = True) -> None:
+        """Take meshes as the hulls that ``kineverse decompose`` made of them, for shapes and distances.
+
+        Those that it has not seen stay one hull; the log says which.
+
+        Raises
+        ------
+        MissingDependencyError
+            If the extra ``geometry`` is not installed.
+        """
+        import_coal()
+        self._set(replace(self.watch.wanted, decomposed=shown))
+
+    @property
+    def nearness(self) -> ProximityResult | None:
+        """What is near, as shown last; None if nothing is looked for, or if there are no distances."""
+        return self.seen.nearness
+
+    def stop(self) -> None:
+        """End what goes on in the background."""
+        self.watch.stop()
+
+    def _add_controls(self, gui: Any, wanted: ProximityRequest) -> None:
+        self._folder = gui.add_folder("Collisions", expand_by_default=wanted.on)
+        with self._folder:
+            self._shapes = gui.add_checkbox(
+                "collision shapes",
+                self._scene.collisions_shown,
+                hint="What distances are computed to; bluish where hulls of what is seen stand in.",
+            )
+            self._shapes.on_update(lambda event: self._scene.show_collisions(event.target.value))
+            if not is_installed():
+                self._report = HtmlBox(gui, Html())
+                return
+            near = gui.add_checkbox("nearest pairs", wanted.on, hint="Lines where bodies are nearest.")
+            radius = gui.add_slider(
+                "within [m]",
+                min=0.0,
+                max=max(LARGEST_RADIUS, wanted.radius),
+                step=0.005,
+                initial_value=wanted.radius,
+                hint="Green lines are that long; the nearer, the redder.",
+            )
+            only = gui.add_text("only", wanted.containing, hint="Only pairs with a name that contains this.")
+            ignored = gui.add_checkbox(
+                "ignored pairs", wanted.ignored, hint="Also pairs that are joined, or excepted by rules."
+            )
+            decomposed = gui.add_checkbox(
+                "decomposed meshes", wanted.decomposed, hint="Meshes as the hulls of kineverse decompose."
+            )
+            self._report = HtmlBox(gui, Html())
+        self._controls = near, radius, only, ignored, decomposed
+        for control in self._controls:
+            control.on_update(self._set_by_hand)
+
+    def _set_by_hand(self, event: Any) -> None:
+        # Values that this program has set come back without a client.
+        if event.client is not None:
+            wanted = ProximityRequest(*(control.value for control in self._controls))
+            self._scene.decompose(wanted.decomposed)
+            self.watch.set_request(wanted)
+            self._tell()
+
+    def _set(self, wanted: ProximityRequest) -> None:
+        with self._lock:
+            self._scene.decompose(wanted.decomposed)
+            self.watch.set_request(wanted)
+            if self._controls:
+                near, radius, only, ignored, decomposed = self._controls
+                self._folder.expand_by_default = wanted.on  # for whoever opens the page from now on
+                radius.max = max(LARGEST_RADIUS, wanted.radius)
+                near.value, radius.value = wanted.on, wanted.radius
+                only.value, ignored.value = wanted.containing, wanted.ignored
+                decomposed.value = wanted.decomposed
+            self._tell()
+
+    def _show(self, seen: ProximityStatus) -> None:
+        """Draw what was seen; called by the thread that looks."""
+        self._tell(seen)
+        self._scene.show_through(self.watch.wanted.on)
+        with self._server.atomic():
+            before = self._drawn
+            marks = None if seen.nearness is None else ProximityMarkers.of(seen.nearness, self._length)
+            self._drawn = self._draw(marks) if marks is not None and len(marks.lines) else {}
+            # What is added under the name of another takes its place, and does not flicker.
+            for name in before.keys() - self._drawn.keys():
+                before[name].remove()
+
+    def _tell(self, new: ProximityStatus | None = None) -> None:
+        """Write the report of what was seen last, which is ``new`` if given."""
+        with self._lock:
+            self.seen = seen = new or self.seen
+            text = Html() if is_installed() else _format_missing_extra()
+            if seen.failure:
+                text = format_proximity_failure(seen.failure)
+            elif seen.nearness is not None:
+                text = format_proximity(seen.nearness, seen.problems or {})
+            elif self.watch.wanted.on:
+                text = WAITING
+            if self._report is not None:
+                self._report.show(text)
+
+    @property
+    def _length(self) -> float:
+        return min(self._scene.length, LONGEST_ARROW)
+
+    def _draw(self, marks: ProximityMarkers) -> dict[str, Any]:
+        """Add marks to the page, and return their nodes by name."""
+        scene, length = self._server.scene, self._length
+        colors = np.repeat(np.round(255 * marks.colors).astype(np.uint8)[:, None], 2, axis=1)
+        nodes = [
+            scene.add_line_segments(
+                "/near/lines", marks.lines, colors, thickness=3.0, thickness_units="screen"
+            ),
+            scene.add_point_cloud(
+                "/near/ends",
+                marks.lines.reshape(-1, 3),
+                colors.reshape(-1, 3),
+                point_size=BALL * length,
+                point_shape="circle",
+                point_shading="flat",
+                precision="float32",
+            ),
+        ]
+        if len(marks.arrows):
+            shaft, head, tip = SHAFT * length, HEAD * length, TIP * length
+            red = tuple(round(255 * c) for c in CONTACT)
+            nodes.append(
+                scene.add_arrows(
+                    "/near/arrows", marks.arrows, red, shaft_radius=shaft, head_radius=head, head_length=tip
+                )
+            )
+        for k, (ends, depth) in enumerate(zip(marks.arrows[:LABELS], marks.depths, strict=False)):
+            nodes.append(scene.add_label(f"/near/depth{k}", depth, position=ends[1], font_screen_scale=0.8))
+        return {node.name: node for node in nodes}
+
+
+def _format_missing_extra() -> Html:
+    return wrap_report(
+        "Distances need the extra ", element("b", "geometry"), f": {install_command('geometry')}"
+    )

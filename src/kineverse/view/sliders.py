@@ -1,0 +1,291 @@
+"""Ranges, units and quaternion angles of the sliders.
+
+A model says by mathematics alone what its coordinates do, so their units are read off the motion: a
+coordinate that turns some frame by one radian a unit is an angle, one that shifts a frame by one metre a unit
+is a length, and of the others (a door lifted by a rope, a screw) nothing is claimed.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping
+from contextlib import suppress
+
+import numpy as np
+
+import kineverse as kv
+from kineverse.errors import NoSolutionError
+from kineverse.model.model_view import ModelView
+from kineverse.state import State
+from kineverse.view.poses import roll_pitch_yaw
+from kineverse.view.triangle_mesh import Floats
+
+UNLIMITED_RANGE = {"rad": np.pi, "m": 2.0, "": 2.0}
+"""Half of the range offered where the model sets no limit [rad], [m]."""
+
+
+STANDSTILL_SPEED = 1e-6
+"""What is slower than this does not move [rad/s], [m/s]: a lock is as sharp as its logic is."""
+
+
+class Ranges:
+    """The limits of all degrees of freedom of a model, evaluated at states.
+
+    Limits that are numbers are asked for once; those whose bounds are expressions (a drawer that opens only
+    as far as the door beside it) are asked for again at every state.
+
+    Attributes
+    ----------
+    names
+        The degrees of freedom, in the order of the model.
+    """
+
+    def __init__(self, model: ModelView) -> None:
+        self._model = model
+        free = model.degrees_of_freedom
+        self.names = [str(symbol) for symbol in free]
+        self._limits = {str(symbol): model.limits(symbol) for symbol in free}
+        bounded = {
+            constraint.expression.symbols[0]
+            for constraint in model.constraints.values()
+            if len(constraint.expression.symbols) == 1
+            and (constraint.lower.symbols or constraint.upper.symbols)
+        }
+        self._dependent = [symbol for symbol in free if symbol in bounded]
+        one_way = {symbol for symbol in free if 0.0 in model.limits(symbol.derivative())}
+        self._locked = [s for s in free if s in one_way or s.derivative() in bounded]
+
+    @property
+    def varying(self) -> list[str]:
+        """The degrees of freedom whose limits may depend on the state."""
+        return [str(symbol) for symbol in self._dependent]
+
+    @property
+    def lockable(self) -> list[str]:
+        """The degrees of freedom that the state may keep from moving one way or both."""
+        return [str(symbol) for symbol in self._locked]
+
+    def held(self, values: Mapping[str, float]) -> dict[str, tuple[bool, bool]]:
+        """Return, for each that is lockable, whether it cannot go down, and whether it cannot go up.
+
+        Locks are limits of speeds. At a limit of its own it cannot go on either, which counts if it is locked
+        the other way.
+        """
+        found = {}
+        state = State(values) if self._locked else None
+        for symbol in self._locked:
+            slowest, fastest = self._model.limits(symbol.derivative(), state)
+            lower, upper = self._model.limits(symbol, state)
+            value, down, up = values[str(symbol)], slowest > -STANDSTILL_SPEED, fastest < STANDSTILL_SPEED
+            at_end = down and value >= upper - STANDSTILL_SPEED, up and value <= lower + STANDSTILL_SPEED
+            found[str(symbol)] = (down or at_end[1], up or at_end[0])
+        return found
+
+    def at(self, values: Mapping[str, float]) -> dict[str, tuple[float, float]]:
+        """Return lower and upper limit of each degree of freedom, -inf and inf where there is none."""
+        limits = dict(self._limits)
+        state = State(values) if self._dependent else None
+        for symbol in self._dependent:
+            limits[str(symbol)] = self._model.limits(symbol, state)
+        return limits
+
+
+def choose_slider_range(
+    limits: tuple[float, float], value: float, unit: str, beyond: float = 0.0
+) -> tuple[float, float]:
+    """Return the range of a slider.
+
+    Parameters
+    ----------
+    limits
+        Lower and upper limit, possibly infinite.
+    value
+        The current value, which is always inside of what is returned.
+    unit
+        ``"rad"``, ``"m"`` or ``""``, which decides the range where there is no limit.
+    beyond
+        The part of the range by which it is widened at either end.
+    """
+    reach = UNLIMITED_RANGE.get(unit, 2.0)
+    lower, upper = limits
+    if not np.isfinite(lower):
+        lower = -reach if upper > -reach else upper - 2 * reach
+    if not np.isfinite(upper):
+        upper = reach if lower < reach else lower + 2 * reach
+    if upper < lower:  # No value is allowed at this state; the slider stays where it is.
+        lower = upper = value
+    wider = beyond * max(upper - lower, 1e-3)
+    # Limits are shown to the last digit; what lies beyond them may as well be a round number.
+    wider = float(f"{wider:.1g}")
+    if wider:
+        lower, upper = round(lower - wider, 6), round(upper + wider, 6)
+    lower, upper = min(lower, value), max(upper, value)
+    if upper - lower < 1e-6:
+        lower, upper = lower - 0.5e-3, upper + 0.5e-3
+    return float(lower), float(upper)
+
+
+def choose_slider_step(limits: tuple[float, float]) -> float:
+    """Return a power of ten of which a range has at least a thousand."""
+    return float(10.0 ** np.floor(np.log10(max(limits[1] - limits[0], 1e-6) / 999.0)))
+
+
+DIFFERENCE_STEP = 1e-4
+"""Step of the differences; their error is its square [unit of the coordinate]."""
+
+UNIT_TOLERANCE = 1e-5
+
+PROBE_DISTANCES = (0.0, 1.0, -1.0, 0.1, -0.1)
+"""Where to look, from the given values on; the later ones are for where nothing is found in the others."""
+
+
+def infer_units(model: ModelView, values: Mapping[str, float], names: Iterable[str]) -> dict[str, str]:
+    """Return ``"rad"``, ``"m"`` or ``""`` for each of the named symbols.
+
+    Parameters
+    ----------
+    model
+        The model; its transforms from parent to child are what is looked at.
+    values
+        Values of all symbols at which to look, by name [rad], [m].
+    names
+        The symbols wanted.
+    """
+    wanted = list(names)
+    # In terms of what is free: the angles of a closed loop follow its crank.
+    moving = [t for frame in model.frames.values() if (t := model.rates.carry(frame.transform)).symbols]
+    if not moving:
+        return dict.fromkeys(wanted, "")
+    function = kv.compile(moving)
+    inputs = [str(symbol) for symbol in function.inputs]
+    base = np.array([values[name] for name in inputs])
+
+    def rates(place: Floats, index: int) -> tuple[Floats, Floats]:
+        offset = np.zeros(len(inputs))
+        offset[index] = DIFFERENCE_STEP
+        return _rates(np.array(function(place - offset)), np.array(function(place + offset)))
+
+    found = dict.fromkeys(wanted, "")
+    # A second place, a little off: what is one radian a unit only by chance is not so there.
+    off = 0.1 + 0.01 * np.arange(len(base))
+    for name in wanted:
+        if name not in inputs:
+            continue
+        seen = []
+        for distance in PROBE_DISTANCES:
+            # Where a loop does not close there is nothing to look at; two places are enough.
+            with suppress(NoSolutionError):
+                seen.append(rates(base + distance * off, inputs.index(name)))
+            if len(seen) == 2:
+                break
+        if len(seen) < 2:
+            continue
+        turning = np.all([np.abs(turn - 1.0) < UNIT_TOLERANCE for turn, _ in seen], axis=0)
+        shifting = np.all(
+            [(turn < UNIT_TOLERANCE) & (np.abs(s - 1.0) < UNIT_TOLERANCE) for turn, s in seen], axis=0
+        )
+        found[name] = "rad" if turning.any() else "m" if shifting.any() else ""
+    return found
+
+
+def _rates(before: Floats, after: Floats) -> tuple[Floats, Floats]:
+    """Return the (N,) rates of turning [rad] and shifting [m] a unit, from poses two steps apart."""
+    with np.errstate(invalid="ignore"):  # A frame that is nowhere does not turn or shift by one a unit.
+        return _differences(before, after)
+
+
+def _differences(before: Floats, after: Floats) -> tuple[Floats, Floats]:
+    # The part of R_before' R_after that is antisymmetric is the sine of the angle between them.
+    change = np.einsum("nji,njk->nik", before[:, :3, :3], after[:, :3, :3])
+    sine = np.stack([change[:, 2, 1], change[:, 0, 2], change[:, 1, 0]], axis=1)
+    turn = np.linalg.norm(
+        sine - np.stack([change[:, 1, 2], change[:, 2, 0], change[:, 0, 1]], axis=1), axis=1
+    )
+    shift = np.linalg.norm(after[:, :3, 3] - before[:, :3, 3], axis=1)
+    return np.asarray(turn / 2.0 / (2.0 * DIFFERENCE_STEP)), np.asarray(shift / (2.0 * DIFFERENCE_STEP))
+
+
+ANGLES = ("roll", "pitch", "yaw")
+ELEMENTS = ("qx", "qy", "qz", "qw")
+
+ANGLE_REACH = {"roll": math.pi, "pitch": math.pi / 2, "yaw": math.pi}
+"""How far each angle goes either way [rad]; within that there is one rotation for each of them."""
+
+
+class QuaternionAngles:
+    """The quaternions among the coordinates of a model, each shown as three angles about fixed x, y and z.
+
+    A quaternion is four coordinates ``name/qx`` to ``name/qw`` that are moved by the same three speeds. Its
+    angles are ``name/roll``, ``name/pitch`` and ``name/yaw`` [rad].
+
+    Parameters
+    ----------
+    model
+        The model.
+    values
+        The values of its symbols, by name.
+
+    Attributes
+    ----------
+    angles
+        What the angles are now, by name [rad]. They may be others than those of the quaternion, where two of
+        them turn the same way: a slider keeps what it was set to.
+    """
+
+    def __init__(self, model: ModelView, values: Mapping[str, float]) -> None:
+        rows = {str(coordinate): frozenset(row) for coordinate, row in model.rates.items()}
+        self._names = []
+        for name in sorted({path.rpartition("/")[0] for path in rows}):
+            speeds = {rows.get(f"{name}/{element}", frozenset()) for element in ELEMENTS}
+            if len(speeds) == 1 and len(speeds.pop()) == 3:
+                self._names.append(name)
+        self.angles: dict[str, float] = {}
+        self.read(values)
+
+    @property
+    def coordinates(self) -> frozenset[str]:
+        """The coordinates that are elements of quaternions, by name."""
+        return frozenset(f"{name}/{element}" for name in self._names for element in ELEMENTS)
+
+    @property
+    def limits(self) -> dict[str, tuple[float, float]]:
+        """How far the angles go [rad]."""
+        return {
+            f"{name}/{angle}": (-ANGLE_REACH[angle], ANGLE_REACH[angle])
+            for name in self._names
+            for angle in ANGLES
+        }
+
+    def slider_names(self, names: Iterable[str]) -> list[str]:
+        """Return names of coordinates with the angles where the elements of quaternions were."""
+        found: dict[str, None] = {}
+        for name in names:
+            stem = name.rpartition("/")[0]
+            for shown in [f"{stem}/{a}" for a in ANGLES] if name in self.coordinates else [name]:
+                found[shown] = None
+        return list(found)
+
+    def turned(self, angle: str, value: float) -> dict[str, float]:
+        """Set an angle [rad] and return the quaternion's elements, by name."""
+        self.angles[angle] = value
+        name = angle.rpartition("/")[0]
+        (cr, sr), (cp, sp), (cy, sy) = (
+            (math.cos(half), math.sin(half)) for half in (self.angles[f"{name}/{a}"] / 2 for a in ANGLES)
+        )
+        elements = (
+            sr * cp * cy - cr * sp * sy,
+            cr * sp * cy + sr * cp * sy,
+            cr * cp * sy - sr * sp * cy,
+            cr * cp * cy + sr * sp * sy,
+        )
+        return {f"{name}/{e}": value for e, value in zip(ELEMENTS, elements, strict=True)}
+
+    def read(self, values: Mapping[str, float]) -> None:
+        """Set the angles to those of the quaternions; of one that is zero, to none."""
+        for name in self._names:
+            q = np.array([values[f"{name}/{element}"] for element in ELEMENTS])
+            size = float(np.linalg.norm(q))
+            found = np.zeros(3)
+            if math.isfinite(size) and size > 1e-9:
+                found = roll_pitch_yaw(kv.quaternion(*q / size)())
+            self.angles.update({f"{name}/{a}": float(v) for a, v in zip(ANGLES, found, strict=True)})

@@ -1,0 +1,111 @@
+"""The arm among boxes: everybody sees the same, and who does not is found out."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from kineverse.bench import DisagreementError, run_benchmarks
+from kineverse.bench.clutter import RADIUS, RULES, make_clutter
+from kineverse.bench.measure_geometry import SearchEntry, check_distances
+from kineverse.bench.peers.clutter_search import CoalSearch, KineverseSearch, MujocoPairSearch, MujocoSearch
+from kineverse.bench.peers.robot_search import BulletRobotSearch, MujocoRobotSearch, RobotSurroundings
+from kineverse.bench.workloads import make_kitchen_robot
+from kineverse.geometry import Scene
+
+
+@pytest.fixture(scope="module")
+def arm():
+    return make_clutter(steps=40)
+
+
+@pytest.fixture
+def scene(arm, tmp_path):
+    return Scene(arm.model(tmp_path), rules=RULES)
+
+
+def names(finder, angles):
+    finder.put(angles)
+    finder.find()
+    return {frozenset(pair[:2]) for pair in finder.distances()}
+
+
+def test_peers_find_what_is_near(arm, scene):
+    pytest.importorskip("mujoco")
+    ours, *peers = KineverseSearch(scene), CoalSearch(scene), MujocoSearch(arm), MujocoPairSearch(arm)
+    for angles in arm.angles[::8]:
+        found = names(ours, angles)
+        assert len(found) > 20
+        assert all(names(peer, angles) == found for peer in peers)
+
+
+def test_bullet_finds_what_is_near(arm, scene):
+    pytest.importorskip("pybullet")
+    from kineverse.bench.peers.bullet import BulletSearch
+
+    check_distances(
+        [SearchEntry("ours", KineverseSearch(scene), 0.0), SearchEntry("bullet", BulletSearch(arm), 3e-3)],
+        arm.angles,
+    )
+
+
+@pytest.fixture(scope="module")
+def robot():
+    return make_kitchen_robot(steps=40)
+
+
+def test_mujoco_finds_what_is_near_a_robot_in_a_kitchen(robot):
+    pytest.importorskip("mujoco")
+    ours = SearchEntry("ours", KineverseSearch(robot.scene()), 0.0)
+    room = RobotSurroundings(robot.scene(), robot.values[0], "robot/")
+    assert len(names(ours.finder, robot.values[0])) > 20
+    check_distances([ours, SearchEntry("mujoco", MujocoRobotSearch(room), 1e-5)], robot.values)
+
+
+def test_bullet_finds_what_is_near_a_robot_in_a_kitchen(robot):
+    pytest.importorskip("pybullet")
+    room = RobotSurroundings(robot.scene(), robot.values[0], "robot/")
+    entries = [
+        SearchEntry("ours", KineverseSearch(robot.scene()), 0.0),
+        SearchEntry("bullet", BulletRobotSearch(room), 3e-3),
+    ]
+    check_distances(entries, robot.values[::4])
+
+
+class Forgetful(KineverseSearch):
+    """Misses the nearest pair, or the furthest."""
+
+    def __init__(self, scene, which):
+        super().__init__(scene)
+        self.which = which
+
+    def distances(self):
+        found = list(super().distances())
+        del found[self.which]
+        return iter(found)
+
+
+def test_who_misses_a_pair_is_found_out(arm, scene):
+    whole = SearchEntry("whole", KineverseSearch(scene), 0.0)
+    check_distances([whole, whole], arm.angles)
+    with pytest.raises(DisagreementError, match="'forgetful' and 'whole' differ by"):
+        check_distances([whole, SearchEntry("forgetful", Forgetful(scene, 0), 1e-6)], arm.angles)
+    furthest = max(distance for *_, distance in whole.finder.distances())
+    assert furthest > 0.9 * RADIUS
+    # Next to the radius, a pair may be there or not.
+    check_distances([whole, SearchEntry("forgetful", Forgetful(scene, -1), 2e-2)], arm.angles[:1])
+
+
+def test_more_boxes_stay_away(arm):
+    many = make_clutter(300, steps=40)
+    np.testing.assert_array_equal(many.angles.shape, arm.angles.shape)
+    assert len(many.sizes) == len(many.poses) == 300
+    assert np.linalg.norm(many.poses[60:, :3, 3], axis=1).max() > 1.0
+
+
+def test_peers_that_are_not_installed_are_reported(tiny, without):
+    without("mujoco", "pybullet")
+    (result,) = run_benchmarks(["geometry"], tiny)
+    assert {c.name.split(", ")[2] for c in result.comparisons if c.status == "missing"} >= {"beside mujoco"}
+    assert any("mujoco is not installed" in line for line in result.missing)
+    assert any("pybullet is not installed" in line for line in result.missing)

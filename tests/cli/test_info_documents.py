@@ -1,0 +1,26 @@
+"""``kineverse info`` of a document says which one it is."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+
+import kineverse as kv
+from kineverse.cli import main
+
+
+@pytest.mark.parametrize("ending", ["kv.json", "kv.msgpack"])
+def test_its_hash_is_shown(ending, tmp_path, capsys):
+    path = tmp_path / f"door.{ending}"
+    model = kv.load("shelf_door")
+    model.save(path)
+    assert main(["info", str(path)]) == 0
+    assert f"  document, sha256 {kv.formats.document_hash(model)}\n" in capsys.readouterr().out
+    assert main(["info", str(path), "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["sha256"] == kv.formats.document_hash(model)
+
+
+def test_what_is_no_document_has_none(capsys):
+    assert main(["info", "shelf_door", "--json"]) == 0
+    assert "sha256" not in json.loads(capsys.readouterr().out)

@@ -1,0 +1,55 @@
+from __future__ import annotations
+
+import io
+import math
+import sys
+
+import pytest
+
+from kineverse.cli.output import format_table, shorten_text, show_progress
+from kineverse.expressions.printing import format_number
+
+
+def test_columns_are_aligned():
+    text = format_table(("name", "value"), [("a", "1"), ("longer", "10")], "<>")
+    assert text.splitlines() == [
+        "name    value",
+        "------  -----",
+        "a           1",
+        "longer     10",
+    ]
+
+
+def test_wide_tables_are_cut_in_the_middle_of_their_first_column():
+    text = format_table(("name", "value"), [("kitchen/a_very_long_name_of_a_frame", "1")], "<>", width=30)
+    assert all(len(line) <= 30 for line in text.splitlines())
+    assert "kitchen/a" in text
+    assert "of_a_frame" in text
+    assert "..." in text
+
+
+def test_tables_of_nothing_have_a_head():
+    assert format_table(("a",), []).splitlines() == ["a", "-"]
+    assert shorten_text("short", 10) == "short"
+
+
+@pytest.mark.parametrize(
+    ("value", "text"), [(0.0, "0"), (-0.0, "0"), (math.inf, "-"), (-math.inf, "-"), (1.23456, "1.235")]
+)
+def test_figures(value, text):
+    assert format_number(value) == text
+
+
+class Terminal(io.StringIO):
+    def isatty(self):
+        return True
+
+
+def test_progress_is_shown_on_a_terminal_and_not_in_a_pipe(monkeypatch):
+    pipe, terminal = io.StringIO(), Terminal()
+    monkeypatch.setattr(sys, "stderr", pipe)
+    assert list(show_progress([1, 2, 3], "working")) == [1, 2, 3]
+    assert pipe.getvalue() == ""
+    monkeypatch.setattr(sys, "stderr", terminal)
+    assert list(show_progress([1, 2, 3], "working", "steps")) == [1, 2, 3]
+    assert "working" in terminal.getvalue()

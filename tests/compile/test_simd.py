@@ -1,0 +1,83 @@
+"""Elementary functions of vectors: as the C library's to 4 ulp, for every width of vectors there is."""
+
+from __future__ import annotations
+
+import ctypes
+import subprocess
+from pathlib import Path
+
+import numpy as np
+import pytest
+from compiled_programs import APPROXIMATED, BINARY, SPECIAL, UNARY, ulps
+
+import kineverse as kv
+from kineverse.compile.batch import _load
+from kineverse.compile.batch_codegen import generate_batch_source
+from kineverse.compile.program import Program
+from kineverse.compile.toolchain import toolchain
+from kineverse.expressions.expression import binary, unary
+
+x, y = kv.position("x"), kv.position("y")
+OPERATIONS = [*UNARY, *BINARY]
+# Vectors of 8, of 4 with and without fused operations, and of 2.
+MACHINES = {"native": "", "haswell": "avx2 fma", "sandybridge": "avx", "x86-64": ""}
+
+
+@pytest.fixture(scope="module")
+def program() -> Program:
+    return Program([unary(op, x) if op in UNARY else binary(op, x, y) for op in OPERATIONS], [x, y])
+
+
+@pytest.fixture(scope="module")
+def inputs() -> np.ndarray:
+    """Pairs of numbers on which reductions are hard, and all pairs of special ones; shape (N, 2)."""
+    rng = np.random.default_rng(0)
+    n = 6000
+    kinds = [
+        rng.uniform(-4, 4, n),
+        rng.uniform(-1, 1, n),
+        rng.normal(size=n) * 1e-3,
+        rng.uniform(-1.6e6, 1.6e6, n),
+        rng.normal(size=n) * 10.0 ** rng.uniform(-300, 300, n),
+        # Next to multiples of a right angle.
+        np.round(rng.uniform(-1e6, 1e6, n)) * np.pi / 2 * (1 + rng.integers(-2, 3, n) * 1.1e-16),
+        rng.uniform(-750, 750, n),
+        1 + rng.normal(size=n) * 10.0 ** rng.uniform(-16, 0, n),
+    ]
+    first = np.concatenate(kinds)
+    pairs = np.stack([first, rng.permutation(first)], axis=1)
+    special = np.array([(u, v) for u in SPECIAL for v in SPECIAL])
+    return np.concatenate([pairs, special])
+
+
+@pytest.fixture(scope="module")
+def wanted(program: Program, inputs: np.ndarray) -> list[np.ndarray]:
+    values = program.function.map(len(inputs))(inputs.T)
+    return [np.array(v).ravel() for v in values]
+
+
+@pytest.mark.compiler
+@pytest.mark.parametrize("machine", MACHINES)
+def test_within_four_ulp(
+    program: Program, inputs: np.ndarray, wanted: list[np.ndarray], machine: str, tmp_path: Path
+) -> None:
+    compiler = toolchain()
+    assert compiler is not None
+    available = Path("/proc/cpuinfo").read_text().split() if Path("/proc/cpuinfo").exists() else []
+    if machine != "native" and (
+        "sse2" not in available or not set(MACHINES[machine].split()) <= set(available)
+    ):
+        pytest.skip(f"this machine does not run code for {machine}")
+    library = str(tmp_path / "library.so")
+    command = compiler.arguments(("-O2", f"-march={machine}"), library)
+    subprocess.run(command, input=generate_batch_source(program).encode(), check=True, capture_output=True)
+    outputs = [np.empty(len(inputs)) for _ in OPERATIONS]
+    places = (ctypes.c_void_p * len(outputs))(*(o.ctypes.data for o in outputs))
+    assert _load(library)(inputs.ctypes.data, ctypes.addressof(places), len(inputs), 1) == 0
+    for op, value, want in zip(OPERATIONS, outputs, wanted, strict=True):
+        apart = ulps(want, value)
+        worst = int(apart.argmax())
+        limit = 4 if op in APPROXIMATED else 0
+        assert apart[worst] <= limit, f"operation {op} at {inputs[worst]}: {value[worst]}, not {want[worst]}"
+        zeros = want == 0
+        assert np.array_equal(np.signbit(want[zeros]), np.signbit(value[zeros]))

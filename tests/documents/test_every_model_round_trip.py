@@ -1,0 +1,107 @@
+"""Every model there is survives: what ships, every scene of the gallery, every file of the shared data that loads."""
+
+from __future__ import annotations
+
+import json
+import random
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import kineverse as kv
+from kineverse import gallery
+from kineverse.formats.document import read_operations, to_json
+
+SHARED = Path(__file__).parents[3] / "shared" / "data"
+FOLDERS = {
+    "articulated_objects": 5,
+    "fetch": 1,
+    "furniture_sim": 6,
+    "hsrb": 1,
+    "iai_kitchen": 1,
+    "kineverse_shelf_objects": 1,
+    "pr2": 1,
+    "sdf_joint_types": 40,
+    "urdf_conformance": 20,
+    "urdf_files_dataset_sample": 20,
+}
+"""How many of the files below load at least."""
+
+SUFFIXES = (".urdf", ".sdf", ".world", ".xml", ".mjcf")
+MOST = 3
+"""Expressions of a kind that are compared for one model."""
+
+
+def read(text: str) -> kv.Model:
+    model = kv.Model()
+    with model.edit() as edit:
+        for tag, operation in read_operations(text):
+            edit.apply(operation, tag)
+    return model
+
+
+def sample(model: kv.Model) -> kv.Expression:
+    """Return the elements of poses, Jacobians, constraints, bounds, and their gradients; of large models a part."""
+    draw = random.Random(1)
+    frames, names = list(model.frames), list(model.constraints)
+    frames = frames if len(frames) <= MOST else draw.sample(frames, MOST)
+    names = names if len(names) <= MOST else draw.sample(names, MOST)
+    found = [model.fk(frame) for frame in frames]
+    for name in names:
+        constraint = model.constraints[name]
+        found += [constraint.lower, constraint.expression, constraint.upper]
+    parts = [
+        part for e in found for part in (e, *e.gradient().values(), *e.gradient(heuristic=False).values())
+    ]
+    parts += [model.jacobian(frame) for frame in frames]
+    if len(frames) > 1:
+        parts.append(model.jacobian(frames[-1], frames[0], "body"))
+    return np.concatenate([part.ravel() for part in parts])  # type: ignore[arg-type, return-value]
+
+
+def survives(model: kv.Model) -> None:
+    """Compare a model with what its document and its packed document say."""
+    text = to_json(model)
+    again = read(text)
+    assert again.snapshot() == model.snapshot()
+    assert to_json(again) == text
+    assert kv.formats.from_bytes(kv.formats.to_bytes(model)).snapshot() == model.snapshot()
+    assert kv.formats.document_hash(model.snapshot()) == json.loads(text)["sha256"]
+    ours, theirs = sample(model), sample(again)
+    home = model.default_state()
+    values = np.array([home.get(s, 0.3 if s.value is None else s.value) for s in ours.symbols])
+    for scale in (0.0, 0.02):
+        moved = values + np.random.default_rng(5).uniform(-scale, scale, len(values))
+        at = dict(zip(ours.symbols, moved, strict=True))
+        results = []
+        for elements in (ours, theirs):
+            try:
+                results.append(elements(at).tobytes())
+            except kv.errors.NoSolutionError as error:
+                results.append(str(error).encode())
+        assert results[0] == results[1]
+
+
+@pytest.mark.parametrize("name", [*kv.shipped_models(), *gallery.names()])
+def test_what_ships(name: str) -> None:
+    try:
+        model = kv.load(name)
+    except kv.errors.UnknownNameError:
+        model = kv.load(f"articulations/{name}")
+    survives(model)
+
+
+@pytest.mark.parametrize("folder", FOLDERS)
+def test_files_of_others(folder: str) -> None:
+    if not (SHARED / folder).is_dir():
+        pytest.skip(f"no {SHARED / folder}")
+    loaded = 0
+    for path in sorted(p for p in (SHARED / folder).rglob("*") if p.suffix in SUFFIXES and p.is_file()):
+        try:
+            model = kv.load(path, prefix="")
+        except kv.errors.FormatError:
+            continue  # with a reason, of which other tests are
+        survives(model)
+        loaded += 1
+    assert loaded >= FOLDERS[folder]

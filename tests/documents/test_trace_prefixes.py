@@ -1,0 +1,118 @@
+"""Traces below prefixes, in documents of documents, beside loops, and what they cost."""
+
+from __future__ import annotations
+
+import gc
+
+import numpy as np
+import pytest
+from trace_models import KNOB, LIFT, Custom, build, reloaded
+
+import kineverse as kv
+from kineverse.formats.document import OpaqueOperation, read_operations, to_json
+from kineverse.model.traces import ReadNode
+
+
+def derived(model: kv.model.ReadRecorder) -> kv.model.Writes:
+    """Differentiate and substitute in what is read."""
+    place = model.fk("car").substitute({LIFT: KNOB})[:3, 3] + model.fk("car")[:3, 3].jacobian([LIFT])[:, 0]
+    driver = model.constraints["range"].expression
+    return kv.model.Writes(frames={"knob": ("car", kv.translation(*place) @ kv.rotation_x(driver))})
+
+
+def branching(model: kv.model.ReadRecorder) -> kv.model.Writes:
+    """Decide by a number."""
+    return kv.model.Writes(data={"said": 2.0 if model.data["number"] > 1 else 3.0})
+
+
+def test_nested_prefixes_follow() -> None:
+    text = to_json(build(derived))
+    model = kv.Model()
+    for prefix in ("a", "b/c", None):
+        _include(model, text, prefix)
+    outer = kv.Model()
+    _include(outer, to_json(model), "z")
+    lift = kv.position("z/a/lift")
+    car = kv.model.Frame.of("world", kv.translation(0.3, 0, lift**2) @ kv.rotation_z(lift))
+    with outer.edit() as edit:
+        edit.replace("z/a/frame car", kv.model.AddFrame("z/a/car", car))
+    live = build(derived, car=kv.translation(0.3, 0, LIFT**2) @ kv.rotation_z(LIFT))
+    at = {"lift": 0.3, "knob": -0.4}
+    for name, twin in (("z/a", live), ("z/b/c", build(derived)), ("z", build(derived))):
+        got = outer.fk(f"{name}/knob")({f"{name}/{k}": v for k, v in at.items()})
+        np.testing.assert_allclose(got, twin.fk("knob")(at), rtol=1e-13, atol=1e-14)
+    again = kv.Model()
+    _include(again, to_json(outer), None)
+    assert again.snapshot() == outer.snapshot()
+    assert to_json(again) == to_json(outer)
+
+
+def _include(model: kv.Model, text: str, prefix: str | None) -> None:
+    with model.edit() as edit:
+        for tag, operation in read_operations(text, prefix=prefix):
+            edit.apply(operation, tag)
+
+
+def test_saving_keeps_nothing_of_the_model_alive() -> None:
+    model = build(derived)
+    assert to_json(model) == to_json(model)
+    gc.collect()
+    assert not [o for o in gc.get_objects() if isinstance(o, ReadNode) and o.arguments]
+
+
+def test_a_trace_is_made_once_for_each_run() -> None:
+    runs = []
+
+    def code(m: kv.model.ReadRecorder) -> kv.model.Writes:
+        runs.append(m)
+        return kv.model.Writes(data={"twice": 2 * m.data["number"]})
+
+    model = build(code)
+    to_json(model)
+    count = len(runs)
+    assert to_json(model) == to_json(model)
+    assert len(runs) == count
+    with model.edit() as edit:
+        edit.replace("data number", kv.model.SetData("number", 5.0))
+    assert reloaded(model).data["twice"] == 10.0
+    assert len(runs) > count + 1
+
+
+def test_an_open_loop_is_refused_and_closed_anew() -> None:
+    model = kv.load("articulations/four_bar", prefix="")
+    read = reloaded(model)
+    longer = kv.model.AddFrame(
+        "board",
+        kv.model.Frame.of("world", kv.translation(0, 0, 0.01) @ model.fk("board")),
+    )
+    before = read.snapshot()
+    advice = r"'loop four_bar'.*CloseLoop\(\.\.\.\) made anew"
+    with pytest.raises(kv.errors.EditError, match=advice), read.edit() as edit:
+        edit.replace("frame board", longer)
+    assert read.snapshot() == before
+    loop = read.history.operation("loop four_bar")
+    assert isinstance(loop, OpaqueOperation)
+    for other, closing in ((model, None), (read, kv.CloseLoop(**loop.parameters))):
+        with other.edit() as edit:
+            edit.replace("frame board", longer)
+            if closing is not None:
+                edit.replace("loop four_bar", closing)
+    crank = model.symbols[0]
+    pose = read.fk("rocker_end")({str(crank): 0.4})
+    np.testing.assert_allclose(pose, model.fk("rocker_end")({str(crank): 0.4}), rtol=1e-12, atol=1e-12)
+
+
+def test_below_a_prefix_the_error_says_what_the_names_lack() -> None:
+    read = kv.Model()
+    _include(read, to_json(build(branching)), "shelf")
+    with pytest.raises(kv.errors.EditError, match=r"in names that lack 'shelf/'"), read.edit() as edit:
+        edit.replace("shelf/data number", kv.model.SetData("shelf/number", 0.5))
+
+
+def test_custom_is_what_it_says() -> None:
+    """An operation without a class at hand equals itself read again, and hashes."""
+    text = to_json(build(derived))
+    one, other = ([o for _, o in read_operations(text)] for _ in range(2))
+    assert one == other
+    assert [hash(o) for o in one] == [hash(o) for o in other]
+    assert not any(isinstance(o, Custom) for o in one)

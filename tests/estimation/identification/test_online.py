@@ -1,0 +1,68 @@
+"""Poses one by one: what is found is what all of them together tell."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from synthetic_recordings import recording
+
+from kineverse.errors import ShapeError
+from kineverse.estimation import Identifier, identify
+from kineverse.estimation.identification.observations import check_observations
+from kineverse.estimation.identification.online import ObservationBuffer
+from kineverse.estimation.identification.solver import solver
+
+
+@pytest.mark.parametrize("family", ["prismatic", "revolute", "planar"])
+def test_found_is_that_of_all_poses_at_every_step(family: str) -> None:
+    seen = recording(family, count=48, position=0.02, orientation=0.03, seed=2)
+    solver.prepare(wait=True)
+    identifier = Identifier(noise=seen.covariance)
+    for k, (a, b) in enumerate(zip(seen.parent, seen.child, strict=True), start=1):
+        identifier.add(a, b)
+        if k < 12:
+            continue
+        found = identifier.found
+        if k % 6:
+            continue
+        whole = identify(seen.parent[:k], seen.child[:k], noise=seen.covariance)
+        assert found.best.family == whole.best.family
+        assert found.best.log_evidence == pytest.approx(whole.best.log_evidence, abs=0.05)
+        for fit in found:
+            # What is improbable may be as probable as it was an eighth of the poses ago.
+            assert fit.probability == pytest.approx(whole[fit.family].probability, abs=0.02)
+            assert len(fit.joint_values) == k
+            if fit.probability > 1e-4:
+                assert fit.log_evidence == pytest.approx(whole[fit.family].log_evidence, abs=0.1)
+
+
+def test_a_surprise_has_all_families_looked_at() -> None:
+    seen = recording("revolute", count=41, position=0.005, orientation=0.01, seed=4)
+    identifier = Identifier(noise=seen.covariance, families=["rigid", "revolute", "cylindrical"])
+    for a, b in zip(seen.parent[:40], seen.child[:40], strict=True):
+        identifier.add(a, b)
+        if len(identifier) > 20:
+            assert identifier.found.best.family == "revolute"
+    assert 1e-6 < identifier.found.probabilities["cylindrical"] < 0.01
+    along = np.eye(4)
+    along[2, 3] = 0.1
+    there = seen.left @ along @ np.linalg.inv(seen.left) @ seen.true_relative[40]
+    identifier.add(seen.true_parent[40], seen.true_parent[40] @ there)
+    assert identifier.found.best.family == "cylindrical"
+
+
+def test_what_was_handed_out_stays_as_it_was() -> None:
+    seen = recording("revolute", count=9, position=0.02, orientation=0.03, seed=2)
+    c, gathered = seen.covariance, ObservationBuffer()
+    for k in range(9):
+        gathered.add(check_observations(seen.parent[k : k + 1], seen.child[k : k + 1], c, c, fewest=1))
+        if k == 4:
+            five = gathered.all
+    nine = gathered.all
+    assert len(five) == 5
+    np.testing.assert_array_equal(five.child, seen.child[:5])
+    np.testing.assert_array_equal(nine.parent, seen.parent)
+    np.testing.assert_array_equal(nine.child_covariance[8], c)
+    with pytest.raises(ShapeError, match="do not mix"):
+        gathered.add(check_observations(None, seen.child[:1], None, c, fewest=1))
+    assert len(gathered) == 9

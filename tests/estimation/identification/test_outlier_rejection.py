@@ -1,0 +1,171 @@
+"""Some of what was seen is wrong altogether, and what moves is found all the same."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+from synthetic_recordings import JOINTS, Array, Recording, angle_between, recording, transform
+
+from kineverse.errors import InvalidValueError
+from kineverse.estimation import IdentificationResult, Identifier, Outliers, identify, pose_covariance
+
+TOLD = ("revolute", "prismatic", "rigid", "screw")
+
+
+def with_wrong(seen: Recording, fraction: float, seed: int) -> tuple[Array, Array]:
+    """Return poses of the child, some of them anywhere within two metres, and which."""
+    random = np.random.default_rng(seed)
+    count = round(fraction * len(seen.child))
+    wrong = np.sort(random.choice(len(seen.child), count, replace=False))
+    child = seen.child.copy()
+    anywhere = transform(Rotation.random(count, random_state=random), random.uniform(-1.0, 1.0, (count, 3)))
+    child[wrong] = seen.parent[wrong] @ anywhere
+    return child, wrong
+
+
+def seen_as(family: str, seed: int, count: int = 20, noise: tuple[float, float] = (0.01, 0.03)) -> Recording:
+    return recording(family, count=count, position=noise[0], orientation=noise[1], seed=seed)
+
+
+# How many of so many recordings are typed right, at least: 97 % where a fifth is wrong.
+CASES = [(0.05, 2, 8), (0.2, 7, 28), (0.4, 3, 11)]
+
+
+@pytest.mark.parametrize(("fraction", "repeats", "least"), CASES)
+def test_what_moves_is_told_as_if_nothing_were_wrong(fraction: float, repeats: int, least: int) -> None:
+    right, off, off_without = 0, [], []
+    for family in TOLD:
+        for seed in range(repeats):
+            seen = seen_as(family, seed)
+            child, wrong = with_wrong(seen, fraction, seed + 100)
+            found = identify(seen.parent, child, noise=seen.covariance, outliers=True)
+            right += found.best.family == family
+            fit = found[family]
+            if family != "rigid":
+                good = np.setdiff1d(np.arange(20), wrong)
+                without = identify(
+                    seen.parent[good], child[good], noise=seen.covariance, families=[family]
+                ).best
+                off.append(angle_between(fit.parameters["axis"], seen.axis))
+                off_without.append(angle_between(without.parameters["axis"], seen.axis))
+    assert right >= least
+    assert np.sqrt(np.mean(np.square(off))) < 1.3 * np.sqrt(np.mean(np.square(off_without)))
+
+
+@pytest.mark.parametrize("family", [*JOINTS])
+def test_nothing_changes_where_nothing_is_wrong(family: str) -> None:
+    seen = seen_as(family, 3)
+    before = identify(seen.parent, seen.child, noise=seen.covariance)
+    after = identify(seen.parent, seen.child, noise=seen.covariance, outliers=True)
+    assert after.best.family == before.best.family == family
+    assert after.best.outliers == ()
+    one, other = before[family], after[family]
+    np.testing.assert_array_equal(one.covariance, other.covariance)
+    np.testing.assert_array_equal(one.joint_values, other.joint_values)
+    # All that were right is a little less probable than if they could not be wrong.
+    assert other.log_evidence == pytest.approx(one.log_evidence + 20 * math.log(0.95))
+    assert other.probability == pytest.approx(one.probability, abs=0.02)
+
+
+@pytest.fixture(scope="module")
+def hinge() -> tuple[Recording, Array, Array, IdentificationResult]:
+    seen = seen_as("revolute", 1)
+    child, wrong = with_wrong(seen, 0.2, 7)
+    return seen, child, wrong, identify(seen.parent, child, noise=seen.covariance, outliers=True)
+
+
+def test_what_is_wrong_is_said_and_does_not_count(hinge) -> None:
+    seen, child, wrong, found = hinge
+    fit = found.best
+    assert fit.outliers == tuple(wrong)
+    np.testing.assert_array_equal(fit.right, np.setdiff1d(np.arange(20), wrong))
+    without = identify(seen.parent[fit.right], child[fit.right], noise=seen.covariance).best
+    np.testing.assert_allclose(fit.range, without.range, atol=1e-3)
+    np.testing.assert_allclose(fit.rms, without.rms, rtol=1e-3)
+    np.testing.assert_allclose(fit.covariance, without.covariance, rtol=0.02, atol=1e-9)
+    # What is wrong has the nearest place on the joint.
+    assert fit.joint_values.shape == fit.deviations.shape == (20, 1)
+    assert np.linalg.norm(fit.residuals[wrong], axis=1).min() > 0.2
+    assert np.linalg.norm(fit.residuals[fit.right], axis=1).max() < 0.2
+    assert (fit.deviations > 0.0).all()
+
+
+def test_families_are_weighed_by_the_same_observations(hinge) -> None:
+    seen, child, _, found = hinge
+    fit = found.best
+    without = identify(seen.parent[fit.right], child[fit.right], noise=seen.covariance)
+    usual = Outliers()
+    belief = 16 * math.log(1 - usual.fraction) + 4 * (math.log(usual.fraction) + usual.log_anywhere)
+    assert fit.log_evidence == pytest.approx(without["revolute"].log_evidence + belief, abs=0.01)
+    # What moves freely explains everything, and what does not move cannot call almost everything wrong.
+    assert found["free"].outliers == found["rigid"].outliers == ()
+    assert found["free"].log_evidence < fit.log_evidence - 100
+    assert identify(seen.parent, child, noise=seen.covariance).best.family == "free"
+
+
+@pytest.mark.parametrize("family", ["revolute", "prismatic", "rigid"])
+def test_positions_alone(family: str) -> None:
+    for seed in range(3):
+        seen = seen_as(family, seed, noise=(0.005, 0.03))
+        child, wrong = with_wrong(seen, 0.2, seed)
+        points = (np.linalg.inv(seen.parent) @ child)[:, :3, 3]
+        points[:] = (np.linalg.inv(seen.true_parent) @ child)[:, :3, 3]
+        found = identify(None, points, noise=pose_covariance(0.005, 0.03)[:3, :3], outliers=True)
+        assert found.best.family == family
+        # Of a place anywhere one may happen to be on the joint.
+        assert len(set(found.best.outliers) ^ set(wrong)) <= 1
+
+
+@pytest.mark.parametrize("family", TOLD)
+def test_noise_that_nobody_knows(family: str) -> None:
+    seen = seen_as(family, 2)
+    child, wrong = with_wrong(seen, 0.2, 2)
+    found = identify(seen.parent, child, outliers=True)
+    assert found.best.family == family
+    assert found.best.outliers == tuple(wrong)
+    assert found.noise_scale == pytest.approx(2.0, rel=0.5)
+
+
+def test_millimetres() -> None:
+    seen = seen_as("revolute", 4)
+    child, wrong = with_wrong(seen, 0.2, 4)
+    parent = seen.parent.copy()
+    for poses in (parent, child):
+        poses[:, :3, 3] *= 1000.0
+    for outliers in (True, Outliers(reach=2000.0)):
+        found = identify(parent, child, noise=pose_covariance(10.0, 0.03), outliers=outliers)
+        assert (found.best.family, found.best.outliers) == ("revolute", tuple(wrong))
+
+
+def test_half_of_it_wrong_is_no_explanation() -> None:
+    """What goes round four axes in turn is no hinge of which most was seen wrong."""
+    several = [seen_as("revolute", seed, count=5) for seed in range(4)]
+    parent, child = (np.concatenate([getattr(s, part) for s in several]) for part in ("parent", "child"))
+    found = identify(parent, child, noise=several[0].covariance, outliers=True)
+    assert found["revolute"].outliers == found["rigid"].outliers == ()
+    assert found.best.family == "free"
+
+
+def test_one_by_one() -> None:
+    seen = seen_as("revolute", 5, count=30)
+    child, wrong = with_wrong(seen, 0.2, 5)
+    identifier = Identifier(noise=seen.covariance, outliers=True)
+    for a, b in zip(seen.parent, child, strict=True):
+        identifier.add(a, b)
+        if len(identifier) >= 16 and len(identifier) % 3 == 0:
+            found = identifier.found
+            assert found.best.family == "revolute"
+    whole = identify(seen.parent, child, noise=seen.covariance, outliers=True).best
+    assert found.best.outliers == whole.outliers == tuple(wrong)
+    assert angle_between(found.best.parameters["axis"], whole.parameters["axis"]) < 0.1 * whole.deviation(
+        "axis.x"
+    )
+
+
+def test_what_outliers_are_is_checked() -> None:
+    seen = seen_as("rigid", 0)
+    with pytest.raises(InvalidValueError, match="Outliers are True, False or Outliers"):
+        identify(seen.parent, seen.child, noise=seen.covariance, outliers=0.2)  # type: ignore[arg-type]

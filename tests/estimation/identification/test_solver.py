@@ -1,0 +1,274 @@
+"""Stages in C are those in numpy."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pytest
+from synthetic_recordings import JOINTS, recording
+
+from kineverse.errors import ShapeError
+from kineverse.estimation import identify
+from kineverse.estimation.identification import maximum_likelihood
+from kineverse.estimation.identification import solver as native
+from kineverse.estimation.identification.bindings import library
+from kineverse.estimation.identification.evidence import evidence_excess, laplace_evidence
+from kineverse.estimation.identification.families import JOINT_FAMILIES, GroupMotion, Parametrisation
+from kineverse.estimation.identification.initial_guess import MotionStatistics, initial_guesses
+from kineverse.estimation.identification.maximum_likelihood import Scored
+from kineverse.estimation.identification.observations import Observations, check_observations
+from kineverse.estimation.identification.optimise import (
+    InitialGuess,
+    JointValuePrior,
+    levenberg_marquardt,
+    solve_from_best_start,
+)
+from kineverse.estimation.identification.solver import solver
+
+HOW = ("both noisy", "parent known", "positions", "each with its own noise")
+MOVING = [family for family in JOINTS if family not in ("rigid", "free")]
+
+
+def seen_as(how: str, family: str) -> Observations:
+    seen = recording(family, count=12, position=0.02, orientation=0.05, seed=1)
+    c = seen.covariance
+    if how == "both noisy":
+        return check_observations(seen.parent, seen.child, c, c)
+    if how == "parent known":
+        return check_observations(seen.true_parent, seen.child, None, c)
+    if how == "positions":
+        return check_observations(seen.parent, seen.child[:, :3, 3], c, c)
+    factors = np.linspace(0.8, 1.3, 12)[:, None, None]
+    return check_observations(seen.parent, seen.child, factors * c, c / factors)
+
+
+def precise(family: str, whole: bool) -> Observations:
+    """Return positions so precise that steps have to be led to them."""
+    seen = recording(family, count=12, position=0.001, orientation=0.1, seed=1)
+    child = seen.child if whole else seen.child[:, :3, 3]
+    result = check_observations(seen.parent, child, seen.covariance, seen.covariance)
+    assert len(result.softened()) > 1
+    return result
+
+
+def same(slow: Scored, fast: Scored, atol: float = 1e-4, log: float = 0.05) -> None:
+    one, other = slow.solution, fast.solution
+    # Steps end where they promise little, which is not the same place to the last digit.
+    assert fast.log_evidence == pytest.approx(slow.log_evidence, abs=log)
+    assert other.cost == pytest.approx(one.cost, abs=log)
+    assert other.belief.marginal == one.belief.marginal
+    np.testing.assert_allclose(other.belief.precision, one.belief.precision, rtol=0.05)
+    seen = slice(None) if one.motion.rows == 6 else 3  # of the pose of what was seen as a position
+    np.testing.assert_allclose(other.linear.pose[:, :3, seen], one.linear.pose[:, :3, seen], atol=atol)
+    np.testing.assert_allclose(other.residuals, one.residuals, atol=atol)
+    # All of it belongs together.
+    for a, b in zip(other.linear, other.motion.at(other.values), strict=True):
+        np.testing.assert_allclose(a, b, atol=1e-12)
+
+
+@pytest.fixture(autouse=True)
+def compiled() -> None:
+    assert solver.prepare(wait=True)
+
+
+@pytest.mark.compiler
+@pytest.mark.parametrize("family", [*JOINTS])
+@pytest.mark.parametrize("how", HOW)
+def test_c_and_numpy_agree(family: str, how: str) -> None:
+    seen = seen_as(how, family)
+    start = next(initial_guesses(family, MotionStatistics(seen)))
+    slow = levenberg_marquardt(seen, *start)
+    fast = solver.solve(seen, start, seen.parent, slow.belief)
+    assert fast.cost == pytest.approx(slow.cost, rel=1e-6, abs=1e-6)
+    if slow.converged and fast.converged:
+        for a, b in zip(slow.motion.at(slow.values), fast.motion.at(fast.values), strict=True):
+            np.testing.assert_allclose(a, b, atol=1e-4)
+        np.testing.assert_allclose(slow.residuals, fast.residuals, atol=1e-4)
+
+
+@pytest.mark.compiler
+@pytest.mark.parametrize("family", MOVING)
+@pytest.mark.parametrize("how", HOW)
+def test_steps_with_joint_values_integrated_out_agree(family: str, how: str) -> None:
+    seen = seen_as(how, family)
+    start = next(initial_guesses(family, MotionStatistics(seen)))
+    near = levenberg_marquardt(seen, start.motion, start.values)
+    # C has derivatives in closed form, and numpy takes differences.
+    belief = JointValuePrior(near.values.mean(axis=0), np.full(near.motion.joints, 0.3**-2), marginal=True)
+    slow = levenberg_marquardt(seen, near.motion, near.values, near.parent, belief, steps=1)
+    fast = solver.solve(seen, InitialGuess(near.motion, near.values), near.parent, belief, steps=1)
+    assert fast.cost == pytest.approx(slow.cost, rel=1e-6, abs=1e-6)
+    np.testing.assert_allclose(fast.linear.pose, slow.linear.pose, atol=1e-6)
+
+
+@pytest.mark.compiler
+@pytest.mark.parametrize("family", [*JOINTS])
+@pytest.mark.parametrize("how", HOW)
+def test_poses_agree(family: str, how: str) -> None:
+    start = next(initial_guesses(family, MotionStatistics(seen_as(how, family))))
+    assert isinstance(start.motion, GroupMotion)
+    for slow, fast in zip(
+        start.motion.at(start.values, native=False), start.motion.at(start.values), strict=True
+    ):
+        np.testing.assert_allclose(slow, fast, atol=1e-13)
+
+
+@pytest.mark.compiler
+@pytest.mark.parametrize("family", [*JOINTS])
+@pytest.mark.parametrize("how", HOW)
+def test_the_likeliest_member_is_the_same(family: str, how: str) -> None:
+    seen = seen_as(how, family)
+    begin = [*initial_guesses(family, MotionStatistics(seen))]
+    same(maximum_likelihood.maximum_likelihood(seen, begin), solver.likeliest(seen, begin))
+
+
+@pytest.mark.compiler
+@pytest.mark.parametrize("family", MOVING)
+@pytest.mark.parametrize("how", ["both noisy", "parent known"])
+def test_integrating_joint_values_out_is_the_same(family: str, how: str) -> None:
+    seen = seen_as(how, family)
+    near = solve_from_best_start(seen, [*initial_guesses(family, MotionStatistics(seen))])
+    slow, fast = maximum_likelihood.maximise_marginal_likelihood(seen, near), solver.refined(seen, near)
+    assert slow.solution.belief.marginal
+    same(slow, fast, atol=0.02)
+    # One more observation, and the first ones are where they were.
+    part = seen.at(slice(0, 10))
+    before = maximum_likelihood.maximise_marginal_likelihood(
+        part, solve_from_best_start(part, [*initial_guesses(family, MotionStatistics(part))])
+    ).solution
+    start = InitialGuess(before.motion, np.concatenate([before.values, slow.solution.values[10:]]))
+    parent = np.concatenate([before.parent, seen.parent[10:]])
+    given = seen, start, parent, before.belief, 10
+    same(maximum_likelihood.continue_from(*given), solver.continued(*given), atol=0.02)
+
+
+@pytest.mark.compiler
+@pytest.mark.parametrize(
+    ("family", "whole"), [("prismatic", True), ("revolute", True), ("spherical", True), ("revolute", False)]
+)
+def test_precise_positions_are_the_same(family: str, whole: bool) -> None:
+    seen = precise(family, whole)
+    begin = [*initial_guesses(family, MotionStatistics(seen))]
+    slow, fast = maximum_likelihood.maximum_likelihood(seen, begin), solver.likeliest(seen, begin)
+    same(slow, fast, atol=0.02)
+    near = slow.solution
+    same(
+        maximum_likelihood.maximise_marginal_likelihood(seen, near),
+        solver.refined(seen, near),
+        atol=0.02,
+        log=0.2,
+    )
+
+
+@pytest.mark.compiler
+@pytest.mark.parametrize("family", [*JOINTS])
+@pytest.mark.parametrize("how", [*HOW, "precise"])
+def test_c_stays_within_the_memory_it_asks_for(
+    family: str, how: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    lent = []
+
+    def lend(size: int) -> np.ndarray:
+        lent.append(np.full(size + 64, 12345.0))
+        return lent[-1][:size]
+
+    monkeypatch.setattr(native._memory, "of", lend)
+    seen = precise(family, True) if how == "precise" else seen_as(how, family)
+    found = solver.likeliest(seen, [*initial_guesses(family, MotionStatistics(seen))]).solution
+    found = solver.refined(seen, found).solution
+    solver.continued(seen, InitialGuess(found.motion, found.values), found.parent, found.belief, 2)
+    solver.evidence(found)
+    assert len(lent) == 4
+    assert all((memory[-64:] == 12345.0).all() for memory in lent)
+
+
+@pytest.mark.compiler
+@pytest.mark.parametrize("family", [*JOINTS])
+@pytest.mark.parametrize("how", HOW)
+def test_evidence_agrees(family: str, how: str) -> None:
+    seen = seen_as(how, family)
+    solution = solver.likeliest(seen, [*initial_guesses(family, MotionStatistics(seen))]).solution
+    for scale in (1.0, 3.0):
+        slow, fast = laplace_evidence(solution.scaled(scale)), solver.evidence(solution, scale)
+        assert fast.log_evidence == pytest.approx(slow.log_evidence, rel=1e-9)
+        assert solver.log_evidences(solution, np.array([scale])) == pytest.approx(slow.log_evidence, rel=1e-9)
+        np.testing.assert_allclose(slow.covariance, fast.covariance, rtol=1e-6, atol=1e-12)
+        np.testing.assert_allclose(slow.joint_values, fast.joint_values, atol=1e-9)
+        np.testing.assert_allclose(slow.joint_covariances, fast.joint_covariances, atol=1e-12)
+
+
+@pytest.mark.compiler
+@pytest.mark.parametrize("family", ["revolute", "planar"])
+def test_what_steps_have_not_reached_does_not_count_in_c_either(family: str) -> None:
+    seen = seen_as("both noisy", family)
+    near = solver.likeliest(seen, [*initial_guesses(family, MotionStatistics(seen))])
+    reached = solver.refined(seen, near.solution)
+    early = replace(reached.solution, converged=False, cost=reached.solution.cost + 20.0)
+    # Its widths have settled, so no step is taken.
+    slow, fast = maximum_likelihood.maximise_marginal_likelihood(seen, early), solver.refined(seen, early)
+    assert evidence_excess(early) == pytest.approx(10.0, abs=0.5)
+    assert fast.log_evidence == pytest.approx(slow.log_evidence, abs=1e-6)
+    assert fast.log_evidence == pytest.approx(reached.log_evidence - evidence_excess(early), abs=1e-3)
+
+
+@dataclass(frozen=True)
+class Pinned(GroupMotion):
+    """A hinge of which only the axis is unknown."""
+
+    @property
+    def freedom(self) -> Parametrisation:
+        return Parametrisation((5,), (3, 4), ())
+
+
+@pytest.mark.compiler
+def test_c_has_nothing_to_do_with_motions_that_are_not_what_their_group_says() -> None:
+    seen = seen_as("both noisy", "revolute")
+    start = next(initial_guesses("revolute", MotionStatistics(seen)))
+    pinned = Pinned(JOINT_FAMILIES["revolute"], 6, start.motion.left, start.motion.right)
+    begin = InitialGuess(pinned, start.values)
+    assert not pinned.is_plain
+    assert pinned.at(start.values).by_parameters.shape == (12, 6, 2)
+    found = solver.likeliest(seen, [begin]).solution
+    assert found.cost == pytest.approx(levenberg_marquardt(seen, *begin).cost)
+    assert solver.evidence(found).covariance.shape == (2, 2)
+
+
+@pytest.mark.compiler
+@pytest.mark.parametrize(
+    "freedom",
+    [
+        Parametrisation((5,), tuple(range(6)), tuple(range(6))),
+        Parametrisation((5,), (0, 1, 2, 3, 4, 5, 0), ()),
+        Parametrisation((6,), (), ()),
+    ],
+    ids=["too many", "more than there are", "no such component"],
+)
+def test_c_refuses_groups_it_has_no_room_for(freedom: Parametrisation) -> None:
+    group = replace(JOINT_FAMILIES["revolute"], poses=freedom, positions=freedom)
+    assert not GroupMotion(group, 6, np.eye(4), np.eye(4)).is_plain
+    assert GroupMotion(JOINT_FAMILIES["revolute"], 6, np.eye(4), np.eye(4)).is_plain
+
+
+@pytest.mark.compiler
+def test_joint_values_of_another_shape_are_refused() -> None:
+    motion = GroupMotion(JOINT_FAMILIES["revolute"], 6, np.eye(4), np.eye(4))
+    with pytest.raises(ShapeError, match=r"\(N, 1\), not \(4, 2\)"):
+        motion.at(np.zeros((4, 2)))
+
+
+@pytest.mark.compiler
+@pytest.mark.parametrize("family", ["prismatic", "revolute", "planar"])
+def test_without_a_compiler_the_same_is_found(family: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    seen = recording(family, count=12, position=0.02, orientation=0.05, seed=1)
+    fast = identify(seen.parent, seen.child, noise=seen.covariance)
+    with monkeypatch.context() as patched:
+        patched.setattr(library, "_code", None)
+        patched.setattr(library, "_hopeless", True)
+        slow = identify(seen.parent, seen.child, noise=seen.covariance)
+        assert not solver.is_native
+        best = slow.best
+    assert fast.probabilities == pytest.approx(slow.probabilities, rel=0.02, abs=1e-4)
+    assert fast.best.family == best.family
+    np.testing.assert_allclose(fast.best.covariance, best.covariance, rtol=0.05, atol=1e-6)
+    np.testing.assert_allclose(fast.best.joint_values, best.joint_values, atol=0.02 * best.deviations.max())

@@ -1,0 +1,297 @@
+"""Limits that depend on several coordinates, coordinates that move several parts, and what is proposed then."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+from observed_frames import NOISE, seen
+
+import kineverse as kv
+from kineverse.estimation import Plausibility, PlausibilityMonitor, check_plausibility
+from kineverse.estimation.identification.observations import check_tracks, exact_track, pair_tracks
+from kineverse.estimation.plausibility.consistency import ConsistencyTests, TimedResiduals
+from kineverse.estimation.plausibility.known_motion import KnownJoint
+from kineverse.estimation.plausibility.known_residuals import KnownResiduals, compute_residuals
+from kineverse.estimation.plausibility.sequential_test import SequentialTest
+from kineverse.estimation.plausibility.testability import find_testable_joints
+
+Array = npt.NDArray[np.float64]
+SOME = ("rigid", "prismatic", "revolute", "free")
+
+
+def cupboard() -> kv.Model:
+    """Return a door, and a drawer that it lets out as far as it is open."""
+    model = kv.Model()
+    door, drawer = kv.position("door"), kv.position("drawer")
+    with model.edit() as edit:
+        edit.apply(kv.Revolute(name="door", parent="world", child="door", lower=0, upper=1.5), tag="door")
+        edit.add_frame("handle", parent="door", transform=kv.translation(0, 0.4, 0))
+        slide = kv.Prismatic(name="drawer", parent="world", child="drawer", lower=0, upper=0.6)
+        edit.apply(slide, tag="drawer")
+        edit.constrain("clear of the door", 0, drawer, 0.1 + 0.3 * np.sin(door))
+    return model
+
+
+def mended(model: kv.Model, report: Plausibility) -> kv.Model:
+    """Return the model with what is proposed, from a document."""
+    copy = model.copy()
+    with copy.edit() as edit:
+        for tag, operation in report.replacements.items():
+            edit.replace(tag, operation)
+    return kv.formats.from_bytes(kv.formats.to_bytes(copy))
+
+
+def told(model: kv.Model, observations: dict[str, Array]) -> dict[str, KnownResiduals]:
+    """Return by tag what is told of articulations, with ties."""
+    found = find_testable_joints(model, observations, "world")
+    known = {
+        "world": exact_track(len(next(iter(observations.values())))),
+        **check_tracks(observations, NOISE),
+    }
+    judged = {link: KnownJoint(model, link.child, link.parent) for link in found.links}
+    each = {}
+    for link, served in judged.items():
+        times = np.flatnonzero(known[link.parent].seen & known[link.child].seen)
+        each[link] = TimedResiduals(
+            times, compute_residuals(served, pair_tracks(known[link.parent], known[link.child], times))
+        )
+    return {link.tag: left for link, left in ConsistencyTests(model, judged, "world").tied(each).items()}
+
+
+def is_standard_normal(z: Array) -> bool:
+    """Whether numbers may well be; of those that are, one set in ten thousand is not taken for it."""
+    count = len(z)
+    mean, squares = abs(float(z.mean())), float(np.sum(z**2))
+    return mean < 4.0 / np.sqrt(count) and abs(squares - count) < 4.0 * np.sqrt(2.0 * count)
+
+
+def test_a_limit_that_another_coordinate_sets_counts() -> None:
+    model = cupboard()
+    random = np.random.default_rng(0)
+    doors = random.uniform(0.1, 1.4, 40)
+    inside = random.uniform(0.0, 1.0, 40) * (0.1 + 0.3 * np.sin(doors))
+    for drawers, explained in ((inside, True), (np.minimum(inside + 0.25, 0.55), False)):
+        values = {"door": doors, "drawer": drawers}
+        observations = seen(model, ["handle", "drawer"], values, 1)
+        report = check_plausibility(model, observations, noise=NOISE, families=SOME)
+        assert report["door"].explains
+        assert report["drawer"].explains is explained
+        if not explained:
+            assert report["drawer"].stopped is not None
+            assert report["drawer"].proposal is None
+            assert "together with what limits" in report["drawer"].reason
+        # Nobody knows what the door lets out where nobody sees it.
+        alone = check_plausibility(model, {"drawer": observations["drawer"]}, noise=NOISE, families=SOME)
+        assert alone["drawer"].explains
+
+
+def test_how_far_a_limit_is_passed_is_standard_normal_where_it_is_reached() -> None:
+    """With the derivatives of the limit by both coordinates: without the door's share it would be 1.4."""
+    model = cupboard()
+    doors = np.random.default_rng(2).uniform(0.3, 1.2, 400)
+    observations = seen(model, ["handle", "drawer"], {"door": doors, "drawer": 0.1 + 0.3 * np.sin(doors)}, 3)
+    observations["handle"][:7] = np.nan
+    tied = told(model, observations)["drawer"].tied
+    above = tied[:, -1]  # below, the limit is 0
+    assert np.isnan(above[:7]).all()
+    assert is_standard_normal(above[7:])
+
+
+def test_a_limit_that_jumps_says_nothing_where_it_may() -> None:
+    model = kv.Model()
+    door, drawer = kv.position("door"), kv.position("drawer")
+    with model.edit() as edit:
+        edit.apply(kv.Revolute(name="door", parent="world", child="door"), tag="door")
+        edit.apply(kv.Prismatic(name="drawer", parent="world", child="drawer"), tag="drawer")
+        edit.constrain("latch", -np.inf, drawer, kv.where(door > 0.5, 0.4, 0.1))
+    doors = np.array([0.2, 0.49, 0.51, 0.9])
+    tied = told(model, seen(model, ["door", "drawer"], {"door": doors, "drawer": np.full(4, 0.2)}, 0))
+    z = tied["drawer"].tied[:, 0]
+    assert z[0] > 5.0
+    assert np.isnan(z[1:3]).all()
+    assert z[3] < -10.0
+
+
+def test_a_limit_of_several_coordinates_of_ones_own_counts() -> None:
+    x, y = kv.position("puck/x"), kv.position("puck/y")
+    model = kv.Model()
+    with model.edit() as edit:
+        edit.apply(kv.Planar(name="puck", parent="world", child="puck"), tag="puck")
+        edit.constrain("rim", -np.inf, x**2 + y**2, 0.25)
+    around, angle, inwards = np.random.default_rng(4).uniform((0, -1, 0.7), (6, 1, 1), (30, 3)).T
+    for radius, explained in ((0.49, True), (0.6, False)):
+        x, y = radius * inwards * np.cos(around), radius * inwards * np.sin(around)
+        values = {"puck/x": x, "puck/y": y, "puck/angle": angle}
+        rating = check_plausibility(model, seen(model, ["puck"], values, 4), noise=NOISE, families=SOME)[
+            "puck"
+        ]
+        assert rating.explains is explained
+        assert (rating.stopped is None) is explained
+
+
+def test_the_cone_of_a_ball_counts() -> None:
+    model = kv.Model()
+    with model.edit() as edit:
+        edit.apply(
+            kv.articulations.Ball(name="arm", parent="world", child="arm", axis=(0, 0, 1), cone=0.5),
+            tag="arm",
+        )
+        edit.add_frame("hand", parent="arm", transform=kv.translation(0, 0, 0.5))
+    around = np.linspace(0.0, 6.0, 30)
+    for lean, explained in ((0.45, True), (0.7, False)):
+        half = np.sin(lean / 2)
+        quaternion = half * np.cos(around), half * np.sin(around), 0 * around, np.cos(lean / 2) + 0 * around
+        values = dict(zip((f"arm/q{c}" for c in "xyzw"), quaternion, strict=True))
+        rating = check_plausibility(model, seen(model, ["hand"], values, 5), noise=NOISE, families=SOME)[
+            "arm"
+        ]
+        assert (rating.stopped is None) is explained
+
+
+def gripper(factor: float = -1.0, shift: float = 0.0) -> kv.Model:
+    """Return two fingers, the second of which mimics the first."""
+    model = kv.Model()
+    with model.edit() as edit:
+        finger = kv.Prismatic(name="left", parent="world", child="left", axis=(0, 1, 0), lower=0, upper=0.4)
+        edit.apply(finger, tag="left")
+        place = kv.model.Pose.of(kv.translation(0.1, shift, 0)())
+        other = replace(
+            finger,
+            name="right",
+            child="right",
+            origin=place,
+            position=factor * kv.position("left"),
+            lower=-0.4,
+        )
+        edit.apply(other, tag="right")
+    return model
+
+
+FINGERS = {"left": np.random.default_rng(0).uniform(0.0, 0.4, 40)}
+
+
+def test_fingers_that_move_as_one_explain_themselves() -> None:
+    observations = seen(gripper(), ["right", "left"], FINGERS, 6)
+    report = check_plausibility(gripper(), observations, noise=NOISE, families=SOME)
+    assert report["left"].explains
+    assert report["right"].explains
+    many = {"left": np.random.default_rng(1).uniform(0.0, 0.4, 400)}
+    left = told(gripper(), seen(gripper(), ["right", "left"], many, 7))
+    assert left["left"].apart.shape == (400, 0)
+    assert is_standard_normal(left["right"].apart[:, 0])
+
+
+@pytest.mark.parametrize(("factor", "shift"), [(-0.5, 0.0), (-1.0, 0.06)])
+def test_a_mimic_joint_that_is_geared_or_placed_otherwise_is_noticed_and_mended(
+    factor: float, shift: float
+) -> None:
+    served = gripper()
+    observations = seen(gripper(factor, shift), ["right", "left"], FINGERS, 8)
+    report = check_plausibility(served, observations, noise=NOISE, families=SOME)
+    assert report["left"].explains
+    assert report["right"].stopped is not None
+    model = mended(served, report)
+    assert model.degrees_of_freedom == served.degrees_of_freedom
+    assert check_plausibility(model, observations, noise=NOISE, families=SOME)["right"].explains
+    slope = model.fk("right")[1, 3].gradient()[kv.position("left").derivative()]
+    assert float(slope({})) == pytest.approx(factor, abs=0.05)
+
+
+def test_a_mimic_joint_whose_leader_nobody_sees_goes_on_to_follow() -> None:
+    served = gripper()
+    truth = gripper()
+    with truth.edit() as edit:
+        turned = kv.model.Pose.of((kv.translation(0.1, 0, 0) @ kv.rotation_z(0.4))())
+        edit.replace("right", replace(truth.history.operation("right"), origin=turned))
+    observations = seen(truth, ["right"], FINGERS, 9)
+    report = check_plausibility(served, observations, noise=NOISE, families=SOME)
+    assert report["right"].stopped is not None
+    model = mended(served, report)
+    assert model.degrees_of_freedom == served.degrees_of_freedom
+    assert model.fk("left") == served.fk("left")
+    assert check_plausibility(model, observations, noise=NOISE, families=SOME)["right"].stopped is None
+
+
+def linkage(pivot: float = 1.0, coupler: float = 1.1) -> kv.Model:
+    """Return a crank that goes round, and a rocker."""
+    model = kv.Model()
+    with model.edit() as edit:
+        bars = [
+            ("crank", "world", 0.0, 0.4),
+            ("coupler", "crank_end", 0.0, coupler),
+            ("rocker", "world", pivot, 0.9),
+        ]
+        for name, parent, x, length in bars:
+            hinge = kv.model.Pose.of(kv.translation(x, 0, 0)())
+            joint = kv.Revolute(name=name, parent=parent, child=name, origin=hinge, axis=(0, 0, 1))
+            edit.apply(joint, tag=name)
+            edit.add_frame(f"{name}_end", name, kv.translation(length, 0, 0))
+        edit.close_loop("coupler_end", "rocker_end", mask=("x", "y"), home={"coupler": 1, "rocker": 1.5})
+    return model
+
+
+@pytest.fixture(scope="module")
+def served_linkage() -> kv.Model:
+    return linkage()
+
+
+def test_bars_of_a_linkage_are_judged_together_and_mended(served_linkage: kv.Model) -> None:
+    served, frames = served_linkage, ["rocker", "crank", "coupler"]
+    cranks = {"crank": np.random.default_rng(0).uniform(-3.0, 3.0, 40)}
+    report = check_plausibility(served, seen(served, frames, cranks, 10), noise=NOISE, families=SOME)
+    assert len(report) == 3
+    assert all(rating.explains and not rating.outliers for rating in report)
+
+    observations = seen(linkage(pivot=1.08), frames, cranks, 11)
+    report = check_plausibility(served, observations, noise=NOISE, families=SOME)
+    assert [rating.tag for rating in report.implausible] == ["rocker"]
+    copy = served.copy()
+    with copy.edit() as edit:
+        edit.replace("rocker", report.replacements["rocker"])
+    assert copy.degrees_of_freedom == served.degrees_of_freedom
+    assert "rocker" in copy.articulations
+    assert check_plausibility(copy, observations, noise=NOISE, families=SOME).implausible == ()
+
+    # The hinge is where it was: it is a bar of another length that moves it otherwise.
+    observations = seen(linkage(coupler=1.2), frames, cranks, 12)
+    report = check_plausibility(served, observations, noise=NOISE, families=SOME)
+    assert [rating.tag for rating in report.implausible] == ["rocker"]
+    assert report["rocker"].proposal is None
+    assert "by itself it explains what is seen" in report["rocker"].reason
+
+
+def test_the_monitor_sees_ties_as_well() -> None:
+    served = gripper()
+    monitor = PlausibilityMonitor(served, ["right", "left"], noise=NOISE, families=SOME)
+    right = seen(gripper(), ["right", "left"], FINGERS, 13)
+    wrong = seen(gripper(-0.5), ["right", "left"], {"left": np.full(20, 0.3)}, 14)
+    for observations, noticed in ((right, ()), (wrong, ("right",))):
+        for k in range(len(observations["left"])):
+            monitor.update({name: poses[k] for name, poses in observations.items()})
+        assert tuple(monitor.stopped) == noticed
+    assert monitor.stopped["right"] == pytest.approx(40, abs=3)
+    assert monitor.report()["right"].stopped == monitor.stopped["right"]
+    # What is not seen now says nothing now.
+    monitor.update({"right": wrong["right"][0]})
+    # A limit that comes later is one of the articulation that it limits.
+    with served.edit() as edit:
+        edit.constrain("narrow", -np.inf, kv.position("left") ** 2, 0.01)
+    for k in range(10):
+        monitor.update({name: poses[k] for name, poses in wrong.items()})
+    assert "left" in monitor.stopped
+
+
+def test_stretched_linkages_alarm_nobody(served_linkage: kv.Model) -> None:
+    """Where the rocker turns back it hardly tells the crank: an alarm in a thousand is allowed, and 18 are looked at."""
+    model, alarms = served_linkage, 0
+    for seed in range(3, 9):
+        cranks = {"crank": np.random.default_rng(seed).uniform(-3.0, 3.0, 40)}
+        for left in told(model, seen(model, ["rocker", "crank", "coupler"], cranks, seed)).values():
+            watch = SequentialTest(1e-3)
+            for row in zip(left.normal, left.by_place, left.against, strict=True):
+                watch.add(*row)
+            alarms += watch.stopped is not None
+    assert alarms == 0

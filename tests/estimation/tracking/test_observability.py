@@ -1,0 +1,273 @@
+"""Where what is seen leaves directions open: redundant arms, mirror images, places without a slope."""
+
+from __future__ import annotations
+
+import pickle
+
+import numpy as np
+import pytest
+from scipy.optimize import least_squares
+from scipy.spatial.transform import Rotation
+from synthetic_observations import Eyes
+
+import kineverse as kv
+from kineverse.estimation import ObservedExpression, ObservedPose, ObservedPosition, Tracker
+
+AXES = [(0, 0, 1), (0, 1, 0), (0, 0, 1), (0, -1, 0), (0, 0, 1), (0, -1, 0), (0, 0, -1)]
+OFFSETS = [(0, 0, 0.3), (0, 0, 0), (0, 0, 0.3), (0.1, 0, 0), (-0.1, 0, 0.4), (0, 0, 0), (0.1, 0, 0)]
+BENT = dict(zip("abcdefg", (0.3, 0.5, 0.2, 1.5, 0.4, 1.4, 0.3), strict=True))
+
+
+def arm() -> kv.Model:
+    """An arm of seven joints, one more than its tip has ways to go."""
+    model = kv.Model()
+    with model.edit() as edit:
+        before = "world"
+        for name, axis, offset in zip(BENT, AXES, OFFSETS, strict=True):
+            origin = kv.translation(*offset)
+            edit.apply(kv.Revolute(name=name, parent=before, child=f"{name} end", axis=axis, origin=origin))
+            before = f"{name} end"
+        edit.add_frame("tip", parent=before, transform=kv.translation(0.1, 0, -0.1))
+    return model
+
+
+def tracked(model: kv.Model, eyes: Eyes, deviation: float, **options) -> Tracker:
+    """A tracker of the arm's tip."""
+    observed = [ObservedPose("tip", covariance=eyes.covariance)]
+    return Tracker(model, observed, start=BENT, uncertainty=dict.fromkeys(BENT, deviation), **options)
+
+
+def test_an_arm_seen_by_its_tip_knows_how_little_it_knows():
+    """The mean of squares varies by 6 % between runs like this one; that of many is .95."""
+    model, rng = arm(), np.random.default_rng(1)
+    eyes = Eyes(model, ["tip"], seed=1)
+    first = tracked(model, eyes, 0.2)
+    found = []
+    for _ in range(70):
+        truth = {name: value + 0.2 * rng.standard_normal() for name, value in BENT.items()}
+        tracker = first.copy()
+        for _ in range(6):
+            estimate = tracker.update(eyes(truth))
+        error = np.array([estimate.state[s] - truth[str(s)] for s in tracker.symbols])
+        found.append(error @ estimate.information @ error / len(error))
+    assert 0.9 < np.mean(found) < 1.1
+
+
+@pytest.mark.parametrize(("noise", "runs", "looks"), [(1e-4, 40, 10), (1e-2, 40, 10)])
+def test_an_arm_that_is_shaken_knows_how_little_it_knows(noise, runs, looks):
+    """The mean of squares varies by 9 %, and that of many is .95 to 1.05."""
+    model, rng = arm(), np.random.default_rng(2)
+    eyes = Eyes(model, ["tip"], seed=2)
+    first = tracked(model, eyes, 0.2, process_noise={f"{name}:velocity": noise for name in BENT})
+    found = []
+    for _ in range(runs):
+        truth = {name: value + 0.2 * rng.standard_normal() for name, value in BENT.items()}
+        tracker = first.copy()
+        for step in range(looks):
+            if step:
+                truth = {q: x + np.sqrt(noise * 0.1) * rng.standard_normal() for q, x in truth.items()}
+            estimate = tracker.update(eyes(truth), at=0.1 * step)
+        error = np.array([estimate.state[s] - truth[str(s)] for s in tracker.symbols])
+        found.append(error @ estimate.information @ error / len(error))
+    assert 0.8 < np.mean(found) < 1.2
+
+
+def test_what_is_linear_and_open_is_a_kalman_filter_in_time():
+    """Two slides of which the sum is seen."""
+    model = kv.Model()
+    with model.edit() as edit:
+        edit.apply(kv.Planar(name="p", parent="world", child="p"))
+    x, y = model.symbol("p/x"), model.symbol("p/y")
+    tracker = Tracker(
+        model,
+        [ObservedExpression("sum", x + y, 0.1**2)],
+        uncertainty={x: 3, y: 3},
+        process_noise={"p/x:velocity": 0.02, "p/y:velocity": 0.03},
+    )
+    h, mean, covariance, evidence = np.ones(2), np.zeros(2), 9 * np.eye(2), 0.0
+    for step, value in enumerate([1.0, 1.2, 0.7, 0.9]):
+        estimate = tracker.update({"sum": value}, at=2.0 * step)
+        covariance += np.diag([0.04, 0.06]) * (step > 0)
+        variance, error = h @ covariance @ h + 0.1**2, value - h @ mean
+        evidence -= (error**2 / variance + np.log(2 * np.pi * variance)) / 2
+        gain = covariance @ h / variance
+        mean, covariance = mean + gain * error, covariance - np.outer(gain, h @ covariance)
+        assert np.allclose([estimate.state[s] for s in (x, y)], mean, rtol=0, atol=1e-9)
+        assert np.allclose(estimate.covariance, covariance, rtol=1e-9)
+        assert tracker.log_evidence == pytest.approx(evidence)
+
+
+def test_a_tracker_with_open_directions_goes_to_another_process():
+    model = arm()
+    eyes = Eyes(model, ["tip"])
+    tracker = tracked(model, eyes, 0.2)
+    truth = {name: value + 0.1 for name, value in BENT.items()}
+    tracker.update(eyes(truth))
+    there, seen = pickle.loads(pickle.dumps(tracker)), eyes(truth)
+    here, again = tracker.update(seen), there.update(seen)
+    np.testing.assert_allclose(again.covariance, here.covariance, rtol=1e-6)
+
+
+def test_an_arm_is_told_as_well_where_observations_may_be_wrong():
+    model = arm()
+    eyes = Eyes(model, ["tip"])
+    one, other = (tracked(model, eyes, 0.2, outliers=wrong) for wrong in (False, True))
+    truth = {name: value + 0.1 for name, value in BENT.items()}
+    for _ in range(5):
+        seen = eyes(truth)
+        a, b = one.update(seen), other.update(seen)
+    assert np.allclose(a.covariance, b.covariance, rtol=0, atol=1e-3 * np.abs(a.covariance).max())
+    seen["tip"][:3, 3] += 0.5
+    assert other.update(seen).outliers == ("tip",)
+
+
+def test_what_stands_still_is_as_if_all_had_been_seen_at_once():
+    model = arm()
+    eyes = Eyes(model, ["tip"], 0.02, np.radians(2))
+    tracker = tracked(model, eyes, 0.3)
+    truth = {name: value + 0.3 for name, value in BENT.items()}
+    names = [str(s) for s in tracker.symbols]
+    readings = [eyes(truth)["tip"] for _ in range(8)]
+
+    def residuals(x):
+        pose = eyes.truth(dict(zip(names, x, strict=True)))[0]
+        errors = [(x - [BENT[name] for name in names]) / 0.3]
+        for seen in readings:
+            turned = Rotation.from_matrix(seen[:3, :3] @ pose[:3, :3].T).as_rotvec()
+            errors += [(seen[:3, 3] - pose[:3, 3]) / 0.02, turned / np.radians(2)]
+        return np.concatenate(errors)
+
+    for seen in readings:
+        estimate = tracker.update({"tip": seen})
+    best = least_squares(residuals, list(estimate.state.values()), xtol=1e-12, ftol=1e-12, gtol=1e-12)
+    # But for the mean of rotations, which is one of rotation vectors only nearly.
+    assert np.allclose(list(estimate.state.values()), best.x, rtol=0, atol=2e-4)
+    assert np.linalg.eigvalsh(tracker._modes.best.information)[0] == pytest.approx(0.3**-2, rel=1e-6)
+
+
+def test_what_is_linear_is_told_as_it_is_although_open():
+    model = kv.Model()
+    with model.edit() as edit:
+        edit.apply(kv.Planar(name="p", parent="world", child="p"))
+    x, y = model.symbol("p/x"), model.symbol("p/y")
+    tracker = Tracker(model, [ObservedExpression("sum", x + y, 0.1**2)], uncertainty={x: 3, y: 3})
+    for value in (1.0, 1.2, 0.9):
+        estimate = tracker.update({"sum": value})
+    information = np.eye(2) / 9 + 300 * np.ones((2, 2))
+    assert np.allclose(estimate.covariance, np.linalg.inv(information), rtol=1e-9)
+    spread = 0.1**2 * np.eye(3) + 18 * np.ones((3, 3))
+    seen = np.array([1.0, 1.2, 0.9])
+    density = -seen @ np.linalg.inv(spread) @ seen / 2 - np.linalg.slogdet(2 * np.pi * spread)[1] / 2
+    assert tracker.log_evidence == pytest.approx(density, rel=1e-9)
+
+
+@pytest.mark.parametrize("outliers", [False, True])
+@pytest.mark.parametrize("limit", [1.5, 3.0, None])
+def test_an_angle_begins_where_its_cosine_has_no_slope(outliers, limit):
+    model = kv.Model()
+    limits = {} if limit is None else {"lower": -limit, "upper": limit}
+    with model.edit() as edit:
+        edit.apply(kv.Revolute(name="q", parent="world", child="hand", axis=(0, 0, 1), **limits))
+    q = model.symbol("q")
+    tracker = Tracker(
+        model, [ObservedExpression("cosine", np.cos(q), 0.01**2)], start={"q": 0.0}, outliers=outliers
+    )
+    for _ in range(3):
+        estimate = tracker.update({"cosine": 0.5})
+    assert abs(estimate.state["q"]) == pytest.approx(np.pi / 3, abs=1e-3)
+    assert estimate.confidence[(q,)] == pytest.approx(0.5, abs=0.01)
+    assert estimate.deviation["q"] < 0.01
+
+
+def test_an_arm_that_is_stretched_out_bends():
+    model = kv.Model()
+    with model.edit() as edit:
+        edit.apply(kv.Revolute(name="a", parent="world", child="upper", axis=(0, 0, 1), lower=-1, upper=1))
+        origin = kv.translation(1, 0, 0)
+        edit.apply(
+            kv.Revolute(
+                name="b", parent="upper", child="lower", axis=(0, 0, 1), origin=origin, lower=-1, upper=1
+            )
+        )
+    tracker = Tracker(model, [ObservedPosition("lower", (1, 0, 0))])
+    for _ in range(3):
+        estimate = tracker.update({"lower": (1.9, 0, 0)})
+    bent = 2 * np.arccos(0.95)
+    assert abs(estimate.state["b"]) == pytest.approx(bent, abs=2e-3)
+    assert estimate.state["a"] == pytest.approx(-estimate.state["b"] / 2, abs=1e-3)
+
+
+def test_who_was_taken_for_its_mirror_image_is_found_when_more_is_seen():
+    model = kv.Model()
+    with model.edit() as edit:
+        edit.apply(kv.Planar(name="p", parent="world", child="p"))
+    x, y = model.symbol("p/x"), model.symbol("p/y")
+    masts = {"a": (0, 0), "b": (3, 0), "c": (0, 3)}
+    observed = [
+        ObservedExpression(n, np.sqrt((x - a) ** 2 + (y - b) ** 2), 0.01**2) for n, (a, b) in masts.items()
+    ]
+    tracker = Tracker(model, observed, start={x: 0.5, y: -3})
+    for name in "ababab":
+        a, b = masts[name]
+        estimate = tracker.update({name: np.hypot(1 - a, 2 - b)})
+    assert estimate.state[y] == pytest.approx(-2, abs=0.01)
+    estimate = tracker.update({"c": np.hypot(1, 1)})
+    assert estimate.state[y] == pytest.approx(2, abs=0.01)
+    assert estimate.nis < 9
+
+
+def test_what_was_seen_at_other_values_of_what_is_known_is_not_linearised_anew():
+    """A slide on another one that somebody moves: where the first ends is open only once it is known."""
+    model = kv.Model()
+    with model.edit() as edit:
+        edit.apply(kv.Planar(name="p", parent="world", child="p"))
+    x, y, pan = model.symbol("p/x"), model.symbol("p/y"), kv.position("pan")
+    seen = ObservedExpression("bearing", np.cos(pan) * x + np.sin(pan) * y, 0.01**2)
+    tracker = Tracker(model, [seen], known=[pan], uncertainty={x: 3, y: 3})
+    for angle in (0.0, 0.5, 1.5):
+        value = np.cos(angle) * 1.0 + np.sin(angle) * 2.0
+        estimate = tracker.update({"bearing": value}, given={pan: angle})
+    assert estimate.state[x] == pytest.approx(1, abs=1e-3)
+    assert estimate.state[y] == pytest.approx(2, abs=1e-3)
+    assert max(estimate.deviation[s] for s in (x, y)) < 0.02
+
+
+def hinged(**options) -> kv.Model:
+    model = kv.Model()
+    with model.edit() as edit:
+        edit.apply(kv.Revolute(name="q", parent="world", child="door", axis=(0, 0, 1), **options))
+    return model
+
+
+@pytest.mark.parametrize("truth", [0.3, 0.5, 0.9, 1.2])
+@pytest.mark.parametrize("kind", ["distance", "wave", "saw"])
+def test_what_explains_as_much_is_not_forgotten(kind, truth):
+    """Numbers that come twice leave two states, of which a pose chooses one."""
+    model = hinged(lower=0.0, upper=1.5)
+    q = model.symbol("q")
+    value = {"distance": np.abs(q - 0.7), "wave": np.cos(4 * q), "saw": kv.where(q < 0.75, q, q - 0.75)}[kind]
+    tracker = Tracker(model, ["door", ObservedExpression(kind, value, 0.01**2)])
+    for _ in range(5):
+        estimate = tracker.update({kind: float(value({"q": truth}))})
+    assert 0.45 < estimate.confidence[(q,)] < 0.6
+    estimate = tracker.update({"door": model.fk("door")({"q": truth})})
+    assert estimate.state["q"] == pytest.approx(truth, abs=1e-3)
+    assert estimate.confidence[(q,)] > 0.999
+
+
+def test_a_shut_door_is_told_open_by_what_noise_allows():
+    """The most probable state inside is max(0, z) for z about 0: .4 deviations open, a NEES of one half."""
+    model, rng = hinged(lower=0.0, upper=1.5), np.random.default_rng(0)
+    q = model.symbol("q")
+    first = Tracker(model, [ObservedExpression("dial", q, 0.02**2)])
+    errors, means = [], []
+    for _ in range(400):
+        tracker = first.copy()
+        for _ in range(10):
+            estimate = tracker.update({"dial": 0.02 * rng.standard_normal()})
+        errors.append(estimate.state["q"] / estimate.deviation["q"])
+        means.append(errors[-1] + estimate.mean[0] / estimate.deviation["q"])
+    assert np.mean(errors) == pytest.approx((2 * np.pi) ** -0.5, abs=0.1)
+    assert np.mean(np.square(errors)) == pytest.approx(0.5, abs=0.15)
+    assert np.mean(means) == pytest.approx(0, abs=0.15)
+    assert np.mean(np.square(means)) == pytest.approx(1, abs=0.25)

@@ -1,0 +1,55 @@
+"""What is no file, and what is no prefix."""
+
+from __future__ import annotations
+
+import os
+
+import pytest
+from urdf_texts import chain
+
+import kineverse as kv
+
+
+@pytest.fixture
+def file(tmp_path):
+    path = tmp_path / "r.urdf"
+    path.write_text(chain(3))
+    return path
+
+
+@pytest.mark.parametrize("prefix", [5, b"x", ["x"], ("x",), 0, False])
+def test_a_prefix_is_a_text(file, prefix):
+    for load in (kv.load, kv.Model().include):
+        with pytest.raises(kv.errors.FormatError, match="A prefix is a text"):
+            load(file, prefix=prefix)
+
+
+@pytest.mark.parametrize("prefix", ["a/", "/a", "a//b", "/", "a\n", "\ud800"])
+def test_a_prefix_is_a_path(file, tmp_path, prefix):
+    kv.load(file).save(tmp_path / "r.kv.json")
+    for source in (file, tmp_path / "r.kv.json", "shelf_door"):
+        with pytest.raises(kv.errors.FormatError, match="The prefix") as caught:
+            kv.load(source, prefix=prefix)
+        assert repr(prefix) in str(caught.value)
+
+
+def test_prefixes(file):
+    assert kv.load(file, prefix="").symbols == kv.load(file).symbols
+    assert all(s.path.startswith("a/b/") for s in kv.load(file, prefix="a/b").symbols)
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="there are no pipes here")
+def test_what_is_no_regular_file(tmp_path, monkeypatch):
+    os.mkfifo(tmp_path / "pipe.urdf")
+    (tmp_path / "circle.urdf").symlink_to(tmp_path / "circle.urdf")
+    (tmp_path / "nowhere.urdf").symlink_to(tmp_path / "missing.urdf")
+    (tmp_path / "zero.urdf").symlink_to("/dev/null")
+    monkeypatch.chdir(tmp_path)
+    for name in ("pipe.urdf", "circle.urdf", "nowhere.urdf", "zero.urdf"):
+        for path in (tmp_path / name, f"./{name}", name):
+            with pytest.raises(kv.errors.FormatError, match="is no regular file"):
+                kv.load(path)
+    with pytest.raises(kv.errors.UnknownNameError, match="There is no file"):
+        kv.load("./missing.urdf")
+    with pytest.raises(kv.errors.UnknownNameError, match="It is a folder"):
+        kv.load(tmp_path)

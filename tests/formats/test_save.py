@@ -1,0 +1,70 @@
+"""Files are written whole or not at all, by the ending of their name."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import pytest
+
+import kineverse as kv
+
+ENDINGS = (".kv.json", ".urdf", ".xml", ".mjcf")
+
+
+@pytest.fixture
+def model() -> kv.Model:
+    result = kv.Model()
+    with result.edit() as edit:
+        edit.apply(kv.Revolute(name="q", parent="world", child="q", lower=0, upper=1))
+    return result
+
+
+@pytest.mark.parametrize("ending", ENDINGS)
+def test_every_ending_is_read_again(ending: str, model: kv.Model, tmp_path: Path) -> None:
+    report = model.save(tmp_path / f"m{ending}")
+    assert report.path == tmp_path / f"m{ending}"
+    assert kv.load(report.path).limits("q") == (0, 1)
+    assert [p.name for p in tmp_path.iterdir()] == [f"m{ending}"]
+
+
+def test_other_endings_are_refused_with_those_there_are(model: kv.Model, tmp_path: Path) -> None:
+    with pytest.raises(kv.errors.FormatError) as info:
+        model.save(tmp_path / "m.usd")
+    assert all(ending in str(info.value) for ending in ENDINGS)
+
+
+@pytest.mark.parametrize("ending", ENDINGS)
+def test_a_refusal_leaves_the_file_that_was_there(ending: str, model: kv.Model, tmp_path: Path) -> None:
+    file = tmp_path / f"m{ending}"
+    file.write_text("before")
+    if ending == ".kv.json":
+        target: Path = tmp_path / "missing" / file.name
+    else:
+        with model.edit() as edit:
+            edit.add_frame("curve", parent="q", transform=kv.rotation_x(kv.position("q") ** 5))
+        target = file
+    with pytest.raises(kv.errors.FormatError):
+        model.save(target)
+    assert file.read_text() == "before"
+    assert [p.name for p in tmp_path.iterdir()] == [file.name]
+
+
+@pytest.mark.parametrize("ending", ENDINGS)
+def test_a_folder_that_is_not_there(ending: str, model: kv.Model, tmp_path: Path) -> None:
+    with pytest.raises(
+        kv.errors.FormatError, match=r"cannot be written: the folder .*nowhere does not exist"
+    ):
+        model.save(tmp_path / "nowhere" / f"m{ending}")
+
+
+@pytest.mark.skipif(os.geteuid() == 0, reason="root may write anywhere")
+def test_a_folder_that_may_not_be_written(model: kv.Model, tmp_path: Path) -> None:
+    tmp_path.chmod(0o500)
+    with pytest.raises(kv.errors.FormatError, match="cannot be written"):
+        model.save(tmp_path / "m.urdf")
+
+
+def test_what_is_no_path(model: kv.Model) -> None:
+    with pytest.raises(kv.errors.FormatError, match="is saved to the path of a file"):
+        model.save(3)  # type: ignore[arg-type]

@@ -1,0 +1,162 @@
+"""Included models: where they are found, where they stand, and where nothing is looked for."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from test_sdf_pose_graph import at, link, pose, sdf
+from urdf_texts import shared
+
+import kineverse as kv
+from kineverse.formats.sdf import read_sdf
+
+ARM = sdf(
+    pose("9 9 9 0 0 0"),
+    link("base"),
+    link("tip", pose("1 0 0 0 0 0")),
+    '<joint name="j" type="revolute"><parent>base</parent><child>tip</child><axis>'
+    '<xyz expressed_in="__model__">0 0 1</xyz></axis></joint>',
+)
+MANIFEST = '<model><sdf version="1.5">old.sdf</sdf><sdf version="1.10">arm.sdf</sdf><sdf version="9.9">n</sdf></model>'
+
+
+def include(uri: str, inside: str = "", attributes: str = "") -> str:
+    return f"<include {attributes}><uri>{uri}</uri>{inside}</include>"
+
+
+@pytest.fixture(autouse=True)
+def models(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Return a folder with a model on the search path."""
+    folder = tmp_path / "models" / "arm"
+    folder.mkdir(parents=True)
+    (folder / "model.config").write_text(MANIFEST)
+    (folder / "arm.sdf").write_text(ARM)
+    for variable in ("IGN_GAZEBO_RESOURCE_PATH", "GAZEBO_MODEL_PATH", "SDF_PATH"):
+        monkeypatch.delenv(variable, raising=False)
+    monkeypatch.setenv("GZ_SIM_RESOURCE_PATH", str(folder.parent))
+    return folder.parent
+
+
+def file(folder: Path, text: str) -> Path:
+    place = folder / "here"
+    place.mkdir(exist_ok=True)
+    path = place / "x.sdf"
+    path.write_text(text)
+    return path
+
+
+@pytest.mark.parametrize("uri", ["model://arm", "arm", "model://arm/arm.sdf", "package://arm"])
+def test_include(tmp_path, uri):
+    inside = "<name>left</name>" + pose("0 2 0 0 0 0", 'relative_to="f"')
+    text = sdf(link("l"), '<frame name="f">' + pose("1 0 0 0 0 0") + "</frame>", include(uri, inside))
+    model = kv.load(file(tmp_path, text))
+    assert set(model.frames) == {"l", "f", "left", "left/base", "left/tip"}
+    scene = read_sdf(file(tmp_path, text))
+    assert {known.name: known.pose.matrix[:3, 3].tolist() for known in scene.links} == {
+        "l": [0, 0, 0],
+        "left/base": [1, 2, 0],
+        "left/tip": [2, 2, 0],
+    }
+
+
+def test_the_pose_of_the_file_counts_where_the_include_has_none(tmp_path):
+    (base, _) = read_sdf(file(tmp_path, f'<sdf version="1.10">{include("arm")}</sdf>')).links
+    assert base.pose.matrix[:3, 3].tolist() == [9, 9, 9]
+
+
+def test_static_and_placement_frame(tmp_path):
+    inside = pose("0 0 0 0 0 0") + "<placement_frame>tip</placement_frame><static>true</static>"
+    world = f'<sdf version="1.10"><world name="w">{include("arm", inside)}</world></sdf>'
+    model = kv.load(file(tmp_path, world), prefix="p")
+    assert model.degrees_of_freedom == ()
+    assert at(model, "p/m/base")[:3, 3].tolist() == [-1, 0, 0]
+
+
+def test_merge(tmp_path):
+    inside = pose("0 0 0 0 0 1.5707963267948966") + "<name>n</name>"
+    text = sdf(link("l"), include("arm", inside, 'merge="true"')).replace(
+        "</model>", '<joint name="k" type="fixed"><parent>l</parent><child>base</child></joint></model>'
+    )
+    model = kv.load(file(tmp_path, text))
+    assert set(model.frames) == {"l", "base", "tip"}
+    np.testing.assert_allclose(at(model, "tip", j=0.0)[:3, 3], [0, 1, 0], atol=1e-15)
+
+
+def test_a_changed_file_is_read_again(tmp_path, models):
+    path = file(tmp_path, sdf(link("l"), include("arm")))
+    assert len(kv.load(path).frames) == 4
+    (models / "arm" / "arm.sdf").write_text(sdf(link("only")))
+    assert set(kv.load(path).frames) == {"l", "m", "m/only"}
+
+
+@pytest.mark.parametrize(
+    ("uri", "reason"),
+    [
+        ("../models/arm", "leads out"),
+        ("model://../arm", "leads out"),
+        ("model://arm/../../here", "leads out"),
+        ("model://arm/%2e%2e/x.sdf", "leads out"),
+        ("/etc/hostname", "leads out of the root"),
+        ("file:///etc/passwd", "leads out of the root"),
+        ("https://fuel.gazebosim.org/1.0/x", "is not fetched"),
+        ("model://nothing", "is not there"),
+        ("", "has no <uri>"),
+    ],
+)
+def test_what_is_not_looked_for(tmp_path, uri, reason):
+    with pytest.raises(kv.errors.FormatError, match=reason) as info:
+        kv.load(file(tmp_path, sdf(link("l"), include(uri))))
+    assert str(info.value).startswith("x.sdf, line 1, <include>: ")
+
+
+def test_absolute_paths_stay_inside(tmp_path):
+    outside = tmp_path / "outside.sdf"
+    outside.write_text(ARM)
+    for uri in (str(outside), f"file://{outside}"):
+        with pytest.raises(kv.errors.FormatError, match="leads out of the root"):
+            kv.load(file(tmp_path, sdf(link("l"), include(uri))))
+    (tmp_path / "here" / "link.sdf").symlink_to(outside)
+    with pytest.raises(kv.errors.FormatError, match="leads out of the root"):
+        kv.load(file(tmp_path, sdf(link("l"), include("link.sdf"))))
+
+
+def test_circles(tmp_path, models):
+    (models / "arm" / "arm.sdf").write_text(sdf(link("l"), include("model://arm")))
+    with pytest.raises(kv.errors.FormatError, match="includes itself"):
+        kv.load(file(tmp_path, sdf(link("l"), include("model://arm"))))
+    with pytest.raises(kv.errors.FormatError, match="includes itself"):
+        kv.load(file(tmp_path, sdf(link("l"), include("x.sdf", "<name>again</name>"))))
+
+
+def test_errors_name_the_included_file(tmp_path, models):
+    (models / "arm" / "arm.sdf").write_text(sdf(link("l"), '<frame name="f" attached_to="nothing"/>'))
+    with pytest.raises(kv.errors.FormatError) as info:
+        kv.load(file(tmp_path, sdf(link("l"), include("arm"))))
+    assert str(info.value).startswith("arm.sdf, line 1, <frame name=")
+
+
+FRAMES = f"""<sdf version="1.8"><model name="test_model_with_frames">
+<frame name="F1">{pose("0 0 0 1.570796 0 0")}</frame>
+<frame name="F2">{pose("0 0 0 0 0.785398 0", 'relative_to="F1"')}</frame>
+{link("L1", pose("", 'relative_to="F1"'))}{link("L2", pose("1 0 0 0 0 0", 'relative_to="F1"'))}
+{link("L3", pose("0 1 0 0 0 0", 'relative_to="L2"'))}{link("L4", pose("0 0 1 0 0 0"))}
+<joint name="J2" type="fixed"><pose>0 0 1 0 0 0</pose><parent>L2</parent><child>L3</child></joint></model></sdf>"""
+
+
+def test_placement_frames_of_sdformat(models, monkeypatch):
+    path = shared("sdf_joint_types", "sdformat_test", "placement_frame.sdf")
+    folder = models / "test_model_with_frames"
+    folder.mkdir()
+    (folder / "model.sdf").write_text(FRAMES)
+    scene = read_sdf(path)
+    places = {thing.name: thing.pose.matrix for thing in scene.links}
+    expected = np.eye(4)
+    c, s = np.cos(1.570796326794895), np.sin(1.570796326794895)
+    expected[1:3, 1:3] = [[c, -s], [s, c]]
+    expected[1, 3] = 10
+    for name in ("placement_frame_using_link", "parent_model_include/placement_frame_using_link"):
+        np.testing.assert_allclose(places[f"{name}/L4"], expected, atol=1e-14)
+    for name in ("include_with_placement_frame_and_pose_relative_to", "model_with_link_placement_frame"):
+        np.testing.assert_allclose(places[f"{name}/L4"], expected, atol=1e-14)

@@ -1,0 +1,56 @@
+"""How far solids reach, and the search for the widest gap, against what is known without it."""
+
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+import pytest
+from convex_shapes import KINDS, gap, random_pose, random_shape
+
+from kineverse.geometry.narrowphase import Narrowphase
+from kineverse.geometry.support import directional_gaps, find_widest_gap, smoothed_support
+
+PAIRS = list(itertools.combinations_with_replacement(KINDS, 2))
+
+
+def two(one, other, seed, spread):
+    rng = np.random.default_rng([seed, KINDS.index(one), KINDS.index(other)])
+    shapes = random_shape(one, rng), random_shape(other, rng)
+    poses = np.stack([random_pose(rng, spread), random_pose(rng, spread)])
+    ways = rng.normal(size=(20, 3))
+    ways /= np.linalg.norm(ways, axis=1, keepdims=True)
+    return shapes, poses, ways
+
+
+def placed(shapes, poses):
+    return [(shape.solid, pose[:, :3], pose[:, 3]) for shape, pose in zip(shapes, poses, strict=True)]
+
+
+@pytest.mark.parametrize(("one", "other"), PAIRS)
+def test_gaps_are_those_of_the_shapes(one, other):
+    shapes, poses, ways = two(one, other, 0, 0.3)
+    found = directional_gaps(*placed(shapes, poses), ways)
+    np.testing.assert_allclose(found, gap(*shapes, poses, ways), rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_the_furthest_point_is_on_the_solid_and_on_its_plane(kind):
+    (shape, _), poses, ways = two(kind, "box", 1, 0.3)
+    solid = placed([shape], poses[:1])[0]
+    ways = np.concatenate([ways, poses[0, :, :3].T, -poses[0, :, :3].T])  # along the axes there are faces
+    for way in ways:
+        point = smoothed_support(solid, way)
+        assert way @ point == pytest.approx(shape.support(way, poses[0]), abs=1e-12)
+        assert (ways @ point <= shape.support(ways, poses[0]) + 1e-6).all()
+
+
+@pytest.mark.parametrize(("one", "other"), PAIRS)
+def test_the_widest_gap_is_the_distance(one, other):
+    """In each other there may be several summits, of which the highest may be missed."""
+    for seed, spread in itertools.product(range(3), (0.05, 0.5)):
+        shapes, poses, ways = two(one, other, seed, spread)
+        found, normal = find_widest_gap(*placed(shapes, poses), ways[:1])
+        distance = Narrowphase([shape.solid for shape in shapes], poses).distance(0, 1)
+        assert gap(*shapes, poses, normal) == pytest.approx(found, abs=1e-12)
+        assert distance - (1e-5 if distance > 0 else 5e-3) < found < distance + 5e-6

@@ -1,0 +1,98 @@
+"""What is said where an extra is missing: a line that works for how the package is installed."""
+
+from __future__ import annotations
+
+import shutil
+import subprocess
+import sys
+import tomllib
+from importlib import metadata
+from pathlib import Path
+
+import pytest
+
+from kineverse import _extras
+from kineverse._extras import DISTRIBUTION, install_command, requirements
+
+ROOT = Path(__file__).parents[1]
+EXTRAS = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"][
+    "optional-dependencies"
+]
+HERE = Path(sys.executable)
+
+
+def pip() -> str:
+    return f"{HERE.with_name('pip')}" if HERE.with_name("pip").is_file() else f"{HERE} -m pip"
+
+
+def test_a_checkout_is_installed_again_with_the_extra(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert install_command("figures") == f"{pip()} install -e '{ROOT}[figures]'"
+
+
+def test_in_the_checkout_the_line_is_short(tmp_path, monkeypatch):
+    root = tmp_path / "clone"
+    (root / "src" / "kineverse").mkdir(parents=True)
+    (root / ".venv" / "bin").mkdir(parents=True)
+    for file in ("pyproject.toml", "src/kineverse/_extras.py", ".venv/bin/pip"):
+        (root / file).touch()
+    monkeypatch.chdir(root)
+    monkeypatch.setattr(_extras, "__file__", str(root / "src" / "kineverse" / "_extras.py"))
+    monkeypatch.setattr(sys, "executable", str(root / ".venv" / "bin" / "python"))
+    assert install_command("figures") == ".venv/bin/pip install -e '.[figures]'"
+    (root / ".venv" / "bin" / "pip").unlink()
+    assert install_command("view") == ".venv/bin/python -m pip install -e '.[view]'"
+
+
+def test_beside_an_installed_copy_goes_what_the_extra_consists_of(tmp_path):
+    place = tmp_path / "site-packages"
+    (place / "kineverse").mkdir(parents=True)
+    (place / "kineverse" / "__init__.py").touch()
+    shutil.copy(_extras.__file__, place / "kineverse")
+    about = place / "kineverse_articulation-0.1.0.dist-info"
+    about.mkdir()
+    text = metadata.distribution(DISTRIBUTION).read_text("METADATA")
+    assert text is not None
+    (about / "METADATA").write_text(text, encoding="utf-8")
+    program = (
+        f"import sys; sys.path.insert(0, {str(place)!r})\n"
+        "from kineverse._extras import install_command\n"
+        "print(install_command('figures')); print(install_command('bench'))"
+    )
+    said = subprocess.run(
+        [sys.executable, "-I", "-c", program], capture_output=True, text=True, check=True, cwd=tmp_path
+    ).stdout.splitlines()
+    assert said[0] == f"{pip()} install '{EXTRAS['figures'][0]}'"
+    assert f" '{EXTRAS['bench'][0]}' " in said[1]
+    assert '; (python_version < "3.12" and' in said[1]
+    assert "extra" not in said[1]
+
+
+def test_a_folder_on_the_path_is_told_to_look_for_a_checkout(tmp_path, monkeypatch):
+    monkeypatch.setattr(_extras, "__file__", str(tmp_path / "a" / "kineverse" / "_extras.py"))
+    monkeypatch.setattr(_extras, "DISTRIBUTION", "no-such-distribution")
+    assert install_command("view").endswith("install -e '.[view]' in a checkout")
+
+
+@pytest.mark.parametrize("extra", [name for name in EXTRAS if name != "all"])
+def test_the_metadata_say_what_each_extra_consists_of(extra):
+    declared = metadata.requires(DISTRIBUTION)
+    found = requirements(extra, declared)
+    assert [line.partition(";")[0].strip() for line in found] == [
+        line.partition(";")[0].strip() for line in EXTRAS[extra]
+    ]
+
+
+def test_every_place_that_misses_an_extra_says_the_same_line():
+    """No message names the distribution to pip, and each names an extra that there is."""
+    named = set()
+    for file in sorted((ROOT / "src").rglob("*.py")):
+        text = file.read_text(encoding="utf-8")
+        assert f"{DISTRIBUTION}[" not in text, file
+        named |= {extra for extra in EXTRAS if f'install_command("{extra}")' in text}
+        named |= {extra for extra in EXTRAS if f"install_command('{extra}')" in text}
+    assert named >= {"figures", "geometry", "decomposition", "mjcf", "view", "exchange", "bench"}
+    for page in [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]:
+        text = page.read_text(encoding="utf-8")
+        assert f"{DISTRIBUTION}[" not in text, page
+        assert "pip install '." not in text.replace("pip install -e '.", ""), page

@@ -1,0 +1,159 @@
+"""The scene that lives as a person meets it: the page, its thread, and a real Chromium that opens it."""
+
+from __future__ import annotations
+
+import socket
+import threading
+
+import numpy as np
+import pytest
+from living_kitchen.simulation import Life
+
+import kineverse as kv
+
+pytest.importorskip("viser", reason="the page needs the extra 'view'")
+
+from living_kitchen.page import LivingPage
+
+PATIENCE = 60_000
+"""Longest wait for anything on the page [ms]: software rendering on a busy machine is slow."""
+
+ARGUMENTS = ["--no-sandbox", "--headless=new", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
+
+
+def threads():
+    return {thread.name for thread in threading.enumerate()}
+
+
+def test_a_page_waits_for_who_looks_and_leaves_nothing_behind():
+    with LivingPage(port=0) as page:
+        assert "kineverse-living" in threads()
+        assert page.address.startswith("http://127.0.0.1:")
+        page.stop()
+        assert page.life.time == 0.0
+        with pytest.raises(kv.KineverseError, match="There is no page to wait for"):
+            page.wait()
+    page.stop()
+    assert "kineverse-living" not in threads()
+    port = int(page.address.rpartition(":")[2])
+    with socket.socket() as probe:
+        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        probe.bind(("127.0.0.1", port))  # and the port is free again
+
+
+def test_a_port_in_use_is_an_error_and_no_thread():
+    with socket.socket() as other:
+        other.bind(("127.0.0.1", 0))
+        other.listen()
+        with pytest.raises(kv.errors.InvalidValueError, match=r"port \d+ is taken"):
+            LivingPage(port=other.getsockname()[1])
+    assert "kineverse-living" not in threads()
+
+
+def test_a_moment_that_fails_is_logged_and_life_goes_on(monkeypatch, caplog):
+    done = threading.Event()
+    moments = iter([True, False])
+
+    def step(self, dt):
+        if next(moments, False):
+            raise RuntimeError("stumbled")
+        done.set()
+
+    with LivingPage(port=0) as page:
+        monkeypatch.setattr(Life, "step", step)
+        monkeypatch.setattr(page._server, "get_clients", lambda: {0: None})
+        assert done.wait(30.0)
+    assert any("could not go on" in record.message for record in caplog.records)
+
+
+@pytest.fixture(scope="module")
+def browser(chromium):
+    playwright = pytest.importorskip("playwright.sync_api", reason="driving a browser needs playwright")
+    with playwright.sync_playwright() as driver:
+        browser = driver.chromium.launch(executable_path=chromium, args=ARGUMENTS, timeout=PATIENCE)
+        yield browser
+        browser.close()
+
+
+def opened(browser, page, errors):
+    """Return a tab that shows a page; what goes wrong on it is noted."""
+    tab = browser.new_page(viewport={"width": 640, "height": 300})
+    tab.set_default_timeout(PATIENCE)
+    tab.on("pageerror", lambda error: errors.append(str(error)))
+    tab.on("console", lambda message: errors.append(message.text) if message.type == "error" else None)
+    tab.goto(page.address)
+    tab.get_by_text("the track is off by").wait_for()
+    return tab
+
+
+def until(tab, condition):
+    """Wait for a condition, frame by frame of the browser."""
+    for _ in range(1500):
+        if condition():
+            return
+        tab.evaluate("() => new Promise(done => requestAnimationFrame(() => requestAnimationFrame(done)))")
+    pytest.fail("waited in vain for the page")
+
+
+def shot(tab):
+    imaging = pytest.importorskip("PIL.Image")
+    import io
+
+    data = tab.screenshot(clip={"x": 0, "y": 0, "width": 250, "height": 300})
+    return np.asarray(imaging.open(io.BytesIO(data)).convert("RGB")).astype(int)
+
+
+@pytest.mark.browser
+def test_the_scene_lives_in_the_browser_and_what_is_learned_is_said(browser, monkeypatch):
+    # However slowly the page is drawn, the stranger waits to be learned.
+    monkeypatch.setattr("living_kitchen.simulation.STAYS", 3600.0)
+    life, errors = Life(), []
+    while life.time < 5.5:
+        life.step(1.0 / 12.0)
+    assert life.learner.found.is_ambiguous
+    with LivingPage(life, port=0) as page:
+        # It starts in a pause: a page that takes long to be drawn would miss the beginning.
+        page._panel._paused.value = True
+        tab = opened(browser, page, errors)
+        tab.get_by_text("cannot tell").wait_for()
+        before = shot(tab)
+        assert np.ptp(before) > 150
+        assert life.time < 6.0
+        tab.get_by_label("pause").uncheck()
+        tab.get_by_text("revolute, 9").wait_for()
+        tab.get_by_text("the tracked part is off by").wait_for()
+        until(tab, lambda: (np.abs(shot(tab) - before).max(axis=2) > 40).sum() > 150)
+        # Switches change what is seen.
+        tab.get_by_label("50% hidden").check()
+        until(tab, lambda: life.seen.there.sum() < 20)
+        tab.get_by_role("button", name="Forget, and learn again").click()
+        until(tab, lambda: len(life.learner.thoughts) < 3)
+        # Who leaves in the midst and comes back misses nothing.
+        tab.close()
+        again = opened(browser, page, errors)
+        time = life.time
+        until(again, lambda: life.time > time)
+        again.close()
+    assert errors == []
+    assert "kineverse-living" not in threads()
+
+
+@pytest.mark.browser
+def test_two_look_at_one_life_and_one_of_them_leaves(browser):
+    errors = []
+    with LivingPage(port=0) as page:
+        tab = opened(browser, page, errors)
+        came, left = threading.Event(), threading.Event()
+        page._server.on_client_connect(lambda _: came.set())
+        page._server.on_client_disconnect(lambda _: left.set())
+        # Two that are drawn at once by software may take minutes: the second has only to be there.
+        other = browser.new_page(viewport={"width": 640, "height": 300})
+        other.goto(page.address, wait_until="commit", timeout=PATIENCE)
+        assert came.wait(60.0)
+        tab.close()
+        assert left.wait(60.0)
+        time = page.life.time
+        other.get_by_text("the track is off by").wait_for(timeout=PATIENCE)
+        until(other, lambda: page.life.time > time)
+        other.close()
+    assert errors == []
