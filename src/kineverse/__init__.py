@@ -3,8 +3,8 @@
 ``import kineverse as kv`` gives what most programs need. The rest is in the packages below it:
 :mod:`kineverse.articulations` (joints, mechanisms, locks), :mod:`kineverse.model` (operations, edits, data),
 :mod:`kineverse.errors`, :mod:`kineverse.logic`, :mod:`kineverse.spatial`, :mod:`kineverse.loops` and
-:mod:`kineverse.formats`. :mod:`kineverse.geometry`, :mod:`kineverse.estimation` and :mod:`kineverse.reasoning`
-are imported on first use, and so is the viewer by :func:`show`.
+:mod:`kineverse.formats`. :mod:`kineverse.geometry`, :mod:`kineverse.estimation`, :mod:`kineverse.reasoning`
+and the viewer (:func:`show`) are imported on first use.
 """
 
 from typing import TYPE_CHECKING
@@ -94,8 +94,6 @@ __all__ = [
     "where",
 ]
 
-_PACKAGES = (expressions, spatial, logic, errors, loops, formats, model, articulations)
-
 
 def __getattr__(name: str) -> object:
     import importlib
@@ -106,7 +104,10 @@ def __getattr__(name: str) -> object:
         return importlib.import_module("kineverse.view.show").show
     from ._synonyms import MODULE_SYNONYMS, unknown_attribute_error
 
-    below = {n: f"kv.{p.__name__[10:]}.{n}" for p in _PACKAGES for n in vars(p) if n[0] != "_"}
+    below: dict[str, str] = {}
+    for package in (expressions, spatial, logic, errors, loops, formats, model, articulations):
+        public = (*vars(package), *getattr(package, "__all__", ()))
+        below |= {n: f"kv.{package.__name__.removeprefix('kineverse.')}.{n}" for n in public if n[0] != "_"}
     raise unknown_attribute_error("The package kineverse", name, __dir__(), below | dict(MODULE_SYNONYMS))
 
 

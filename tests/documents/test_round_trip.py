@@ -73,7 +73,7 @@ def test_the_text_is_canonical(model, tmp_path):
 def test_the_same_text_in_another_process():
     script = (
         "import sys; sys.path.insert(0, sys.argv[1]); from document_models import rich_model;"
-        "from kineverse.formats.document import document_of; sys.stdout.buffer.write(document_of(rich_model()).encode())"
+        "from kineverse.formats.document import to_json; sys.stdout.buffer.write(to_json(rich_model()).encode())"
     )
     command = [sys.executable, "-c", script, str(Path(__file__).parent)]
     environment = {**os.environ, "PYTHONHASHSEED": "7"}

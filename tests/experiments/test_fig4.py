@@ -117,7 +117,7 @@ def test_the_bound_is_that_of_the_models_own_jacobians(kitchen):
 
 def test_the_published_filter_is_within_5_percent_of_the_authors_code():
     """On their kitchen, by their noise, mean of four seeds."""
-    from formats.robots import shared
+    from formats.urdf_texts import shared
 
     scene = make_observed_model(kv.load(shared("iai_kitchen", "iai_kitchen", "urdf_obj", "IAI_kitchen.urdf")))
     for noise, reported in zip(LEVELS, REPORTED_MEAN, strict=True):

@@ -94,18 +94,18 @@ CASES = {
         lambda x: homogeneous(Rotation.from_rotvec(x[:3] / np.linalg.norm(x[:3]) * x[3])),
     ),
     "rpy": (3, lambda x: spatial.rpy(*x), lambda x: homogeneous(Rotation.from_euler("xyz", x))),
-    "rpy_of": (6, lambda x: spatial.to_rpy(pose(x)), lambda x: turned(x).as_euler("xyz")),
+    "to_rpy": (6, lambda x: spatial.to_rpy(pose(x)), lambda x: turned(x).as_euler("xyz")),
     "quaternion": (4, lambda x: spatial.quaternion(*x), lambda x: homogeneous(Rotation.from_quat(x))),
-    "quaternion_of": (
+    "to_quaternion": (
         6,
         lambda x: spatial.to_quaternion(pose(x)),
         lambda x: turned(x).as_quat(canonical=True),
     ),
-    "rotation_vector": (6, lambda x: spatial.log_so3(pose(x)), lambda x: turned(x).as_rotvec()),
+    "log_so3": (6, lambda x: spatial.log_so3(pose(x)), lambda x: turned(x).as_rotvec()),
     "rotation_angle": (6, lambda x: spatial.rotation_angle(pose(x)), lambda x: turned(x).magnitude()),
-    "exponential": (3, spatial.exp_so3, lambda x: homogeneous(expm(cross_matrix(x)))),
-    "twist_exponential": (6, spatial.exp_se3, lambda x: expm(twist_matrix(x))),
-    "twist_logarithm": (6, lambda x: spatial.log_se3(pose(x)), lambda x: logarithm(pose_numbers(x))),
+    "exp_so3": (3, spatial.exp_so3, lambda x: homogeneous(expm(cross_matrix(x)))),
+    "exp_se3": (6, spatial.exp_se3, lambda x: expm(twist_matrix(x))),
+    "log_se3": (6, lambda x: spatial.log_se3(pose(x)), lambda x: logarithm(pose_numbers(x))),
     "inverse": (6, lambda x: spatial.inverse(pose(x)), lambda x: np.linalg.inv(pose_numbers(x))),
     "transform": (6, lambda x: spatial.transform(spatial.exp_so3(x[:3])[:3, :3], x[3:]), pose_numbers),
     "rotation_of": (6, lambda x: spatial.rotation_of(pose(x)), lambda x: pose_numbers(x)[:3, :3]),
@@ -114,8 +114,8 @@ CASES = {
     "vector": (3, lambda x: spatial.vector(*x), lambda x: np.append(x, 0)),
     "skew": (3, spatial.skew, lambda x: np.array([np.cross(x, e) for e in np.eye(3)]).T),
     "adjoint": (6, lambda x: spatial.adjoint(pose(x)), lambda x: adjoint_numbers(pose_numbers(x))),
-    "transform_like": (6, lambda x: spatial.as_transform(pose(x)), pose_numbers),
-    "unit": (3, spatial.unit_vector, lambda x: x / np.linalg.norm(x)),
+    "as_transform": (6, lambda x: spatial.as_transform(pose(x)), pose_numbers),
+    "unit_vector": (3, spatial.unit_vector, lambda x: x / np.linalg.norm(x)),
 }
 ALL = pytest.mark.parametrize("name", CASES)
 
@@ -145,7 +145,12 @@ def test_every_public_function_is_here():
         for name, f in vars(spatial).items()
         if inspect.isfunction(f) and f.__module__ == spatial.__name__ and not name.startswith("_")
     }
-    assert public == {name.split(" ")[0] for name in CASES} | {"normalised", "snapped"}
+    assert public == {name.split(" ")[0] for name in CASES} | {
+        "normalize",
+        "round_exact",
+        "rotation_about",
+        "translation_along",
+    }
 
 
 @ALL

@@ -65,7 +65,7 @@ def trees(draw: st.DrawFn, kinds: tuple[str, ...] = KINDS) -> kv.Model:
             elif kind == "planar":
                 edit.apply(kv.Planar(**common, **draw(st.sampled_from([{}, limits]))))
             elif kind in ("continuous", "universal", "floating", "ball"):
-                edit.apply(getattr(kv, kind.capitalize())(**common))
+                edit.apply(getattr(kv.articulations, kind.capitalize())(**common))
             else:
                 edit.apply(kv.Fixed(**common))
             parents.append(name)

@@ -10,7 +10,7 @@ import pytest
 from scene_models import arm_among_boxes, body, brute_force, by_names, random_state
 
 import kineverse as kv
-from kineverse.geometry import Rule, Scene, bindings, broadphase, collision_world, objects
+from kineverse.geometry import Rule, Scene, bindings, broadphase, collision_world, distance_queries, objects
 from kineverse.model.body import Body, Box, Shape, Sphere
 from kineverse.model.kinematics import ancestors
 
@@ -29,8 +29,8 @@ def either_sweep(request, monkeypatch):
     else:
         library.place, library.near = broadphase.place_objects, broadphase.find_near_pairs
         library.prepare = lambda wait=False: False
-    for module in ("mirror", "queries"):
-        monkeypatch.setattr(f"kineverse.geometry.{module}.sweep_library", library)
+    for module in (collision_world, distance_queries):
+        monkeypatch.setattr(module, "collision_library", library)
 
 
 def test_what_is_near_is_what_brute_force_finds(model, either_sweep):
@@ -198,7 +198,9 @@ def counted(monkeypatch):
 
     monkeypatch.setattr(objects, "CollisionObject", counting("pieces", objects.CollisionObject))
     monkeypatch.setattr(objects, "solid_from_geometry", counting("solids", objects.solid_from_geometry))
-    monkeypatch.setattr(collision_world, "compile", counting("compiled", collision_world.compile_expressions))
+    monkeypatch.setattr(
+        collision_world, "compile_expressions", counting("compiled", collision_world.compile_expressions)
+    )
     return counts
 
 

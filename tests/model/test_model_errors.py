@@ -120,7 +120,7 @@ MESSAGES: dict[str, tuple[Callable[[kv.Model], Any], str]] = {
     ),
     "a name of another package": (
         lambda _: kv.reasoning.interlock_,
-        "The package kineverse.reasoning has no 'interlock_'. Did you mean 'Interlock' or 'interlocks' or 'Interval'?",
+        "The package kineverse.reasoning has no 'interlock_'. Did you mean 'Interlock' or 'interlocks' or 'IntervalBox'?",
     ),
     "a name of a package that is an extra": (
         lambda _: kv.geometry.Scen,

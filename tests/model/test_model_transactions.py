@@ -353,7 +353,7 @@ def test_a_model_reaches_another_process(tmp_path: Path) -> None:
     program = f"""
 import pickle, sys
 sys.path.insert(0, {str(Path(__file__).parent)!r})
-from model_steps import Put
+from history_operations import Put
 with open({str(sent)!r}, "rb") as file:
     model, snapshot = pickle.load(file)
 assert model.snapshot() == snapshot

@@ -84,7 +84,7 @@ def test_it_is_short_and_shares_nothing_with_what_it_checks() -> None:
     text = Path(reasoning.certify.__file__).read_text(encoding="utf-8")
     assert len([line for line in text.splitlines() if line.strip()]) < 100
     own = {line.split()[1] for line in text.splitlines() if line.startswith("from .")}
-    assert own == {".boxes", ".evaluating", ".interlock"}
+    assert own == {".boxes", ".point_evaluation", ".interlock"}
 
 
 def test_a_claim_is_looked_at_where_its_constraint_is_unknown() -> None:

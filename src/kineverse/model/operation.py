@@ -145,7 +145,7 @@ _TYPES = {BODIES: Body, ARTICULATIONS: Articulation}
 
 def _check_value(kind: str, name: str, value: object) -> None:
     if kind in _TYPES and not isinstance(value, _TYPES[kind]):
-        raise InvalidValueError(f"{kind}/{name} is a kv.{_TYPES[kind].__name__}, not {value!r}.")
+        raise InvalidValueError(f"{kind}/{name} is a kv.model.{_TYPES[kind].__name__}, not {value!r}.")
     if isinstance(value, Articulation):
         check_home(name, value)
     try:

@@ -1,6 +1,6 @@
 """Entry point of the CoACD process, which may crash, hang, or exhaust its memory.
 
-    python -P program.py IN OUT ERROR MEMORY
+    python -P _coacd_main.py IN OUT ERROR MEMORY
 
 IN and OUT are archives of numpy; ERROR is in metres, MEMORY in bytes. It ends when its standard input does,
 so that it does not outlive whoever started it.

@@ -21,7 +21,7 @@ from kineverse.geometry.mesh_files import Floats
 
 from .mesh_cleanup import CleanMesh
 
-PROGRAM = Path(__file__).with_name("program.py")
+PROGRAM = Path(__file__).with_name("_coacd_main.py")
 _POLL = 0.05
 _MAX_MESSAGE = 300
 # What Python, C++ and the loader of libraries say when there is no memory.

@@ -1,0 +1,126 @@
+"""The vocabulary of the sources: one name for one thing, and docstrings in the field's terms."""
+
+from __future__ import annotations
+
+import ast
+import re
+from collections import defaultdict
+from collections.abc import Iterator
+from functools import cache
+from pathlib import Path
+
+import pytest
+
+import kineverse as kv
+
+SRC = Path(__file__).parents[1] / "src"
+CLAUSE = re.compile(
+    r"(What|Who|Whose|Whom|Whoever|Whatever|Whether|Where|Wherever|How|However|Which|When|Why|That|If)\b"
+)
+TWINS = {"lie", "spatial"}
+"""Modules that have the same names on purpose: numbers and expressions."""
+
+INTERFACES = {
+    "cli": {"add_arguments", "main", "run"},
+    "bench": {"measure", "main"},
+    "experiments": {"run"},
+}
+"""Functions that every command, benchmark or experiment has, since they are called by that name."""
+
+
+@cache
+def trees() -> dict[str, ast.Module]:
+    return {
+        ".".join(path.relative_to(SRC / "kineverse").with_suffix("").parts): ast.parse(
+            path.read_text("utf-8")
+        )
+        for path in sorted((SRC / "kineverse").rglob("*.py"))
+    }
+
+
+def documented(tree: ast.Module) -> Iterator[tuple[int, str]]:
+    """Yield the line and the text of all docstrings, those of attributes included."""
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef):
+            for first, statement in enumerate(node.body):
+                if isinstance(statement, ast.Expr) and isinstance(statement.value, ast.Constant):
+                    text = statement.value.value
+                    if isinstance(text, str) and (first == 0 or not isinstance(node, ast.FunctionDef)):
+                        yield statement.lineno, text.strip()
+
+
+def test_no_docstring_begins_with_a_clause() -> None:
+    clauses = [
+        f"{module}:{line}: {text.splitlines()[0]}"
+        for module, tree in trees().items()
+        for line, text in documented(tree)
+        if CLAUSE.match(text)
+    ]
+    assert not clauses, "\n".join(clauses)
+
+
+def test_functions_begin_with_a_verb_and_classes_do_not() -> None:
+    """Functions say what they do ("Return", "Compute"); D401 of the linter holds the mood."""
+    functions: set[str] = set()
+    for tree in trees().values():
+        for node in ast.walk(tree):
+            if isinstance(node, ast.FunctionDef) and not is_property(node) and ast.get_docstring(node):
+                functions.add((ast.get_docstring(node) or "").split()[0].strip(".,;:"))
+    nouns = {
+        word for word in functions if word in ("The", "A", "An", "This", "It", "Its", "All", "Each", "No")
+    }
+    assert not nouns
+    verbs = {"Return", "Yield", "Compute", "Raise", "Check", "Write", "Give", "Make", "Build", "Find"}
+    assert verbs <= functions
+    classes = [
+        f"{module}.{node.name}: {text}"
+        for module, tree in trees().items()
+        for node in ast.walk(tree)
+        if isinstance(node, ast.ClassDef) and (text := ast.get_docstring(node) or "-").split()[0] in verbs
+    ]
+    assert not classes, "\n".join(classes)
+
+
+def is_property(node: ast.FunctionDef) -> bool:
+    return any(
+        (isinstance(d, ast.Name) and d.id.endswith("property"))
+        or (isinstance(d, ast.Attribute) and d.attr in ("setter", "getter"))
+        for d in node.decorator_list
+    )
+
+
+def test_one_name_is_one_thing() -> None:
+    """A public class or function of a module has a name of its own in the whole package."""
+    owners: defaultdict[str, set[str]] = defaultdict(set)
+    for module, tree in trees().items():
+        for node in tree.body:
+            if isinstance(node, ast.ClassDef | ast.FunctionDef) and not node.name.startswith("_"):
+                if node.name not in INTERFACES.get(module.partition(".")[0], ()):
+                    owners[node.name].add(module)
+    several = {
+        name: sorted(modules)
+        for name, modules in owners.items()
+        if len(modules - TWINS) > 1 or (len(modules) > 1 and modules & TWINS and modules - TWINS)
+    }
+    assert not several, "\n".join(f"{name}: {', '.join(where)}" for name, where in sorted(several.items()))
+
+
+def test_the_face_is_small() -> None:
+    assert len(kv.__all__) <= 56
+    for name in kv.__all__:
+        assert getattr(kv, name) is not None
+
+
+@pytest.mark.parametrize(
+    ("name", "place"),
+    [
+        ("Ball", "kv.articulations.Ball"),
+        ("UnknownNameError", "kv.errors.UnknownNameError"),
+        ("Writes", "kv.model.Writes"),
+        ("less", "kv.logic.less"),
+        ("to_bytes", "kv.formats.to_bytes"),
+    ],
+)
+def test_a_name_that_lives_below_is_answered_with_its_place(name: str, place: str) -> None:
+    with pytest.raises(AttributeError, match=re.escape(place)):
+        getattr(kv, name)
