@@ -146,6 +146,7 @@ def test_every_public_function_is_here():
         if inspect.isfunction(f) and f.__module__ == spatial.__name__ and not name.startswith("_")
     }
     assert public == {name.split(" ")[0] for name in CASES} | {
+        "as_one_axis_transform",
         "normalize",
         "round_exact",
         "rotation_about",

@@ -139,10 +139,10 @@ class Tracker:
         names = {str(v): i for i, v in enumerate(chart.tangent)}
         own = [v for v in chart.tangent if v.position in chart.coordinates]
         names.update({str(v.position): chart.tangent.index(v) for v in own})
-        for key, value in uncertainty.items():
-            if str(key) not in names:
-                raise UnknownNameError(f"'{key}' is not estimated. {suggest(str(key), names, 'coordinate')}")
-            deviations[names[str(key)]] = require_positive(key, value)
+        for symbol, value in uncertainty.items():
+            if str(symbol) not in names:
+                raise UnknownNameError(f"'{symbol}' is not estimated. {suggest(str(symbol), names, 'coordinate')}")
+            deviations[names[str(symbol)]] = require_positive(symbol, value)
         filter_.openness.deviations = deviations
         belief = InformationState((len(x), len(deviations), len(layout.groups)))
         belief.x[:] = x
