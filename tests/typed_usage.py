@@ -48,3 +48,50 @@ kv.translation([1, 2, 3])
 kv.transform(np.eye(3), [1, 2, 3])
 with contextlib.suppress(kv.errors.InvalidValueError):
     kv.Revolute(name="d", parent="world", child="d", axis=3.0)  # type: ignore[arg-type]
+
+# The face of the package: models, states, constraints, operations, loops.
+model: kv.Model = kv.load("shelf_door")
+assert_type(kv.formats.shipped_models(), tuple[str, ...])
+assert "kitchen" in kv.shipped_models()
+with model.edit() as edit:
+    edit.add_frame("door", parent="world", transform=kv.rotation_x(a) @ kv.translation(np.ones(3)))
+    edit.constrain("door/range", 0, a, kv.parameter("door/most", 2.0))
+    edit.apply(kv.Continuous(name="wheel", parent="door", child="wheel", axis=np.array([0.0, 1.0, 0.0])))
+    edit.apply(kv.Fixed(name="stop", parent="wheel", child="stop", origin=np.eye(4)))
+    edit.apply(kv.Floating(name="cup", parent="stop", child="cup"))
+    edit.apply(kv.articulations.Ball(name="ball", parent="cup", child="ball"))
+assert_type(model.fk("door"), kv.Expression)
+assert_type(model.jacobian("wheel"), kv.Expression)
+assert_type(model.constraints["door/range"], kv.Constraint)
+assert_type(model.limits("a"), tuple[float, float])
+home: kv.State = model.default_state()
+values: kv.StateLike = {"a": 0.5}
+values = {a: 0.5}
+values = home
+assert_type(home.updated({a: 0.25}), kv.State)
+assert_type(model.violations(home).__class__.__name__, str)
+assert_type(kv.velocity("a"), kv.Symbol)
+assert_type(a.derivative(), kv.Symbol)
+assert kv.symbols.symbol("a") == a
+assert_type(kv.rotation_y(a), kv.Expression)
+assert_type(kv.inverse(model.fk("door")), kv.Expression)
+assert_type(kv.where(a < b, a, 2.0), kv.Expression)
+assert_type(kv.clip(a, 0.0, 1.0), kv.Expression)
+assert_type(kv.maximum(a, b) + kv.minimum(a, 0.0) + kv.norm(kv.array([a, b])), kv.Expression)
+assert_type(kv.spline(a, [0.0, 1.0, 2.0], [0.0, 1.0, 0.0]), kv.Expression)
+assert_type(kv.logic.less(a, b), kv.Expression)
+assert_type(kv.spatial.log_so3(kv.rotation_x(a)), kv.Expression)
+assert_type(kv.expressions.total_derivative(a * b), kv.Expression)
+assert_type(kv.Limits(0, 1).lower is None, bool)
+loop = kv.CloseLoop(name="tie", frame="door", to="stop")
+operations: list[kv.Operation] = [loop, kv.model.SetData("name", "value")]
+try:
+    model.fk("dor")
+except kv.errors.UnknownNameError as error:
+    assert isinstance(error, kv.KineverseError)
+scene: kv.geometry.Scene
+tracker: kv.estimation.Tracker
+found: kv.reasoning.Interlocks
+shower = kv.show
+version: str = kv.__version__
+assert kv.loops.CloseLoop is kv.CloseLoop
