@@ -88,7 +88,7 @@ operations: list[kv.Operation] = [loop, kv.model.SetData("name", "value")]
 try:
     model.fk("dor")
 except kv.errors.UnknownNameError as error:
-    assert isinstance(error, kv.KineverseError)
+    base: kv.KineverseError = error
 scene: kv.geometry.Scene
 tracker: kv.estimation.Tracker
 found: kv.reasoning.Interlocks
