@@ -1,7 +1,7 @@
 """Layer 7: speed, measured beside the peers.
 
-:func:`run_benchmarks` yields a :class:`BenchmarkResult` for each benchmark. Nothing here decides whether a build passes: a
-benchmark measures, a test decides.
+:func:`run_benchmarks` yields a :class:`BenchmarkResult` for each benchmark. A benchmark measures; whether a
+build passes is decided by tests alone.
 """
 
 from .harness import QUICK, BenchmarkSettings, DisagreementError

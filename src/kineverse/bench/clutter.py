@@ -19,7 +19,7 @@ LINKS, RADIUS = 20, 0.1
 """The links of the arm, and how near is near [m]."""
 
 KINDS = ("hull", "box", "capsule")
-"""What the links are, in turns."""
+"""Shapes of the links, in turns."""
 
 LINK_LENGTH = 0.1
 CAPSULE_SIZE = 0.03, 0.06
@@ -92,7 +92,7 @@ class Clutter:
 RULES = (Rule("link*", "link*", why="only boxes are of interest here"),)
 
 CENTRE = 0.0, 0.0, LINK_LENGTH / 2
-"""Where the middle of a link's shape is in its frame [m]."""
+"""Position of the centre of a link's shape in its frame [m]."""
 
 
 def make_clutter(boxes: int = _BOXES_NEAR_ARM, steps: int = 200, seed: int = 0) -> Clutter:

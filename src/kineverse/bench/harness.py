@@ -37,7 +37,7 @@ def _no_progress(items: Iterable[Any], what: str, unit: str) -> Iterable[Any]:
 
 @dataclass(frozen=True, slots=True)
 class BenchmarkSettings:
-    """How much is measured, and on which robot.
+    """Amount of measurement, and the robot.
 
     Attributes
     ----------
@@ -82,7 +82,7 @@ QUICK = BenchmarkSettings(rounds=5, processes=3, steps=20, operations=1_000)
 Array: TypeAlias = npt.NDArray[np.float64]
 
 EQUALITY_TOLERANCE = 1e-9
-"""How far poses and Jacobians may be apart [m], [rad]."""
+"""Tolerance of the comparison of poses and Jacobians [m], [rad]."""
 
 
 class DisagreementError(KineverseError, ArithmeticError):
@@ -214,7 +214,7 @@ def time_contenders(
 DISTRIBUTIONS: Mapping[str, str] = MappingProxyType(
     {"pinocchio": "pin", "ripl_articulation": "ripl-articulation"}
 )
-"""What brings a module that is called otherwise."""
+"""Distribution of a module with another name."""
 
 IN_THE_EXTRA = ("pinocchio", "mujoco", "pybullet")
 """The modules that the extra ``bench`` brings."""
@@ -222,7 +222,7 @@ IN_THE_EXTRA = ("pinocchio", "mujoco", "pybullet")
 
 @dataclass(slots=True)
 class Contenders:
-    """Who takes part in a race, and who is missing.
+    """Contenders of a race, and missing peers.
 
     Attributes
     ----------
@@ -244,7 +244,7 @@ class Contenders:
 
 
 def has_peer(module: str) -> bool:
-    """Whether a peer can be imported."""
+    """Return whether a peer can be imported."""
     try:
         with _silence_stderr() if module == "pybullet" else contextlib.nullcontext():
             peer = importlib.import_module(module)
@@ -282,35 +282,35 @@ def _silence_stderr() -> Iterator[None]:
         os.close(nowhere)
 
 
-PROGRAMS = Path(__file__).parent / "programs"
+FRESH_PROCESS = Path(__file__).with_name("fresh_process.py")
 
 
 class ProgramError(KineverseError, RuntimeError):
-    """What was to be measured in a process of its own did not get to its end."""
+    """Failure of a measurement in a process of its own."""
 
 
 def run_program(name: str, *arguments: str, cache: str | None = None) -> dict[str, Any]:
-    """Run one of the programs in a fresh process; return what it says.
+    """Run a function of :mod:`.fresh_process` in a process of its own; return its JSON.
 
     Parameters
     ----------
     name
-        The program's file, without suffix.
+        Of the function.
     arguments
-        What it is given.
+        Its arguments.
     cache
-        Where compiled code is kept; where it always is if None.
+        Folder of the cache of compiled code; the usual one if None.
 
     Raises
     ------
     ProgramError
-        If it fails, with what it said last.
+        If it fails, with its last line.
     """
     environment = dict(os.environ)
     if cache is not None:
         environment["KINEVERSE_CACHE_DIR"] = cache
-    # With -P the program's neighbours cannot be imported by accident.
-    command = [sys.executable, "-P", str(PROGRAMS / f"{name}.py"), *arguments]
+    # With -P the file's neighbours cannot be imported by accident.
+    command = [sys.executable, "-P", str(FRESH_PROCESS), name, *arguments]
     done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
     try:
         said: dict[str, Any] = json.loads(done.stdout)

@@ -26,7 +26,7 @@ COPY = "copy a large model, per operation"
 RELEVANT, RELEVANT_NEW = "constraints_for a pose", "constraints_for a new expression"
 
 READERS = 7
-"""How many operations read what the replaced one wrote."""
+"""Number of operations that read the writes of the replaced one."""
 
 _AXES = (1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)
 _APPENDED = 100
@@ -145,7 +145,7 @@ NODES_PER_CONSTRAINT = 9
 
 @dataclass(frozen=True, slots=True)
 class DocumentTimes:
-    """What one document takes.
+    """Size and times of one document.
 
     Attributes
     ----------

@@ -1,4 +1,4 @@
-"""Where the measurements are taken, as numbers mean nothing without it."""
+"""Machine on which measurements are taken."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ VERSIONS = ("casadi", "numpy", "pin", "mujoco", "coal", "pybullet")
 
 @dataclass(frozen=True, slots=True)
 class Machine:
-    """Where the measurements are taken.
+    """Machine and software of a run.
 
     Attributes
     ----------

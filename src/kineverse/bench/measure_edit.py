@@ -34,10 +34,10 @@ JOINT, PINOCCHIO, MUJOCO = (
 )
 
 _SHIFT = 0.01
-"""How far the joint is moved [m]."""
+"""Displacement of the joint [m]."""
 
 _CONFIGURATION_RANGE = 0.3
-"""Where all coordinates are [rad], [m]."""
+"""Value of all coordinates [rad], [m]."""
 
 
 def replace_joint(robot: BenchmarkRobot) -> Contender:

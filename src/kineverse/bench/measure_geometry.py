@@ -34,7 +34,7 @@ SEARCH, PAIRS, BULLET = "mujoco, mj_collision", "mujoco, mj_geomDistance and num
 UPDATE, QUERY = "update", "query"
 
 _EXACT, _CURVED, _MARGINS = 1e-6, 1e-4, 3e-3
-"""How far distances may be apart [m]: of polytopes and capsules; of whatever a robot has; of Bullet with
+"""Tolerances of distances [m]: of polytopes and capsules; of whatever a robot has; of Bullet with
 its margins."""
 
 _NEAR, _WHOLE = 0.06, " without rules, within .06 m"

@@ -21,7 +21,7 @@ GAIN, INFORMATION = "numpy, textbook gain", "numpy, information form"
 
 POSITION, ORIENTATION = 0.01, math.radians(1.0)
 LONGEST = 1e-4
-"""What an update may take [s]; the papers' took 4 ms."""
+"""Time allowed for an update [s]; the papers' took 4 ms."""
 
 _UPDATES = 25
 # So many are compared, and done with the textbook gain, each of which takes as long as a hundred of ours.

@@ -27,7 +27,7 @@ BENCHMARKS: Mapping[str, str] = MappingProxyType(
         "edit": "models of 10 000 operations, and a robot with one joint replaced",
     }
 )
-"""What there is, in the order in which it is run; each name belongs to the module ``measure_NAME``."""
+"""Benchmarks in the order of running; each name belongs to the module ``measure_NAME``."""
 
 
 def select_benchmarks(names: Sequence[str]) -> list[str]:

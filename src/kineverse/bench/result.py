@@ -1,4 +1,4 @@
-"""What a benchmark finds: measurements, and what they are worth beside each other."""
+"""Results of benchmarks: measurements, and their ratios."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ Status: TypeAlias = Literal["met", "missed", "missing", "no bar"]
 
 @dataclass(frozen=True, slots=True)
 class Measurement:
-    """What one contender needed.
+    """Times of one contender.
 
     Attributes
     ----------
@@ -30,24 +30,24 @@ class Measurement:
 
     @property
     def median(self) -> float:
-        """What it usually takes."""
+        """Median time."""
         return statistics.median(self.samples)
 
     @property
     def best(self) -> float:
-        """What it takes when nothing disturbs."""
+        """Best time, without disturbance."""
         return min(self.samples)
 
 
 @dataclass(frozen=True, slots=True)
 class Bar:
-    """What a figure is to reach: at least, or at most, the limit."""
+    """Target of a figure: at least, or at most, the limit."""
 
     limit: float
     at_least: bool
 
     def met_by(self, value: float) -> bool:
-        """Whether a figure does."""
+        """Return whether a figure reaches the target."""
         return value >= self.limit if self.at_least else value <= self.limit
 
     def __str__(self) -> str:
@@ -81,7 +81,7 @@ class Comparison:
 
     @property
     def status(self) -> Status:
-        """Whether the bar is met."""
+        """True if the target is reached."""
         if self.value is None:
             return "missing"
         if self.bar is None:
@@ -91,7 +91,7 @@ class Comparison:
 
 @dataclass(frozen=True, slots=True)
 class BenchmarkResult:
-    """What a benchmark found.
+    """Result of a benchmark.
 
     Attributes
     ----------

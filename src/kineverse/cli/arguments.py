@@ -68,7 +68,7 @@ def parse_assignments(texts: Iterable[str]) -> dict[str, float]:
 
 
 def has_unit(text: str) -> bool:
-    """Whether a value says what it is measured in; parts of pi are angles."""
+    """Return whether a value has a unit; parts of pi are angles."""
     return unit_kind(text) is not None
 
 
@@ -151,7 +151,7 @@ def load_model(arguments: argparse.Namespace, source: str, prefix: str | None = 
 
 
 ALTERNATIVE_UNITS = {"rad": ("deg",), "m": ("cm", "mm")}
-"""What people think in instead of radians and metres."""
+"""Units accepted on the command line, in radians and metres."""
 
 
 def find_limit_notes(model: kv.Model, values: Mapping[str, float], texts: Iterable[str]) -> list[str]:

@@ -42,7 +42,7 @@ examples:
 
 STDOUT = "-"
 SHOWN = 10
-"""How many remarks are printed unless all are asked for."""
+"""Number of reader warnings printed without --all."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

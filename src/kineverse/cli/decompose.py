@@ -38,7 +38,7 @@ examples:
   kineverse decompose --list"""
 
 ENDINGS = (".stl", ".obj", ".dae", ".ply", ".off", ".glb")
-"""What is taken for a mesh rather than a model."""
+"""Suffixes of mesh files."""
 
 WRONG_MESH, WRONG_MODEL = 1, 2
 
@@ -52,7 +52,7 @@ class MeshTask:
 
     @property
     def name(self) -> str:
-        """What it is called in a table: its first links, and the name of the file."""
+        """Label in a table: its first links, and the name of the file."""
         file = Path(self.mesh.uri).name
         if not self.links:
             return file

@@ -32,7 +32,7 @@ examples:
 
 EQUAL, DIFFERENT = 0, 1
 SHOWN = 20
-"""How many differences of a kind are printed unless all are asked for."""
+"""Number of differences of a kind printed without --all."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

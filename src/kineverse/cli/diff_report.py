@@ -27,7 +27,7 @@ _WIDEST = 44
 
 @dataclass(frozen=True)
 class ModelComparisonReport:
-    """What two models differ in, to be printed."""
+    """Printable differences of two models, by value."""
 
     found: ModelComparison
 
@@ -62,7 +62,8 @@ def _difference_lines(differences: list[ValueDifference], most: int | None) -> l
     entries = []
     for difference in shown:
         first, *others = _difference_texts(difference)
-        line = f"  {colorize(difference.sign, difference.sign)} {difference.change.name:<{width}}  {first}".rstrip()
+        sign = colorize(difference.sign, difference.sign)
+        line = f"  {sign} {difference.change.name:<{width}}  {first}".rstrip()
         entries.append("\n".join([line, *(" " * (width + 6) + text for text in others)]))
     return [*entries, *truncate_lines([""] * len(differences), len(shown))[len(shown) :]]
 
@@ -117,7 +118,7 @@ def _delta_to_json(delta: Delta) -> dict[str, Any]:
 
 @dataclass(frozen=True)
 class BehaviourComparisonReport:
-    """What two models do differently, to be printed."""
+    """Printable differences of two models, by behaviour."""
 
     found: BehaviourComparison
 
@@ -143,7 +144,8 @@ class BehaviourComparisonReport:
         if self.found.ranges:
             width = max(len(r.name) for r in self.found.ranges)
             lines = [
-                f"  {colorize('~', '~')} {r.name:<{width}}  {format_interval(*r.before)} → {format_interval(*r.after)}"
+                f"  {colorize('~', '~')} {r.name:<{width}}  "
+                f"{format_interval(*r.before)} → {format_interval(*r.after)}"
                 for r in self.found.ranges
             ]
             result.append([colorize("limits", "bold"), *truncate_lines(lines, most)])

@@ -22,7 +22,7 @@ CHECKED_PER_RANGE = 5
 
 @dataclass(frozen=True, slots=True)
 class ExerciseResult:
-    """How it went.
+    """Result of an exercise.
 
     ``poses`` of frames were computed, ``rate`` of them a second; ``violations`` is the number of constraints
     violated inside the ranges; ``problems`` are those in words, and poses that are none.

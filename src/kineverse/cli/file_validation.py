@@ -21,12 +21,12 @@ from kineverse.formats.xml_reader import read_root_tag
 FORMATS = {".kv.json": "document", ".urdf": "URDF", ".sdf": "SDF", ".world": "SDF", ".mjcf": "MJCF"}
 
 VALID, INVALID, UNREADABLE = 0, 1, 2
-"""What :attr:`ValidationResult.status` may be."""
+"""Values of :attr:`ValidationResult.status`."""
 
 
 @dataclass(frozen=True)
 class ValidationResult:
-    """What was found in a file.
+    """Findings in one file.
 
     Attributes
     ----------
@@ -72,14 +72,14 @@ class ValidationResult:
 
     @property
     def contents(self) -> str:
-        """What is in the model, counted."""
+        """Counts of frames, coordinates and constraints."""
         if self.model is None:
             return ""
         return f"{format_contents(self.model)}, {format_count(len(self.model.bodies), 'body')}"
 
     @property
     def reason(self) -> str:
-        """Why it cannot be read, on one line."""
+        """Reason on one line if the file cannot be read."""
         if isinstance(self.error, OSError) and self.error.strerror:
             return self.error.strerror
         return " ".join(str(self.error).split())

@@ -51,7 +51,7 @@ MAX_ROTATION_STEP = 2.0
 
 @dataclass(frozen=True)
 class ObservationNoise:
-    """How far observations are believed to be off.
+    """Assumed noise of the observations.
 
     Attributes
     ----------
@@ -157,7 +157,7 @@ def parse_noise(text: str) -> tuple[float, float | None]:
 
 @dataclass(frozen=True)
 class LearnedJoint:
-    """What was learned from poses.
+    """Joint identified from poses.
 
     Attributes
     ----------

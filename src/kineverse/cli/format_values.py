@@ -20,7 +20,7 @@ from kineverse.view.poses import roll_pitch_yaw
 
 LONGEST = 60
 _NOTHING = 1e-9
-"""What is shown as no distance at all beside a larger one [m], [rad]."""
+"""Threshold below which a distance is printed as zero beside a larger one [m], [rad]."""
 
 
 def format_contents(model: ModelView) -> str:

@@ -25,7 +25,7 @@ examples:
 
 
 SHOWN = 10
-"""How many remarks of the reader are printed."""
+"""Number of reader warnings printed."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

@@ -25,7 +25,7 @@ from kineverse.view.rasterizer import TriangleSoup
 from kineverse.view.sliders import infer_units
 
 CONTACT_DEPTH = 1e-5
-"""What is less deep than this only touches, as a drawer lies on its rail [m]."""
+"""Depth below which bodies only touch, such as a drawer on its rail [m]."""
 
 
 def find_contacts(model: ModelView) -> Sequence[DistanceResult] | None:
@@ -87,7 +87,7 @@ class ConstraintSummary:
 
 @dataclass(frozen=True, slots=True)
 class ModelSummary:
-    """What a model consists of.
+    """Contents of a model, for printing and JSON.
 
     ``frames`` are the parents by name; ``low``, ``high`` and ``extent`` the box around all shapes at the
     default state [m]; ``mass`` that of all bodies [kg]; ``problems`` what could not be loaded; ``unplaced``
@@ -163,7 +163,10 @@ def _summarize_constraint(name: str, constraint: Constraint) -> ConstraintSummar
     simple = bounds_are_numbers and only is not None and bool(constraint.expression == only)
     return ConstraintSummary(
         name=name,
-        text=f"{_format_bound(constraint.lower)} <= {constraint.expression!r} <= {_format_bound(constraint.upper)}",
+        text=(
+            f"{_format_bound(constraint.lower)} <= {constraint.expression!r} <= "
+            f"{_format_bound(constraint.upper)}"
+        ),
         symbols=[str(symbol) for symbol in constraint.symbols],
         simple=simple,
     )

@@ -33,7 +33,7 @@ examples:
   kineverse validate home.kv.json --json"""
 
 SHOWN, SHOWN_OF_SEVERAL = 10, 3
-"""How many remarks, and problems of a kind, are printed of a file unless all are asked for."""
+"""Number of reader warnings, and of problems of a kind, printed for a file without --all."""
 
 TITLES = {
     "limit": "limits",

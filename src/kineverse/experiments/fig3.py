@@ -42,7 +42,7 @@ _BEFORE_CLOSED = tuple(10.0**-k for k in range(1, 9))
 
 @dataclass(frozen=True)
 class GarageDoorCurves:
-    """What both plots show, and the slopes.
+    """Data of both plots, and the slopes.
 
     Attributes
     ----------

@@ -16,7 +16,7 @@ from .report import Report
 
 @dataclass(frozen=True)
 class Options:
-    """What is asked of an experiment beside its name; each takes some of these.
+    """Options of experiments; each takes some of these.
 
     Attributes
     ----------
@@ -57,7 +57,7 @@ EXPERIMENTS: Mapping[str, str] = MappingProxyType(
         "estimation-grid": "hinges and sliders learned from noisy poses, against the Cramér-Rao bound",
     }
 )
-"""What there is; each name is that of a module of this package, with an underscore for a dash."""
+"""Names of experiments: the modules of this package, with a dash for an underscore."""
 
 
 def reproduce(name: str, progress: Progress | None = None, options: Options | None = None) -> Report:

@@ -1,4 +1,4 @@
-"""What comes out of an experiment."""
+"""Report of an experiment: tables, figures, JSON."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ class Figure:
 
 @dataclass(frozen=True)
 class Report:
-    """What an experiment measured.
+    """Measurements of an experiment.
 
     Attributes
     ----------

@@ -14,7 +14,7 @@ from kineverse.view.poses import to_quaternions
 from .clutter_search import PairDistances
 
 _LINKS_PER_BODY = 100
-"""How many boxes are in one body: those of Bullet have a bounded number of links."""
+"""Number of boxes in one body: Bullet bounds the number of links."""
 
 
 class BulletSearch:

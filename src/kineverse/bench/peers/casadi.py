@@ -17,7 +17,7 @@ from kineverse.compile import compiler_information
 from kineverse.errors import CompileError
 
 COMPILER_FLAGS = ("-O3", "-march=native", "-fPIC", "-shared")
-"""What a user of CasADi would choose. The C of the map is faster than a map over the C of the function."""
+"""Choice of a user of CasADi. The C of the map is faster than a map over the C of the function."""
 
 
 def make_casadi_function(robot: BenchmarkRobot) -> Any:
@@ -96,7 +96,7 @@ NUMPY_OPERATIONS: Mapping[int, Callable[..., Any]] = MappingProxyType(
         ca.OP_ASSIGN: lambda x, out: np.copyto(out, x),
     }
 )
-"""What the kinematics of joints with one coordinate are made of."""
+"""Data of the kinematics of joints with one coordinate."""
 
 
 class NumpyGraph:

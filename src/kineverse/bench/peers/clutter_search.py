@@ -51,7 +51,7 @@ class KineverseSearch:
 
 
 class CoalSearch:
-    """What one writes around coal: boxes and spheres compared in numpy, a functor for each pair.
+    """Search around coal as a user writes it: boxes and spheres in numpy, a functor for each pair.
 
     Poses come from our compiled function, in place.
     """
@@ -193,8 +193,9 @@ def _clutter_mjcf(crowd: Clutter) -> str:
                 f'<mesh name="link{link}" vertex="{format_mjcf_numbers(corners)}" maxhullvert="-1"/>'
             )
             shape = f'type="mesh" mesh="link{link}" pos="{here}"'
+        axis = format_mjcf_numbers(crowd.axis(link))
         arm = (
-            f'<body pos="0 0 {LINK_LENGTH if link else 0.0}"><joint axis="{format_mjcf_numbers(crowd.axis(link))}"/>'
+            f'<body pos="0 0 {LINK_LENGTH if link else 0.0}"><joint axis="{axis}"/>'
             f'<geom name="link{link}" {shape} margin="{RADIUS}" contype="1" conaffinity="0"/>{arm}</body>'
         )
     for k, (size, pose) in enumerate(zip(crowd.sizes, crowd.poses, strict=True)):

@@ -89,7 +89,8 @@ def _mjcf_geom(number: int, solid: Solid) -> tuple[str, str]:
     if isinstance(shape, Capsule | Cylinder):
         kind = type(shape).__name__.lower()
         return "", f'{name} type="{kind}" size="{shape.radius!r} {shape.length / 2!r}"'
-    asset = f'<mesh {name} vertex="{format_mjcf_numbers(_solid_corners(solid))}" inertia="shell" maxhullvert="-1"/>'
+    vertices = format_mjcf_numbers(_solid_corners(solid))
+    asset = f'<mesh {name} vertex="{vertices}" inertia="shell" maxhullvert="-1"/>'
     return asset, f'{name} type="mesh" mesh="{number}"'
 
 

@@ -1,4 +1,4 @@
-"""What came out of the estimation grid, cell by cell, and whether it is as good as can be."""
+"""Results of the estimation grid by cell, and their comparison with the attainable bound."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ Array = npt.NDArray[np.float64]
 Flags = npt.NDArray[np.bool_]
 
 NEAR, TELLING = 10.0, 5.0
-"""Where a bound is below these [deg], errors are held against it, and types have to be right."""
+"""Bounds [deg] below which errors are compared with the bound, and types have to be right."""
 
 MOST_OVER, LEAST_RIGHT = 1.1, 0.99
-"""How much errors may exceed a bound, and how many types have to be right."""
+"""Allowed ratio of errors to the bound, and required part of correct types."""
 
 FAR_OFF = 6.0
 """An error of so many times what can be attained is a divergence: by chance, hardly one in a million is."""
@@ -26,7 +26,7 @@ FAR_OFF = 6.0
 
 @dataclass(frozen=True, eq=False)
 class CellResult:
-    """What became of the samples of a cell.
+    """Outcome of the samples of a cell.
 
     Attributes
     ----------
@@ -68,7 +68,7 @@ class CellResult:
 
     @property
     def attainable(self) -> float:
-        """What can be attained at best of it [deg]."""
+        """Attainable bound of the error [deg]."""
         return rms(self.attainable_degrees)
 
     @property
@@ -83,7 +83,7 @@ class CellResult:
 
     @property
     def diverged(self) -> int:
-        """How many have no axis, or where it can be known, one that is far off."""
+        """Number of samples without an axis, or with one that is far off where it can be known."""
         lost = ~np.isfinite(self.degrees)
         if self.attainable < NEAR:
             lost |= self.degrees > FAR_OFF * self.attainable_degrees
@@ -91,7 +91,7 @@ class CellResult:
 
     @property
     def by_chance(self) -> float:
-        """How probable it is that errors at what can be attained exceed it by too much all the same."""
+        """Probability that attainable errors exceed the bound by too much by chance."""
         excess = (MOST_OVER**2 - 1.0) / math.sqrt(self.spread)
         return 0.5 * math.erfc(excess / math.sqrt(2.0))
 

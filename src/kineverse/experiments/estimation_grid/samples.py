@@ -26,7 +26,7 @@ TO_AXIS, LEVER = 0.5, 0.4
 
 @dataclass(frozen=True)
 class Cell:
-    """What the samples of one cell of the grid have in common.
+    """Parameters common to the samples of one cell of the grid.
 
     Attributes
     ----------

@@ -1,4 +1,4 @@
-"""How far both filters end from the truth, after 25 observations of each configuration."""
+"""Error of both filters after 25 observations of each configuration."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Whether a filter is as good as it can be, and knows how good it is.
+"""Consistency of a filter (NEES, NIS), and its error beside the Cramér-Rao bound.
 
 The noise is Gaussian on each axis here, so that there is a bound: of all unbiased estimators from K poses of
 m frames none has a smaller covariance than the inverse of K Σ Jᵀ W J (Cramér and Rao), with the frames'
@@ -43,7 +43,7 @@ _STEP = 1e-5
 
 @dataclass(frozen=True)
 class FilterConsistency:
-    """What a filter makes of one level of noise.
+    """Statistics of a filter at one level of noise.
 
     Attributes
     ----------

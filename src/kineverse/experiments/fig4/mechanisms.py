@@ -41,7 +41,7 @@ MECHANISMS: dict[str, tuple[Operation, str]] = {
 
 @dataclass(frozen=True)
 class CoordinateErrors:
-    """How a filter followed a coordinate.
+    """Error of a filter in one coordinate.
 
     Attributes
     ----------
@@ -61,7 +61,7 @@ class CoordinateErrors:
 
 @dataclass(frozen=True)
 class MechanismErrors:
-    """How both filters followed a mechanism at one level of noise."""
+    """Errors of both filters for a mechanism at one level of noise."""
 
     mechanism: str
     noise: PoseNoise

@@ -47,7 +47,7 @@ class PoseNoise:
 
     @property
     def on_axes(self) -> PoseNoise:
-        """What noise along a random direction is on each of the three axes."""
+        """Factor from noise along a random direction to noise on each of the three axes."""
         return PoseNoise(self.position / math.sqrt(3), self.orientation / math.sqrt(3))
 
     def __str__(self) -> str:
@@ -84,7 +84,7 @@ class ObservedModel:
 
     @cached_property
     def turning(self) -> npt.NDArray[np.bool_]:
-        """Which coordinates turn a frame: their errors are angles, those of the others lengths."""
+        """Coordinates that turn a frame: their errors are angles, those of the others lengths."""
         return np.array([any(_is_rotation(self.model, f, s) for f in self.frames) for s in self.symbols])
 
     @cached_property
@@ -192,7 +192,7 @@ def _directions(rng: Generator, lead: tuple[int, ...], how: Directions) -> Array
 
 @dataclass(frozen=True)
 class FilterRun:
-    """Where a filter ended with C configurations.
+    """Final estimates of a filter for C configurations.
 
     Attributes
     ----------

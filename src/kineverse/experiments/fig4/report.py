@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Fig4Results:
-    """What was measured, see the modules of this package.
+    """Results of all parts of the experiment, see the modules of this package.
 
     Attributes
     ----------
@@ -204,8 +204,9 @@ def _table_of_variants(results: Fig4Results) -> ReportTable:
 
 def _table_of_consistency(results: Fig4Results) -> ReportTable:
     return ReportTable(
-        f"Gaussian noise on each axis: NEES per state (1 is right) of truths {INTERIOR_DEVIATIONS:g}σ inside the limits "
-        "and of all, NIS and its 95 % band, and errors over the Cramér-Rao bound",
+        "Gaussian noise on each axis: NEES per state (1 is right) of truths "
+        f"{INTERIOR_DEVIATIONS:g}σ inside the limits and of all, NIS and its 95 % band, "
+        "and errors over the Cramér-Rao bound",
         (
             "noise",
             "filter",

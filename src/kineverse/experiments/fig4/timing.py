@@ -20,7 +20,7 @@ from .protocol import DT, LEVELS, Array, ObservedModel, PoseNoise, make_tracker
 Step: TypeAlias = Callable[[Array], None]
 
 REPORTED = 4.0
-"""What the papers stay below with all 23 degrees of freedom [ms]."""
+"""Time reported by the papers for all 23 degrees of freedom [ms]."""
 
 
 @dataclass(frozen=True)

@@ -50,7 +50,7 @@ class Classification:
 
     @property
     def right(self) -> bool:
-        """Whether that is the label."""
+        """True if the type is the label."""
         return self.called == self.recording.label
 
 

@@ -46,20 +46,20 @@ LABELS: Mapping[str, Label] = MappingProxyType(
         "models_data/door.txt": "revolute",
     }
 )
-"""What is in which files, by the names of the objects."""
+"""Objects by the names of their files."""
 
 COLUMNS: Mapping[str, str] = MappingProxyType({"models_data/door.txt": "x,y,z,qx,qy,qz,qw,-,-"})
-"""Where files have more columns than those of a pose."""
+"""Columns of the pose in files that have more."""
 
 POSITION, ORIENTATION = 0.01, math.radians(5.0)
-"""How far what was tracked is off an ideal joint, in each coordinate [m] and about each axis [rad].
+"""Deviation of tracked poses from an ideal joint, in each coordinate [m] and about each axis [rad].
 
 That is not the jitter of a sensor, a millimetre and less: hands slip, handles and hinges give way, and planar
 markers are seen tilted.
 """
 
 THINNED = 20
-"""How many poses of a recording are taken, evenly over time: neighbouring ones share most of their errors."""
+"""Number of poses taken of a recording, evenly over time: neighbouring ones share most of their errors."""
 
 
 @dataclass(frozen=True, eq=False)
