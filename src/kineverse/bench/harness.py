@@ -46,7 +46,7 @@ class BenchmarkSettings:
     frame
         The frame whose pose and Jacobian are computed; a gripper if None.
     rounds
-        How many times everybody takes a turn.
+        Number of turns of each contender.
     processes
         The same where every turn is a fresh process.
     configurations
@@ -86,7 +86,7 @@ EQUALITY_TOLERANCE = 1e-9
 
 
 class DisagreementError(KineverseError, ArithmeticError):
-    """Those who are compared do not compute the same, so their times mean nothing."""
+    """Disagreement of contenders, which makes their times meaningless."""
 
 
 def check_equal(
@@ -129,7 +129,7 @@ def check_equal(
 
 @dataclass(frozen=True, slots=True)
 class Contender:
-    """Someone who does the work.
+    """Library or implementation that does the work.
 
     Attributes
     ----------
@@ -186,7 +186,7 @@ def time_contenders(
     contenders
         Who takes part.
     rounds
-        How many times everybody takes a turn; another one before does not count.
+        Number of turns of each contender, after one that is not counted.
     progress
         See :class:`.harness.BenchmarkSettings`.
 
@@ -202,10 +202,10 @@ def time_contenders(
     for contender in contenders:
         contender.sample()
     for number in progress(range(rounds), what, "round"):
-        # Nobody always comes after the same neighbour, who may leave caches warm or the processor hot.
+        # The order changes: a neighbour may leave caches warm or the processor hot.
         first = number % len(contenders)
         for contender in (*contenders[first:], *contenders[:first]):
-            # The collector would charge everybody's garbage to whoever happens to run.
+            # The collector would charge all garbage to the contender that happens to run.
             with no_collection():
                 samples[contender.name].append(contender.sample())
     return {c.name: Measurement(c.name, c.unit, tuple(samples[c.name])) for c in contenders}
@@ -229,7 +229,7 @@ class Contenders:
     contenders
         Who takes part.
     missing
-        A line for everybody else.
+        A line for each other one.
     """
 
     contenders: list[Contender] = field(default_factory=list)
@@ -270,7 +270,7 @@ def install_advice(module: str) -> str:
 
 @contextlib.contextmanager
 def _silence_stderr() -> Iterator[None]:
-    """Keep what C code prints off standard error: Bullet greets whoever imports it."""
+    """Keep what C code prints off standard error: Bullet prints a greeting at import."""
     sys.stderr.flush()
     kept, nowhere = os.dup(2), os.open(os.devnull, os.O_WRONLY)
     os.dup2(nowhere, 2)

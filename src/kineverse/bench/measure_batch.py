@@ -25,7 +25,7 @@ CASADI, NUMPY, PINOCCHIO = "casadi, map in C", "numpy, same graph", "pinocchio, 
 
 
 def measure(settings: BenchmarkSettings) -> BenchmarkResult:
-    """Measure batches; everybody but those who say otherwise on the same one core."""
+    """Measure batches, on one core unless the label says otherwise."""
     robot = find_robot(settings)
     configurations = robot.configurations(settings.rows)
     points = robot.of_chain(configurations)
@@ -74,7 +74,7 @@ def _ours(robot: BenchmarkRobot, points: Array) -> Iterator[Contender]:
 def _of_the_graph(
     robot: BenchmarkRobot, points: Array, folder: Path, missing: list[str]
 ) -> Iterator[Contender]:
-    """Yield those who evaluate the graph that Kineverse makes, in their own ways."""
+    """Yield contenders that evaluate Kineverse's graph by other means."""
     rows, function = len(points), make_casadi_function(robot)
     by_numpy = NumpyGraph(function)
     outputs = _outputs(robot, rows)

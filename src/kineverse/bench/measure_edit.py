@@ -41,7 +41,7 @@ _CONFIGURATION_RANGE = 0.3
 
 
 def replace_joint(robot: BenchmarkRobot) -> Contender:
-    """Return who replaces an operation, and evaluates the new pose."""
+    """Return the contender that replaces an operation and evaluates the new pose."""
     model = robot.model.copy()
     tag, joint = _middle_joint(robot)
     origin = joint.origin
@@ -79,7 +79,7 @@ def _sampled_configurations(robot: BenchmarkRobot) -> dict[str, Array]:
 
 
 def reread_file(robot: BenchmarkRobot, folder: Path) -> Contender:
-    """Return who reads a file in which the joint is moved, as a model in pinocchio stays what it is."""
+    """Return the contender that reads a file with the joint moved, since models in pinocchio are immutable."""
     import pinocchio as pin
 
     from .peers.pinocchio import PinocchioRobot
@@ -99,7 +99,7 @@ def reread_file(robot: BenchmarkRobot, folder: Path) -> Contender:
 
 
 def recompile_specification(robot: BenchmarkRobot) -> Contender:
-    """Return who moves a body in MuJoCo's specification, and compiles that."""
+    """Return the contender that moves a body in MuJoCo's specification and compiles it."""
     import mujoco
 
     from .peers.mujoco_kinematics import MujocoRobot, make_robot_mjcf

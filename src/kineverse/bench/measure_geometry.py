@@ -45,7 +45,7 @@ _CHECKED = 20
 
 @dataclass(frozen=True)
 class SearchEntry:
-    """Someone who finds what is near, and how exact that is [m]."""
+    """Search for near objects, and its tolerance [m]."""
 
     name: str
     finder: ProximitySearch
@@ -107,7 +107,7 @@ def measure(settings: BenchmarkSettings) -> BenchmarkResult:
 
 
 def check_distances(entries: Sequence[SearchEntry], rows: Array) -> None:
-    """Compare what everybody finds at some states with what the first one finds.
+    """Compare the results of all searches at some states with those of the first.
 
     A pair that is found by one and not by another counts as being at the radius for the other, so that only
     those may be missing that are next to it. Depths in penetration are not compared: they count as touching.
@@ -154,7 +154,7 @@ def _among_boxes(field: Contenders, folder: Path, steps: int) -> Iterator[Search
 
 
 def _around_robot(robot: KitchenRobot) -> Iterator[SearchEntry]:
-    """Yield who takes part where a robot moves; who does not is missed by :func:`_among_boxes`."""
+    """Yield the searches that support a moving robot; :func:`_among_boxes` lists the others as missing."""
     yield SearchEntry(f"{robot.name}: {OURS}", KineverseSearch(robot.scene()), _CURVED)
     yield SearchEntry(f"{robot.name}: {COAL}", CoalSearch(robot.scene()), _CURVED)
     if has_peer("mujoco"):

@@ -59,7 +59,7 @@ def _packages() -> Iterator[Measurement]:
 
 
 def find_requirements(distribution: str) -> set[str]:
-    """Return a distribution and all that it requires here, without extras that nobody asks for.
+    """Return a distribution and all that it requires here, without extras.
 
     Raises
     ------

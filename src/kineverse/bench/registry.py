@@ -66,7 +66,7 @@ def run_benchmarks(
     UnknownNameError
         If there is no such benchmark, before any is run.
     DisagreementError
-        If those who are compared do not compute the same.
+        If the contenders do not compute the same.
     """
     for name in select_benchmarks(names):
         # A benchmark is imported when it is run, as it brings its peers.

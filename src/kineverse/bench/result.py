@@ -98,7 +98,7 @@ class BenchmarkResult:
     name
         The benchmark.
     work
-        What everybody did, in words.
+        Description of the work.
     measurements
         What each contender needed.
     comparisons

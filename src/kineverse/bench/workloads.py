@@ -36,7 +36,7 @@ class BenchmarkRobot:
     Attributes
     ----------
     file
-        The file that everybody reads.
+        File that all libraries read.
     model
         What Kineverse makes of it, without prefix.
     frame
@@ -170,7 +170,7 @@ def _mimic_joint(model: Model, frame: str) -> str | None:
 
 
 def strip_shapes(file: str | os.PathLike[str]) -> str:
-    """Return a URDF file without shapes, so that nobody looks for meshes.
+    """Return a URDF file without shapes, so that no library looks for meshes.
 
     Raises
     ------

@@ -105,7 +105,7 @@ def benchmark_to_json(result: BenchmarkResult) -> dict[str, Any]:
 
 
 def format_benchmark(result: BenchmarkResult, targets: bool = False) -> str:
-    """Return a result as tables; who is missing is left to whoever prints several.
+    """Return a result as tables; missing peers are listed once, after all results.
 
     Parameters
     ----------

@@ -20,7 +20,7 @@ COMMANDS = {
 }
 
 ERROR, INTERRUPTED, PIPE_CLOSED = 2, 130, 141
-"""Exit statuses: what was asked for cannot be done; Ctrl-C; nobody reads on (128 and the signal's number)."""
+"""Exit statuses: the request failed; Ctrl-C; the output pipe was closed (128 and the signal's number)."""
 
 # Meshes that are missing are counted by the commands, and without a compiler they answer the same.
 QUIET = ("kineverse.view.meshes", "kineverse.compile.toolchain")
@@ -51,7 +51,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     Returns
     -------
     0 if all went well; 2 if what was asked for cannot be done, with one line on standard error that says why;
-    130 after Ctrl-C; 141 if whoever read the output went away.
+    130 after Ctrl-C; 141 if the output pipe was closed.
     """
     words = sys.argv[1:] if argv is None else list(argv)
     if not set(words) - {"-v", "--verbose"}:

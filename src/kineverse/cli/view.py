@@ -101,7 +101,7 @@ def run(arguments: argparse.Namespace) -> int:
     if assigned:
         print_notes(find_limit_notes(model, complete(model, assigned), arguments.assignments))
     for mesh in show_progress(meshes.list_visual_meshes(model), "reading meshes", "file"):
-        meshes.load_mesh(mesh)  # and remembered: whoever draws them finds them read
+        meshes.load_mesh(mesh)  # cached for the drawing
     if arguments.picture is not None:
         return _write_picture(arguments, model, assigned, near)
     options = page_options(arguments)

@@ -17,7 +17,7 @@ PairDistances: TypeAlias = Iterator[tuple[str, str, float]]
 
 
 class ProximitySearch(Protocol):
-    """Someone who finds the pairs that are within :data:`RADIUS`, with points and normals."""
+    """Search for the pairs that are within :data:`RADIUS`, with points and normals."""
 
     def put(self, angles: Array) -> None:
         """Move what moves."""

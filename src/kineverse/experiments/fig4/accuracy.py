@@ -50,9 +50,9 @@ class Errors:
     by_filter: dict[str, Array]
     nees: dict[str, float]
 
-    def summary(self, who: str, coordinates: Any = slice(None)) -> dict[str, Any]:
+    def summary(self, filter_name: str, coordinates: Any = slice(None)) -> dict[str, Any]:
         """Return mean, standard deviation and maximum over all, and means and maxima by seed."""
-        errors = self.by_filter[who][:, :, coordinates]
+        errors = self.by_filter[filter_name][:, :, coordinates]
         return {
             "mean": float(errors.mean()),
             "sd": float(errors.std()),
@@ -61,9 +61,9 @@ class Errors:
             "maxima": errors.max(axis=(1, 2)).tolist(),
         }
 
-    def rms(self, who: str, coordinates: Any) -> float:
+    def rms(self, filter_name: str, coordinates: Any) -> float:
         """Return the root of the mean square of some coordinates' errors."""
-        return float(np.sqrt((self.by_filter[who][:, :, coordinates] ** 2).mean()))
+        return float(np.sqrt((self.by_filter[filter_name][:, :, coordinates] ** 2).mean()))
 
 
 @dataclass(frozen=True)
@@ -95,17 +95,20 @@ def measure_errors(
     }
     for noise, seed in progress(jobs, "fig4: errors", "run"):
         truth, seen, training = simulate_observations(scene, noise, seed, configurations)
-        for who, run in (
+        for filter_name, run in (
             ("published", run_published(scene, seen, training)),
             ("proper", run_proper(scene, seen, noise.on_axes)),
         ):
             error = np.abs(run.q - truth)
-            found[noise][who].append((error, error**2 / run.variance))
+            found[noise][filter_name].append((error, error**2 / run.variance))
     return tuple(
         Errors(
             noise,
-            {who: np.stack([error for error, _ in runs]) for who, runs in by_filter.items()},
-            {who: float(np.mean([nees for _, nees in runs])) for who, runs in by_filter.items()},
+            {filter_name: np.stack([error for error, _ in runs]) for filter_name, runs in by_filter.items()},
+            {
+                filter_name: float(np.mean([nees for _, nees in runs]))
+                for filter_name, runs in by_filter.items()
+            },
         )
         for noise, by_filter in found.items()
     )

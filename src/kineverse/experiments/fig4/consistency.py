@@ -105,7 +105,8 @@ def measure_consistency(
         truth = np.concatenate(truths)
         bound = cramer_rao(scene, truth, noise)
         found[noise] = {
-            who: _evaluate_consistency(scene, truth, bound, [run[who] for run in runs]) for who in runs[0]
+            filter_name: _evaluate_consistency(scene, truth, bound, [run[filter_name] for run in runs])
+            for filter_name in runs[0]
         }
     return found
 

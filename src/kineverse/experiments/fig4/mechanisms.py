@@ -94,7 +94,9 @@ def _track_mechanism(name: str, noise: PoseNoise, configurations: int) -> Mechan
         "proper": run_proper(scene, seen, noise),
     }
     return MechanismErrors(
-        name, noise, {who: _coordinate_errors(run, truth, column) for who, run in runs.items()}
+        name,
+        noise,
+        {filter_name: _coordinate_errors(run, truth, column) for filter_name, run in runs.items()},
     )
 
 

@@ -60,38 +60,52 @@ class Fig4Results:
             "errors": [
                 {
                     **_noise_to_json(errors.noise),
-                    **{who: {**errors.summary(who), "nees": errors.nees[who]} for who in FILTERS},
+                    **{
+                        filter_name: {**errors.summary(filter_name), "nees": errors.nees[filter_name]}
+                        for filter_name in FILTERS
+                    },
                     "reported_mean": mean,
                     "reported_max": largest,
                 }
                 for errors, mean, largest in zip(self.errors, REPORTED_MEAN, REPORTED_MAX, strict=True)
             ],
             "by_degrees_of_freedom": [
-                {"degrees_of_freedom": dof, **{who: self._at_size(dof, times[who], who) for who in FILTERS}}
+                {
+                    "degrees_of_freedom": dof,
+                    **{
+                        filter_name: self._at_size(dof, times[filter_name], filter_name)
+                        for filter_name in FILTERS
+                    },
+                }
                 for dof, times in self.by_size
             ],
             "milliseconds_by_noise": [
-                {**_noise_to_json(noise), **{who: asdict(times[who]) for who in FILTERS}}
+                {
+                    **_noise_to_json(noise),
+                    **{filter_name: asdict(times[filter_name]) for filter_name in FILTERS},
+                }
                 for noise, times in self.by_noise
             ],
             "variants": dict(self.variants),
             "consistency": [
-                {**_noise_to_json(noise), **{who: c.plain() for who, c in by_filter.items()}}
+                {**_noise_to_json(noise), **{filter_name: c.plain() for filter_name, c in by_filter.items()}}
                 for noise, by_filter in self.consistency.items()
             ],
             "mechanisms": [
                 {
                     "mechanism": f.mechanism,
                     **_noise_to_json(f.noise),
-                    **{who: _without_nan(asdict(f.by_filter[who])) for who in FILTERS},
+                    **{
+                        filter_name: _without_nan(asdict(f.by_filter[filter_name])) for filter_name in FILTERS
+                    },
                 }
                 for f in self.mechanisms
             ],
             "paper": {"milliseconds_below": REPORTED},
         }
 
-    def _at_size(self, dof: int, time: Duration, who: str) -> dict[str, Any]:
-        errors = [e.summary(who, slice(dof)) for e in self.errors]
+    def _at_size(self, dof: int, time: Duration, filter_name: str) -> dict[str, Any]:
+        errors = [e.summary(filter_name, slice(dof)) for e in self.errors]
         return {"errors": errors, "milliseconds": asdict(time)}
 
 
@@ -149,11 +163,13 @@ def _table_of_reported(results: Fig4Results) -> ReportTable:
 def _table_by_noise(results: Fig4Results) -> ReportTable:
     rows = []
     for errors, (_, times) in zip(results.errors, results.by_noise, strict=True):
-        for who in FILTERS:
-            found = errors.summary(who)
+        for filter_name in FILTERS:
+            found = errors.summary(filter_name)
             values = (_format_fixed(found[key]) for key in ("mean", "sd", "max"))
-            nees = f"{errors.nees[who]:.2f}"
-            rows.append((str(errors.noise), FILTER_NAMES[who], *values, nees, *_format_ms(times[who])))
+            nees = f"{errors.nees[filter_name]:.2f}"
+            rows.append(
+                (str(errors.noise), FILTER_NAMES[filter_name], *values, nees, *_format_ms(times[filter_name]))
+            )
     return ReportTable(
         "Errors against noise, and the time of one prediction and update",
         ("noise", "filter", "mean", "sd", "max", "NEES", "time [ms]", "sd", "median"),
@@ -167,12 +183,16 @@ def _table_by_kind(results: Fig4Results) -> ReportTable:
     rows = []
     for errors in results.errors:
         cells = [
-            f"{unit * errors.rms(who, where):.2f}" if where.any() else "-"
+            f"{unit * errors.rms(filter_name, where):.2f}" if where.any() else "-"
             for where, unit in kinds
-            for who in FILTERS
+            for filter_name in FILTERS
         ]
         rows.append((str(errors.noise), *cells))
-    titles = (f"{what}: {FILTER_NAMES[who]}" for what in ("shifts [mm]", "turns [deg]") for who in FILTERS)
+    titles = (
+        f"{what}: {FILTER_NAMES[filter_name]}"
+        for what in ("shifts [mm]", "turns [deg]")
+        for filter_name in FILTERS
+    )
     return ReportTable(
         "Root mean square errors of what shifts and what turns",
         ("noise", *titles),
@@ -184,12 +204,16 @@ def _table_by_size(results: Fig4Results) -> ReportTable:
     strongest = results.errors[-1]
     rows = []
     for dof, times in results.by_size:
-        means = (_format_fixed(strongest.summary(who, slice(dof))["mean"]) for who in FILTERS)
-        rows.append((str(dof), *means, *(cell for who in FILTERS for cell in _format_ms(times[who]))))
-    titles = (title for who in FILTERS for title in (f"{FILTER_NAMES[who]} [ms]", "sd", "median"))
+        means = (_format_fixed(strongest.summary(filter_name, slice(dof))["mean"]) for filter_name in FILTERS)
+        rows.append(
+            (str(dof), *means, *(cell for filter_name in FILTERS for cell in _format_ms(times[filter_name])))
+        )
+    titles = (
+        title for filter_name in FILTERS for title in (f"{FILTER_NAMES[filter_name]} [ms]", "sd", "median")
+    )
     return ReportTable(
         f"Against degrees of freedom, at {strongest.noise}; the papers stay below {REPORTED:g} ms",
-        ("DoF", *(f"{FILTER_NAMES[who]}: mean error" for who in FILTERS), *titles),
+        ("DoF", *(f"{FILTER_NAMES[filter_name]}: mean error" for filter_name in FILTERS), *titles),
         tuple(rows),
     )
 
@@ -219,9 +243,9 @@ def _table_of_consistency(results: Fig4Results) -> ReportTable:
             "turns: RMSE, bound [deg]",
         ),
         tuple(
-            (str(noise), FILTER_NAMES[who], *_consistency_row(found))
+            (str(noise), FILTER_NAMES[filter_name], *_consistency_row(found))
             for noise, by_filter in results.consistency.items()
-            for who, found in by_filter.items()
+            for filter_name, found in by_filter.items()
         ),
     )
 
@@ -244,15 +268,15 @@ def _consistency_row(found: FilterConsistency) -> tuple[str, ...]:
 def _table_of_mechanisms(results: Fig4Results) -> ReportTable:
     rows = []
     for followed in results.mechanisms:
-        for who in FILTERS:
-            found = followed.by_filter[who]
+        for filter_name in FILTERS:
+            found = followed.by_filter[filter_name]
             values = (
                 _format_fixed(found.mean),
                 _format_fixed(found.max),
                 f"{found.nees:.2f}",
                 f"{found.lost_percent:.0f}",
             )
-            rows.append((followed.mechanism, str(followed.noise), FILTER_NAMES[who], *values))
+            rows.append((followed.mechanism, str(followed.noise), FILTER_NAMES[filter_name], *values))
     return ReportTable(
         "Mechanisms that are no joints: |q̂ - q| [rad], [m]; lost: a step to where the model has no value",
         ("mechanism", "noise", "filter", "mean", "max", "NEES", "lost [%]"),
@@ -284,15 +308,15 @@ def draw_results(canvas: Canvas, results: Fig4Results) -> None:
 
 def _plot_errors_by_noise(axes: Any, results: Fig4Results) -> None:
     places = np.arange(len(results.errors))
-    for who in FILTERS:
-        found = [errors.summary(who) for errors in results.errors]
+    for filter_name in FILTERS:
+        found = [errors.summary(filter_name) for errors in results.errors]
         for key, style in (("max", "^"), ("mean", "o-"), ("sd", ":")):
             axes.plot(
                 places,
                 [f[key] for f in found],
                 style,
-                color=_COLORS[who],
-                label=f"{FILTER_NAMES[who]}: {key}",
+                color=_COLORS[filter_name],
+                label=f"{FILTER_NAMES[filter_name]}: {key}",
             )
     axes.plot(places, REPORTED_MAX, "k+", label="authors' code: max of one run")
     axes.plot(places, REPORTED_MEAN, "kx", label="authors' code: mean")
@@ -304,10 +328,16 @@ def _plot_errors_by_noise(axes: Any, results: Fig4Results) -> None:
 
 def _plot_errors_by_size(axes: Any, results: Fig4Results) -> None:
     sizes = [dof for dof, _ in results.by_size]
-    for who in FILTERS:
+    for filter_name in FILTERS:
         for errors, style in zip(results.errors[::3], ("-", "--"), strict=True):
-            means = [errors.summary(who, slice(dof))["mean"] for dof in sizes]
-            axes.plot(sizes, means, style, color=_COLORS[who], label=f"{FILTER_NAMES[who]}, {errors.noise}")
+            means = [errors.summary(filter_name, slice(dof))["mean"] for dof in sizes]
+            axes.plot(
+                sizes,
+                means,
+                style,
+                color=_COLORS[filter_name],
+                label=f"{FILTER_NAMES[filter_name]}, {errors.noise}",
+            )
     axes.set(title="mean error against degrees of freedom", xlabel="degrees of freedom")
     axes.set(ylabel="|q̂ - q| [m], [rad]")
     axes.set_ylim(bottom=0)
@@ -316,12 +346,17 @@ def _plot_errors_by_size(axes: Any, results: Fig4Results) -> None:
 
 def _plot_times(axes: Any, results: Fig4Results) -> None:
     sizes = [dof for dof, _ in results.by_size]
-    for who in FILTERS:
-        times = [by_filter[who] for _, by_filter in results.by_size]
+    for filter_name in FILTERS:
+        times = [by_filter[filter_name] for _, by_filter in results.by_size]
         for key, style in (("mean", "o-"), ("sd", ":"), ("median", "--")):
             values = [getattr(time, key) for time in times]
             axes.plot(
-                sizes, values, style, color=_COLORS[who], markersize=4, label=f"{FILTER_NAMES[who]}: {key}"
+                sizes,
+                values,
+                style,
+                color=_COLORS[filter_name],
+                markersize=4,
+                label=f"{FILTER_NAMES[filter_name]}: {key}",
             )
     axes.axhline(REPORTED, color="0.6", label="the papers stay below")
     axes.set(
@@ -332,12 +367,22 @@ def _plot_times(axes: Any, results: Fig4Results) -> None:
 
 def _plot_consistency(axes: Any, results: Fig4Results) -> None:
     places = np.arange(len(results.consistency))
-    for who in FILTERS:
-        found = [by_filter[who] for by_filter in results.consistency.values()]
+    for filter_name in FILTERS:
+        found = [by_filter[filter_name] for by_filter in results.consistency.values()]
         nees, ratio = [c.nees_inside for c in found], [c.over_bound for c in found]
-        axes.plot(places, nees, "o-", color=_COLORS[who], label=f"{FILTER_NAMES[who]}: NEES per state")
         axes.plot(
-            places, ratio, "s--", color=_COLORS[who], label=f"{FILTER_NAMES[who]}: RMSE over Cramér-Rao"
+            places,
+            nees,
+            "o-",
+            color=_COLORS[filter_name],
+            label=f"{FILTER_NAMES[filter_name]}: NEES per state",
+        )
+        axes.plot(
+            places,
+            ratio,
+            "s--",
+            color=_COLORS[filter_name],
+            label=f"{FILTER_NAMES[filter_name]}: RMSE over Cramér-Rao",
         )
     axes.axhspan(0.9, 1.1, color="0.9", zorder=0)
     axes.set(title="consistency, Gaussian noise on each axis: 1 is right", yscale="log")
