@@ -79,7 +79,7 @@ def _sampled_configurations(robot: BenchmarkRobot) -> dict[str, Array]:
 
 
 def reread_file(robot: BenchmarkRobot, folder: Path) -> Contender:
-    """Return the contender that reads a file with the joint moved, since models in pinocchio are immutable."""
+    """Return the contender that reads a file with the joint moved, as models in pinocchio are immutable."""
     import pinocchio as pin
 
     from .peers.pinocchio import PinocchioRobot

@@ -29,10 +29,10 @@ CONTACT_DEPTH = 1e-5
 
 
 def find_contacts(model: ModelView) -> Sequence[DistanceResult] | None:
-    """Return the pairs that touch or penetrate at the default state, deepest first; None without the extra ``geometry``.
+    """Return the touching or penetrating pairs at the default state, deepest first; else None.
 
-    Shapes that cannot be used are left out. Nobody can say without the extra ``geometry``, or where
-    there are no poses at the default state.
+    Shapes that cannot be used are left out. The result is None without the extra ``geometry``, or where
+    the default state has no poses.
     """
     if not is_installed():
         return None
@@ -93,7 +93,7 @@ class ModelSummary:
     default state [m]; ``mass`` that of all bodies [kg]; ``problems`` what could not be loaded; ``unplaced``
     the frames whose pose there is not finite, which the box leaves out; ``interlocks`` what locks what;
     ``touched_as_seen`` the bodies without collision shapes, for which distances are to hulls of what is seen;
-    ``find_contacts`` the pairs that touch at the default state, deepest first, None without the extra ``geometry``;
+    ``find_contacts`` the pairs that touch at the default state, deepest first, None if not known;
     ``sha256`` the hash of the content if the model is from a document, else empty.
     """
 
