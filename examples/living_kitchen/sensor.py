@@ -9,7 +9,7 @@ import numpy.typing as npt
 
 from kineverse.errors import InvalidValueError
 from kineverse.estimation import pose_covariance
-from kineverse.lie import exp_so3
+from kineverse.lie import retract
 from kineverse.view.triangle_mesh import Floats
 
 TURN = np.radians(1.0) / 0.01
@@ -84,8 +84,7 @@ class Markers:
             self._lot = self._random.uniform(size=count)
         wrong = self._random.uniform(size=count) < sight.outliers
         size = np.where(wrong, ASTRAY, sight.noise)[:, None]
-        seen = poses.copy()
-        seen[:, :3, 3] += size * self._random.standard_normal((count, 3))
-        turns = exp_so3(TURN * size * self._random.standard_normal((count, 3)))
-        seen[:, :3, :3] = turns @ poses[:, :3, :3]
+        moved = size * self._random.standard_normal((count, 3))
+        turned = TURN * size * self._random.standard_normal((count, 3))
+        seen = retract(poses, np.concatenate([moved, turned], axis=1))
         return Seen(seen, self._lot >= sight.hidden, wrong)

@@ -8,7 +8,7 @@ import numpy as np
 
 from kineverse.view import backdrop
 from kineverse.view.drawables import Drawable, Rgba
-from kineverse.view.poses import to_quaternions
+from kineverse.view.poses import to_wxyz
 from kineverse.view.triangle_mesh import Floats
 
 from . import marker_meshes as marks
@@ -165,14 +165,14 @@ class Stagehand:
     def _place(self, key: str, pose: Floats) -> None:
         self._poses[key] = pose
         node = self._nodes[key]
-        node.position, node.wxyz = pose[:3, 3], to_quaternions(pose[None])[0]
+        node.position, node.wxyz = pose[:3, 3], to_wxyz(pose[None])[0]
 
     def _update_markers(self) -> None:
         life = self._scenery.life
         poses = np.concatenate([life.seen.poses, life.stranger_seen.poses])
         there = np.concatenate([life.seen.there, life.stranger_seen.there])
         self._markers.batched_positions = poses[:, :3, 3].astype(np.float32)
-        self._markers.batched_wxyzs = to_quaternions(poses).astype(np.float32)
+        self._markers.batched_wxyzs = to_wxyz(poses).astype(np.float32)
         self._markers.batched_scales = np.where(there, 1.0, HIDDEN).astype(np.float32)
 
     def _draw_learned(self) -> None:

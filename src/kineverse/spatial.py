@@ -13,12 +13,10 @@ part.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
 from typing import Any, TypeAlias
 
 import casadi as ca
 import numpy as np
-import numpy.typing as npt
 
 from .errors import InvalidValueError, ShapeError
 from .expressions.expression import (
@@ -27,11 +25,13 @@ from .expressions.expression import (
     access_listener,
     array,
     as_expression,
+    binary,
     from_casadi,
     union_nodes,
 )
 from .expressions.functions import arctan2, cos, norm, sin, sqrt, where
 from .expressions.layout import SX
+from .lie import normalize
 
 Direction = tuple[float, float, float]
 
@@ -225,8 +225,8 @@ def translation(
     else:
         others = (0.0 if y is None else y, 0.0 if z is None else z)
         parts = _components("A translation", ("x", "y", "z"), (first, *others))
-    column = ca.vertcat(_ONE, _ONE, _ONE, *(p._sx for p in parts), _ONE)
-    return from_casadi(ca.SX(_TRANSLATION, column), (4, 4), union_nodes(parts))
+    column = ca.vertcat(_UNIT_ENTRY, _UNIT_ENTRY, _UNIT_ENTRY, *(p._sx for p in parts), _UNIT_ENTRY)
+    return from_casadi(ca.SX(_TRANSLATION_SPARSITY, column), (4, 4), union_nodes(parts))
 
 
 def _components(
@@ -255,10 +255,6 @@ def _components(
     if len(present) != len(names):
         raise ShapeError(f"{wanted}, not as {len(present)}.")
     return tuple(present)
-
-
-_ONE = ca.SX(1)
-_TRANSLATION = ca.Sparsity.triplet(4, 4, [0, 1, 2, 0, 1, 2, 3], [0, 1, 2, 3, 3, 3, 3])
 
 
 def rotation_x(angle: ExpressionLike) -> Expression:
@@ -549,32 +545,6 @@ def unit_vector(v: VectorLike, what: str = "The vector") -> Expression:
     return expression / norm(expression)
 
 
-def normalize(v: Iterable[float]) -> tuple[float, ...] | None:
-    """Return numbers divided by their length, entries within 1e-15 of 0 and ±1 exact; None if it is zero."""
-    numbers = [float(c) for c in v]
-    largest = max(map(abs, numbers))
-    if not 0 < largest < math.inf:
-        return None
-    scaled = [c / largest for c in numbers]  # or the square of something tiny is nothing
-    length = math.sqrt(sum(c * c for c in scaled))
-    result = tuple(_round_exact(c / length) for c in scaled)
-    return None if any(math.isnan(c) for c in result) else result
-
-
-def _round_exact(number: float) -> float:
-    nearest = float(round(number)) if math.isfinite(number) else number
-    # Adding 0.0 turns -0.0 into 0.0.
-    return (nearest if abs(number - nearest) < 1e-15 else number) + 0.0
-
-
-def round_exact(numbers: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
-    """Return rotation entries with those within 1e-15 of 0 and ±1 made exact.
-
-    cos(π/2) is 6e-17 in floating point; what was meant is 0, and zeros make expressions small.
-    """
-    return np.reshape([_round_exact(n) for n in numbers.ravel().tolist()], numbers.shape)
-
-
 def _as_vector3(v: VectorLike, what: str) -> Expression:
     expression = as_expression(v)
     if expression.shape != (3,):
@@ -584,10 +554,6 @@ def _as_vector3(v: VectorLike, what: str) -> Expression:
 
 def _greater(a: ExpressionLike, b: ExpressionLike) -> Expression:
     """Return 1 where a > b, else 0: a plain fact for selections, with no slope and no trend."""
-    import casadi as ca
-
-    from .expressions.expression import binary
-
     return binary(ca.OP_LT, b, a)
 
 

@@ -10,7 +10,7 @@ from small_models import cabinet, dependent
 
 import kineverse as kv
 from kineverse.view.animation import RangeAnimation
-from kineverse.view.poses import FramePoses, complete, roll_pitch_yaw, to_quaternions
+from kineverse.view.poses import FramePoses, complete, roll_pitch_yaw, to_wxyz
 from kineverse.view.sliders import Ranges, choose_slider_range, choose_slider_step, infer_units
 from kineverse.view.violations import MOST_LINES, format_failure, format_violations
 
@@ -118,7 +118,7 @@ def test_quaternions_come_back(numbers):
             [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
         ]
     )
-    found = to_quaternions(matrix[None])[0]
+    found = to_wxyz(matrix[None])[0]
     assert abs(found @ q) == pytest.approx(1.0, abs=1e-9)
     assert found[0] >= 0.0
 

@@ -12,12 +12,12 @@ from typing import Any
 from kineverse._checks import real_number
 from kineverse.errors import DuplicateNameError, InvalidValueError, KineverseError
 from kineverse.expressions.expression import Expression, ExpressionLike
+from kineverse.lie import normalize
 from kineverse.model.articulation import Articulation
 from kineverse.model.body import AxisLike, Pose, Vector3
 from kineverse.model.frame import TransformLike
 from kineverse.model.operation import Operation, Writes
 from kineverse.model.read_recorder import ReadRecorder
-from kineverse.spatial import normalize
 from kineverse.symbols import Symbol, position
 
 from .limits import limit_constraints

@@ -12,11 +12,12 @@ import numpy as np
 from kineverse.errors import InvalidValueError
 from kineverse.expressions.expression import Expression, array
 from kineverse.expressions.functions import norm
+from kineverse.lie import round_exact, smallest_rotation_from_z, transform
 from kineverse.model.body import AxisLike, Pose
 from kineverse.model.constraint import Constraint
 from kineverse.model.operation import Writes
 from kineverse.model.read_recorder import ReadRecorder
-from kineverse.spatial import quaternion, rotation_z, round_exact, translation
+from kineverse.spatial import quaternion, rotation_z, translation
 from kineverse.symbols import Symbol, position, velocity
 
 from .joint import Joint, check_axis, check_joint_number
@@ -256,14 +257,5 @@ def orientation(name: str) -> Orientation:
 
 def rotation_from_z(axis: AxisLike) -> np.ndarray[tuple[int, int], np.dtype[np.float64]]:
     """Return the smallest rotation that turns z into the axis, 4×4."""
-    n = np.array(unit_axis(axis))
-    turn = np.eye(4)
-    if n[2] < 0 and not n[:2].any():
-        turn[1, 1] = turn[2, 2] = -1.0
-        return turn
-    v = np.array([-n[1], n[0], 0.0])  # z × n
-    k = np.array([[0, -v[2], v[1]], [v[2], 0, -v[0]], [-v[1], v[0], 0]])
-    # 1 / (1 + cos) of the angle; near a half turn by its sine, because nothing is left of the sum.
-    factor = 1 / (1 + n[2]) if n[2] > 0 else (1 - n[2]) / (v @ v)
-    turn[:3, :3] = round_exact(np.eye(3) + k + k @ k * factor)
-    return turn
+    rotation = smallest_rotation_from_z(np.array(unit_axis(axis)))
+    return transform(round_exact(rotation), np.zeros(3))

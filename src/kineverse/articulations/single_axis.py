@@ -9,10 +9,11 @@ import numpy as np
 
 from kineverse.errors import InvalidValueError
 from kineverse.expressions.expression import Expression
+from kineverse.lie import normalize, round_exact, transform
 from kineverse.model.body import AxisLike, Pose
 from kineverse.model.operation import Writes
 from kineverse.model.read_recorder import ReadRecorder
-from kineverse.spatial import X, Y, Z, normalize, rotation_about, round_exact, translation_along
+from kineverse.spatial import X, Y, Z, rotation_about, translation_along
 from kineverse.symbols import position
 
 from .joint import Joint, OneDofJoint, check_axis, check_joint_number
@@ -146,10 +147,9 @@ def rotation_factors(axis: AxisLike, q: Expression) -> tuple[Pose | Expression, 
     for component, about in ((x, X), (y, Y), (z, Z)):
         if abs(component) == 1.0 and (x, y, z).count(0.0) == 2:
             return (rotation_about(about, q if component > 0 else -q),)
-    to_axis = np.eye(4)
     a = np.array([x, y, z])
     helper = np.eye(3)[np.argmin(np.abs(a))]
     first = np.cross(helper, a)
     first /= np.linalg.norm(first)
-    to_axis[:3, :3] = round_exact(np.column_stack([first, np.cross(a, first), a]))
+    to_axis = transform(round_exact(np.column_stack([first, np.cross(a, first), a])), np.zeros(3))
     return Pose.of(to_axis), rotation_about(Z, q), Pose.of(to_axis.T)

@@ -11,7 +11,7 @@ import numpy as np
 
 from kineverse.estimation import Identifier, identify, pose_covariance
 from kineverse.estimation.identification.solver import solver
-from kineverse.lie import exp_so3, log_so3, transform
+from kineverse.lie import exp_so3, inverse, log_so3, pose_difference, retract, transform, translation
 
 from .harness import (
     Array,
@@ -66,18 +66,15 @@ def _recording() -> tuple[Array, Array]:
     angles = random.uniform(-_RANGE / 2, _RANGE / 2, count)
     turns = exp_so3(angles[:, None] * (0.0, 0.0, 1.0))
     hinge = transform(exp_so3(np.array([0.3, -0.2, 0.1])), np.array([0.5, 0.0, 0.0]))
-    relative = (
-        hinge @ transform(turns, np.zeros((count, 3))) @ transform(np.eye(3), np.array([0.4, 0.0, 0.0]))
-    )
+    relative = hinge @ transform(turns, np.zeros((count, 3))) @ translation(np.array([0.4, 0.0, 0.0]))
     parents = transform(exp_so3(random.normal(0.0, 1.0, (count, 3))), random.uniform(-1.0, 1.0, (count, 3)))
     return _noisy(parents, random), _noisy(parents @ relative, random)
 
 
 def _noisy(poses: Array, random: np.random.Generator) -> Array:
-    turns = exp_so3(random.normal(0.0, _ORIENTATION, (len(poses), 3)))
-    return transform(
-        turns @ poses[:, :3, :3], poses[:, :3, 3] + random.normal(0.0, _POSITION, (len(poses), 3))
-    )
+    turned = random.normal(0.0, _ORIENTATION, (len(poses), 3))
+    moved = random.normal(0.0, _POSITION, (len(poses), 3))
+    return retract(poses, np.concatenate([moved, turned], axis=1))
 
 
 def _ours(parents: Array, children: Array) -> Iterator[Contender]:
@@ -108,20 +105,19 @@ def _scipy(parents: Array, children: Array) -> Contender:
     start = identify(a, b, noise=pose_covariance(_POSITION, _ORIENTATION), families=["revolute"]).best
 
     def apart(seen: Array, true: Array) -> Array:
-        turned = log_so3(seen[:, :3, :3] @ np.swapaxes(true[:, :3, :3], 1, 2))
-        off: Array = np.concatenate([seen[:, :3, 3] - true[:, :3, 3], turned], axis=1) * scale
-        return off
+        weighted: Array = pose_difference(seen, true) * scale
+        return weighted
 
     def errors(unknown: Array) -> Array:
         left = transform(exp_so3(unknown[:3]), unknown[3:6])
         right = transform(exp_so3(unknown[6:9]), unknown[9:12])
         turns = exp_so3(unknown[12 : 12 + _COUNT, None] * (0.0, 0.0, 1.0))
         moved = unknown[12 + _COUNT :].reshape(_COUNT, 6)
-        true = transform(exp_so3(moved[:, 3:]) @ a[:, :3, :3], a[:, :3, 3] + moved[:, :3])
+        true = retract(a, moved)
         there = true @ left @ transform(turns, np.zeros((_COUNT, 3))) @ right
         return np.concatenate([apart(a, true), apart(b, there)]).ravel()
 
-    left, right = start.frame, np.linalg.inv(start.frame) @ start.parameters["reference"]
+    left, right = start.frame, inverse(start.frame) @ start.parameters["reference"]
     sides = [np.concatenate([log_so3(side[:3, :3]), side[:3, 3]]) for side in (left, right)]
     first = np.concatenate([*sides, start.joint_values[:, 0], np.zeros(6 * _COUNT)])
     return Contender(SCIPY, time_calls(lambda: optimize.least_squares(errors, first, method="lm")))
@@ -131,5 +127,5 @@ def _ripl(parents: Array, children: Array) -> Contender:
     peer: Any = importlib.import_module("ripl_articulation")
     a, b = parents[:_COUNT], children[:_COUNT]
     # It takes the parts to coincide at joint value 0.
-    aligned = b @ np.linalg.inv(np.linalg.inv(a[0]) @ b[0])
+    aligned = b @ inverse(inverse(a[0]) @ b[0])
     return Contender(RIPL, time_calls(lambda: peer.solve_articulation_from_poses(a, aligned)))

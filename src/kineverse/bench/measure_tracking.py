@@ -10,6 +10,7 @@ import numpy as np
 from kineverse.compile import compile  # noqa: A004
 from kineverse.estimation import ObservedPose, Tracker, pose_covariance
 from kineverse.formats import load
+from kineverse.lie import retract
 from kineverse.model.model import Model
 
 from .harness import Array, BenchmarkSettings, Contender, Contenders, time_calls, time_contenders
@@ -66,14 +67,9 @@ def _readings(model: Model, frames: list[str], count: int) -> list[Array]:
 
 
 def _noisy(poses: Array, rng: np.random.Generator) -> Array:
-    seen = poses.copy()
-    seen[:, :3, 3] += POSITION * rng.standard_normal((len(poses), 3))
-    vectors = ORIENTATION * rng.standard_normal((len(poses), 3))
-    angles = np.linalg.norm(vectors, axis=1)[:, None, None]
-    k = np.cross(np.eye(3), vectors[:, None, :]) / angles
-    turns = np.eye(3) + np.sin(angles) * k + (1 - np.cos(angles)) * (k @ k)
-    seen[:, :3, :3] = turns @ seen[:, :3, :3]
-    return seen
+    moved = POSITION * rng.standard_normal((len(poses), 3))
+    turned = ORIENTATION * rng.standard_normal((len(poses), 3))
+    return retract(poses, np.concatenate([moved, turned], axis=1))
 
 
 def _ours(model: Model, frames: list[str], covariance: Array, readings: list[Array]) -> Iterator[Contender]:

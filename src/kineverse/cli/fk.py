@@ -16,6 +16,7 @@ from kineverse.cli.arguments import (
 )
 from kineverse.errors import InvalidValueError
 from kineverse.expressions.printing import format_number
+from kineverse.lie import to_quaternion
 
 if TYPE_CHECKING:
     pass
@@ -48,7 +49,7 @@ def run(arguments: argparse.Namespace) -> int:
     import numpy as np
 
     import kineverse as kv
-    from kineverse.view.poses import complete, roll_pitch_yaw, to_quaternions
+    from kineverse.view.poses import complete, roll_pitch_yaw
 
     model = load_model(arguments, arguments.model)
     expression = model.fk(arguments.frame, arguments.relative_to)
@@ -63,7 +64,7 @@ def run(arguments: argparse.Namespace) -> int:
             "set other positions with --set."
         )
     position, rpy = pose[:3, 3], roll_pitch_yaw(pose)
-    xyzw = np.roll(to_quaternions(pose[None])[0], -1)
+    xyzw = to_quaternion(pose[:3, :3])
     if arguments.json:
         answer = {
             "frame": arguments.frame,

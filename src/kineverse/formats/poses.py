@@ -9,14 +9,8 @@ from __future__ import annotations
 import math
 from functools import lru_cache
 
+from kineverse.lie import snap
 from kineverse.model.body import Pose, Vector3
-
-SNAP = 1e-15
-"""Entries of a rotation this close to 0, 1 or -1 are exactly that.
-
-Quarter turns are written to 16 digits, whose cosine is 6e-17; taken literally, it would stay in every
-expression of a chain as a term that only noise feeds.
-"""
 
 
 @lru_cache(maxsize=8192)
@@ -82,15 +76,6 @@ def pose_from_quaternion(xyz: tuple[float, ...], xyzw: tuple[float, ...]) -> Pos
             z,
         )
     )
-
-
-def snap(value: float) -> float:
-    """Return 0, 1 or -1 if the value is within ``SNAP`` of it, else the value."""
-    if abs(value) <= SNAP:
-        return 0.0
-    if abs(abs(value) - 1.0) <= SNAP:
-        return math.copysign(1.0, value)
-    return value
 
 
 IDENTITY = Pose()

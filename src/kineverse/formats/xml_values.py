@@ -20,6 +20,7 @@ from typing import TypeVar
 from kineverse.formats import poses
 from kineverse.formats.reader_warnings import ReaderWarnings
 from kineverse.formats.xml_reader import TEXT, Element, ElementError, find_child, quote
+from kineverse.lie import snap
 from kineverse.model.body import Pose, Vector3
 
 from .xml_reader import abbreviate
@@ -300,7 +301,7 @@ def read_axis_direction(axis: Element) -> Vector3:
     length = math.hypot(x, y, z)
     if length < 1e-9:
         raise ElementError(axis, f"has the direction {x:g} {y:g} {z:g}, which has length zero.")
-    return (poses.snap(x / length), poses.snap(y / length), poses.snap(z / length))
+    return (snap(x / length), snap(y / length), snap(z / length))
 
 
 def read_element_pose(element: Element, remarks: ReaderWarnings) -> Pose:

@@ -14,6 +14,7 @@ import numpy.typing as npt
 
 from kineverse.articulations.mechanisms import simple_bodies
 from kineverse.articulations.mechanisms.simple_bodies import BLUE, DARK, STEEL, WOOD
+from kineverse.lie import rotation_z, transform
 from kineverse.model.body import Box, Capsule, Cylinder, Geometry, Pose, Rgba, Shape, Sphere, Vector3
 
 __all__ = [
@@ -155,9 +156,7 @@ def _triple(point: Point) -> Vector3:
 
 
 def _placed(geometry: Geometry, at: Point, axis: Point, color: Rgba, turn: float = 0.0) -> Shape:
-    c, s = math.cos(turn), math.sin(turn)
-    about = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
-    return Shape(geometry, _pose(_frame(axis) @ about, at), color=color)
+    return Shape(geometry, _pose(_frame(axis) @ rotation_z(np.asarray(turn)), at), color=color)
 
 
 def _frame(axis: Point) -> npt.NDArray[np.float64]:
@@ -173,6 +172,4 @@ def _frame(axis: Point) -> npt.NDArray[np.float64]:
 
 
 def _pose(rotation: npt.NDArray[np.float64], at: Point) -> Pose:
-    matrix = np.eye(4)
-    matrix[:3, :3], matrix[:3, 3] = rotation, at
-    return Pose.of(matrix)
+    return Pose.of(transform(rotation, np.asarray(at, dtype=float)))

@@ -10,6 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from kineverse.errors import InvalidValueError, UnknownNameError, suggest
+from kineverse.lie import inverse
 from kineverse.model.frame import WORLD
 from kineverse.model.kinematics import ancestors
 from kineverse.model.model_view import ModelView
@@ -114,7 +115,7 @@ class Scene:
         mirror.ready(())
         piece = mirror.members[mirror.number(body)][0]
         world_T_piece = np.vstack([mirror.table.poses[piece], [0.0, 0.0, 0.0, 1.0]])
-        return np.asarray(world_T_piece @ np.linalg.inv(mirror.pieces[piece].shape.origin.matrix))
+        return np.asarray(world_T_piece @ inverse(mirror.pieces[piece].shape.origin.matrix))
 
     # -- distances -----------------------------------------------------------------------------------------
 

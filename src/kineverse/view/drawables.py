@@ -16,6 +16,7 @@ from kineverse.geometry.exclusions import is_installed
 from kineverse.geometry.mesh_files import Faces
 from kineverse.geometry.objects import collision_shapes
 from kineverse.geometry.shapes import Solid, solid_from_geometry, solid_from_points, solid_surface
+from kineverse.lie import translation
 from kineverse.model.body import Body, Box, Mesh, Shape
 from kineverse.model.model_view import ModelView
 from kineverse.view.meshes import LoadedMesh, load_mesh, mesh_geometry
@@ -201,7 +202,6 @@ def create_axes(model: ModelView, corners: Floats, poses: Mapping[str, Floats]) 
     for axis, color in enumerate(AXIS_COLORS):
         size = np.full(3, width)
         size[axis] = length
-        shift = np.eye(4)
-        shift[axis, 3] = length / 2
+        shift = translation(0.5 * length * np.eye(3)[axis])
         bars.append((mesh_geometry(Box((size[0], size[1], size[2]))).moved(shift), color))
     return [Drawable(name, surface, color, "visual") for name in poses for surface, color in bars]

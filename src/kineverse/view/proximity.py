@@ -10,11 +10,11 @@ from dataclasses import dataclass, field
 from itertools import takewhile
 
 import numpy as np
-import numpy.typing as npt
 
 from kineverse.errors import KineverseError
 from kineverse.geometry import DistanceResult, Rule, Scene
 from kineverse.geometry.exclusions import RIGID, ExcludedPairs, find_unusable_shapes, label_unusable_shapes
+from kineverse.lie import rotation_along_z, transform, translation
 from kineverse.model.body import Cone, Cylinder
 from kineverse.model.frame import WORLD
 from kineverse.model.model_view import ModelView
@@ -227,7 +227,7 @@ def create_marker_drawables(marks: ProximityMarkers, length: float) -> list[Draw
     for ends, shade in zip(marks.lines, marks.colors, strict=True):
         rgba = (float(shade[0]), float(shade[1]), float(shade[2]), 1.0)
         ball = mesh_placeholder().scaled(length * BALL / 0.05)  # which is 0.05 m large
-        surfaces = [ball.moved(_translation_to(end)) for end in ends]
+        surfaces = [ball.moved(translation(end)) for end in ends]
         if (rod := _rod(ends, length * LINE)) is not None:
             surfaces.append(rod)
         found += [Drawable(WORLD, surface, rgba, "visual") for surface in surfaces]
@@ -254,20 +254,9 @@ def _rod(ends: Floats, radius: float) -> TriangleMesh | None:
     return mesh_geometry(Cylinder(radius, length)).moved(_pose_along(ends)) if length > 1e-6 else None
 
 
-def _translation_to(point: npt.NDArray[np.float64]) -> Floats:
-    pose = np.eye(4)
-    pose[:3, 3] = point
-    return pose
-
-
 def _pose_along(ends: Floats) -> Floats:
     """Return the pose in the middle of a line with z along it, 4×4."""
-    z = (ends[1] - ends[0]) / np.linalg.norm(ends[1] - ends[0])
-    x = np.cross(z, np.eye(3)[int(np.argmin(np.abs(z)))])
-    x /= np.linalg.norm(x)
-    pose = _translation_to(ends.mean(axis=0))
-    pose[:3, :3] = np.stack([x, np.cross(z, x), z], axis=1)
-    return pose
+    return transform(rotation_along_z(ends[1] - ends[0]), ends.mean(axis=0))
 
 
 logger = logging.getLogger(__name__)

@@ -20,7 +20,7 @@ from kineverse.view.auto_camera import (
 )
 from kineverse.view.camera import Camera
 from kineverse.view.drawables import Drawable, Kind, choose_axis_length, collect_drawables
-from kineverse.view.poses import FramePoses, to_quaternions
+from kineverse.view.poses import FramePoses, to_wxyz
 from kineverse.view.rasterizer import TriangleSoup
 from kineverse.view.triangle_mesh import Floats, Integers, TriangleMesh
 
@@ -104,7 +104,7 @@ class ViewerScene:
             self.poses = poses
             if not len(moved):
                 return 0
-            turned = to_quaternions(poses[moved])
+            turned = to_wxyz(poses[moved])
             with self._server.atomic():
                 for k, wxyz in zip(moved, turned, strict=True):
                     node = self._nodes.get(self.names[k])
@@ -135,7 +135,7 @@ class ViewerScene:
             if axes and wanted:
                 self._axes = self._server.scene.add_batched_axes(
                     "/axes",
-                    to_quaternions(self.poses[wanted]),
+                    to_wxyz(self.poses[wanted]),
                     self.poses[wanted, :3, 3],
                     axes_length=self.length,
                     axes_radius=0.035 * self.length,
@@ -231,13 +231,13 @@ class ViewerScene:
                 show_axes=False,
                 visible=frame not in self.unplaced,
                 position=self.poses[k, :3, 3],
-                wxyz=to_quaternions(self.poses[k : k + 1])[0],
+                wxyz=to_wxyz(self.poses[k : k + 1])[0],
             )
         return self._nodes[frame]
 
     def _move_frames(self) -> None:
         if self._axes is not None:
-            self._axes.batched_wxyzs = to_quaternions(self.poses[self._shown]).astype(np.float32)
+            self._axes.batched_wxyzs = to_wxyz(self.poses[self._shown]).astype(np.float32)
             self._axes.batched_positions = self.poses[self._shown, :3, 3].astype(np.float32)
         for k, label in zip(self._shown, self._labels, strict=False):
             label.position = self.poses[k, :3, 3]

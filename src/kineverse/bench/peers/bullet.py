@@ -5,11 +5,9 @@ from __future__ import annotations
 import itertools
 from typing import Any
 
-import numpy as np
-
 from kineverse.bench.clutter import BOX_SIZE, CAPSULE_SIZE, CENTRE, LINK_LENGTH, LINKS, RADIUS, Clutter
 from kineverse.bench.harness import Array
-from kineverse.view.poses import to_quaternions
+from kineverse.lie import to_quaternion
 
 from .clutter_search import PairDistances
 
@@ -119,5 +117,5 @@ def _create_body(
 
 def xyzw_quaternions(poses: Array) -> list[list[float]]:
     """Return (x, y, z, w) of (N, 3, 4) or larger poses."""
-    found: list[list[float]] = np.roll(to_quaternions(poses), -1, axis=1).tolist()
+    found: list[list[float]] = to_quaternion(poses[:, :3, :3]).tolist()
     return found

@@ -10,6 +10,7 @@ import numpy as np
 
 from kineverse.bench.harness import Array
 from kineverse.bench.workloads import BenchmarkRobot, strip_shapes
+from kineverse.lie import transform
 
 
 class MujocoRobot:
@@ -52,10 +53,7 @@ class MujocoRobot:
 
     def pose(self, body: int) -> Array:
         """Return where a body is, shape (4, 4)."""
-        pose = np.eye(4)
-        pose[:3, :3] = self.data.xmat[body].reshape(3, 3)
-        pose[:3, 3] = self.data.xpos[body]
-        return pose
+        return transform(self.data.xmat[body].reshape(3, 3), self.data.xpos[body])
 
 
 def make_robot_mjcf(robot: BenchmarkRobot) -> str:

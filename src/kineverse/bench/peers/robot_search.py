@@ -11,7 +11,7 @@ from kineverse.bench.harness import Array
 from kineverse.geometry import Scene
 from kineverse.geometry.shapes import Solid
 from kineverse.model.body import Box, Capsule, Cylinder, Ellipsoid, Sphere
-from kineverse.view.poses import to_quaternions
+from kineverse.view.poses import to_wxyz
 
 from .bullet import create_static_bodies, xyzw_quaternions
 from .clutter_search import UNIT_BOX_CORNERS, MujocoSearch, PairDistances, format_mjcf_numbers, make_mjcf
@@ -75,7 +75,7 @@ class MujocoRobotSearch(MujocoSearch):
     def put(self, angles: Array) -> None:
         """Move what moves."""
         poses = self._room.update(angles)
-        self.data.qpos.reshape(-1, 7)[:] = np.hstack([poses[:, :, 3], to_quaternions(poses)])
+        self.data.qpos.reshape(-1, 7)[:] = np.hstack([poses[:, :, 3], to_wxyz(poses)])
         self._mujoco.mj_kinematics(self.model, self.data)
 
 

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from kineverse.lie import Stack, exp_so3, orthonormalize, rotation_along_z, transform
+from kineverse.lie import Stack, exp_so3, orthonormalize, rotation_along_z, transform, translation
 
 from .families import VZ, WZ, GroupMotion
 from .motion_model import FamilyMember
@@ -53,9 +53,7 @@ def _origin(motion: GroupMotion) -> GroupMotion:
     place = motion.right[:3, 3]
     free = (1, 1, 1) if motion.group.name == "prismatic" else (0, 0, 1)
     way = place * free
-    to, back = np.eye(4), np.eye(4)
-    to[:3, 3], back[:3, 3] = way, -way
-    return replace(motion, left=motion.left @ to, right=back @ motion.right)
+    return replace(motion, left=motion.left @ translation(way), right=translation(-way) @ motion.right)
 
 
 def _axes(motion: GroupMotion, values: Stack, flip: bool) -> tuple[GroupMotion, Stack]:

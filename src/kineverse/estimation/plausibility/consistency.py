@@ -20,7 +20,7 @@ from kineverse.compile import compile  # noqa: A004
 from kineverse.errors import KineverseError
 from kineverse.estimation.linear_algebra import multiply_vectors
 from kineverse.expressions.expression import Expression, array, as_expression
-from kineverse.lie import Stack, log_so3
+from kineverse.lie import Stack, pose_difference
 from kineverse.model.model import Model
 from kineverse.model.operation import ARTICULATIONS
 from kineverse.model.rate_nodes import to_plain
@@ -252,7 +252,7 @@ def _apart(
         own = back @ here.by_joints
         spread = (own @ left.covariances @ np.swapaxes(own, 1, 2))[:, k, k]
         z = _deviations(
-            multiply_vectors(back, _between(expected.pose, here.pose))[:, k], spread, variance, shared
+            multiply_vectors(back, pose_difference(here.pose, expected.pose))[:, k], spread, variance, shared
         )
         # Where a linkage is stretched its slope does not say how well anything is known, here or there.
         enough = _BENT * _FAR * np.sqrt(spread + variance)
@@ -261,17 +261,14 @@ def _apart(
             for step in (-_FAR * np.sqrt(own_variance), _FAR * np.sqrt(own_variance)):
                 moved = values.copy()
                 moved[:, k] += step
-                off = _between(linear.pose, served.at(moved).pose) - step[:, None] * linear.by_joints[:, :, k]
+                off = (
+                    pose_difference(served.at(moved).pose, linear.pose)
+                    - step[:, None] * linear.by_joints[:, :, k]
+                )
                 z[~(np.abs(multiply_vectors(back, off)[:, k]) <= enough)] = np.nan
     except KineverseError:
         return np.full(len(left), np.nan)
     return z
-
-
-def _between(poses: Stack, others: Stack) -> Stack:
-    """Return the twists (N, 6) that lead from some poses to others, to first order in positions."""
-    turned = log_so3(others[:, :3, :3] @ np.swapaxes(poses[:, :3, :3], 1, 2))
-    return np.concatenate([others[:, :3, 3] - poses[:, :3, 3], turned], axis=1)
 
 
 def _variances(slopes: Stack, covariances: Stack) -> Stack:

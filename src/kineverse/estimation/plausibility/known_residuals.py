@@ -16,7 +16,7 @@ import numpy.typing as npt
 from kineverse.estimation.identification.motion_model import LinearisedPoses
 from kineverse.estimation.identification.observations import Observations
 from kineverse.estimation.linear_algebra import invert_matrices
-from kineverse.lie import Stack, log_so3, skew
+from kineverse.lie import Stack, pose_difference, skew
 
 from .known_motion import KnownJoint
 
@@ -121,10 +121,7 @@ def compute_residuals(served: KnownJoint, seen: Observations) -> KnownResiduals:
 
 def _turns(linear: LinearisedPoses) -> Stack:
     """Return the joint values that lead from the first pose to each, to first order."""
-    first = linear.pose[0]
-    turned = log_so3(linear.pose[:, :3, :3] @ first[:3, :3].T)
-    twists = np.concatenate([linear.pose[:, :3, 3] - first[:3, 3], turned], axis=1)
-    values: Stack = twists @ np.linalg.pinv(linear.by_joints[0]).T
+    values: Stack = pose_difference(linear.pose, linear.pose[0]) @ np.linalg.pinv(linear.by_joints[0]).T
     return values
 
 

@@ -16,6 +16,7 @@ from kineverse.estimation.recordings.columns import SAYS, WITHOUT_NAMES, Columns
 from kineverse.estimation.recordings.recording import Indices, RecordedTrack, Recording
 from kineverse.formats.files import read_file
 from kineverse.formats.xml_values import LARGEST
+from kineverse.lie import exp_so3, quaternion, rpy, transform
 
 COMMENT = "#"
 
@@ -201,10 +202,7 @@ def _track(table: TextTable, columns: Columns, where: PartColumns, rows: Indices
     lines = np.array(table.lines, dtype=np.intp)[rows]
     poses = _numbers(table, columns, where.position, rows)
     if where.form:
-        whole = np.tile(np.eye(4), (len(rows), 1, 1))
-        whole[:, :3, :3] = _rotations(table, columns, where, rows)
-        whole[:, :3, 3] = poses
-        poses = whole
+        poses = transform(_rotations(table, columns, where, rows), poses)
     times = None
     if columns.time is not None:
         times = _numbers(table, columns, (columns.time,), rows)[:, 0]
@@ -247,38 +245,8 @@ def _rotations(table: TextTable, columns: Columns, where: PartColumns, rows: Ind
                 f"{lengths[worst]:.4g}, which is off by {off[worst]:.2g}; {int((off > OFF_UNIT).sum())} of "
                 f"{len(off)} are not of unit length."
             )
-        return _rotations_from_quaternions(numbers / lengths[:, None])
-    if where.form == "rpy":
-        roll, pitch, yaw = (_axis_rotations(axis, numbers[:, axis]) for axis in range(3))
-        return np.asarray(yaw @ pitch @ roll)
-    angles = np.linalg.norm(numbers, axis=1)
-    half = 0.5 * angles
-    # sin(φ/2)/φ, which is 1/2 where nothing turns.
-    scale = 0.5 * np.sinc(half / np.pi)
-    return _rotations_from_quaternions(np.column_stack([numbers * scale[:, None], np.cos(half)]))
-
-
-def _rotations_from_quaternions(q: Array) -> Array:
-    x, y, z, w = q.T
-    return np.stack(
-        [
-            np.stack([1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)], axis=-1),
-            np.stack([2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)], axis=-1),
-            np.stack([2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)], axis=-1),
-        ],
-        axis=-2,
-    )
-
-
-def _axis_rotations(axis: int, angles: Array) -> Array:
-    """Return the rotations about x, y or z, (N, 3, 3)."""
-    after, last = (axis + 1) % 3, (axis + 2) % 3
-    turned = np.zeros((len(angles), 3, 3))
-    turned[:, axis, axis] = 1.0
-    turned[:, after, after] = turned[:, last, last] = np.cos(angles)
-    turned[:, last, after] = np.sin(angles)
-    turned[:, after, last] = -np.sin(angles)
-    return turned
+        return quaternion(numbers)
+    return rpy(numbers) if where.form == "rpy" else exp_so3(numbers)
 
 
 def _check_order(table: TextTable, times: Array, lines: Indices) -> None:

@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 from kineverse.compile import CompiledFunction
 from kineverse.errors import InvalidValueError, ShapeError, UnknownNameError, suggest
-from kineverse.lie import Array, inverse_right_jacobian, log_so3
+from kineverse.lie import Array, inverse_right_jacobian, pose_difference, transform
 
 from .layout import Layout
 from .measurements import MeasurementModel, require_covariance, wrap_difference
@@ -69,9 +69,7 @@ class MeasurementReader:
         for i, one in enumerate(self._layout.observations):
             value = said[self._layout.value_slices[i]]
             if one.is_pose:
-                pose = np.eye(4)
-                pose[:3, :3], pose[:3, 3] = value[:9].reshape(3, 3), value[9:]
-                value = pose.reshape(-1)
+                value = transform(value[:9].reshape(3, 3), value[9:]).reshape(-1)
             values[self._layout.seen_slices[i]] = value
         return values
 
@@ -258,12 +256,9 @@ class Residuals:
         if poses:
             said = np.stack([out[layout.value_slices[i]] for i in poses])
             found = np.stack([values[i] for i in poses]).reshape(-1, 4, 4)
-            turned = found[:, :3, :3] @ np.swapaxes(said[:, :9].reshape(-1, 3, 3), 1, 2)
-            vectors = log_so3(turned)
-            back = inverse_right_jacobian(vectors)
-            errors.update(
-                zip(poses, np.concatenate([found[:, :3, 3] - said[:, 9:], vectors], axis=1), strict=True)
-            )
+            differences = pose_difference(found, transform(said[:, :9].reshape(-1, 3, 3), said[:, 9:]))
+            back = inverse_right_jacobian(differences[:, 3:])
+            errors.update(zip(poses, differences, strict=True))
             for i, turn in zip(poses, back, strict=True):
                 slope = slopes[i]
                 slopes[i] = np.concatenate([slope[:3], turn @ slope[3:]])

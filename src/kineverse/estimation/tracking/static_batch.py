@@ -15,7 +15,7 @@ from typing import TypeAlias
 
 import numpy as np
 
-from kineverse.lie import Array, exp_so3, log_so3
+from kineverse.lie import Array, pose_difference, retract
 
 from .gaussian import InformationState, QuadraticCost, inverse_spd
 from .layout import Layout
@@ -57,17 +57,13 @@ class MeanMeasurement:
         peak = self.peak + other.peak - float(apart @ self.information @ step) / 2
         if not one.is_pose:
             return MeanMeasurement(self.value + step, information, peak)
-        pose = self.value.reshape(4, 4).copy()
-        pose[:3, :3] = exp_so3(step[3:]) @ pose[:3, :3]
-        pose[:3, 3] += step[:3]
+        pose = retract(self.value.reshape(4, 4), step)
         return MeanMeasurement(pose.reshape(-1), information, peak)
 
     def _apart(self, other: MeanMeasurement, one: MeasurementModel) -> Array:
         if not one.is_pose:
             return wrap_difference(other.value - self.value, one.period)
-        mine, theirs = self.value.reshape(4, 4), other.value.reshape(4, 4)
-        turn = log_so3(theirs[:3, :3] @ mine[:3, :3].T)
-        return np.concatenate([theirs[:3, 3] - mine[:3, 3], turn])
+        return pose_difference(other.value.reshape(4, 4), self.value.reshape(4, 4))
 
 
 @dataclass(frozen=True, eq=False)

@@ -22,7 +22,7 @@ import numpy as np
 import numpy.typing as npt
 
 from kineverse.experiments.estimation_grid.samples import Cell, JointSamples, joint_motions
-from kineverse.lie import exp_so3
+from kineverse.lie import retract
 
 Array = npt.NDArray[np.float64]
 
@@ -118,21 +118,14 @@ def _observation_errors(samples: JointSamples, shared: int, k: int, step: float)
     axis = samples.axis + sides @ change[:2]
     axis /= np.linalg.norm(axis, axis=1, keepdims=True)
     point = samples.point + (sides @ change[2:4] if shared == 10 else 0.0)
-    zero = _perturb_poses(samples.zero, change[shared - 6 : shared])
-    parents = _perturb_poses(samples.parents, change[shared : shared + 6])
+    zero = retract(samples.zero, change[shared - 6 : shared])
+    parents = retract(samples.parents, change[shared : shared + 6])
     joint = samples.cell.joint
     children = parents @ joint_motions(joint, axis, point, samples.joint_values + change[-1]) @ zero[:, None]
     truth = joint_motions(joint, samples.axis, samples.point, samples.joint_values) @ samples.zero[:, None]
     return np.concatenate(
         [_pose_errors(parents, samples.parents), _pose_errors(children, samples.parents @ truth)], axis=-1
     )
-
-
-def _perturb_poses(poses: Array, change: Array) -> Array:
-    moved = poses.copy()
-    moved[..., :3, 3] += change[:3]
-    moved[..., :3, :3] = exp_so3(change[3:]) @ moved[..., :3, :3]
-    return moved
 
 
 def _pose_errors(poses: Array, others: Array) -> Array:

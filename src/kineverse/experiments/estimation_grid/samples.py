@@ -15,7 +15,7 @@ from typing import Literal
 import numpy as np
 import numpy.typing as npt
 
-from kineverse.lie import exp_so3
+from kineverse.lie import exp_so3, quaternion, retract, transform, translation, unit_vector
 
 Array = npt.NDArray[np.float64]
 Joint = Literal["prismatic", "revolute"]
@@ -82,11 +82,11 @@ class JointSamples:
 
 def draw_samples(cell: Cell, count: int, rng: np.random.Generator) -> JointSamples:
     """Return so many samples of a cell."""
-    axis, zero = _random_directions(rng, count), np.tile(np.eye(4), (count, 1, 1))
+    axis = _random_directions(rng, count)
     to_axis, lever = _random_orthogonal(rng, axis), _random_orthogonal(rng, axis)
     point = TO_AXIS * to_axis
-    zero[:, :3, :3] = exp_so3(rng.uniform(-math.pi, math.pi, (count, 1)) * _random_directions(rng, count))
-    zero[:, :3, 3] = point + LEVER * lever
+    turn = rng.uniform(-math.pi, math.pi, (count, 1)) * _random_directions(rng, count)
+    zero = transform(exp_so3(turn), point + LEVER * lever)
     values = np.tile(np.linspace(0.0, cell.range, cell.count), (count, 1))
     parents = _random_poses(rng, (count, cell.count))
     children = parents @ joint_motions(cell.joint, axis, point, values) @ zero[:, None]
@@ -98,42 +98,28 @@ def draw_samples(cell: Cell, count: int, rng: np.random.Generator) -> JointSampl
 
 def joint_motions(joint: Joint, axis: Array, point: Array, values: Array) -> Array:
     """Return how joints have moved things, (S, N, 4, 4), by axes (S, 3), points on them and values (S, N)."""
-    moved = np.tile(np.eye(4), (*values.shape, 1, 1))
     along = values[..., None] * axis[:, None]
     if joint == "prismatic":
-        moved[..., :3, 3] = along
-        return moved
+        return translation(along)
     turned = exp_so3(along)
-    moved[..., :3, :3] = turned
-    moved[..., :3, 3] = point[:, None] - (turned @ point[:, None, :, None])[..., 0]
-    return moved
+    return transform(turned, point[:, None] - (turned @ point[:, None, :, None])[..., 0])
 
 
 def _observe(poses: Array, cell: Cell, rng: np.random.Generator) -> Array:
-    seen, shape = poses.copy(), (*poses.shape[:2], 3)
-    seen[..., :3, 3] += cell.position * rng.standard_normal(shape)
-    seen[..., :3, :3] = exp_so3(cell.orientation * rng.standard_normal(shape)) @ seen[..., :3, :3]
-    return seen
+    shape = (*poses.shape[:2], 3)
+    moved, turned = cell.position * rng.standard_normal(shape), cell.orientation * rng.standard_normal(shape)
+    return retract(poses, np.concatenate([moved, turned], axis=-1))
 
 
 def _random_directions(rng: np.random.Generator, count: int) -> Array:
-    found = rng.standard_normal((count, 3))
-    units: Array = found / np.linalg.norm(found, axis=1, keepdims=True)
-    return units
+    return unit_vector(rng.standard_normal((count, 3)))
 
 
 def _random_orthogonal(rng: np.random.Generator, axis: Array) -> Array:
     """Return directions across axes, (S, 3)."""
-    found = np.cross(axis, _random_directions(rng, len(axis)))
-    across: Array = found / np.linalg.norm(found, axis=1, keepdims=True)
-    return across
+    return unit_vector(np.cross(axis, _random_directions(rng, len(axis))))
 
 
 def _random_poses(rng: np.random.Generator, shape: tuple[int, int]) -> Array:
-    poses = np.tile(np.eye(4), (*shape, 1, 1))
-    q = rng.standard_normal((*shape, 4))
-    w, v = q[..., :1], q[..., 1:]
-    length = np.linalg.norm(v, axis=-1, keepdims=True)
-    poses[..., :3, :3] = exp_so3(2.0 * np.arctan2(length, w) * v / length)
-    poses[..., :3, 3] = rng.uniform(-1.0, 1.0, (*shape, 3))
-    return poses
+    wxyz = rng.standard_normal((*shape, 4))
+    return transform(quaternion(np.roll(wxyz, -1, axis=-1)), rng.uniform(-1.0, 1.0, (*shape, 3)))

@@ -15,7 +15,7 @@ from kineverse.compile import CompiledFunction, compile  # noqa: A004
 from kineverse.errors import ModelError
 from kineverse.estimation import ObservedPose, Tracker, pose_covariance
 from kineverse.experiments.fig4.paper_ekf import SPREAD, STEPS, PaperEkf
-from kineverse.lie import exp_so3
+from kineverse.lie import exp_so3, retract, transform
 from kineverse.model.model_view import ModelView
 from kineverse.symbols import Symbol
 
@@ -165,21 +165,17 @@ def add_published_noise(
         half of it, on which y and z have a correlation of 2/π. ``"uniform"`` draws over all of it.
     """
     lead = poses.shape[:-2]
-    moved = poses.copy()
     shift = _directions(rng, lead, directions) * rng.normal(0, noise.position, (*lead, 1))
     turn = _directions(rng, lead, directions) * rng.normal(0, noise.orientation, (*lead, 1))
-    moved[..., :3, 3] += (poses[..., :3, :3] @ shift[..., None])[..., 0]
-    moved[..., :3, :3] = poses[..., :3, :3] @ exp_so3(turn)
-    return moved
+    return poses @ transform(exp_so3(turn), shift)
 
 
 def add_gaussian_noise(poses: Array, noise: PoseNoise, rng: Generator) -> Array:
     """Return poses (p + δp, Exp(δθ) R), all six N(0, σ): see :mod:`kineverse.estimation.noise`."""
     lead = poses.shape[:-2]
-    moved = poses.copy()
-    moved[..., :3, 3] += rng.normal(0, noise.position, (*lead, 3))
-    moved[..., :3, :3] = exp_so3(rng.normal(0, noise.orientation, (*lead, 3))) @ poses[..., :3, :3]
-    return moved
+    moved = rng.normal(0, noise.position, (*lead, 3))
+    turned = rng.normal(0, noise.orientation, (*lead, 3))
+    return retract(poses, np.concatenate([moved, turned], axis=-1))
 
 
 def _directions(rng: Generator, lead: tuple[int, ...], how: Directions) -> Array:

@@ -18,8 +18,9 @@ import numpy.typing as npt
 from kineverse.expressions.expression import Expression
 from kineverse.formats.description import IDENTITY_COEFFICIENTS, Coefficients
 from kineverse.intervals.graph import Term, TermGraph
+from kineverse.lie import rotation_along_z, round_exact, transform, translation
 from kineverse.model.body import Pose, Vector3
-from kineverse.spatial import OneAxisTransform, round_exact
+from kineverse.spatial import OneAxisTransform
 
 from .trig_polynomial import NOISE, TooManyTermsError, TrigPolynomial, TrigPolynomialConverter
 
@@ -360,19 +361,16 @@ def _ellipse(
     normal = np.cross(c.real, -c.imag)
     if np.linalg.norm(normal) < NOISE * np.abs(c).max():
         along = c.real if np.abs(c.real).max() > np.abs(c.imag).max() else c.imag
-        normal = np.cross(np.eye(3)[int(np.argmin(np.abs(along)))], along)
+        normal = rotation_along_z(along)[:, 0]
     normal = round_exact(normal / np.linalg.norm(normal))
-    u = np.cross(np.eye(3)[int(np.argmin(np.abs(normal)))], normal)
-    u /= np.linalg.norm(u)
-    v = np.cross(normal, u)
+    u, v, _ = rotation_along_z(normal).T
     found: list[Matrix | AnyJointMotion] = []
     for sign in (1, -1):
         arm = (c @ u + sign * 1j * (c @ v)) / 2
         if abs(arm) < NOISE:
             continue
         # Re(arm · (u - sign·i·v) · exp(iθ)): an arm that is turned by θ about sign · normal.
-        reach = np.eye(4)
-        reach[:3, 3] = arm.real * u + sign * arm.imag * v
+        reach = translation(arm.real * u + sign * arm.imag * v)
         axis = as_vector3(sign * normal)
         turns = [
             JointMotion(True, axis, ZERO_VECTOR, harmonics.variables[index], (0.0, w))
@@ -385,6 +383,4 @@ def _ellipse(
 
 def _clean_pose(pose: Matrix) -> Matrix:
     """Return a pose without the noise that products leave."""
-    result = np.eye(4)
-    result[:3, :3], result[:3, 3] = round_exact(pose[:3, :3]), round_position(pose[:3, 3])
-    return result
+    return transform(round_exact(pose[:3, :3]), round_position(pose[:3, 3]))

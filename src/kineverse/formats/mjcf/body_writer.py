@@ -16,6 +16,7 @@ from kineverse.formats.export.mesh_paths import RemarkCallback, find_file, path_
 from kineverse.formats.export.poses import unit_quaternion
 from kineverse.formats.resource_paths import locate_mesh
 from kineverse.formats.xml_writer import Tag
+from kineverse.lie import transform
 from kineverse.model.body import (
     Body,
     Box,
@@ -244,9 +245,8 @@ class MjcfBodyWriter:
                 f"the inertia of '{name}' has a moment of as good as nothing, which MuJoCo refuses: it is "
                 f"written as {floor:g} kg m²"
             )
-            turn = np.eye(4)
-            turn[:3, :3] = axes if np.linalg.det(axes) > 0 else -axes
-            pose, diagonal = pose @ turn, True
+            turn = axes if np.linalg.det(axes) > 0 else -axes
+            pose, diagonal = pose @ transform(turn, np.zeros(3)), True
             xx, yy, zz = least, middle, most
         if least + middle < most * (1 - _ROUNDING):
             self._unbalanced = True

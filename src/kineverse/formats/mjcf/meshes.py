@@ -19,6 +19,7 @@ from kineverse.formats import poses
 from kineverse.formats.files import read_file
 from kineverse.formats.poses import compose_poses
 from kineverse.formats.xml_reader import quote
+from kineverse.lie import transform
 from kineverse.model.body import Mesh, Pose
 
 from .elements import MjcfElement, find_below_root
@@ -172,8 +173,6 @@ def place_mesh(asset: MeshAsset, body_T_mesh: Pose, folder: str, root: str) -> t
     along = turn @ scale @ turn.T
     if np.abs(along - np.diag(np.diag(along))).max() > _DIAGONAL * np.abs(scale).max():
         return None
-    mesh_T_file = np.eye(4)
-    mesh_T_file[:3, :3] = turn.T
-    mesh_T_file[:3, 3] = -scale @ turn.T @ asset.position
+    mesh_T_file = transform(turn.T, -scale @ turn.T @ asset.position)
     a, b, c = np.diag(along).tolist()
     return Mesh(asset.uri, (a, b, c), folder, root), compose_poses(body_T_mesh, Pose.of(mesh_T_file + 0.0))

@@ -11,7 +11,6 @@ import math
 import sys
 
 from kineverse.errors import suggest
-from kineverse.formats.poses import snap
 from kineverse.formats.reader_warnings import ReaderWarnings
 from kineverse.formats.urdf.description import (
     DOF_BY_TYPE,
@@ -34,6 +33,7 @@ from kineverse.formats.xml_values import (
     read_origin,
     scale_to_bounds,
 )
+from kineverse.lie import snap
 from kineverse.model.body import Vector3
 
 _X = (1.0, 0.0, 0.0)

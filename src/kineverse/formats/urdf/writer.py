@@ -38,6 +38,7 @@ from kineverse.formats.reader_warnings import collect_warnings
 from kineverse.formats.urdf.operations import urdf_operations
 from kineverse.formats.urdf.reader import parse_urdf
 from kineverse.formats.xml_writer import Tag, format_xml
+from kineverse.lie import translation
 from kineverse.model.body import (
     Body,
     Box,
@@ -288,12 +289,12 @@ class UrdfWriter:
             element = self._root.add("link", name=child)
             if last:
                 self._bodies.write(element, link.body)
-            self._axis_joint(joint, parent, child, pose @ _translation(point - at))
+            self._axis_joint(joint, parent, child, pose @ translation(point - at))
             parent, pose, at = child, np.eye(4), point
         if at.any() or not link.joints:
             name = link.label or self._joints.take(f"{link.name}/fixed")
             self._bodies.write(self._root.add("link", name=link.name), link.body)
-            self._joint(name, "fixed", parent, link.name, pose @ _translation(-at))
+            self._joint(name, "fixed", parent, link.name, pose @ translation(-at))
 
     def _compound(self, link: LinkDescription) -> tuple[str, str, tuple[float, ...] | None] | None:
         """Return name, kind and axis of a joint with several coordinates, if the link moves by one."""
@@ -383,12 +384,6 @@ class UrdfWriter:
         if axis is not None:
             element.add("axis", xyz=axis)
         return element
-
-
-def _translation(offset: Matrix) -> Matrix:
-    pose = np.eye(4)
-    pose[:3, 3] = offset
-    return pose
 
 
 def _axis_key(joint: JointDescription) -> tuple[str, bool, tuple[float, ...]]:

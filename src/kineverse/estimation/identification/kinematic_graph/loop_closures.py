@@ -23,7 +23,7 @@ from kineverse.estimation.identification.families import GroupMotion
 from kineverse.estimation.identification.found_operations import family_coordinates, rigid_pose
 from kineverse.estimation.identification.result import Fit
 from kineverse.estimation.linear_algebra import invert_matrices
-from kineverse.lie import Stack, inverse, skew
+from kineverse.lie import Stack, inverse, skew, transform
 from kineverse.loops import CloseLoop
 from kineverse.loops.equations import AXES
 from kineverse.model.frame import Frame
@@ -172,8 +172,7 @@ def close_loops(
             continue
         followers.add(plan.motion, plan.columns, plan.slopes)
         joint, names = loop.joint, plan.motion.names
-        turn = np.eye(4)
-        turn[:3, :3] = plan.axes
+        turn = transform(plan.axes, np.zeros(3))
         yield (
             loop,
             LoopClosure(
