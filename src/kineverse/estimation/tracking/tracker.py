@@ -141,7 +141,9 @@ class Tracker:
         names.update({str(v.position): chart.tangent.index(v) for v in own})
         for symbol, value in uncertainty.items():
             if str(symbol) not in names:
-                raise UnknownNameError(f"'{symbol}' is not estimated. {suggest(str(symbol), names, 'coordinate')}")
+                raise UnknownNameError(
+                    f"'{symbol}' is not estimated. {suggest(str(symbol), names, 'coordinate')}"
+                )
             deviations[names[str(symbol)]] = require_positive(symbol, value)
         filter_.openness.deviations = deviations
         belief = InformationState((len(x), len(deviations), len(layout.groups)))
