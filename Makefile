@@ -15,7 +15,7 @@ DEMO := $(patsubst %,requirements/%.txt,build core view figures geometry)
 
 help:
 	@echo "make demo    open a kitchen that lives in the browser (ARGS=--headless: numbers, a picture, and end)"
-	@echo "make test    formatter, linter, types, tests"
+	@echo "make test    formatter, linter, types, layers, tests"
 	@echo "make fuzz    look for inputs that break a reader (ARGS='--target sdf --minutes 60')"
 	@echo "make format  format the code and mend what the linter can mend"
 	@echo "make clean   remove the environment and what the tools left"
@@ -27,6 +27,7 @@ test: $(VENV)/test.installed
 	$(BIN)/ruff format --check .
 	$(BIN)/ruff check .
 	$(BIN)/mypy
+	$(BIN)/lint-imports --no-logo
 	@# Tests start commands by the dozen: each would compile the package anew where Python is told to keep nothing.
 	$(BIN)/python -m compileall -q src
 	$(BIN)/python -m pytest -q -n $(JOBS) $(ARGS)
@@ -39,7 +40,7 @@ format: $(VENV)/test.installed
 	$(BIN)/ruff check --fix .
 
 clean:
-	rm -rf $(VENV) .mypy_cache .pytest_cache .ruff_cache .hypothesis build dist
+	rm -rf $(VENV) .import_linter_cache .mypy_cache .pytest_cache .ruff_cache .hypothesis build dist
 
 $(BIN)/python:
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || { \

@@ -1,7 +1,7 @@
 """Draw the tree of the package for docs/architecture.md.
 
-    python tools/source_tree.py            print it
-    python tools/source_tree.py --write    put it into the page
+python tools/source_tree.py            print it
+python tools/source_tree.py --write    put it into the page
 """
 
 import ast
@@ -24,14 +24,22 @@ def tree() -> str:
     for folder in folders:
         depth = len(folder.relative_to(source).parts)
         indent = "  " * depth
-        subject = (ast.get_docstring(ast.parse((folder / "__init__.py").read_text("utf-8"))) or "").partition("\n")[0]
+        subject = (ast.get_docstring(ast.parse((folder / "__init__.py").read_text("utf-8"))) or "").partition(
+            "\n"
+        )[0]
         subject = re.sub(r"^Layer \d: ", "", subject).rstrip(".")
         if subject[1:2].islower():
             subject = subject[0].lower() + subject[1:]
         lines.append(f"{indent}{folder.name}/  ({subject})")
-        modules = " ".join(sorted(p.stem for p in folder.glob("*.py") if p.stem not in ("__init__", "_version")))
+        modules = " ".join(
+            sorted(p.stem for p in folder.glob("*.py") if p.stem not in ("__init__", "_version"))
+        )
         lines += textwrap.wrap(
-            modules, WIDTH, initial_indent=indent + "    ", subsequent_indent=indent + "    ", break_on_hyphens=False
+            modules,
+            WIDTH,
+            initial_indent=indent + "    ",
+            subsequent_indent=indent + "    ",
+            break_on_hyphens=False,
         )
     return "\n".join(lines) + "\n"
 

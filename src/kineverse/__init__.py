@@ -94,6 +94,12 @@ __all__ = [
     "where",
 ]
 
+# Packages that are imported at first use.
+model.registry.register_collection(
+    "articulations", model.registry.ModelCollection("kineverse.gallery:names", "kineverse.gallery:operations")
+)
+model.registry.register_service("read_mesh", "kineverse.geometry.mesh_files:read_mesh")
+
 
 def __getattr__(name: str) -> object:
     import importlib

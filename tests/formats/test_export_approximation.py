@@ -12,10 +12,10 @@ from round_trip import posing, random_values
 
 import kineverse as kv
 from hypothesis_profiles import attempts
-from kineverse.formats.description import FrameDeviation
 from kineverse.intervals import taylor
 from kineverse.intervals.enclosure import Enclosures
 from kineverse.intervals.graph import TermGraph
+from kineverse.model.registry import FrameDeviation
 
 Q = kv.position("q")
 CURVES = [

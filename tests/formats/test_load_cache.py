@@ -10,6 +10,7 @@ from urdf_texts import chain
 
 import kineverse as kv
 from kineverse.formats import loader
+from kineverse.formats.urdf import operations
 
 
 @pytest.fixture
@@ -21,8 +22,8 @@ def parses(monkeypatch):
         names.append(source)
         return original(content, source, *further)
 
-    original = loader.parse_urdf
-    monkeypatch.setattr(loader, "parse_urdf", parse_urdf)
+    original = operations.parse_urdf
+    monkeypatch.setattr(operations, "parse_urdf", parse_urdf)
     monkeypatch.setattr(loader, "_REMEMBERED", type(loader._REMEMBERED)())
     return names
 

@@ -15,7 +15,7 @@ from kineverse.errors import DuplicateNameError, FormatError, InvalidValueError
 
 if TYPE_CHECKING:
     import kineverse as kv
-    from kineverse.formats.saver import Saved
+    from kineverse.model.registry import SaveResult
 
 HELP = """write a model to a file, in the format that its name ends in
 
@@ -91,13 +91,13 @@ def run(arguments: argparse.Namespace) -> int:
             )
 
     from kineverse.formats.reader_warnings import collect_warnings
-    from kineverse.formats.saver import Saved
+    from kineverse.model.registry import SaveResult
 
     with collect_warnings() as left_out, show_activity(f"reading {arguments.source}"):
         model = load_model(arguments, arguments.source, arguments.prefix)
     with show_activity(f"writing {arguments.target}"):
         if to_stdout:
-            saved, size = Saved(Path(STDOUT)), _print_document(model)
+            saved, size = SaveResult(Path(STDOUT)), _print_document(model)
         else:
             saved = _save_model(model, arguments)
             size = os.path.getsize(saved.path)
@@ -111,7 +111,7 @@ def run(arguments: argparse.Namespace) -> int:
     return 0
 
 
-def _save_model(model: kv.Model, arguments: argparse.Namespace) -> Saved:
+def _save_model(model: kv.Model, arguments: argparse.Namespace) -> SaveResult:
     from kineverse.formats.export.capabilities import UnsupportedError
 
     try:
@@ -138,17 +138,18 @@ def check_writable(target: str, source: str, force: bool = False) -> None:
         If a file is there, and the source is not.
     """
     from kineverse.formats.locate import locate_model
-    from kineverse.formats.saver import ENDINGS
+    from kineverse.model.registry import writable_suffixes
 
+    endings = writable_suffixes()
     if not target:
         raise FormatError("Which file is to be written? Its name is empty.")
     path = Path(target).expanduser()
     if path.is_dir():
-        inside = path / f"{_source_stem(source)}{ENDINGS[0]}"
+        inside = path / f"{_source_stem(source)}{endings[0]}"
         raise FormatError(f"{target} is a folder; name a file in it, such as {inside}.")
-    if not path.name.endswith(ENDINGS):
+    if not path.name.endswith(endings):
         raise FormatError(
-            f"{target}: nothing is known that ends like this. Written are {', '.join(ENDINGS)}."
+            f"{target}: nothing is known that ends like this. Written are {', '.join(endings)}."
         )
     if not path.parent.is_dir():
         raise FormatError(f"{target}: the folder {path.parent} does not exist.")
@@ -178,7 +179,7 @@ def _print_document(model: kv.Model) -> int:
 
 
 def _print_report(
-    arguments: argparse.Namespace, model: kv.Model, size: int, left_out: list[str], saved: Saved
+    arguments: argparse.Namespace, model: kv.Model, size: int, left_out: list[str], saved: SaveResult
 ) -> list[str]:
     from kineverse.cli.format_values import format_contents
 
@@ -195,7 +196,7 @@ def _print_report(
     return lines
 
 
-def _omission_notes(arguments: argparse.Namespace, saved: Saved) -> list[str]:
+def _omission_notes(arguments: argparse.Namespace, saved: SaveResult) -> list[str]:
     """Return what the file does not say, for standard error."""
     from kineverse.cli.format_values import format_count
 
@@ -205,7 +206,7 @@ def _omission_notes(arguments: argparse.Namespace, saved: Saved) -> list[str]:
     return [head, *truncate_lines(lines, None if arguments.all else SHOWN, "  ")]
 
 
-def _approximation_errors(saved: Saved) -> str:
+def _approximation_errors(saved: SaveResult) -> str:
     """Return by how much frames are off at most, and which ones."""
     from kineverse.cli.format_values import format_count, format_pose_difference
 
@@ -228,7 +229,7 @@ def _format_size(size: int) -> str:
 
 
 def _as_json(
-    arguments: argparse.Namespace, model: kv.Model, size: int, left_out: list[str], saved: Saved
+    arguments: argparse.Namespace, model: kv.Model, size: int, left_out: list[str], saved: SaveResult
 ) -> dict[str, object]:
     worst_first = sorted(saved.errors.items(), key=lambda item: (-item[1].position, -item[1].angle))
     return {

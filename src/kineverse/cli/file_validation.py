@@ -12,11 +12,11 @@ from kineverse.cli.summary import find_penetrations
 from kineverse.errors import KineverseError
 from kineverse.formats.document import OpaqueOperation
 from kineverse.formats.files import read_file
-from kineverse.formats.loader import LoopTreatment
 from kineverse.formats.locate import Source, locate_model
 from kineverse.formats.reader_warnings import Fault, collect_warnings
 from kineverse.formats.validate import ModelProblem, find_problems
 from kineverse.formats.xml_reader import read_root_tag
+from kineverse.model.registry import LoopTreatment
 
 FORMATS = {".kv.json": "document", ".urdf": "URDF", ".sdf": "SDF", ".world": "SDF", ".mjcf": "MJCF"}
 

@@ -2,13 +2,17 @@
 
 from typing import TYPE_CHECKING
 
+from . import urdf
+from .file_formats import register_file_formats
 from .loader import load
 from .locate import locate_model, shipped_models
 
 if TYPE_CHECKING:
     from .document import document_hash, from_bytes, to_bytes
 
-__all__ = ["document_hash", "from_bytes", "load", "locate_model", "shipped_models", "to_bytes"]
+__all__ = ["document_hash", "from_bytes", "load", "locate_model", "shipped_models", "to_bytes", "urdf"]
+
+register_file_formats()
 
 
 def __getattr__(name: str) -> object:

@@ -12,6 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from kineverse.model.body import Body, Vector3
+from kineverse.model.registry import FrameDeviation
 from kineverse.symbols import Symbol
 
 Matrix: TypeAlias = npt.NDArray[np.float64]
@@ -126,21 +127,6 @@ class LoopJoint:
     free: tuple[str, ...]
     dependent: tuple[str, ...]
     constraints: tuple[str, ...] = ()
-
-
-@dataclass(frozen=True, slots=True)
-class FrameDeviation:
-    """By how much a frame may be off at most, wherever coordinates are within their limits.
-
-    ``position`` is how far its origin may be from where it should be [m], ``angle`` that of the rotation that
-    may be left [rad].
-    """
-
-    position: float = 0.0
-    angle: float = 0.0
-
-    def __str__(self) -> str:
-        return f"{self.position:.3g} m and {self.angle:.3g} rad"
 
 
 @dataclass

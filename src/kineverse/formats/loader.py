@@ -5,27 +5,26 @@ from __future__ import annotations
 import hashlib
 import os
 from collections import OrderedDict
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Literal, TypeAlias, get_args
+from typing import TypeAlias
 
 from kineverse._gc import no_collection
-from kineverse.errors import FormatError, InvalidValueError, KineverseError, MissingDependencyError
+from kineverse.errors import FormatError, KineverseError, MissingDependencyError
+from kineverse.model import registry
 from kineverse.model.edit import Edit
-from kineverse.model.frame import WORLD
 from kineverse.model.model import Model, Snapshot
 from kineverse.model.operation import Operation
-from kineverse.shipped.bases import mobile_base
+from kineverse.model.registry import FileContent, FileFormat, LoopTreatment, check_loops
 
+from .file_formats import DOCUMENT_SUFFIXES
 from .files import read_file
-from .locate import Source, locate_model
+from .locate import GALLERY, Source, locate_model
+from .loop_closures import LoopClosures
 from .names import check_prefix
 from .reader_warnings import collect_warnings, warn
 from .root_folder import NOWHERE, find_root
-from .urdf.operations import urdf_operations
-from .urdf.reader import parse_urdf
-from .xml_reader import read_root_tag
 
 READ = "URDF (.urdf, .xml), SDF (.sdf, .world), MJCF (.xml, .mjcf) and documents (.kv.json, .kv.msgpack)"
 
@@ -65,20 +64,6 @@ def unsupported_format(path: Path) -> FormatError:
     if advice is not None:
         return FormatError(f"{path}: {advice}")
     return FormatError(f"{path}: this version reads {READ}, not '{''.join(path.suffixes) or path.name}'.")
-
-
-LoopTreatment: TypeAlias = Literal["solve", "constraint", "refuse"]
-
-LOOP_TREATMENTS: tuple[LoopTreatment, ...] = get_args(LoopTreatment)
-
-
-def check_loops(loops: object) -> None:
-    """Raise unless this is one of the ways in which loops are read."""
-    if loops not in LOOP_TREATMENTS:
-        raise InvalidValueError(
-            "loops= is 'solve', which keeps as constraints what cannot be solved, 'constraint' or 'refuse', "
-            f"not {loops!r}."
-        )
 
 
 MOST_REMEMBERED = 16
@@ -136,6 +121,10 @@ def load(
     """
     check_prefix(prefix)
     check_loops(loops)
+    if registry.find_scheme(source) is not None:
+        model = Model()
+        model.include(source, prefix, root=root, strict=strict, loops=loops)
+        return model
     found = locate_model(source)
     content = _content(found)
     remembered = _stands_alone(found, content)
@@ -167,7 +156,7 @@ def _blaming(path: Path) -> Iterator[None]:
     except (FormatError, MissingDependencyError):
         raise
     except KineverseError as error:
-        if path.name.endswith((".kv.json", ".kv.msgpack")):
+        if path.name.endswith(DOCUMENT_SUFFIXES):
             raise FormatError(f"{path}: its operations cannot be applied: {error}") from error
         raise
 
@@ -198,19 +187,30 @@ def _applied(
     loops: LoopTreatment,
 ) -> Iterator[str]:
     """Apply the operations of a source, and yield their tags."""
-    name = source.path.name
-    closing = "joint" if _is_sdf(name) else "equality" if _is_mjcf(name, content) else ""
-    operations = _operations(source, content, prefix, root, strict)
-    if not closing or source.scene:
+    prefix = source.shipped if prefix is None else prefix
+    file_format = _format(source, content)
+    operations: Iterable[tuple[str, Operation]]
+    if file_format is None:
+        operations = _build(source, prefix or None)
+    else:
+        file = FileContent(source.path, content, prefix or None, root, strict, source.shipped)
+        operations = file_format.operations(file)
+    if file_format is None or not file_format.loop_element:
         for tag, operation in operations:
             yield edit.apply(operation, tag)
         return
-    from .loop_closures import LoopClosures  # of what few files close
-
-    closures = LoopClosures(edit, edit.model, name, closing, loops)
+    closures = LoopClosures(edit, edit.model, source.path.name, file_format.loop_element, loops)
     for tag, operation in operations:
         yield from closures.apply(tag, operation)
     yield from closures.finish()
+
+
+def _build(source: Source, prefix: str | None) -> Iterator[tuple[str, Operation]]:
+    """Yield the operations of a model of a collection, each with its tag."""
+    collection = registry.find_collection(GALLERY)
+    assert collection is not None  # the source was found in it
+    for operation in collection.operations(source.path.name, prefix):
+        yield operation.default_tag(), operation
 
 
 def _root(source: Source, root: str | os.PathLike[str] | None) -> str:
@@ -224,64 +224,19 @@ def _content(source: Source) -> bytes:
     return b"" if source.scene else read_file(source.path)
 
 
-def _operations(
-    source: Source, content: bytes, prefix: str | None, root: str, strict: bool
-) -> Iterator[tuple[str, Operation]]:
-    path, name = source.path, source.path.name
-    if prefix is None:
-        prefix = source.shipped
-    prefix = prefix or None
+def _format(source: Source, content: bytes) -> FileFormat | None:
+    """Return the format of a file; None for a model of a collection, which has no file."""
     if source.scene:
-        from kineverse import gallery  # when it is asked for
-
-        for operation in gallery.operations(name, prefix):
-            yield operation.default_tag(), operation
-    elif name.endswith(".kv.json"):
-        from .document import read_operations  # nor does every process read a document
-
-        yield from read_operations(content, str(path), prefix, root)
-    elif name.endswith(".kv.msgpack"):
-        from .document import read_packed_operations
-
-        yield from read_packed_operations(content, str(path), prefix, root)
-    elif _is_mjcf(name, content):
-        from .mjcf.operations import mjcf_operations
-        from .mjcf.reader import parse_mjcf
-
-        description = parse_mjcf(content, name, str(path.absolute().parent), root, strict)
-        for operation in mjcf_operations(description, prefix):
-            yield operation.default_tag(), operation
-    elif name.endswith((".urdf", ".xml")):
-        robot = parse_urdf(content, name, str(path.absolute().parent), root, strict)
-        base = mobile_base(source.shipped, prefix) if source.shipped else None
-        if base is not None:
-            yield base.default_tag(), base
-        parent = WORLD if base is None else base.child
-        for operation in urdf_operations(robot, prefix, parent, strict):
-            yield operation.default_tag(), operation
-    elif _is_sdf(name):
-        # Many modules, which most processes never need.
-        from .sdf.operations import sdf_operations
-        from .sdf.reader import parse_sdf
-
-        scene = parse_sdf(content, name, str(path.absolute().parent), root, strict)
-        for operation in sdf_operations(scene, prefix):
-            yield operation.default_tag(), operation
-    else:
-        raise unsupported_format(path)
-
-
-def _is_sdf(name: str) -> bool:
-    return name.endswith((".sdf", ".world"))
-
-
-def _is_mjcf(name: str, content: bytes) -> bool:
-    return name.endswith(".mjcf") or (name.endswith(".xml") and read_root_tag(content).startswith("mujoco"))
+        return None
+    file_format = registry.find_format(source.path.name, content)
+    if file_format is None:
+        raise unsupported_format(source.path)
+    return file_format
 
 
 def _stands_alone(source: Source, content: bytes) -> bool:
-    """Return whether a model follows from its file alone: what a file names may change while it does not."""
-    plain = content.replace(b"\0", b"")  # in two bytes a letter, too
-    if _is_sdf(source.path.name):
-        return b"include" not in plain
-    return b"file" not in plain or not _is_mjcf(source.path.name, content)
+    """Return whether a model follows from its file alone, and not from files that it refers to."""
+    file_format = _format(source, content)
+    if file_format is None or not file_format.reference:
+        return True
+    return file_format.reference not in content.replace(b"\0", b"")  # UTF-16 has two bytes a letter

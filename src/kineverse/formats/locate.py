@@ -13,8 +13,8 @@ from pathlib import Path
 
 from kineverse import shipped
 from kineverse.errors import FormatError, UnknownNameError, suggest
+from kineverse.model import registry
 
-SUFFIXES = (".urdf", ".sdf", ".world", ".xml", ".mjcf", ".kv.json", ".kv.msgpack")
 MODEL_PATH = "KINEVERSE_MODEL_PATH"
 _DEPTH = 6
 _LISTED = 6
@@ -22,12 +22,12 @@ _LONGEST = 200
 
 
 GALLERY = "articulations"
-"""The folder, which is none, whose models are the scenes of :mod:`kineverse.gallery`."""
+"""First part of the names of the models that the package builds, one for each articulation."""
 
 
 @dataclass(frozen=True, slots=True)
 class Source:
-    """A file, and the name it ships under if it does; or a scene of the gallery, which has no file."""
+    """File of a model, with its name if the package has it; or a model of a collection, without a file."""
 
     path: Path
     shipped: str | None = None
@@ -85,7 +85,7 @@ def locate_model(name: str | os.PathLike[str]) -> Source:
     path = _expanded(text)
     if _is(path, Path.is_file):
         return Source(path.resolve())
-    explicit = path.is_absolute() or text.startswith(".") or text.endswith(SUFFIXES)
+    explicit = path.is_absolute() or text.startswith(".") or text.endswith(registry.readable_suffixes())
     if explicit and not _is(path, Path.is_dir) and _is(path, os.path.lexists):
         raise FormatError(
             f"{_shown(text)} is no regular file, but a pipe, a device, or a link that leads nowhere."
@@ -112,9 +112,8 @@ def locate_model(name: str | os.PathLike[str]) -> Source:
 
 
 def _scenes() -> tuple[str, ...]:
-    from kineverse import gallery  # when it is asked for
-
-    return gallery.names()
+    collection = registry.find_collection(GALLERY)
+    return () if collection is None else collection.names()
 
 
 def _no_scene(name: str) -> str:
@@ -144,18 +143,18 @@ def model_folders() -> Iterator[tuple[str, Path]]:
 
 
 def _files(folder: Path, depth: int = _DEPTH) -> Iterator[Path]:
-    base = len(folder.parts)
+    base, suffixes = len(folder.parts), registry.readable_suffixes()
     for root, folders, files in os.walk(folder):
         if len(Path(root).parts) - base >= depth:
             folders.clear()
         folders[:] = sorted(f for f in folders if not f.startswith("."))
         for file in sorted(files):
-            if file.endswith(SUFFIXES):
+            if file.endswith(suffixes):
                 yield Path(root, file)
 
 
 def _is_called(file: str, name: str) -> bool:
-    return any(f"/{file}".endswith(f"/{name}{suffix}") for suffix in ("", *SUFFIXES))
+    return any(f"/{file}".endswith(f"/{name}{suffix}") for suffix in ("", *registry.readable_suffixes()))
 
 
 def _only(found: list[str], name: str, folder: Path) -> str:
@@ -198,7 +197,7 @@ def _end(path: str) -> str:
 
 
 def _stem(file: str) -> str:
-    return next((file.removesuffix(s) for s in SUFFIXES if file.endswith(s)), file)
+    return next((file.removesuffix(s) for s in registry.readable_suffixes() if file.endswith(s)), file)
 
 
 def _missing_places() -> str:
@@ -223,7 +222,7 @@ def _beside(path: Path) -> str:
     if _is(path, Path.is_dir):
         inside = [p.relative_to(path).as_posix() for p in islice(_files(path, 2), _LISTED)]
         return f" It is a folder; models in it: {', '.join(inside) or 'none'}."
-    if not path.name.endswith(SUFFIXES):
+    if not path.name.endswith(registry.readable_suffixes()):
         return ""
     if not _is(path.parent, Path.is_dir):
         return f" The folder {_shown(str(path.parent))} does not exist."

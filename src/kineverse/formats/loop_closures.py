@@ -18,11 +18,11 @@ from kineverse.model.model_view import ModelView
 from kineverse.model.operation import Operation
 from kineverse.model.operations import SetHome
 from kineverse.model.projection import project
+from kineverse.model.registry import LoopTreatment
 from kineverse.model.sampling import StateSamples
 from kineverse.state import State
 from kineverse.symbols import Symbol
 
-from .loader import LoopTreatment
 from .reader_warnings import warn
 
 CLOSED = 1e-6

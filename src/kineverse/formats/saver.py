@@ -5,51 +5,18 @@ from __future__ import annotations
 import contextlib
 import math
 import os
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
 from kineverse._checks import real_number
 from kineverse.errors import FormatError, InvalidValueError
-from kineverse.formats.description import FrameDeviation, WrittenFile
+from kineverse.formats.description import WrittenFile
 from kineverse.formats.files import replace_file
 from kineverse.formats.reader_warnings import warn
+from kineverse.model import registry
 from kineverse.model.model_view import ModelView
-
-ENDINGS = (".kv.json", ".kv.msgpack", ".urdf", ".xml", ".mjcf")
-
-
-@dataclass(frozen=True, slots=True)
-class Saved:
-    """What has become of a model that was saved.
-
-    Attributes
-    ----------
-    path
-        Of the file.
-    remarks
-        What the file says other than the model, or not at all, though nothing was refused.
-    left_out
-        Constraints, and articulations whose speeds are tied to others', that the format cannot say, each with
-        the reason. All frames are where they should be without them.
-    errors
-        By how much frames are off at most [m], [rad], where that was tolerated: certain bounds over all
-        values of coordinates within their limits. Frames that are not in here are exact.
-    """
-
-    path: Path
-    remarks: tuple[str, ...] = ()
-    errors: Mapping[str, FrameDeviation] = field(default_factory=dict)
-    left_out: Mapping[str, str] = field(default_factory=dict)
-
-    @property
-    def error(self) -> FrameDeviation:
-        """The largest of the errors."""
-        found = self.errors.values()
-        return FrameDeviation(
-            max((e.position for e in found), default=0.0), max((e.angle for e in found), default=0.0)
-        )
+from kineverse.model.registry import FileFormat, SaveResult
 
 
 def save(
@@ -59,7 +26,7 @@ def save(
     tolerance: float | None = None,
     leave_out: Iterable[str] = (),
     strict: bool = False,
-) -> Saved:
+) -> SaveResult:
     """Write a model to a file, whose ending says what it becomes.
 
     The file is there whole or not at all; if it cannot be written, it is what it was before. URDF and MJCF
@@ -94,19 +61,21 @@ def save(
         For a tolerance that is no positive number.
     """
     target = _target(path)
-    _check(target)
-    if target.name.endswith((".kv.json", ".kv.msgpack")):
+    file_format = _check(target)
+    if file_format.exact:
         if tuple(leave_out) or tolerance is not None:
             what = "nothing can be left out" if tolerance is None else "it has no tolerance"
             raise FormatError(f"{target.name}: a document says all of a model exactly, so {what}.")
-        from .document import write_document
-
-        write_document(model, target)
-        return Saved(target)
-    written = _written(model, target, leave_out, _checked(tolerance), strict)
+        registry.import_entry(file_format.write)(model, target)
+        return SaveResult(target)
+    try:
+        write = registry.import_entry(file_format.write)
+        written: WrittenFile = write(model, target, leave_out, _checked(tolerance), strict)
+    except FormatError as error:
+        raise _named(target, error) from None
     _put(target, written)
     warn(f"{target.name}: {remark}" for remark in written.remarks)
-    return Saved(target, written.remarks, written.errors, dict(written.left_out))
+    return SaveResult(target, written.remarks, written.errors, dict(written.left_out))
 
 
 def _put(target: Path, written: WrittenFile) -> None:
@@ -130,25 +99,28 @@ def _put(target: Path, written: WrittenFile) -> None:
         raise
 
 
-def _check(target: Path) -> None:
-    """Look at the name of a file before anything is made, which may take a while.
+def _check(target: Path) -> FileFormat:
+    """Check the name of a file before the file is made, which may take long; return its format.
 
     Raises
     ------
     FormatError
         If nothing is written that ends like this, or there is no such folder.
     """
-    if not target.name.endswith(ENDINGS):
+    file_format = registry.find_writer(target.name)
+    endings = registry.writable_suffixes()
+    if file_format is None:
         raise FormatError(
-            f"{target}: a model is saved to a name that ends in {', '.join(ENDINGS[:-1])} or {ENDINGS[-1]}, "
-            f"as in {target.stem + ENDINGS[0]!r}."
+            f"{target}: a model is saved to a name that ends in {', '.join(endings[:-1])} or {endings[-1]}, "
+            f"as in {target.stem + endings[0]!r}."
         )
     if target.is_dir():
         raise FormatError(
-            f"{target} is a folder; name a file in it, such as {target / f'model{ENDINGS[0]}'}."
+            f"{target} is a folder; name a file in it, such as {target / f'model{endings[0]}'}."
         )
     if not target.parent.is_dir():
         raise FormatError(f"{target} cannot be written: the folder {target.parent} does not exist.")
+    return file_format
 
 
 def _checked(tolerance: object) -> float | None:
@@ -158,21 +130,6 @@ def _checked(tolerance: object) -> float | None:
     except (TypeError, ValueError, OverflowError):
         pass
     raise InvalidValueError(f"A tolerance is a positive number [m] and [rad], or None, not {tolerance!r}.")
-
-
-def _written(
-    model: ModelView, target: Path, leave_out: Iterable[str], tolerance: float | None, strict: bool
-) -> WrittenFile:
-    try:
-        if target.name.endswith(".urdf"):
-            from .urdf.writer import to_urdf
-
-            return to_urdf(model, target, leave_out, tolerance, strict)
-        from .mjcf.writer import to_mjcf
-
-        return to_mjcf(model, target, leave_out, tolerance, strict)
-    except FormatError as error:
-        raise _named(target, error) from None
 
 
 def _named(target: Path, error: FormatError) -> FormatError:

@@ -76,6 +76,11 @@ def find_mesh_file(mesh: Mesh) -> MeshFile:
     return MeshFile(path, hashlib.sha256(path.read_bytes()).hexdigest())
 
 
+def read_mesh(mesh: Mesh) -> Faces:
+    """Read the triangles of a mesh, see :func:`find_mesh_file` and :func:`read_faces`."""
+    return read_faces(find_mesh_file(mesh))
+
+
 def read_faces(file: MeshFile) -> Faces:
     """Return all triangles of a file, in its frame [m]; files of equal content are read once.
 

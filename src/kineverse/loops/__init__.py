@@ -1,6 +1,10 @@
 """Closed loops: coordinates that follow others so that two frames stay together."""
 
+from kineverse.model import registry
+
 from .close_loop import CloseLoop, LoopConstraint
 from .solve_branch import SolvedLoop, solve_loop
 
 __all__ = ["CloseLoop", "LoopConstraint", "SolvedLoop", "solve_loop"]
+
+registry.register_shorthand("close_loop", "kineverse.loops.close_loop:CloseLoop")

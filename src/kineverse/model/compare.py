@@ -266,8 +266,8 @@ def compare_models(before: Model | Snapshot, after: Model | Snapshot) -> Diff:
         The models; they need not have a history in common.
     """
     old, new = _snapshot(before), _snapshot(after)
-    entries = {entry.tag: entry for entry in old._entries}
-    later = {entry.tag: entry for entry in new._entries}
+    entries = {entry.tag: entry for entry in old.entries}
+    later = {entry.tag: entry for entry in new.entries}
     common = [tag for tag in entries if tag in later]
     return Diff(
         version=new.version,

@@ -12,6 +12,7 @@ from kineverse.errors import DuplicateNameError, EditError
 from kineverse.expressions.expression import ExpressionLike
 from kineverse.symbols import Symbol
 
+from . import registry
 from .body import Body, Pose
 from .constraint import Constraint
 from .diff import Change, Diff, find_moved_tags
@@ -20,10 +21,9 @@ from .history import History, HistoryEntry
 from .operation import Operation
 from .operations import AddFrame, Attach, Constrain, Override, SetData, SetRate
 from .rates import as_row
+from .registry import LoopTreatment
 
 if TYPE_CHECKING:
-    from kineverse.formats.loader import LoopTreatment
-
     from .model_view import ModelView
 
 
@@ -170,9 +170,8 @@ class Edit:
         **options: Any,
     ) -> str:
         """Let two frames coincide, see :class:`kineverse.CloseLoop`, which also says what the options are."""
-        from kineverse.loops import CloseLoop
-
-        loop = CloseLoop(name=name or f"{frame} to {to}", frame=frame, to=to, mask=mask, **options)
+        name = name or f"{frame} to {to}"
+        loop = registry.make_shorthand("close_loop", name=name, frame=frame, to=to, mask=mask, **options)
         return self.apply(loop, tag)
 
     def set_rate(
@@ -213,11 +212,9 @@ class Edit:
         loops: LoopTreatment = "solve",
     ) -> list[str]:
         """Append the operations of a file or shipped model, see :func:`kineverse.load`; return their tags."""
-        from kineverse.formats.loader import include
-
         with no_collection():
             try:
-                return include(self, source, prefix, root=root, strict=strict, loops=loops)
+                return registry.include_source(self, source, prefix, root=root, strict=strict, loops=loops)
             except DuplicateNameError as error:
                 raise DuplicateNameError(
                     f"{error} include(source, prefix=...) puts a prefix in front of all names."

@@ -18,7 +18,7 @@ from kineverse.errors import ModelError
 from kineverse.expressions.expression import NO_NODES, Expression, from_casadi
 from kineverse.expressions.layout import SX
 from kineverse.expressions.node import Node
-from kineverse.spatial import OneAxisTransform
+from kineverse.spatial import OneAxisTransform, inverse
 from kineverse.symbols import Symbol
 
 from .body import Pose
@@ -173,8 +173,6 @@ def place_in_world(name: str, lookup: FrameLookup) -> Placement:
 
 def relative_pose(frame: str, relative_to: str, lookup: FrameLookup) -> Expression:
     """Return relative_to_T_frame in plain coordinates."""
-    from kineverse.spatial import inverse
-
     base, down = branches(frame, relative_to, lookup)
     tip = compose_chain(down, lookup).matrix()
     if not base:

@@ -17,9 +17,7 @@ from .history import History, HistoryEntry
 from .listeners import Listener, Listeners
 from .model_view import ModelView
 from .read_recorder import ABSENT
-
-if TYPE_CHECKING:
-    from kineverse.formats.loader import LoopTreatment
+from .registry import LoopTreatment
 
 
 class EditContext(AbstractContextManager["Edit"]):
@@ -211,6 +209,11 @@ class Snapshot(ModelView):
     ) -> None:
         self._entries = entries
         super().__init__(head, version)
+
+    @property
+    def entries(self) -> tuple[HistoryEntry, ...]:
+        """The operations in order, each with its tag, its reads and its writes."""
+        return self._entries
 
     def model(self) -> Model:
         """Return a model that goes on from here."""

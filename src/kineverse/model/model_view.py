@@ -6,7 +6,7 @@ import math
 import os
 from collections.abc import Collection, Iterable, Sequence
 from html import escape
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -16,16 +16,15 @@ from kineverse.expressions.expression import Expression
 from kineverse.state import State, StateLike, as_state, check_meant
 from kineverse.symbols import Symbol, parse_symbol_name
 
+from . import registry
 from .constraint import Constraint
 from .integration import integrate
 from .operation import ARTICULATIONS, CONSTRAINTS
 from .projection import TOLERANCE, EqualityConstraints, project
+from .registry import SaveResult
 from .symbolic_view import SymbolicView
 from .velocity_rows import VelocityRows, velocity_rows
 from .violations import Checks, Violations, find_violations
-
-if TYPE_CHECKING:
-    from kineverse.formats.saver import Saved
 
 
 class ModelView(SymbolicView):
@@ -341,7 +340,7 @@ class ModelView(SymbolicView):
         tolerance: float | None = None,
         leave_out: Iterable[str] = (),
         strict: bool = False,
-    ) -> Saved:
+    ) -> SaveResult:
         """Write the model to a file: a document (.kv.json), URDF (.urdf) or MJCF (.xml).
 
         A document says all of it. Motions that the others cannot say are refused by name; constraints are
@@ -364,10 +363,8 @@ class ModelView(SymbolicView):
         FormatError
             If the name has another ending, the file cannot be written, or naming what the format cannot say.
         """
-        from kineverse.formats.saver import save
-
         names = (leave_out,) if isinstance(leave_out, str) else leave_out
-        return save(self, path, tolerance=tolerance, leave_out=names, strict=strict)
+        return registry.save_model(self, path, tolerance=tolerance, leave_out=names, strict=strict)
 
     # -- printing ------------------------------------------------------------------------------------------
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING
 
-from kineverse.expressions.expression import Expression
+from kineverse.expressions.expression import Expression, from_casadi
 from kineverse.expressions.graph import leaves, topological_order
 from kineverse.expressions.node import Node
 from kineverse.expressions.substitution import apply_substitution, compose_gradient, replace_nodes
@@ -198,6 +198,4 @@ def _subjects(node: Node) -> tuple[Expression, ...]:
 
 
 def _expression_of(node: Node) -> Expression:
-    from kineverse.expressions.expression import from_casadi
-
     return from_casadi(node.sx, node.shape, frozenset((node,)))

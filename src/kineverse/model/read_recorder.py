@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from enum import IntFlag
 from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
@@ -66,7 +66,33 @@ class ReadRecorder:
         self._names_at = names_at
         self._reads = reads
 
-    # Made when asked for: most operations read little, and some read nothing at all.
+    def read(self, cell: Cell, how: Read) -> Any:
+        """Record a read of a cell, and return its value; :data:`ABSENT` if it has none."""
+        self._reads.add(cell, how)
+        return self._value_at(cell)
+
+    def list_names(self, kind: str) -> list[str]:
+        """Record that the names of a kind were listed, and return them."""
+        self._reads.listings.add(kind)
+        return self._names_at(kind)
+
+    def restricted(self, prefix: str) -> ReadRecorder:
+        """Return a reader that lists only names with a prefix, and records in the same place."""
+        return ReadRecorder(
+            self._value_at,
+            lambda kind: [name for name in self._names_at(kind) if name.startswith(prefix)],
+            self._reads,
+        )
+
+    def replaced(self, values: Mapping[Cell, Any], listings: Mapping[str, Sequence[str]]) -> ReadRecorder:
+        """Return a reader with other values in some cells and other listings; this one records nothing."""
+        return ReadRecorder(
+            lambda cell: values[cell] if cell in values else self._value_at(cell),
+            lambda kind: list(listings[kind]) if kind in listings else self._names_at(kind),
+            Reads(),
+        )
+
+    # Mappings are made on demand: most operations read little, and some read nothing.
 
     @property
     def frames(self) -> Mapping[str, Frame]:

@@ -23,7 +23,7 @@ from .display import as_html, as_lines
 from .frame import WORLD, Frame
 from .operation import ARTICULATIONS, BODIES, CONSTRAINTS, DATA, FRAMES, RATES, Cell
 from .projection import EqualityConstraints
-from .rates import Rates
+from .rates import RateEntry, Rates
 from .read_recorder import ABSENT, unknown_name_error
 from .relevance import Relevance, SymbolIndex
 from .violations import Checks
@@ -215,6 +215,18 @@ class SymbolicView:
         """Constraints by name, coordinates carried by their rates."""
         return NamedMapping(self, CONSTRAINTS, self._carried)
 
+    def plain_constraints(self) -> dict[str, Constraint]:
+        """Return the constraints by name, as operations wrote them: coordinates are plain symbols."""
+        with self._lock:
+            self._settle()
+            return dict(self._head[CONSTRAINTS])
+
+    def plain_rates(self) -> dict[Symbol, RateEntry]:
+        """Return the entries of the rate table by coordinate, as operations wrote them."""
+        with self._lock:
+            self._settle()
+            return dict(self._head[RATES].values())
+
     def _named(self, kind: str) -> Mapping[str, Any]:
         return NamedMapping(self, kind, None)
 
@@ -246,7 +258,7 @@ class SymbolicView:
         with self._lock:
             self._settle()
             if self._rates is None:
-                self._rates = Rates(dict(self._head[RATES].values()))
+                self._rates = Rates(self.plain_rates())
             return self._rates
 
     @property

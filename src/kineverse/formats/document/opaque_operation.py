@@ -9,7 +9,7 @@ from typing import Any
 
 from kineverse.errors import KineverseError, ModelError, UnknownNameError
 from kineverse.model.operation import Cell, Operation, Writes
-from kineverse.model.read_recorder import ABSENT, Read, ReadRecorder, Reads
+from kineverse.model.read_recorder import ABSENT, Read, ReadRecorder
 from kineverse.model.traces import Trace
 
 from .parameters import rebuild_parameter
@@ -105,22 +105,16 @@ class OpaqueOperation(Operation):
         """Return the reader without the names of others, if the document has a prefix of its own."""
         if not self.scope:
             return model
-        return ReadRecorder(
-            model._value_at,
-            lambda kind: [name for name in model._names_at(kind) if name.startswith(self.scope)],
-            model._reads,
-        )
+        return model.restricted(self.scope)
 
     def _changed(self, model: ReadRecorder) -> list[str]:
         """Look at what the original looked at, and return what is different."""
         changed = []
         for kind, names in self.listings:
-            model._reads.listings.add(kind)
-            if tuple(model._names_at(kind)) != names:
+            if tuple(model.list_names(kind)) != names:
                 changed.append(f"the list of all {kind}")
         for cell, how in self.reads:
-            model._reads.add(cell, how)
-            now, then = model._value_at(cell), self.seen.get(cell, ABSENT)
+            now, then = model.read(cell, how), self.seen.get(cell, ABSENT)
             if now is then:
                 continue
             if then is ABSENT or now is ABSENT or (how & Read.VALUE and now != then):
@@ -129,12 +123,7 @@ class OpaqueOperation(Operation):
 
     def _before(self, model: ReadRecorder) -> ReadRecorder:
         """Return a reader of what the original read; what it did not read cannot have mattered to it."""
-        listings = dict(self.listings)
-        return ReadRecorder(
-            lambda cell: self.seen[cell] if cell in self.seen else model._value_at(cell),
-            lambda kind: list(listings[kind]) if kind in listings else model._names_at(kind),
-            Reads(),
-        )
+        return model.replaced(self.seen, dict(self.listings))
 
     @cached_property
     def _effects(self) -> Writes:

@@ -19,6 +19,7 @@ from kineverse.model.model import Model
 from kineverse.model.model_view import ModelView
 from kineverse.model.operation import BODIES, FRAMES, KINDS, RATES, Cell, find_expressions
 from kineverse.model.read_recorder import ABSENT, Read
+from kineverse.model.registry import FileContent
 from kineverse.model.traces import Trace
 from kineverse.model.traces.placeholder import find_read_nodes
 from kineverse.symbols import symbol_name
@@ -82,6 +83,16 @@ def read_packed_operations(
     """
     _check_size(data, source)
     return _Document(source, prefix, root).read(unpack_document, data)
+
+
+def document_operations(file: FileContent) -> list[tuple[str, OpaqueOperation]]:
+    """Return the operations of a ``.kv.json`` file, each with its tag."""
+    return read_operations(file.content, str(file.path), file.prefix, file.root)
+
+
+def packed_document_operations(file: FileContent) -> list[tuple[str, OpaqueOperation]]:
+    """Return the operations of a ``.kv.msgpack`` file, each with its tag."""
+    return read_packed_operations(file.content, str(file.path), file.prefix, file.root)
 
 
 class _Document:

@@ -72,7 +72,7 @@ def to_json(model: ModelView) -> str:
 
 
 def _write_text(snapshot: Snapshot) -> str:
-    parts = [_Parts(entry, cells) for entry, cells in _with_cells_before(snapshot._entries)]
+    parts = [_Parts(entry, cells) for entry, cells in _with_cells_before(snapshot.entries)]
     table = NodeTable(e for part in parts for e in part.expressions)
     operations = [_operation(part, table) for part in parts]
     body = "".join(

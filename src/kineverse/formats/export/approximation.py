@@ -11,13 +11,13 @@ import numpy as np
 
 from kineverse.expressions.expression import Expression
 from kineverse.expressions.graph import expand_nodes
-from kineverse.formats.description import FrameDeviation
 from kineverse.intervals import arithmetic, taylor
 from kineverse.intervals.arithmetic import RealInterval
 from kineverse.intervals.enclosure import Enclosures
 from kineverse.intervals.graph import Term, TermGraph, reachable_terms
 from kineverse.intervals.taylor import TaylorSeries
 from kineverse.model.frame import WORLD
+from kineverse.model.registry import FrameDeviation
 from kineverse.symbols import Symbol
 
 from .joint_axes import JointMotion, MotionChain, QuaternionMotion

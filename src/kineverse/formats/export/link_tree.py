@@ -17,7 +17,6 @@ from kineverse.formats.description import (
     IDENTITY_COEFFICIENTS,
     NO_BODY,
     BallJointDescription,
-    FrameDeviation,
     JointDescription,
     LinkDescription,
     LoopJoint,
@@ -34,8 +33,8 @@ from kineverse.model.body import Pose
 from kineverse.model.constraint import Constraint
 from kineverse.model.frame import WORLD
 from kineverse.model.model_view import ModelView
-from kineverse.model.operation import CONSTRAINTS, RATES
 from kineverse.model.rates import Rates
+from kineverse.model.registry import FrameDeviation
 from kineverse.spatial import OneAxisTransform, quaternion
 from kineverse.symbols import Symbol
 
@@ -172,7 +171,7 @@ class LinkTreeBuilder:
         self._loops = list(find_loop_joints(model)) if target.loops else []
         determined = {name for loop in self._loops for name in loop.dependent}
         tied_by_loops = {s for s in model.rates.dependent if str(s) in determined}
-        given = dict(model._head[RATES].values())
+        given = model.plain_rates()
         self._rates = Rates({x: e for x, e in given.items() if x not in tied_by_loops})
         # What a tie determines is a coordinate like any other for who reads it.
         self._coordinates = sorted({*model.degrees_of_freedom, *tied_by_loops}, key=lambda s: s.sort_key)
@@ -180,7 +179,12 @@ class LinkTreeBuilder:
     def plan(self) -> RobotDescription:
         """Return the plan; what cannot be said is in :attr:`refusals`."""
         tied = {name for loop in self._loops for name in loop.constraints}
-        kept = {n: c for n, c in self._plain_constraints() if n not in self._left_out and n not in tied}
+        # With rates, ``model.constraints`` has coordinates as nodes, which only look like curves.
+        kept = {
+            n: c
+            for n, c in self.model.plain_constraints().items()
+            if n not in self._left_out and n not in tied
+        }
         found = list(classify_constraints(kept, self.resolve, self.refusals))
         ranges = intersect_limits(item for item in found if isinstance(item, CoordinateLimit))
         approximation = None
@@ -412,11 +416,6 @@ class LinkTreeBuilder:
             self.refusals.leave_out_speeds(
                 owner, f"moves by speeds that are not its own, {', '.join(sorted(speeds))}"
             )
-
-    def _plain_constraints(self) -> Iterator[tuple[str, Constraint]]:
-        # Plain ones: with rates, what is handed out has coordinates as nodes that only look like curves.
-        self.model._settle()
-        yield from self.model._head[CONSTRAINTS].items()
 
     def _remark(self) -> None:
         if self.model.data:

@@ -29,6 +29,7 @@ from kineverse.model.body import (
     Shape,
     Sphere,
 )
+from kineverse.model.registry import find_service
 
 _HEADER, _TRIANGLE = 84, 50
 MAX_STL_FACES = 200_000
@@ -98,11 +99,8 @@ class MeshFiles:
         return self._convert(mesh, there)
 
     def _convert(self, mesh: Mesh, there: Path) -> str | None:
-        # Where meshes are read is a layer above, as it needs an extra; only who converts asks for it.
-        from kineverse.geometry.mesh_files import find_mesh_file, read_faces
-
         try:
-            triangles = read_faces(find_mesh_file(mesh))
+            triangles = find_service("read_mesh")(mesh)
         except (FormatError, MissingDependencyError, OSError) as error:
             self._note(f"the mesh {mesh.uri} is left out: MuJoCo cannot read it, and {error}")
             return None

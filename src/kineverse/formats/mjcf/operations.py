@@ -24,12 +24,14 @@ from kineverse.model.frame import WORLD as MODEL_WORLD
 from kineverse.model.frame import Frame
 from kineverse.model.operation import Operation
 from kineverse.model.operations import AddFrame, Constrain, SetBody, SetHome
+from kineverse.model.registry import FileContent
 from kineverse.spatial import axis_angle
 from kineverse.symbols import position, symbol_name
 
 from .description import COORDINATE_SUFFIXES, WORLD, MjcfClosure, MjcfCoupling, MjcfJoint, MjcfLink, MjcfScene
 from .held_bodies import attach_held_bodies
 from .joint_equalities import FollowerJoints
+from .reader import parse_mjcf
 from .tendons import Tendon, TendonCoupling
 
 _LoopNameMap = Callable[[str], str]
@@ -107,6 +109,13 @@ def _nonzero_rest(joint: MjcfJoint, named: _LoopNameMap) -> Iterator[tuple[str, 
 
 
 MjcfNameMap = Callable[[str], str]
+
+
+def mjcf_file_operations(file: FileContent) -> Iterator[tuple[str, Operation]]:
+    """Yield the operations of an MJCF file, each with its tag."""
+    scene = parse_mjcf(file.content, file.path.name, str(file.path.absolute().parent), file.root, file.strict)
+    for operation in mjcf_operations(scene, file.prefix):
+        yield operation.default_tag(), operation
 
 
 def mjcf_operations(scene: MjcfScene, prefix: str | None = None) -> Iterator[Operation]:

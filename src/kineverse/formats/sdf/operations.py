@@ -36,9 +36,11 @@ from kineverse.model.frame import WORLD as MODEL_WORLD
 from kineverse.model.frame import Frame as Placed
 from kineverse.model.operation import Operation
 from kineverse.model.operations import AddFrame, SetBody
+from kineverse.model.registry import FileContent
 from kineverse.symbols import position, symbol_name
 
 from .description import WORLD, SdfAxis, SdfJoint, SdfScene
+from .reader import parse_sdf
 
 _AXIS_JOINTS: dict[str, type[OneDofJoint]] = {
     "revolute": Revolute,
@@ -48,6 +50,13 @@ _AXIS_JOINTS: dict[str, type[OneDofJoint]] = {
 _PERPENDICULAR = 1e-6
 
 SdfNameMap = Callable[[str], str]
+
+
+def sdf_file_operations(file: FileContent) -> Iterator[tuple[str, Operation]]:
+    """Yield the operations of an SDF file, each with its tag."""
+    scene = parse_sdf(file.content, file.path.name, str(file.path.absolute().parent), file.root, file.strict)
+    for operation in sdf_operations(scene, file.prefix):
+        yield operation.default_tag(), operation
 
 
 def sdf_operations(scene: SdfScene, prefix: str | None = None) -> Iterator[Operation]:

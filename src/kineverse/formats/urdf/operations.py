@@ -29,7 +29,11 @@ from kineverse.model.body import Pose, is_empty_body
 from kineverse.model.frame import WORLD, Frame
 from kineverse.model.operation import Operation
 from kineverse.model.operations import AddFrame, SetBody, SoftLimits
+from kineverse.model.registry import FileContent
+from kineverse.shipped.bases import mobile_base
 from kineverse.symbols import position
+
+from .reader import parse_urdf
 
 _AXIS_JOINTS: dict[str, type[OneDofJoint]] = {
     "revolute": Revolute,
@@ -42,6 +46,17 @@ _SUFFIXES = {
     "floating": ("x", "y", "z", "qx", "qy", "qz", "qw", "wx", "wy", "wz"),
 }
 _ROOT = Pose()
+
+
+def urdf_file_operations(file: FileContent) -> Iterator[tuple[str, Operation]]:
+    """Yield the operations of a URDF file, each with its tag; a shipped robot has its mobile base first."""
+    robot = parse_urdf(file.content, file.path.name, str(file.path.absolute().parent), file.root, file.strict)
+    base = mobile_base(file.shipped, file.prefix) if file.shipped else None
+    if base is not None:
+        yield base.default_tag(), base
+    parent = WORLD if base is None else base.child
+    for operation in urdf_operations(robot, file.prefix, parent, file.strict):
+        yield operation.default_tag(), operation
 
 
 def urdf_operations(

@@ -54,6 +54,7 @@ from kineverse.model.body import (
     Sphere,
 )
 from kineverse.model.frame import WORLD
+from kineverse.model.model import Model
 from kineverse.model.model_view import ModelView
 
 _IDENTITY = Pose()
@@ -209,8 +210,6 @@ def _check_read_back(content: bytes, path: Path) -> None:
     FormatError
         If there is something wrong with it.
     """
-    from kineverse.model.model import Model
-
     model = Model()
     try:
         with collect_warnings(), model.edit() as edit, no_collection():

@@ -1,0 +1,70 @@
+"""Registration of the file formats: endings of file names, readers and writers."""
+
+from __future__ import annotations
+
+from kineverse.model import registry
+from kineverse.model.registry import FileFormat
+
+from .xml_reader import read_root_tag
+
+DOCUMENT_SUFFIXES = (".kv.json", ".kv.msgpack")
+
+
+def is_mjcf(name: str, content: bytes) -> bool:
+    """Return whether a file is MJCF, which shares the ending ``.xml`` with URDF."""
+    return name.endswith(".mjcf") or (name.endswith(".xml") and read_root_tag(content).startswith("mujoco"))
+
+
+def _is_urdf(name: str, content: bytes) -> bool:
+    return name.endswith((".urdf", ".xml")) and not is_mjcf(name, content)
+
+
+def register_file_formats() -> None:
+    """Register all formats of this package, and the functions that load and save models."""
+    formats = "kineverse.formats"
+    for suffix, read in zip(
+        DOCUMENT_SUFFIXES, ("document_operations", "packed_document_operations"), strict=True
+    ):
+        registry.register_format(
+            FileFormat(
+                name=f"document ({suffix})",
+                suffixes=(suffix,),
+                read=f"{formats}.document.reader:{read}",
+                written=(suffix,),
+                write=f"{formats}.document.writer:write_document",
+                exact=True,
+            )
+        )
+    registry.register_format(
+        FileFormat(
+            name="URDF",
+            suffixes=(".urdf", ".xml"),
+            read=f"{formats}.urdf.operations:urdf_file_operations",
+            written=(".urdf",),
+            write=f"{formats}.urdf.writer:to_urdf",
+            recognize=_is_urdf,
+        )
+    )
+    registry.register_format(
+        FileFormat(
+            name="MJCF",
+            suffixes=(".xml", ".mjcf"),
+            read=f"{formats}.mjcf.operations:mjcf_file_operations",
+            written=(".xml", ".mjcf"),
+            write=f"{formats}.mjcf.writer:to_mjcf",
+            recognize=is_mjcf,
+            loop_element="equality",
+            reference=b"file",
+        )
+    )
+    registry.register_format(
+        FileFormat(
+            name="SDF",
+            suffixes=(".sdf", ".world"),
+            read=f"{formats}.sdf.operations:sdf_file_operations",
+            loop_element="joint",
+            reference=b"include",
+        )
+    )
+    registry.register_service("include", f"{formats}.loader:include")
+    registry.register_service("save", f"{formats}.saver:save")

@@ -1,0 +1,312 @@
+"""Registry of readers and writers of models, filled by the packages above the model.
+
+A model imports nothing from above. It asks here for the reader of a source, by the address scheme or by the
+suffix of the file, for the writer of a file, and for the shorthands of other packages. Entries are texts,
+``"package.module:function"``, which are imported at first use. So a registration costs no start-up time.
+"""
+
+from __future__ import annotations
+
+import importlib
+import os
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass, field
+from functools import cache
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal, TypeAlias, get_args
+
+from kineverse.errors import InvalidValueError, UnknownNameError, suggest
+
+from .operation import Operation
+
+if TYPE_CHECKING:
+    from .edit import Edit
+    from .model_view import ModelView
+
+LoopTreatment: TypeAlias = Literal["solve", "constraint", "refuse"]
+
+LOOP_TREATMENTS: tuple[LoopTreatment, ...] = get_args(LoopTreatment)
+
+
+def check_loops(loops: object) -> None:
+    """Raise unless the value is one of the treatments of loops."""
+    if loops not in LOOP_TREATMENTS:
+        raise InvalidValueError(
+            "loops= is 'solve', which keeps as constraints what cannot be solved, 'constraint' or 'refuse', "
+            f"not {loops!r}."
+        )
+
+
+# -- records -------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True)
+class FileContent:
+    """Content of a model file and the options of its reader.
+
+    Attributes
+    ----------
+    path
+        Path of the file.
+    content
+        All bytes of the file.
+    prefix
+        Prefix of all names, without the slash; None for none.
+    root
+        Folder below which the reader may open further files.
+    strict
+        True if mistakes that have no effect on motion are errors.
+    shipped
+        Name of the model if it comes with the package.
+    """
+
+    path: Path
+    content: bytes
+    prefix: str | None
+    root: str
+    strict: bool
+    shipped: str | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class FileFormat:
+    """File format of models, with its reader and its writer.
+
+    Attributes
+    ----------
+    name
+        Name of the format.
+    suffixes
+        Endings of the file names that it reads.
+    read
+        Function from a :class:`FileContent` to an iterable of ``(tag, operation)``.
+    written
+        Endings of the file names that it writes.
+    write
+        Function that writes a model: ``(model, path, leave_out, tolerance, strict)`` to the content of files.
+    recognize
+        Predicate ``(name, content)`` for endings that several formats share. By default the ending decides.
+    exact
+        True if files hold all of a model exactly. Their writer has no options: ``(model, path)``.
+    loop_element
+        Element of the format that closes a loop; empty if the format has none.
+    reference
+        Text in every file that refers to further files; empty if files never do.
+    """
+
+    name: str
+    suffixes: tuple[str, ...]
+    read: str
+    written: tuple[str, ...] = ()
+    write: str = ""
+    recognize: Callable[[str, bytes], bool] | None = None
+    exact: bool = False
+    loop_element: str = ""
+    reference: bytes = b""
+
+    def reads(self, name: str, content: bytes) -> bool:
+        """Return whether the format reads a file of this name and content."""
+        return name.endswith(self.suffixes) if self.recognize is None else self.recognize(name, content)
+
+    def operations(self, file: FileContent) -> Iterable[tuple[str, Operation]]:
+        """Yield the operations of a file, each with its tag."""
+        found: Iterable[tuple[str, Operation]] = import_entry(self.read)(file)
+        return found
+
+
+@dataclass(frozen=True, slots=True)
+class ModelCollection:
+    """Models that functions build, loaded as ``collection/name``.
+
+    Attributes
+    ----------
+    list_names
+        Function that returns all names.
+    build
+        Function from a name and a prefix to an iterable of operations.
+    """
+
+    list_names: str
+    build: str
+
+    def names(self) -> tuple[str, ...]:
+        """Return the names of the models."""
+        return tuple(import_entry(self.list_names)())
+
+    def operations(self, name: str, prefix: str | None) -> Iterator[Operation]:
+        """Yield the operations of a model."""
+        yield from import_entry(self.build)(name, prefix)
+
+
+@dataclass(frozen=True, slots=True)
+class FrameDeviation:
+    """Upper bound on the error of a frame while all coordinates are within their limits.
+
+    ``position`` bounds the distance of the origin from its true place [m], ``angle`` the angle of the
+    remaining rotation [rad].
+    """
+
+    position: float = 0.0
+    angle: float = 0.0
+
+    def __str__(self) -> str:
+        return f"{self.position:.3g} m and {self.angle:.3g} rad"
+
+
+@dataclass(frozen=True, slots=True)
+class SaveResult:
+    """Report on a model that was saved.
+
+    Attributes
+    ----------
+    path
+        Path of the file.
+    remarks
+        Differences between the file and the model that are no errors.
+    left_out
+        Constraints, and articulations whose speeds are tied to those of others, that the format cannot
+        express, each with the reason. No pose of a frame depends on them.
+    errors
+        Bounds on the errors of frames [m], [rad], where a tolerance allows some: valid for all values of
+        coordinates within their limits. Other frames are exact.
+    """
+
+    path: Path
+    remarks: tuple[str, ...] = ()
+    errors: Mapping[str, FrameDeviation] = field(default_factory=dict)
+    left_out: Mapping[str, str] = field(default_factory=dict)
+
+    @property
+    def error(self) -> FrameDeviation:
+        """The largest of the errors."""
+        found = self.errors.values()
+        return FrameDeviation(
+            max((e.position for e in found), default=0.0), max((e.angle for e in found), default=0.0)
+        )
+
+
+# -- registration --------------------------------------------------------------------------------------------
+
+_FORMATS: dict[str, FileFormat] = {}
+_COLLECTIONS: dict[str, ModelCollection] = {}
+_SCHEMES: dict[str, str] = {}
+_SHORTHANDS: dict[str, str] = {}
+_SERVICES: dict[str, str] = {}
+
+Service: TypeAlias = Literal["include", "save", "read_mesh"]
+
+
+def register_format(file_format: FileFormat) -> None:
+    """Register a file format. Of formats that read the same file, the first one registered counts."""
+    _FORMATS[file_format.name] = file_format
+
+
+def register_collection(name: str, collection: ModelCollection) -> None:
+    """Register a collection of models under the first part of their names."""
+    _COLLECTIONS[name] = collection
+
+
+def register_scheme(scheme: str, include: str) -> None:
+    """Register the reader of addresses ``scheme:…``: a function with the signature of :func:`include_source`."""
+    _SCHEMES[scheme] = include
+
+
+def register_shorthand(name: str, operation: str) -> None:
+    """Register the class of operations that an edit appends under a method's name."""
+    _SHORTHANDS[name] = operation
+
+
+def register_service(name: Service, function: str) -> None:
+    """Register a function of a package above: the reader or writer of files, or the reader of meshes."""
+    _SERVICES[name] = function
+
+
+# -- queries -------------------------------------------------------------------------------------------------
+
+
+def include_source(
+    edit: Edit,
+    source: Any,
+    prefix: str | None = None,
+    *,
+    root: Any = None,
+    strict: bool = False,
+    loops: LoopTreatment = "solve",
+) -> list[str]:
+    """Append the operations of a source to an edit, and return their tags.
+
+    A text ``scheme:…`` with a registered scheme is an address; any other source is a file or a name.
+    """
+    reader = find_scheme(source) or _SERVICES["include"]
+    tags: list[str] = import_entry(reader)(edit, source, prefix, root=root, strict=strict, loops=loops)
+    return tags
+
+
+def save_model(
+    model: ModelView,
+    path: str | os.PathLike[str],
+    *,
+    tolerance: float | None = None,
+    leave_out: Iterable[str] = (),
+    strict: bool = False,
+) -> SaveResult:
+    """Write a model to a file, in the format that belongs to the ending of its name."""
+    write = find_service("save")
+    result: SaveResult = write(model, path, tolerance=tolerance, leave_out=leave_out, strict=strict)
+    return result
+
+
+def find_scheme(source: object) -> str | None:
+    """Return the reader of an address; None if the source is no address with a registered scheme."""
+    if not isinstance(source, str):
+        return None
+    scheme, colon, _ = source.partition(":")
+    return _SCHEMES.get(scheme) if colon else None
+
+
+def find_format(name: str, content: bytes) -> FileFormat | None:
+    """Return the format of a file; None if no registered format reads it."""
+    return next((one for one in _FORMATS.values() if one.reads(name, content)), None)
+
+
+def find_writer(name: str) -> FileFormat | None:
+    """Return the format that writes files of this name; None if none does."""
+    return next((one for one in _FORMATS.values() if name.endswith(one.written)), None)
+
+
+def find_collection(name: str) -> ModelCollection | None:
+    """Return the collection of models of this name; None if there is none."""
+    return _COLLECTIONS.get(name)
+
+
+def make_shorthand(name: str, /, **parameters: Any) -> Operation:
+    """Return an operation of the class that is registered for a method of an edit."""
+    if name not in _SHORTHANDS:
+        raise UnknownNameError(
+            f"No operation is registered as {name!r}. {suggest(name, _SHORTHANDS, 'operation')}"
+        )
+    operation: Operation = import_entry(_SHORTHANDS[name])(**parameters)
+    return operation
+
+
+def find_service(name: Service) -> Callable[..., Any]:
+    """Return a registered function of a package above."""
+    return import_entry(_SERVICES[name])
+
+
+def readable_suffixes() -> tuple[str, ...]:
+    """Return the endings of all file names that a registered format reads."""
+    return tuple(dict.fromkeys(suffix for one in _FORMATS.values() for suffix in one.suffixes))
+
+
+def writable_suffixes() -> tuple[str, ...]:
+    """Return the endings of all file names that a registered format writes."""
+    return tuple(dict.fromkeys(suffix for one in _FORMATS.values() for suffix in one.written))
+
+
+@cache
+def import_entry(entry: str) -> Callable[..., Any]:
+    """Import the function of an entry ``"package.module:function"``."""
+    module, _, name = entry.partition(":")
+    found: Callable[..., Any] = getattr(importlib.import_module(module), name)
+    return found
