@@ -79,7 +79,7 @@ def pages(monkeypatch):
 
 
 @pytest.mark.parametrize("page", IN_CONSOLES, ids=_name)
-def test_commands_run_and_print_what_the_page_says(page, at_the_root, pages, capsys):
+def test_documented_commands_print_the_documented_output(page, at_the_root, pages, capsys):
     for name in ("matplotlib", "coal", "coacd", "viser"):
         pytest.importorskip(name)
     opened = 0
@@ -131,7 +131,7 @@ def test_the_helps_show_commands_that_can_be_said(capsys):
 
 
 @pytest.mark.parametrize("page", PAGES, ids=_name)
-def test_what_pages_say_in_passing_can_be_said(page, capsys):
+def test_inline_commands_of_the_docs_parse(page, capsys):
     """Commands in the text, which need not be whole: command and options exist."""
     for said in re.findall(r"`kineverse\s([^`]+)`", page.read_text(encoding="utf-8")):
         command, *words = said.split()

@@ -154,7 +154,7 @@ MADE = {
 
 
 @pytest.mark.parametrize("mistake", PYTHON, ids=lambda m: m.name)
-def test_a_piece_of_code_works_or_says_what_to_do(mistake, monkeypatch):
+def test_a_newcomers_code_works_or_names_the_alternative(mistake, monkeypatch):
     if "coal" in mistake.name:
         monkeypatch.setitem(sys.modules, "coal", None)
         assert kv.geometry
@@ -169,7 +169,7 @@ def test_a_piece_of_code_works_or_says_what_to_do(mistake, monkeypatch):
 
 
 @pytest.mark.parametrize("call", [f"m.{method}" for method in METHODS] + CALLS)
-def test_what_users_of_numpy_try_works_or_says_what_does(call):
+def test_numpy_idioms_work_or_name_the_alternative(call):
     said = ""
     try:
         assert eval(call, {}, Names()) is not None
@@ -204,7 +204,7 @@ COMMANDS = [
 
 
 @pytest.mark.parametrize("mistake", COMMANDS, ids=lambda m: m.name)
-def test_a_command_says_what_to_do(mistake, tmp_path, monkeypatch):
+def test_a_wrong_command_names_the_alternative(mistake, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "robot.urdf.xacro").write_text(
         '<robot name="r" xmlns:xacro="http://ros.org/wiki/xacro"><xacro:include filename="a.xacro"/></robot>'

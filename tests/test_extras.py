@@ -44,7 +44,7 @@ def test_in_the_checkout_the_line_is_short(tmp_path, monkeypatch):
     assert install_command("view") == ".venv/bin/python -m pip install -e '.[view]'"
 
 
-def test_beside_an_installed_copy_goes_what_the_extra_consists_of(tmp_path):
+def test_install_command_of_an_installed_copy_lists_the_extra(tmp_path):
     place = tmp_path / "site-packages"
     (place / "kineverse").mkdir(parents=True)
     (place / "kineverse" / "__init__.py").touch()
@@ -75,7 +75,7 @@ def test_a_folder_on_the_path_is_told_to_look_for_a_checkout(tmp_path, monkeypat
 
 
 @pytest.mark.parametrize("extra", [name for name in EXTRAS if name != "all"])
-def test_the_metadata_say_what_each_extra_consists_of(extra):
+def test_metadata_list_each_extra(extra):
     declared = metadata.requires(DISTRIBUTION)
     found = requirements(extra, declared)
     assert [line.partition(";")[0].strip() for line in found] == [

@@ -66,7 +66,7 @@ def test_json_is_one_object_and_nothing_else(run, asked):
     assert {c["status"] for c in result["comparisons"]} <= {"met", "missed", "missing", "no bar"}
 
 
-def test_words_say_where_and_what(run, asked):
+def test_output_names_the_machine_and_the_benchmarks(run, asked):
     status, out, err = run("frames")
     assert (status, err) == (0, "")
     for word in ("tier", "vector unit", "compiler", "processor", "casadi", "frames: ", "median"):
@@ -75,7 +75,7 @@ def test_words_say_where_and_what(run, asked):
         assert word not in out
 
 
-def test_who_is_missing_is_named_once_at_the_end_and_all_is_well(run, asked, without):
+def test_missing_peers_are_named_once_at_the_end(run, asked, without):
     without("mujoco", "pinocchio", "coal", "pybullet")
     status, out, err = run("frames", "geometry", "edit")
     assert (status, err) == (0, "")
@@ -116,7 +116,7 @@ RESULT = BenchmarkResult(
 )
 
 
-def test_tables_say_how_fast_who_is():
+def test_tables_have_ratios_of_times():
     assert format_benchmark(RESULT) == (
         "game: playing\n"
         "              median        best\n"

@@ -18,7 +18,7 @@ BATCH = pytest.param("batch", marks=pytest.mark.compiler)
 
 
 @pytest.mark.parametrize("name", [BATCH if name == "batch" else name for name in BENCHMARKS])
-def test_a_benchmark_measures_everybody_who_is_there(name, tiny):
+def test_a_benchmark_measures_all_installed_peers(name, tiny):
     (result,) = run_benchmarks([name], tiny)
     assert result.name == name
     assert result.work
@@ -94,7 +94,7 @@ def test_an_unknown_name_is_refused_before_anything_is_run(tiny):
         next(run_benchmarks(["call", "bacth"], tiny))
 
 
-def test_a_program_that_fails_is_an_error_that_says_what_it_said(tmp_path):
+def test_run_program_reports_the_last_line_of_a_failure(tmp_path):
     with pytest.raises(ProgramError, match=r"'import_time' ended with status 1.*no_such_module"):
         run_program("import_time", "no_such_module")
 

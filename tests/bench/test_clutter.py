@@ -30,7 +30,7 @@ def names(finder, angles):
     return {frozenset(pair[:2]) for pair in finder.distances()}
 
 
-def test_peers_find_what_is_near(arm, scene):
+def test_peers_find_the_same_pairs(arm, scene):
     pytest.importorskip("mujoco")
     ours, *peers = KineverseSearch(scene), CoalSearch(scene), MujocoSearch(arm), MujocoPairSearch(arm)
     for angles in arm.angles[::8]:
@@ -39,7 +39,7 @@ def test_peers_find_what_is_near(arm, scene):
         assert all(names(peer, angles) == found for peer in peers)
 
 
-def test_bullet_finds_what_is_near(arm, scene):
+def test_bullet_finds_the_same_pairs(arm, scene):
     pytest.importorskip("pybullet")
     from kineverse.bench.peers.bullet import BulletSearch
 
@@ -54,7 +54,7 @@ def robot():
     return make_kitchen_robot(steps=40)
 
 
-def test_mujoco_finds_what_is_near_a_robot_in_a_kitchen(robot):
+def test_mujoco_finds_the_pairs_of_a_robot_in_a_kitchen(robot):
     pytest.importorskip("mujoco")
     ours = SearchEntry("ours", KineverseSearch(robot.scene()), 0.0)
     room = RobotSurroundings(robot.scene(), robot.values[0], "robot/")
@@ -62,7 +62,7 @@ def test_mujoco_finds_what_is_near_a_robot_in_a_kitchen(robot):
     check_distances([ours, SearchEntry("mujoco", MujocoRobotSearch(room), 1e-5)], robot.values)
 
 
-def test_bullet_finds_what_is_near_a_robot_in_a_kitchen(robot):
+def test_bullet_finds_the_pairs_of_a_robot_in_a_kitchen(robot):
     pytest.importorskip("pybullet")
     room = RobotSurroundings(robot.scene(), robot.values[0], "robot/")
     entries = [
@@ -85,7 +85,7 @@ class Forgetful(KineverseSearch):
         return iter(found)
 
 
-def test_who_misses_a_pair_is_found_out(arm, scene):
+def test_a_missed_pair_is_an_error(arm, scene):
     whole = SearchEntry("whole", KineverseSearch(scene), 0.0)
     check_distances([whole, whole], arm.angles)
     with pytest.raises(DisagreementError, match="'forgetful' and 'whole' differ by"):

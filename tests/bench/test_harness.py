@@ -14,7 +14,7 @@ def silent(items, what, unit):
     return items
 
 
-def test_everybody_takes_turns_and_nobody_always_begins():
+def test_contenders_take_turns_in_changing_order():
     order = []
 
     def contender(name):
@@ -26,7 +26,7 @@ def test_everybody_takes_turns_and_nobody_always_begins():
     assert measured["a"].samples == (4.0, 9.0, 11.0)
 
 
-def test_rounds_are_what_progress_sees():
+def test_progress_counts_rounds():
     seen = []
 
     def watch(items, what, unit):
@@ -44,7 +44,7 @@ def test_the_collector_rests_during_a_turn_and_only_then():
     assert gc.isenabled()
 
 
-def test_nobody_is_timed_who_computes_something_else():
+def test_disagreeing_contenders_are_not_timed():
     timed_ones = []
 
     def contender(name, *arrays):
@@ -71,7 +71,7 @@ def test_other_shapes_and_nan_are_no_agreement(found, message):
         check_equal("game", [("a", [np.zeros((2, 2))]), ("b", found)])
 
 
-def test_a_first_one_that_is_not_finite_agrees_with_nobody():
+def test_a_nonfinite_reference_is_an_error():
     with pytest.raises(DisagreementError, match="not finite"):
         check_equal("game", [("a", [np.array([np.nan])]), ("b", [np.array([np.nan])])])
 

@@ -28,7 +28,7 @@ def test_positions_are_those_of_all_joints(tiny):
     np.testing.assert_array_equal(robot.of_chain(configurations)[:, 1], positions["lift"])
 
 
-def test_shapes_are_left_out_for_those_who_would_look_for_them(robot_file):
+def test_shapes_are_left_out_for_libraries_that_load_meshes(robot_file):
     assert "mesh" in SMALL_ROBOT
     text = strip_shapes(robot_file)
     assert "mesh" not in text
@@ -36,7 +36,7 @@ def test_shapes_are_left_out_for_those_who_would_look_for_them(robot_file):
     assert text.count("<inertial") == 7
 
 
-def test_what_cannot_be_compared_is_refused(tiny, tmp_path):
+def test_an_unsuitable_robot_is_refused(tiny, tmp_path):
     with pytest.raises(kv.errors.UnknownNameError, match="Did you mean 'tip'"):
         find_robot(replace(tiny, frame="tipp"))
     with pytest.raises(kv.errors.InvalidValueError, match="'base'; choose another --frame"):

@@ -72,7 +72,7 @@ def test_numbers_are_read_exactly(value):
         "f(1)",
     ],
 )
-def test_what_is_no_finite_number_is_refused(text):
+def test_nonfinite_values_are_refused(text):
     with pytest.raises(InvalidValueError, match=r"write|zero|finite"):
         parse_value(text)
 
@@ -83,7 +83,7 @@ def test_assignments_leave_names_alone():
 
 
 @pytest.mark.parametrize("text", ["door", "=3", "  =3", "door=", ""])
-def test_what_is_no_assignment_is_refused(text):
+def test_invalid_assignments_are_refused(text):
     with pytest.raises(InvalidValueError):
         parse_assignments([text])
 
@@ -99,6 +99,6 @@ def test_lengths(text, value):
 
 
 @pytest.mark.parametrize("text", ["30deg", "1rad", "pi", "3°", "", "far", "nan", "inf", "1e400", "1/0"])
-def test_what_is_no_length(text):
+def test_invalid_lengths_are_refused(text):
     with pytest.raises(InvalidValueError):
         parse_length(text)

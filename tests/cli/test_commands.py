@@ -91,7 +91,7 @@ def test_info_as_json_is_one_object_and_nothing_else(run):
     assert answer["size"]["mass"] > 10
 
 
-def test_info_says_what_locks_what(run):
+def test_info_lists_interlocks(run):
     status, out, _ = run("info", "articulations/garage_door")
     assert status == 0
     assert (

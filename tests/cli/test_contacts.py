@@ -36,7 +36,7 @@ def robot(tmp_path):
     return write
 
 
-def test_info_says_what_touches(run, robot):
+def test_info_lists_contacts(run, robot):
     out = run("info", robot(0, 0.2, 0.9, 1.05))[1]
     assert "2 pairs of bodies touch at the default state, first l1 and l3, 0.15 m deep" in out
     out = run("info", robot(0, 5, 0.75))[1]
@@ -76,7 +76,7 @@ def test_validate_without_the_extra_names_it(run, robot, monkeypatch):
     assert "[geometry]" in err
 
 
-def test_view_writes_pictures_of_what_is_near(run, robot, tmp_path):
+def test_view_writes_pictures_of_near_bodies(run, robot, tmp_path):
     file, path = robot(0, 5, 1.1), tmp_path / "near.png"
     images = []
     for words in ([], ["--near", "20cm"]):
@@ -88,7 +88,7 @@ def test_view_writes_pictures_of_what_is_near(run, robot, tmp_path):
     assert (near != plain).any()
 
 
-def test_view_says_what_a_picture_cannot_show(run, robot, tmp_path):
+def test_view_names_the_limits_of_a_picture(run, robot, tmp_path):
     status, _, err = run(
         "view", robot(0, 5, 1.1, shape=MESH), "--picture", tmp_path / "p.png", "--near", "0.2"
     )

@@ -50,13 +50,13 @@ def test_a_document_is_the_model_to_the_bit(run, robot, tmp_path):
 
 @pytest.mark.parametrize("ending", [".kv.json", ".urdf"])
 @pytest.mark.parametrize("source", ["robot.urdf", "shelf_door", "articulations/revolute"])
-def test_what_is_written_moves_alike(run, robot, source, ending):
+def test_a_converted_model_moves_alike(run, robot, source, ending):
     status, _, err = run(source, f"out{ending}")
     assert (status, err) == (0, "")
     assert main(["diff", "--values", source, f"out{ending}"]) == 0
 
 
-def test_what_a_format_cannot_say_is_remarked(run, robot):
+def test_unsupported_constraints_are_remarked(run, robot):
     pytest.importorskip("mujoco")
     status, out, err = run("robot.urdf", "robot.xml")
     assert (status, err) == (0, "")
@@ -91,7 +91,7 @@ def test_a_dash_is_standard_output(robot, tmp_path, capfdbinary):
         assert option[0].encode() in captured.err
 
 
-def test_what_is_left_out_is_missing_and_nothing_else(run, tmp_path, monkeypatch):
+def test_leave_out_removes_the_named_constraints_only(run, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     model = kv.Model()
     q, bolt = kv.position("door"), kv.position("bolt")
@@ -223,7 +223,7 @@ def test_places_that_cannot_be_written_to(run, robot, tmp_path, target, hint):
 
 
 @pytest.mark.parametrize("source", ["missing.urdf", ".", "noise.urdf", "notes.txt", ""])
-def test_what_cannot_be_read_writes_nothing(run, robot, tmp_path, source):
+def test_an_unreadable_file_writes_nothing(run, robot, tmp_path, source):
     (tmp_path / "noise.urdf").write_bytes(os.urandom(100))
     (tmp_path / "notes.txt").write_text("hello")
     status, out, err = run(source, "out.kv.json")

@@ -126,7 +126,7 @@ def test_a_model_that_cannot_be_read_does_not_stop_the_others(run):
         (("--list", "--clear"), "one at a time"),
     ],
 )
-def test_what_makes_no_sense_is_refused_in_a_line(run, words, message):
+def test_decompose_refuses_invalid_arguments_in_one_line(run, words, message):
     status, out, err = run(*words)
     assert (status, out) == (2, "")
     assert message in err

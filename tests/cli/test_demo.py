@@ -110,7 +110,7 @@ def test_a_picture_is_no_jpeg(tmp_path, capsys, words):
     assert not path.exists()
 
 
-def test_driving_finds_what_is_wrong_with_a_model():
+def test_exercise_finds_faults_of_a_model():
     a, b = kv.position("a"), kv.position("b")
     model = kv.Model()
     with model.edit() as edit:

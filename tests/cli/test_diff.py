@@ -132,7 +132,7 @@ def test_rounding_is_no_difference_unless_asked(run, files):
     assert run(one, two, "--tolerance", 0, "--values")[0] == 1
 
 
-def test_formats_that_differ_are_compared_by_what_they_do(run, files, tmp_path):
+def test_different_formats_are_compared_by_behaviour(run, files, tmp_path):
     one, _ = files()
     twin = tmp_path / "twin.sdf"
     twin.write_text(
@@ -326,7 +326,7 @@ def test_colours_on_a_terminal_only(run, files, monkeypatch):
         ("notes.txt", "notes.txt"),
     ],
 )
-def test_what_cannot_be_read_is_status_2(run, files, tmp_path, monkeypatch, second, hint):
+def test_an_unreadable_file_is_status_2(run, files, tmp_path, monkeypatch, second, hint):
     monkeypatch.chdir(tmp_path)
     one, _ = files()
     (tmp_path / "noise.urdf").write_bytes(os.urandom(100))
@@ -368,7 +368,7 @@ def test_frames_that_a_format_needs_in_between_are_no_difference(run, tmp_path, 
     assert run(one, two)[0] == 1
 
 
-def test_frames_that_somebody_added_are_a_difference(run, files, tmp_path):
+def test_added_frames_are_a_difference(run, files, tmp_path):
     def added(name, parent, inside=""):
         return link(name, inside) + joint(f"{name}_mount", parent, name, "fixed", " ")
 

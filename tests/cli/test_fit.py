@@ -85,7 +85,7 @@ def test_a_door_is_a_hinge_with_its_axis(door, capsys):
     assert sum(fit["probability"] for fit in found["fits"]) == pytest.approx(1)
 
 
-def test_what_is_found_is_said(door, capsys):
+def test_fit_prints_the_joint(door, capsys):
     assert main(["fit", door, "--parent", "cupboard", "--child", "door", "--noise", "2mm,0.5deg"]) == 0
     out = capsys.readouterr().out
     assert "door in cupboard: 30 poses" in out
@@ -138,7 +138,7 @@ def test_a_pose_that_does_not_fit_is_named(tmp_path, capsys):
     assert answer([*words, "--thin", "9"], capsys)["outliers"] == []
 
 
-def test_neighbours_whose_errors_are_alike_count_once(tmp_path, capsys):
+def test_correlated_neighbours_count_once(tmp_path, capsys):
     rng = np.random.default_rng(5)
     seen = noisy(hinge(np.linspace(0.0, 1.2, 200)), rng)
     seen[:, 0, 3] += 0.006 * np.sin(np.linspace(0, 12, 200))
@@ -216,7 +216,7 @@ def test_poses_that_do_not_tell_are_not_told(tmp_path, capsys):
     assert found["told"] == ("cannot tell" not in out)
 
 
-def test_what_means_nothing_is_noted(tmp_path, capsys):
+def test_fit_notes_options_without_effect(tmp_path, capsys):
     points = noisy(slider(np.linspace(0, 0.4, 10)), np.random.default_rng(5))[:, :3, 3]
     table = tmp_path / "handle.csv"
     table.write_text("x,y,z,force\n" + "\n".join(",".join(map(str, [*p, 1.0])) for p in points))
@@ -249,7 +249,7 @@ def test_thinned_recordings_are_shorter(door, capsys):
         ("0 0 0\n0 0 1\n", ["--document", "a.urdf"], "whose name ends in .kv.json"),
     ],
 )
-def test_what_cannot_be_is_answered_in_a_line(rows, words, says, tmp_path, capsys):
+def test_fit_refuses_invalid_input_in_one_line(rows, words, says, tmp_path, capsys):
     table = tmp_path / "poses.csv"
     table.write_text(rows)
     assert main(["fit", str(table), *words]) == 2

@@ -21,6 +21,6 @@ def test_its_hash_is_shown(ending, tmp_path, capsys):
     assert json.loads(capsys.readouterr().out)["sha256"] == kv.formats.document_hash(model)
 
 
-def test_what_is_no_document_has_none(capsys):
+def test_only_documents_have_a_hash(capsys):
     assert main(["info", "shelf_door", "--json"]) == 0
     assert "sha256" not in json.loads(capsys.readouterr().out)

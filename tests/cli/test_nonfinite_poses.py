@@ -48,7 +48,7 @@ def test_fk_says_that_the_pose_is_not_finite(run, garage, options):
     assert "'garage/door' in 'world' is not finite at garage/door=3" in line
 
 
-def test_fk_of_what_stays_finite_is_printed(run, pole):
+def test_fk_of_a_finite_frame_is_printed(run, pole):
     status, out, err = run("fk", pole, "post", "--json")
     assert (status, err) == (0, "")
     assert json.loads(out)["position"] == [0, 0, 1]
@@ -57,7 +57,7 @@ def test_fk_of_what_stays_finite_is_printed(run, pole):
     assert "'ring' in 'world' is not finite at q=0" in err
 
 
-def test_info_leaves_out_what_is_not_finite_and_names_it(run, pole):
+def test_info_leaves_out_and_names_nonfinite_frames(run, pole):
     status, out, err = run("info", pole)
     assert (status, err) == (0, "")
     assert "1.00 x 1.00 x 1.00 m" in out
@@ -69,7 +69,7 @@ def test_info_leaves_out_what_is_not_finite_and_names_it(run, pole):
     assert answer["size"]["extent"] == [1, 1, 1]
 
 
-def test_info_of_what_is_finite_lists_nothing(run, garage):
+def test_info_of_a_finite_model_lists_no_frame(run, garage):
     _, out, _ = run("info", garage)
     assert "not finite" not in out
     _, out, _ = run("info", garage, "--json")

@@ -56,7 +56,7 @@ def test_the_module_is_the_same_command():
         ),
     ],
 )
-def test_a_line_says_what_may_have_been_meant(run, words, said):
+def test_a_line_suggests_the_intended_value(run, words, said):
     assert run(*words) == (2, "", f"kineverse: {said}\n")
 
 
@@ -89,7 +89,7 @@ def test_a_forgotten_unit_is_remarked(run, assignment, said):
     assert err == f"kineverse: note: {said}\n"
 
 
-def test_what_turns_for_ever_may_be_meant_in_degrees(run):
+def test_large_values_of_continuous_joints_suggest_degrees(run):
     words = ("fk", "pr2", "pr2/r_gripper_tool_frame", "--set")
     _, _, err = run(*words, "pr2/r_forearm_roll_joint=90")
     assert err == (

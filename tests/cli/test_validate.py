@@ -56,7 +56,7 @@ def body(mass=1.0, moments=(1.0, 1.0, 1.0)):
     return model
 
 
-def test_nothing_is_wrong_with_what_ships(run):
+def test_shipped_models_have_no_problems(run):
     status, out, err = run(*kv.shipped_models())
     assert (status, err) == (0, "")
     assert len(out.splitlines()) == 2 + len(kv.shipped_models())
@@ -104,7 +104,7 @@ def test_documents_say_their_version(run, tmp_path, good):
         ("a.mjcf", "<mujoco><worldbody><body/></worldbody></mujoco>", "MJCF"),
     ],
 )
-def test_it_says_what_a_file_is(run, tmp_path, name, text, language):
+def test_validate_prints_the_contents_of_a_file(run, tmp_path, name, text, language):
     if language == "MJCF":
         pytest.importorskip("mujoco")
     (tmp_path / name).write_text(text)
@@ -292,7 +292,7 @@ def test_several_files_are_a_table_and_the_worst_status(run, good, tmp_path):
 @pytest.mark.parametrize(
     "name", ["missing.urdf", "folder", "noise.urdf", "noise.kv.json", "notes.txt", "тело 机.urdf"]
 )
-def test_what_cannot_be_read_is_status_2(run, tmp_path, monkeypatch, name):
+def test_an_unreadable_file_is_status_2(run, tmp_path, monkeypatch, name):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "folder").mkdir()
     for noise in ("noise.urdf", "noise.kv.json"):
@@ -307,7 +307,7 @@ def test_what_cannot_be_read_is_status_2(run, tmp_path, monkeypatch, name):
     assert json.loads(out)["files"][0]["error"]
 
 
-def test_what_may_not_be_read_is_status_2(run, good, monkeypatch):
+def test_a_file_without_permission_is_status_2(run, good, monkeypatch):
     def refuse(*_, **__):
         raise PermissionError(errno.EACCES, os.strerror(errno.EACCES), str(good))
 

@@ -9,7 +9,7 @@ import pytest
 URDF = '<robot name="lamp"><link name="foot"/></robot>'
 
 
-def test_without_a_name_it_lists_what_can_be_opened(run):
+def test_view_without_a_name_lists_all_models(run):
     status, out, err = run("view")
     assert (status, err) == (0, "")
     assert out.startswith("models: fetch, hsr, kitchen, pr2, shelf_door, shelf_drawers\n\nmodel ")

@@ -34,7 +34,7 @@ def relative(parents, children):
 
 
 @by_cell
-def test_the_noise_is_what_it_is_said_to_be(cell):
+def test_the_noise_has_the_stated_deviation(cell):
     many = Cell(cell.joint, cell.position, cell.orientation, 400, cell.range)
     samples = draw_samples(many, 5, np.random.default_rng(0))
     seen, true = samples.seen_parents.reshape(-1, 4, 4), samples.parents.reshape(-1, 4, 4)
@@ -149,7 +149,7 @@ def test_short_motions_tell_as_much_as_joint_values_drawn_from_a_gaussian_would(
 
 
 @by_cell
-def test_what_can_be_attained_is_the_bound_where_noise_is_small(cell):
+def test_the_attainable_bound_is_cramer_rao_for_small_noise(cell):
     exact = Cell(cell.joint, 1e-5, 1e-5, cell.count, cell.range)
     samples = draw_samples(exact, 3, np.random.default_rng(5))
     np.testing.assert_allclose(
@@ -216,7 +216,7 @@ def test_ratios_are_told_apart_from_chance():
     assert (bad.attainable.over, bad.right, bad.told_wrong) == (1, 0.5, 40)
 
 
-def test_divergences_are_what_is_far_off_and_what_is_not_there():
+def test_divergences_count_large_errors_and_missing_axes():
     far = made_up(CELLS[0], 1.0)
     far.degrees[3] = 60.0
     far.degrees[4] = np.nan
@@ -235,7 +235,7 @@ def test_the_report_says_which_bars_hold(tmp_path):
     assert (tmp_path / "grid.png").stat().st_size > 10_000
 
 
-def test_processes_give_what_one_gives():
+def test_several_processes_give_the_results_of_one():
     cells = [Cell("prismatic", 0.001, 1 * DEG, n, 0.4) for n in (5, 6)]
     alone = fit_all(cells, 2, lambda items, what, unit: items, workers=1)
     together = fit_all(cells, 2, lambda items, what, unit: items, workers=2)

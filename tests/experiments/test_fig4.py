@@ -148,7 +148,7 @@ def test_consistency_is_judged_right(kitchen):
     assert "nis" not in proud.plain()
 
 
-def test_who_is_lost_is_counted_and_left_out():
+def test_lost_runs_are_counted_and_left_out():
     q = np.array([[0.5], [math.nan], [0.7], [math.nan]])
     found = _coordinate_errors(FilterRun(q, np.full((4, 1), 0.01)), np.full((4, 1), 0.6), 0)
     assert (found.mean, found.max, found.nees, found.lost_percent) == pytest.approx((0.1, 0.1, 1.0, 50.0))

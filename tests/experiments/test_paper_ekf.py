@@ -223,7 +223,7 @@ def test_parameters_keep_their_values():
     assert 0 < published.q[0] <= 0.4
 
 
-def test_what_cannot_be_is_refused_and_changes_nothing(furniture):
+def test_invalid_observations_are_refused_without_effect(furniture):
     rng = np.random.default_rng(7)
     published = PaperEkf(furniture, HINGE)
     true = poses(furniture, HINGE, door=1.0)

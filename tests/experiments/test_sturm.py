@@ -62,7 +62,7 @@ def test_recordings_are_known_by_their_names(folder):
     np.testing.assert_array_equal(found[0].covariance, POSITION**2 * np.eye(3))
 
 
-def test_what_is_written_beside_poses_is_left_out(folder):
+def test_further_columns_of_recordings_are_ignored(folder):
     door = list(read_labelled_recordings(folder))[-1]
     np.testing.assert_allclose(door.poses[-1, :2, 0], [np.cos(59 / 40), np.sin(59 / 40)])
 
@@ -72,7 +72,7 @@ def test_arcs_are_hinges_and_lines_are_drawers():
     assert classify_recording(LabelledRecording("a line", "prismatic", line(0.45, 20))).right
 
 
-def test_what_is_missed_is_named_and_drawn(tmp_path):
+def test_misclassified_recordings_are_named_and_drawn(tmp_path):
     pytest.importorskip("matplotlib")
     judged = [
         classify_recording(LabelledRecording("kitchen/door", "revolute", arc(0.4, 1.5, 20))),
@@ -101,7 +101,7 @@ def test_the_missed_one_is_shown_with_both_explanations():
     assert "revolute" in titles
 
 
-def test_without_recordings_it_says_what_and_where(tmp_path, monkeypatch):
+def test_missing_recordings_are_an_error_with_their_place(tmp_path, monkeypatch):
     with pytest.raises(FormatError, match=r"nowhere: there is no such folder.*cabinet_one/001\.log.*--data"):
         read_labelled_recordings(tmp_path / "nowhere")
     with pytest.raises(FormatError, match="none of them is there"):
