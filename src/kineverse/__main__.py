@@ -1,4 +1,4 @@
-"""``python -m kineverse``, for where the command is not on the path."""
+"""Command line as ``python -m kineverse``, if the command is not on the path."""
 
 from __future__ import annotations
 

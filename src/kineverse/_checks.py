@@ -7,21 +7,18 @@ from typing import Any
 
 import numpy as np
 
-from kineverse.errors import (
-    InvalidValueError,
-)
+from kineverse.errors import InvalidValueError
 
 
 def real_number(value: Any) -> float:
-    """Return a value as a float, NaN and infinities included.
+    """Return a real number as a float, NaN and infinities included.
 
-    Text is none, though ``float`` reads it, and nothing is cut off: no imaginary parts, no further elements,
-    no mask.
+    Unlike ``float``, it raises for text, complex numbers, arrays of one or more elements, and masked values.
 
     Raises
     ------
     TypeError, ValueError, OverflowError
-        For what is no number.
+        For values that are not real numbers.
     """
     if type(value) is float:
         return value
@@ -35,7 +32,7 @@ def real_number(value: Any) -> float:
 
 
 def finite_number(value: Any) -> float | None:
-    """Return a finite number as a float; None for infinities, NaN and whatever is no number."""
+    """Return a finite number as a float; None for infinities, NaN and other values."""
     try:
         number = real_number(value)
     except (TypeError, ValueError, OverflowError):
@@ -44,12 +41,12 @@ def finite_number(value: Any) -> float | None:
 
 
 def as_tolerance(given: float) -> float:
-    """Return by how much something may be off.
+    """Return a tolerance as a float.
 
     Raises
     ------
     InvalidValueError
-        If that is no finite number from 0.
+        For negative numbers and values that are not finite numbers.
     """
     tolerance = finite_number(given)
     if tolerance is None or tolerance < 0:
@@ -58,12 +55,12 @@ def as_tolerance(given: float) -> float:
 
 
 def check_flag(name: str, given: object) -> None:
-    """Look whether a keyword that switches something is True or False: the text 'no' would be taken for yes.
+    """Check that a keyword argument is True or False, since a text such as 'no' counts as true.
 
     Raises
     ------
     InvalidValueError
-        If it is neither.
+        For other values.
     """
     if not isinstance(given, bool | np.bool_):
         raise InvalidValueError(f"{name}= is True or False, not {given!r}.")

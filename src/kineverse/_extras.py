@@ -16,10 +16,10 @@ _EXTRA = re.compile(r"""(?:\s*and\s*)?extra\s*==\s*["'](?P<name>[^"']+)["']""")
 
 
 def install_command(extra: str) -> str:
-    """Return the command that adds an extra to the installation that is running.
+    """Return the command that adds an extra to the running installation.
 
-    The package is on no index, so its name says nothing to pip. A checkout is installed again, editable, with
-    the extra; beside anything else goes what the extra consists of.
+    The package is on no index, so pip cannot find it by name. A checkout is installed again, editable, with
+    the extra; for other installations, the requirements of the extra are installed.
 
     Parameters
     ----------
@@ -30,19 +30,19 @@ def install_command(extra: str) -> str:
     if here is not None:
         return f"{_pip()} install -e {shlex.quote(f'{_relative_to_cwd(here)}[{extra}]')}"
     wanted = requirements(extra, _declared())
-    if not wanted:  # a folder that somebody put on the path
+    if not wanted:  # the package is not installed, but on the path
         return f"{_pip()} install -e '.[{extra}]' in a checkout"
     return f"{_pip()} install {' '.join(map(shlex.quote, wanted))}"
 
 
 def checkout(module: Path) -> Path | None:
-    """Return the root of the checkout from which a module of this package runs; None if it was copied."""
+    """Return the root of the checkout that contains a module of this package; None if it is installed."""
     root = module.resolve().parents[2]
     return root if (root / "src" / "kineverse").is_dir() and (root / "pyproject.toml").is_file() else None
 
 
 def requirements(extra: str, declared: Iterable[str]) -> list[str]:
-    """Return what an extra consists of, by the lines of metadata (``coal>=3.0; extra == "geometry"``)."""
+    """Return the requirements of an extra, from lines of metadata (``coal>=3.0; extra == "geometry"``)."""
     found = []
     for line in declared:
         match = _EXTRA.search(line)
@@ -62,7 +62,7 @@ def _declared() -> list[str]:
 
 
 def _pip() -> str:
-    """Return how the pip of this interpreter is called, whichever environment the shell is in."""
+    """Return the command of this interpreter's pip, in any environment of the shell."""
     pip = Path(sys.executable).with_name("pip")
     return (
         shlex.quote(_relative_to_cwd(pip))
@@ -72,9 +72,9 @@ def _pip() -> str:
 
 
 def _relative_to_cwd(path: Path) -> str:
-    """Return a path as short as it can be typed here."""
+    """Return a path relative to the working directory if it is below, else as it is."""
     try:
         here = Path.cwd()
-    except FileNotFoundError:  # somebody removed the folder
+    except FileNotFoundError:  # the working directory was removed
         return str(path)
     return os.path.relpath(path, here) if path.is_relative_to(here) else str(path)

@@ -9,7 +9,7 @@ from contextlib import contextmanager
 
 @contextmanager
 def no_collection() -> Iterator[None]:
-    """Pause the collector: for what makes many objects and no garbage, and would wait for it."""
+    """Pause the garbage collector, for code that creates many objects and no garbage."""
     collecting = gc.isenabled()
     gc.disable()
     try:

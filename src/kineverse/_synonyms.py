@@ -173,18 +173,18 @@ STATE_SYNONYMS: Mapping[str, str] = {
 def unknown_attribute_error(
     owner: str, name: str, available: Iterable[str], elsewhere: Mapping[str, str]
 ) -> UnknownAttributeError:
-    """Return the error for an attribute that is not there, with what is called like it or does its work.
+    """Return the error for an unknown attribute, with similar names or the equivalent of a foreign name.
 
     Parameters
     ----------
     owner
-        What lacks it, as the subject of a sentence.
+        The object, as the subject of a sentence.
     name
-        Of the attribute.
+        The unknown attribute.
     available
-        Names that there are.
+        The known attributes.
     elsewhere
-        From names in other libraries to what is written here.
+        From names in other libraries to their equivalents here.
     """
     problem = f"{owner} has no {name!r}."
     if name.startswith("_"):

@@ -1,8 +1,7 @@
 """Exceptions of the library and the parts of their messages.
 
-All of them derive from :class:`KineverseError`, so one ``except`` catches whatever Kineverse has to say; each
-also derives from the built-in error a Python programmer would expect (``KeyError``, ``ValueError`` ...).
-A message says what was wrong, where, what was available and what to do.
+All of them derive from :class:`KineverseError`, and also from the corresponding built-in error (``KeyError``,
+``ValueError`` ...). A message names the mistake, its place, the alternatives and the correction.
 """
 
 from __future__ import annotations
@@ -15,7 +14,7 @@ class KineverseError(Exception):
     """Base of all errors of this package."""
 
     def __str__(self) -> str:
-        # KeyError prints the repr of its argument; a message for people is printed as it is.
+        # KeyError prints the repr of its argument; the message is printed as it is.
         return str(self.args[0]) if len(self.args) == 1 else super().__str__()
 
 
@@ -24,23 +23,23 @@ class UnknownNameError(KineverseError, KeyError):
 
 
 class DuplicateNameError(KineverseError, ValueError):
-    """The name is in use already; names, tags and constraints are unique."""
+    """A name, tag or constraint is in use already."""
 
 
 class ShapeError(KineverseError, ValueError):
-    """Operands, arrays or matrices have shapes that do not fit."""
+    """Operands, arrays or matrices have incompatible shapes."""
 
 
 class InvalidValueError(KineverseError, ValueError):
-    """A number is not acceptable here: NaN, an empty range, a zero axis ..."""
+    """A value is outside of its domain: NaN, an empty range, an axis of length zero ..."""
 
 
 class ExpressionError(KineverseError, TypeError):
-    """An expression is used in a way that has no meaning (such as ``if expression:``)."""
+    """An expression is used in a way that is not defined (such as ``if expression:``)."""
 
 
 class CompileError(KineverseError, RuntimeError):
-    """Expressions could not be turned into a function."""
+    """Expressions cannot be compiled to a function."""
 
 
 class NoSolutionError(KineverseError, ValueError):
@@ -48,16 +47,16 @@ class NoSolutionError(KineverseError, ValueError):
 
 
 class ModelError(KineverseError, ValueError):
-    """The model would not be consistent: cyclic frames, cyclic rates, rows that end nowhere."""
+    """A model would be inconsistent: cyclic frames, cyclic rates, rates by undefined symbols."""
 
 
 class EditError(KineverseError, RuntimeError):
-    """An edit was refused, and the model is what it was before.
+    """An edit failed, and the model is unchanged.
 
     Attributes
     ----------
     failures
-        The operations that cannot be applied, by tag, with what each says.
+        The errors of operations that cannot be applied, by tag.
     """
 
     def __init__(self, message: str, failures: Mapping[str, KineverseError] | None = None) -> None:
@@ -66,11 +65,11 @@ class EditError(KineverseError, RuntimeError):
 
 
 class UnknownAttributeError(KineverseError, AttributeError):
-    """Something has no such attribute; the message says what is called like that."""
+    """An object has no such attribute; the message lists similar names."""
 
 
 class FormatError(KineverseError, ValueError):
-    """A file or document cannot be read as what it claims to be."""
+    """A file or document does not follow its format."""
 
 
 class MissingDependencyError(KineverseError, ImportError):
@@ -89,23 +88,23 @@ _LONGEST = 100
 
 
 def suggest(name: str, available: Iterable[str], what: str = "name", limit: int = 12) -> str:
-    """Return the half of an error message that lists close matches, or what there is.
+    """Return the part of an error message that lists similar names, or the available ones.
 
     Parameters
     ----------
     name
-        What was asked for.
+        The unknown name.
     available
-        What could have been asked for.
+        The known names.
     what
-        The noun used for the listed things.
+        The noun for the names.
     limit
-        At most so many names are listed.
+        The largest number of listed names.
     """
     names = sorted(set(available))
     if not names:
         return f"There is no {what} at all."
-    # What is longer resembles nothing, and takes long to compare.
+    # Longer names have no similar ones, and take long to compare.
     close = difflib.get_close_matches(name[:1000], names, n=4, cutoff=0.6) if len(names) <= 20_000 else []
     parts = (n for n in names if n.endswith(f"/{name}") or n.startswith((f"{name}/", f"{name}:")))
     close += [n for n in parts if n not in close][: max(0, 4 - len(close))]

@@ -1,8 +1,8 @@
 """Continuous boolean logic (2020 paper, III-C and Eq. 4).
 
 Values lie in [0, 1]. Every node has two kinds of derivative: as a *fact* it is locally constant, and its
-*trend* says in which direction to move for it to become true. Trends are what ``gradient()`` gives;
-``gradient(heuristic=False)`` leaves them out.
+*trend* is a direction in which it becomes true. ``gradient()`` contains trends; ``gradient(heuristic=False)``
+leaves them out.
 
 For operands ``v_i`` with trends ``D_i``, ``P = Π v_i`` and ``Q = Π (1 - v_i)``:
 
@@ -15,10 +15,9 @@ and        P                   Σ (1 - v_i + P)·D_i
 or         1 - Q               Σ (v_i + Q)·D_i
 =========  ==================  ==========================
 
-The trend of ``and`` is the product rule where at most one operand is false and the plain sum where all are,
-where the product rule would be blind; it leaves alone what already holds, and is dual to that of ``or`` under
-De Morgan. ``a * b`` and ``1 - a`` keep the product rule, as the papers write them; ``&`` and ``~`` are the
-ones to use for locks.
+The trend of ``and`` is the product rule if at most one operand is false, and the plain sum if all are, where
+the product rule is zero. Operands that are true do not contribute. It is dual to the trend of ``or`` under De
+Morgan. ``a * b`` and ``1 - a`` keep the product rule, as in the papers; locks use ``&`` and ``~``.
 """
 
 from __future__ import annotations
@@ -41,25 +40,25 @@ CONTRAST = 1e10
 
 
 def less(a: ExpressionLike, b: ExpressionLike, contrast: float = CONTRAST) -> Expression:
-    """Return the truth of a < b: 1 or 0, and 0.5 at equality, that of two infinities included.
+    """Return the truth of a < b: 1 or 0, and 0.5 at equality, also of two equal infinities.
 
     Parameters
     ----------
     a, b
-        What is compared, elementwise.
+        The operands, compared elementwise.
     contrast
         R, per unit: the value changes within about 1/R around equality.
     """
     if not isinstance(contrast, Real) or not 0 < contrast < math.inf:
         raise InvalidValueError(f"The contrast is a positive number, not {contrast!r}.")
     x, y = broadcast(as_expression(a), as_expression(b))
-    return Less.of((x, y), x.shape, (float(contrast),))
+    return Less.from_arguments((x, y), x.shape, (float(contrast),))
 
 
 def logic_not(a: ExpressionLike) -> Expression:
     """Return the truth of "not a"; also ``~a``."""
     operand = as_expression(a)
-    return Not.of((operand,), operand.shape)
+    return Not.from_arguments((operand,), operand.shape)
 
 
 def logic_and(*operands: ExpressionLike) -> Expression:
@@ -78,17 +77,17 @@ def _join(kind: type[_Joined], operands: tuple[ExpressionLike, ...]) -> Expressi
     flat: list[Expression] = []
     for operand in operands:
         expression = as_expression(operand)
-        # (a & b) & c is a & b & c: the trend is defined over all operands together.
+        # (a & b) & c is flattened to a & b & c, because the trend is defined over all operands together.
         inner = _is_only(expression, kind)
         flat.extend(inner.arguments if inner is not None else (expression,))
     if len(flat) == 1 and _is_only(flat[0], _Logic) is not None:
         return flat[0]
     shaped = broadcast(*flat)
-    return kind.of(shaped, shaped[0].shape)
+    return kind.from_arguments(shaped, shaped[0].shape)
 
 
 def _is_only(expression: Expression, kind: type[object]) -> Node | None:
-    """Return the node if the expression is nothing but one node of this kind."""
+    """Return the node if the expression consists of one node of this kind."""
     if len(expression._nodes) != 1:
         return None
     (node,) = expression._nodes
@@ -98,7 +97,7 @@ def _is_only(expression: Expression, kind: type[object]) -> Node | None:
 
 
 class _Logic(Node):
-    """Nodes whose gradient is a trend and nothing else."""
+    """Base of nodes with a trend as their only gradient."""
 
     __slots__ = ()
     symbol: ClassVar[str]
@@ -107,7 +106,7 @@ class _Logic(Node):
         return self._trend() if heuristic else {}
 
     def differentiated(self, heuristic: bool) -> tuple[Expression, ...]:
-        """Return the operands for a trend; as a fact the node is constant."""
+        """Return the operands, for a trend; none for facts, as the node is locally constant."""
         return self.arguments if heuristic else ()
 
     def _trend(self) -> Mapping[Symbol, Expression]:
@@ -124,12 +123,12 @@ class Less(_Logic):
         return (1 + tanh(self._excess() * self.options[0])) / 2
 
     def _excess(self) -> Expression:
-        """Return b - a, and 0 where both are the same infinity."""
+        """Return b - a, and 0 if both are the same infinity."""
         a, b = self.arguments
         difference = b - a
         if _is_finite(a) or _is_finite(b):
             return difference
-        # Infinities that are equal differ by NaN; NaN differs from itself, so it stays.
+        # The difference of equal infinities is NaN and becomes 0; NaN operands stay NaN.
         number = binary(ca.OP_LE, absolute(difference), math.inf)
         return binary(ca.OP_IF_ELSE_ZERO, binary(ca.OP_OR, number, binary(ca.OP_NE, a, b)), difference)
 
@@ -191,7 +190,7 @@ class Or(_Joined):
 
 
 def weighted_sum(terms: list[tuple[ExpressionLike, Mapping[Symbol, Expression]]]) -> dict[Symbol, Expression]:
-    """Return ``Σ weight·gradient`` over the union of keys."""
+    """Return ``Σ weight·gradient`` over the union of keys of all gradients."""
     result: dict[Symbol, Expression] = {}
     for weight, gradient in terms:
         for key, entry in gradient.items():

@@ -1,8 +1,7 @@
 """Rotations, rigid transforms and twists (SO(3), SE(3)) as expressions.
 
-An :class:`OneAxisTransform` is a 4×4 expression like any other. But it remembers direction and amount, which is all
-that kinematics wants of it, and builds its matrix when somebody looks at it. A robot has dozens of them and
-most questions are about a few.
+An :class:`OneAxisTransform` is a 4×4 expression that stores its axis and amount, which is all that kinematics
+needs, and builds its matrix on first access: a model has dozens of them, and most queries need a few.
 
 ``a_T_b`` is the 4×4 homogeneous transform that maps coordinates in frame b to coordinates in frame a, so
 ``a_T_c = a_T_b @ b_T_c``. Rotations are right-handed, angles in [rad], lengths in [m], quaternions in the
@@ -37,8 +36,8 @@ Direction = tuple[float, float, float]
 
 X, Y, Z = (1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)
 
-# Which entries a rotation about an axis has, column by column, and what they are: cos, sin, -sin or 1. Built
-# sparse, because element by element each would cost ten times as much.
+# Rows and columns of the entries of a rotation about an axis, column by column, and the entries: cos, sin,
+# -sin or 1. A sparse matrix is ten times faster to build than one element by element.
 _ROTATION_ENTRIES = {
     X: ([0, 1, 2, 1, 2], [0, 1, 1, 2, 2], (3, 0, 1, 2, 0)),
     Y: ([0, 2, 1, 0, 2], [0, 0, 1, 2, 2], (0, 2, 3, 1, 0)),
@@ -54,7 +53,7 @@ _TRANSFORM_SPARSITIES = {
 _TRANSLATION_SPARSITY = ca.Sparsity.triplet(4, 4, [0, 1, 2, 0, 1, 2, 3], [0, 1, 2, 3, 3, 3, 3])
 _UNIT_ENTRY = ca.SX(1)
 _UNIT_TOLERANCE = 1e-9
-"""How far the length of a direction may be from 1."""
+"""Largest difference of the length of a direction from 1."""
 
 
 class OneAxisTransform(Expression):
@@ -66,31 +65,31 @@ class OneAxisTransform(Expression):
         A constant unit vector; of a rotation, one of the three coordinate axes.
     amount
         A scalar, [rad] or [m].
-    turns
-        Whether it is a rotation.
+    is_rotation
+        True for a rotation, False for a translation.
     """
 
-    __slots__ = ("amount", "direction", "turns")
+    __slots__ = ("amount", "direction", "is_rotation")
 
     direction: Direction
     amount: Expression
-    turns: bool
+    is_rotation: bool
 
-    def __new__(cls, direction: Direction, amount: ExpressionLike, turns: bool) -> OneAxisTransform:
-        """Return the motion; :func:`rotation_about` and :func:`translation_along` are the ways to get one."""
+    def __new__(cls, direction: Direction, amount: ExpressionLike, is_rotation: bool) -> OneAxisTransform:
+        """Return a rotation or translation; see :func:`rotation_about` and :func:`translation_along`."""
         self = object.__new__(cls)
-        self.direction, self.amount, self.turns = direction, as_expression(amount), turns
+        self.direction, self.amount, self.is_rotation = direction, as_expression(amount), is_rotation
         if self.amount.shape:
-            what = "An angle" if turns else "A distance"
+            what = "An angle" if is_rotation else "A distance"
             raise ShapeError(f"{what} is a scalar, not of shape {self.amount.shape}.")
         self._describe((4, 4), self.amount._nodes)
         return self
 
     def __getattr__(self, name: str) -> Any:
-        # Called for what is not there: the graph, before it is looked at for the first time.
+        # Called for missing attributes: the graph before its first access.
         if name != "_sx":
             return super().__getattr__(name)  # type: ignore[misc]
-        if self.turns:
+        if self.is_rotation:
             graph = ca.SX(_TRANSFORM_SPARSITIES[self.direction], ca.vertcat(*self._entries(), _UNIT_ENTRY))
         else:
             graph = ca.SX(
@@ -102,12 +101,12 @@ class OneAxisTransform(Expression):
 
     @property
     def rotation(self) -> SX:
-        """The 3×3 rotation of a motion that turns."""
+        """The 3×3 matrix of a rotation."""
         return ca.SX(_ROTATION_SPARSITIES[self.direction], ca.vertcat(*self._entries()))
 
     @property
     def offset(self) -> SX:
-        """The translation of a motion that does not turn, 3×1."""
+        """The offset of a translation, 3×1."""
         sx = self.amount._sx
         return ca.vertcat(*(sx if d == 1 else ca.SX(d) if d == 0 else d * sx for d in self.direction))
 
@@ -119,11 +118,11 @@ class OneAxisTransform(Expression):
 
     @property
     def is_constant(self) -> bool:
-        """Whether the amount is constant."""
+        """True if the amount is constant."""
         return self.amount.is_constant
 
     def __reduce__(self) -> Any:
-        return OneAxisTransform, (self.direction, self.amount, self.turns)
+        return OneAxisTransform, (self.direction, self.amount, self.is_rotation)
 
 
 def rotation_about(axis: Direction, angle: ExpressionLike) -> OneAxisTransform:
@@ -137,13 +136,14 @@ def translation_along(direction: Direction, distance: ExpressionLike) -> OneAxis
 
 
 def as_one_axis_transform(transform: Expression) -> Expression:
-    """Return a 4×4 transform as the motion that its matrix is, if it is one; else as it is.
+    """Return a transform as a :class:`OneAxisTransform` if its matrix is one, else as it is.
 
-    So a motion is the same to kinematics however it was written down, and after it was sent as a matrix.
+    So kinematics treats a rotation or translation alike however it was written, also after it was stored as a
+    matrix.
     """
     if isinstance(transform, OneAxisTransform):
-        # Along a skew line, factors of the amount and those of the direction are one in the matrix.
-        is_skew = not transform.turns and sum(d != 0 for d in transform.direction) > 1
+        # Along a skew line, the matrix does not separate factors of the amount from those of the direction.
+        is_skew = not transform.is_rotation and sum(d != 0 for d in transform.direction) > 1
         return transform if not is_skew else _as_translation(transform)
     sparsity = transform._sx.sparsity()
     if sparsity == _TRANSLATION_SPARSITY:
@@ -191,7 +191,7 @@ def _as_translation(transform: Expression) -> Expression:
 
 
 def _split_factor(part: SX) -> tuple[float, SX]:
-    """Return a scalar as a number and what it is a multiple of."""
+    """Return a scalar as a constant factor and the rest."""
     if part.op() == ca.OP_NEG:
         factor, rest = _split_factor(part.dep(0))
         return -factor, rest
@@ -203,7 +203,7 @@ def _split_factor(part: SX) -> tuple[float, SX]:
 
 
 def _without_axis(transform: Expression) -> Expression:
-    """Return a transform without what it knows beside its matrix."""
+    """Return a transform as a plain matrix expression."""
     if not isinstance(transform, OneAxisTransform):
         return transform
     return from_casadi(transform._sx, transform.shape, transform._nodes)
@@ -215,9 +215,9 @@ VectorLike: TypeAlias = ExpressionLike
 def translation(
     x: ExpressionLike, y: ExpressionLike | None = None, z: ExpressionLike | None = None
 ) -> Expression:
-    """Return the 4×4 transform that moves by (x, y, z) [m]; a single vector of three is taken apart.
+    """Return the 4×4 translation by (x, y, z) [m], given one by one or as one vector of shape (3,).
 
-    What is not given is 0.
+    Missing coordinates are 0.
     """
     first = as_expression(x)
     if first.shape and y is None and z is None:
@@ -232,7 +232,7 @@ def translation(
 def _components(
     what: str, names: tuple[str, ...], given: tuple[ExpressionLike | None, ...]
 ) -> tuple[Expression, ...]:
-    """Return the numbers that are given one by one, or as one vector alone.
+    """Return the numbers that are given one by one, or as a single vector.
 
     Raises
     ------
@@ -308,15 +308,15 @@ def rpy(
 def to_rpy(a_R_b: ExpressionLike) -> Expression:
     """Return roll, pitch and yaw [rad], shape (3,), of a rotation or transform; pitch in [-π/2, π/2].
 
-    At pitch ±π/2 roll and yaw are not defined apart: any yaw is given, and the roll that goes with it. The
-    derivative does not exist there.
+    At pitch ±π/2 only a sum of roll and yaw is defined; the result is any yaw with the corresponding roll.
+    The derivative does not exist there.
     """
     r = rotation_of(a_R_b)
     yaw = arctan2(r[1, 0], r[0, 0])
     c, s = cos(yaw), sin(yaw)
     return array(
         [
-            # Not arctan2(r21, r22), which knows nothing of that yaw and is noise at pitch ±π/2.
+            # Not arctan2(r21, r22), which does not depend on that yaw and is noise at pitch ±π/2.
             arctan2(s * r[0, 2] - c * r[1, 2], c * r[1, 1] - s * r[0, 1]),
             arctan2(-r[2, 0], norm(array([r[0, 0], r[1, 0]]))),
             yaw,
@@ -330,21 +330,21 @@ def quaternion(
     z: ExpressionLike | None = None,
     w: ExpressionLike | None = None,
 ) -> Expression:
-    """Return the 4×4 rotation of the quaternion (x, y, z, w) of any length but zero: the scalar is last.
+    """Return the 4×4 rotation of a quaternion (x, y, z, w) of any length but zero, the scalar last.
 
     The four are given one by one, or as one vector of shape (4,) alone.
 
     Raises
     ------
     ShapeError
-        For more or fewer than four.
+        For another number of components.
     InvalidValueError
         For a constant quaternion of length zero, or infinite.
     """
     q = array(list(_components("A quaternion", ("x", "y", "z", "w"), (x, y, z, w))))
-    watcher = access_listener(q)
-    if watcher is not None:
-        anew: Expression = watcher.ask("quaternion", q)
+    listener = access_listener(q)
+    if listener is not None:
+        anew: Expression = listener.ask("quaternion", q)
         return anew
     if not q.symbols:
         largest = float(np.abs(q()).max())
@@ -352,7 +352,7 @@ def quaternion(
             raise InvalidValueError(
                 f"A quaternion of length {'zero' if not largest else 'infinity'} has no direction."
             )
-        # By a power of two, which changes no digit, or the square of something tiny is nothing.
+        # Scaled by a power of two, which is exact, because the square of a tiny number underflows.
         q = q * math.ldexp(1.0, min(-math.frexp(largest)[1], 1000))
     scale = 2 / (q @ q)
     x, y, z, w = q
@@ -400,8 +400,7 @@ def log_so3(a_R_b: ExpressionLike) -> Expression:
     q = to_quaternion(a_R_b)
     v, w = q[:3], q[3]
     squared = v @ v
-    # 2·atan2(√s, w)/√s, by its series in s/w² where s is small; the series is in no danger as w is near 1
-    # there.
+    # 2·atan2(√s, w)/√s, by its series in s/w² where s is small and w is near 1.
     small = _greater(1e-3, squared)
     ratio = squared / where(small, w * w, 1)
     series = 2 / where(small, w, 1) * _polynomial(ratio, [(-1) ** k / (2 * k + 1) for k in range(7)])
@@ -479,7 +478,7 @@ def position_of(a_T_b: ExpressionLike) -> Expression:
 
 
 def point(x: ExpressionLike, y: ExpressionLike | None = None, z: ExpressionLike | None = None) -> Expression:
-    """Return the homogeneous coordinates (x, y, z, 1) of a point: transforms move it.
+    """Return the homogeneous coordinates (x, y, z, 1) of a point, which transforms rotate and translate.
 
     The three are given one by one, or as one vector of shape (3,) alone.
     """
@@ -487,7 +486,7 @@ def point(x: ExpressionLike, y: ExpressionLike | None = None, z: ExpressionLike 
 
 
 def vector(x: ExpressionLike, y: ExpressionLike | None = None, z: ExpressionLike | None = None) -> Expression:
-    """Return the homogeneous coordinates (x, y, z, 0) of a direction: transforms only turn it.
+    """Return the homogeneous coordinates (x, y, z, 0) of a direction, which transforms only rotate.
 
     The three are given one by one, or as one vector of shape (3,) alone.
     """
@@ -532,9 +531,9 @@ def unit_vector(v: VectorLike, what: str = "The vector") -> Expression:
         For a constant vector of length zero.
     """
     expression = _as_vector3(v, what)
-    watcher = access_listener(expression)
-    if watcher is not None:
-        anew: Expression = watcher.ask("unit", expression)
+    listener = access_listener(expression)
+    if listener is not None:
+        anew: Expression = listener.ask("unit", expression)
         return anew
     if not expression.symbols:
         number = normalize(expression())
@@ -553,7 +552,7 @@ def _as_vector3(v: VectorLike, what: str) -> Expression:
 
 
 def _greater(a: ExpressionLike, b: ExpressionLike) -> Expression:
-    """Return 1 where a > b, else 0: a plain fact for selections, with no slope and no trend."""
+    """Return 1 where a > b, else 0: a comparison for selections, without gradient and trend."""
     return binary(ca.OP_LT, b, a)
 
 
@@ -565,7 +564,7 @@ def _polynomial(x: Expression, coefficients: list[float]) -> Expression:
 
 
 def _sine_series(squared: Expression) -> tuple[Expression, Expression, Expression]:
-    """Return sin θ/θ, (1 - cos θ)/θ² and (θ - sin θ)/θ³ of θ², by their series where θ² is small."""
+    """Return sin θ/θ, (1 - cos θ)/θ² and (θ - sin θ)/θ³ of θ², by Taylor series where θ² is small."""
     small = _greater(1e-2, squared)
     theta2 = where(small, 1, squared)
     theta = sqrt(theta2)

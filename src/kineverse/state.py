@@ -1,4 +1,4 @@
-"""Values of symbols at one moment, and their conversion from what users give."""
+"""Values of symbols at one time, and their conversion from mappings."""
 
 from __future__ import annotations
 
@@ -27,29 +27,29 @@ StateLike: TypeAlias = "State | Mapping[Symbol, float] | Mapping[str, float] | M
 
 
 class State(Mapping[Symbol, float]):
-    """An immutable mapping from symbols to numbers, with the time it was true at and who said so.
+    """An immutable mapping from symbols to numbers, with time stamp and source.
 
-    Whatever takes values takes a state; other than a plain mapping it may know more symbols than are asked
-    for. It can be indexed by symbols and by their names. :meth:`updated` changes values of symbols that it
-    knows, :meth:`extended` adds symbols; ``state | {...}`` is ``state.updated({...})``, and ``state | other``
-    has the symbols of two states.
+    Functions that take values take a state. Unlike a plain mapping, it may contain more symbols than needed.
+    It can be indexed by symbols and by their names. :meth:`updated` changes values of its symbols,
+    :meth:`extended` adds symbols; ``state | {...}`` is ``state.updated({...})``, and ``state | other`` has
+    the symbols of both states.
 
     Parameters
     ----------
     values
         From symbols, or names of degrees of freedom, to numbers: [m], [rad] and their rates by time.
     stamp
-        Time in seconds, of whatever clock the source uses; None if there is none.
+        Time [s] by the clock of the source; None if there is none.
     source
-        Who measured or computed it.
+        The name of the sensor or computation.
 
     Raises
     ------
     InvalidValueError
         For NaN or values that are not numbers.
     DuplicateNameError
-        If a symbol is given a value and its name another one; likewise, later, if a value is asked for by a
-        name that several of the symbols have.
+        If values are given for a symbol and for its name; likewise, later, for access by a name that several
+        of the symbols have.
     """
 
     __slots__ = ("_by_name", "_values", "source", "stamp")
@@ -66,7 +66,7 @@ class State(Mapping[Symbol, float]):
         self._values = known
         self._by_name: dict[str, Symbol | None] = {str(s): s for s in known}
         if len(self._by_name) < len(known):
-            # A parameter may have the name of something else; then the name alone says nothing.
+            # A parameter may have the name of another symbol; then the name is ambiguous.
             counts = Counter(map(str, known))
             self._by_name = {name: s if counts[name] == 1 else None for name, s in self._by_name.items()}
         if stamp is not None and not _is_number(stamp):
@@ -79,10 +79,10 @@ class State(Mapping[Symbol, float]):
             raise ExpressionError("States are immutable; use updated({symbol: number}, stamp=...).")
         object.__setattr__(self, name, value)
 
-    if not TYPE_CHECKING:  # a type checker says so on its own
+    if not TYPE_CHECKING:  # a type checker reports unknown attributes itself
 
         def __getattr__(self, name):
-            if name in State.__slots__:  # not set yet, which __setattr__ asks about for every state
+            if name in State.__slots__:  # not set yet, while __setattr__ checks for it
                 raise AttributeError(name)
             if name in self._by_name:
                 raise UnknownAttributeError(f"A state has no {name!r}. Its value is state[{name!r}].")
@@ -108,7 +108,7 @@ class State(Mapping[Symbol, float]):
             ) from None
 
     def _known(self, key: object) -> Symbol:
-        """Return the symbol that a key stands for; a KeyError if there is none."""
+        """Return the symbol of a key; raise a KeyError if there is none."""
         if not isinstance(key, str):
             if key in self._values:
                 return key  # type: ignore[return-value]
@@ -121,9 +121,9 @@ class State(Mapping[Symbol, float]):
         return symbol
 
     def given(self, symbol: Symbol) -> float | None:
-        """Return the value of a symbol, else what was given by its name alone, None if there is neither.
+        """Return the value of a symbol, else the value that was given by its name, else None.
 
-        A name in a state stands for a degree of freedom until somebody asks for a parameter of that name.
+        A name in a state is that of a degree of freedom, or else of the parameter of that name.
         """
         value = self._values.get(symbol)
         if value is None and symbol.role != "dof":
@@ -145,13 +145,13 @@ class State(Mapping[Symbol, float]):
         Raises
         ------
         UnknownNameError
-            For a symbol or name that the state says nothing about, with similar ones.
+            For a symbol or name without a value in the state, with similar ones.
         """
         changed: dict[Symbol, float] = {}
         for key, value in _items(values):
             try:
                 symbol = self._known(key)
-            except (KeyError, TypeError):  # of a name, and of what cannot be a key at all
+            except (KeyError, TypeError):  # TypeError for unhashable keys
                 raise self._unknown(key) from None
             if symbol in changed:
                 raise duplicate_value_error(symbol)
@@ -159,12 +159,12 @@ class State(Mapping[Symbol, float]):
         return self._with(changed, stamp, source)
 
     def extended(self, values: StateLike, *, stamp: float | None = None, source: str | None = None) -> State:
-        """Return a state that knows more symbols, too; stamp and source are kept unless given.
+        """Return a state with further symbols; stamp and source are kept unless given.
 
         Raises
         ------
         DuplicateNameError
-            For a symbol that the state has a value for, which :meth:`updated` changes.
+            For a symbol of the state; :meth:`updated` changes its value.
         """
         added = State(values)._values
         for symbol in added:
@@ -267,21 +267,21 @@ def _restore(values: dict[Symbol, float], stamp: float | None, source: str) -> S
 
 
 def as_state(values: StateLike, known: Iterable[Symbol]) -> State:
-    """Return values as a state, refusing what a plain mapping says about symbols that are not known.
+    """Return values as a state, and raise for unknown symbols in a plain mapping.
 
     Parameters
     ----------
     values
-        A state, which may know more, or a mapping from symbols or names to numbers, which may not.
+        A state, which may have more symbols, or a mapping from symbols or names to numbers, which may not.
     known
-        The symbols that there are.
+        The known symbols.
 
     Raises
     ------
     UnknownNameError
         For other symbols and names.
     DuplicateNameError
-        If a symbol has two values, by name and as such, or a name is that of several symbols.
+        If a symbol has two values, by symbol and by name, or a name is that of several symbols.
     """
     if isinstance(values, State):
         return values
@@ -295,16 +295,16 @@ def as_state(values: StateLike, known: Iterable[Symbol]) -> State:
     result: dict[Symbol, float] = {}
     for key, value in values.items():
         name = str(key)
-        meant = by_name.get(name, set())
+        matching = by_name.get(name, set())
         if isinstance(key, Symbol):
-            meant = meant & {key}
-        if not meant:
+            matching = matching & {key}
+        if not matching:
             raise UnknownNameError(f"Unknown symbol {name!r}. {suggest(name, by_name, 'symbol')}")
-        if len(meant) > 1:
+        if len(matching) > 1:
             raise DuplicateNameError(
                 f"Several symbols have the name {name!r}; give their values by symbol, not by name."
             )
-        (symbol,) = meant
+        (symbol,) = matching
         if symbol in result:
             raise duplicate_value_error(symbol)
         result[symbol] = value
@@ -312,12 +312,12 @@ def as_state(values: StateLike, known: Iterable[Symbol]) -> State:
 
 
 def check_meant(state: State, known: Iterable[Symbol]) -> None:
-    """Refuse a state that has no value for anything in a model: it is one of another model.
+    """Raise for a state without a value for any symbol of a model: it belongs to another model.
 
     Raises
     ------
     UnknownNameError
-        With a name like its first one.
+        With names similar to that of the first symbol.
     """
     symbols = list(known)
     if any(state.given(symbol) is not None for symbol in symbols):

@@ -1,4 +1,4 @@
-"""Symbols: the degrees of freedom and parameters that expressions are about.
+"""Symbols of degrees of freedom and parameters.
 
 A symbol has a path (``kitchen/fridge_door``), an order (0 position, 1 velocity, 2 acceleration ...) and a
 role. Symbols are interned, so equal ones are the same object in one process, and they sort by path and order
@@ -30,18 +30,18 @@ _INTERNING = threading.Lock()
 
 
 class Symbol(Expression):
-    """A scalar symbol; make one with :func:`position`, :func:`velocity`, :func:`symbol` or :func:`parameter`.
+    """A scalar symbol, see :func:`position`, :func:`velocity`, :func:`symbol` and :func:`parameter`.
 
     Attributes
     ----------
     path
         Namespaced name, such as ``kitchen/fridge_door``.
     order
-        How many times the position is differentiated by time; 0 for parameters.
+        The number of time derivatives of the position; 0 for parameters.
     role
-        What the symbol stands for: ``dof``, ``parameter``, ``contact``, ``location``.
+        The kind of variable: ``dof``, ``parameter``, ``contact``, ``location``.
     value
-        The value a parameter has unless another is given; None for everything else.
+        The default value of a parameter; None for other roles.
     """
 
     __slots__ = ("_hash", "_text", "order", "path", "role", "sort_key", "value")
@@ -59,21 +59,21 @@ class Symbol(Expression):
         if value is not None and type(value) is not float:
             if isinstance(value, bool) or not isinstance(value, int | float):
                 _check(path, order, role, value)
-            value = float(value)  # its repr is part of the name below, and numpy's numbers have another one
+            value = float(value)  # its repr is part of the name below, and that of numpy's numbers differs
         key = (path, order, role, value)
         try:
             if type(path) is str and type(order) is int and key in _INTERNED:
                 return _INTERNED[key]
         except TypeError:
-            pass  # what is no path or role need not be hashable; it is refused by name
+            pass  # an invalid path or role may be unhashable; _check raises for it
         _check(path, order, role, value)
         if value is not None:
-            value += 0.0  # -0.0 is the same symbol as 0.0, so it must not be told apart by its name
+            value += 0.0  # -0.0 is the same symbol as 0.0, so both have the same name
         self = object.__new__(cls)
         self._text = symbol_name(path, order)
-        # The name is part of what CasADi serialises, so symbols that differ have names that differ.
+        # CasADi serialises the name, so different symbols have different names.
         kind = "" if role == "dof" else f":{role}" if value is None else f":{role}:{value!r}"
-        # CasADi takes what begins with a bracket for a list of names; no other name begins with a colon.
+        # CasADi parses a name that begins with a bracket as a list; no other name begins with a colon.
         bracket = ":" if path.startswith("[") else ""
         self._set(ca.SX.sym(f"{bracket}{self._text}{kind}"), (), NO_NODES)
         self._leaves = ((self,), ())
@@ -103,7 +103,7 @@ class Symbol(Expression):
 
     @property
     def has_derivative(self) -> bool:
-        """Whether the symbol moves with time; parameters do not."""
+        """True if the symbol varies with time; parameters do not."""
         return self.role != "parameter"
 
     def derivative(self) -> Symbol:
@@ -195,9 +195,9 @@ def velocity(path: str) -> Symbol:
 
 
 def parameter(path: str, value: float) -> Symbol:
-    """Return a symbol that does not move, with the value it has unless another is given.
+    """Return the symbol of a constant parameter with a default value.
 
-    ``D`` of a parameter is empty. Two parameters of one path and different values are different symbols.
+    ``D`` of a parameter is empty. Parameters of one path with different values are different symbols.
     """
     if isinstance(value, bool):
         raise InvalidValueError(f"Parameter '{path}' needs a number as its value, not {value!r}.")

@@ -47,7 +47,7 @@ def compiled() -> None:
 
 def store_a_file() -> None:
     store = library_cache()
-    path = Path(store.workplace(), "library.so")
+    path = Path(store.create_build_folder(), "library.so")
     path.write_text("some code")
     store.store("stored", str(path))
     path.parent.rmdir()
@@ -182,7 +182,7 @@ def test_a_folder_of_someone_else_is_refused(
 def test_what_was_used_longest_ago_makes_room(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     store = library_cache()
     monkeypatch.setattr(cache, "MAXIMUM_BYTES", 350)
-    place = store.workplace()
+    place = store.create_build_folder()
     for i, name in enumerate("abcde"):
         path = Path(place, name)
         path.write_bytes(bytes(100 - cache._TRAILER))
@@ -195,7 +195,7 @@ def test_what_was_used_longest_ago_makes_room(folder: Path, monkeypatch: pytest.
 
 def test_remains_of_killed_processes_are_removed(folder: Path) -> None:
     store = library_cache()
-    old, new = Path(store.workplace()), Path(store.workplace())
+    old, new = Path(store.create_build_folder()), Path(store.create_build_folder())
     (old / "library.so").write_text("half")
     os.utime(old, (1000, 1000))
     store_a_file()

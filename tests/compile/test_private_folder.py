@@ -66,7 +66,7 @@ def as_nobody(script: str, given: bytes) -> None:
 def test_what_was_stored_is_loaded_and_nobody_elses(folder: Path) -> None:
     before = os.umask(0o002)
     try:
-        library = Path(library_cache().workplace(), "library.so")
+        library = Path(library_cache().create_build_folder(), "library.so")
         library.write_bytes(b"good")
         library_cache().store(KEY, str(library))
     finally:

@@ -266,7 +266,7 @@ def test_tiers_agree_to_the_bit_on_constants_beside_a_loop() -> None:
     cubic = ImplicitFunction(
         "cubic", (x,), (u,), kv.array([x**3 + x - u]), (0,), kv.array([np.arcsinh(u)]), 12
     )
-    outputs = [cubic.of([a]), kv.array(table(20, 20))]
+    outputs = [cubic.apply([a]), kv.array(table(20, 20))]
     slow, fast = kv.compile(outputs, tier="interpreter"), kv.compile(outputs, tier="c", wait=True)
     agree(slow, fast, np.random.default_rng(0).uniform(-0.5, 0.5, (20, len(slow.inputs))))
 

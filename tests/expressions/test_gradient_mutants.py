@@ -20,7 +20,8 @@ from kineverse import logic
 from kineverse.errors import KineverseError
 from kineverse.expressions import array, expression, gradient, graph, numpy_protocol, substitution
 from kineverse.expressions.expression import as_expression, binary
-from kineverse.expressions.functions import matrix_inverse, maximum, norm, where
+from kineverse.expressions.functions import maximum, norm, where
+from kineverse.expressions.linear_algebra import matrix_inverse
 from kineverse.expressions.node import Augment, Node
 from kineverse.expressions.nonsmooth import Extremum, Norm, Select
 from kineverse.logic import And, Less, Not, Or, weighted_sum
@@ -328,7 +329,7 @@ def where_carries_the_trend_of_its_condition(patch):
 
 @mutant
 def where_wants_more_than_half(patch):
-    patch(Select, "_holds", property(lambda self: binary(ca.OP_LT, 0.5, self.arguments[0])))
+    patch(Select, "_is_true", property(lambda self: binary(ca.OP_LT, 0.5, self.arguments[0])))
 
 
 @mutant

@@ -52,11 +52,11 @@ def slopes(of, point, step=1e-5):
 
 
 def test_values_are_those_of_closed_forms():
-    cubic = known.cubic().of([u])
+    cubic = known.cubic().apply([u])
     for p in np.linspace(-30, 30, 61):
         assert_allclose(cubic({u: p}), [known.cubic_root(p)], rtol=0, atol=1e-14)
-    polar = known.polar().of([u, v])
-    spherical = known.spherical().of([u, v, w])
+    polar = known.polar().apply([u, v])
+    spherical = known.spherical().apply([u, v, w])
     for p in points(known.spherical()):
         wanted = [np.linalg.norm(p), np.arctan2(p[1], p[0]), np.arctan2(p[2], np.hypot(p[0], p[1]))]
         assert_allclose(at(spherical, known.spherical(), p), wanted, rtol=0, atol=1e-14)
@@ -67,7 +67,7 @@ def test_values_are_those_of_closed_forms():
 @pytest.mark.parametrize("eccentricity", [0.0, 0.1, 0.6])
 def test_kepler_by_the_inverse(eccentricity):
     anomalies = np.linspace(-7, 7, 101)
-    solve = kv.compile(known.kepler().of([u, v]), tier="interpreter")
+    solve = kv.compile(known.kepler().apply([u, v]), tier="interpreter")
     means = anomalies - eccentricity * np.sin(anomalies)
     found = [solve([m, eccentricity])[0] for m in means]
     assert_allclose(found, anomalies, rtol=0, atol=1e-14)
@@ -77,8 +77,8 @@ def test_residuals_vanish_where_inputs_are_expressions(function):
     arguments = [f.sin(a) * 0.3 + 0.9 + 0.1 * k * b for k in range(len(function.inputs))]
     if function.name == "Kepler":
         arguments[1] = 0.5 * f.cos(b)
-    itself = function.of(arguments)
-    residual = function.at(function.residual, [itself[i] for i in range(itself.shape[0])], arguments)
+    itself = function.apply(arguments)
+    residual = function.substitute(function.residual, [itself[i] for i in range(itself.shape[0])], arguments)
     for p, q in np.random.default_rng(2).uniform(-1, 1, (20, 2)):
         assert np.abs(residual({a: p, b: q})).max() < 1e-14
 
@@ -87,7 +87,7 @@ def test_residuals_vanish_where_inputs_are_expressions(function):
 
 
 def test_first_and_second_derivatives_by_finite_differences(function):
-    itself = function.of(function.inputs)
+    itself = function.apply(function.inputs)
     first = itself.jacobian(function.inputs)
     second = first.jacobian(function.inputs)
     third = second.jacobian(function.inputs)
@@ -107,10 +107,10 @@ def test_the_theorem_in_numpy(function):
     """x' = -A⁻¹ B, and x'' by differentiating r(x(u), u) = 0 twice."""
     n, k = len(function.unknowns), len(function.inputs)
     everything = [*function.unknowns, *function.inputs]
-    first = function.chosen.partial(everything)
+    first = function.equations.partial(everything)
     second = first.partial(everything)
     numbers = kv.compile([first, second], everything, tier="interpreter")
-    itself = function.of(function.inputs)
+    itself = function.apply(function.inputs)
     jacobian = itself.jacobian(function.inputs)
     hessian = jacobian.jacobian(function.inputs)
     for p in points(function, 10):
@@ -130,14 +130,14 @@ def test_partial_is_the_same_by_positions_and_by_parameters():
     kepler, polar = known.kepler(), known.polar()
     symbols = [u, v]
     for function, values in ((kepler, {p: 0.4, q: 1.3}), (polar, {p: 0.7, q: 1.3})):
-        by_position = function.of(symbols).partial(symbols)({u: values[q], v: values[p]})
-        assert_allclose(function.of(symbols).jacobian(symbols)({u: values[q], v: values[p]}), by_position)
-        fixed = function.of([q, p])
+        by_position = function.apply(symbols).partial(symbols)({u: values[q], v: values[p]})
+        assert_allclose(function.apply(symbols).jacobian(symbols)({u: values[q], v: values[p]}), by_position)
+        fixed = function.apply([q, p])
         assert fixed.gradient() == {}
         assert_allclose(fixed.partial([q, p])(values), by_position, rtol=1e-14)
-        twice = function.of([q, a * p]).partial([p, a, q]).partial([p])
+        twice = function.apply([q, a * p]).partial([p, a, q]).partial([p])
         steps = [
-            function.of([q, a * p]).partial([p, a, q])({**values, a: 0.8, p: values[p] + s})
+            function.apply([q, a * p]).partial([p, a, q])({**values, a: 0.8, p: values[p] + s})
             for s in (1e-5, -1e-5)
         ]
         assert_allclose(twice({**values, a: 0.8})[..., 0], (steps[0] - steps[1]) / 2e-5, rtol=1e-6, atol=1e-7)
@@ -160,7 +160,7 @@ def _solved(kind, arguments):
         f.sin,
         lambda e, n: e + n,
         lambda n, e: n * e,
-        lambda *e: FUNCTIONS[kind][0].of([array(i) for i in e]),
+        lambda *e: FUNCTIONS[kind][0].apply([array(i) for i in e]),
     )
     if kind == "Kepler":
         ours = ours[0]
@@ -235,9 +235,9 @@ def test_substitution_is_composition(kind, first, second):
 def test_functions_of_functions():
     """A root of what another root is, in one step and by substitution afterwards."""
     cubic, kepler = known.cubic(), known.kepler()
-    inner = cubic.of([a * b])[0]
-    nested = kepler.of([inner, 0.3 * inner])
-    later = kepler.of([c, 0.3 * c]).substitute({c: inner})
+    inner = cubic.apply([a * b])[0]
+    nested = kepler.apply([inner, 0.3 * inner])
+    later = kepler.apply([c, 0.3 * c]).substitute({c: inner})
     assert nested == later
     assert implicit_nodes([nested])[0].function is not implicit_nodes([nested])[1].function
     assert [n.label for n in implicit_nodes([nested])] == ["cubic", "Kepler"]
@@ -253,7 +253,7 @@ def test_functions_of_functions():
 
 
 def test_an_unused_gradient_and_a_locally_constant_input():
-    sharp = known.cubic().of([a < b])[0]
+    sharp = known.cubic().apply([a < b])[0]
     assert sharp.gradient(heuristic=False) == {}
     assert set(sharp.gradient()) == {a.derivative(), b.derivative()}
     trend = sharp.gradient()[b.derivative()]({a: 0.1, b: 0.9})

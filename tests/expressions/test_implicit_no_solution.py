@@ -16,7 +16,7 @@ from kineverse.expressions import functions as f
 a, b = kv.position("implicit/a"), kv.position("implicit/b")
 p = kv.parameter("implicit/p", 0.5)
 CIRCLE = known.half_circle()
-height = CIRCLE.of([a])[0]
+height = CIRCLE.apply([a])[0]
 TIERS = ["interpreter", pytest.param("c", marks=pytest.mark.compiler)]
 WHERE = r"'half circle' has no solution at input/u = 1\.5\b"
 
@@ -44,9 +44,9 @@ def outputs():
     result = []
     for function in (known.kepler(), known.polar(), known.spherical()):
         arguments = [f.sin(a) * 0.2 + 1.1, 0.4 * f.cos(b), 0.3 * a]
-        itself = function.of(arguments[: len(function.inputs)])
+        itself = function.apply(arguments[: len(function.inputs)])
         result += [itself, itself.jacobian([a, b]), itself.jacobian([a, b]).jacobian([a, b])]
-    nested = known.cubic().of([known.kepler().of([a, 0.3 * f.sin(b)])[0] * b])
+    nested = known.cubic().apply([known.kepler().apply([a, 0.3 * f.sin(b)])[0] * b])
     return [*result, nested, nested.jacobian([a, b])]
 
 
@@ -79,7 +79,7 @@ def test_batches_agree_with_single_calls():
 
 def test_values_do_not_depend_on_what_was_asked_before():
     function = known.polar()
-    evaluate = compiled([function.of([u, v])], [u, v])
+    evaluate = compiled([function.apply([u, v])], [u, v])
     points = np.random.default_rng(5).uniform((0.5, -2), (3, 2), (200, 2))
     first = [evaluate(x)[0].tobytes() for x in points]
     orders = [np.random.default_rng(k).permutation(200) for k in range(3)]
@@ -176,10 +176,10 @@ def test_large_batches_in_pieces(monkeypatch):
 
 
 def test_the_inner_one_of_nested_functions_is_named():
-    nested = known.cubic().of([height * b])[0]
+    nested = known.cubic().apply([height * b])[0]
     with pytest.raises(kv.errors.NoSolutionError, match=WHERE):
         nested({a: 1.5, b: 1.0})
-    outer = CIRCLE.of([known.cubic().of([b])[0] * 1.0])[0]
+    outer = CIRCLE.apply([known.cubic().apply([b])[0] * 1.0])[0]
     with pytest.raises(
         kv.errors.NoSolutionError, match=r"'half circle' has no solution at input/u = 1\.5\d*\b"
     ):
@@ -188,7 +188,7 @@ def test_the_inner_one_of_nested_functions_is_named():
 
 def test_all_inputs_are_said_parameters_too():
     function = known.radius_and_height()
-    e = function.of([a * 2, p])[0]
+    e = function.apply([a * 2, p])[0]
     assert e({a: 0.15}) == pytest.approx(0.4)
     with pytest.raises(
         kv.errors.NoSolutionError, match=r"'height' has no solution at input/u = 0\.6, input/v = 0\.5\b"
@@ -239,7 +239,7 @@ def test_what_is_nan_elsewhere_stays_so(tier):
     with pytest.raises(kv.errors.NoSolutionError, match=WHERE):
         function([1.5, -1.0])
     # A logarithm that an input of the function is made of.
-    inner = compiled([CIRCLE.of([f.log(b)])[0]], [b], tier)
+    inner = compiled([CIRCLE.apply([f.log(b)])[0]], [b], tier)
     assert np.isnan(inner([-1.0])[0])
 
 

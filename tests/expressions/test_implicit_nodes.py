@@ -21,20 +21,20 @@ a, b, c = (kv.position(f"implicit/{n}") for n in "abc")
 
 
 def test_equal_content_is_one_node():
-    first, second = known.polar().of([a, b]), known.polar().of([a, b])
+    first, second = known.polar().apply([a, b]), known.polar().apply([a, b])
     assert first == second
     assert hash(first) == hash(second)
     assert implicit_nodes([first, second, first * 2]) == implicit_nodes([second])
     assert (first - second)({a: 1.0, b: 0.2}).tolist() == [0.0, 0.0]
     others = [
-        known.polar().of([b, a]),
-        known.spherical().of([a, b, b])[:2],
-        _changed(known.polar(), steps=13).of([a, b]),
-        _changed(known.polar(), rows=(2, 1)).of([a, b]),
-        _changed(known.polar(), name="other").of([a, b]),
-        _changed(known.polar(), seed=array([u, v])).of([a, b]),
-        _changed(known.polar(), residual=known.polar().residual * 2).of([a, b]),
-        _changed(known.polar(), inputs=(v, u), seed=array([v, u])).of([a, b]),
+        known.polar().apply([b, a]),
+        known.spherical().apply([a, b, b])[:2],
+        _changed(known.polar(), steps=13).apply([a, b]),
+        _changed(known.polar(), rows=(2, 1)).apply([a, b]),
+        _changed(known.polar(), name="other").apply([a, b]),
+        _changed(known.polar(), seed=array([u, v])).apply([a, b]),
+        _changed(known.polar(), residual=known.polar().residual * 2).apply([a, b]),
+        _changed(known.polar(), inputs=(v, u), seed=array([v, u])).apply([a, b]),
     ]
     assert all(e != o for e, o in itertools.combinations([first, *others], 2))
 
@@ -46,19 +46,19 @@ def _changed(function, **parts):
 
 def test_what_is_about_the_function_alone_stays_inside():
     """Its unknowns and inputs are its own: the same symbols outside are others."""
-    itself = known.polar().of([x, y])
+    itself = known.polar().apply([x, y])
     assert set(itself.symbols) == {x, y}
     assert set(itself.gradient()) == {x.derivative(), y.derivative()}
     assert_allclose(itself({x: 3.0, y: 4.0}), [5, np.arctan2(4, 3)])
     assert_allclose(itself.substitute({x: 4.0})({y: 3.0}), [5, np.arctan2(3, 4)])
-    swapped = known.polar().of([v, u])
+    swapped = known.polar().apply([v, u])
     assert_allclose(swapped({v: 3.0, u: 4.0}), [5, np.arctan2(4, 3)])
-    assert swapped.substitute({u: v, v: u}) == known.polar().of([u, v])
+    assert swapped.substitute({u: v, v: u}) == known.polar().apply([u, v])
 
 
 @pytest.mark.parametrize("function", [known.cubic(), known.polar(), known.spherical()], ids=lambda f: f.name)
 def test_pickled_copied_and_deep_copied(function):
-    itself = function.of(function.inputs)
+    itself = function.apply(function.inputs)
     jacobian = itself.jacobian(function.inputs)
     values = dict(zip(function.inputs, (0.9, 0.3, -0.2), strict=False))
     for other in (pickle.loads(pickle.dumps([itself, jacobian])), copy.deepcopy([itself, jacobian])):
@@ -70,9 +70,9 @@ def test_pickled_copied_and_deep_copied(function):
 
 
 def test_it_prints():
-    assert "polar" in repr(known.polar().of([a, b])) or "implicit" in repr(known.polar().of([a, b]))
-    assert implicit_nodes([known.polar().of([a, b])])[0].label == "polar"
-    assert isinstance(implicit_nodes([known.cubic().of([a])])[0], Implicit)
+    assert "polar" in repr(known.polar().apply([a, b])) or "implicit" in repr(known.polar().apply([a, b]))
+    assert implicit_nodes([known.polar().apply([a, b])])[0].label == "polar"
+    assert isinstance(implicit_nodes([known.cubic().apply([a])])[0], Implicit)
 
 
 @pytest.mark.parametrize(
@@ -106,9 +106,9 @@ def test_bad_definitions_are_refused(parts, error, text):
 @pytest.mark.parametrize("count", [0, 1, 3])
 def test_the_wrong_number_of_arguments_is_refused(count):
     with pytest.raises(ShapeError, match=f"'polar' is a function of 2 inputs, not of {count}\\."):
-        known.polar().of([a, b, c][:count])
+        known.polar().apply([a, b, c][:count])
 
 
 def test_arguments_are_scalars():
     with pytest.raises(ShapeError, match="'polar' is a function of scalars"):
-        known.polar().of([array([a, b]), b])
+        known.polar().apply([array([a, b]), b])

@@ -12,9 +12,9 @@ from round_trip import posing, random_values
 
 import kineverse as kv
 from hypothesis_profiles import attempts
-from kineverse.intervals import taylor
 from kineverse.intervals.enclosure import Enclosures
 from kineverse.intervals.graph import TermGraph
+from kineverse.intervals.taylor import taylor_variable
 from kineverse.model.registry import FrameDeviation
 
 Q = kv.position("q")
@@ -66,10 +66,10 @@ def test_series_contain_the_function_and_those_of_all_points(
     curve: kv.Expression, low: float, width: float, part: float
 ) -> None:
     terms = TermGraph({})
-    enclosures, term = Enclosures(terms), terms.of(curve)
+    enclosures, term = Enclosures(terms), terms.term(curve)
     at = min(low + width, max(low, low + part * width))
-    (whole,) = enclosures.of([term], {Q: taylor.taylor_variable((low, low + width))})
-    (point,) = enclosures.of([term], {Q: taylor.taylor_variable((at, at))})
+    (whole,) = enclosures.enclose([term], {Q: taylor_variable((low, low + width))})
+    (point,) = enclosures.enclose([term], {Q: taylor_variable((at, at))})
     value = float(curve({Q: at}))
     assert whole[0][0] - 1e-12 <= value <= whole[0][1] + 1e-12
     for here, everywhere in zip(point, whole, strict=False):
@@ -78,7 +78,7 @@ def test_series_contain_the_function_and_those_of_all_points(
         assert everywhere[0] - slack <= here[0]
         assert here[1] <= everywhere[1] + slack
     step = 1e-3
-    (around,) = enclosures.of([term], {Q: taylor.taylor_variable((at - step, at + step))})
+    (around,) = enclosures.enclose([term], {Q: taylor_variable((at - step, at + step))})
     if len(around) > 3:  # smooth there: the series is that of Taylor
         near = sum((a + b) / 2 * step**k for k, (a, b) in enumerate(point))
         assert float(curve({Q: at + step})) == pytest.approx(near, abs=1e-8)
@@ -90,7 +90,7 @@ def test_implicit_functions_are_enclosed() -> None:
     enclosures = Enclosures(terms)
     crank = model.symbol("four_bar/crank")
     for follower in model.rates.dependent.values():
-        (whole,) = enclosures.of([terms.of(follower)], {crank: taylor.taylor_variable((0.5, 0.51))})
+        (whole,) = enclosures.enclose([terms.term(follower)], {crank: taylor_variable((0.5, 0.51))})
         values = [float(follower({crank: x})) for x in np.linspace(0.5, 0.51, 9)]
         assert whole[0][0] <= min(values)
         assert max(values) <= whole[0][1]

@@ -12,9 +12,8 @@ from time import perf_counter
 import numpy as np
 
 from kineverse.compile import CompiledFunction, Evaluator, compile  # noqa: A004
-from kineverse.compile.c_library import optimisation_level
 from kineverse.compile.program import Program
-from kineverse.compile.toolchain import NO_UNDEFINED_FLAGS, toolchain
+from kineverse.compile.toolchain import NO_UNDEFINED_FLAGS, optimisation_level, toolchain
 from kineverse.expressions import array
 
 from .harness import Array, BenchmarkSettings, Contender, Contenders, time_calls, time_contenders

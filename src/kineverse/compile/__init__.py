@@ -1,4 +1,4 @@
-"""Layer 2: expressions to fast functions."""
+"""Compilation of expressions to fast functions."""
 
 from .c_library import CompilerInformation, compiler_information
 from .evaluator import Evaluator

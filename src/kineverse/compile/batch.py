@@ -1,8 +1,8 @@
 """Evaluation at many points, into reused aligned buffers.
 
-Memory that is new to a process is filled with zeros by the system at first touch, which takes three times as
-long as computing and writing poses does. A loop over batches drops one result for each it makes, so it gets
-that memory back.
+The system fills new memory with zeros at first touch, which takes three times as long as computing and
+writing poses. A loop over batches releases one result for each new one, so memory of released results is
+reused.
 """
 
 from __future__ import annotations
@@ -26,24 +26,24 @@ from .program import CasadiFunction, Program
 from .signature import Signature, as_doubles
 
 _CACHE_LINE = 64
-# Smaller blocks the C library keeps by itself.
+# The C library itself reuses smaller blocks.
 _SMALLEST_BUFFER = 4 * 2**20
 _LARGEST_TOTAL = 128 * 2**20
 
-# Longest free first. Used by operations that are atomic: garbage collection may interrupt this very code to
-# give back a block.
+# Longest free first. Accessed by atomic operations only: garbage collection may interrupt this code to return
+# a block.
 _free_blocks: list[npt.NDArray[np.float64]] = []
 
 
 def allocate_aligned(size: int) -> npt.NDArray[np.float64]:
     """Return an uninitialised vector that begins at a cache line.
 
-    Its memory is used for another vector only after this one and all arrays made from it are gone.
+    Its memory is reused only after this vector and all views of it are deleted.
 
     Parameters
     ----------
     size
-        How many numbers.
+        The number of doubles.
     """
     if 8 * size < _SMALLEST_BUFFER:
         return _from_line(np.empty(size + _CACHE_LINE // 8))[:size]
@@ -56,7 +56,7 @@ def allocate_aligned(size: int) -> npt.NDArray[np.float64]:
 
 
 class _Lease:
-    """What arrays in a block are made from: they refer to it, so it lives as long as the last of them."""
+    """Owner of a block, which lives as long as the last array in the block."""
 
     __slots__ = ("__array_interface__", "__weakref__")
 
@@ -90,12 +90,12 @@ def _give_back(block: npt.NDArray[np.float64]) -> None:
             break
 
 
-# Results beyond this are written past the caches: nobody could read them from there in time.
+# Larger results are written past the caches, which they would not fit.
 _STREAMED_BYTES = 8 * 2**20
 # Seconds on one core, in all and for each instruction, as measured with gcc 12 and CasADi 3.8.
 _COMPILING, _COMPILING_ONE = 0.3, 1e-3
 _INTERPRETING, _INTERPRETING_ONE = 50e-9, 3e-9
-# So many rows at a time go through CasADi's map.
+# Rows per call of CasADi's map.
 _MAPPED = 32
 
 BatchFunction = Callable[[int, int, int, int], int]
@@ -104,21 +104,20 @@ BatchFunction = Callable[[int, int, int, int], int]
 class Batch:
     """Evaluation of one program at many points.
 
-    The program is compiled for vectors when that pays: a call whose rows would keep the interpreter busy for
-    longer than the compiler waits for it, smaller ones add up until it is compiled in the background. What
-    cannot be done on vectors stays with CasADi's map over the function of single
-    calls.
+    The program is compiled for vectors when that pays. A call that would take the interpreter longer than the
+    compiler waits for the compiler; smaller calls add up until they start a compilation in the background.
+    Programs with other operations stay with CasADi's map over the function of single calls.
 
     Parameters
     ----------
     program
-        What is computed.
+        The program.
     signature
         Its inputs.
     shapes
         The shape of each output.
     single
-        Whether the one array is returned rather than a tuple.
+        True to return the only array instead of a tuple.
     tier
         As for :func:`compile`.
     """
@@ -144,16 +143,16 @@ class Batch:
         x
             The points, shape (N, n).
         out
-            Arrays to write to, or None.
+            Arrays for the results, or None.
         function
-            CasADi's function, for as long as there is nothing better.
+            CasADi's function, for use until the program is compiled.
         """
         points = self._points(x)
         rows = len(points)
         if out is None:
-            results = self._allocated(rows)
+            results = self._allocate(rows)
         else:
-            results = self._checked(out, rows)
+            results = self._check_out(out, rows)
             if _overlap([points, *results]):
                 points = points.copy()
         code = self._code(rows)
@@ -181,14 +180,14 @@ class Batch:
             raise ShapeError(f"Expected {wanted}, not an array of shape {points.shape}.")
         return np.ascontiguousarray(points)
 
-    def _allocated(self, rows: int) -> list[Array]:
-        """Return arrays that begin at cache lines, so that they can be written in whole lines."""
+    def _allocate(self, rows: int) -> list[Array]:
+        """Return new arrays that begin at cache lines."""
         return [
             allocate_aligned(rows * size).reshape(rows, *shape)
             for shape, size in zip(self._shapes, self._program.sizes, strict=True)
         ]
 
-    def _checked(self, out: Any, rows: int) -> list[Array]:
+    def _check_out(self, out: Any, rows: int) -> list[Array]:
         given = list(out) if isinstance(out, (list, tuple)) else [out]
         if len(given) != len(self._shapes):
             raise ShapeError(f"out= takes {len(self._shapes)} arrays, one per output, not {len(given)}.")
@@ -208,7 +207,7 @@ class Batch:
         return given
 
     def _code(self, rows: int) -> BatchFunction | None:
-        """Return compiled code if there is some, or if it pays to wait for it."""
+        """Return the compiled code, waiting for it if that pays; None without code."""
         library = self._library
         if library is None or library.error is not None:
             if self._insist and library is not None:
@@ -253,7 +252,7 @@ class Batch:
             run, _keep = bind(several, vectors, outputs, None)
             for start in range(first, end, count):
                 stop = min(start + count, end)
-                # Rows of an earlier round stay behind the last ones and are computed for nothing.
+                # In the last round, rows of the previous one are evaluated again and ignored.
                 vectors[: stop - start] = points[start:stop]
                 run()
                 for target, output in zip(flat, outputs, strict=True):
@@ -263,7 +262,7 @@ class Batch:
 
 
 def _overlap(arrays: Sequence[Array]) -> bool:
-    """Whether any of these contiguous arrays share memory."""
+    """Return True if any of these contiguous arrays share memory."""
     spans = sorted((_address(array), array.nbytes) for array in arrays if array.nbytes)
     return any(start + size > following for (start, size), (following, _) in itertools.pairwise(spans))
 

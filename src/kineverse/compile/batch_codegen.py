@@ -1,8 +1,9 @@
 """SIMD C code for batches: instruction schedule and source generation.
 
-CasADi's instructions write to places of a work vector again and again. Here every result is a value with a
-number of its own. Long programs are cut into parts, each of which becomes a C function, because the time of a
-compiler grows faster than the length of a function. Values that a later part needs wait in places of a store.
+CasADi's instructions overwrite places of a work vector. In a :class:`Schedule` every result is a value with a
+number of its own (static single assignment). Long programs are split into several C functions, because
+compile time grows faster than the length of a function. Values for later functions are saved to slots of a
+store.
 """
 
 from __future__ import annotations
@@ -19,10 +20,10 @@ from .simd import ARITHMETIC, EXPONENTIAL, ROWS, TRIGONOMETRIC, TYPES, scalar_fa
 
 @dataclass(frozen=True, slots=True)
 class Instruction:
-    """One value: an operation and the numbers of the values it is applied to.
+    """An operation and the numbers of its arguments, which defines one value.
 
-    For inputs (``OP_INPUT``) the one argument is the place in the input vector, and ``constant`` is the
-    number of a constant (``OP_CONST``).
+    The argument of an input (``OP_INPUT``) is its place in the input vector; ``constant`` is the number of a
+    constant (``OP_CONST``).
     """
 
     op: int
@@ -32,18 +33,18 @@ class Instruction:
 
 @dataclass(slots=True)
 class CFunction:
-    """What one C function does.
+    """The values, loads and saves of one C function.
 
     Attributes
     ----------
     values
-        The values it computes, in order.
+        The computed values, in order.
     loads
-        From values of earlier parts to their places in the store.
+        From values of earlier functions to their slots in the store.
     saves
-        From values of its own that later parts need to their places in the store.
+        From own values for later functions to their slots in the store.
     outputs
-        From places in the outputs to the values that belong there.
+        Pairs of a place in the outputs and its value.
     """
 
     values: list[int] = field(default_factory=list)
@@ -54,16 +55,16 @@ class CFunction:
 
 @dataclass(frozen=True, slots=True)
 class Schedule:
-    """A whole program.
+    """The C functions of a program.
 
     Attributes
     ----------
     steps
-        All values, by their numbers.
+        The instructions of all values, by their numbers.
     constants
-        From places in the outputs to numbers that never change.
+        Pairs of a place in the outputs and its constant number.
     parts
-        What is computed, in order.
+        The functions, in order.
     stored
         The size of the store.
     """
@@ -80,9 +81,9 @@ def schedule(function: CasadiFunction, length: int) -> Schedule:
     Parameters
     ----------
     function
-        CasADi's function; its outputs are laid one behind the other.
+        CasADi's function; its outputs are concatenated.
     length
-        So many operations go into one part.
+        The number of operations of one C function.
     """
     steps, outputs = _values(function)
     constants = [(place, steps[v].constant) for place, v in outputs if steps[v].op == ca.OP_CONST]
@@ -94,7 +95,7 @@ def schedule(function: CasadiFunction, length: int) -> Schedule:
 
 
 def _values(function: CasadiFunction) -> tuple[list[Instruction], list[tuple[int, int]]]:
-    """Return all values, and pairs of a place in the outputs and a value."""
+    """Return the instructions of all values, and pairs of a place in the outputs and a value."""
     offsets = [0]
     for i in range(function.n_out()):
         offsets.append(offsets[-1] + function.numel_out(i))
@@ -122,7 +123,7 @@ def _values(function: CasadiFunction) -> tuple[list[Instruction], list[tuple[int
 
 
 def _split_functions(steps: list[Instruction], length: int) -> tuple[list[CFunction], dict[int, int]]:
-    """Return the parts with what they compute, and the part each value is computed in."""
+    """Return the functions with their values, and the number of the function of each value."""
     parts = [CFunction()]
     home: dict[int, int] = {}
     for value, step in enumerate(steps):
@@ -136,7 +137,7 @@ def _split_functions(steps: list[Instruction], length: int) -> tuple[list[CFunct
 
 
 def _allocate_slots(steps: list[Instruction], parts: list[CFunction], home: dict[int, int]) -> int:
-    """Give values that are needed in later parts places in the store; return its size."""
+    """Assign slots of the store to values for later functions, and return the size of the store."""
     last: dict[int, int] = {}
     for number, part in enumerate(parts):
         for argument in _arguments(steps, part.values):
@@ -167,7 +168,7 @@ def _arguments(steps: list[Instruction], values: Iterable[int]) -> Iterable[int]
     return (argument for value in values for argument in steps[value].arguments)
 
 
-# How operations are written; a and b are the operands, z is zero.
+# C of operations with the operands a and b.
 _PLAIN = {
     ca.OP_ASSIGN: "{a}",
     ca.OP_LIFT: "{a}",
@@ -285,7 +286,7 @@ BATCH_KIND = "batch 2 " + hashlib.sha256((_TEXTS + _LOOP + repr((_PLAIN, _TRUTH)
 
 
 def is_vectorizable(program: Program) -> bool:
-    """Whether every operation of the program can be done on vectors."""
+    """Return True if every operation of the program has a version for vectors."""
     function = program.function
     known = {
         *_PLAIN,
@@ -303,8 +304,8 @@ def is_vectorizable(program: Program) -> bool:
 def generate_batch_source(program: Program) -> str:
     """Return the C source of ``kineverse_batch``, which evaluates a program at many points.
 
-    Its arguments are the rows of inputs, a pointer to the rows of each output, the number of rows, and
-    whether the outputs are written past the caches.
+    Its arguments are the rows of inputs, a pointer to the rows of each output, the number of rows, and a flag
+    to write the outputs past the caches.
     """
     plan = schedule(program.function, _PART_LENGTH)
     definitions = {
@@ -346,7 +347,7 @@ def _generate_function(plan: Schedule, part: CFunction, number: int) -> str:
         names = [_operand(plan.steps, argument) for argument in step.arguments]
         operands = dict(zip("ab", names, strict=False))
         if step.op in _CIRCLE:
-            # Sine and cosine of one angle are computed together.
+            # The sine and cosine of an angle are computed together.
             pair = [angles[op].get(step.arguments[0]) for op in _CIRCLE]
             sine, cosine = (f"v{v}" if v is not None else f"unused{value}" for v in pair)
             lines.append(f"  V {sine}, {cosine}; sincos_({names[0]}, &{sine}, &{cosine});")

@@ -1,8 +1,8 @@
 """Background queue of C builds: one compiler at a time, at low priority.
 
-A :class:`BuildJob` is one library that is wanted. Builds nobody is interested in any more when their turn comes
-are dropped, and builds somebody waits for go first. The thread is a daemon and ends with the process, and the
-compiler with it; sources go through a pipe and everything else lives in one folder that is always removed.
+A :class:`BuildJob` is a requested library. Jobs whose listeners are all deleted are dropped, and urgent jobs
+are compiled first. The worker thread is a daemon: it ends with the process, together with the compiler.
+Sources are piped to the compiler; all other files are in one folder that is always removed.
 """
 
 from __future__ import annotations
@@ -40,11 +40,11 @@ class BuildJob:
     Attributes
     ----------
     path
-        The library, when it is done.
+        The path of the library when it is compiled.
     error
-        Why there is none, when that failed.
+        The reason of a failure.
     forgotten
-        Whether it was given up although nothing is wrong with it.
+        True if the job was dropped without a failure.
     """
 
     def __init__(
@@ -60,31 +60,31 @@ class BuildJob:
         self.forgotten = False
         self.urgent = False
         self.started = False
-        self.watchers: list[WeakMethod[BuildCallback]] = []
+        self.listeners: list[WeakMethod[BuildCallback]] = []
         self._done = threading.Event()
 
     @property
     def done(self) -> bool:
-        """Whether it was built, failed or was given up."""
+        """True if the library was built, or the job failed or was dropped."""
         return self._done.is_set()
 
     def wait(self, timeout: float | None = None) -> bool:
-        """Wait until it is done, ahead of all builds nobody waits for; return whether it is.
+        """Wait until the job is done, ahead of jobs that are not urgent, and return True if it is.
 
         Parameters
         ----------
         timeout
             In seconds; forever if None.
         """
-        _worker.hurry(self)
+        _worker.prioritise(self)
         return self._done.wait(timeout)
 
     def finish(self, path: str | None = None, error: str | None = None) -> None:
-        """Say how it went to whoever is interested; in the worker's thread."""
+        """Set the result and notify the listeners, in the worker's thread."""
         self.path, self.error = path, error
-        # The functions first: whoever waits shall find them changed.
-        for watcher in self.watchers:
-            notify = watcher()
+        # Listeners first, so that functions have changed when :meth:`wait` returns.
+        for listener in self.listeners:
+            notify = listener()
             if notify is not None:
                 try:
                     notify(self)
@@ -98,33 +98,33 @@ def request(
     compiler: Toolchain,
     source: Callable[[], str],
     flags: Sequence[str],
-    watcher: BuildCallback,
+    listener: BuildCallback,
     urgent: bool = False,
 ) -> BuildJob | None:
-    """Have a library compiled in the background.
+    """Request the compilation of a library in the background.
 
     Parameters
     ----------
     key
-        What it will be found by in the cache.
+        The key of the library in the cache.
     compiler
         The compiler.
     source
-        Returns the C source; called in the worker's thread.
+        Function that returns the C source; called in the worker's thread.
     flags
-        Of the compiler.
-    watcher
-        A method that is called when it is done, in the worker's thread. It is held weakly: a build whose
-        watchers are all gone is not begun.
+        Flags of the compiler.
+    listener
+        Method to be called in the worker's thread when the job is done. It is referenced weakly: a job whose
+        listeners are all deleted is dropped.
     urgent
-        Whether somebody waits for it.
+        True to compile it before jobs that are not urgent.
 
     Returns
     -------
-    Build or None
-        None if too many are waiting already.
+    BuildJob or None
+        None if too many jobs are waiting.
     """
-    return _worker.request(BuildJob(key, compiler, source, flags), watcher, urgent)
+    return _worker.request(BuildJob(key, compiler, source, flags), listener, urgent)
 
 
 class _Worker:
@@ -135,13 +135,13 @@ class _Worker:
         self._wanted: dict[str, BuildJob] = {}
         self._thread: threading.Thread | None = None
         self._compiler: subprocess.Popen[bytes] | None = None
-        self._workplace: str | None = None
-        # Held while the compiler is started or the process ends, so that neither misses the other.
+        self._build_folder: str | None = None
+        # Acquired to start the compiler and to end the process, which therefore ends a started compiler.
         self._starting = threading.Lock()
         self._closing = False
-        self._complained = False
+        self._warned = False
 
-    def request(self, build: BuildJob, watcher: BuildCallback, urgent: bool) -> BuildJob | None:
+    def request(self, build: BuildJob, listener: BuildCallback, urgent: bool) -> BuildJob | None:
         with self._lock:
             known = self._wanted.get(build.key)
             if known is None:
@@ -156,12 +156,12 @@ class _Worker:
                 if self._thread is None:
                     self._thread = threading.Thread(target=self._run, name="kineverse-compile", daemon=True)
                     self._thread.start()
-            known.watchers.append(WeakMethod(watcher))
+            known.listeners.append(WeakMethod(listener))
         if urgent:
-            self.hurry(known)
+            self.prioritise(known)
         return known
 
-    def hurry(self, build: BuildJob) -> None:
+    def prioritise(self, build: BuildJob) -> None:
         with self._lock:
             if not build.urgent and not build.started and not build.done:
                 build.urgent = True
@@ -173,21 +173,21 @@ class _Worker:
 
     def _serve(self, build: BuildJob) -> None:
         with self._lock:
-            # A build that somebody began to wait for is in the queue twice.
+            # A job that became urgent is in the queue twice.
             if build.started:
                 return
             build.started = True
-            build.forgotten = not build.urgent and all(watcher() is None for watcher in build.watchers)
+            build.forgotten = not build.urgent and all(listener() is None for listener in build.listeners)
             if build.forgotten:
-                # Who asks for it from now on gets a new one.
+                # Later requests get a new job.
                 del self._wanted[build.key]
         path, error = None, None
         try:
-            # Another process may have been faster.
+            # Another process may have compiled it meanwhile.
             path = None if build.forgotten else build.cache.find(build.key) or self._compile(build)
         except Exception as problem:
             error = str(problem)
-            self._complain(error)
+            self._log_failure(error)
         with self._lock:
             if self._wanted.get(build.key) is build:
                 del self._wanted[build.key]
@@ -199,59 +199,59 @@ class _Worker:
             with self._starting:
                 if self._closing:
                     raise RuntimeError("the process ends.")
-                self._workplace = workplace = build.cache.workplace()
-                output = os.path.join(workplace, "library.so")
+                self._build_folder = build_folder = build.cache.create_build_folder()
+                output = os.path.join(build_folder, "library.so")
                 compiler = self._compiler = subprocess.Popen(
                     build.compiler.arguments(build.flags, output),
                     stdin=subprocess.PIPE,
                     stdout=subprocess.DEVNULL,
                     stderr=subprocess.PIPE,
-                    env={**os.environ, "TMPDIR": workplace, "LC_ALL": "C"},
-                    # The compiler starts processes of its own; in a session of theirs they can be ended
-                    # together, and do not hear of the user's Ctrl-C.
+                    env={**os.environ, "TMPDIR": build_folder, "LC_ALL": "C"},
+                    # The compiler starts processes of its own; in a session of their own they can be ended
+                    # together, and do not receive the user's Ctrl-C.
                     start_new_session=True,
                 )
             if not build.urgent:
                 _lower_priority(compiler.pid)
             began = time.monotonic()
             try:
-                _, complaints = compiler.communicate(source, timeout=TIME_LIMIT)
+                _, messages = compiler.communicate(source, timeout=TIME_LIMIT)
             except subprocess.TimeoutExpired:
                 raise RuntimeError(f"the C compiler needed more than {TIME_LIMIT:.0f} s.") from None
             finally:
                 _end(compiler)
                 self._compiler = None
             if compiler.returncode or not os.path.exists(output):
-                text = complaints.decode(errors="replace").strip()
+                text = messages.decode(errors="replace").strip()
                 raise RuntimeError(f"the C compiler failed ({compiler.returncode}): {text[:500]}")
             logger.debug("Compiled %s in %.2f s.", build.key[:12], time.monotonic() - began)
             return build.cache.store(build.key, output)
         finally:
-            if self._workplace is not None:
-                shutil.rmtree(self._workplace, ignore_errors=True)
-            self._workplace = None
+            if self._build_folder is not None:
+                shutil.rmtree(self._build_folder, ignore_errors=True)
+            self._build_folder = None
 
-    def _complain(self, error: str) -> None:
-        """Log loudly once: a compiler that fails for one function will fail for all."""
+    def _log_failure(self, error: str) -> None:
+        """Log a failure, as a warning only once: a compiler that fails for one function fails for all."""
         if not self._closing:
-            level = logging.DEBUG if self._complained else logging.WARNING
+            level = logging.DEBUG if self._warned else logging.WARNING
             logger.log(level, "A function stays with CasADi's interpreter: %s", error)
-            self._complained = True
+            self._warned = True
 
     def close(self) -> None:
         """End the compiler and remove its folder, when the process ends."""
         with self._starting:
             self._closing = True
-            compiler, workplace = self._compiler, self._workplace
+            compiler, build_folder = self._compiler, self._build_folder
             if compiler is not None:
                 _end(compiler)
-            if workplace is not None:
-                shutil.rmtree(workplace, ignore_errors=True)
+            if build_folder is not None:
+                shutil.rmtree(build_folder, ignore_errors=True)
 
     def abandon(self) -> None:
-        """Give up what the parent process was asked for, in a child process that has no thread of ours."""
+        """Drop the jobs of the parent process, in a child process without the worker's thread."""
         for build in self._wanted.values():
-            # The lock inside of the old event may be held by a thread that does not exist here.
+            # A thread that does not exist here may own the lock inside of the old event.
             build._done = threading.Event()
             build.forgotten = True
             build._done.set()

@@ -1,4 +1,4 @@
-"""Shared libraries of generated and hand-written C, from the cache or the build queue; report on the compiler."""
+"""Shared libraries of generated and hand-written C, from the cache or the build queue."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from .build_queue import BuildJob, request
 from .cache import library_cache
 from .parallel import cores
 from .program import Program
-from .toolchain import FLOATING_POINT_FLAGS, NO_UNDEFINED_FLAGS, Toolchain, toolchain
+from .toolchain import FLOATING_POINT_FLAGS, NO_UNDEFINED_FLAGS, Toolchain, optimisation_level, toolchain
 
 Code = TypeVar("Code")
 
@@ -23,27 +23,27 @@ NO_COMPILER = "there is no C compiler (cc, gcc or clang) on the PATH"
 
 
 class ProgramLibrary(Generic[Code]):
-    """Code of one program, once there is some.
+    """The compiled library of one program, loaded when it is ready.
 
     Parameters
     ----------
     program
-        What it computes.
+        The program.
     kind
-        What is generated from the program, and by which version of what generates it.
+        The kind of generated code, with the version of its generator.
     source
-        Generates the C; called in another thread, if at all.
+        Function that generates the C, called in another thread.
     load
-        Makes of the path of a library what can be called; raises if that fails.
+        Function from the path of a library to its code; raises if that fails.
     ready
-        A method that is called when the compiler has made it, in another thread. It is held weakly.
+        Method to be called in another thread when the library is compiled. It is referenced weakly.
 
     Attributes
     ----------
     code
-        What can be called; None until it is there.
+        The loaded code; None until it is ready.
     error
-        Why it will never be there; None until that is known.
+        The reason why there will be no code; None while there is none.
     """
 
     def __init__(
@@ -72,20 +72,20 @@ class ProgramLibrary(Generic[Code]):
             self._key = program.key(kind, self._toolchain.identity, level)
 
     def find(self) -> bool:
-        """Take it from the cache; return whether it is there now."""
+        """Load the library from the cache, and return True if it is loaded."""
         if self.code is None and self.error is None:
             self.code = library_cache().load(self._key, self._load)
         return self.code is not None
 
     def request(self, urgent: bool = False) -> None:
-        """Have it compiled in the background, unless it is there or there is no hope."""
+        """Request compilation in the background, unless the library is loaded or cannot be compiled."""
         if self.code is not None or self.error is not None or self._toolchain is None:
             return
         if self._build is None or self._build.done:
             self._build = request(self._key, self._toolchain, self._source, self._flags, self._built, urgent)
 
     def wait(self, timeout: float | None = None) -> bool:
-        """Wait until it is there or cannot be made; return whether it is there.
+        """Wait until the library is loaded or has failed, and return True if it is loaded.
 
         Parameters
         ----------
@@ -110,34 +110,19 @@ class ProgramLibrary(Generic[Code]):
             notify()
 
 
-def optimisation_level(instructions: int) -> str | None:
-    """Return how hard the compiler may try without taking minutes; None if it should not be asked at all.
-
-    gcc 12 takes 0.2 ms an instruction at -O3, 0.12 ms at -O1 (7 % slower code) and 0.06 ms at -O0 (three
-    times slower, and four times faster than the interpreter).
-    """
-    if instructions <= 8_000:
-        return "-O3"
-    if instructions <= 60_000:
-        return "-O1"
-    if instructions <= 400_000:
-        return "-O0"
-    return None
-
-
 class SourceLibrary:
-    """The functions of a C source, once there are any.
+    """The compiled functions of a hand-written C source, loaded when they are ready.
 
-    Until then, and without a compiler, who uses them does the same in numpy.
+    Until then, and without a compiler, the callers compute the same in numpy.
 
     Parameters
     ----------
     source
-        The C.
+        The C source.
     declare
-        Gives the loaded functions their types.
+        Function that sets the argument types of the loaded functions.
     flags
-        For the compiler.
+        Flags of the compiler.
     """
 
     def __init__(
@@ -149,12 +134,12 @@ class SourceLibrary:
         self._source, self._declare, self._flags = source, declare, flags
         self._code: Any = None
         self._build: BuildJob | None = None
-        self._hopeless = False
+        self._failed = False
         self._lock = threading.Lock()
 
     @property
     def is_native(self) -> bool:
-        """Whether C does the work."""
+        """True if the compiled functions are loaded."""
         return self._code is not None
 
     @property
@@ -163,37 +148,37 @@ class SourceLibrary:
         return self._code
 
     def prepare(self, wait: bool = False) -> bool:
-        """Take it from the cache or have it compiled in the background; return whether it is there."""
+        """Load the library from the cache or request its compilation, and return True if it is loaded."""
         if self._code is not None:
             return True
         with self._lock:
             if self._build is None and self._code is None:
-                self._build = self._seek()
+                self._build = self._find_or_request()
             build = self._build
         if wait and build is not None:
             build.wait(None)
             self._built(build)
         return self.is_native
 
-    def _seek(self) -> BuildJob | None:
-        compiler = None if self._hopeless else toolchain()
+    def _find_or_request(self) -> BuildJob | None:
+        compiler = None if self._failed else toolchain()
         if compiler is None:
-            self._hopeless = True
+            self._failed = True
             return None
         version = (self._source, self._flags, compiler.identity)
         key = hashlib.sha256(repr(version).encode()).hexdigest()[:40]
-        self._code = library_cache().load(key, self._loaded)
+        self._code = library_cache().load(key, self._load)
         if self._code is not None:
             return None
         return request(key, compiler, lambda: self._source, self._flags, self._built)
 
     def _built(self, build: BuildJob) -> None:
         if build.path is not None and self._code is None:
-            self._code = build.cache.load(build.key, self._loaded)
-        self._hopeless = self._code is None and not build.forgotten
+            self._code = build.cache.load(build.key, self._load)
+        self._failed = self._code is None and not build.forgotten
         self._build = None
 
-    def _loaded(self, path: str) -> Any:
+    def _load(self, path: str) -> Any:
         code = ctypes.CDLL(path)
         self._declare(code)
         return code
@@ -201,23 +186,23 @@ class SourceLibrary:
 
 @dataclass(frozen=True, slots=True)
 class CompilerInformation:
-    """What compiles functions on this machine.
+    """Compiler, vector instructions, cores and cache of this machine.
 
     Attributes
     ----------
     compiler
-        The path of the C compiler; None if there is none, so that everything stays interpreted.
+        The path of the C compiler; None if there is none and all functions are interpreted.
     version
-        What the compiler says it is.
+        The compiler's version text.
     flags
-        What it is told about optimisation and arithmetic, for functions of moderate size.
+        Flags for optimisation and arithmetic, for functions of moderate size.
     vector_unit
-        The widest vector instructions that batches use: ``avx512``, ``avx2``, ``avx``, ``sse2``, ``neon``,
+        The widest vector instructions of batches: ``avx512``, ``avx2``, ``avx``, ``sse2``, ``neon``,
         ``none``.
     cores
-        How many cores batches are spread over.
+        The number of cores for batches.
     cache_folder
-        Where compiled libraries are kept.
+        The folder of compiled libraries.
     """
 
     compiler: str | None
@@ -229,7 +214,7 @@ class CompilerInformation:
 
 
 def compiler_information() -> CompilerInformation:
-    """Return what compiles functions on this machine; it asks the compiler, which takes some milliseconds."""
+    """Return information on the compiler of this machine; running it takes some milliseconds."""
     found = toolchain()
     return CompilerInformation(
         compiler=found.command[0] if found else None,

@@ -1,10 +1,10 @@
 """Disk cache of compiled libraries, keyed by the digest of their source.
 
-Code from this folder is loaded into the process, so nobody else may be able to write there, see
-:mod:`.private_folder`. Every library ends in a digest of itself that is checked before it is loaded, and it
-is loaded through the descriptor that was checked. One that is broken, that is not this user's alone, or that
-does not hold what was looked for counts as absent and is made anew. Libraries arrive by renaming, so any
-number of processes can share the folder.
+Code from this folder is loaded into the process, so only this user may write to it, see
+:mod:`.private_folder`. Every library ends in a digest of its content, which is checked, and it is loaded
+through the checked descriptor. A library that is damaged, that others can write to, or that lacks the
+expected functions counts as absent and is compiled again. Libraries are moved in by renaming, so any number
+of processes can share the folder.
 """
 
 from __future__ import annotations
@@ -42,21 +42,21 @@ Code = TypeVar("Code")
 
 
 class LibraryCache:
-    """One folder of compiled libraries.
+    """A folder of compiled libraries.
 
     Parameters
     ----------
     folder
-        A folder that only this user can write to; it is made if it is not there.
+        A folder that only this user can write to; it is created if it does not exist.
     made
-        Whether it was just made by this process.
+        True if this process has just created it.
 
     Raises
     ------
     NotPrivateError
         If others can write to it.
     OSError
-        If it cannot be made.
+        If it cannot be created.
     """
 
     def __init__(self, folder: Path, made: bool = False) -> None:
@@ -65,11 +65,11 @@ class LibraryCache:
 
     @property
     def is_still_private(self) -> bool:
-        """Whether the folder is still there, and still nobody else's."""
+        """True if the folder still exists and only this user can write to it."""
         return self._inside.is_still_private
 
     def find(self, key: str) -> str | None:
-        """Return the path of a library that is there and whole, else None."""
+        """Return the path of a library that exists and is undamaged, else None."""
         found = self._opened(key)
         if found is None:
             return None
@@ -77,15 +77,15 @@ class LibraryCache:
         return str(self.folder / _name(key))
 
     def load(self, key: str, load: Callable[[str], Code]) -> Code | None:
-        """Return what is made of a library; None if there is none, or if it is not what it should be.
+        """Return the code of a library; None if it does not exist or cannot be used.
 
         Parameters
         ----------
         key
-            What it is found by.
+            The key of the library.
         load
-            Makes of a path what can be called. The path is good only now, and no other library ever has it:
-            what has the name of a library that is loaded already would be taken for that one.
+            Function from a path to the code. The path is valid only during the call, and unique: the loader
+            would take a library with the path of a loaded one for that one.
         """
         found = self._opened(key)
         if found is None:
@@ -100,7 +100,7 @@ class LibraryCache:
             os.close(found[0])
 
     def _opened(self, key: str) -> tuple[int, bytes] | None:
-        """Open and read a library that is there and whole; whoever asks closes the descriptor."""
+        """Open and read a library that exists and is undamaged; the caller closes the descriptor."""
         try:
             descriptor = self._inside.open(_name(key))
         except NotPrivateError as error:
@@ -125,14 +125,14 @@ class LibraryCache:
         self._inside.remove(_name(key))
 
     def store(self, key: str, library: str) -> str:
-        """Move a library that was just compiled in here; return its path.
+        """Move a compiled library into the folder, and return its path.
 
         Parameters
         ----------
         key
-            What it will be found by.
+            The key of the library.
         library
-            A file on the same file system (see :meth:`workplace`).
+            A file on the same file system (see :meth:`create_build_folder`).
         """
         with open(library, "rb") as file:
             digest = hashlib.sha256(file.read()).digest()
@@ -140,12 +140,12 @@ class LibraryCache:
         self._make_room()
         return str(self.folder / _name(key))
 
-    def workplace(self) -> str:
-        """Return a new folder to compile in; the caller removes it."""
+    def create_build_folder(self) -> str:
+        """Create a folder to compile in, which the caller removes, and return its path."""
         return tempfile.mkdtemp(prefix=".build-", dir=self.folder)
 
     def _make_room(self) -> None:
-        """Remove what was used longest ago, and what processes left behind that were killed."""
+        """Remove the least recently used libraries, and build folders of killed processes."""
         files: list[tuple[float, int, str]] = []
         now = time.time()
         for name, status in self._inside.entries():
@@ -166,8 +166,8 @@ def library_cache() -> LibraryCache:
     """Return the cache of this user.
 
     The folder is ``KINEVERSE_CACHE_DIR``, else ``kineverse`` in ``XDG_CACHE_HOME``, else
-    ``~/.cache/kineverse``. Where that cannot be used, a private folder that is removed when the process ends
-    takes its place, and the log says why.
+    ``~/.cache/kineverse``. If that cannot be used, which is logged, it is a private folder that is removed
+    when the process ends.
     """
     get = os.environ.get
     where = get("KINEVERSE_CACHE_DIR"), get("XDG_CACHE_HOME"), get("HOME")
@@ -179,7 +179,7 @@ def library_cache() -> LibraryCache:
 
 
 def private_subfolder(name: str) -> PrivateFolder:
-    """Return a folder in the cache of this user, or in a private one that ends with the process."""
+    """Return a folder in the cache of this user, or in a private one that is removed with the process."""
     path = library_cache().folder / name
     try:
         return PrivateFolder(path)
@@ -233,10 +233,10 @@ def _is_whole(content: bytes) -> bool:
 
 @contextlib.contextmanager
 def _path_of(descriptor: int, content: bytes) -> Iterator[str]:
-    """Give a file that is open a path for the loader, one that no other had before.
+    """Yield a unique path of an open file, for the loader.
 
-    On Linux it is that of the descriptor, with the number of the library in its slashes and dots. Elsewhere
-    what was read is written to a private folder.
+    On Linux it is the path of the descriptor, with the number of the library encoded in slashes and dots.
+    Elsewhere the content is written to a private folder.
     """
     number = next(_loaded)
     path = f"{_DESCRIPTORS}{''.join('./' if bit == '1' else '/' for bit in f'{number:b}')}{descriptor}"
@@ -263,7 +263,7 @@ def _private_folder_is_there() -> bool:
 
 def _forked() -> None:
     if _private_folder.cache_info().currsize:
-        # The parent's folder is the parent's to remove.
+        # The parent process removes its own folder.
         _private_folder()._finalizer.detach()  # type: ignore[attr-defined]
         _private_folder.cache_clear()
         _open.cache_clear()

@@ -1,10 +1,7 @@
 """CPython extension that calls compiled functions with little overhead (C source and loader).
 
-It does what :mod:`.binding` and :mod:`.evaluator` do in Python, and is used where Python's headers are
-installed.
-
-It saves four fifths of the time of a call. Where Python's headers or a compiler are missing, calls go through
-CasADi's buffers instead and give the same.
+The extension does in C the same as :mod:`.evaluator` in Python, and saves four fifths of the time of a call.
+Without Python's headers or a compiler, calls go through CasADi's buffers instead, with the same results.
 """
 
 from __future__ import annotations
@@ -309,13 +306,13 @@ PyMODINIT_FUNC PyInit_kineverse_native(void) {
 """
 
 
-# The extension has room for so many results.
+# The capacity of the extension for outputs.
 MOST_OUTPUTS = 256
 _EXTENSION_NAME = "kineverse_native"
 
 
 class CallExtension:
-    """The extension, once there is one.
+    """The extension module, loaded when it is ready.
 
     Attributes
     ----------
@@ -326,29 +323,29 @@ class CallExtension:
     def __init__(self) -> None:
         self.module: Any = None
         self._state: Literal["unknown", "awaited", "settled"] = "unknown"
-        self._watchers: list[WeakMethod[Callable[[], object]]] = []
+        self._listeners: list[WeakMethod[Callable[[], object]]] = []
         self._lock = threading.Lock()
 
-    def prepare(self, watcher: Callable[[], object], urgent: bool = False) -> None:
-        """Load the extension from the cache, or have it compiled in the background; it is tried once.
+    def prepare(self, listener: Callable[[], object], urgent: bool = False) -> None:
+        """Load the extension from the cache, or request its compilation in the background, once.
 
         Parameters
         ----------
-        watcher
-            A method that is called if it is loaded later, in another thread; held weakly.
+        listener
+            Method to be called in another thread if the extension is loaded later; referenced weakly.
         urgent
-            Whether somebody waits for something that will use it.
+            True to compile it before jobs that are not urgent.
         """
         if self._state == "settled":
             return
         with self._lock:
             if self._state == "unknown":
-                self._state = "awaited" if self._seek(urgent) else "settled"
+                self._state = "awaited" if self._find_or_request(urgent) else "settled"
             if self._state == "awaited":
-                self._watchers.append(WeakMethod(watcher))
+                self._listeners.append(WeakMethod(listener))
 
-    def _seek(self, urgent: bool) -> bool:
-        """Load it or have it compiled; return whether it is still to come."""
+    def _find_or_request(self, urgent: bool) -> bool:
+        """Load the extension or request its compilation, and return True if it is requested."""
         compiler = toolchain()
         if compiler is None:
             return False
@@ -367,9 +364,9 @@ class CallExtension:
             self._take(build.cache, build.key)
         with self._lock:
             self._state = "settled"
-            watchers, self._watchers = self._watchers, []
-        for watcher in watchers:
-            notify = watcher()
+            listeners, self._listeners = self._listeners, []
+        for listener in listeners:
+            notify = listener()
             if notify is not None:
                 notify()
 

@@ -1,8 +1,8 @@
 """CasADi functions bound to memory: evaluators for one thread and pools for many.
 
-A plain call of a CasADi function takes some 17 µs whatever it computes; one that is bound to its arguments
-and results takes a tenth of one. But it has one place for its results and no lock, so a function that may be
-called from anywhere keeps a pool of bindings, takes one out for each call and hands out copies.
+A plain call of a CasADi function takes some 17 µs, whatever it computes; a call that is bound to arrays of
+arguments and results takes 0.1 µs. A binding has one set of result arrays and no lock. So a function for many
+threads has a pool of bindings, uses one of them for each call and returns copies.
 """
 
 from __future__ import annotations
@@ -33,16 +33,16 @@ def bind(
     function
         CasADi's function.
     vector
-        Where it reads; contiguous.
+        The array of inputs; contiguous.
     outputs
-        Where it writes, an array per output; contiguous.
+        An array per output; contiguous.
     check
-        What is done with vector and outputs after each evaluation; None for nothing.
+        Function of vector and outputs, called after each evaluation; None for none.
 
     Returns
     -------
     tuple
-        What evaluates, and an object that must be kept for as long as that may be called.
+        The bound call, and an object that has to live as long as it.
     """
     buffer, run = function.buffer()
     buffer.set_arg(0, vector.data)
@@ -66,7 +66,7 @@ def make_pooled_call(
     convert: VectorCall,
     check: Check | None,
 ) -> VectorCall:
-    """Return a call that gives fresh arrays and can be used by any number of threads.
+    """Return a call that returns new arrays and can be used by any number of threads.
 
     Parameters
     ----------
@@ -77,9 +77,9 @@ def make_pooled_call(
     shapes
         The shape of each output.
     single
-        Whether the one array is returned, rather than a tuple of them.
+        True to return the only array instead of a tuple.
     convert
-        Turns what is not a vector of doubles into one, or raises.
+        Function that converts other values to a vector of doubles, or raises.
     check
         As for :func:`bind`.
     """
@@ -101,13 +101,13 @@ def make_pooled_call(
             binding = new()
         vector, run, copies, _ = binding
         try:
-            # This assignment refuses everything but doubles of the right number; it would not see a mask.
+            # This assignment refuses everything but n doubles; it ignores masks, hence the type check.
             vector[:] = x if type(x) is np.ndarray else convert(x)  # type: ignore[assignment]
         except (ValueError, TypeError):
             vector[:] = convert(x)
         run()
         if pair:
-            # The usual case; going through a list of copies would take a quarter of the whole call.
+            # The usual case; a loop over copies would take a quarter of the whole call.
             first, second = copies
             results = first(), second()
         elif single:
@@ -121,21 +121,21 @@ def make_pooled_call(
 
 
 class Evaluator(metaclass=ABCMeta):
-    """A function with a place for its input and for its outputs, for one thread.
+    """A function bound to arrays for its input and outputs, for one thread.
 
     Fill :attr:`input`, call, read :attr:`outputs`. Every call rewrites the arrays in :attr:`outputs` in
-    place: copy what has to outlive the next one. Made by :meth:`CompiledFunction.bind`; it becomes faster by
-    itself when the function's C is ready.
+    place; copy those that have to outlive the next call. Made by :meth:`CompiledFunction.bind`. It switches
+    to C when the function's C is ready.
 
     Attributes
     ----------
     input
-        The vector that is evaluated at, shape (n,); zeros at first.
+        The input vector, shape (n,); zeros at first.
     outputs
-        The arrays that calls write to, one per output.
+        The arrays of results, one per output.
     """
 
-    __slots__ = ("__weakref__", "_convert", "_kept", "_run", "_view", "input", "outputs")
+    __slots__ = ("__weakref__", "_convert", "_references", "_run", "_view", "input", "outputs")
 
     input: DoubleVector
     outputs: tuple[Array, ...]
@@ -143,12 +143,12 @@ class Evaluator(metaclass=ABCMeta):
     def __init__(
         self, shapes: tuple[OutputShape, ...], size: int, convert: Callable[[Any], DoubleVector]
     ) -> None:
-        put = super().__setattr__
-        put("input", np.zeros(size))
-        put("outputs", tuple(np.zeros(shape) for shape in shapes))
-        put("_view", self.input.data)
-        put("_convert", convert)
-        put("_kept", [])
+        assign = super().__setattr__
+        assign("input", np.zeros(size))
+        assign("outputs", tuple(np.zeros(shape) for shape in shapes))
+        assign("_view", self.input.data)
+        assign("_convert", convert)
+        assign("_references", [])
 
     def __call__(self, x: Any = None, /) -> None:
         """Evaluate, and rewrite :attr:`outputs`.
@@ -156,12 +156,12 @@ class Evaluator(metaclass=ABCMeta):
         Parameters
         ----------
         x
-            The input; what :attr:`input` holds if None. It is copied there.
+            The input, which is copied to :attr:`input`; the present content of :attr:`input` if None.
 
         Raises
         ------
         ShapeError
-            If ``x`` is no vector of n numbers.
+            If ``x`` is not a vector of n numbers.
         """
         if x is not None:
             try:
@@ -171,20 +171,20 @@ class Evaluator(metaclass=ABCMeta):
         self._run()
 
     def _evaluate_by(self, run: BoundCall, keep: object) -> None:
-        """Evaluate by something else from the next call on, in the same memory.
+        """Replace the function from the next call on, with the same arrays.
 
         Parameters
         ----------
         run
-            What reads :attr:`input` and writes :attr:`outputs`.
+            A function that reads :attr:`input` and writes :attr:`outputs`.
         keep
-            What has to live as long as ``run`` may be called.
+            An object that has to live as long as ``run``.
         """
-        # A call may be running in another thread: what it uses must stay.
-        self._kept.append(keep)
+        # A call may be running in another thread, so the previous object must stay alive.
+        self._references.append(keep)
         object.__setattr__(self, "_run", run)
 
-    _kept: list[object]
+    _references: list[object]
     _run: BoundCall
     _view: memoryview
     _convert: Callable[[Any], DoubleVector]

@@ -1,4 +1,4 @@
-"""Expressions as functions of numbers."""
+"""Compilation of expressions to functions of numbers."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from .signature import make_signature
 if TYPE_CHECKING:
     from typing_extensions import TypeVar
 
-    # Without brackets it is a function of anything.
+    # Without brackets the type of the results is Any.
     Results = TypeVar("Results", default=Any)
 else:
     from typing import TypeVar
@@ -40,10 +40,10 @@ logger = logging.getLogger("kineverse.compile")
 Tier: TypeAlias = Literal["interpreter", "c"]
 WantedTier: TypeAlias = Literal["auto", "interpreter", "c"]
 
-# Inputs and outputs count as operations too: below this there is nothing to compute. Everything else is worth
-# it, as the extension calls a compiled sum in a fifth of the time that CasADi's interpreter needs.
+# Inputs and outputs count as operations too. Any program with a further operation is worth compiling: the
+# extension calls a compiled sum in a fifth of the time of CasADi's interpreter.
 _WORTH_COMPILING = 4
-# So many operations take some microseconds: others may have the GIL meanwhile.
+# From so many operations on, which take some microseconds, a call releases the GIL.
 _LENGTHY = 5000
 
 
@@ -76,8 +76,9 @@ def compile(  # noqa: A001
 ) -> CompiledFunction[Any]:
     """Return a fast function of numbers that evaluates expressions.
 
-    The function can be called at once, by CasADi's interpreter. Meanwhile C is generated and compiled in the
-    background; it takes over when it is ready, gives the same numbers to the last bit, and is kept for later.
+    The function can be called at once, by CasADi's interpreter. C is generated and compiled in the
+    background; it replaces the interpreter when it is ready, with the same results to the last bit, and is
+    cached on disk.
 
     Parameters
     ----------
@@ -85,23 +86,23 @@ def compile(  # noqa: A001
         An expression (calls return one array), or a list or tuple of them (calls return a tuple of arrays).
     inputs
         The symbols that make up the input vector, in this order; by default all symbols of the outputs,
-        sorted by name, which is not the order of a chain: that is ``model.find_term_symbols(frame)``.
+        sorted by name, which is not the order of a chain: that is ``model.symbols_of(frame)``.
     tier
-        ``"auto"`` as described; without a C compiler, or where C is of no use, the interpreter stays.
-        ``"interpreter"`` never compiles. ``"c"`` insists on C.
+        ``"auto"`` as described; without a C compiler, or if C does not pay, the interpreter stays.
+        ``"interpreter"`` never compiles. ``"c"`` requires C.
     wait
-        Whether to return only when C is ready (or is known not to come).
+        True to return only when C is ready or has failed.
 
     Raises
     ------
     ExpressionError
-        If something else than symbols is among the inputs.
+        If an input is not a symbol.
     DuplicateNameError
         If a symbol is among the inputs twice.
     UnknownNameError
         If outputs depend on symbols that are not among the inputs.
     CompileError
-        If there is nothing to compile, or if tier ``"c"`` is known to be impossible.
+        If there is no output, or if tier ``"c"`` is impossible.
     """
     if tier not in ("auto", "interpreter", "c"):
         raise InvalidValueError(f"Unknown tier {tier!r}; tiers are 'auto', 'interpreter' and 'c'.")
@@ -113,34 +114,32 @@ def compile(  # noqa: A001
 
 
 class CompiledFunction(Generic[Results]):
-    """A function of a vector of numbers, made by :func:`compile`.
+    """A function of a vector of numbers, created by :func:`compile`.
 
-    To a type checker ``CompiledFunction[R]`` is one whose calls return R: an array for a function of a single
-    expression, a tuple of arrays otherwise.
-
-    It may be called from any number of threads.
+    To a type checker, calls of a ``CompiledFunction[R]`` return R: an array for a function of a single
+    expression, a tuple of arrays otherwise. Any number of threads may call it at the same time.
 
     Parameters
     ----------
     outputs
-        What is computed.
+        The expressions.
     inputs
         The symbols in the order of the vector, or None.
     single
-        Whether calls return one array instead of a tuple.
+        True if calls return one array instead of a tuple.
     tier, wait
         See :func:`compile`.
 
     Attributes
     ----------
     inputs
-        The symbols whose values make up the input vector, in its order.
+        The symbols of the input vector, in its order.
     names
         Their text names.
     shapes
         The shape of every output.
     tier
-        What evaluates at the moment: ``"interpreter"`` or ``"c"``.
+        The present kind of evaluation: ``"interpreter"`` or ``"c"``.
     """
 
     __slots__ = (
@@ -180,7 +179,7 @@ class CompiledFunction(Generic[Results]):
             if tier == "c" and self._library.error:
                 raise CompileError(f"The function cannot be compiled: {self._library.error}.")
         if self._library is not None:
-            # First, so that it is there when the function's own library is.
+            # First, so that it is ready when the function's own library is.
             call_extension.prepare(self._ready, urgent=wait)
         if self._library is not None and self._library.find():
             self._ready()
@@ -192,15 +191,15 @@ class CompiledFunction(Generic[Results]):
                 self.wait()
 
     def __call__(self, x: Any = (), /) -> Results:
-        """Return the outputs at ``x``, in arrays that belong to the caller.
+        """Return the outputs at ``x``, in new arrays.
 
-        A function without inputs, of constants, is called without anything.
+        A function without inputs is called without an argument.
 
         Parameters
         ----------
         x
             The values of :attr:`inputs`, a sequence of n numbers; or a mapping from symbols or their names to
-            numbers, where parameters may be left out; or a State, which may know more.
+            numbers, without which parameters have their own; or a State, which may have more symbols.
 
         Returns
         -------
@@ -210,27 +209,27 @@ class CompiledFunction(Generic[Results]):
         Raises
         ------
         ShapeError
-            If ``x`` is no vector of n numbers.
+            If ``x`` is not a vector of n numbers.
         UnknownNameError
-            If a mapping misses a symbol or knows one that is not among the inputs.
+            If a mapping lacks a symbol or has one that is not an input.
         InvalidValueError
-            If a mapping contains NaN or what is not a number.
+            If a mapping contains NaN or values that are not numbers.
         """
         return self._call(x)
 
     def batch(self, x: npt.ArrayLike, out: Any = None) -> Results:
         """Return the outputs at many points.
 
-        Rows are spread over all cores. The numbers are those of single calls but for the last digits (4 ulp)
-        of elementary functions. The first batch that is large enough to pay for it waits for a compiler.
+        Rows are distributed over all cores. The results are those of single calls, except for the last digits
+        (4 ulp) of elementary functions. The first batch that is large enough waits for the compiler.
 
         Parameters
         ----------
         x
             A point per row, shape (N, n).
         out
-            Where to write: contiguous float64 arrays of shape (N, *shape), one per output (alone if there is
-            a single output). New ones are made if None.
+            Arrays for the results: contiguous, float64, of shape (N, *shape), one per output (alone if there
+            is a single output). New ones if None.
 
         Returns
         -------
@@ -240,7 +239,7 @@ class CompiledFunction(Generic[Results]):
         Raises
         ------
         ShapeError
-            If ``x`` is no array of n columns of numbers, or ``out`` does not fit.
+            If ``x`` is not an array of n columns of numbers, or ``out`` does not fit.
         """
         if self._batch is None:
             self._batch = Batch(self._program, self._signature, self.shapes, self._single, self._wanted)
@@ -248,20 +247,20 @@ class CompiledFunction(Generic[Results]):
         return results
 
     def bind(self) -> Evaluator:
-        """Return an evaluator of one's own, which writes its results in place, for one thread."""
+        """Return an evaluator for one thread, which writes its results in place."""
         size, convert = self._signature.size, self._signature.vector
         with self._lock:
             if self._native:
                 outputs = tuple(np.zeros(shape) for shape in self.shapes)
                 return self._native_evaluator(np.zeros(size), outputs)
             evaluator = Evaluator(self.shapes, size, convert)
-            self._let_evaluate(evaluator)
+            self._set_function(evaluator)
             if self.tier != "c":
                 self._evaluators.add(evaluator)
         return evaluator
 
     def wait(self, timeout: float | None = None) -> bool:
-        """Wait until C evaluates, or is known not to come; return whether it does.
+        """Wait until C is ready or has failed, and return True if it is ready.
 
         Parameters
         ----------
@@ -271,7 +270,7 @@ class CompiledFunction(Generic[Results]):
         Raises
         ------
         CompileError
-            If C was insisted on (``tier="c"``) and cannot be had.
+            If C is required (``tier="c"``) and has failed.
         """
         if self._library is None:
             return False
@@ -282,24 +281,24 @@ class CompiledFunction(Generic[Results]):
 
     @property
     def address(self) -> int | None:
-        """Where the C is, for other C to call; None while there is none. It lives as long as the function."""
+        """Address of the C function, valid as long as this object; None while there is none."""
         code = self._library.code if self._library is not None else None
         return None if code is None else code.address
 
     def _ready(self) -> None:
-        """Let C take over, or the extension that calls it, in whichever thread it was loaded."""
+        """Switch to C, or to the extension that calls it; called in any thread."""
         if self._library is not None and self._library.code is not None:
             self._evaluate_by(self._library.code.function, self._library.code.address)
 
     def _evaluate_by(self, function: CasadiFunction, address: int | None) -> None:
-        """Evaluate by another function from the next call on.
+        """Replace the function from the next call on.
 
         Parameters
         ----------
         function
             CasADi's function.
         address
-            Where its C is, if it is compiled.
+            The address of its C, if it is compiled.
         """
         shapes, check, convert = self.shapes, self._program.checked, self._signature.vector
         direct = address is not None and len(shapes) <= MOST_OUTPUTS and call_extension.module is not None
@@ -312,16 +311,16 @@ class CompiledFunction(Generic[Results]):
         with self._lock:
             self._function = function
             self._native = address if direct else None
-            # One assignment: a call sees the old function with its bindings or the new one with its own.
+            # One assignment: a call uses the old function with its bindings or the new one with its own.
             self._call = call
             self.tier = "interpreter" if address is None else "c"
             if self.tier == "c":
                 for evaluator in self._evaluators:
-                    self._let_evaluate(evaluator)
+                    self._set_function(evaluator)
                 self._evaluators.clear()
 
-    def _let_evaluate(self, evaluator: Evaluator) -> None:
-        """Have an evaluator use the present function."""
+    def _set_function(self, evaluator: Evaluator) -> None:
+        """Set the present function of an evaluator."""
         if self._native:
             run = self._native_evaluator(evaluator.input, evaluator.outputs)
             evaluator._evaluate_by(run, None)
@@ -353,7 +352,7 @@ class CompiledFunction(Generic[Results]):
 
 @dataclass(frozen=True, slots=True)
 class _Code:
-    """A compiled function: as CasADi's, and where it is."""
+    """A compiled function: CasADi's, and its address."""
 
     function: CasadiFunction
     address: int

@@ -6,30 +6,30 @@ import os
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 
-# A thread takes this many pieces on average, so that one that was held up leaves its rest to the others.
+# Pieces per thread on average, so that the other threads take over from a delayed one.
 _PIECES = 4
 
 _threads: ThreadPoolExecutor | None = None
 
 
 def cores() -> int:
-    """Return how many cores this process may use."""
+    """Return the number of cores for this process."""
     if hasattr(os, "sched_getaffinity"):
         return len(os.sched_getaffinity(0))
     return os.cpu_count() or 1
 
 
 def parallel_rows(work: Callable[[int, int], object], rows: int, smallest: int, align: int = 8) -> None:
-    """Call ``work(first, end)`` for pieces that make up all rows, in several threads if there are enough.
+    """Call ``work(first, end)`` for pieces of all rows, in several threads if there are enough rows.
 
     Parameters
     ----------
     work
-        What is done; it has to release the GIL to gain anything.
+        The function; threads only help if it releases the GIL.
     rows
-        How many rows there are.
+        The number of rows.
     smallest
-        Fewer rows than this are not worth a thread.
+        The smallest number of rows that is worth a thread.
     align
         Pieces begin at multiples of this.
     """
@@ -43,7 +43,7 @@ def parallel_rows(work: Callable[[int, int], object], rows: int, smallest: int, 
     starts = iter(range(0, rows, piece))
 
     def take() -> None:
-        # Going on with a range is atomic; every thread takes the next piece when it is done with one.
+        # Advancing a range iterator is atomic; every thread takes the next piece after finishing one.
         for first in starts:
             work(first, min(first + piece, rows))
 

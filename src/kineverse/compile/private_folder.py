@@ -1,10 +1,10 @@
 """Folder that only this user can write to, held open against replacement.
 
-Code from the cache is loaded into the process. So the way to the folder is walked one step after the other:
-every folder on it belongs to root or to this user and cannot be written by others, unless it is sticky like
-``/tmp``, and so does every link. Files are opened relative to the folder that was checked, links are not
-followed, and what was opened is looked at: a plain file of this user, with one name, which nobody else can
-write to. Where the system has no such calls, names are joined to the path.
+Code from the cache is loaded into the process. So each folder and link on the path is checked: it belongs to
+root or to this user, and others cannot write to it, unless it is sticky like ``/tmp``. Files are opened
+relative to the checked folder, without following links. An opened file is checked as well: it is a plain file
+of this user, with one name, and others cannot write to it. On systems without such calls, names are joined to
+the path.
 """
 
 from __future__ import annotations
@@ -23,14 +23,14 @@ _MOST_LINKS = 40
 _BY_DESCRIPTOR = hasattr(os, "geteuid") and {os.open, os.stat, os.unlink, os.rename} <= os.supports_dir_fd
 _FOLDER = getattr(os, "O_DIRECTORY", 0) | getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_CLOEXEC", 0)
 _STEP = _FOLDER | getattr(os, "O_PATH", os.O_RDONLY)
-# A pipe must not keep anybody waiting.
+# Opening a pipe must not block.
 _FILE = (
     os.O_RDONLY | getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_CLOEXEC", 0)
 )
 
 
 class NotPrivateError(Exception):
-    """Raised for what others may have written; the message begins with a verb."""
+    """Raised for files and folders that others may have written; the message begins with a verb."""
 
 
 class PrivateFolder:
@@ -39,16 +39,16 @@ class PrivateFolder:
     Parameters
     ----------
     path
-        Where it is; it is made with mode 0700 if it is not there.
+        The path; the folder is created with mode 0700 if it does not exist.
     made
-        Whether it was just made by this process, so that there is nothing to check.
+        True if this process has just created it, so that it needs no check.
 
     Raises
     ------
     NotPrivateError
-        If others can write to it or put another one in its place.
+        If others can write to it or replace it.
     OSError
-        If it cannot be made or opened.
+        If it cannot be created or opened.
     """
 
     def __init__(self, path: Path, made: bool = False) -> None:
@@ -64,7 +64,7 @@ class PrivateFolder:
 
     @property
     def is_still_private(self) -> bool:
-        """Whether it is still there, and still nobody else's."""
+        """True if the folder still exists and only this user can write to it."""
         if self._descriptor is None:
             return self.path.is_dir()
         status = os.fstat(self._descriptor)
@@ -76,9 +76,9 @@ class PrivateFolder:
         Raises
         ------
         NotPrivateError
-            If it is no plain file of this user alone.
+            If it is not a plain file of this user alone.
         OSError
-            If there is none.
+            If it does not exist.
         """
         try:
             descriptor = os.open(*self._at(name, _FILE), **self._relative())
@@ -93,23 +93,23 @@ class PrivateFolder:
         return descriptor
 
     def is_link(self, name: str) -> bool:
-        """Whether there is a symbolic link of that name."""
+        """Return True if a symbolic link has that name."""
         try:
             return stat.S_ISLNK(os.stat(*self._at(name), follow_symlinks=False, **self._relative()).st_mode)
         except OSError:
             return False
 
     def adopt(self, path: str, name: str, end: bytes = b"") -> None:
-        """Move a file in here, over any that was there, and make it this user's alone.
+        """Move a file into the folder, in place of one of that name, with access for this user only.
 
         Parameters
         ----------
         path
             A file on the same file system.
         name
-            How it is called here.
+            Its name in the folder.
         end
-            What is written behind its content.
+            Bytes to append to its content.
         """
         with open(os.open(path, os.O_APPEND | os.O_RDWR | _FILE), "ab") as file:
             reason = _file_refusal(os.fstat(file.fileno()), writable=False)
@@ -124,14 +124,14 @@ class PrivateFolder:
             os.replace(path, name, dst_dir_fd=self._descriptor)
 
     def remove(self, name: str) -> bool:
-        """Remove a file or link, and return whether it is gone."""
+        """Remove a file or link, and return True if that succeeded."""
         with contextlib.suppress(OSError):
             os.unlink(*self._at(name), **self._relative())
             return True
         return False
 
     def entries(self) -> Iterator[tuple[str, os.stat_result]]:
-        """Yield the names of what is in here, with the status of each; links are not followed."""
+        """Yield the names and the status of all entries; links are not followed."""
         with os.scandir(self.path if self._descriptor is None else self._descriptor) as found:
             for entry in found:
                 with contextlib.suppress(OSError):
@@ -145,7 +145,7 @@ class PrivateFolder:
 
 
 def _make(path: Path) -> None:
-    """Make a folder and those it is in, all of them for this user alone."""
+    """Create a folder and its missing parents, with access for this user only."""
     missing = []
     while not os.path.lexists(path):
         missing.append(path)
@@ -156,7 +156,7 @@ def _make(path: Path) -> None:
 
 
 def _walk(path: Path) -> int:
-    """Return the descriptor of a folder after looking at everything on the way to it."""
+    """Return the descriptor of a folder after checking every folder and link on its path."""
     parts = deque(path.parts[1:])
     here = os.open(path.anchor, _STEP)
     passed, links = path.anchor, 0
@@ -190,7 +190,7 @@ def _walk(path: Path) -> int:
 
 
 def _check_passage(status: os.stat_result, passed: str) -> None:
-    """Refuse a folder in which others can put something else in place of what leads on."""
+    """Raise for a folder in which others can replace entries."""
     if status.st_uid not in (0, os.geteuid()):
         raise NotPrivateError(f"is reached through {passed}, which belongs to another user")
     if status.st_mode & _OTHERS and not status.st_mode & stat.S_ISVTX and not _own_group(status):
@@ -201,7 +201,7 @@ def _check_passage(status: os.stat_result, passed: str) -> None:
 
 
 def _own_group(status: os.stat_result) -> bool:
-    """Whether only the group can write, and it is one that a system made for this user, of that name."""
+    """Return True if only the group can write, and it is the private group of this user."""
     if status.st_mode & stat.S_IWOTH or os.geteuid() == 0 or status.st_gid != os.getegid():
         return False
     import grp
@@ -219,7 +219,7 @@ def _own_group(status: os.stat_result) -> bool:
 
 
 def _refusal(status: os.stat_result) -> str | None:
-    """Return why a folder is not this user's alone; None if it is."""
+    """Return the reason why others can write to a folder; None if they cannot."""
     if status.st_uid != os.geteuid():
         return "belongs to another user"
     if status.st_mode & _OTHERS:
@@ -228,7 +228,7 @@ def _refusal(status: os.stat_result) -> str | None:
 
 
 def _file_refusal(status: os.stat_result, writable: bool = True) -> str | None:
-    """Return why what was opened is no plain file of this user alone; None if it is."""
+    """Return the reason why an opened file is not a plain file of this user alone; None if it is."""
     if not stat.S_ISREG(status.st_mode):
         return "is no plain file"
     if not _BY_DESCRIPTOR:
@@ -237,7 +237,7 @@ def _file_refusal(status: os.stat_result, writable: bool = True) -> str | None:
         return "belongs to another user"
     if writable and status.st_mode & _OTHERS:
         return "can be written by others"
-    # Without a name it was replaced since it was opened, which is no harm.
+    # A file without a name was replaced after it was opened, which does no harm.
     if status.st_nlink > 1:
         return "has other names"
     return None

@@ -1,7 +1,7 @@
-"""Expressions as one function of a vector of numbers, without any name from outside.
+"""Expressions as one function of a vector of numbers, independent of names.
 
-The symbols are replaced by elements of one neutral vector first. So the same mechanism under other names is
-the same program, with the same compiled library, and no name of a document can reach generated code.
+Symbols are replaced by elements of one vector. So equal mechanisms with different names are the same program,
+with the same compiled library, and no name from a document occurs in generated code.
 """
 
 from __future__ import annotations
@@ -39,19 +39,19 @@ static inline double first_larger(double x, double y) { return x >= y || y != y 
 # Raise the number when other source is generated from the same program.
 SINGLE_KIND = "single 2"
 
-# From so many constants on an output begins as a copy of a table: the time of a compiler goes by statements.
+# From so many constants on, an output is initialised from a table: compile time grows with statements.
 _TABLE = 64
 
 
 class Program:
-    """What is computed: n numbers in, and one column of numbers, in C order, per output.
+    """A function of a vector, with one column of numbers, in C order, per output.
 
     Parameters
     ----------
     outputs
         The expressions.
     inputs
-        All symbols that occur in them, and maybe others, in the order of the input vector.
+        All symbols of the expressions, and maybe others, in the order of the input vector.
     """
 
     def __init__(self, outputs: Sequence[Expression], inputs: Sequence[Symbol]) -> None:
@@ -62,22 +62,22 @@ class Program:
         symbols = ca.vertcat(*(s.casadi for s in inputs)) if inputs else ca.SX(0, 1)
         self._columns = ca.substitute(columns, [symbols], [self._vector])
         self._function: CasadiFunction = None
-        # Common parts are not shared yet: for a library that exists already, that would be time lost.
+        # Common parts are shared later, since that takes time and an existing library does not need it.
         graph = ca.Function(FUNCTION_NAME, [self._vector], self._columns)
         self.instructions: int = graph.n_instructions()
-        # Closed loops, which have no solution everywhere.
+        # Closed loops, which may have no solution.
         self.implicit = implicit_nodes(outputs)
         self._symbols = tuple(inputs)
         text = f"{_PRELUDE} {ca.CasadiMeta.version()} {graph.serialize()}"
         self.digest = hashlib.sha256(text.encode())
 
     def key(self, *details: str) -> str:
-        """Return the digest of this program and of how it is compiled, the same in every process.
+        """Return the digest of this program and of its compilation, the same in every process.
 
         Parameters
         ----------
         details
-            All that the library depends on beside the program.
+            Everything else that the library depends on.
         """
         digest = self.digest.copy()
         digest.update(repr(details).encode())
@@ -89,14 +89,14 @@ class Program:
         Parameters
         ----------
         vector
-            What was evaluated at, shape (n,).
+            The inputs, shape (n,).
         results
-            What came out: arrays of any shape, or a single one.
+            The results: arrays of any shape, or a single one.
 
         Raises
         ------
         NoSolutionError
-            Naming the function, and where it was asked for.
+            With the name of the function, and its inputs.
         """
         arrays = (results,) if isinstance(results, np.ndarray) else results
         if any(np.isnan(array).any() for array in arrays):
@@ -144,7 +144,7 @@ class Program:
             columns.append(ca.densify(ca.vertcat(*elements)) if elements else column)
         generator = ca.CodeGenerator("kineverse.c")
         generator.add(ca.Function(FUNCTION_NAME, [self._vector], columns))
-        # Comments hold the names of functions that are called inside, such as those of loops.
+        # Comments contain the names of inner functions, such as those of loops.
         code = re.sub(r"/\*.*?\*/", "", generator.dump(), flags=re.DOTALL)
         if re.search(r"\berfinv\(", code):
             raise CompileError("CasADi has no C for the inverse error function.")
@@ -156,7 +156,7 @@ class Program:
         )
 
 
-# The function itself; those that it calls come after it and may be asked for a part of their results.
+# The function itself; inner functions come after it, and are called for part of their results.
 _MAIN = re.compile(
     r"(static int casadi_f0\(.*?\) \{\n(?:  casadi_(?:real|int)[^=;]*;\n)*)(.*?\n\}\n)", re.DOTALL
 )
@@ -165,7 +165,7 @@ _OUTPUT = re.compile(r"  if \(res\[(\d+)\]!=0\) res\[\d+\]\[(\d+)\]=(\w+);\n")
 
 
 def _remove_branches(main: re.Match[str], sizes: Sequence[int], tables: dict[int, dict[int, float]]) -> str:
-    """Return a function without a branch for each number, and with constants that come from tables."""
+    """Return a C function without a branch for each number, and with constants from tables."""
     declared, body = main.groups()
 
     def written(output: re.Match[str]) -> str:
@@ -184,7 +184,7 @@ def _remove_branches(main: re.Match[str], sizes: Sequence[int], tables: dict[int
 
 
 def c_literal(x: float) -> str:
-    """Return a number as C has it, exactly."""
+    """Return a number as a C literal, exactly."""
     if x != x:
         return "NAN"
     if x in (float("inf"), float("-inf")):

@@ -1,4 +1,4 @@
-"""What a compiled function takes: symbols in an order of its own, and numbers for them in many guises."""
+"""Inputs of a compiled function: the order of symbols, and conversion of values to a vector."""
 
 from __future__ import annotations
 
@@ -60,11 +60,11 @@ class Signature:
         Raises
         ------
         ShapeError
-            If it is no vector of n numbers.
+            If it is not a vector of n numbers.
         UnknownNameError
-            If a mapping lacks a symbol that has no value of its own, or has one that is none of the inputs.
+            If a mapping lacks a symbol without a value of its own, or has one that is not an input.
         InvalidValueError
-            If a mapping has NaN or what is not a number.
+            If a mapping contains NaN or values that are not numbers.
         """
         if isinstance(x, Mapping):
             return self._from_mapping(x)
@@ -78,7 +78,7 @@ class Signature:
         return np.ascontiguousarray(array) if array.flags.aligned else array.copy()
 
     def _from_mapping(self, values: Mapping[Any, Any]) -> npt.NDArray[np.float64]:
-        if isinstance(values, State):  # it describes a whole world, and may know more
+        if isinstance(values, State):  # which may have more symbols
             held = [(s, values.given(s)) for s in self.inputs]
             return self._complete([s.value if value is None else value for s, value in held])
         positions = self.positions
@@ -94,7 +94,7 @@ class Signature:
                 raise duplicate_value_error(self.names[position])
             given.add(position)
             vector[position] = self._number(position, value)
-        # Such mappings are written for this function, typing errors included.
+        # A mapping is written for this function, so unknown names are mistakes.
         if unknown:
             raise UnknownNameError(
                 f"Not among the inputs: {_listed(unknown)}. {suggest(unknown[0], self.names, 'input')}"
@@ -128,14 +128,14 @@ def make_signature(outputs: Sequence[Expression], inputs: Iterable[Symbol] | Non
     Parameters
     ----------
     outputs
-        What the function computes.
+        The expressions of the function.
     inputs
-        The symbols in the order wanted; those of the outputs in their canonical order if None.
+        The symbols in the order of the vector; those of the outputs in canonical order if None.
 
     Raises
     ------
     ExpressionError
-        If something else than symbols is among the inputs.
+        If an input is not a symbol.
     DuplicateNameError
         If a symbol occurs twice, or two have the same text name.
     UnknownNameError
@@ -163,12 +163,12 @@ def make_signature(outputs: Sequence[Expression], inputs: Iterable[Symbol] | Non
 
 
 def as_doubles(x: Any, wanted: str) -> npt.NDArray[np.float64]:
-    """Return what holds real numbers as an array of doubles, of any shape and strides.
+    """Return real numbers as an array of doubles, of any shape and strides.
 
     Raises
     ------
     ShapeError
-        If it does not; the message says what was ``wanted``.
+        For other values; the message says what was ``wanted``.
     """
     if isinstance(x, np.ma.MaskedArray):
         raise ShapeError(

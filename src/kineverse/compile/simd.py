@@ -1,13 +1,13 @@
 """C source of SIMD vector types and of elementary functions within 4 ulp.
 
-A vector ``V`` holds the same quantity of W configurations, as many as the widest register of this machine has
-room for. Rows of numbers are brought to that form and back by transposing W×W blocks. Everything is written
-for any W; the few instructions that the extension has no notation for are named once, here.
+A vector ``V`` contains the same quantity of W configurations, where W is the width of the machine's widest
+register. Rows of numbers are converted to that form and back by transposing W×W blocks. The code is generic
+in W; intrinsics are only used for instructions without a notation in the vector extension.
 
-Every function reduces its argument to a small interval and evaluates a polynomial there whose coefficients
-minimise the largest relative error (Remez' algorithm in 60 digits, then rounded; the error is given beside
-each, an ulp being 1.1e-16 to 2.2e-16). Lanes that the reduction is not made for (huge, tiny, infinite,
-outside of the domain) are given to the C library one by one, so they come out as it says. NaN goes through.
+Every function reduces its argument to a small interval and evaluates a minimax polynomial there (Remez'
+algorithm in 60 digits, then rounded; the error is given beside each, an ulp being 1.1e-16 to 2.2e-16). Lanes
+outside of the range of the reduction (huge, tiny, infinite, outside of the domain) are computed by the C
+library, one by one. NaN propagates.
 """
 
 TYPES = r"""
@@ -435,13 +435,13 @@ INLINE V sign_(V x) {
 }
 """
 
-# Functions that are evaluated lane by lane: seldom used, and as good as the C library then.
+# Functions that are seldom used, evaluated lane by lane by the C library.
 UNARY_BY_LANE = ("sinh", "cosh", "asinh", "acosh", "atanh", "erf", "log1p")
 BINARY_BY_LANE = ("pow", "fmod", "remainder", "hypot")
 
 
 def scalar_fallbacks() -> str:
-    """Return C of the functions that have no version for vectors."""
+    """Return the C of functions without a version for vectors, lane by lane."""
     lanes = "for (int i = 0; i < W; i++)"
     unary = f"static NOINLINE V {{0}}_(V x) {{{{ {lanes} x[i] = {{0}}(x[i]); return x; }}}}\n"
     binary = f"static NOINLINE V {{0}}_(V x, V y) {{{{ {lanes} x[i] = {{0}}(x[i], y[i]); return x; }}}}\n"

@@ -1,9 +1,9 @@
 """C compiler of this machine: detection, flags and identity.
 
-Compiled libraries are kept on disk, where another machine may find them (a home directory on a network) and
-where they outlive an update of the compiler. So everything that code made here depends on goes into
-:attr:`Toolchain.identity`. It is read off files rather than asked of the compiler, because it is needed
-whenever a function is compiled and starting a compiler takes longer than everything else.
+Compiled libraries are stored on disk, which other machines may share (a home directory on a network) and
+where they outlive an update of the compiler. So :attr:`Toolchain.identity` covers everything that generated
+code depends on. It is read from files, because it is needed whenever a function is compiled, and starting a
+compiler takes far longer.
 """
 
 from __future__ import annotations
@@ -22,11 +22,11 @@ from dataclasses import dataclass
 
 logger = logging.getLogger(__name__)
 
-# What makes C and interpreter agree to the last bit. No -ffast-math, which also deletes checks for NaN; no
-# contraction to fused operations; no values of functions computed by the compiler (-frounding-math), which
-# rounds them better than the C library.
+# Flags with which C and interpreter agree to the last bit. No -ffast-math, which also deletes checks for NaN;
+# no contraction to fused operations; no constant folding of functions by the compiler (-frounding-math),
+# which rounds them better than the C library.
 FLOATING_POINT_FLAGS = ("-march=native", "-ffp-contract=off", "-fno-math-errno", "-frounding-math")
-# Undefined names shall fail when a function is linked and not when it is called.
+# Undefined names fail when a library is linked and not when a function is called.
 NO_UNDEFINED_FLAGS = ("-Wl,-z,defs",) if sys.platform.startswith("linux") else ()
 
 _CPU_LINES = (
@@ -42,9 +42,9 @@ class Toolchain:
     Attributes
     ----------
     command
-        The absolute path of the compiler, and arguments it is always given.
+        The absolute path of the compiler, and its constant arguments.
     identity
-        A digest of compiler, processor and platform; libraries of different identities are not exchanged.
+        Digest of compiler, processor and platform; libraries of different identities are not exchanged.
     """
 
     command: tuple[str, ...]
@@ -56,19 +56,19 @@ class Toolchain:
         Parameters
         ----------
         flags
-            Beside those that every library is compiled with.
+            Flags in addition to those for every library.
         output
-            Where the library is written.
+            The path of the library.
         """
         always = ("-std=gnu11", "-fPIC", "-shared", "-fvisibility=hidden", "-w")
         return [*self.command, *FLOATING_POINT_FLAGS, *always, *flags, "-x", "c", "-", "-o", output, "-lm"]
 
     def version(self) -> str:
-        """Return the first line of what the compiler says about itself."""
+        """Return the first line of the compiler's version text."""
         return (self._ask("--version").splitlines() or ["unknown"])[0]
 
     def vector_unit(self) -> str:
-        """Return the widest vector instructions of doubles it uses: avx512, avx2, avx, sse2, neon or none."""
+        """Return the widest vector instructions for doubles: avx512, avx2, avx, sse2, neon or none."""
         macros = self._ask(*FLOATING_POINT_FLAGS, "-dM", "-E", "-x", "c", os.devnull)
         units = {
             "__AVX512DQ__": "avx512",
@@ -94,11 +94,26 @@ class Toolchain:
 
 
 def toolchain() -> Toolchain | None:
-    """Return the compiler that ``CC`` names, else ``cc``, ``gcc`` or ``clang``.
+    """Return the compiler named by ``CC``, else ``cc``, ``gcc`` or ``clang``.
 
     None if there is none, which is logged once.
     """
     return _find(os.environ.get("CC", ""), os.environ.get("PATH", os.defpath))
+
+
+def optimisation_level(instructions: int) -> str | None:
+    """Return the optimisation flag for a program of some size; None if it is too large for a compiler.
+
+    gcc 12 takes 0.2 ms an instruction at -O3, 0.12 ms at -O1 (7 % slower code) and 0.06 ms at -O0 (three
+    times slower, and four times faster than the interpreter).
+    """
+    if instructions <= 8_000:
+        return "-O3"
+    if instructions <= 60_000:
+        return "-O1"
+    if instructions <= 400_000:
+        return "-O0"
+    return None
 
 
 @functools.lru_cache(maxsize=16)
@@ -122,11 +137,10 @@ def _identity(command: tuple[str, ...]) -> str:
 
 
 def _cpu() -> str:
-    """Return what decides which instructions exist here."""
+    """Return the description of the processor that determines its instructions."""
     try:
         with open("/proc/cpuinfo") as file:
-            # The first processor is enough, and the kernel writes the text of the others only when it is
-            # read.
+            # One processor is enough, and the kernel generates the text of the others only when it is read.
             lines = file.read(8192).split("\n\n", 1)[0].splitlines()
     except OSError:
         return platform.processor()

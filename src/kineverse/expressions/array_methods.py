@@ -1,4 +1,4 @@
-"""The methods that arrays of numpy have and expressions have too."""
+"""Methods of numpy arrays that expressions have too."""
 
 from __future__ import annotations
 
@@ -30,12 +30,12 @@ class ArrayMethods:
         return result
 
     def squeeze(self, axis: Axis = None) -> Expression:
-        """Return the array without its axes of length 1, or without those that are given."""
+        """Return the array without its axes of length 1, or without the given ones."""
         result: Expression = np.squeeze(self, axis)
         return result
 
     def diagonal(self, offset: int = 0, axis1: int = 0, axis2: int = 1) -> Expression:
-        """Return the diagonal, or one beside it, along the last axis."""
+        """Return a diagonal along the last axis."""
         result: Expression = np.diagonal(self, offset, axis1, axis2)
         return result
 
@@ -50,7 +50,7 @@ class ArrayMethods:
         return result
 
     def copy(self) -> Expression:
-        """Return the expression itself, which never changes."""
+        """Return the expression itself, which is immutable."""
         result: Expression = np.copy(self)
         return result
 
@@ -70,7 +70,7 @@ class ArrayMethods:
         return self.copy()
 
     def item(self, *place: Any) -> Expression:
-        """Return one element as a scalar: the only one, or that at an index."""
+        """Return one element as a scalar: the only one, or the one at an index."""
         flat: Expression = np.ravel(self)
         if not place and flat.size != 1:
             raise ExpressionError(
@@ -87,7 +87,7 @@ class ArrayMethods:
         rows: Any = self
         return [row.tolist() for row in rows] if np.ndim(self) else self
 
-    # -- sums and their kin --------------------------------------------------------------------------------
+    # -- reductions ---------------------------------------------------------------------------------------
 
     def sum(self, axis: Axis = None, *, keepdims: bool = False) -> Expression:
         """Return the sum over all elements, or along one axis or several."""

@@ -1,6 +1,6 @@
 """Values of expressions at numbers, through CasADi's interpreter.
 
-For a few evaluations by hand; whoever evaluates often compiles (:mod:`kineverse.compile`).
+For single evaluations; for many, see :mod:`kineverse.compile`.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ def evaluate(
     if by_name and isinstance(values, Mapping):
         values = {**values, **by_name}
     vector = symbol_values(symbols, values, derived=True)
-    # Looking for common parts would take longer than computing them twice, once.
+    # Finding common subexpressions takes longer than computing them twice in one evaluation.
     column = dense_column(expression)
     inputs = ca.vertcat(*(s._sx for s in symbols)) if symbols else ca.SX(0, 1)
     result = np.array(ca.Function("e", [inputs], [column])(vector)).reshape(expression.shape)
@@ -53,18 +53,18 @@ def symbol_values(
 ) -> npt.NDArray[np.float64]:
     """Return the numbers of ``symbols`` in their order, from a mapping by symbol or by name.
 
-    A value by name is for the symbol of that name, whatever its role. Names that are not among the symbols
-    are an error, unless ``values`` is a :class:`~kineverse.State`, which describes a whole world. If
-    ``derived``, other symbols may be given as such: a derivative depends on fewer than its function.
+    A value by name is for the symbol of that name, of any role. Unknown names are an error, unless ``values``
+    is a :class:`~kineverse.State`, which may describe more than the symbols. If ``derived``, values may be
+    given by other symbols too: a derivative depends on fewer symbols than its function.
 
     Raises
     ------
     UnknownNameError
         For symbols without a value and values without a symbol.
     DuplicateNameError
-        If several of the symbols have the name that a value is given by, or a symbol has two values.
+        If a value is given by a name that several of the symbols have, or a symbol has two values.
     InvalidValueError
-        For NaN and whatever is not a number.
+        For NaN and for values that are not numbers.
     """
     from kineverse.state import State
 
@@ -80,7 +80,7 @@ def symbol_values(
         given[place] = value
         if place not in asked and not (derived and isinstance(key, Expression)):
             unknown.append(place)
-    # What depends on nothing is the same whatever the values: a Jacobian of a drawer, say.
+    # A constant has the same value at any values: the Jacobian of a drawer, for example.
     if unknown and not isinstance(values, State) and (names or not derived):
         more = " Values that know more than is asked for go into kv.State({...})." if derived else ""
         raise UnknownNameError(f"Unknown symbol {unknown[0]!r}. {suggest(unknown[0], names, 'symbol')}{more}")

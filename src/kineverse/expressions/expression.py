@@ -1,9 +1,8 @@
-"""The one type of layer 1: arrays of symbolic expressions that know their gradient.
+"""Arrays of symbolic expressions with augmented gradients.
 
-An :class:`Expression` behaves like a numpy array of fixed shape. CasADi's ``SX`` does the algebra inside.
-What CasADi cannot say, such as gradients that differ from the partial derivatives, lives in opaque nodes
-(:mod:`kineverse.expressions.node`) that stand in the ``SX`` graph as symbols of their own until the
-expression is lowered to numbers.
+An :class:`Expression` behaves like a numpy array of fixed shape and holds a CasADi ``SX``. Values that CasADi
+cannot represent, such as gradients that differ from the partial derivatives, are opaque nodes
+(:mod:`kineverse.expressions.node`): symbols of their own in the ``SX`` graph until the expression is lowered.
 """
 
 from __future__ import annotations
@@ -39,7 +38,7 @@ NO_NODES: frozenset[Node] = frozenset()
 # of freed elements, and a symbol is a name, of which there are finitely many.
 SYMBOLS: dict[int, Symbol] = {}
 
-# Nodes likewise, as long as someone holds them: expressions hold the nodes in their graphs.
+# Nodes likewise, but weakly: expressions hold the nodes in their graphs.
 NODES: WeakValueDictionary[int, Node] = WeakValueDictionary()
 
 
@@ -76,7 +75,7 @@ class Expression(ArrayMethods):
         self._key: bytes | None = None
         self._lowered: Any = None
 
-    # -- what it is ----------------------------------------------------------------------------------------
+    # -- properties ----------------------------------------------------------------------------------------
 
     @property
     def shape(self) -> ArrayShape:
@@ -109,7 +108,7 @@ class Expression(ArrayMethods):
 
     @property
     def is_constant(self) -> bool:
-        """Whether the value depends on no symbol and the gradient is empty."""
+        """True if the value depends on no symbol and the gradient is empty."""
         if not self._nodes:
             return bool(self._sx.is_constant())
         from .graph import leaves
@@ -263,7 +262,7 @@ class Expression(ArrayMethods):
     def __rmatmul__(self, other: ExpressionLike) -> Expression:
         return matmul(other, self)
 
-    # -- logic (kineverse.logic says what it means) --------------------------------------------------------
+    # -- logic (see kineverse.logic) -----------------------------------------------------------------------
 
     def __lt__(self, other: ExpressionLike) -> Expression:
         from kineverse.logic import less
@@ -320,7 +319,7 @@ class Expression(ArrayMethods):
         Parameters
         ----------
         heuristic
-            Whether logic and ``augment(..., heuristic=True)`` contribute their trends. ``False`` takes a
+            True if logic and ``augment(..., heuristic=True)`` contribute their trends. ``False`` takes a
             logic node as locally constant and such an augmentation as absent: only facts remain.
         """
         from .gradient import gradient
@@ -335,9 +334,8 @@ class Expression(ArrayMethods):
         Raises
         ------
         ExpressionError
-            If something else than symbols is given, or a parameter, which has no derivative; and for speeds
-            where positions are meant: if no column has an entry, while D(e) has the symbols themselves as
-            keys.
+            For arguments that are not symbols, for a parameter, which has no derivative, and for speeds in
+            place of positions: if no column has an entry, but D(e) has the symbols themselves as keys.
         """
         from .gradient import jacobian
 
@@ -354,13 +352,13 @@ class Expression(ArrayMethods):
         return partial(self, symbols)
 
     def augment(self, gradient: Mapping[Symbol, ExpressionLike], heuristic: bool = False) -> Expression:
-        """Return the same value whose gradient has these entries overridden or added, the others kept.
+        """Return the same value with some entries of the gradient overridden or added, the others kept.
 
         Parameters
         ----------
         gradient
-            From derivative symbols (order at least 1; they need not be derivatives of symbols in here, such
-            as the speeds of wheels) to expressions that fit this shape.
+            From derivative symbols (order at least 1, also of symbols that the expression does not contain,
+            such as the speeds of wheels) to expressions that fit this shape.
         heuristic
             Marks the entries as directions to try rather than rates (see :meth:`gradient`).
         """
@@ -391,15 +389,15 @@ class Expression(ArrayMethods):
         Parameters
         ----------
         values
-            A mapping from symbols or their names to numbers, or a :class:`~kineverse.State`. A state may know
-            more symbols than there are here, and other symbols may be given as such, as a derivative depends
-            on fewer than its function; names have to be those of symbols in here, if there are any.
-            Parameters that are not given have their own values.
+            A mapping from symbols or their names to numbers, or a :class:`~kineverse.State`. A state may have
+            values of more symbols than the expression contains, and so may a mapping by symbol, since a
+            derivative depends on fewer symbols than its function. Names have to be those of symbols of the
+            expression, if it has any. Parameters without a given value have their own.
 
         Raises
         ------
         UnknownNameError
-            Listing what is missing, or naming what is not in here, and similar names.
+            For missing values, listed, and for unknown names, with similar ones.
         """
         from .evaluation import evaluate
 
@@ -431,10 +429,10 @@ class Expression(ArrayMethods):
                 ) from None
         return format(float(self), spec)
 
-    if not TYPE_CHECKING:  # a type checker says so on its own
+    if not TYPE_CHECKING:  # a type checker reports unknown attributes itself
 
         def __getattr__(self, name):
-            if hasattr(type(self), name):  # a slot that is not filled yet, which some classes ask about
+            if hasattr(type(self), name):  # a slot without a value yet
                 raise AttributeError(name)
             raise unknown_attribute_error("An expression", name, dir(type(self)), EXPRESSION_SYNONYMS)
 
@@ -442,13 +440,13 @@ class Expression(ArrayMethods):
 
     @property
     def key(self) -> bytes:
-        """A digest of shape and structure, the same in every process."""
+        """Digest of shape and structure, the same in every process."""
         from .graph import structural_hash
 
         return structural_hash(notify_access(self))
 
     if TYPE_CHECKING:
-        # For checkers that report deprecated calls: nobody means to ask whether a symbol is a number.
+        # For type checkers that report deprecated calls: comparing a symbol with a number is a mistake.
         @overload
         def __eq__(self, other: Expression) -> bool: ...
         @overload
@@ -507,7 +505,7 @@ class Expression(ArrayMethods):
     def _repr_html_(self) -> str | None:
         from .printing import html
 
-        # What is short is a formula; of two representations a notebook would take this one.
+        # A notebook prefers HTML to LaTeX, so there is none for expressions that are short enough for LaTeX.
         return html(self) if self._repr_latex_() is None else None
 
     # -- numpy ---------------------------------------------------------------------------------------------
@@ -530,20 +528,20 @@ class Expression(ArrayMethods):
 
 
 def access_listener(expression: Expression) -> AccessListener | None:
-    """Return who wants to know how closely an expression is looked at; None but while code is traced."""
-    return next((node.watcher for node in expression._nodes if node.watcher is not None), None)
+    """Return the listener of an expression that stands for a traced read; None outside of tracing."""
+    return next((node.listener for node in expression._nodes if node.listener is not None), None)
 
 
 def notify_access(expression: Expression) -> Expression:
-    """Return an expression for those who decide by what it is, and let it be known that they do."""
-    watcher = access_listener(expression) if expression._nodes else None
-    return expression if watcher is None else watcher.settled(expression)
+    """Notify the listener that code inspects an expression, and return the expression with its content."""
+    listener = access_listener(expression) if expression._nodes else None
+    return expression if listener is None else listener.notify(expression)
 
 
 def from_casadi(sx: SX, shape: ArrayShape, nodes: frozenset[Node]) -> Expression:
     """Wrap an ``SX`` that only contains known symbols and the symbols of ``nodes``.
 
-    A scalar that is nothing but a symbol is that :class:`Symbol`, so ``v[0]`` can be used as a key.
+    A scalar that consists of one symbol is that :class:`Symbol`, so ``v[0]`` can be used as a key.
     """
     if not shape and sx.is_symbolic():
         symbol = SYMBOLS.get(sx.element_hash())
@@ -564,7 +562,7 @@ def as_expression(value: ExpressionLike) -> Expression:
     ShapeError
         For ragged sequences.
     ExpressionError
-        For anything that is not numeric.
+        For other values that are not numeric.
     """
     if isinstance(value, Expression):
         return value
@@ -600,7 +598,7 @@ def as_expression(value: ExpressionLike) -> Expression:
 
 
 def _refuse(value: object) -> NoReturn:
-    """Refuse arrays that mean more than their numbers say."""
+    """Raise the error for array types with their own semantics: masked arrays and matrices."""
     if isinstance(value, np.ma.MaskedArray):
         raise ExpressionError(
             "A masked array has elements without a value, which an expression cannot have. Write "
@@ -656,7 +654,7 @@ def array(values: Any) -> Expression:
 
 
 _MOST_DIMENSIONS = 32
-"""Those that every version of numpy has."""
+"""The limit of the oldest supported version of numpy."""
 
 
 def _flatten(values: Any, flat: list[Expression], depth: int = 0) -> ArrayShape | None:
@@ -678,7 +676,7 @@ def _flatten(values: Any, flat: list[Expression], depth: int = 0) -> ArrayShape 
 
 def union_nodes(expressions: Sequence[Expression]) -> frozenset[Node]:
     """Return the nodes of several expressions together."""
-    # Most of them share one and the same set.
+    # Expressions of one model mostly share the same set.
     sets = {id(e._nodes): e._nodes for e in expressions if e._nodes}
     if len(sets) < 2:
         return next(iter(sets.values()), NO_NODES)

@@ -1,9 +1,7 @@
 """Elementary functions and rounding, elementwise, with numpy's names.
 
-What has a kink is a node of :mod:`kineverse.expressions.nonsmooth`.
-
-All of these are steps, so their gradients are 0, but for that of the remainder,
-D(a % b) = D(a) - (a // b)·D(b).
+Functions with a kink are nodes of :mod:`kineverse.expressions.nonsmooth`. Rounding functions are steps: their
+gradient is 0, except that of the remainder, D(a % b) = D(a) - (a // b)·D(b).
 """
 
 from __future__ import annotations
@@ -11,11 +9,9 @@ from __future__ import annotations
 import math
 
 import casadi as ca
-import numpy as np
 
 from kineverse.errors import ShapeError
 
-from . import layout
 from .expression import (
     Expression,
     ExpressionLike,
@@ -24,7 +20,6 @@ from .expression import (
     binary,
     broadcast,
     from_casadi,
-    matmul,
     unary,
 )
 from .nonsmooth import Extremum as Extremum
@@ -176,11 +171,11 @@ def copysign(x: ExpressionLike, y: ExpressionLike) -> Expression:
 def where(condition: ExpressionLike, if_true: ExpressionLike, if_false: ExpressionLike) -> Expression:
     """Select elementwise: ``if_true`` where the condition is at least 0.5, else ``if_false``.
 
-    A selection, not a blend: NaN in the branch that is not taken stays there, in the gradient as well. The
-    gradient carries no trend of the condition.
+    A selection, not a blend: NaN in the branch that is not taken does not reach the result or its gradient.
+    The gradient carries no trend of the condition.
     """
     c, a, b = broadcast(as_expression(condition), as_expression(if_true), as_expression(if_false))
-    return Select.of((c, a, b), a.shape)
+    return Select.from_arguments((c, a, b), a.shape)
 
 
 def minimum(a: ExpressionLike, b: ExpressionLike) -> Expression:
@@ -189,7 +184,7 @@ def minimum(a: ExpressionLike, b: ExpressionLike) -> Expression:
     NaN if one of them is NaN, and so is the gradient then; ``np.fmin`` returns the other one.
     """
     x, y = broadcast(as_expression(a), as_expression(b))
-    return Extremum.of((x, y), x.shape, ("min",))
+    return Extremum.from_arguments((x, y), x.shape, ("min",))
 
 
 def maximum(a: ExpressionLike, b: ExpressionLike) -> Expression:
@@ -198,17 +193,17 @@ def maximum(a: ExpressionLike, b: ExpressionLike) -> Expression:
     NaN if one of them is NaN, and so is the gradient then; ``np.fmax`` returns the other one.
     """
     x, y = broadcast(as_expression(a), as_expression(b))
-    return Extremum.of((x, y), x.shape, ("max",))
+    return Extremum.from_arguments((x, y), x.shape, ("max",))
 
 
 def fmin(a: ExpressionLike, b: ExpressionLike) -> Expression:
-    """Return the smaller, elementwise, and of a number and NaN the number."""
+    """Return the smaller, elementwise; of a number and NaN, the number."""
     x, y = broadcast(as_expression(a), as_expression(b))
     return where(_is_number(x), where(_is_number(y), minimum(x, y), x), y)
 
 
 def fmax(a: ExpressionLike, b: ExpressionLike) -> Expression:
-    """Return the larger, elementwise, and of a number and NaN the number."""
+    """Return the larger, elementwise; of a number and NaN, the number."""
     x, y = broadcast(as_expression(a), as_expression(b))
     return where(_is_number(x), where(_is_number(y), maximum(x, y), x), y)
 
@@ -231,7 +226,7 @@ def norm(x: ExpressionLike) -> Expression:
     vector = as_expression(x).ravel()
     if vector.size == 0:
         raise ShapeError("The norm of an empty array is not defined here.")
-    return Norm.of((vector,), ())
+    return Norm.from_arguments((vector,), ())
 
 
 def hypot(a: ExpressionLike, b: ExpressionLike) -> Expression:
@@ -243,99 +238,17 @@ def hypot(a: ExpressionLike, b: ExpressionLike) -> Expression:
     return array([norm(array([first, second])) for first, second in pairs]).reshape(x.shape)
 
 
-def sum_along(x: ExpressionLike, axis: int | tuple[int, ...] | None = None) -> Expression:
-    """Return the sum over all elements, or along one axis or several."""
-    rows, rest = axis_first(x, axis)
-    return from_casadi(ca.sum1(rows._sx).T, (rows.shape[1],), rows._nodes).reshape(rest)
-
-
-def product_along(x: ExpressionLike, axis: int | tuple[int, ...] | None = None) -> Expression:
-    """Return the product of all elements, or along one axis or several; 1 of none."""
-    rows, rest = axis_first(x, axis)
-    result = as_expression(np.ones(rows.shape[1]))
-    for row in rows:
-        result = result * row
-    return result.reshape(rest)
-
-
-def min_along(x: ExpressionLike, axis: int | tuple[int, ...] | None = None) -> Expression:
-    """Return the smallest of all elements, or along one axis or several.
-
-    The gradient is the mean of those of all the elements that are the smallest; see :func:`minimum`.
-    """
-    return _extremum_along(x, axis, "min")
-
-
-def max_along(x: ExpressionLike, axis: int | tuple[int, ...] | None = None) -> Expression:
-    """Return the largest of all elements, or along one axis or several.
-
-    The gradient is the mean of those of all the elements that are the largest; see :func:`maximum`.
-    """
-    return _extremum_along(x, axis, "max")
-
-
-def _extremum_along(x: ExpressionLike, axis: int | tuple[int, ...] | None, which: str) -> Expression:
-    rows, rest = axis_first(x, axis)
-    if not rows.shape[0]:
-        raise ShapeError("Nothing has no smallest or largest element.")
-    columns = (tuple(column) for column in rows.T)
-    return array([c[0] if len(c) == 1 else Extremum.of(c, (), (which,)) for c in columns]).reshape(rest)
-
-
-def axis_first(x: ExpressionLike, axis: int | tuple[int, ...] | None) -> tuple[Expression, tuple[int, ...]]:
-    """Return a matrix with the wanted axes as its rows and all others as its columns; the others' shape."""
-    operand = as_expression(x)
-    axes = tuple(range(operand.ndim)) if axis is None else axis if isinstance(axis, tuple) else (axis,)
-    try:
-        index = np.moveaxis(layout.indices(operand.shape), axes, range(len(axes)))
-    except (ValueError, TypeError):
-        raise ShapeError(f"Axis {axis} does not fit an array of shape {operand.shape}.") from None
-    along, rest = index.shape[: len(axes)], index.shape[len(axes) :]
-    return operand._rearranged(index.reshape(math.prod(along), math.prod(rest))), rest
-
-
-def matrix_inverse(matrix: ExpressionLike) -> Expression:
-    """Return the inverse of a square matrix, ``D(A⁻¹) = -A⁻¹ D(A) A⁻¹``.
-
-    For homogeneous transforms use :func:`kineverse.spatial.inverse`, which is far smaller.
-    """
-    a = as_expression(matrix)
-    if a.ndim != 2 or a.shape[0] != a.shape[1]:
-        raise ShapeError(f"Only a square matrix has an inverse, not one of shape {a.shape}.")
-    return from_casadi(ca.inv(a._sx), a.shape, a._nodes)
-
-
-def determinant(matrix: ExpressionLike) -> Expression:
-    """Return the determinant of a square matrix, a scalar."""
-    a = as_expression(matrix)
-    if a.ndim != 2 or a.shape[0] != a.shape[1]:
-        raise ShapeError(f"Only a square matrix has a determinant, not one of shape {a.shape}.")
-    n = a.shape[0]
-    if not n:
-        return as_expression(1.0)
-    if n < 5:
-        return from_casadi(ca.det(a._sx), (), a._nodes)
-    # Minors grow with n!, so larger ones by the characteristic polynomial (Faddeev-LeVerrier).
-    identity = as_expression(np.eye(n))
-    power, coefficient = identity, as_expression(1.0)
-    for k in range(1, n + 1):
-        product = matmul(a, power)
-        coefficient = sum_along(product[np.arange(n), np.arange(n)]) / -k
-        power = product + coefficient * identity
-    return coefficient if n % 2 == 0 else -coefficient
-
-
 def floor_divide(a: ExpressionLike, b: ExpressionLike) -> Expression:
-    """Return the largest whole number not greater than the quotient, elementwise.
+    """Return the largest integer not greater than the quotient, elementwise.
 
-    As numpy and Python have it: of the true quotient, so that ``1.0 // 0.1`` is 9, since 0.1 is a little more
-    than a tenth. By 0 it is the quotient: infinite, or NaN.
+    As in numpy and Python, the exact quotient of the two floats is meant: ``1.0 // 0.1`` is 9, since the
+    float 0.1 is slightly larger than a tenth. For a divisor of 0 the quotient is returned: ±infinity or NaN.
     """
     _, numerator, denominator = _with_positive_divisor(a, b)
     rest = binary(ca.OP_FMOD, numerator, denominator)
     quotient = (numerator - rest) / denominator - binary(ca.OP_LT, rest, 0.0)
     whole = floor(quotient)
-    # What should be whole may be off by its rounding.
+    # Rounding may have left a quotient that should be whole slightly below it.
     whole = whole + binary(ca.OP_LT, 0.5, quotient - whole)
     if not _nonzero_divisor(denominator):
         by_zero = binary(ca.OP_EQ, denominator, 0.0)
@@ -353,13 +266,8 @@ def remainder(a: ExpressionLike, b: ExpressionLike) -> Expression:
     return sense * (rest + binary(ca.OP_IF_ELSE_ZERO, binary(ca.OP_LT, rest, 0.0), denominator))
 
 
-def fmod(a: ExpressionLike, b: ExpressionLike) -> Expression:
-    """Return the remainder of the division rounded towards 0, elementwise: it has the sign of a."""
-    return binary(ca.OP_FMOD, a, b)
-
-
 def _with_positive_divisor(a: ExpressionLike, b: ExpressionLike) -> tuple[Expression, Expression, Expression]:
-    """Return the sign of b, and both operands times it: a divisor that is not negative."""
+    """Return the sign of b, and both operands times that sign."""
     divisor = as_expression(b)
     sense = copysign(1.0, divisor)
     return sense, sense * as_expression(a), sense * divisor
@@ -370,7 +278,7 @@ def _nonzero_divisor(x: Expression) -> bool:
 
 
 def rint(x: ExpressionLike) -> Expression:
-    """Return the nearest whole number, elementwise; of two, the even one."""
+    """Return the nearest integer, elementwise; of two equally near, the even one."""
     operand = as_expression(x)
     below = floor(operand)
     above_half = operand - below

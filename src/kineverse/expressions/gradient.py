@@ -1,8 +1,8 @@
 """Augmented gradients: the chain rule over symbols and opaque nodes (2022 paper, Eqs. 5-8).
 
 For an expression e with leaves l (symbols and elements of nodes), ``D(e)[w] = Σ_l ∂e/∂l · D(l)[w]``, where a
-symbol a has ``D(a) = {ȧ: 1}``, a parameter ``{}`` and a node says itself what its D is. CasADi computes the
-partial derivatives, all keys at once.
+symbol a has ``D(a) = {ȧ: 1}``, a parameter ``{}`` and a node its own D. CasADi computes the partial
+derivatives, all keys at once.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 class Gradient(Mapping["Symbol", Expression]):
     """D(e): an immutable mapping from derivative symbols to expressions, in the order of the symbols.
 
-    Entries are asked for by symbol or by its name, ``door:velocity``.
+    Keys are symbols or their names, such as ``door:velocity``.
     """
 
     __slots__ = ("_entries",)
@@ -57,10 +57,10 @@ class Gradient(Mapping["Symbol", Expression]):
     def __len__(self) -> int:
         return len(self._entries)
 
-    # A dictionary's own are a multiple faster than those of Mapping.
+    # The methods of dict are several times faster than those of Mapping.
 
     def get(self, key: object, default: Any = None) -> Any:
-        """Return the entry of a speed, by symbol or name, else what is given instead."""
+        """Return the entry of a speed, by symbol or name, else the default."""
         if isinstance(key, str):
             return next((entry for speed, entry in self._entries.items() if str(speed) == key), default)
         return self._entries.get(key, default)  # type: ignore[call-overload]
@@ -106,7 +106,7 @@ def _gradient(expression: Expression, heuristic: bool) -> dict[Symbol, Expressio
     if len(symbols) == 1 and symbols[0] is expression:
         return {symbols[0].derivative(): as_expression(1.0)} if symbols[0].has_derivative else {}
     # Only leaves with a gradient take part: the partial derivative by a parameter in an exponent is NaN for a
-    # negative base, and nobody asked for it.
+    # negative base.
     moving = [s for s in symbols if s.has_derivative]
     for node in topological_order(
         inner, lambda n: n.differentiated(heuristic), lambda n: heuristic in n._gradients
@@ -120,7 +120,7 @@ def _gradient(expression: Expression, heuristic: bool) -> dict[Symbol, Expressio
     keys = sorted(
         {s.derivative() for s in moving}.union(*(entries for _, entries in opaque)), key=lambda s: s.sort_key
     )
-    # The order of sums, and so the last bit, follows from what is shared: equal expressions share the same.
+    # Shared parts determine the order of sums, and so the last bit: equal expressions share equal parts.
     elements = ca.cse(layout.column(expression._sx, expression._shape))
     if not opaque:
         by_key = ca.jacobian(elements, ca.vertcat(*(s._sx for s in moving)))
@@ -172,9 +172,9 @@ def jacobian(expression: Expression, symbols: Sequence[Symbol], heuristic: bool 
                 f"Parameter '{symbol}' has no derivative to read a column from; "
                 "use partial([...]) for ∂/∂parameter."
             )
-    watcher = access_listener(expression)
-    if watcher is not None:
-        anew: Expression = watcher.ask("jacobian" if heuristic else "facts", expression, array(list(wanted)))
+    listener = access_listener(expression)
+    if listener is not None:
+        anew: Expression = listener.ask("jacobian" if heuristic else "facts", expression, array(list(wanted)))
         return anew
     entries = gradient(expression, heuristic)
     columns = [entries.get(symbol.derivative()) for symbol in wanted]
@@ -184,7 +184,7 @@ def jacobian(expression: Expression, symbols: Sequence[Symbol], heuristic: bool 
 
 
 def _refuse_speeds(speeds: Sequence[Symbol]) -> None:
-    """Refuse columns of zeros for speeds by which the expression does move."""
+    """Raise for speeds in place of positions, for which all columns would be zero."""
     if speeds:
         raise ExpressionError(
             f"'{speeds[0]}' is a speed, and the columns of a jacobian are named by positions: that of "
@@ -199,11 +199,11 @@ def partial(expression: Expression, symbols: Sequence[Symbol]) -> Expression:
     from kineverse.symbols import check_symbols
 
     wanted = check_symbols(symbols)
-    watcher = access_listener(expression)
-    if watcher is not None:
-        anew: Expression = watcher.ask("partial", expression, array(list(wanted)))
+    listener = access_listener(expression)
+    if listener is not None:
+        anew: Expression = listener.ask("partial", expression, array(list(wanted)))
         return anew
-    # Parameters do not move, so D has nothing to say about them; symbols that do move take their places.
+    # D has no entries for parameters; dummy symbols with a derivative take their places.
     moving = dummy_symbols(wanted)
     entries = gradient(rename_symbols(_without_augmentation(expression), moving), False)
     back = {stand_in: s for s, stand_in in moving.items()}
@@ -222,7 +222,11 @@ def _without_augmentation(expression: Expression) -> Expression:
 
     for node in topological_order(leaves(expression)[1], parts, plain.__contains__):
         replaced = tuple(replace_nodes(part, plain) for part in parts(node))
-        plain[node] = type(node).of(replaced, node.shape, node.options) if node.own_partials else replaced[0]
+        plain[node] = (
+            type(node).from_arguments(replaced, node.shape, node.options)
+            if node.own_partials
+            else replaced[0]
+        )
     return replace_nodes(expression, plain)
 
 
@@ -236,15 +240,15 @@ def _stack_columns(columns: list[Expression | None], shape: layout.ArrayShape) -
 
 
 def _last_axis(matrix: layout.SX, shape: layout.ArrayShape) -> layout.SX:
-    # rows are the elements of the expression in C order, so this already is the layout of the longer shape;
-    # only a vector of columns, which is stored upright, has to be turned.
+    # The rows are the elements of the expression in C order, which is the layout of the longer shape, except
+    # for a vector, which is stored as a column.
     return matrix.T if len(shape) == 1 else matrix
 
 
 def total_derivative(expression: Expression, heuristic: bool = False) -> Expression:
     """Return ``ė = Σ D(e)[v]·v``, of the expression's shape: its rate as a function of the speeds."""
     if not expression._shape and not expression._nodes and expression._sx.is_symbolic():
-        (symbol,) = expression.symbols  # by far the most frequent case: a limit on a joint's speed
+        (symbol,) = expression.symbols  # the most frequent case: a limit on a joint's speed
         return (
             symbol.derivative()
             if symbol.has_derivative

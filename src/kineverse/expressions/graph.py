@@ -1,7 +1,7 @@
 """Traversal of expression graphs: leaves, lowering to CasADi, structural hash, pickling.
 
-Both use CasADi's own serialisation, which is exact to the last bit. It is for pickling between like versions
-only, documents have their own form.
+Hashes and pickles use CasADi's serialisation, which is exact to the last bit. Pickles are for equal versions
+of CasADi only; documents have a format of their own.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 
 def leaves(expression: Expression) -> tuple[tuple[Symbol, ...], tuple[Node, ...]]:
-    """Return the symbols and the nodes that occur in the graph itself, each in canonical order."""
+    """Return the symbols and the nodes of the graph, those inside of nodes excluded, in canonical order."""
     if expression._leaves is None:
         if expression._sx.is_constant():
             expression._leaves = (), ()
@@ -43,7 +43,7 @@ def leaves(expression: Expression) -> tuple[tuple[Symbol, ...], tuple[Node, ...]
 
 
 def free_symbols(expression: Expression) -> tuple[Symbol, ...]:
-    """Return the symbols that the value depends on, looking into nodes; sorted."""
+    """Return the symbols that the value depends on, those inside of nodes included, sorted."""
     symbols, nodes = leaves(expression)
     if not nodes:
         return symbols
@@ -52,7 +52,7 @@ def free_symbols(expression: Expression) -> tuple[Symbol, ...]:
 
 
 def node_symbols(node: Node) -> frozenset[Symbol]:
-    """Return the symbols that the value of a node depends on, looking into nodes."""
+    """Return the symbols that the value of a node depends on, those inside of other nodes included."""
     found: set[Symbol] = set()
     for inner in topological_order((node,), lambda n: (n.value,), lambda n: n._symbols is not None):
         found.update(leaves(inner.value)[0])
@@ -62,7 +62,7 @@ def node_symbols(node: Node) -> frozenset[Symbol]:
 
 
 def gradient_keys(expression: Expression, heuristic: bool = True) -> frozenset[Symbol]:
-    """Return the keys that D(e) can have, without differentiating anything."""
+    """Return the keys that D(e) can have, without differentiation."""
     symbols, nodes = leaves(expression)
     keys = {s.derivative() for s in symbols if s.has_derivative}
     for node in topological_order(
@@ -77,10 +77,10 @@ def topological_order(
     parts: Callable[[Node], Iterable[Expression]],
     done: Callable[[Node], bool],
 ) -> Iterator[Node]:
-    """Yield the nodes, and before each of them those in its ``parts``, none twice and none that is ``done``.
+    """Yield the nodes, each after the nodes in its ``parts``, none twice and none that is ``done``.
 
-    What is defined by recursion over nodes is computed along this order instead: a minimum over a thousand
-    distances is a thousand nodes deep, and a node that occurs twice is not worth twice the work.
+    It replaces recursion over nodes: a minimum over a thousand distances is a thousand nodes deep, and a node
+    that occurs twice is visited once.
     """
     seen: set[Node] = set()
     stack: list[tuple[Node, bool]] = [(node, False) for node in nodes]
@@ -138,7 +138,7 @@ def _offsets(columns: list[SX]) -> list[int]:
     return offsets
 
 
-_STOREY = 16
+_PICKLING_DEPTH = 16
 
 
 def structural_hash(expression: Expression) -> bytes:
@@ -154,25 +154,25 @@ def structural_hash(expression: Expression) -> bytes:
         if not sx.is_dense():
             sx = ca.densify(sx)
         if not sx.is_constant() and not sx.is_symbolic():
-            sx = ca.cse(sx)  # whether equal parts are shared is no difference
+            sx = ca.cse(sx)  # sharing of equal parts makes no difference
         digest.update(sx.serialize().encode())
         expression._key = digest.digest()
     return expression._key
 
 
 def pack(expression: Expression) -> tuple[Any, ...]:
-    """Return what :func:`unpack` needs, all of it picklable."""
+    """Return the picklable arguments of :func:`unpack`."""
     symbols, nodes = leaves(expression)
     function = _casadi_function(expression._sx, [*(s._sx for s in symbols), *(n.sx for n in nodes)])
     return _pickling_order(nodes), symbols, nodes, expression._shape, function.serialize()
 
 
 def _pickling_order(nodes: tuple[Node, ...]) -> tuple[Node, ...]:
-    """Return nodes on the way down, lowest first: pickled in this order, none of them is deep any more."""
-    if all(node.depth <= _STOREY for node in nodes):
+    """Return every sixteenth level of inner nodes, lowest first, so that pickling does not recurse deeper."""
+    if all(node.depth <= _PICKLING_DEPTH for node in nodes):
         return ()
     below = topological_order(nodes, lambda n: n.arguments, lambda n: False)
-    return tuple(node for node in below if node.depth % _STOREY == 0)
+    return tuple(node for node in below if node.depth % _PICKLING_DEPTH == 0)
 
 
 def unpack(

@@ -1,15 +1,15 @@
 """Implicit functions: unknowns x(u) that make a residual r(x, u) zero.
 
-An :class:`Implicit` node is worth what a few Newton steps lead to from a *seed*, which is a function of the
-inputs: so the value, and which of several solutions it is, follows from the inputs alone and never from
-earlier calls. Derivatives come from the implicit function theorem and not from the steps,
+The value of an :class:`Implicit` node is computed by a fixed number of Newton steps from a *seed*, which is a
+function of the inputs. So the value, and the selected one of several solutions, depends on the inputs alone
+and not on earlier calls. Derivatives follow from the implicit function theorem,
 
     ∂x/∂u = -(∂r/∂x)⁻¹ ∂r/∂u,
 
-and again from it where these are differentiated, so they are exact to every order. Where the steps do not
-arrive, because there is no solution or it is singular, the value is NaN inside the graph; whoever evaluates
-asks :func:`explain_no_solution` and raises. So it is outside of the *domain*, the inputs for which the seed is known to
-lead to its branch: another solution has a residual of zero as well.
+and not from the steps, so they are exact to every order. The value is NaN where the steps do not converge,
+because there is no solution or it is singular; evaluation then raises the error of
+:func:`explain_no_solution`. It is NaN as well outside of the *domain*, the inputs for which the seed is known
+to lead to its branch: another solution has a residual of zero too.
 """
 
 from __future__ import annotations
@@ -38,38 +38,37 @@ if TYPE_CHECKING:
     from kineverse.symbols import Symbol
 
 RESIDUAL_TOLERANCE = 1e-10
-"""What a residual may be, in its own unit [m] or [rad]."""
+"""The largest norm of a residual at a solution, in its own unit [m] or [rad]."""
 
 
 @dataclass(frozen=True, eq=False)
 class ImplicitFunction:
-    """What defines unknowns as a function of inputs.
+    """A definition of unknowns as a function of inputs.
 
     Attributes
     ----------
     name
-        What errors call it.
+        The name in error messages.
     unknowns, inputs
-        The symbols x, of shape (n,), and u, of shape (k,), that the expressions below are about. They are the
-        function's own: where it is used, other expressions take the places of u.
+        The symbols x, of shape (n,), and u, of shape (k,), of the expressions below. They are the function's
+        own: other expressions take the place of u where it is applied.
     residual
         r(x, u), of shape (m,) with m at least n; all of it is zero at a solution.
     rows
-        Which n rows of the residual Newton's method uses; a closed loop has more equations than unknowns.
+        The n rows of the residual for Newton's method; a closed loop has more equations than unknowns.
     seed
         The first guess of x, of shape (n,), a function of u alone.
     steps
-        How many Newton steps.
+        The number of Newton steps.
     domain
-        Pairs (lower, upper), one for each input, outside of which there is no value; empty for none. What is
-        infinite at all ends becomes empty.
+        Pairs (lower, upper), one for each input, outside of which there is no value; empty if unbounded.
 
     Raises
     ------
     ShapeError
         If the parts do not fit together.
     InvalidValueError
-        If residual or seed are about other symbols, steps are negative, or the domain is empty in between.
+        If residual or seed contain other symbols, steps are negative, or the domain is empty.
     """
 
     name: str
@@ -117,37 +116,37 @@ class ImplicitFunction:
 
     @cached_property
     def key(self) -> bytes:
-        """A digest of the content, the same in every process."""
+        """Digest of the content, the same in every process."""
         digest = hashlib.blake2b(digest_size=16)
         symbols = [[s.sort_key for s in group] for group in (self.unknowns, self.inputs)]
         digest.update(repr((self.name, symbols, self.rows, self.steps)).encode())
         digest.update(self.residual.key + self.seed.key)
-        if self.domain:  # without one, the digest is what it was before there were any
+        if self.domain:  # functions without a domain keep the digest of versions that had none
             digest.update(repr(self.domain).encode())
         return digest.digest()
 
     @cached_property
-    def chosen(self) -> Expression:
-        """The rows of the residual that are solved, shape (n,)."""
+    def equations(self) -> Expression:
+        """The rows of the residual for Newton's method, shape (n,)."""
         return self.residual[np.array(self.rows)]
 
     @cached_property
     def by_unknowns(self) -> Expression:
-        """∂r/∂x of the chosen rows, n×n."""
-        return self.chosen.partial(self.unknowns)
+        """∂r/∂x of the equations, n×n."""
+        return self.equations.partial(self.unknowns)
 
     @cached_property
     def by_inputs(self) -> Expression:
-        """∂r/∂u of the chosen rows, n×k."""
-        return self.chosen.partial(self.inputs)
+        """∂r/∂u of the equations, n×k."""
+        return self.equations.partial(self.inputs)
 
-    def of(self, arguments: Sequence[Expression]) -> Expression:
-        """Return the unknowns at other inputs than the function's own, shape (n,).
+    def apply(self, arguments: Sequence[Expression]) -> Expression:
+        """Return the unknowns, shape (n,), at other inputs than the function's own.
 
         Raises
         ------
         ShapeError
-            If these are not as many scalars as there are inputs.
+            If the arguments are not one scalar for each input.
         """
         if len(arguments) != len(self.inputs):
             raise ShapeError(
@@ -156,10 +155,10 @@ class ImplicitFunction:
         shapes = [a.shape for a in arguments if a.shape]
         if shapes:
             raise ShapeError(f"'{self.name}' is a function of scalars, not of arrays of shape {shapes[0]}.")
-        return Implicit.of(tuple(arguments), (len(self.unknowns),), (self,))
+        return Implicit.from_arguments(tuple(arguments), (len(self.unknowns),), (self,))
 
-    def at(self, part: Expression, x: Sequence[Expression], u: Sequence[Expression]) -> Expression:
-        """Return a part of the definition with unknowns and inputs put in."""
+    def substitute(self, part: Expression, x: Sequence[Expression], u: Sequence[Expression]) -> Expression:
+        """Return a part of the definition at other unknowns and inputs."""
         return apply_substitution(part, dict(zip((*self.unknowns, *self.inputs), (*x, *u), strict=True)))
 
     def __reduce__(self) -> Any:
@@ -178,13 +177,13 @@ class Implicit(Node):
 
     @property
     def function(self) -> ImplicitFunction:
-        """What defines it."""
+        """The definition of the function."""
         function: ImplicitFunction = self.options[0]
         return function
 
     @property
     def parts(self) -> tuple[Expression, ...]:
-        """The arguments, and what defines the function."""
+        """The arguments, residual and seed."""
         return (*self.arguments, self.function.residual, self.function.seed)
 
     @property
@@ -199,12 +198,12 @@ class Implicit(Node):
     def _value(self) -> Expression:
         f, u = self.function, self.arguments
         n = len(f.unknowns)
-        x = f.at(f.seed, f.unknowns, u)
+        x = f.substitute(f.seed, f.unknowns, u)
         for _ in range(f.steps):
             point = [x[i] for i in range(n)]
-            matrix, residual = f.at(f.by_unknowns, point, u), f.at(f.chosen, point, u)
+            matrix, residual = f.substitute(f.by_unknowns, point, u), f.substitute(f.equations, point, u)
             x = x - _solve(matrix, residual)
-        error = f.at(f.residual, [x[i] for i in range(n)], u)
+        error = f.substitute(f.residual, [x[i] for i in range(n)], u)
         fits = ca.sumsqr(error._sx) <= RESIDUAL_TOLERANCE**2
         for argument, (lower, upper) in zip(u, f.domain, strict=False):
             if lower > -math.inf:
@@ -221,7 +220,7 @@ class Implicit(Node):
             return {}
         itself = from_casadi(self.sx, self.shape, frozenset((self,)))
         x = [itself[i] for i in range(len(f.unknowns))]
-        matrix, by_inputs = f.at(f.by_unknowns, x, u), f.at(f.by_inputs, x, u)
+        matrix, by_inputs = f.substitute(f.by_unknowns, x, u), f.substitute(f.by_inputs, x, u)
         columns = []
         for key in keys:
             entries = [g.get(key) for g in gradients]
@@ -244,10 +243,10 @@ def _solve(matrix: Expression, right: Expression) -> Expression:
 
 
 def clamp_to_domains(expression: Expression) -> Expression:
-    """Hold what implicit functions are about at the edge of their domains, in all of an expression.
+    """Replace the inputs of all implicit functions in an expression by their values clamped to the domains.
 
-    For whoever leads back into the domain and so has to look at what is outside of it: there, the expression
-    is worth what it is at the edge.
+    Outside of a domain the expression then has the value at its boundary, so that a controller can evaluate
+    it there and lead back.
     """
     bounded = [n for n in implicit_nodes([expression]) if n.function.domain] if expression._nodes else []
     if not bounded:
@@ -265,7 +264,7 @@ def clamp_to_domains(expression: Expression) -> Expression:
 
 
 def _symbol_of(argument: Expression) -> Symbol | None:
-    """Return the symbol that an argument is worth; None if it is something else."""
+    """Return the symbol that an argument is equal to; None if there is none."""
     symbols = argument.symbols
     if len(symbols) == 1 and ca.is_equal(expand_nodes(argument), symbols[0]._sx):
         return symbols[0]
@@ -273,7 +272,7 @@ def _symbol_of(argument: Expression) -> Symbol | None:
 
 
 def implicit_nodes(expressions: Sequence[Expression]) -> tuple[Implicit, ...]:
-    """Return the implicit functions inside of values, those first that others need."""
+    """Return the implicit functions in the values of expressions, inner ones first."""
     found = [
         node
         for node in topological_order(
@@ -287,19 +286,19 @@ def implicit_nodes(expressions: Sequence[Expression]) -> tuple[Implicit, ...]:
 def explain_no_solution(
     nodes: Sequence[Implicit], symbols: Sequence[Symbol], numbers: npt.NDArray[np.float64]
 ) -> NoSolutionError | None:
-    """Return why values are NaN: the first function that has no solution here, None if all have one."""
+    """Return the error of the first implicit function without a solution at given numbers, if any."""
     if not nodes:
         return None
     vector = ca.vertcat(*(s._sx for s in symbols)) if symbols else ca.SX(0, 1)
     for node in nodes:
         arguments = [ca.densify(expand_nodes(a)) for a in node.arguments]
         outputs = [ca.densify(expand_nodes(node.value)), ca.vertcat(*arguments)]
-        # What cancels in the expression has no value here, and any will do.
+        # Symbols that cancel in the expression have no given value; any value will do.
         given = {s.element_hash() for s in ca.symvar(vector)}
         others = [s for s in ca.symvar(ca.vertcat(*outputs)) if s.element_hash() not in given]
         found = ca.Function("at", [vector, ca.vertcat(*others)], outputs)
         value, inputs = (np.array(part).ravel() for part in found(numbers, 0))
-        # What was asked for at NaN owes no answer; if another function is to blame for it, that came first.
+        # At NaN inputs the cause is another function, which is earlier in the order.
         if np.isnan(value).any() and not np.isnan(inputs).any():
             names = node.function.inputs
             for symbol, x, (lower, upper) in zip(names, inputs, node.function.domain, strict=False):

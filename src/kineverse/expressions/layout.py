@@ -1,8 +1,8 @@
-"""How arrays of any dimension lie in CasADi's two-dimensional matrices.
+"""Storage of arrays of any dimension in CasADi's two-dimensional matrices.
 
 An expression of shape ``(a, b, c)`` is stored as an ``SX`` of ``a*b`` rows and ``c`` columns, a vector as one
-column, a scalar as 1×1. Rearrangements are computed on arrays of indices, where numpy itself says what a
-slice or a transpose means, and carried out once on the elements.
+column, a scalar as 1×1. Rearrangements are computed by numpy on arrays of indices and applied once to the
+elements.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ def column(sx: SX, shape: ArrayShape) -> SX:
 
 
 def from_column(sx: SX, shape: ArrayShape) -> SX:
-    """Undo :func:`column` for an array of this shape."""
+    """Return the matrix that stores an array of this shape, from its :func:`column`."""
     rows, columns = rows_and_columns(shape)
     if columns == 1:
         return ca.reshape(sx, rows, 1) if sx.shape[0] != rows else sx

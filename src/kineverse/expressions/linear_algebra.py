@@ -1,7 +1,7 @@
-"""Matrix and tensor products, Einstein sums, linear solve and matrix power.
+"""Matrix and tensor products, Einstein sums, inverse, determinant, linear solve and matrix power.
 
-What belongs together is brought side by side by indices, multiplied elementwise and added up, so D is that of
-sums and products.
+Products align the axes of their operands by indices, multiply elementwise and sum, so D is that of sums and
+products.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ from kineverse.errors import ExpressionError, ShapeError
 
 from . import layout
 from .expression import Expression, ExpressionLike, array, as_expression, broadcast, from_casadi, matmul
+from .reductions import move_axis, sum_axes
 
 
 def einsum(subscripts: str, *operands: ExpressionLike) -> Expression:
@@ -29,9 +30,9 @@ def einsum(subscripts: str, *operands: ExpressionLike) -> Expression:
     Raises
     ------
     ExpressionError
-        For a notation that is none.
+        For subscripts that cannot be parsed.
     ShapeError
-        If it does not fit the shapes.
+        For subscripts that do not fit the shapes.
     """
     if not isinstance(subscripts, str):
         raise ExpressionError('np.einsum of expressions takes its subscripts as text: "ij,jk->ik".')
@@ -59,7 +60,7 @@ def einsum(subscripts: str, *operands: ExpressionLike) -> Expression:
 
 
 def _parse_subscripts(subscripts: str, operands: Sequence[Expression]) -> tuple[list[str], str]:
-    """Return the letters of each operand and of the result, with letters for what an ellipsis stands for."""
+    """Return the letters of each operand and of the result, with letters in place of each ellipsis."""
     text = subscripts.replace(" ", "")
     left, arrow, right = text.partition("->")
     inputs = left.split(",")
@@ -78,7 +79,7 @@ def _parse_subscripts(subscripts: str, operands: Sequence[Expression]) -> tuple[
             raise ShapeError(
                 f"np.einsum: {part!r} in {subscripts!r} does not fit an operand of shape {operand.shape}."
             )
-        # Those of several operands are aligned at the end, as in broadcasting.
+        # Axes of an ellipsis are aligned at the end, as in broadcasting.
         filled = "".join(reversed(free[:missing]))
         inputs[place] = before + filled + after
         hidden = max(hidden, filled, key=len)
@@ -99,7 +100,7 @@ def _parse_subscripts(subscripts: str, operands: Sequence[Expression]) -> tuple[
 
 
 def _contract(parts: Sequence[tuple[str, Expression]], output: str, lengths: dict[str, int]) -> Expression:
-    """Return the product of operands with letters for axes, summed over the letters that are not wanted."""
+    """Return the product of operands with letters for axes, summed over letters not in the output."""
     summed = "".join(dict.fromkeys(x for letters, _ in parts for x in letters if x not in output))
     kept, rest = math.prod(lengths[x] for x in output), math.prod(lengths[x] for x in summed)
     factors = [_align_axes(operand, letters, output + summed, lengths) for letters, operand in parts]
@@ -111,11 +112,11 @@ def _contract(parts: Sequence[tuple[str, Expression]], output: str, lengths: dic
 
 
 def _align_axes(operand: Expression, letters: str, wanted: str, lengths: dict[str, int]) -> Expression:
-    """Return an operand with one axis for each letter wanted: diagonals taken, missing axes repeated."""
+    """Return an operand with one axis for each letter: diagonals taken, missing axes repeated."""
     index = layout.indices(operand.shape)
     unique = "".join(dict.fromkeys(letters))
     for letter in unique:
-        # Where an axis of a diagonal has length 1 it is repeated.
+        # An axis of length 1 is repeated before the diagonal is taken.
         while letters.count(letter) > 1:
             first, second = letters.index(letter), letters.rindex(letter)
             length = max(index.shape[first], index.shape[second])
@@ -128,7 +129,7 @@ def _align_axes(operand: Expression, letters: str, wanted: str, lengths: dict[st
 
 
 def stacked_product(a: Expression, b: Expression) -> Expression:
-    """Return the matrix products of two stacks of matrices, which are broadcast against each other."""
+    """Return the matrix products of two stacks of matrices, broadcast against each other."""
     left, right = "j" if a.ndim == 1 else "...ij", "j" if b.ndim == 1 else "...jk"
     try:
         return einsum(f"{left},{right}->...{'i' * (a.ndim > 1)}{'k' * (b.ndim > 1)}", a, b)
@@ -179,8 +180,8 @@ def tensordot(a: ExpressionLike, b: ExpressionLike, axes: Any = 2) -> Expression
 
 
 def vecdot(a: ExpressionLike, b: ExpressionLike, axis: int = -1) -> Expression:
-    """Return the sums of products along an axis of both, which are broadcast against each other."""
-    x, y = (_move_axis(as_expression(o), axis, -1) for o in (a, b))
+    """Return the sums of products along an axis of two arrays, broadcast against each other."""
+    x, y = (move_axis(as_expression(o), axis, -1) for o in (a, b))
     if x.shape[-1] != y.shape[-1]:
         raise ShapeError(f"np.vecdot: shapes {x.shape} and {y.shape} have last axes of different lengths.")
     return einsum("...i,...i->...", x, y)
@@ -214,7 +215,7 @@ def cross(
     """Return the cross products of 3-vectors along an axis of two arrays, broadcast against each other."""
     if axis is not None:
         axisa = axisb = axisc = axis
-    x, y = _move_axis(as_expression(a), axisa, -1), _move_axis(as_expression(b), axisb, -1)
+    x, y = move_axis(as_expression(a), axisa, -1), move_axis(as_expression(b), axisb, -1)
     if x.shape[-1:] != (3,) or y.shape[-1:] != (3,):
         raise ShapeError(
             f"The cross product is one of two 3-vectors, or of stacks of them along an axis, not of shapes "
@@ -225,23 +226,42 @@ def cross(
     x, y = broadcast(x, y)
     following, last = [1, 2, 0], [2, 0, 1]
     product = x[..., following] * y[..., last] - x[..., last] * y[..., following]
-    return _move_axis(product, -1, axisc)
+    return move_axis(product, -1, axisc)
 
 
-def _move_axis(x: Expression, source: int, destination: int) -> Expression:
-    if source == destination:
-        return x
-    try:
-        index = np.moveaxis(layout.indices(x.shape), source, destination)
-    except ValueError:
-        raise ShapeError(
-            f"Axis {source if source != -1 else destination} does not fit an array of shape {x.shape}."
-        ) from None
-    return x._rearranged(index)
+def matrix_inverse(matrix: ExpressionLike) -> Expression:
+    """Return the inverse of a square matrix, ``D(A⁻¹) = -A⁻¹ D(A) A⁻¹``.
+
+    For homogeneous transforms use :func:`kineverse.spatial.inverse`, which is far smaller.
+    """
+    a = as_expression(matrix)
+    if a.ndim != 2 or a.shape[0] != a.shape[1]:
+        raise ShapeError(f"Only a square matrix has an inverse, not one of shape {a.shape}.")
+    return from_casadi(ca.inv(a._sx), a.shape, a._nodes)
+
+
+def determinant(matrix: ExpressionLike) -> Expression:
+    """Return the determinant of a square matrix, a scalar."""
+    a = as_expression(matrix)
+    if a.ndim != 2 or a.shape[0] != a.shape[1]:
+        raise ShapeError(f"Only a square matrix has a determinant, not one of shape {a.shape}.")
+    n = a.shape[0]
+    if not n:
+        return as_expression(1.0)
+    if n < 5:
+        return from_casadi(ca.det(a._sx), (), a._nodes)
+    # Minors grow with n!; larger matrices by the characteristic polynomial (Faddeev-LeVerrier).
+    identity = as_expression(np.eye(n))
+    power, coefficient = identity, as_expression(1.0)
+    for k in range(1, n + 1):
+        product = matmul(a, power)
+        coefficient = sum_axes(product[np.arange(n), np.arange(n)]) / -k
+        power = product + coefficient * identity
+    return coefficient if n % 2 == 0 else -coefficient
 
 
 def solve_linear(matrix: ExpressionLike, right: ExpressionLike) -> Expression:
-    """Return the solution of ``matrix @ x = right``, for a vector or the columns of a matrix on the right."""
+    """Return x with ``matrix @ x = right``, for a vector or a matrix on the right."""
     a, b = as_expression(matrix), as_expression(right)
     if a.ndim != 2 or a.shape[0] != a.shape[1] or b.ndim not in (1, 2) or b.shape[0] != a.shape[0]:
         raise ShapeError(
@@ -254,9 +274,7 @@ def solve_linear(matrix: ExpressionLike, right: ExpressionLike) -> Expression:
 
 
 def matrix_power(matrix: ExpressionLike, exponent: int) -> Expression:
-    """Return a square matrix to a whole power; negative ones are of its inverse."""
-    from .functions import matrix_inverse
-
+    """Return a square matrix to an integer power; a negative one of its inverse."""
     a = as_expression(matrix)
     if a.ndim != 2 or a.shape[0] != a.shape[1]:
         raise ShapeError(f"Only a square matrix has powers, not one of shape {a.shape}.")

@@ -1,9 +1,9 @@
 """Opaque nodes: values with a gradient of their own.
 
-A node stands in a CasADi graph as a symbol that nobody else owns. It knows its value and its D, so CasADi's
-partial derivatives and the chain rule give the gradient of everything built on it, at full speed, and the
-override belongs to the node: ``g(augmented) + h(a)`` keeps ``h'``. Nodes with equal content are the same
-object, so two equal augmentations cancel.
+A node is a symbol of its own in a CasADi graph. It has a value and a D, so CasADi's partial derivatives and
+the chain rule give the gradient of expressions that contain it. The override belongs to the node:
+``g(augmented) + h(a)`` keeps ``h'``. Nodes with equal content are the same object, so two equal augmentations
+cancel.
 """
 
 from __future__ import annotations
@@ -34,20 +34,20 @@ _INTERNING = threading.Lock()
 
 
 class AccessListener(Protocol):
-    """Who wants to know how closely code looks at expressions that it was given, see :mod:`.model.traces`."""
+    """Callback invoked when traced code inspects an expression, see :mod:`kineverse.model.traces`."""
 
-    def settled(self, expression: Expression) -> Expression:
-        """Return an expression of what was given as it is, and note that it was looked at."""
+    def notify(self, expression: Expression) -> Expression:
+        """Record that an expression was inspected, and return it with its actual content."""
 
     def ask(self, kind: str, *arguments: Any) -> Any:
-        """Return what a function that looks at its arguments makes of them, so that it is made anew later."""
+        """Record a call of a function that depends on its arguments' content, and return its result."""
 
 
 class Node(ABC):
     """A value with a gradient of its own; immutable, and interned by content.
 
-    Subclasses name their ``kind`` and say what they are worth (:meth:`_value`) and how they change
-    (:meth:`_gradient`), in terms of their ``arguments``.
+    Subclasses define their ``kind``, their value (:meth:`_value`) and their gradient (:meth:`_gradient`) in
+    terms of their ``arguments``.
     """
 
     __slots__ = (
@@ -60,26 +60,26 @@ class Node(ABC):
         "depth",
         "elements",
         "key",
+        "listener",
         "options",
         "shape",
         "sx",
-        "watcher",
     )
 
     kind: ClassVar[str]
     own_partials: ClassVar[bool] = False
-    """Whether plain partial derivatives are those of :meth:`_gradient`, as the value's are NaN at a kink."""
+    """True if partial derivatives are those of :meth:`_gradient`: those of the value are NaN at a kink."""
 
     arguments: tuple[Expression, ...]
     options: tuple[Any, ...]
     depth: int
-    watcher: AccessListener | None
+    listener: AccessListener | None
 
     @classmethod
-    def of(
+    def from_arguments(
         cls, arguments: tuple[Expression, ...], shape: layout.ArrayShape, options: tuple[Any, ...] = ()
     ) -> Expression:
-        """Return the expression that is this node, made once for equal arguments and options."""
+        """Return the node as an expression; one node for equal arguments and options."""
         key = cls._content_key(arguments, shape, options)
         node = _INTERNED.get(key)
         if node is None:
@@ -114,7 +114,7 @@ class Node(ABC):
         self.arguments = arguments
         self.options = options
         self.shape = shape
-        # The name is part of what CasADi serialises, so it must be the same in every process.
+        # CasADi serialises the name, so it must be the same in every process.
         self.sx = ca.SX.sym(key.hex(), *layout.rows_and_columns(shape))
         self.elements = tuple(e.element_hash() for e in ca.symvar(self.sx))
         self._value_cache: Expression | None = None
@@ -122,7 +122,7 @@ class Node(ABC):
         self._keys: dict[bool, frozenset[Symbol]] = {}
         self._symbols: frozenset[Symbol] | None = None
         self.depth = 1 + max((inner.depth for a in arguments for inner in a._nodes), default=0)
-        self.watcher = next((w for a in arguments for inner in a._nodes if (w := inner.watcher)), None)
+        self.listener = next((w for a in arguments for inner in a._nodes if (w := inner.listener)), None)
 
     @property
     def symbols(self) -> frozenset[Symbol]:
@@ -133,12 +133,12 @@ class Node(ABC):
 
     @property
     def is_constant(self) -> bool:
-        """Whether the value depends on no symbol and the gradient is empty."""
+        """True if the value depends on no symbol and the gradient is empty."""
         return not self.symbols and not self.gradient(True)
 
     @property
     def parts(self) -> tuple[Expression, ...]:
-        """All expressions that the node is made of, those among its options included."""
+        """All expressions of the node, those among its options included."""
         return self.arguments
 
     @property
@@ -148,12 +148,12 @@ class Node(ABC):
 
     @property
     def label(self) -> str:
-        """What the node is called in print."""
+        """The name in printed expressions."""
         return self.kind
 
     @property
     def value(self) -> Expression:
-        """What the node is worth."""
+        """The value as an expression of the arguments."""
         if self._value_cache is None:
             self._value_cache = self._value()
         return self._value_cache
@@ -168,22 +168,22 @@ class Node(ABC):
         return known
 
     def gradient_keys(self, heuristic: bool) -> frozenset[Symbol]:
-        """Return the keys that :meth:`gradient` can have, without computing entries where that is cheap."""
+        """Return the keys that :meth:`gradient` can have, without computing entries where possible."""
         return frozenset().union(*(gradient_keys(a, heuristic) for a in self.differentiated(heuristic)))
 
     def differentiated(self, heuristic: bool) -> tuple[Expression, ...]:
-        """Return the arguments whose D is part of this node's."""
+        """Return the arguments from whose D this node's D is computed."""
         return self.arguments
 
     def depends_on(self, substitution: Substitution) -> bool:
-        """Whether value or gradient contain one of the symbols that are to be replaced."""
+        """Return True if value or gradient contain one of the replaced symbols."""
         return any(substitution.changes(argument) for argument in self.arguments)
 
     def substitute(self, substitution: Substitution) -> Expression:
         """Return the composition: the same kind of node over the substituted arguments."""
         from .substitution import apply_substitution
 
-        return type(self).of(
+        return type(self).from_arguments(
             tuple(apply_substitution(a, substitution) for a in self.arguments), self.shape, self.options
         )
 
@@ -205,15 +205,15 @@ class Node(ABC):
 def _restore(
     kind: type[Node], arguments: tuple[Expression, ...], shape: layout.ArrayShape, options: tuple[Any, ...]
 ) -> Node:
-    (node,) = kind.of(arguments, shape, options)._nodes
+    (node,) = kind.from_arguments(arguments, shape, options)._nodes
     return node
 
 
 class Augment(Node):
-    """A value some of whose gradient entries are given: ``augment`` and ``with_gradient``.
+    """A value with given entries of its gradient: ``augment`` and ``with_gradient``.
 
-    The arguments are the value and the given entries, whose keys are in ``options`` together with
-    ``replace`` (nothing of the value's own gradient remains) and ``heuristic`` (the entries are trends).
+    The arguments are the value and the given entries. The options are ``replace`` (the given entries are the
+    whole gradient), ``heuristic`` (the entries are trends) and the keys of the entries.
     """
 
     __slots__ = ()
@@ -221,12 +221,12 @@ class Augment(Node):
 
     @property
     def replace(self) -> bool:
-        """Whether the entries are the whole gradient."""
+        """True if the entries are the whole gradient."""
         return bool(self.options[0])
 
     @property
     def heuristic(self) -> bool:
-        """Whether the entries are trends rather than facts."""
+        """True if the entries are trends rather than facts."""
         return bool(self.options[1])
 
     @property
@@ -257,18 +257,18 @@ class Augment(Node):
         return () if self.replace and (heuristic or not self.heuristic) else self.arguments[:1]
 
     def depends_on(self, substitution: Substitution) -> bool:
-        """Return whether a substitution changes the node."""
-        # An entry for ȧ is carried along D(S(a)) even where a itself does not occur.
+        """Return True if a substitution changes the node."""
+        # An entry for ȧ is mapped along D(S(a)) even if the value does not contain a.
         return super().depends_on(substitution) or any(
             a.has_derivative and a.derivative() in self.options[2:] for a in substitution
         )
 
     def substitute(self, substitution: Substitution) -> Expression:
-        """Return what the node becomes under a substitution."""
+        """Return the composition of the node with a substitution."""
         from .substitution import apply_substitution, compose_gradient
 
-        # After composition an overridden ẇ may also be reached through a replaced symbol, so what was
-        # "override these, keep the rest" becomes the complete mapping, for facts and trends separately.
+        # After composition an overridden ẇ may also be reached through a replaced symbol. So "override these,
+        # keep the others" becomes the complete mapping, for facts and trends separately.
         value = apply_substitution(self.arguments[0], substitution)
         facts = compose_gradient(self.gradient(False), substitution, False)
         trends = compose_gradient(self.gradient(True), substitution, True)
@@ -305,4 +305,6 @@ def augment(
     if replace:
         entries = {k: e for k, e in entries.items() if not e._sx.is_zero()}
     keys = tuple(sorted(entries, key=lambda s: s.sort_key))
-    return Augment.of((value, *(entries[k] for k in keys)), value.shape, (replace, heuristic, *keys))
+    return Augment.from_arguments(
+        (value, *(entries[k] for k in keys)), value.shape, (replace, heuristic, *keys)
+    )

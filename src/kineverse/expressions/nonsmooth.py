@@ -1,7 +1,7 @@
 """Nonsmooth nodes: selection, extrema, Euclidean norm and power.
 
-They are written so that a gradient is finite wherever a derivative can be given: what was not chosen is never
-multiplied, and the norm has gradient 0 at the origin.
+Their gradients are finite wherever a derivative exists: branches that are not selected are never multiplied.
+The gradient of the norm at the origin is 0.
 """
 
 from __future__ import annotations
@@ -32,41 +32,41 @@ if TYPE_CHECKING:
 
 
 class Select(Node):
-    """``where``: its arguments are condition and branches, all of the node's shape."""
+    """``where``, with condition and branches as arguments, all of the node's shape."""
 
     __slots__ = ()
     kind = "select"
     own_partials = True
 
     @property
-    def _holds(self) -> Expression:
+    def _is_true(self) -> Expression:
         return binary(ca.OP_LE, 0.5, self.arguments[0])
 
     def _value(self) -> Expression:
-        return self._chosen(self.arguments[1], self.arguments[2])
+        return self._select(self.arguments[1], self.arguments[2])
 
     def _gradient(self, heuristic: bool) -> Mapping[Symbol, Expression]:
         a, b = (argument.gradient(heuristic) for argument in self.arguments[1:])
         zero = as_expression(np.zeros(self.shape))
-        return {key: self._chosen(a.get(key, zero), b.get(key, zero)) for key in {**a, **b}}
+        return {key: self._select(a.get(key, zero), b.get(key, zero)) for key in {**a, **b}}
 
-    def _chosen(self, if_true: Expression, if_false: Expression) -> Expression:
+    def _select(self, if_true: Expression, if_false: Expression) -> Expression:
         from .implicit import implicit_nodes
 
         if implicit_nodes(self.arguments[:1]):
-            # A loop that does not close here is NaN. Nothing is chosen then, and evaluation says why.
+            # A loop that does not close is NaN. Then the result is NaN too, and evaluation raises the reason.
             fails = binary(ca.OP_LT, self.arguments[0], 0.5)
             neither = from_casadi(ca.SX.nan(*if_false._sx.shape), if_false.shape, frozenset())
             if_false = _select(fails, if_false, neither)
-        return _select(self._holds, if_true, if_false)
+        return _select(self._is_true, if_true, if_false)
 
     def differentiated(self, heuristic: bool) -> tuple[Expression, ...]:
-        """Return the branches; the condition selects and has no part in the gradient."""
+        """Return the branches; the condition has no part in the gradient."""
         return self.arguments[1:]
 
 
 def _select(holds: Expression, if_true: Expression, if_false: Expression) -> Expression:
-    """Return a choice by a comparison; CasADi keeps such choices free of NaN in every derivative."""
+    """Return a selection by a comparison; CasADi keeps selections free of NaN in every derivative."""
     return from_casadi(
         ca.if_else(holds._sx, if_true._sx, if_false._sx),
         holds._shape,
@@ -88,8 +88,8 @@ class Extremum(Node):
 
     def _value(self) -> Expression:
         number = _reduce_pairwise(ca.OP_FMIN if self.options[0] == "min" else ca.OP_FMAX, self.arguments)
-        # Where an argument is NaN this is NaN, and else a number or infinite. CasADi takes x == x for true,
-        # and 0 <= sqrt(x) too.
+        # NaN if an argument is NaN, else a number or infinity. CasADi simplifies x == x, and also
+        # 0 <= sqrt(x), to true.
         size = _reduce_pairwise(ca.OP_ADD, [unary(ca.OP_FABS, a) for a in self.arguments])
         unordered = unary(ca.OP_NOT, binary(ca.OP_LE, size, math.inf))
         # Subtracted, because -0 + 0 would be another zero.
@@ -102,14 +102,14 @@ class Extremum(Node):
         for argument, wins in zip(self.arguments, won, strict=True):
             share = wins * each  # 1, 0, at a tie 1/n; of NaN 0/0, NaN as well
             for key, entry in argument.gradient(heuristic).items():
-                # Zero times NaN would be NaN; what has no share is not looked at.
+                # Zero times NaN would be NaN, so terms without a share are selected out.
                 term = binary(ca.OP_IF_ELSE_ZERO, share, share * entry)
                 result[key] = result[key] + term if key in result else term
         return result
 
 
 def _reduce_pairwise(op: int, operands: Sequence[Expression]) -> Expression:
-    """Return operands joined in pairs, these again in pairs, and so on: a thousand are ten deep."""
+    """Return operands joined pairwise by an operation, in a tree of logarithmic depth."""
     joined = list(operands)
     while len(joined) > 1:
         odd = joined[-1:] if len(joined) % 2 else []
@@ -126,12 +126,12 @@ class Norm(Node):
 
     @property
     def unscaled(self) -> Expression:
-        """√Σ x²: what the norm is in real numbers, and in doubles unless a square leaves their range."""
+        """√Σ x², which equals the norm unless a square overflows or underflows."""
         return _root_of_squares(self.arguments[0])
 
     def _value(self) -> Expression:
-        # A power of two changes no digit, and 1 none at all. It brings huge and tiny vectors to where squares
-        # neither overflow nor vanish.
+        # Scaling by a power of two is exact. It brings huge and tiny vectors to a range in which squares
+        # neither overflow nor underflow.
         (vector,) = self.arguments
         squares = from_casadi(ca.sumsqr(vector._sx), (), vector._nodes)
         huge, tiny = binary(ca.OP_LT, _LARGE, squares), binary(ca.OP_LT, squares, _SMALL)
@@ -140,10 +140,10 @@ class Norm(Node):
 
     def _gradient(self, heuristic: bool) -> Mapping[Symbol, Expression]:
         (vector,) = self.arguments
-        # Divided first: a product of two large numbers may be too large.
+        # Divided first, because a product of two large numbers may overflow.
         zero = as_expression(np.zeros(vector.shape))
         away = binary(ca.OP_LT, zero, self.value)
-        direction = Select.of((away, vector / self.value, zero), vector.shape)
+        direction = Select.from_arguments((away, vector / self.value, zero), vector.shape)
         return {key: direction @ entry for key, entry in vector.gradient(heuristic).items()}
 
 
@@ -156,9 +156,9 @@ def _root_of_squares(vector: Expression) -> Expression:
 
 
 class Power(Node):
-    """One scalar to the power of another that is not constant.
+    """A scalar to the power of a scalar that is not constant.
 
-    CasADi's derivatives are NaN at 0, where log is infinite; these are right wherever there is one.
+    CasADi's derivatives are NaN at base 0, where the logarithm is infinite; those of this node are not.
     """
 
     __slots__ = ()
@@ -167,7 +167,7 @@ class Power(Node):
 
     @staticmethod
     def is_needed(base: SX, exponent: SX) -> bool:
-        """Return whether a power may have derivatives that CasADi does not know: those of 0 to something."""
+        """Return True if a power may have derivatives that CasADi lacks: those at base 0."""
         return not exponent.is_constant() and not (
             base.is_constant() and all(float(element) for element in base.elements())
         )
@@ -184,22 +184,22 @@ class Power(Node):
         of_base, of_exponent = base.gradient(heuristic), exponent.gradient(heuristic)
         result: dict[Symbol, Expression] = {}
         if of_base:
-            slope = Select.of((one, zero, exponent * power(base, exponent - 1)), ())
+            slope = Select.from_arguments((one, zero, exponent * power(base, exponent - 1)), ())
             result = {key: slope * entry for key, entry in of_base.items()}
         if of_exponent:
-            slope = Select.of((nothing, zero, self.value * unary(ca.OP_LOG, base)), ())
+            slope = Select.from_arguments((nothing, zero, self.value * unary(ca.OP_LOG, base)), ())
             for key, entry in of_exponent.items():
                 result[key] = result[key] + slope * entry if key in result else slope * entry
         return result
 
 
 def power(base: ExpressionLike, exponent: ExpressionLike) -> Expression:
-    """Return the power, elementwise, with derivatives wherever they exist: at 0 too."""
+    """Return the power, elementwise, with derivatives wherever they exist, also at base 0."""
     x, y = as_expression(base), as_expression(exponent)
     if not Power.is_needed(x._sx, y._sx):
         return binary(ca.OP_POW, x, y)
     x, y = broadcast(x, y)
     if not x.shape:
-        return Power.of((x, y), ())
+        return Power.from_arguments((x, y), ())
     pairs = zip(x.ravel(), y.ravel(), strict=True)
     return array([power(a, b) for a, b in pairs]).reshape(x.shape)

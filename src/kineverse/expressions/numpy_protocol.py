@@ -1,7 +1,6 @@
-"""numpy's functions on expressions: ``np.sin(e)``, ``np.stack([a, b])``, ``array + e`` and their kin.
+"""numpy's functions on expressions: ``np.sin(e)``, ``np.stack([a, b])``, ``array + e``.
 
-Functions that only rearrange elements are applied to arrays of indices, so numpy itself decides what they
-mean.
+Functions that only rearrange elements are applied to arrays of indices, so numpy itself defines their result.
 """
 
 from __future__ import annotations
@@ -16,8 +15,8 @@ import numpy as np
 
 from kineverse.errors import ExpressionError, KineverseError, ShapeError
 
-from . import functions, layout
 from . import functions as f
+from . import layout
 from . import linear_algebra as c
 from . import reductions as r
 from .expression import Expression, as_expression, binary, from_casadi, matmul, unary, union_nodes
@@ -41,11 +40,11 @@ _UFUNCS: dict[Any, Callable[..., Any]] = {
     np.copysign: f.copysign,
     np.power: f.power,
     np.float_power: f.power,
-    np.floor_divide: functions.floor_divide,
-    np.remainder: functions.remainder,
-    np.divmod: lambda a, b: (functions.floor_divide(a, b), functions.remainder(a, b)),
-    np.rint: functions.rint,
-    np.trunc: functions.trunc,
+    np.floor_divide: f.floor_divide,
+    np.remainder: f.remainder,
+    np.divmod: lambda a, b: (f.floor_divide(a, b), f.remainder(a, b)),
+    np.rint: f.rint,
+    np.trunc: f.trunc,
     np.log10: f.log10,
     np.log2: f.log2,
     np.exp2: lambda a: f.power(2.0, a),
@@ -76,7 +75,7 @@ _UFUNCS: dict[Any, Callable[..., Any]] = {
 }
 
 
-# Those that came with version 2 of numpy.
+# Functions that version 2 of numpy added.
 _LATER_UFUNCS: dict[str, Callable[..., Any]] = {
     "vecdot": c.vecdot,
     "matvec": lambda a, x: c.einsum("...ij,...j->...i", a, x),
@@ -128,14 +127,14 @@ _REARRANGING = {
     np.delete, np.atleast_1d, np.atleast_2d, np.atleast_3d, np.split, np.array_split, np.hsplit, np.vsplit,
     np.dsplit,
 }  # fmt: skip
-# Those that put zeros between the elements.
+# Functions that put zeros between the elements.
 _SPREADING = {np.diag, np.diagflat, np.tril, np.triu}
 _LATER = [(np, "matrix_transpose"), (np, "unstack"), (np.linalg, "matrix_transpose"), (np.linalg, "diagonal")]
 _REARRANGING |= {getattr(home, name) for home, name in _LATER if hasattr(home, name)}
 
 _AT_LEAST = {np.atleast_1d, np.atleast_2d, np.atleast_3d}
 _JOINING = {np.concatenate, np.stack, np.vstack, np.hstack, np.dstack, np.column_stack, np.block, np.append}
-# How many arguments come before an array to write into.
+# Numbers of arguments before the array to write into.
 _BEFORE_OUT = {np.take: 3, np.concatenate: 2, np.stack: 2}
 
 
@@ -160,7 +159,7 @@ def apply_function(function: Any, args: Sequence[Any], options: Mapping[str, Any
             ) from None
         return _FUNCTIONS[function](*bound.args, **bound.kwargs)
     if function is np.append and len(args) > 1:
-        # The second part comes as an argument of its own, and both are flat without an axis.
+        # np.append takes two arguments instead of a sequence, and flattens both without an axis.
         axis = args[2] if len(args) > 2 else options.get("axis")
         return apply_function(np.concatenate, (args[:2],), {"axis": axis})
     if function not in _REARRANGING and function not in _SPREADING and function not in _JOINING:
@@ -212,7 +211,7 @@ def _rearrange(function: Any, operand: Any, args: Sequence[Any], options: Mappin
     spreading = function in _SPREADING
     index = function(layout.indices(expression.shape) + spreading, *args, **options)
     if spreading:
-        # Elements are counted from 1, so 0 is what the function filled in; it becomes a last one.
+        # Elements are counted from 1, so 0 marks a filled place; it refers to an additional last element.
         index = np.where(index == 0, expression.size, index - 1)
         expression = _join(np.concatenate, [expression.ravel(), np.zeros(1)], (), {})
     if isinstance(index, (list, tuple)):
@@ -249,7 +248,7 @@ def _leaves(parts: Any) -> list[Any]:
 
 def _trace(a: Any, offset: int = 0, axis1: int = 0, axis2: int = 1) -> Expression:
     diagonal: Any = np.diagonal(as_expression(a), offset, axis1, axis2)
-    return f.sum_along(diagonal, -1)
+    return r.sum_axes(diagonal, -1)
 
 
 def _clip(
@@ -281,9 +280,9 @@ _FUNCTIONS: dict[Any, Callable[..., Any]] = {
     np.cumsum: r.cumsum,
     np.cumprod: r.cumprod,
     np.diff: r.diff,
-    np.round: functions.around,
-    np.around: functions.around,
-    np.fix: functions.trunc,
+    np.round: f.around,
+    np.around: f.around,
+    np.fix: f.trunc,
     np.copy: as_expression,
     np.trace: _trace,
     np.dot: c.dot,
@@ -295,8 +294,8 @@ _FUNCTIONS: dict[Any, Callable[..., Any]] = {
     np.einsum: c.einsum,
     np.tensordot: c.tensordot,
     np.linalg.norm: r.norm_axes,
-    np.linalg.inv: f.matrix_inverse,
-    np.linalg.det: f.determinant,
+    np.linalg.inv: c.matrix_inverse,
+    np.linalg.det: c.determinant,
     np.linalg.solve: c.solve_linear,
     np.linalg.matrix_power: c.matrix_power,
     np.linalg.multi_dot: lambda arrays: reduce(c.dot, arrays),

@@ -1,8 +1,8 @@
-"""Piecewise polynomials of a number, and the cubic splines made of them: profiles given by points.
+"""Piecewise polynomials and cubic splines of a scalar.
 
-A :class:`Piecewise` node picks the coefficients of the piece that its argument is in, and evaluates one
-polynomial. Its gradient is a piecewise polynomial again, so it is right at the knots too, to every order.
-The work grows with the number of pieces, by a handful of operations for each and without a branch.
+A :class:`Piecewise` node selects the coefficients of the piece that contains its argument, and evaluates one
+polynomial. Its gradient is a piecewise polynomial again, so it is exact at the knots too, to every order. The
+cost is linear in the number of pieces, without a branch.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ import casadi as ca
 import numpy as np
 
 from kineverse.errors import InvalidValueError
+from kineverse.lie import Array
 
 from . import layout
 from .expression import Expression, ExpressionLike, as_expression, from_casadi
@@ -36,11 +37,11 @@ def spline(
 ) -> Expression:
     """Return the cubic spline through points, elementwise; all of its derivatives are exact.
 
-    Surprise first: outside of its knots a spline goes on *straight*, with the slopes it has at the ends.
-    These are 0 unless given, so it stays at its first and last value. The first derivative is continuous
-    everywhere, the second between the first and the last knot. A periodic spline is twice continuously
-    differentiable everywhere. At ±infinity a spline has its limit: the last value, or ±infinity where it has
-    a slope there; a periodic one has none, and is NaN.
+    Surprise first: outside of its knots a spline continues *straight*, with the slopes at its ends. These are
+    0 unless given, so it stays at its first and last value. The first derivative is continuous everywhere,
+    the second between the first and the last knot. A periodic spline is twice continuously differentiable
+    everywhere. At ±infinity a spline has its limit, which is the last value, or ±infinity with a slope; a
+    periodic spline has no limit and is NaN there.
 
     Between the knots t_k and t_k+1, at a distance h and with s = x - t_k, it is
 
@@ -52,21 +53,21 @@ def spline(
     Parameters
     ----------
     x
-        Where it is asked for.
+        The argument.
     knots
-        At least two numbers that increase, in the unit of x.
+        At least two increasing numbers, in the unit of x.
     values
-        What it is worth there.
+        The values at the knots.
     periodic
-        Whether it repeats: the last knot is the first one again, one period later, and has the same value.
+        True to repeat: the last knot is the first one a period later, and has the same value.
     slopes
-        The derivatives at the first and the last knot, (0, 0) by default; not for a periodic one.
+        The derivatives at the first and the last knot, (0, 0) by default; not for a periodic spline.
 
     Raises
     ------
     InvalidValueError
-        For knots that do not increase, as many values as there are not knots, NaN, or a periodic spline that
-        does not end where it begins.
+        For knots that do not increase, another number of values than of knots, NaN, or a periodic spline with
+        different first and last values.
     """
     t, y = _numbers(knots, "knot"), _numbers(values, "value")
     _check_knots(t)
@@ -99,29 +100,29 @@ def piecewise(
     Parameters
     ----------
     x
-        Where it is asked for.
+        The argument.
     periodic
-        Whether it repeats after the distance from the first to the last knot.
+        True to repeat with the distance from the first to the last knot as the period.
     knots
-        At least two numbers that increase. A piece holds from its knot on, up to the next one.
+        At least two increasing numbers. A piece holds from its knot on, up to the next one.
     pieces
         The coefficients of each piece, constant first, all equally many: of powers of the distance from the
-        knot before it. Beside those between knots there is one before the first knot, about that knot, and
-        one after the last, unless it is periodic.
+        knot before it. Unless it is periodic, there is a piece before the first knot too, about that knot,
+        and one after the last.
 
     Raises
     ------
     InvalidValueError
-        For knots that do not increase, another number of pieces, or numbers that are not finite.
+        For knots that do not increase, a wrong number of pieces, or numbers that are not finite.
     """
     operand = as_expression(x)
-    return Piecewise.of((operand,), operand.shape, check_pieces(periodic, knots, pieces))
+    return Piecewise.from_arguments((operand,), operand.shape, check_pieces(periodic, knots, pieces))
 
 
 def check_pieces(
     periodic: bool, knots: Sequence[float], pieces: Sequence[Sequence[float]]
 ) -> tuple[bool, tuple[float, ...], PolynomialPieces]:
-    """Return the options of a node, from what :func:`piecewise` takes."""
+    """Return the options of a node, from the arguments of :func:`piecewise`."""
     t = _numbers(knots, "knot")
     _check_knots(t)
     table = tuple(tuple(_numbers(piece, "coefficient")) for piece in pieces)
@@ -134,7 +135,7 @@ def check_pieces(
 
 
 class Piecewise(Node):
-    """A piecewise polynomial of its argument; the options are whether it repeats, knots and coefficients."""
+    """A piecewise polynomial of its argument; the options are periodicity, knots and coefficients."""
 
     __slots__ = ()
     kind = "piecewise"
@@ -142,12 +143,12 @@ class Piecewise(Node):
 
     @property
     def periodic(self) -> bool:
-        """Whether it repeats."""
+        """True if it repeats."""
         return bool(self.options[0])
 
     @property
     def knots(self) -> tuple[float, ...]:
-        """Where pieces begin and end."""
+        """The boundaries of the pieces."""
         knots: tuple[float, ...] = self.options[1]
         return knots
 
@@ -184,7 +185,7 @@ class Piecewise(Node):
             result = coefficient + s * result
         if self.periodic:
             return result
-        # 0 times infinity is no number, but a line without slope goes on forever.
+        # 0 times infinity is NaN, but a constant has a limit at infinity.
         below, above = _limit(self.pieces[0], -1.0), _limit(self.pieces[-1], 1.0)
         beyond_all = ca.SX.binary(ca.OP_EQ, ca.fabs(x), math.inf)
         return ca.if_else(beyond_all, ca.if_else(x < 0, below, above), result)
@@ -194,12 +195,12 @@ class Piecewise(Node):
         steps = tuple(tuple(k * c for k, c in enumerate(piece) if k) for piece in self.pieces)
         if not any(map(any, steps)):
             return {}
-        slope = Piecewise.of(self.arguments, self.shape, (self.periodic, self.knots, steps))
+        slope = Piecewise.from_arguments(self.arguments, self.shape, (self.periodic, self.knots, steps))
         return {key: slope * entry for key, entry in x.gradient(heuristic).items()}
 
 
 def _limit(piece: tuple[float, ...], side: float) -> float:
-    """Return what a polynomial tends to at infinity, or at minus infinity."""
+    """Return the limit of a polynomial at infinity, or at minus infinity."""
     power, leading = next(((k, c) for k, c in reversed(list(enumerate(piece))) if c), (0, piece[0]))
     return math.copysign(math.inf, leading * side**power) if power else leading
 
@@ -224,25 +225,23 @@ def _check_knots(t: list[float]) -> None:
 
 
 def _slopes(
-    h: np.ndarray[tuple[int], np.dtype[np.float64]],
-    d: np.ndarray[tuple[int], np.dtype[np.float64]],
+    h: Array,
+    d: Array,
     first: float,
     last: float,
-) -> np.ndarray[tuple[int], np.dtype[np.float64]]:
+) -> Array:
     """Return the slopes at all knots for which the second derivative is continuous at the inner ones."""
     n = len(h)
     system, right = np.eye(n + 1), np.array([first, *np.zeros(n - 1), last])
     for k in range(1, n):
         system[k, k - 1 : k + 2] = h[k], 2 * (h[k - 1] + h[k]), h[k - 1]
         right[k] = 3 * (h[k] * d[k - 1] + h[k - 1] * d[k])
-    solution: np.ndarray[tuple[int], np.dtype[np.float64]] = np.linalg.solve(system, right)
+    solution: Array = np.linalg.solve(system, right)
     return solution
 
 
-def _periodic_slopes(
-    h: np.ndarray[tuple[int], np.dtype[np.float64]], d: np.ndarray[tuple[int], np.dtype[np.float64]]
-) -> np.ndarray[tuple[int], np.dtype[np.float64]]:
-    """Return the same where the last knot is the first one again."""
+def _periodic_slopes(h: Array, d: Array) -> Array:
+    """Return the slopes at all knots of a periodic spline, with a continuous second derivative everywhere."""
     n = len(h)
     system, right = np.zeros((n, n)), np.zeros(n)
     for k in range(n):

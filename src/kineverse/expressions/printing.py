@@ -59,7 +59,7 @@ def text(expression: Expression) -> str:
 
 
 def latex(expression: Expression) -> str | None:
-    r"""Return LaTeX: ``\dot{a}`` for velocities, matrices up to 6×6; None for what is too long to read."""
+    r"""Return LaTeX: ``\dot{a}`` for velocities, matrices up to 6×6; None if it is too long to read."""
     writer = _Latex()
     if not expression.shape:
         formula = writer.bounded(expression._sx)
@@ -77,7 +77,7 @@ def latex(expression: Expression) -> str | None:
 
 
 def html(expression: Expression) -> str:
-    """Return the text as HTML, for what is too long for a formula."""
+    """Return the text as HTML, for expressions that are too long for a formula."""
     return f"<code>{escape(repr(expression))}</code>"
 
 
@@ -95,13 +95,8 @@ def mapping_text(gradient: Mapping[Symbol, Expression]) -> str:
 
 def mapping_html(gradient: Mapping[Symbol, Expression]) -> str:
     """Return a gradient as a table of HTML, its first entries if it has many."""
-    rows = [
-        f"<tr><td>{escape(_truncate(str(key)))}</td><td><code>{escape(_truncate(repr(entry)))}</code></td></tr>"
-        for key, entry in itertools.islice(gradient.items(), _ROWS)
-    ]
-    if len(gradient) > _ROWS:
-        rows.append(f"<tr><td>… {len(gradient) - _ROWS} more</td><td></td></tr>")
-    return f"<table><tr><th>speed</th><th>entry of D</th></tr>{''.join(rows)}</table>"
+    rows = [(str(key), repr(entry)) for key, entry in itertools.islice(gradient.items(), _ROWS)]
+    return html_table("D", ("speed", "entry"), rows, len(gradient))
 
 
 def _truncate(text: str) -> str:
@@ -109,7 +104,7 @@ def _truncate(text: str) -> str:
 
 
 class _Writer:
-    """Writes one scalar after another, giving up politely on large ones."""
+    """Writer of scalars as text of bounded length, with an ellipsis in place of deep parts."""
 
     ellipsis = "..."
     limit = _LIMIT
@@ -244,15 +239,28 @@ _MOST_TABLE_ROWS = 50
 _LONGEST_CELL = 200
 
 
-def html_table(caption: str, header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """Return a table of texts, which are escaped; long ones are cut, and so are many rows."""
+def html_table(
+    caption: str, header: Sequence[str], rows: Sequence[Sequence[str]], total: int | None = None
+) -> str:
+    """Return an HTML table of texts, which are escaped; long texts and many rows are cut.
+
+    Parameters
+    ----------
+    caption, header
+        The caption, and the title of each column.
+    rows
+        The texts of each row; rows after the first 50 are counted.
+    total
+        The number of all rows, if only the first of them are given.
+    """
     head = "".join(f"<th>{escape(title)}</th>" for title in header)
     body = "".join(
         f"<tr>{''.join(f'<td>{escape(_shorten_cell(cell))}</td>' for cell in row)}</tr>"
         for row in rows[:_MOST_TABLE_ROWS]
     )
-    if len(rows) > _MOST_TABLE_ROWS:
-        body += f'<tr><td colspan="{len(header)}">... {len(rows) - _MOST_TABLE_ROWS} more</td></tr>'
+    more = (len(rows) if total is None else total) - min(len(rows), _MOST_TABLE_ROWS)
+    if more:
+        body += f'<tr><td colspan="{len(header)}">... {more} more</td></tr>'
     return (
         f"<table><caption>{escape(caption)}</caption><thead><tr>{head}</tr></thead>"
         f"<tbody>{body}</tbody></table>"
@@ -264,7 +272,7 @@ def _shorten_cell(text: str) -> str:
 
 
 def format_number(value: float, digits: int = 4) -> str:
-    """Return a number in few digits; an absent limit as ``-``."""
+    """Return a number with few digits; an infinite limit as ``-``."""
     if math.isinf(value):
         return "-"
     text = f"{value:.{digits}g}"

@@ -1,4 +1,4 @@
-"""Replacing symbols by expressions: composition, with gradients by the chain rule."""
+"""Substitution of expressions for symbols, with gradients by the chain rule."""
 
 from __future__ import annotations
 
@@ -28,32 +28,32 @@ if TYPE_CHECKING:
 
 
 class Substitution(dict["Symbol", Expression]):
-    """What is replaced by what, and what the nodes met so far have become."""
+    """Replacements of symbols by expressions, with the images of nodes found so far."""
 
     def __init__(self, replacements: Mapping[Symbol, Expression]) -> None:
         super().__init__(replacements)
         self._images: dict[Node, Expression | None] = {}
 
     @classmethod
-    def of(cls, replacements: Mapping[Symbol, Expression]) -> Substitution:
-        """Return the replacements as a substitution, itself if it is one."""
+    def from_mapping(cls, replacements: Mapping[Symbol, Expression]) -> Substitution:
+        """Return replacements as a substitution; a substitution is returned as it is."""
         return replacements if isinstance(replacements, cls) else cls(replacements)
 
     def changes(self, expression: Expression) -> bool:
-        """Whether value or gradient of the expression become others."""
+        """Return True if the value or the gradient of an expression changes."""
         symbols, nodes = leaves(expression)
         if any(symbol in self for symbol in symbols):
             return True
-        self.meet(nodes)
+        self.substitute_nodes(nodes)
         return any(self._images[node] is not None for node in nodes)
 
     def image(self, node: Node) -> Expression | None:
-        """Return what a node becomes, None if it stays what it is."""
-        self.meet((node,))
+        """Return the image of a node, None if it does not change."""
+        self.substitute_nodes((node,))
         return self._images[node]
 
-    def meet(self, nodes: Iterable[Node]) -> None:
-        """Find out what nodes become, those below them first."""
+    def substitute_nodes(self, nodes: Iterable[Node]) -> None:
+        """Compute the images of nodes, inner ones first."""
         for node in topological_order(nodes, lambda n: n.arguments, self._images.__contains__):
             self._images[node] = node.substitute(self) if node.depends_on(self) else None
 
@@ -75,29 +75,29 @@ def substitute(expression: Expression, values: Mapping[Symbol, ExpressionLike]) 
             )
         if replacement is not symbol:
             substitution[symbol] = replacement
-    watcher = access_listener(expression)
-    if watcher is not None and substitution:
-        anew: Expression = watcher.ask(
+    listener = access_listener(expression)
+    if listener is not None and substitution:
+        anew: Expression = listener.ask(
             "substitute", expression, array(list(substitution)), array(list(substitution.values()))
         )
         return anew
     moving = dummy_symbols(s for s, e in substitution.items() if not s.has_derivative and gradient_keys(e))
     if moving:
-        # D of a parameter is empty; for a while it is a symbol that has one, which is then replaced.
+        # D of a parameter is empty, so a dummy symbol with a derivative is replaced in its place.
         expression = rename_symbols(expression, moving)
         substitution |= {stand_in: substitution[s] for s, stand_in in moving.items()}
     return apply_substitution(expression, substitution)
 
 
 def dummy_symbols(parameters: Iterable[Symbol]) -> dict[Symbol, Symbol]:
-    """Return symbols that move and occur nowhere else, for parameters to be differentiated by."""
+    """Return a unique symbol with a derivative for each parameter, to differentiate by."""
     from kineverse.symbols import Symbol
 
     return {p: Symbol(f"∂/{i}/{p.path}") for i, p in enumerate(parameters) if not p.has_derivative}
 
 
 def rename_symbols(expression: Expression, names: Mapping[Symbol, Symbol]) -> Expression:
-    """Return the expression with symbols exchanged for ones that occur nowhere in it."""
+    """Return the expression with symbols replaced by symbols that it does not contain."""
     images: dict[Node, Expression] = {}
 
     def rename(part: Expression) -> Expression:
@@ -109,15 +109,15 @@ def rename_symbols(expression: Expression, names: Mapping[Symbol, Symbol]) -> Ex
         return from_casadi(sx, part._shape, inner._nodes)
 
     for node in topological_order(leaves(expression)[1], lambda n: n.arguments, images.__contains__):
-        images[node] = type(node).of(tuple(map(rename, node.arguments)), node.shape, node.options)
+        images[node] = type(node).from_arguments(tuple(map(rename, node.arguments)), node.shape, node.options)
     return rename(expression)
 
 
 def apply_substitution(expression: Expression, replacements: Mapping[Symbol, Expression]) -> Expression:
-    """Return e∘S for a substitution that is known to be well formed."""
+    """Return e∘S for a valid substitution."""
     if not replacements:
         return expression
-    substitution = Substitution.of(replacements)
+    substitution = Substitution.from_mapping(replacements)
     symbols, nodes = leaves(expression)
     old: list[SX] = []
     new: list[SX] = []
@@ -128,7 +128,7 @@ def apply_substitution(expression: Expression, replacements: Mapping[Symbol, Exp
             old.append(symbol._sx)
             new.append(ca.densify(replacement._sx))
             kept |= replacement._nodes
-    substitution.meet(nodes)
+    substitution.substitute_nodes(nodes)
     for node in nodes:
         image = substitution.image(node)
         if image is None:
@@ -144,7 +144,7 @@ def apply_substitution(expression: Expression, replacements: Mapping[Symbol, Exp
 
 
 def replace_nodes(expression: Expression, replacements: Mapping[Node, Expression]) -> Expression:
-    """Return the expression with nodes of its own graph exchanged for expressions of their shape."""
+    """Return the expression with nodes of its own graph replaced by expressions of their shape."""
     _, nodes = leaves(expression)
     chosen = [n for n in nodes if n in replacements]
     if not chosen:
@@ -161,8 +161,8 @@ def replace_nodes(expression: Expression, replacements: Mapping[Node, Expression
 def compose_gradient(
     entries: Mapping[Symbol, Expression], replacements: Mapping[Symbol, Expression], heuristic: bool
 ) -> dict[Symbol, Expression]:
-    """Return D(e∘S) from D(e): ``Σ_a (D(e)[ȧ]∘S)·D(S(a))[w]`` and the keys that no replaced symbol has."""
-    substitution = Substitution.of(replacements)
+    """Return D(e∘S) from D(e): ``Σ_a (D(e)[ȧ]∘S)·D(S(a))[w]`` plus the entries of other keys."""
+    substitution = Substitution.from_mapping(replacements)
     result: dict[Symbol, Expression] = {}
 
     def add(key: Symbol, value: Expression) -> None:

@@ -1,6 +1,7 @@
 """Interval arithmetic with outward rounding.
 
-Results are rounded outwards, so what they say is certain. Ranges are pairs of floats and contain their ends.
+An interval is a pair of floats and contains its ends. Results are rounded outwards, so they enclose the exact
+range.
 """
 
 from __future__ import annotations
@@ -19,20 +20,20 @@ ZERO_INTERVAL: RealInterval = (0.0, 0.0)
 
 
 def round_outwards(low: float, high: float, steps: int = 1) -> RealInterval:
-    """Return a range that also holds what rounding may have lost."""
+    """Return an interval widened by a number of floats at both ends, to include rounding errors."""
     for _ in range(steps):
         low, high = math.nextafter(low, -math.inf), math.nextafter(high, math.inf)
     return low, high
 
 
 def enclose_number(number: float | Fraction) -> RealInterval:
-    """Return a range that holds an exact number."""
+    """Return an interval that contains an exact number."""
     near = float(number)
     return (near, near) if near == number else round_outwards(near, near)
 
 
 def interval_hull(a: RealInterval, b: RealInterval) -> RealInterval:
-    """Return the smallest range that contains both."""
+    """Return the smallest interval that contains both."""
     return min(a[0], b[0]), max(a[1], b[1])
 
 
@@ -50,7 +51,7 @@ def interval_negate(a: RealInterval) -> RealInterval:
 
 
 def interval_multiply(a: RealInterval, b: RealInterval) -> RealInterval:
-    """Return the range of x·y, where 0 times what grows without bounds is 0."""
+    """Return the range of x·y, with 0 times infinity equal to 0."""
     if ZERO_INTERVAL in (a, b):
         return ZERO_INTERVAL
     ends = [0.0 if 0 in (x, y) else x * y for x in a for y in b]
@@ -70,7 +71,7 @@ def interval_square(a: RealInterval) -> RealInterval:
 
 
 def interval_reciprocal(a: RealInterval) -> RealInterval:
-    """Return the range of 1/x for x of one sign, which may come close to 0."""
+    """Return the range of 1/x for x of one sign, 0 included as an end."""
     if a[0] >= 0:
         low, high = round_outwards(1 / a[1] if a[1] else math.inf, 1 / a[0] if a[0] else math.inf)
         return max(0.0, low), high
@@ -80,7 +81,7 @@ def interval_reciprocal(a: RealInterval) -> RealInterval:
 
 
 def interval_power(a: RealInterval, exponent: RealInterval) -> RealInterval:
-    """Return the range of x**y for x >= 0, or for one whole y."""
+    """Return the range of x**y for x >= 0, or for a single integer y."""
     if exponent[0] == exponent[1] and exponent[0] == int(exponent[0]) and abs(exponent[0]) < 64:
         n = int(exponent[0])
         if n < 0:
@@ -97,7 +98,7 @@ def interval_power(a: RealInterval, exponent: RealInterval) -> RealInterval:
 
 
 def interval_unary(op: int, a: RealInterval) -> RealInterval:
-    """Return the range of one of CasADi's functions of one argument."""
+    """Return the range of a unary CasADi operation."""
     if op in _INCREASING:
         low, high = _ends(_INCREASING[op], a)
         return (max(0.0, low), high) if op in (ca.OP_SQRT, ca.OP_EXP) else (low, high)
@@ -119,7 +120,7 @@ def interval_unary(op: int, a: RealInterval) -> RealInterval:
 
 
 def interval_slope(op: int, a: RealInterval) -> RealInterval | None:
-    """Return the range of such a function's derivative, None where it may have none."""
+    """Return the range of the derivative of a unary CasADi operation, None if it may not exist."""
     if op == ca.OP_SIN:
         return interval_unary(ca.OP_COS, a)
     if op == ca.OP_COS:
@@ -145,7 +146,7 @@ def interval_slope(op: int, a: RealInterval) -> RealInterval | None:
 
 
 def interval_polynomial(coefficients: tuple[float, ...], a: RealInterval) -> RealInterval:
-    """Return a range of a polynomial, constant coefficient first."""
+    """Return an enclosure of the range of a polynomial, constant coefficient first, by Horner's scheme."""
     result = ZERO_INTERVAL
     for coefficient in reversed(coefficients):
         result = (
@@ -170,7 +171,7 @@ def _pow(x: float, y: float) -> float:
 
 
 def _ends(function: Callable[[float], float], a: RealInterval) -> RealInterval:
-    """Return the range of an increasing function, which is right to a few last digits."""
+    """Return the range of an increasing function that is accurate to a few last digits."""
     return round_outwards(_at(function, a[0], -math.inf), _at(function, a[1], math.inf), 4)
 
 
@@ -186,7 +187,7 @@ def _cosine(a: RealInterval, peak: float) -> RealInterval:
     low, high = a[0] - peak, a[1] - peak
     if not high - low < 2 * math.pi or max(abs(low), abs(high)) > 1e6:
         return -1.0, 1.0
-    around = 1e-9  # what rounding of the multiples of π can make of it
+    around = 1e-9  # above the rounding error of multiples of π
     top = math.floor((high + around) / (2 * math.pi)) * 2 * math.pi >= low - around
     bottom = (math.floor((high + around) / (2 * math.pi) - 0.5) + 0.5) * 2 * math.pi >= low - around
     ends = math.cos(low), math.cos(high)

@@ -13,10 +13,31 @@ from kineverse.expressions.graph import expand_nodes
 from kineverse.expressions.implicit import ImplicitFunction
 from kineverse.symbols import Symbol
 
-from . import arithmetic, taylor
-from .arithmetic import REALS, RealInterval
+from .arithmetic import (
+    REALS,
+    ZERO_INTERVAL,
+    RealInterval,
+    interval_add,
+    interval_hull,
+    interval_multiply,
+    interval_negate,
+    round_outwards,
+)
 from .graph import Term, TermGraph
-from .taylor import TaylorSeries
+from .taylor import (
+    TaylorSeries,
+    taylor_add,
+    taylor_arctan2,
+    taylor_constant,
+    taylor_divide,
+    taylor_hull,
+    taylor_multiply,
+    taylor_negate,
+    taylor_polynomial,
+    taylor_power,
+    taylor_subtract,
+    taylor_unary,
+)
 
 RealMatrix = npt.NDArray[np.float64]
 _UNKNOWN: TaylorSeries = (REALS,)
@@ -26,20 +47,20 @@ _ATTEMPTS = 4
 
 
 class Enclosures:
-    """Evaluates terms over intervals.
+    """Evaluation of terms over intervals.
 
     Parameters
     ----------
     terms
-        Where the terms are from.
+        The graph of the terms.
     """
 
     def __init__(self, terms: TermGraph) -> None:
         self._terms = terms
         self._solvers: dict[ImplicitFunction, _Solver] = {}
 
-    def of(self, roots: list[Term], values: Mapping[Symbol, TaylorSeries]) -> list[TaylorSeries]:
-        """Return the series of terms, from those of the symbols that they are about."""
+    def enclose(self, roots: list[Term], values: Mapping[Symbol, TaylorSeries]) -> list[TaylorSeries]:
+        """Return the series of terms, from those of their symbols."""
         known: dict[int, TaylorSeries] = {}
         solved: dict[object, list[TaylorSeries]] = {}
         waiting = list(roots)
@@ -57,37 +78,37 @@ class Enclosures:
             elif term.op == "implicit":
                 node, element = term.data
                 if node not in solved:
-                    solved[node] = self.solved(node.function, [known[a.index] for a in term.args])
+                    solved[node] = self.enclose_implicit(node.function, [known[a.index] for a in term.args])
                 known[term.index] = solved[node][element]
             else:
                 known[term.index] = _step(term, [known[a.index] for a in term.args])
         return [known[term.index] for term in roots]
 
-    def solved(self, function: ImplicitFunction, inputs: list[TaylorSeries]) -> list[TaylorSeries]:
+    def enclose_implicit(self, function: ImplicitFunction, inputs: list[TaylorSeries]) -> list[TaylorSeries]:
         """Return the series of the unknowns of an implicit function, from those of its inputs."""
         if function not in self._solvers:
             self._solvers[function] = _Solver(function, self._terms, self)
-        return self._solvers[function].over(inputs)
+        return self._solvers[function].enclose(inputs)
 
 
 class _Solver:
-    """Encloses the unknowns of one implicit function.
+    """Enclosure of the unknowns of one implicit function.
 
-    Over a box U of inputs, with an approximate solution x and Y near the inverse of ∂r/∂x, the operator of
-    Krawczyk K(X) = x - Y r(x, U) + (1 - Y ∂r/∂x(X, U))(X - x) lies inside of X only if X has just one
+    Over a box U of inputs, with an approximate solution x and Y near the inverse of ∂r/∂x, Krawczyk's
+    operator K(X) = x - Y r(x, U) + (1 - Y ∂r/∂x(X, U))(X - x) lies inside of X only if X contains exactly one
     solution for each u in U (A. Neumaier, Interval Methods for Systems of Equations, 5.2).
     """
 
     def __init__(self, function: ImplicitFunction, terms: TermGraph, enclosures: Enclosures) -> None:
         self._function, self._enclosures = function, enclosures
-        self._chosen = terms.elements(function.chosen)
+        self._equations = terms.elements(function.equations)
         self._by_unknowns = terms.elements(function.by_unknowns)
         self._by_inputs = terms.elements(function.by_inputs)
         inputs = ca.vertcat(*(s._sx for s in function.inputs))
-        solution = ca.densify(expand_nodes(function.of(function.inputs)))
+        solution = ca.densify(expand_nodes(function.apply(function.inputs)))
         self._solve = ca.Function("solve", [inputs], [solution])
 
-    def over(self, inputs: list[TaylorSeries]) -> list[TaylorSeries]:
+    def enclose(self, inputs: list[TaylorSeries]) -> list[TaylorSeries]:
         """Return the series of the unknowns, from those of the inputs."""
         n = len(self._function.unknowns)
         if not all(math.isfinite(low) and math.isfinite(high) for (low, high), *_ in inputs):
@@ -102,14 +123,14 @@ class _Solver:
         box, inverse, slack = found
         unknowns: list[list[RealInterval]] = [[r] for r in box]
         for k in range(1, min(len(s) for s in inputs)):
-            trial = [(*u, arithmetic.ZERO_INTERVAL) for u in unknowns]
-            rest = self._at(self._chosen, trial, [s[: k + 1] for s in inputs])
+            trial = [(*u, ZERO_INTERVAL) for u in unknowns]
+            rest = self._at(self._equations, trial, [s[: k + 1] for s in inputs])
             if any(len(r) <= k for r in rest):
                 break
             applied = _multiply_column(inverse, [r[k] for r in rest])
             size = max(max(abs(a), abs(b)) for a, b in applied) * slack
             for unknown, (low, high) in zip(unknowns, applied, strict=True):
-                unknown.append(arithmetic.interval_add((-high, -low), (-size, size)))
+                unknown.append(interval_add((-high, -low), (-size, size)))
         return [tuple(u) for u in unknowns]
 
     def _krawczyk(
@@ -117,8 +138,8 @@ class _Solver:
     ) -> tuple[list[RealInterval], RealMatrix, float] | None:
         """Return a box with one solution for each input, Y, and β/(1 - β) with β = |1 - Y ∂r/∂x|.
 
-        It is made around the tangent D at the middle m, from which the solution departs by far less than from
-        x: r along it is r(x, m) + (∂r/∂u + ∂r/∂x D)(u - m).
+        The box is centred on the tangent D at the middle m, which is far closer to the solution than x is.
+        The residual along it is r(x, m) + (∂r/∂u + ∂r/∂x D)(u - m).
         """
         n, count = len(x), len(inputs)
         there: list[TaylorSeries] = [((float(v), float(v)),) for v in x]
@@ -129,13 +150,13 @@ class _Solver:
             return None
         inverse: RealMatrix = np.asarray(np.linalg.inv(slope), dtype=np.float64)
         tangent = -inverse @ by_inputs
-        away = [arithmetic.round_outwards(u[0] - m, u[1] - m) for u, m in zip(inputs, middle, strict=True)]
+        away = [round_outwards(u[0] - m, u[1] - m) for u, m in zip(inputs, middle, strict=True)]
         straight = _multiply_column(tangent, away)
-        residual = [s[0] for s in self._at(self._chosen, there, here)]
+        residual = [s[0] for s in self._at(self._equations, there, here)]
         radius = [1e-14] * n
         for _ in range(_ATTEMPTS):
             box = [
-                arithmetic.interval_add(arithmetic.round_outwards(float(v) - r, float(v) + r), along)
+                interval_add(round_outwards(float(v) - r, float(v) + r), along)
                 for v, r, along in zip(x, radius, straight, strict=True)
             ]
             points: list[TaylorSeries] = [(b,) for b in box]
@@ -148,20 +169,17 @@ class _Solver:
                 for k in range(n):
                     scale = float(tangent[k, j])
                     turned = [
-                        arithmetic.interval_add(t, arithmetic.interval_multiply((scale, scale), a[i + n * k]))
+                        interval_add(t, interval_multiply((scale, scale), a[i + n * k]))
                         for i, t in enumerate(turned)
                     ]
                 along_tangent = [
-                    arithmetic.interval_add(r, arithmetic.interval_multiply(t, away[j]))
+                    interval_add(r, interval_multiply(t, away[j]))
                     for r, t in zip(along_tangent, turned, strict=True)
                 ]
-            shift = [arithmetic.interval_negate(s) for s in _multiply_column(inverse, along_tangent)]
+            shift = [interval_negate(s) for s in _multiply_column(inverse, along_tangent)]
             columns = [_multiply_column(inverse, a[n * j : n * (j + 1)]) for j in range(n)]
             rest = [
-                [
-                    arithmetic.interval_add((float(i == j),) * 2, arithmetic.interval_negate(columns[j][i]))
-                    for j in range(n)
-                ]
+                [interval_add((float(i == j),) * 2, interval_negate(columns[j][i])) for j in range(n)]
                 for i in range(n)
             ]
             norm = max(sum(max(-low, high) for low, high in row) for row in rest)
@@ -171,9 +189,7 @@ class _Solver:
             for i in range(n):
                 total = shift[i]
                 for j in range(n):
-                    total = arithmetic.interval_add(
-                        total, arithmetic.interval_multiply(rest[i][j], (-radius[j], radius[j]))
-                    )
+                    total = interval_add(total, interval_multiply(rest[i][j], (-radius[j], radius[j])))
                 left.append(total)
             if all(-r < low and high < r for (low, high), r in zip(left, radius, strict=True)):
                 return box, inverse, norm / (1 - norm)
@@ -193,7 +209,7 @@ class _Solver:
     ) -> list[TaylorSeries]:
         function = self._function
         values = dict(zip((*function.unknowns, *function.inputs), (*unknowns, *inputs), strict=True))
-        return self._enclosures.of(roots, values)
+        return self._enclosures.enclose(roots, values)
 
 
 def _middle(a: RealInterval) -> float:
@@ -203,9 +219,9 @@ def _middle(a: RealInterval) -> float:
 def _multiply_column(matrix: RealMatrix, column: list[RealInterval]) -> list[RealInterval]:
     result = []
     for row in matrix.tolist():
-        total = arithmetic.ZERO_INTERVAL
+        total = ZERO_INTERVAL
         for entry, value in zip(row, column, strict=True):
-            total = arithmetic.interval_add(total, arithmetic.interval_multiply((entry, entry), value))
+            total = interval_add(total, interval_multiply((entry, entry), value))
         result.append(total)
     return result
 
@@ -214,41 +230,41 @@ def _step(term: Term, args: list[TaylorSeries]) -> TaylorSeries:
     """Return the series of a step from those of its arguments."""
     op = term.op
     if op == ca.OP_CONST:
-        return taylor.taylor_constant(term.data) if math.isfinite(term.data) else _UNKNOWN
+        return taylor_constant(term.data) if math.isfinite(term.data) else _UNKNOWN
     if op == ca.OP_ADD:
-        return taylor.taylor_add(*args)
+        return taylor_add(*args)
     if op == ca.OP_SUB:
-        return taylor.taylor_subtract(*args)
+        return taylor_subtract(*args)
     if op == ca.OP_MUL:
-        return taylor.taylor_multiply(*args)
+        return taylor_multiply(*args)
     if op == ca.OP_DIV:
-        return taylor.taylor_divide(*args)
+        return taylor_divide(*args)
     if op == ca.OP_NEG:
-        return taylor.taylor_negate(args[0])
+        return taylor_negate(args[0])
     if op == ca.OP_POW:
-        return taylor.taylor_power(args[0], args[1][0])
+        return taylor_power(args[0], args[1][0])
     if op == ca.OP_ATAN2:
-        return taylor.taylor_arctan2(*args)
+        return taylor_arctan2(*args)
     if op == "piecewise":
         periodic, knots, pieces = term.data
         return _piecewise(periodic, knots, pieces, args[0])
     if op in (ca.OP_FMIN, ca.OP_FMAX):
         a, b = args if op == ca.OP_FMIN else args[::-1]
-        return a if a[0][1] <= b[0][0] else b if b[0][1] <= a[0][0] else taylor.taylor_hull(a, b)
+        return a if a[0][1] <= b[0][0] else b if b[0][1] <= a[0][0] else taylor_hull(a, b)
     if op == "select":
         truth, yes, no = args
         if truth[0][0] >= 0.5 or truth[0][1] < 0.5:
             return yes if truth[0][0] >= 0.5 else no
-        return (arithmetic.interval_hull(yes[0], no[0]),)
+        return (interval_hull(yes[0], no[0]),)
     if len(args) == 1 and isinstance(op, int):
-        return taylor.taylor_unary(op, args[0])
-    return (arithmetic.round_outwards(0.0, 1.0),) if op == "less" else _UNKNOWN
+        return taylor_unary(op, args[0])
+    return (round_outwards(0.0, 1.0),) if op == "less" else _UNKNOWN
 
 
 def _piecewise(
     periodic: bool, knots: tuple[float, ...], pieces: tuple[tuple[float, ...], ...], x: TaylorSeries
 ) -> TaylorSeries:
-    """Return the series of a piecewise polynomial, of all pieces that the argument may be in."""
+    """Return the series of a piecewise polynomial, over all pieces that the argument meets."""
     low, high = x[0]
     if periodic:
         period = knots[-1] - knots[0]
@@ -256,11 +272,11 @@ def _piecewise(
             return _UNKNOWN
         turn = math.floor((low - knots[0]) / period) * period
         if high - turn > knots[-1]:
-            # Across the end of a period: what is left of it, and what is right of it.
+            # Across the end of a period: the parts before and after it.
             end = turn + knots[-1]
             left = _piecewise(periodic, knots, pieces, ((low, math.nextafter(end, low)), *x[1:]))
-            return taylor.taylor_hull(left, _piecewise(periodic, knots, pieces, ((end, high), *x[1:])))
-        x = taylor.taylor_subtract(x, taylor.taylor_constant(turn))
+            return taylor_hull(left, _piecewise(periodic, knots, pieces, ((end, high), *x[1:])))
+        x = taylor_subtract(x, taylor_constant(turn))
     low, high = x[0]
     starts = knots[:-1] if periodic else (knots[0], *knots)
     begins = knots[:-1] if periodic else (-math.inf, *knots)
@@ -269,8 +285,6 @@ def _piecewise(
     for piece, start, begin, end in zip(pieces, starts, begins, ends, strict=True):
         if begin <= high and low <= end:
             inside: RealInterval = (max(low, begin), min(high, end))
-            here = taylor.taylor_polynomial(
-                piece, taylor.taylor_subtract((inside, *x[1:]), taylor.taylor_constant(start))
-            )
-            found = here if found is None else taylor.taylor_hull(found, here)
+            here = taylor_polynomial(piece, taylor_subtract((inside, *x[1:]), taylor_constant(start)))
+            found = here if found is None else taylor_hull(found, here)
     return _UNKNOWN if found is None else found

@@ -1,8 +1,8 @@
 """Expression graphs as elementary operations with logic, choices and kinks visible.
 
-CasADi's graph of an expression contains nodes of Kineverse as symbols. Here both become one graph: steps of
-arithmetic, and beside them ``less``, ``select``, ``min`` and ``max``, and piecewise polynomials, which are
-what cases are distinguished by. Equal steps are one object.
+CasADi's graph of an expression contains Kineverse's nodes as symbols. A :class:`TermGraph` combines both:
+arithmetic operations together with ``less``, ``select``, ``min``, ``max`` and piecewise polynomials, at which
+a case split branches. Equal operations are one object.
 """
 
 from __future__ import annotations
@@ -25,11 +25,11 @@ from kineverse.logic import Less
 from kineverse.symbols import Symbol
 
 SHARP_CONTRAST = 1e7
-"""The contrast [per unit] from which on ``less`` counts as a step, whatever its ramp is."""
+"""The contrast [per unit] from which on the ramp of ``less`` is neglected, and ``less`` is a step."""
 SATURATED = 20.0
-"""Where tanh is 1 to the last bit."""
+"""An argument from which on tanh is 1 to the last bit."""
 
-_SOLVED = "implicit"
+_IMPLICIT = "implicit"
 DOMAINS: dict[int, tuple[float, float]] = {
     ca.OP_SQRT: (0, math.inf),
     ca.OP_LOG: (0, math.inf),
@@ -44,16 +44,16 @@ _COMPARISONS = (ca.OP_LT, ca.OP_LE, ca.OP_EQ, ca.OP_NE)
 
 @dataclass(frozen=True, eq=False)
 class Term:
-    """One step: an operation (a number of CasADi's, or a name) on others.
+    """An operation (by CasADi's number, or a name) on other terms.
 
     Attributes
     ----------
     index
-        Counts up; arguments come before what is made of them.
+        The number of the term; arguments have smaller ones.
     data
-        A constant's number, a symbol, a contrast, or a node.
+        The number of a constant, a symbol, a contrast, or a node.
     deciders
-        Terms whose signs decide which case this step is in.
+        Terms whose signs determine the case of this operation.
     """
 
     index: int
@@ -64,45 +64,45 @@ class Term:
 
 
 class TermGraph:
-    """All steps met so far.
+    """The terms of one or more expressions.
 
     Parameters
     ----------
     given
-        Values of symbols that are taken as constant.
+        Values of symbols to be taken as constant.
     """
 
     def __init__(self, given: Mapping[Symbol, float]) -> None:
         self._given = given
         self._known: dict[Any, Term] = {}
-        self._of_node: dict[Node, list[Term]] = {}
+        self._node_terms: dict[Node, list[Term]] = {}
 
-    def of(self, expression: Expression) -> Term:
-        """Return a scalar expression as a term."""
+    def term(self, expression: Expression) -> Term:
+        """Return the term of a scalar expression."""
         (term,) = self.elements(expression)
         return term
 
     def elements(self, expression: Expression) -> list[Term]:
-        """Return the elements of an expression as terms, column by column."""
-        nodes = topological_order(leaves(expression)[1], _parts, self._of_node.__contains__)
+        """Return the terms of the elements of an expression, column by column."""
+        nodes = topological_order(leaves(expression)[1], _parts, self._node_terms.__contains__)
         for node in nodes:
-            self._of_node[node] = self._node(node)
+            self._node_terms[node] = self._node(node)
         return self._graph(expression)
 
     def constant(self, number: float) -> Term:
-        """Return a number."""
+        """Return the term of a number."""
         return self._step(ca.OP_CONST, data=float(number))
 
-    def minus(self, a: Term, b: Term) -> Term:
-        """Return a difference, such that a - b and b - a are decided by the same one."""
+    def subtract(self, a: Term, b: Term) -> Term:
+        """Return the difference; b - a is the negative of a - b, so both have the same deciders."""
         if b.op == ca.OP_CONST and b.data == 0:
             return a
         if a.index < b.index:
-            return self._step(ca.OP_NEG, (self.minus(b, a),))
+            return self._step(ca.OP_NEG, (self.subtract(b, a),))
         return self._step(ca.OP_SUB, (a, b))
 
-    def over(self, a: Term, b: Term) -> Term:
-        """Return a quotient."""
+    def divide(self, a: Term, b: Term) -> Term:
+        """Return the quotient."""
         return a if b.op == ca.OP_CONST and b.data == 1 else self._step(ca.OP_DIV, (a, b))
 
     def _step(
@@ -115,7 +115,7 @@ class TermGraph:
         return known
 
     def _graph(self, expression: Expression) -> list[Term]:
-        """Return the elements, column by column as CasADi keeps them; nodes in it are known already."""
+        """Return the terms of the elements, column by column as in CasADi; those of nodes are known."""
         sx = ca.densify(expression._sx)
         elements = ca.symvar(sx)
         function = ca.Function("terms", [ca.vertcat(*elements)] if elements else [], [sx])
@@ -140,14 +140,14 @@ class TermGraph:
         symbol = SYMBOLS.get(name)
         if symbol is None:
             node = NODES[name]
-            return self._of_node[node][node.elements.index(name)]
+            return self._node_terms[node][node.elements.index(name)]
         if symbol in self._given:
             return self.constant(self._given[symbol])
         return self._step(ca.OP_PARAMETER, data=symbol)
 
     def _operation(self, op: int, args: tuple[Term, ...]) -> Term:
         if op == ca.OP_SUB:
-            return self.minus(*args)
+            return self.subtract(*args)
         if op == ca.OP_TWICE:
             return self._step(ca.OP_MUL, (args[0], self.constant(2.0)))
         if op == ca.OP_INV:
@@ -155,7 +155,7 @@ class TermGraph:
         if op == ca.OP_SQ:
             return self._step(ca.OP_MUL, (args[0], args[0]))
         if op in _COMPARISONS or op in (ca.OP_FMIN, ca.OP_FMAX):
-            return self._step(op, args, deciders=(self.minus(*args),))
+            return self._step(op, args, deciders=(self.subtract(*args),))
         if op in (ca.OP_FABS, ca.OP_SIGN):
             return self._step(op, args, deciders=args)
         if op in (ca.OP_IF_ELSE_ZERO, ca.OP_NOT):
@@ -166,15 +166,15 @@ class TermGraph:
             return self._step(ca.OP_POW, args, deciders=args[:1])
         if op in DOMAINS:
             low, high = DOMAINS[op]
-            ends = [self.minus(args[0], self.constant(low))]
-            ends += [self.minus(self.constant(high), args[0])] if high < math.inf else []
+            ends = [self.subtract(args[0], self.constant(low))]
+            ends += [self.subtract(self.constant(high), args[0])] if high < math.inf else []
             return self._step(op, args, deciders=tuple(ends))
         return self._step(op, args)
 
     def _node(self, node: Node) -> list[Term]:
         if isinstance(node, Implicit):
-            inputs = tuple(self.of(a) for a in node.arguments)
-            return [self._step(_SOLVED, inputs, (node, i)) for i in range(node.size)]
+            inputs = tuple(self.term(a) for a in node.arguments)
+            return [self._step(_IMPLICIT, inputs, (node, i)) for i in range(node.size)]
         if isinstance(node, Less | Select | Extremum | Piecewise):
             rows = list(zip(*(self._graph(a) for a in node.arguments), strict=True))
             return [self._choice(node, row) for row in rows]
@@ -183,16 +183,18 @@ class TermGraph:
     def _choice(self, node: Node, args: tuple[Term, ...]) -> Term:
         if isinstance(node, Less):
             contrast = float(node.options[0])
-            excess = self.minus(args[1], args[0])
+            excess = self.subtract(args[1], args[0])
             if contrast >= SHARP_CONTRAST:
                 return self._step("less", (excess,), contrast, (excess,))
             width = self.constant(SATURATED / contrast)
-            ramp = (self._step(ca.OP_ADD, (excess, width)), self.minus(excess, width))
+            ramp = (self._step(ca.OP_ADD, (excess, width)), self.subtract(excess, width))
             return self._step("less", (excess,), contrast, ramp)
         if isinstance(node, Select):
-            return self._step("select", args, deciders=(self.minus(args[0], self.constant(0.5)),))
+            return self._step("select", args, deciders=(self.subtract(args[0], self.constant(0.5)),))
         if isinstance(node, Piecewise):
-            ends = () if node.periodic else tuple(self.minus(args[0], self.constant(t)) for t in node.knots)
+            ends = (
+                () if node.periodic else tuple(self.subtract(args[0], self.constant(t)) for t in node.knots)
+            )
             return self._step("piecewise", args, (node.periodic, node.knots, node.pieces), ends)
         op = ca.OP_FMIN if node.options[0] == "min" else ca.OP_FMAX
         result = args[0]
@@ -211,7 +213,7 @@ def _formula(node: Node) -> Expression:
 
 
 def reachable_terms(roots: tuple[Term, ...]) -> list[Term]:
-    """Return the terms that others are made of or decided by, arguments first."""
+    """Return the arguments and deciders of terms, theirs, and so on, arguments first."""
     found: dict[int, Term] = {}
     stack = list(roots)
     while stack:

@@ -1,8 +1,8 @@
 """Taylor series with interval coefficients.
 
-The coefficient k of a series over an interval of x holds f⁽ᵏ⁾(x)/k! for each x in there (R. E. Moore, Methods
-and Applications of Interval Analysis, 3.4). A series is as long as that is known: one that only has its first
-coefficient says between which numbers the function lies, one with two also how steep it is.
+Coefficient k of a series over an interval of x contains f⁽ᵏ⁾(x)/k! for each x of the interval (R. E. Moore,
+Methods and Applications of Interval Analysis, 3.4). A series is as long as its coefficients are known: one of
+a single coefficient encloses the values of the function, one of two the slopes as well.
 """
 
 from __future__ import annotations
@@ -12,36 +12,48 @@ from typing import TypeAlias
 
 import casadi as ca
 
-from . import arithmetic
-from .arithmetic import REALS, RealInterval
+from .arithmetic import (
+    REALS,
+    ZERO_INTERVAL,
+    RealInterval,
+    interval_add,
+    interval_hull,
+    interval_multiply,
+    interval_negate,
+    interval_power,
+    interval_reciprocal,
+    interval_square,
+    interval_unary,
+    round_outwards,
+)
 
 TaylorSeries: TypeAlias = tuple[RealInterval, ...]
 
 TAYLOR_ORDER = 5
-"""The power up to which series go."""
+"""The highest power of a series."""
 
 ONE_INTERVAL: RealInterval = (1.0, 1.0)
 _UNBOUNDED: TaylorSeries = (REALS,)
 
 
 def taylor_constant(number: float) -> TaylorSeries:
-    """Return a number."""
-    return ((number, number), *(arithmetic.ZERO_INTERVAL,) * TAYLOR_ORDER)
+    """Return the series of a constant."""
+    return ((number, number), *(ZERO_INTERVAL,) * TAYLOR_ORDER)
 
 
 def taylor_variable(where: RealInterval) -> TaylorSeries:
-    """Return x itself, anywhere in an interval."""
-    return (where, ONE_INTERVAL, *(arithmetic.ZERO_INTERVAL,) * (TAYLOR_ORDER - 1))
+    """Return the series of x over an interval."""
+    return (where, ONE_INTERVAL, *(ZERO_INTERVAL,) * (TAYLOR_ORDER - 1))
 
 
 def taylor_add(a: TaylorSeries, b: TaylorSeries) -> TaylorSeries:
     """Return the series of f + g."""
-    return tuple(arithmetic.interval_add(x, y) for x, y in zip(a, b, strict=False))
+    return tuple(interval_add(x, y) for x, y in zip(a, b, strict=False))
 
 
 def taylor_negate(a: TaylorSeries) -> TaylorSeries:
     """Return the series of -f."""
-    return tuple(map(arithmetic.interval_negate, a))
+    return tuple(map(interval_negate, a))
 
 
 def taylor_subtract(a: TaylorSeries, b: TaylorSeries) -> TaylorSeries:
@@ -54,7 +66,7 @@ def taylor_multiply(a: TaylorSeries, b: TaylorSeries) -> TaylorSeries:
     count = min(len(a), len(b))
     result = [_dot(a, b, 0, k) for k in range(count)]
     if a is b:
-        result[0] = arithmetic.interval_square(a[0])
+        result[0] = interval_square(a[0])
     return tuple(result)
 
 
@@ -62,11 +74,11 @@ def taylor_divide(a: TaylorSeries, b: TaylorSeries) -> TaylorSeries:
     """Return the series of f/g."""
     if b[0][0] <= 0 <= b[0][1]:
         return _UNBOUNDED
-    inverse = arithmetic.interval_reciprocal(b[0])
+    inverse = interval_reciprocal(b[0])
     result: list[RealInterval] = []
     for k in range(min(len(a), len(b))):
-        rest = arithmetic.interval_add(a[k], arithmetic.interval_negate(_dot(b, result, 1, k)))
-        result.append(arithmetic.interval_multiply(rest, inverse))
+        rest = interval_add(a[k], interval_negate(_dot(b, result, 1, k)))
+        result.append(interval_multiply(rest, inverse))
     return tuple(result)
 
 
@@ -74,21 +86,21 @@ def taylor_power(a: TaylorSeries, exponent: RealInterval) -> TaylorSeries:
     """Return the series of f to a constant power."""
     n = exponent[0]
     if exponent[0] != exponent[1]:
-        return (arithmetic.interval_power(a[0], exponent),)
+        return (interval_power(a[0], exponent),)
     if n == int(n) and abs(n) <= 16:
         result = taylor_constant(1.0)
         for _ in range(int(abs(n))):
             result = taylor_multiply(result, a)
-        result = (arithmetic.interval_power(a[0], (abs(n), abs(n))), *result[1:])
+        result = (interval_power(a[0], (abs(n), abs(n))), *result[1:])
         return taylor_divide(taylor_constant(1.0), result) if n < 0 else result
     if a[0][0] <= 0:
-        return (arithmetic.interval_power(a[0], exponent),) if a[0][0] == 0 else _UNBOUNDED
+        return (interval_power(a[0], exponent),) if a[0][0] == 0 else _UNBOUNDED
     return taylor_unary(ca.OP_EXP, taylor_multiply(taylor_constant(n), taylor_unary(ca.OP_LOG, a)))
 
 
 def taylor_unary(op: int, a: TaylorSeries) -> TaylorSeries:
-    """Return the series of one of CasADi's functions of one argument, of f."""
-    value = arithmetic.interval_unary(op, a[0])
+    """Return the series of a unary CasADi operation on f."""
+    value = interval_unary(op, a[0])
     if op in (ca.OP_SIN, ca.OP_COS):
         sine, cosine = _sine_and_cosine(a)
         return sine if op == ca.OP_SIN else cosine
@@ -119,39 +131,29 @@ def taylor_unary(op: int, a: TaylorSeries) -> TaylorSeries:
 
 
 def taylor_arctan2(y: TaylorSeries, x: TaylorSeries) -> TaylorSeries:
-    """Return the series of the angle of (x, y), in (-π, π]; nothing is known where it jumps."""
-    half = arithmetic.round_outwards(math.pi / 2, math.pi / 2)
+    """Return the series of the angle of (x, y), in (-π, π]; the full range if it may jump."""
+    half = round_outwards(math.pi / 2, math.pi / 2)
     if x[0][0] > 0:
-        value = arithmetic.interval_unary(
-            ca.OP_ATAN, arithmetic.interval_multiply(y[0], arithmetic.interval_reciprocal(x[0]))
-        )
+        value = interval_unary(ca.OP_ATAN, interval_multiply(y[0], interval_reciprocal(x[0])))
     elif y[0][0] > 0 or y[0][1] < 0:
-        turned = arithmetic.interval_unary(
-            ca.OP_ATAN, arithmetic.interval_multiply(x[0], arithmetic.interval_reciprocal(y[0]))
-        )
-        value = arithmetic.interval_add(
-            half if y[0][0] > 0 else arithmetic.interval_negate(half), arithmetic.interval_negate(turned)
-        )
+        turned = interval_unary(ca.OP_ATAN, interval_multiply(x[0], interval_reciprocal(y[0])))
+        value = interval_add(half if y[0][0] > 0 else interval_negate(half), interval_negate(turned))
     else:
-        return (arithmetic.round_outwards(-math.pi, math.pi),)
+        return (round_outwards(-math.pi, math.pi),)
     squared = taylor_add(taylor_multiply(x, x), taylor_multiply(y, y))
     # θ' = (x y' - y x') / (x² + y²)
     count = min(len(x), len(y))
     result = [value]
     for k in range(1, count):
-        rest = arithmetic.interval_add(_weighted(y, x, k), arithmetic.interval_negate(_weighted(x, y, k)))
-        rest = arithmetic.interval_add(
-            rest, arithmetic.interval_negate(_weighted(tuple(result), squared, k, last=False))
-        )
-        result.append(
-            _over(arithmetic.interval_multiply(rest, arithmetic.interval_reciprocal(squared[0])), k)
-        )
+        rest = interval_add(_weighted(y, x, k), interval_negate(_weighted(x, y, k)))
+        rest = interval_add(rest, interval_negate(_weighted(tuple(result), squared, k, last=False)))
+        result.append(_over(interval_multiply(rest, interval_reciprocal(squared[0])), k))
     return tuple(result)
 
 
 def taylor_hull(a: TaylorSeries, b: TaylorSeries) -> TaylorSeries:
-    """Return what holds for both of two functions that meet: their values, and how steep they are."""
-    return tuple(arithmetic.interval_hull(x, y) for x, y in list(zip(a, b, strict=False))[:2])
+    """Return the hulls of the values and slopes of two functions that meet."""
+    return tuple(interval_hull(x, y) for x, y in list(zip(a, b, strict=False))[:2])
 
 
 def taylor_polynomial(coefficients: tuple[float, ...], x: TaylorSeries) -> TaylorSeries:
@@ -170,11 +172,11 @@ def _dot(
     a: TaylorSeries | list[RealInterval], b: TaylorSeries | list[RealInterval], start: int, k: int
 ) -> RealInterval:
     """Return Σ a_i b_k-i for i from ``start`` to k."""
-    total = arithmetic.ZERO_INTERVAL
+    total = ZERO_INTERVAL
     for i in range(start, k + 1):
-        if a[i] != arithmetic.ZERO_INTERVAL and b[k - i] != arithmetic.ZERO_INTERVAL:
-            product = arithmetic.interval_multiply(a[i], b[k - i])
-            total = product if total == arithmetic.ZERO_INTERVAL else arithmetic.interval_add(total, product)
+        if a[i] != ZERO_INTERVAL and b[k - i] != ZERO_INTERVAL:
+            product = interval_multiply(a[i], b[k - i])
+            total = product if total == ZERO_INTERVAL else interval_add(total, product)
     return total
 
 
@@ -182,55 +184,53 @@ def _weighted(
     a: TaylorSeries, b: TaylorSeries | list[RealInterval], k: int, last: bool = True
 ) -> RealInterval:
     """Return Σ i a_i b_k-i for i from 1 to k, or to k - 1."""
-    total = arithmetic.ZERO_INTERVAL
+    total = ZERO_INTERVAL
     for i in range(1, k + last):
-        total = arithmetic.interval_add(
+        total = interval_add(
             total,
-            arithmetic.interval_multiply((float(i), float(i)), arithmetic.interval_multiply(a[i], b[k - i])),
+            interval_multiply((float(i), float(i)), interval_multiply(a[i], b[k - i])),
         )
     return total
 
 
 def _over(a: RealInterval, k: int) -> RealInterval:
-    return arithmetic.interval_multiply(a, arithmetic.interval_reciprocal((float(k), float(k))))
+    return interval_multiply(a, interval_reciprocal((float(k), float(k))))
 
 
 def _sine_and_cosine(a: TaylorSeries) -> tuple[TaylorSeries, TaylorSeries]:
-    sine, cosine = [arithmetic.interval_unary(ca.OP_SIN, a[0])], [arithmetic.interval_unary(ca.OP_COS, a[0])]
+    sine, cosine = [interval_unary(ca.OP_SIN, a[0])], [interval_unary(ca.OP_COS, a[0])]
     for k in range(1, len(a)):
         s, c = _over(_weighted(a, cosine, k), k), _over(_weighted(a, sine, k), k)
         sine.append(s)
-        cosine.append(arithmetic.interval_negate(c))
+        cosine.append(interval_negate(c))
     return tuple(sine), tuple(cosine)
 
 
 def _root(a: TaylorSeries, value: RealInterval) -> TaylorSeries:
     if a[0][0] <= 0:
         return (value,) if a[0][1] >= 0 else _UNBOUNDED
-    twice = arithmetic.interval_reciprocal(arithmetic.interval_multiply((2.0, 2.0), value))
+    twice = interval_reciprocal(interval_multiply((2.0, 2.0), value))
     result = [value]
     for k in range(1, len(a)):
-        rest = arithmetic.interval_add(a[k], arithmetic.interval_negate(_inner(result, k)))
-        result.append(arithmetic.interval_multiply(rest, twice))
+        rest = interval_add(a[k], interval_negate(_inner(result, k)))
+        result.append(interval_multiply(rest, twice))
     return tuple(result)
 
 
 def _inner(result: list[RealInterval], k: int) -> RealInterval:
     """Return Σ c_i c_k-i for i from 1 to k - 1."""
-    total = arithmetic.ZERO_INTERVAL
+    total = ZERO_INTERVAL
     for i in range(1, k):
-        total = arithmetic.interval_add(total, arithmetic.interval_multiply(result[i], result[k - i]))
+        total = interval_add(total, interval_multiply(result[i], result[k - i]))
     return total
 
 
 def _integrate(value: RealInterval, a: TaylorSeries, divisor: TaylorSeries) -> TaylorSeries:
-    """Return the series of y with y' = f'/g, whose value is known."""
+    """Return the series of y with y' = f'/g, for a known enclosure of its values."""
     result = [value]
-    inverse = arithmetic.interval_reciprocal(divisor[0])
+    inverse = interval_reciprocal(divisor[0])
     for k in range(1, min(len(a), len(divisor))):
-        rest = arithmetic.interval_multiply((float(k), float(k)), a[k])
-        rest = arithmetic.interval_add(
-            rest, arithmetic.interval_negate(_weighted(tuple(result), divisor, k, last=False))
-        )
-        result.append(_over(arithmetic.interval_multiply(rest, inverse), k))
+        rest = interval_multiply((float(k), float(k)), a[k])
+        rest = interval_add(rest, interval_negate(_weighted(tuple(result), divisor, k, last=False)))
+        result.append(_over(interval_multiply(rest, inverse), k))
     return tuple(result)

@@ -160,7 +160,7 @@ class CloseLoop(Operation):
             upright=array(signs) if signs else None,
         )
         self._check(model, closed)
-        solution = closed.function.of(closed.function.inputs)
+        solution = closed.function.apply(closed.function.inputs)
         return Writes(
             constraints={f"{self.name}/{k}": (a, by_name[k], b) for k, a, b in self.within},
             rates={x: solution[i] for i, x in enumerate(closed.dependent)},

@@ -63,7 +63,7 @@ class Placement:
             steps.append(ChainStep(rotation, position, nodes, factor))
             nodes = nodes | factor._nodes if factor._nodes else nodes
             if isinstance(factor, OneAxisTransform):
-                if factor.turns:
+                if factor.is_rotation:
                     rotation = ca.mtimes(rotation, factor.rotation)
                 else:
                     position = ca.mtimes(rotation, factor.offset) + position
@@ -241,7 +241,7 @@ def _axis_twists(
         direction = ca.mtimes(step.rotation, ca.SX(ca.DM(motion.direction)))
     for key, entry in motion.amount.gradient(heuristic).items():
         along = direction * entry._sx
-        if motion.turns:
+        if motion.is_rotation:
             yield key, ca.cross(along, tip - step.position), along, entry._nodes
         else:
             yield key, along, ca.SX(3, 1), entry._nodes

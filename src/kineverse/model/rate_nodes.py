@@ -67,7 +67,7 @@ class Carried(Node):
         """Return what the node becomes under a substitution."""
         relevant = {s: e for s, e in substitution.items() if s in self.rates.symbols}
         itself = _expression_of(self)
-        return Composed.of((itself, *relevant.values()), (), tuple(relevant))
+        return Composed.from_arguments((itself, *relevant.values()), (), tuple(relevant))
 
 
 class Dependent(Node):
@@ -137,7 +137,9 @@ class Composed(Node):
 
     def substitute(self, substitution: Substitution) -> Expression:
         """Return what the node becomes under a substitution."""
-        return Composed.of((_expression_of(self), *substitution.values()), (), tuple(substitution))
+        return Composed.from_arguments(
+            (_expression_of(self), *substitution.values()), (), tuple(substitution)
+        )
 
 
 def to_plain(expression: Expression) -> Expression:
@@ -166,7 +168,7 @@ def _plain_image(node: Node, plain_part: Callable[[Expression], Expression]) -> 
     arguments = tuple(map(plain_part, node.arguments))
     if all(new is old for new, old in zip(arguments, node.arguments, strict=True)):
         return None
-    return type(node).of(arguments, node.shape, node.options)
+    return type(node).from_arguments(arguments, node.shape, node.options)
 
 
 def _recompose(node: Composed, plain_part: Callable[[Expression], Expression]) -> Expression | None:

@@ -266,9 +266,9 @@ class Rates(Mapping[Symbol, Mapping[Symbol, Expression]]):
         known = self._carried.get(coordinate)
         if known is None:
             if coordinate in self._rows:
-                known = Carried.of((coordinate,), (), (self.closure(coordinate),))
+                known = Carried.from_arguments((coordinate,), (), (self.closure(coordinate),))
             else:
-                known = Dependent.of((self.carry(self.dependent[coordinate]),), (), (coordinate,))
+                known = Dependent.from_arguments((self.carry(self.dependent[coordinate]),), (), (coordinate,))
             self._carried[coordinate] = known
         return known
 

@@ -11,8 +11,22 @@ from functools import lru_cache
 import casadi as ca
 
 from kineverse.expressions.implicit import ImplicitFunction
-from kineverse.intervals import arithmetic
-from kineverse.intervals.arithmetic import REALS, RealInterval
+from kineverse.intervals.arithmetic import (
+    REALS,
+    ZERO_INTERVAL,
+    RealInterval,
+    enclose_number,
+    interval_add,
+    interval_hull,
+    interval_multiply,
+    interval_negate,
+    interval_polynomial,
+    interval_power,
+    interval_reciprocal,
+    interval_square,
+    interval_unary,
+    round_outwards,
+)
 from kineverse.intervals.enclosure import Enclosures
 from kineverse.intervals.graph import DOMAINS, Term, TermGraph, reachable_terms
 from kineverse.intervals.taylor import TaylorSeries
@@ -35,13 +49,13 @@ def find_implicit_functions(terms: Iterable[Term]) -> set[ImplicitFunction]:
 
 @lru_cache(256)
 def _nested_loops(function: ImplicitFunction) -> set[ImplicitFunction]:
-    return find_implicit_functions(reachable_terms(tuple(TermGraph({}).elements(function.chosen))))
+    return find_implicit_functions(reachable_terms(tuple(TermGraph({}).elements(function.equations))))
 
 
 # Bisection comes back to the same intervals for every unknown and every case.
 @lru_cache(10_000)
 def _enclose(function: ImplicitFunction, inputs: tuple[TaylorSeries, ...]) -> tuple[TaylorSeries, ...]:
-    return tuple(_enclosures(function).solved(function, list(inputs)))
+    return tuple(_enclosures(function).enclose_implicit(function, list(inputs)))
 
 
 @lru_cache(64)
@@ -95,7 +109,7 @@ def from_number(number: float | Fraction) -> AbstractValue:
         return NOT_A_NUMBER
     if math.isinf(number):
         return AbstractValue((float(number), float(number)))
-    return AbstractValue(arithmetic.enclose_number(number), Polynomial.constant(number))
+    return AbstractValue(enclose_number(number), Polynomial.constant(number))
 
 
 def evaluate_term(term: Term, values: dict[int, AbstractValue], sign: Signs) -> AbstractValue:
@@ -185,10 +199,8 @@ def _value(
     if op == ca.OP_ATAN2:
         return AbstractValue((-3.1415926535897936, 3.1415926535897936), None, live)
     if op == ca.OP_HYPOT:
-        squares = arithmetic.interval_add(
-            arithmetic.interval_square(a.range), arithmetic.interval_square(b.range)
-        )
-        return AbstractValue(arithmetic.interval_unary(ca.OP_SQRT, squares), None, live)
+        squares = interval_add(interval_square(a.range), interval_square(b.range))
+        return AbstractValue(interval_unary(ca.OP_SQRT, squares), None, live)
     return AbstractValue(REALS, None, live)
 
 
@@ -206,9 +218,9 @@ def _choice(
         return chosen[0]
     span = chosen[0].range
     for other in chosen[1:]:
-        span = arithmetic.interval_hull(span, other.range)
+        span = interval_hull(span, other.range)
     if term.op == ca.OP_IF_ELSE_ZERO:
-        span = arithmetic.interval_hull(span, arithmetic.ZERO_INTERVAL)
+        span = interval_hull(span, ZERO_INTERVAL)
     elif term.op == ca.OP_FMIN:
         span = span[0], min(a.range[1] for a in args)
     elif term.op == ca.OP_FMAX:
@@ -222,7 +234,7 @@ def _unary(term: Term, a: AbstractValue, sign: Signs, live: frozenset[Symbol]) -
     turn = sign(term.args[0]) if op == ca.OP_FABS else None
     if op == ca.OP_NEG or turn == -1:
         return AbstractValue(
-            arithmetic.interval_negate(a.range),
+            interval_negate(a.range),
             None if a.polynomial is None else a.polynomial.scaled(-1),
             live,
         )
@@ -233,7 +245,7 @@ def _unary(term: Term, a: AbstractValue, sign: Signs, live: frozenset[Symbol]) -
     ends = [] if op == ca.OP_FABS else [sign(d) for d in term.deciders]
     if -1 in ends:
         return NOT_A_NUMBER
-    span = arithmetic.interval_unary(op, a.range)
+    span = interval_unary(op, a.range)
     if a.number == 0 and op in (ca.OP_SIN, ca.OP_TAN, ca.OP_SQRT, ca.OP_ATAN, ca.OP_ASIN, ca.OP_TANH):
         return from_number(0.0)
     if op in (ca.OP_FLOOR, ca.OP_CEIL) and span[1] - span[0] < 1:
@@ -246,13 +258,13 @@ def _sum(
 ) -> AbstractValue:
     if op == ca.OP_SUB and same:
         return from_number(0.0)
-    other = b.range if op == ca.OP_ADD else arithmetic.interval_negate(b.range)
+    other = b.range if op == ca.OP_ADD else interval_negate(b.range)
     if math.inf in (a.range[0], -a.range[1]) and a.range[0] == -other[0] and other[0] == other[1]:
         return NOT_A_NUMBER  # infinity less infinity
     exact = None
     if a.polynomial is not None and b.polynomial is not None:
         exact = a.polynomial + b.polynomial if op == ca.OP_ADD else a.polynomial - b.polynomial
-    return AbstractValue(arithmetic.interval_add(a.range, other), exact, live)
+    return AbstractValue(interval_add(a.range, other), exact, live)
 
 
 def _product(a: AbstractValue, b: AbstractValue, same: bool, live: frozenset[Symbol]) -> AbstractValue:
@@ -264,7 +276,7 @@ def _product(a: AbstractValue, b: AbstractValue, same: bool, live: frozenset[Sym
     if a.polynomial is not None and b.polynomial is not None:
         exact = a.polynomial.times(b.polynomial)
     return AbstractValue(
-        arithmetic.interval_square(a.range) if same else arithmetic.interval_multiply(a.range, b.range),
+        interval_square(a.range) if same else interval_multiply(a.range, b.range),
         exact,
         live,
     )
@@ -278,9 +290,7 @@ def _quotient(a: AbstractValue, b: AbstractValue, sign: int | None, live: frozen
         return AbstractValue(REALS, None, live, doubtful=True)
     below = (max(low, 0.0), high) if sign == 1 else (low, min(high, 0.0)) if sign == -1 else b.range
     exact = a.polynomial.scaled(1 / b.number) if a.polynomial is not None and b.number else None
-    return AbstractValue(
-        arithmetic.interval_multiply(a.range, arithmetic.interval_reciprocal(below)), exact, live
-    )
+    return AbstractValue(interval_multiply(a.range, interval_reciprocal(below)), exact, live)
 
 
 def _power(a: AbstractValue, b: AbstractValue, sign: int | None, live: frozenset[Symbol]) -> AbstractValue:
@@ -290,13 +300,13 @@ def _power(a: AbstractValue, b: AbstractValue, sign: int | None, live: frozenset
         exact: Polynomial | None = Polynomial.constant(1)
         for _ in range(int(n)):
             exact = None if exact is None else exact.times(a.polynomial)
-        return AbstractValue(arithmetic.interval_power(a.range, b.range), exact, live)
+        return AbstractValue(interval_power(a.range, b.range), exact, live)
     low, high = a.range
     if not whole and (sign == -1 or high < 0):
         return NOT_A_NUMBER
     grows = n is not None and n > 0
     safe = low > 0 or sign == 1 or (grows and (whole or low >= 0 or sign == 0)) or (whole and high < 0)
-    span = arithmetic.interval_power((max(low, 0.0), high) if not whole else a.range, b.range)
+    span = interval_power((max(low, 0.0), high) if not whole else a.range, b.range)
     return AbstractValue(span, None, live, doubtful=not safe)
 
 
@@ -325,16 +335,14 @@ def _piecewise(term: Term, x: AbstractValue, values: dict[int, AbstractValue], s
         for k in range(first, last + 1):
             start = -math.inf if k == 0 else starts[k]
             spans.append((pieces[k], max(low, start) - starts[k], min(high, ends[k]) - starts[k]))
-    found = [
-        arithmetic.interval_polynomial(p, arithmetic.round_outwards(a, b)) for p, a, b in spans if a <= b
-    ]
+    found = [interval_polynomial(p, round_outwards(a, b)) for p, a, b in spans if a <= b]
     span = (min(f[0] for f in found), max(f[1] for f in found)) if found else REALS
     return AbstractValue(span, None, x.live)
 
 
 def _polynomial_of(piece: tuple[float, ...], start: float, x: AbstractValue) -> AbstractValue:
     s = (x.range[0] - start, x.range[1] - start)
-    span = arithmetic.interval_polynomial(piece, arithmetic.round_outwards(*s))
+    span = interval_polynomial(piece, round_outwards(*s))
     exact: Polynomial | None = None
     if not any(piece[1:]):
         return from_number(piece[0])

@@ -10,7 +10,7 @@ from typing import TypeVar
 
 import casadi as ca
 
-from kineverse.intervals import arithmetic
+from kineverse.intervals.arithmetic import RealInterval, enclose_number
 from kineverse.intervals.graph import Term, reachable_terms
 from kineverse.symbols import Symbol
 
@@ -156,10 +156,10 @@ class Case:
             if p is not None and p.degree > 1:
                 p = p.at(self._pinned)
         if p is None or p.degree != 1:
-            span = value.range if p is None or p.symbols else arithmetic.enclose_number(p.offset)
+            span = value.range if p is None or p.symbols else enclose_number(p.offset)
             return AbstractValue(span, p, live, value.doubtful)
         side = self._sum(p.terms) if len(p.symbols) == 1 else self._line(p)
-        (low, _), (_, high) = arithmetic.enclose_number(side.lower), arithmetic.enclose_number(side.upper)
+        (low, _), (_, high) = enclose_number(side.lower), enclose_number(side.upper)
         span = (max(low, value.range[0]), min(high, value.range[1]))
         return AbstractValue(span, p, live, value.doubtful)
 
@@ -261,7 +261,7 @@ class Case:
             )
         order = reachable_terms((term,))
 
-        def look(low: float, high: float) -> tuple[arithmetic.RealInterval, arithmetic.RealInterval | None]:
+        def look(low: float, high: float) -> tuple[RealInterval, RealInterval | None]:
             span = Interval(_exact(low), _exact(high), not math.isinf(low), not math.isinf(high))
             inner = Case((term,), self._domain, {**self._axes, axis: span}, self._signs, order)
             rates = root_isolation.slope_ranges(order, inner._values, inner.sign, symbol)

@@ -46,10 +46,10 @@ def find_speed_effect(
     terms = TermGraph(given)
     held, weight, offset = _alone(constraint)
     ends = (constraint.lower, constraint.upper, offset, weight)
-    lower, upper, rest, factor = (terms.of(apply_substitution(part, follow)) for part in ends)
-    above, below = terms.minus(upper, rest), terms.minus(rest, lower)
+    lower, upper, rest, factor = (terms.term(apply_substitution(part, follow)) for part in ends)
+    above, below = terms.subtract(upper, rest), terms.subtract(rest, lower)
     blocked = SpeedEffect(held)
-    whole = terms.of(held) if not isinstance(held, Symbol) else None
+    whole = terms.term(held) if not isinstance(held, Symbol) else None
     start = Case((factor, above, below, *([] if whole is None else [whole])), domain)
     sides = [(above, below, blocked.up, blocked.up_beyond), (below, above, blocked.down, blocked.down_beyond)]
     if whole is not None and start.value(whole).range[0] >= -1e-300:
@@ -171,9 +171,11 @@ def find_position_effects(
     ``follow`` says by what coordinates are told that follow others.
     """
     terms = TermGraph(given)
-    asked = _Query(terms, domain, {terms.of(e).index: s for s, e in follow.items()}, unknown)
-    expression = terms.of(constraint.expression)
-    lower, upper = (terms.of(apply_substitution(end, follow)) for end in (constraint.lower, constraint.upper))
+    asked = _Query(terms, domain, {terms.term(e).index: s for s, e in follow.items()}, unknown)
+    expression = terms.term(constraint.expression)
+    lower, upper = (
+        terms.term(apply_substitution(end, follow)) for end in (constraint.lower, constraint.upper)
+    )
     form = Case((expression,), domain).value(expression).polynomial
     moves = bool(constraint.lower.symbols or constraint.upper.symbols)
     found: list[PositionEffect] = []
@@ -184,8 +186,8 @@ def find_position_effects(
             for monomial, factor in form.terms.items():
                 if monomial and monomial[0][0] != symbol:
                     rest = rest + float(factor) * monomial[0][0]
-            other, scale = terms.of(apply_substitution(rest, follow)), terms.constant(float(weight))
-            low, high = (terms.over(terms.minus(end, other), scale) for end in (lower, upper))
+            other, scale = terms.term(apply_substitution(rest, follow)), terms.constant(float(weight))
+            low, high = (terms.divide(terms.subtract(end, other), scale) for end in (lower, upper))
             if weight < 0:
                 low, high = high, low
             found += _find_effects(asked, symbol, low, high)
@@ -193,7 +195,7 @@ def find_position_effects(
         found += _find_effects(asked, constraint.expression, lower, upper)
     elif len(constraint.expression.symbols) > 1:
         found += _joint_limit_effects(
-            asked, constraint, terms.of(apply_substitution(constraint.expression, follow))
+            asked, constraint, terms.term(apply_substitution(constraint.expression, follow))
         )
     return found
 
@@ -287,13 +289,13 @@ def _agree(bound: Expression, other: Expression, at: dict[Symbol, float]) -> boo
 
 def _leaves(asked: _Query, low: Term, high: Term, limit: Interval) -> Iterator[_Leaf]:
     terms = asked.terms
-    compared = {"room": terms.minus(high, low)}
+    compared = {"room": terms.subtract(high, low)}
     if not math.isinf(limit.lower):
         end = terms.constant(float(limit.lower))
-        compared |= {"high above": terms.minus(high, end), "low above": terms.minus(low, end)}
+        compared |= {"high above": terms.subtract(high, end), "low above": terms.subtract(low, end)}
     if not math.isinf(limit.upper):
         end = terms.constant(float(limit.upper))
-        compared |= {"high below": terms.minus(end, high), "low below": terms.minus(end, low)}
+        compared |= {"high below": terms.subtract(end, high), "low below": terms.subtract(end, low)}
     bounds = (low, high)
 
     def ask(case: Case) -> dict[str, int] | str | Unclear:

@@ -36,7 +36,7 @@ def find_orientations(rates: Rates) -> tuple[UnitSphere, ...]:
 
 def _keep_length(group: list[Symbol], rates: Rates) -> bool:
     for speed in rates[group[0]]:
-        growth = TermGraph({}).of(sum((x * rates[x][speed] for x in group), as_expression(0.0)))
+        growth = TermGraph({}).term(sum((x * rates[x][speed] for x in group), as_expression(0.0)))
         exact = Case((growth,), Domain({})).value(growth).polynomial
         if exact is None or exact.terms:
             return False

@@ -120,5 +120,5 @@ def _loop_turn_counts(function: ImplicitFunction, inputs: tuple[Fraction, ...]) 
         return (None,) * len(function.unknowns)  # after a turn it is where the function has no value
     by = _turn_counts(function.seed, moving)
     moving |= {s: g for s, g in zip(function.unknowns, by, strict=True) if g}
-    same = None not in by and all(g == 0 for g in _turn_counts(function.chosen, moving))
+    same = None not in by and all(g == 0 for g in _turn_counts(function.equations, moving))
     return tuple(by) if same else (None,) * len(by)

@@ -7,8 +7,18 @@ from collections.abc import Callable, Sequence
 
 import casadi as ca
 
-from kineverse.intervals import arithmetic
-from kineverse.intervals.arithmetic import ZERO_INTERVAL, RealInterval
+from kineverse.intervals.arithmetic import (
+    ZERO_INTERVAL,
+    RealInterval,
+    interval_add,
+    interval_hull,
+    interval_multiply,
+    interval_negate,
+    interval_power,
+    interval_reciprocal,
+    interval_slope,
+    interval_square,
+)
 from kineverse.intervals.graph import Term
 from kineverse.symbols import Symbol
 
@@ -52,37 +62,29 @@ def _slope(
     if op in ("select", ca.OP_IF_ELSE_ZERO, ca.OP_FMIN, ca.OP_FMAX):
         if len(inner) == 1 and sign(term.deciders[0]) is not None:
             return inner[0]
-        return arithmetic.interval_hull(*inner) if op in (ca.OP_FMIN, ca.OP_FMAX) else None
+        return interval_hull(*inner) if op in (ca.OP_FMIN, ca.OP_FMAX) else None
     if op in (ca.OP_ADD, ca.OP_SUB):
-        return arithmetic.interval_add(
-            inner[0], inner[1] if op == ca.OP_ADD else arithmetic.interval_negate(inner[1])
-        )
+        return interval_add(inner[0], inner[1] if op == ca.OP_ADD else interval_negate(inner[1]))
     if op == ca.OP_MUL:
-        return arithmetic.interval_add(
-            arithmetic.interval_multiply(inner[0], spans[1]), arithmetic.interval_multiply(spans[0], inner[1])
-        )
+        return interval_add(interval_multiply(inner[0], spans[1]), interval_multiply(spans[0], inner[1]))
     if op == ca.OP_DIV:
-        inverse = arithmetic.interval_reciprocal(spans[1])
-        over = arithmetic.interval_multiply(
-            arithmetic.interval_multiply(spans[0], inner[1]), arithmetic.interval_square(inverse)
-        )
-        return arithmetic.interval_add(
-            arithmetic.interval_multiply(inner[0], inverse), arithmetic.interval_negate(over)
-        )
+        inverse = interval_reciprocal(spans[1])
+        over = interval_multiply(interval_multiply(spans[0], inner[1]), interval_square(inverse))
+        return interval_add(interval_multiply(inner[0], inverse), interval_negate(over))
     if op == ca.OP_POW and inner[1] == ZERO_INTERVAL and spans[1][0] == spans[1][1]:
         n = spans[1][0]
-        rate = arithmetic.interval_power(spans[0], (n - 1, n - 1))
-        return arithmetic.interval_multiply(arithmetic.interval_multiply((n, n), rate), inner[0])
+        rate = interval_power(spans[0], (n - 1, n - 1))
+        return interval_multiply(interval_multiply((n, n), rate), inner[0])
     if op == ca.OP_NEG:
-        return arithmetic.interval_negate(inner[0])
+        return interval_negate(inner[0])
     if op == ca.OP_FABS:
-        return arithmetic.interval_hull(inner[0], arithmetic.interval_negate(inner[0]))
+        return interval_hull(inner[0], interval_negate(inner[0]))
     if op == "implicit":
         series = enclose_loop(term, list(zip(spans, inner, strict=True)))
         return series[1] if len(series) > 1 else None
     if len(term.args) == 1 and isinstance(op, int):
-        outer = arithmetic.interval_slope(op, spans[0])
-        return None if outer is None else arithmetic.interval_multiply(outer, inner[0])
+        outer = interval_slope(op, spans[0])
+        return None if outer is None else interval_multiply(outer, inner[0])
     return None
 
 

@@ -264,7 +264,7 @@ def test_without_a_compiler_the_same_is_found(family: str, monkeypatch: pytest.M
     fast = identify(seen.parent, seen.child, noise=seen.covariance)
     with monkeypatch.context() as patched:
         patched.setattr(library, "_code", None)
-        patched.setattr(library, "_hopeless", True)
+        patched.setattr(library, "_failed", True)
         slow = identify(seen.parent, seen.child, noise=seen.covariance)
         assert not solver.is_native
         best = slow.best

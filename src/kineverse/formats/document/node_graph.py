@@ -171,7 +171,7 @@ class NodeGraph:
         compositions = max(map(self._compositions.__getitem__, below), default=0) + (kind is Composed)
         if compositions > MAX_COMPOSITIONS:
             raise InvalidDocumentError(f"more than {MAX_COMPOSITIONS} compositions of compositions")
-        made = kind.of(tuple(self.expression(ref) for ref in refs), shape, options)
+        made = kind.from_arguments(tuple(self.expression(ref) for ref in refs), shape, options)
         self.keep(made, depth, 1 + self._count(below), compositions)
 
     def keep(self, expression: Expression, depth: int, below: int = 1, compositions: int = 0) -> None:

@@ -11,11 +11,10 @@ import numpy as np
 
 from kineverse.expressions.expression import Expression
 from kineverse.expressions.graph import expand_nodes
-from kineverse.intervals import arithmetic, taylor
-from kineverse.intervals.arithmetic import RealInterval
+from kineverse.intervals.arithmetic import REALS, RealInterval, interval_multiply
 from kineverse.intervals.enclosure import Enclosures
 from kineverse.intervals.graph import Term, TermGraph, reachable_terms
-from kineverse.intervals.taylor import TaylorSeries
+from kineverse.intervals.taylor import TaylorSeries, taylor_polynomial, taylor_variable
 from kineverse.model.frame import WORLD
 from kineverse.model.registry import FrameDeviation
 from kineverse.symbols import Symbol
@@ -70,7 +69,7 @@ class CurveApproximation:
             names = ", ".join(map(str, symbols))
             return f"moves by a curve over several coordinates, {names}, and one of them is approximated"
         (symbol,) = symbols
-        lower, upper = self._limits.get(symbol, arithmetic.REALS)
+        lower, upper = self._limits.get(symbol, REALS)
         if not (math.isfinite(lower) and math.isfinite(upper) and lower < upper):
             return f"moves by a curve over '{symbol}', which has no limits between which it is approximated"
         key = motion.variable.index, motion.amount
@@ -90,12 +89,12 @@ class CurveApproximation:
                 f"moves by a curve over '{symbol}', and the best polynomial of degree {self._degree} is "
                 f"off by {least:.3g} {unit}"
             )
-        variable = self._terms.of(symbol)
+        variable = self._terms.term(symbol)
         return replace(motion, variable=variable, amount=found.polynomial, curve=None), found.error
 
     def _series(self, motion: JointMotion, symbol: Symbol, where: RealInterval) -> TaylorSeries:
-        (inner,) = self._enclosures.of([motion.variable], {symbol: taylor.taylor_variable(where)})
-        return taylor.taylor_polynomial(motion.amount, inner)
+        (inner,) = self._enclosures.enclose([motion.variable], {symbol: taylor_variable(where)})
+        return taylor_polynomial(motion.amount, inner)
 
     def _values(self, motion: JointMotion, symbol: Symbol, lower: float, upper: float) -> np.ndarray:
         x = chebyshev_points(lower, upper)
@@ -111,7 +110,7 @@ class CurveApproximation:
         if len(positions) != 1 or any(s.order > 1 for s in expression.symbols):
             return False
         (symbol,) = positions
-        ends = self._limits.get(symbol, arithmetic.REALS)
+        ends = self._limits.get(symbol, REALS)
         if not (math.isfinite(ends[0]) and math.isfinite(ends[1]) and ends[0] < ends[1]):
             return False
         factor: RealInterval = (1.0, 1.0)
@@ -121,12 +120,12 @@ class CurveApproximation:
             rest = expression({symbol: sum(ends) / 2, speeds[0]: 0.0})
             if any(s.order for s in slope.symbols) or abs(float(rest)) > 0:
                 return False
-            expression, factor = slope, self._limits.get(speeds[0], arithmetic.REALS)
+            expression, factor = slope, self._limits.get(speeds[0], REALS)
         (term,) = self._terms.elements(expression)
         span = enclose_curve(
-            lambda where: self._enclosures.of([term], {symbol: taylor.taylor_variable(where)})[0], *ends
+            lambda where: self._enclosures.enclose([term], {symbol: taylor_variable(where)})[0], *ends
         )
-        low, high = arithmetic.interval_multiply(span, factor)
+        low, high = interval_multiply(span, factor)
         return lower - _ROUNDING <= low and high <= upper + _ROUNDING
 
     def errors(
@@ -163,13 +162,11 @@ class CurveApproximation:
         """Return how far a motion takes the origin of its frame at most, also where it is off."""
         if isinstance(motion, QuaternionMotion) or motion.turns:
             return 2 * float(np.linalg.norm(motion.point))  # around a circle about the line
-        lower, upper = self._limits.get(motion.variable.data, arithmetic.REALS)
+        lower, upper = self._limits.get(motion.variable.data, REALS)
         if not (math.isfinite(lower) and math.isfinite(upper)):
             return math.inf
         amount = motion.amount
-        span = enclose_curve(
-            lambda where: taylor.taylor_polynomial(amount, taylor.taylor_variable(where)), lower, upper
-        )
+        span = enclose_curve(lambda where: taylor_polynomial(amount, taylor_variable(where)), lower, upper)
         return max(abs(span[0]), abs(span[1])) + error
 
 

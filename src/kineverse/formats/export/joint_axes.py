@@ -164,7 +164,7 @@ def _parts(factor: Expression, terms: TermGraph, offsets: bool) -> list[Matrix |
     harmonics = TrigPolynomialConverter()
     try:
         if isinstance(factor, OneAxisTransform):
-            amount = harmonics.of(terms.of(factor.amount))
+            amount = harmonics.of(terms.term(factor.amount))
             found = _axis_motion(factor, amount, harmonics, terms, offsets)
             if found is not None:
                 return found
@@ -215,23 +215,28 @@ def _axis_motion(
     """Return one by its amount; None for a translation by waves, which is one along circles."""
     sums = _as_polynomials(amount, harmonics)
     if sums is None:
-        if _of_coordinates(amount, harmonics) and not factor.turns:
+        if _of_coordinates(amount, harmonics) and not factor.is_rotation:
             return None
         curve = factor.amount
         return [
             JointMotion(
-                factor.turns, factor.direction, ZERO_VECTOR, terms.of(curve), IDENTITY_COEFFICIENTS, curve
+                factor.is_rotation,
+                factor.direction,
+                ZERO_VECTOR,
+                terms.term(curve),
+                IDENTITY_COEFFICIENTS,
+                curve,
             )
         ]
     polynomials, offset = sums
     found: list[Matrix | AnyJointMotion] = []
     if offset and not (offsets and polynomials):
-        found.append(OneAxisTransform(factor.direction, offset, factor.turns)())
+        found.append(OneAxisTransform(factor.direction, offset, factor.is_rotation)())
         offset = 0.0
     for index, coefficients in sorted(polynomials.items()):
         whole = (offset, *coefficients)
         found.append(
-            JointMotion(factor.turns, factor.direction, ZERO_VECTOR, harmonics.variables[index], whole)
+            JointMotion(factor.is_rotation, factor.direction, ZERO_VECTOR, harmonics.variables[index], whole)
         )
         offset = 0.0
     return found

@@ -305,7 +305,7 @@ class LinkTreeBuilder:
             return (
                 factor
                 if amount is factor.amount
-                else OneAxisTransform(factor.direction, amount, factor.turns)
+                else OneAxisTransform(factor.direction, amount, factor.is_rotation)
             )
         return self.resolve(factor)
 

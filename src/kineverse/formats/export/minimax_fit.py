@@ -17,9 +17,16 @@ import numpy as np
 import numpy.typing as npt
 
 from kineverse.formats.description import Coefficients
-from kineverse.intervals import arithmetic, taylor
-from kineverse.intervals.arithmetic import RealInterval
-from kineverse.intervals.taylor import TaylorSeries
+from kineverse.intervals.arithmetic import (
+    ZERO_INTERVAL,
+    RealInterval,
+    interval_add,
+    interval_hull,
+    interval_multiply,
+    interval_power,
+    round_outwards,
+)
+from kineverse.intervals.taylor import TaylorSeries, taylor_polynomial, taylor_subtract, taylor_variable
 
 Matrix = npt.NDArray[np.float64]
 SeriesCurve = Callable[[RealInterval], TaylorSeries]
@@ -79,9 +86,7 @@ def fit_polynomial(
     if sampled > enough:
         return MinimaxFit(polynomial, math.inf, sampled, largest)
     error = bound_error(curve, polynomial, lower, upper, sampled, _NEGLIGIBLE * enough)
-    extent = enclose_curve(
-        lambda where: taylor.taylor_polynomial(polynomial, taylor.taylor_variable(where)), lower, upper
-    )
+    extent = enclose_curve(lambda where: taylor_polynomial(polynomial, taylor_variable(where)), lower, upper)
     return MinimaxFit(polynomial, error, sampled, max(abs(extent[0]), abs(extent[1])))
 
 
@@ -96,9 +101,7 @@ def bound_error(
     """Return a number that |curve - polynomial| exceeds nowhere in an interval, close to the least such."""
 
     def difference(where: RealInterval) -> TaylorSeries:
-        return taylor.taylor_subtract(
-            curve(where), taylor.taylor_polynomial(polynomial, taylor.taylor_variable(where))
-        )
+        return taylor_subtract(curve(where), taylor_polynomial(polynomial, taylor_variable(where)))
 
     def entry(low: float, high: float) -> tuple[float, float, float]:
         nonlocal sampled
@@ -130,7 +133,7 @@ def enclose_curve(curve: SeriesCurve, lower: float, upper: float, pieces: int = 
         if more and not math.isfinite(here[1] - here[0]):
             waiting += [(low, middle, more - 1), (middle, high, more - 1)]
             continue
-        result = here if result is None else arithmetic.interval_hull(result, here)
+        result = here if result is None else interval_hull(result, here)
     assert result is not None
     return result
 
@@ -141,15 +144,13 @@ def _evaluate_series(here: TaylorSeries, around: TaylorSeries, low: float, high:
     if count == 1:
         return value
     middle = (low + high) / 2
-    away = arithmetic.round_outwards(low - middle, high - middle)
-    total = arithmetic.ZERO_INTERVAL
+    away = round_outwards(low - middle, high - middle)
+    total = ZERO_INTERVAL
     for k in range(count):
         coefficient = around[k] if k == count - 1 else here[k]
-        total = arithmetic.interval_add(
+        total = interval_add(
             total,
-            arithmetic.interval_multiply(
-                coefficient, arithmetic.interval_power(away, (k, k)) if k else (1.0, 1.0)
-            ),
+            interval_multiply(coefficient, interval_power(away, (k, k)) if k else (1.0, 1.0)),
         )
     return max(total[0], value[0]), min(total[1], value[1])
 

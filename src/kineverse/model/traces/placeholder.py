@@ -48,14 +48,14 @@ class ReadNode(Node):
     kind = "read"
 
     @classmethod
-    def standing_for(cls, expression: Expression, watcher: Tracer, question: int, part: int) -> Expression:
+    def standing_for(cls, expression: Expression, listener: Tracer, question: int, part: int) -> Expression:
         """Return the place of an expression, of its shape."""
-        return cls.of((expression,), expression.shape, (watcher, question, part, ()))
+        return cls.from_arguments((expression,), expression.shape, (listener, question, part, ()))
 
     @classmethod
     def empty(cls, shape: ArrayShape, question: int, part: int, path: GradientPath) -> Expression:
         """Return a place that stands for nothing yet."""
-        return cls.of((), shape, (None, question, part, path))
+        return cls.from_arguments((), shape, (None, question, part, path))
 
     @property
     def question(self) -> int:
@@ -87,13 +87,13 @@ class ReadNode(Node):
         self, key: bytes, arguments: tuple[Expression, ...], shape: ArrayShape, options: tuple[Any, ...]
     ) -> None:
         super()._initialise(key, arguments, shape, options)
-        self.watcher = options[0]
+        self.listener = options[0]
 
     @classmethod
     def _options_key(cls, options: tuple[Any, ...]) -> str:
-        watcher, question, part, path = options
+        listener, question, part, path = options
         steps = [(symbol.sort_key, heuristic) for symbol, heuristic in path]
-        return repr((watcher and watcher.serial, question, part, steps))
+        return repr((listener and listener.serial, question, part, steps))
 
     def _look(self, how: Access) -> Expression:
         """Return what it stands for, and let it be known."""
@@ -115,9 +115,11 @@ class ReadNode(Node):
 
     def gradient(self, heuristic: bool) -> Mapping[Symbol, Expression]:
         """Return D, whose entries are places, too."""
-        watcher, question, part, path = self.options
+        listener, question, part, path = self.options
         return {
-            key: ReadNode.of((entry,), self.shape, (watcher, question, part, (*path, (key, heuristic))))
+            key: ReadNode.from_arguments(
+                (entry,), self.shape, (listener, question, part, (*path, (key, heuristic)))
+            )
             for key, entry in self._look(Access.SYMBOLS).gradient(heuristic).items()
         }
 
@@ -167,7 +169,7 @@ def fill_read_nodes(expression: Expression, put: Callable[[ReadNode], Expression
             continue
         arguments = tuple(replace_nodes(part, images) for part in node.arguments)
         if any(new is not old for new, old in zip(arguments, node.arguments, strict=True)):
-            images[node] = type(node).of(arguments, node.shape, node.options)
+            images[node] = type(node).from_arguments(arguments, node.shape, node.options)
     return replace_nodes(expression, images)
 
 

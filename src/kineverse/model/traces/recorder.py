@@ -119,7 +119,7 @@ class _RecordingReader(TracingReader):
         """Note that the value of an answer matters."""
         self._looks[question] = Access.VALUE
 
-    def settled(self, expression: Expression) -> Expression:
+    def notify(self, expression: Expression) -> Expression:
         return fill_read_nodes(expression, lambda answer: answer.value)
 
     def ask(self, kind: str, *arguments: Any) -> Any:
