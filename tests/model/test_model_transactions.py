@@ -139,7 +139,7 @@ def test_a_diff_is_exactly_what_changed_structurally() -> None:
         ("put z",),
         ("put x",),
     )
-    assert second.runs == 3
+    assert second.reruns == 3
 
 
 def test_an_equal_rewrite_changes_nothing() -> None:

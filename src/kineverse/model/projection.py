@@ -1,14 +1,13 @@
 """Projection of a state onto the manifold of equality constraints.
 
-Of the free coordinates q that equalities are about, those are moved for which something does not hold, and
-what shares equalities with these. With rows c(q) = 0 for the equalities and h(q) <= 0 for all other
-constraints on positions, Gauss-Newton steps of least change,
+The unknowns q are the free coordinates of violated equalities, and those of equalities that share coordinates
+with them. With rows c(q) = 0 for the equalities and h(q) <= 0 for the other position constraints,
+Gauss-Newton steps of minimum norm,
 
     min ‖Δq‖  subject to  J Δq = -(c, max(h, 0)),  lower <= q + Δq <= upper,
 
-lead to where they hold; coordinates that would leave their limits stay at them, and the rest makes up for it.
-From there, steps along the manifold lead to the place on it nearest to where the state was. Quaternions stay
-of unit length.
+lead to a feasible point. Coordinates at a limit stay there, and the others compensate. From there, steps
+along the manifold minimise the distance to the original state. Quaternions stay of unit length.
 """
 
 from __future__ import annotations
@@ -39,7 +38,7 @@ _QUATERNION = ("qx", "qy", "qz", "qw")
 
 @dataclass(frozen=True)
 class ResidualRow:
-    """What a constraint asks for: that an expression is zero, or that it is not positive."""
+    """Residual of a constraint: an expression that has to be zero, or not positive."""
 
     name: str
     value: Expression
@@ -47,27 +46,28 @@ class ResidualRow:
 
 
 class EqualityConstraints:
-    """The equalities of a model and what else its coordinates have to keep, as functions of numbers.
+    """Equality constraints of a model, and the other constraints on their coordinates, as numeric functions.
 
     Parameters
     ----------
     constraints
-        All of a model's, plain.
+        All constraints of the model, in plain coordinates.
     rates
-        Its table.
+        Rate table of the model.
     articulations
-        Its records, which know quaternions.
+        Records of the model, which name the coordinates of quaternions.
     wanted
-        The names of the equalities that are to hold; None for all.
+        Names of the equalities to satisfy; None for all.
 
     Attributes
     ----------
     rows
-        The equalities, and behind them other constraints on what they are about, but for limits.
+        Residuals of the equalities, followed by those of other constraints on their coordinates, without
+        limits on single coordinates.
     count
-        How many equalities there are.
+        Number of equalities.
     symbols, coordinates
-        What the rows are about, and which of it is theirs to move.
+        Symbols of the rows, and the coordinates among them that may move.
     """
 
     def __init__(
@@ -93,12 +93,12 @@ class EqualityConstraints:
 
     @cached_property
     def evaluate(self) -> Any:
-        """An evaluator of all rows, shape (m,), and their derivatives by the coordinates, (m, n)."""
+        """Evaluator of all rows, shape (m,), and their derivatives by the coordinates, shape (m, n)."""
         values = array([row.value for row in self.rows])
         return compile([values, values.partial(self.coordinates)], self.symbols, tier="interpreter").bind()
 
     def evaluated(self, at: Array) -> tuple[Array, Array] | None:
-        """Return all rows and their derivatives; None where a closed loop among them does not close."""
+        """Return all rows and their derivatives; None if a closed loop among them does not close."""
         try:
             self.evaluate(at)
         except NoSolutionError:
@@ -108,7 +108,7 @@ class EqualityConstraints:
 
     @cached_property
     def limits(self) -> tuple[Array, Array]:
-        """Lower and upper limits of the coordinates, ±inf where there are none."""
+        """Lower and upper limits of the coordinates; ±inf for none."""
         lower, upper = np.full(len(self.coordinates), -np.inf), np.full(len(self.coordinates), np.inf)
         for row in self._simple:
             (symbol,) = row.value.symbols
@@ -125,7 +125,7 @@ class EqualityConstraints:
 
     @cached_property
     def quaternions(self) -> list[list[int]]:
-        """Where the four numbers of each quaternion are among the coordinates."""
+        """Indices of the four coordinates of each quaternion."""
         place = {s: i for i, s in enumerate(self.coordinates)}
         found = []
         for record in self.articulations.values():
@@ -136,7 +136,7 @@ class EqualityConstraints:
 
 
 def is_equality(constraint: Constraint) -> bool:
-    """Return whether a constraint is one on positions whose bounds are the same."""
+    """Return whether a constraint is a position constraint with equal bounds."""
     if constraint.order or constraint.lower != constraint.upper:
         return False
     return bool(constraint.lower.symbols) or abs(float(constraint.lower)) < np.inf
@@ -172,11 +172,11 @@ def _about_one(row: ResidualRow) -> bool:
 
 
 TOLERANCE = 1e-9
-"""How far from holding a constraint may be, as in :meth:`kineverse.Model.violations`."""
+"""Largest residual of a satisfied constraint, as in :meth:`kineverse.Model.violations`."""
 
 _STEPS, _NEARER = 100, 40
 _LONGEST = 0.5
-"""How far a step goes at most [m], [rad]: farther away, derivatives say little."""
+"""Longest step [m], [rad]. Linearisations are not valid beyond."""
 _STARTS = 12
 _SINGULAR, _AT_BOUND = 1e-9, 1e-9
 
@@ -187,7 +187,7 @@ def project(
     fixed: Iterable[Symbol | str] = (),
     tolerance: float = TOLERANCE,
 ) -> State:
-    """Move coordinates so that equalities hold, and return the state, see :meth:`ModelView.project`."""
+    """Project a state onto the manifold of equality constraints, see :meth:`ModelView.project`."""
     tolerance = as_tolerance(tolerance)
     held = _held(equalities, fixed)
     symbols = equalities.symbols
@@ -208,7 +208,7 @@ def project(
 
 
 def _held(equalities: EqualityConstraints, fixed: Iterable[Symbol | str]) -> frozenset[Symbol]:
-    """Return the coordinates that stay, those behind what depends on others among them."""
+    """Return the fixed coordinates; a dependent coordinate stands for those that determine it."""
     dependent = {str(s): e for s, e in equalities.rates.dependent.items()}
     records = equalities.articulations
     by_name = {str(s): s for s in equalities.symbols}
@@ -235,7 +235,7 @@ def _held(equalities: EqualityConstraints, fixed: Iterable[Symbol | str]) -> fro
 def _search(
     equalities: EqualityConstraints, at: Array, held: frozenset[Symbol], tolerance: float
 ) -> _Search | None:
-    """Return what is to be solved: what is broken, with all equalities about the same coordinates."""
+    """Return the problem to solve: the violated rows, and all equalities that share their coordinates."""
     count = equalities.count
     if not count:
         return None
@@ -259,7 +259,7 @@ def _search(
 
 
 class _Search:
-    """The search for one state: some rows, and some of the coordinates."""
+    """Search for one state: a subset of the rows and of the coordinates."""
 
     def __init__(
         self,
@@ -284,12 +284,12 @@ class _Search:
         ]
 
     def nearest(self) -> Array:
-        """Return all numbers where everything holds, as near as can be to where they were.
+        """Return all values at the feasible point nearest to the original state.
 
         Raises
         ------
         NoSolutionError
-            Naming what does not hold, by how much, and what was tried.
+            Naming the violated constraints, their residuals, and the attempts.
         """
         start = self._unit(np.clip(self._at[self._places], self._lower, self._upper))
         best, found = start, []
@@ -310,7 +310,7 @@ class _Search:
         return self._all(x)
 
     def _restored(self, x: Array) -> tuple[Array, float]:
-        """Return where rows hold, or where it goes on nowhere, and by how much the worst is off there."""
+        """Return a feasible point, or the point without further progress, and the largest residual there."""
         damping = 0.0
         there = self._look(x)
         if there is None:
@@ -336,7 +336,7 @@ class _Search:
         return x, float(np.abs(wrong).max(initial=0.0))
 
     def _step(self, x: Array, wrong: Array, by_x: Array, damping: float) -> Array:
-        """Return the shortest step that mends rows to first order; who would leave limits stops there."""
+        """Return the shortest step that zeroes the rows to first order, clipped to the limits."""
         step = np.zeros(len(x))
         free = np.ones(len(x), dtype=bool)
         rows = wrong != 0.0
@@ -363,7 +363,7 @@ class _Search:
         return step
 
     def _drawn_back(self, x: Array, start: Array) -> Array:
-        """Return where rows hold as well, and nearer to where the search began: along the manifold."""
+        """Return a feasible point nearer to the start, by steps along the manifold."""
         pull = 1.0
         for _ in range(_NEARER):
             there = self._look(x)
@@ -372,7 +372,7 @@ class _Search:
             way, (values, by_x) = start - x, there
             free = ~(((x <= self._lower) & (way < 0)) | ((x >= self._upper) & (way > 0)))
             along = np.zeros(len(x))
-            # What is at a bound may leave it, and not go on.
+            # A coordinate at a bound may only move inwards.
             kept = self._equal | ((by_x @ way > 0) & (values > -_AT_BOUND))
             matrix = by_x[kept][:, free]
             along[free] = way[free] - np.linalg.lstsq(matrix, matrix @ way[free], rcond=_SINGULAR)[0]
@@ -387,7 +387,7 @@ class _Search:
         return x
 
     def _look(self, x: Array) -> tuple[Array, Array] | None:
-        """Return the values of rows and their derivatives; None where something has none."""
+        """Return the values of the rows and their derivatives; None if one is undefined."""
         found = self._equalities.evaluated(self._all(x))
         if found is None:
             return None
@@ -395,9 +395,9 @@ class _Search:
         return (values, by_x) if np.isfinite(values).all() and np.isfinite(by_x).all() else None
 
     def _off(self, values: Array) -> Array:
-        """Return by how much rows are off: bounds that are kept by nothing."""
+        """Return the residuals of the rows; satisfied inequalities have none."""
         off = np.where(self._equal | (values > 0), values, 0.0)
-        return np.where(np.abs(off) < 1e-15, 0.0, off)  # what rounding leaves is no reason to move
+        return np.where(np.abs(off) < 1e-15, 0.0, off)  # rounding errors are no residuals
 
     def _all(self, x: Array) -> Array:
         at = self._at.copy()
@@ -414,7 +414,7 @@ class _Search:
         return [str(self._equalities.coordinates[self._columns[k]]) for k in columns]
 
     def _elsewhere(self, start: Array, generator: np.random.Generator, attempt: int) -> Array:
-        """Return another place to begin at, first near by, then anywhere within limits."""
+        """Return another start, first near the state, later anywhere within the limits."""
         reach = np.where(np.isfinite(self._upper - self._lower), (self._upper - self._lower) / 2, np.pi)
         reach = np.minimum(reach, np.pi) * min(1.0, 0.1 * attempt)
         moved = start + generator.uniform(-1, 1, len(start)) * reach
