@@ -75,7 +75,7 @@ order = st.lists(st.tuples(st.integers(0, 20), st.integers(0, 20)), max_size=5)
 
 @given(order, st.booleans())
 @settings(max_examples=attempts(100))
-def test_what_has_moved_is_what_a_comparison_of_before_and_after_finds(steps: Any, with_others: bool) -> None:
+def test_moved_tags_of_a_commit_equal_those_of_a_comparison(steps: Any, with_others: bool) -> None:
     model = kv.Model()
     with model.edit() as edit:
         for k in range(6):

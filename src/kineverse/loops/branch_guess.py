@@ -47,7 +47,7 @@ class InputDomain:
     upper: float
     whole: bool = False
 
-    def wider(self, below: float = 1.0, above: float = 1.0) -> InputDomain:
+    def widen(self, below: float = 1.0, above: float = 1.0) -> InputDomain:
         """Return the domain widened by fractions of the margin; a full revolution stays."""
         if self.whole:
             return self
@@ -57,9 +57,9 @@ class InputDomain:
     def samples(self, count: int) -> Array:
         """Return sample points for well-conditioned fits, in order."""
         parts = np.arange(count) + (0.0 if self.whole else 0.5)
-        return self.spread(parts / count)
+        return self.place_points(parts / count)
 
-    def spread(self, parts: Array) -> Array:
+    def place_points(self, parts: Array) -> Array:
         """Map numbers in [0, 1) to the domain, with the density of the sample points."""
         width = self.upper - self.lower
         if self.whole:
@@ -72,7 +72,7 @@ class InputDomain:
             return [(i + 1) // 2 for i in range(2 * degree + 1)]
         return [0] if self.upper == self.lower else list(range(degree + 1))
 
-    def numbers(self, u: Array, degree: int) -> Array:
+    def evaluate_basis(self, u: Array, degree: int) -> Array:
         """Evaluate the basis functions at points, shape (N, size)."""
         if self.whole:
             parts = [np.ones_like(u)]
@@ -84,7 +84,7 @@ class InputDomain:
         t = np.clip((2 * u - self.lower - self.upper) / (self.upper - self.lower), -1, 1)
         return np.polynomial.chebyshev.chebvander(t, degree).astype(np.float64)
 
-    def functions(self, u: Symbol, degree: int) -> list[Expression]:
+    def basis_expressions(self, u: Symbol, degree: int) -> list[Expression]:
         """Return the basis functions as expressions of an input."""
         one = array(1.0)
         if self.upper == self.lower:
@@ -135,7 +135,7 @@ class BranchGuess:
         coefficients[np.abs(coefficients) < 1e-14 * np.abs(coefficients).max(initial=0.0)] = 0.0
         return BranchGuess(tuple(intervals), degree, coefficients, winding)
 
-    def at(self, inputs: Array) -> Array:
+    def evaluate(self, inputs: Array) -> Array:
         """Return the guesses at inputs (N, k), shape (N, n)."""
         basis = _evaluate_products(inputs, self.intervals, self.degree)
         return basis @ self.coefficients + inputs @ self.winding
@@ -147,7 +147,7 @@ class BranchGuess:
 
     def expression(self, inputs: Sequence[Symbol]) -> Expression:
         """Return the guesses as an expression of shape (n,)."""
-        bases = [i.functions(u, self.degree) for i, u in zip(self.intervals, inputs, strict=True)]
+        bases = [i.basis_expressions(u, self.degree) for i, u in zip(self.intervals, inputs, strict=True)]
         products = []
         for which in list_products(self.intervals, self.degree):
             product = array(1.0)
@@ -170,7 +170,7 @@ def _evaluate_products(inputs: Array, intervals: Sequence[InputDomain], degree: 
     which = list_products(intervals, degree)
     result = np.ones((len(inputs), len(which)))
     for column, interval, i in zip(inputs.T, intervals, np.array(which, dtype=int).T, strict=True):
-        result *= interval.numbers(column, degree)[:, i]
+        result *= interval.evaluate_basis(column, degree)[:, i]
     return result
 
 
@@ -229,16 +229,16 @@ class BranchSamples:
         lower = np.array([i.lower for i in intervals])
         upper = np.array([i.upper for i in intervals])
         home = np.clip(u[:k], lower, upper)
-        x = self._followed(x, u[:k], home)
+        x = self._continue(x, u[:k], home)
         if k <= FEW:
             grid = _grid([i.samples(_SAMPLES.get(k, 1)) for i in intervals])
         else:  # a grid would have too many points
             parts = generator.uniform(size=(_SCATTERED, k))
-            grid = np.column_stack([i.spread(p) for i, p in zip(intervals, parts.T, strict=True)])
+            grid = np.column_stack([i.place_points(p) for i, p in zip(intervals, parts.T, strict=True)])
         corners = np.vstack([_corners(limits, generator), _corners(intervals, generator)])
         tried = np.vstack([corners, generator.uniform(lower, upper, (_TRIED, k))])
         everywhere = np.vstack([home, grid, tried])
-        solutions = self._everywhere(x, everywhere)
+        solutions = self._continue_to(x, everywhere)
         self.inputs, self.solutions = everywhere[: len(grid) + 1], solutions[: len(grid) + 1]
         self.tried, self.wanted = everywhere[len(grid) + 1 :], solutions[len(grid) + 1 :]
         self.winding = self._winding(x, home)
@@ -256,13 +256,13 @@ class BranchSamples:
         """Return the free coordinates, followed by the parameters."""
         return np.concatenate([q, self._given])
 
-    def turns_over(self, rows: Sequence[int]) -> bool:
+    def changes_sign(self, rows: Sequence[int]) -> bool:
         """Return whether det ∂r/∂x of these rows changes its sign, so that it is zero in between."""
         points = zip((*self.inputs, *self.tried), (*self.solutions, *self.wanted), strict=True)
         matrices = (self.equations(x, self.all_inputs(q))[1][list(rows)] for q, x in points)
         return len({float(np.linalg.slogdet(matrix)[0]) for matrix in matrices}) > 1
 
-    def _followed(self, x: Array, start: Array, end: Array) -> Array:
+    def _continue(self, x: Array, start: Array, end: Array) -> Array:
         reached = continue_solution(self.equations, x, self.all_inputs(start), self.all_inputs(end))
         if reached.part < 1.0:
             there = start + reached.part * (end - start)
@@ -276,18 +276,18 @@ class BranchSamples:
             )
         return reached.solution
 
-    def _everywhere(self, x: Array, points: Array) -> Array:
+    def _continue_to(self, x: Array, points: Array) -> Array:
         """Return the solutions at points, each continued from the nearest known one."""
         scale = np.array([max(i.upper - i.lower, 1e-12) for i in self.intervals])
         solutions = np.zeros((len(points), len(x)))
-        solutions[0] = self._followed(x, points[0], points[0])
+        solutions[0] = self._continue(x, points[0], points[0])
         left = np.arange(1, len(points))
         nearest = np.zeros(len(points), dtype=int)
         distance = np.abs((points - points[0]) / scale).max(axis=1, initial=0.0)
         while len(left):
             position = int(distance[left].argmin())
             i, left = left[position], np.delete(left, position)
-            solutions[i] = self._followed(solutions[nearest[i]], points[nearest[i]], points[i])
+            solutions[i] = self._continue(solutions[nearest[i]], points[nearest[i]], points[i])
             closer = np.abs((points - points[i]) / scale).max(axis=1, initial=0.0)
             better = closer < distance
             nearest[better], distance[better] = i, closer[better]
@@ -301,7 +301,7 @@ class BranchSamples:
                 continue
             end = home.copy()
             end[k] += 2 * np.pi
-            grown = (self._followed(x, home, end) - x) / (2 * np.pi)
+            grown = (self._continue(x, home, end) - x) / (2 * np.pi)
             whole = np.abs(grown - np.round(grown)) < 1e-6
             if not np.all(whole | ~self._angles):
                 raise NoSolutionError(

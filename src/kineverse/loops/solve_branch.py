@@ -121,7 +121,7 @@ def solve_loop(
     rank = _rank(unknown, start, given)
     if not rank:
         raise InvalidValueError(f"Loop '{name}' is closed whatever its coordinates are.")
-    followers = _followers(name, unknown, start, given, rank, dependent)
+    followers = _choose_dependent(name, unknown, start, given, rank, dependent)
     free = tuple(s for s in coordinates if s not in followers)
     inputs = (*free, *parameters)
     equations = Equations(residual, followers, inputs, effort)
@@ -170,7 +170,7 @@ def _rank(equations: Equations, x: Array, given: Array) -> int:
     return most
 
 
-def _followers(
+def _choose_dependent(
     name: str,
     equations: Equations,
     x: Array,
@@ -249,10 +249,10 @@ def _fit_guess(
 
     if all(i.whole for i in limits):
         return fitted(limits)
-    reaches = _reaches(equations, limits, x, u)
+    reaches = _margin_fractions(equations, limits, x, u)
     alone: tuple[BranchSamples, BranchGuess, int, tuple[int, ...]] | None = None
     for part in _PARTS:
-        wider = [i.wider(part * r[0], part * r[1]) for i, r in zip(limits, reaches, strict=True)]
+        wider = [i.widen(part * r[0], part * r[1]) for i, r in zip(limits, reaches, strict=True)]
         try:
             return fitted(wider)
         except NoSolutionError:
@@ -262,7 +262,7 @@ def _fit_guess(
     return alone
 
 
-def _reaches(
+def _margin_fractions(
     equations: Equations, limits: Sequence[InputDomain], x: Array, u: Array
 ) -> list[tuple[float, float]]:
     """Return the fractions of the margin below and above each limit that the branch extends to.
@@ -273,7 +273,7 @@ def _reaches(
     home[: len(limits)] = [min(max(v, i.lower), i.upper) for v, i in zip(u, limits, strict=False)]
     x = continue_solution(equations, x, u, home).solution
     reaches = []
-    for k, (limit, wide) in enumerate(zip(limits, [i.wider() for i in limits], strict=True)):
+    for k, (limit, wide) in enumerate(zip(limits, [i.widen() for i in limits], strict=True)):
         parts = []
         for edge, end in ((limit.lower, wide.lower), (limit.upper, wide.upper)):
             there, beyond = home.copy(), home.copy()
@@ -303,7 +303,7 @@ def _choose_guess(name: str, samples: BranchSamples) -> tuple[BranchGuess, int, 
     """Return the cheapest guess and number of steps that converge at all samples, and the rows used."""
     rows = _rows(samples)
     n = len(samples.equations.unknowns)
-    if samples.turns_over(rows):
+    if samples.changes_sign(rows):
         raise _too_close(name, samples)
     best: tuple[float, BranchGuess, int] | None = None
     count = len(samples.inputs)
@@ -354,7 +354,7 @@ def _steps(samples: BranchSamples, seed: BranchGuess, rows: tuple[int, ...]) -> 
     """Return the number of Newton steps that suffices at all samples; None without convergence."""
     needed = 0
     chosen = list(rows)
-    for q, x, wanted in zip(samples.tried, seed.at(samples.tried), samples.wanted, strict=True):
+    for q, x, wanted in zip(samples.tried, seed.evaluate(samples.tried), samples.wanted, strict=True):
         u = samples.all_inputs(q)
         for step in range(_STEPS[-1] + 1):  # noqa: B007 - how many it took
             residual, by_x, _ = samples.equations(x, u)

@@ -70,7 +70,7 @@ def measure_deltas(changes: Sequence[Change], samples: StateSamples) -> list[tup
     measured = iter(_measure_distance(pairs, samples))
     return [
         tuple(
-            Delta(what, a, b, *(next(measured) if _is_symbolic(a, b) else _measured(a, b)))
+            Delta(what, a, b, *(next(measured) if _is_symbolic(a, b) else _measure(a, b)))
             for what, a, b in found
         )
         for found in parts
@@ -180,7 +180,7 @@ def transform_of(frame: Frame) -> Pose | Expression:
 # -- measuring ---------------------------------------------------------------------------------------------
 
 
-def _measured(a: Any, b: Any) -> tuple[float, float, tuple[float, float]]:
+def _measure(a: Any, b: Any) -> tuple[float, float, tuple[float, float]]:
     """Return distance, angle, and both at the default state, of two parts without symbols."""
     if isinstance(a, Pose) and isinstance(b, Pose):
         distance, angle = (float(x[0]) for x in measure_pose_distances(a.matrix[None], b.matrix[None]))
@@ -347,7 +347,7 @@ class ModelComparison:
             if change.path in elsewhere:
                 found = (found[0], elsewhere[change.path])
             counting = tuple(delta for delta in found if not delta.is_within(tolerance))
-            alone = (change.before is None or change.after is None) and not self._says_nothing(change)
+            alone = (change.before is None or change.after is None) and not self._is_redundant_record(change)
             if counting or alone:
                 self.differences.append(ValueDifference(change, counting))
             else:
@@ -379,7 +379,7 @@ class ModelComparison:
             )
         return found
 
-    def _says_nothing(self, change: Change) -> bool:
+    def _is_redundant_record(self, change: Change) -> bool:
         """Return whether a change is the record of a fixed joint between frames of both models."""
         record = change.after if change.before is None else change.before
         return (
@@ -394,7 +394,7 @@ class ModelComparison:
         """True if there are no differences beyond the tolerance."""
         return not (self.differences or any(self.operations.values()))
 
-    def of(self, kind: str) -> list[ValueDifference]:
+    def of_kind(self, kind: str) -> list[ValueDifference]:
         """Return the differences of one kind of data."""
         return [found for found in self.differences if found.change.kind == kind]
 

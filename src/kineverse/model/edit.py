@@ -73,7 +73,7 @@ class Edit:
         if override and isinstance(operation, Operation):
             operation = Override(operation)
         chosen = self._tag(operation, tag)
-        self._changing().append(chosen, operation)
+        self._check_open().append(chosen, operation)
         return self._note_added(chosen)
 
     def insert(
@@ -99,7 +99,7 @@ class Edit:
         """
         if sum(x is not None for x in (before, after, to_affect)) != 1:
             raise EditError("Say where to insert: exactly one of before=, after= and to_affect=.")
-        history = self._changing()
+        history = self._check_open()
         if to_affect is not None:
             before = to_affect
             writers = history.cells.get(("frames", to_affect))
@@ -112,13 +112,13 @@ class Edit:
 
     def replace(self, tag: str, operation: Operation) -> None:
         """Replace an operation under its tag; operations that depend on it are applied again."""
-        self._changing().replace(tag, operation)
+        self._check_open().replace(tag, operation)
         if tag not in self._added:
             self._replaced[tag] = None
 
     def remove(self, tag: str) -> None:
         """Remove an operation, with its constraints and all its other writes."""
-        history = self._changing()
+        history = self._check_open()
         before = [] if self._order else list(history.sequence)
         history.remove(tag)
         self._order = self._order or before
@@ -255,7 +255,7 @@ class Edit:
             tuple(entry.tag for entry in sorted(rerun, key=lambda entry: entry.place)),
         )
 
-    def _changing(self) -> History:
+    def _check_open(self) -> History:
         if not self._open:
             raise EditError("This edit is over; start another one with model.edit().")
         return self._history

@@ -178,17 +178,17 @@ class History:
         with self._step():
             self._exchange(HistoryEntry(tag, operation, old.place, old.reads, old.writes))
             if self._dirty:
-                self._soil(tag)
+                self._mark_outdated(tag)
             else:
                 self._run(tag)
-                self._check_free(self.entries[tag])
+                self._check_overwrite(self.entries[tag])
 
     def remove(self, tag: str) -> None:
         """Remove an operation and its writes."""
         entry = self.entry(tag)
         self._unlink(entry)
         for cell, value in entry.writes.items():
-            self._touched(cell, value, ABSENT, entry.place)
+            self._mark_readers(cell, value, ABSENT, entry.place)
 
     def _add(self, tag: str, operation: Operation, place: int) -> None:
         if not isinstance(tag, str) or not tag:
@@ -202,13 +202,13 @@ class History:
             entry = HistoryEntry(tag, operation, place, Reads(), {})
             if self._dirty:
                 self._link(entry)
-                self._soil(tag)
+                self._mark_outdated(tag)
             else:
-                entry = self._applied(entry)
-                self._check_free(entry)
+                entry = self._apply(entry)
+                self._check_overwrite(entry)
                 self._link(entry)
                 for cell, value in entry.writes.items():
-                    self._touched(cell, ABSENT, value, place)
+                    self._mark_readers(cell, ABSENT, value, place)
 
     @contextmanager
     def _step(self) -> Iterator[None]:
@@ -254,15 +254,15 @@ class History:
         if failures:
             # The edit may still correct this; if not, it fails again at the end.
             self._dirty = failed
-            raise EditError(self._refusal(failures), failures)
+            raise EditError(self._edit_error(failures), failures)
         self._contested.clear()
         self._moved_frames.clear()
 
-    def _refusal(self, failures: Mapping[str, KineverseError]) -> str:
+    def _edit_error(self, failures: Mapping[str, KineverseError]) -> str:
         lines = [f"  {tag!r}: {error}" for tag, error in list(failures.items())[:_LISTED]]
         if len(failures) > _LISTED:
             lines.append(f"  and {len(failures) - _LISTED} more operations.")
-        needing = self._needing(failures)
+        needing = self._dependents(failures)
         if needing:
             some = ", ".join(map(repr, needing[:_FEW]))
             more = f" and {len(needing) - _FEW} more" if len(needing) > _FEW else ""
@@ -270,7 +270,7 @@ class History:
         listed = "\n".join(lines)
         return f"The edit is refused, because these operations cannot be applied:\n{listed}"
 
-    def _needing(self, tags: Iterable[str]) -> list[str]:
+    def _dependents(self, tags: Iterable[str]) -> list[str]:
         """Return the tags of all operations that depend on others, directly or indirectly, in order."""
         waiting = list(tags)
         found = set(waiting)
@@ -288,12 +288,12 @@ class History:
 
     def _run(self, tag: str) -> None:
         old = self.entries[tag]
-        new = self._applied(old)
+        new = self._apply(old)
         self._exchange(new)
         for cell in {**old.writes, **new.writes}:
-            self._touched(cell, old.writes.get(cell, ABSENT), new.writes.get(cell, ABSENT), new.place)
+            self._mark_readers(cell, old.writes.get(cell, ABSENT), new.writes.get(cell, ABSENT), new.place)
 
-    def _applied(self, entry: HistoryEntry) -> HistoryEntry:
+    def _apply(self, entry: HistoryEntry) -> HistoryEntry:
         """Apply an operation at its place, and return its entry with its reads and writes."""
         self.runs += 1
         tag = entry.tag
@@ -339,7 +339,7 @@ class History:
             error = unknown_name_error(FRAMES, parent, self.names_at(FRAMES, place))
             raise UnknownNameError(f"The parent of frame '{name}' is missing. {error}")
 
-    def _check_free(self, entry: HistoryEntry) -> None:
+    def _check_overwrite(self, entry: HistoryEntry) -> None:
         """Refuse an operation that overwrites a value of an earlier one without having read it."""
         for cell in entry.writes:
             writers = self.cells.get(cell)
@@ -358,12 +358,12 @@ class History:
     def _check_frames(self, failures: dict[str, KineverseError]) -> None:
         """Report cycles of frames at any place of the sequence; only frames with new writes can close one."""
         for name, place in self._moved_frames:
-            circle = self._circle(name, place)
+            circle = self._find_cycle(name, place)
             if circle is not None:
                 tag, names = circle
                 failures.setdefault(tag, ModelError(f"Cyclic frames: {' -> '.join([*names, names[0]])}."))
 
-    def _circle(self, name: str, place: int) -> tuple[str, list[str]] | None:
+    def _find_cycle(self, name: str, place: int) -> tuple[str, list[str]] | None:
         """Return the first cycle through a frame, between a place and the frame's next write.
 
         The result is the tag of the operation that closes the cycle, and the names of its frames.
@@ -393,7 +393,7 @@ class History:
         index = bisect_right(writers, place, key=_PLACE)
         return writers[index].place if index < len(writers) else None
 
-    def _touched(self, cell: Cell, old: Any, new: Any, place: int) -> None:
+    def _mark_readers(self, cell: Cell, old: Any, new: Any, place: int) -> None:
         """Mark the readers of a write at ``place`` as outdated."""
         kind, name = cell
         writers = self.cells.get(cell, ())
@@ -422,14 +422,14 @@ class History:
                 and (following is None or reader <= following)
                 and (how & Read.VALUE or existence)
             ):
-                self._soil(tag)
+                self._mark_outdated(tag)
         if existence:
             for tag in self.listing[kind]:
                 reader = self.entries[tag].place
                 if reader > place and (following is None or reader <= following):
-                    self._soil(tag)
+                    self._mark_outdated(tag)
 
-    def _soil(self, tag: str) -> None:
+    def _mark_outdated(self, tag: str) -> None:
         heapq.heappush(self._dirty, (self.entries[tag].place, tag))
 
     def value_at(self, cell: Cell, place: int) -> Any:

@@ -121,7 +121,7 @@ class Model(ModelView):
             self._history.settle()
         events = self._history.take_events()
         if events:
-            self._changed(events)
+            self._invalidate(events)
 
     def _writers(self, path: str) -> list[str]:
         return self._history.writers(path)

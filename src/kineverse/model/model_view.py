@@ -65,10 +65,10 @@ class ModelView(SymbolicView):
         with self._lock:
             self._catch_up()
             head = self._head[CONSTRAINTS]
-            names = self._relevance.of(
+            names = self._relevance.find(
                 self._expressions(subject), head, exact=exact, bounds=bounds, closure=closure
             )
-            return {name: self._carried(name, head[name]) for name in names}
+            return {name: self._carry_constraint(name, head[name]) for name in names}
 
     def _expressions(self, subject: Expression | str | Iterable[Symbol | Expression | str]) -> Any:
         """Return a subject with poses in place of names of frames."""
@@ -114,7 +114,7 @@ class ModelView(SymbolicView):
         with self._lock:
             self._catch_up()
             if self._checks is None:
-                followed = {name: self._followed(c) for name, c in self._head[CONSTRAINTS].items()}
+                followed = {name: self._eliminate_dependent(c) for name, c in self._head[CONSTRAINTS].items()}
                 self._checks = Checks(followed, self.rates.dependent.values())
             found = find_violations(self._checks, values, self._known(values), tolerance)
             if isinstance(values, State) and 0 < len(found.unchecked) == len(self._checks.names):

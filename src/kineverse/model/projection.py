@@ -79,11 +79,13 @@ class EqualityConstraints:
     ) -> None:
         self.rates, self.articulations = rates, articulations
         rows = list(_make_rows(constraints, rates, wanted))
-        self._simple = [row for row in rows if not row.equality and _about_one(row)]
+        self._simple = [row for row in rows if not row.equality and _limits_single(row)]
         equal = [row for row in rows if row.equality]
         moved = {s for row in equal for s in row.value.symbols if s.has_derivative}
         self.rows: Sequence[ResidualRow] = equal + [
-            row for row in rows if not row.equality and not _about_one(row) and moved & set(row.value.symbols)
+            row
+            for row in rows
+            if not row.equality and not _limits_single(row) and moved & set(row.value.symbols)
         ]
         self.count = len(equal)
         self.symbols = tuple(
@@ -97,7 +99,7 @@ class EqualityConstraints:
         values = array([row.value for row in self.rows])
         return compile([values, values.partial(self.coordinates)], self.symbols, tier="interpreter").bind()
 
-    def evaluated(self, at: Array) -> tuple[Array, Array] | None:
+    def evaluate_rows(self, at: Array) -> tuple[Array, Array] | None:
         """Return all rows and their derivatives; None if a closed loop among them does not close."""
         try:
             self.evaluate(at)
@@ -166,7 +168,7 @@ def _line(value: Expression) -> tuple[float, float] | None:
     return Constraint(value, value, value).line
 
 
-def _about_one(row: ResidualRow) -> bool:
+def _limits_single(row: ResidualRow) -> bool:
     """Return whether a row limits a single coordinate."""
     return len(row.value.symbols) == 1 and _line(row.value) is not None
 
@@ -189,7 +191,7 @@ def project(
 ) -> State:
     """Project a state onto the manifold of equality constraints, see :meth:`ModelView.project`."""
     tolerance = as_tolerance(tolerance)
-    held = _held(equalities, fixed)
+    held = _fixed_coordinates(equalities, fixed)
     symbols = equalities.symbols
     given = [state.given(s) for s in symbols]
     missing = [s for s, value in zip(symbols, given, strict=True) if value is None and s.value is None]
@@ -207,7 +209,7 @@ def project(
     return state.updated(moved) if moved else state
 
 
-def _held(equalities: EqualityConstraints, fixed: Iterable[Symbol | str]) -> frozenset[Symbol]:
+def _fixed_coordinates(equalities: EqualityConstraints, fixed: Iterable[Symbol | str]) -> frozenset[Symbol]:
     """Return the fixed coordinates; a dependent coordinate stands for those that determine it."""
     dependent = {str(s): e for s, e in equalities.rates.dependent.items()}
     records = equalities.articulations
@@ -296,38 +298,38 @@ class _Search:
         least = np.inf
         generator = np.random.default_rng(0)
         for attempt in range(_STARTS + 1):
-            begin = start if not attempt else self._elsewhere(start, generator, attempt)
-            x, off = self._restored(begin)
+            begin = start if not attempt else self._random_start(start, generator, attempt)
+            x, off = self._restore(begin)
             if off <= self._tolerance:
-                found.append(self._drawn_back(x, start))
+                found.append(self._minimize_distance(x, start))
                 if not attempt or len(found) == 3:
                     break
             elif off < least:
                 best, least = x, off
         if not found:
-            raise self._unsolved(best)
+            raise self._no_solution_error(best)
         x = min(found, key=lambda x: float(np.linalg.norm(x - start)))
         return self._all(x)
 
-    def _restored(self, x: Array) -> tuple[Array, float]:
+    def _restore(self, x: Array) -> tuple[Array, float]:
         """Return a feasible point, or the point without further progress, and the largest residual there."""
         damping = 0.0
-        there = self._look(x)
+        there = self._evaluate_rows(x)
         if there is None:
             return x, np.inf
-        wrong, by_x = self._off(there[0]), there[1]
+        wrong, by_x = self._residuals(there[0]), there[1]
         for _ in range(_STEPS):
             if not wrong.any():
                 break
             step = self._step(x, wrong, by_x, damping)
             for scale in (1.0, 0.5, 0.1):
                 tried = self._unit(np.clip(x + scale * step, self._lower, self._upper))
-                there = self._look(tried)
-                if there is not None and np.linalg.norm(self._off(there[0])) < np.linalg.norm(wrong):
+                there = self._evaluate_rows(tried)
+                if there is not None and np.linalg.norm(self._residuals(there[0])) < np.linalg.norm(wrong):
                     break
                 there = None
             if there is not None:
-                x, wrong, by_x = tried, self._off(there[0]), there[1]
+                x, wrong, by_x = tried, self._residuals(there[0]), there[1]
                 damping = damping / 10 if damping > 1e-8 else 0.0
             elif np.abs(wrong).max() <= 0.1 * self._tolerance or damping > 1e4:
                 break
@@ -362,11 +364,11 @@ class _Search:
             free &= ~left
         return step
 
-    def _drawn_back(self, x: Array, start: Array) -> Array:
+    def _minimize_distance(self, x: Array, start: Array) -> Array:
         """Return a feasible point nearer to the start, by steps along the manifold."""
         pull = 1.0
         for _ in range(_NEARER):
-            there = self._look(x)
+            there = self._evaluate_rows(x)
             if there is None or pull < 1e-3:
                 break
             way, (values, by_x) = start - x, there
@@ -378,7 +380,7 @@ class _Search:
             along[free] = way[free] - np.linalg.lstsq(matrix, matrix @ way[free], rcond=_SINGULAR)[0]
             if np.linalg.norm(along) <= 1e-9:
                 break
-            tried, off = self._restored(self._unit(np.clip(x + pull * along, self._lower, self._upper)))
+            tried, off = self._restore(self._unit(np.clip(x + pull * along, self._lower, self._upper)))
             nearer = np.linalg.norm(tried - start) < np.linalg.norm(x - start) - 1e-14
             if off <= self._tolerance and nearer:
                 x, pull = tried, min(1.0, 2 * pull)
@@ -386,15 +388,15 @@ class _Search:
                 pull /= 2
         return x
 
-    def _look(self, x: Array) -> tuple[Array, Array] | None:
+    def _evaluate_rows(self, x: Array) -> tuple[Array, Array] | None:
         """Return the values of the rows and their derivatives; None if one is undefined."""
-        found = self._equalities.evaluated(self._all(x))
+        found = self._equalities.evaluate_rows(self._all(x))
         if found is None:
             return None
         values, by_x = found[0][self._rows], found[1][self._rows][:, self._columns]
         return (values, by_x) if np.isfinite(values).all() and np.isfinite(by_x).all() else None
 
-    def _off(self, values: Array) -> Array:
+    def _residuals(self, values: Array) -> Array:
         """Return the residuals of the rows; satisfied inequalities have none."""
         off = np.where(self._equal | (values > 0), values, 0.0)
         return np.where(np.abs(off) < 1e-15, 0.0, off)  # rounding errors are no residuals
@@ -413,21 +415,21 @@ class _Search:
     def _names(self, columns: Iterable[int]) -> list[str]:
         return [str(self._equalities.coordinates[self._columns[k]]) for k in columns]
 
-    def _elsewhere(self, start: Array, generator: np.random.Generator, attempt: int) -> Array:
+    def _random_start(self, start: Array, generator: np.random.Generator, attempt: int) -> Array:
         """Return another start, first near the state, later anywhere within the limits."""
         reach = np.where(np.isfinite(self._upper - self._lower), (self._upper - self._lower) / 2, np.pi)
         reach = np.minimum(reach, np.pi) * min(1.0, 0.1 * attempt)
         moved = start + generator.uniform(-1, 1, len(start)) * reach
         return self._unit(np.clip(moved, self._lower, self._upper))
 
-    def _unsolved(self, x: Array) -> NoSolutionError:
-        there = self._look(x)
+    def _no_solution_error(self, x: Array) -> NoSolutionError:
+        there = self._evaluate_rows(x)
         if there is None:
             return NoSolutionError(
                 "The state cannot be projected: a closed loop that the equalities are about has no solution "
                 "there. Begin where it closes."
             )
-        off = np.abs(self._off(there[0]))
+        off = np.abs(self._residuals(there[0]))
         worst = [i for i in np.argsort(-off) if off[i] > self._tolerance]
         sizes = {self._equalities.rows[self._rows[i]].name: off[i] for i in worst}
         listed = ", ".join(f"'{n}' is off by {size:.3g}" for n, size in list(sizes.items())[:4])
@@ -437,15 +439,15 @@ class _Search:
         )
         moved, stopped = self._names(range(len(x))), self._names(np.flatnonzero(ends).tolist())
         held = sorted(str(s) for s in self._held if s in self._equalities.coordinates)
-        tried = [f"moved were {_some(moved)}" if moved else "nothing was free to move"]
-        tried += [f"at their limits are {_some(stopped)}"] if stopped else []
-        tried += [f"fixed were {_some(held)}"] if held else []
+        tried = [f"moved were {_format_names(moved)}" if moved else "nothing was free to move"]
+        tried += [f"at their limits are {_format_names(stopped)}"] if stopped else []
+        tried += [f"fixed were {_format_names(held)}"] if held else []
         return NoSolutionError(
             f"The state cannot be projected: at best {listed}{more}, from {_STARTS + 1} starts. "
             f"{'; '.join(tried).capitalize()}. Begin nearer to where it closes, or let more coordinates move."
         )
 
 
-def _some(names: Sequence[str]) -> str:
+def _format_names(names: Sequence[str]) -> str:
     shown = ", ".join(f"'{name}'" for name in names[:6])
     return shown + (f" and {len(names) - 6} more" if len(names) > 6 else "")

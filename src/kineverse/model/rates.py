@@ -122,16 +122,16 @@ class Rates(Mapping[Symbol, Mapping[Symbol, Expression]]):
         }
         for x in _sort_topologically(expressions, made_of.__getitem__, _DEPENDING):
             self.dependent[x] = self.resolve(expressions[x])
-        rows = {x: self._expanded(e) for x, e in self._given.items() if not isinstance(e, Expression)}
+        rows = {x: self._expand(e) for x, e in self._given.items() if not isinstance(e, Expression)}
         paths = {x.path for x in rows}
 
         def through(x: Symbol) -> list[Symbol]:
             return [v.position for v, _ in rows[x] if v.path in paths and v.position in rows]
 
         for x in _sort_topologically(rows, through, _CYCLIC):
-            self._rows[x] = self._combined(rows[x])
+            self._rows[x] = self._combine(rows[x])
 
-    def _expanded(self, row: RateRow) -> RateRow:
+    def _expand(self, row: RateRow) -> RateRow:
         """Return a row in terms of independent coordinates."""
         if not self.dependent:
             return row
@@ -143,7 +143,7 @@ class Rates(Mapping[Symbol, Mapping[Symbol, Expression]]):
             _add(result, {v: factor * g for v, g in gradient.items()})
         return tuple(result.items())
 
-    def _combined(self, row: Iterable[tuple[Symbol, Expression]]) -> dict[Symbol, Expression]:
+    def _combine(self, row: Iterable[tuple[Symbol, Expression]]) -> dict[Symbol, Expression]:
         """Return a row over free speeds."""
         result: dict[Symbol, Expression] = {}
         for speed, factor in row:
@@ -165,7 +165,7 @@ class Rates(Mapping[Symbol, Mapping[Symbol, Expression]]):
             coordinate = named[coordinate]
         itself = self.dependent.get(coordinate)
         if itself is not None:
-            return self._combined(itself.gradient(False).items())
+            return self._combine(itself.gradient(False).items())
         return self._rows.get(coordinate)
 
     @property

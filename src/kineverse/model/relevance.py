@@ -71,7 +71,7 @@ class Relevance:
         """Return the names of the constraints whose expression has this symbol and no other."""
         return [*self._alone.get(symbol, ()), *self._lines.get(symbol, ())]
 
-    def of(
+    def find(
         self,
         subject: Expression | Iterable[Symbol | Expression],
         constraints: Mapping[str, Constraint],

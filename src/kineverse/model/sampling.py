@@ -54,13 +54,13 @@ class StateSamples:
                 found.setdefault(symbol, (model, value))
         return found
 
-    def of(self, symbol: Symbol) -> Array:
+    def values_of(self, symbol: Symbol) -> Array:
         """Return the values of a symbol, one for each state."""
         if symbol not in self._columns:
-            self._columns[symbol] = self._drawn(symbol)
+            self._columns[symbol] = self._draw(symbol)
         return self._columns[symbol]
 
-    def _drawn(self, symbol: Symbol) -> Array:
+    def _draw(self, symbol: Symbol) -> Array:
         if symbol.value is not None:
             return np.full(self.size, symbol.value)
         model, default = self._known.get(symbol.position) or (None, 0.0)
@@ -85,7 +85,7 @@ class StateSamples:
         vector = ca.vertcat(*(symbol._sx for symbol in symbols)) if symbols else ca.SX(0, 1)
         function = ca.Function("samples", [vector], [stacked])
         if symbols:
-            numbers = np.array(function(np.array([self.of(symbol) for symbol in symbols]))).T
+            numbers = np.array(function(np.array([self.values_of(symbol) for symbol in symbols]))).T
         else:
             numbers = np.tile(np.array(function(ca.DM(0, 1))).T, (self.size, 1))
         ends = np.cumsum([e.size for e in expressions])[:-1]

@@ -136,7 +136,7 @@ class SpeedLimits:
         self._affine.append(row)
         return None
 
-    def of(self, moving: Collection[Symbol]) -> AdmissibleSpeeds:
+    def admissible_speeds(self, moving: Collection[Symbol]) -> AdmissibleSpeeds:
         """Return the limits of some speeds while all others are zero."""
         box: SpeedBox = {}
         coupled = []

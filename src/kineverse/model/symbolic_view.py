@@ -133,7 +133,7 @@ class SymbolicView:
         self._checks: Checks | None = None
         self._equalities: EqualityConstraints | None = None
 
-    def _changed(self, changes: Sequence[tuple[Cell, Any, Any]]) -> None:
+    def _invalidate(self, changes: Sequence[tuple[Cell, Any, Any]]) -> None:
         """Invalidate the caches that changes affect."""
         kinds = {cell[0] for cell, _, _ in changes}
         if self._is_indexed:
@@ -196,27 +196,27 @@ class SymbolicView:
     @property
     def frames(self) -> Mapping[str, Frame]:
         """Frames by name, without the world. Transforms are in plain coordinates."""
-        return self._named(FRAMES)
+        return self._mapping(FRAMES)
 
     @property
     def bodies(self) -> Mapping[str, Body]:
         """Bodies by the name of their frame."""
-        return self._named(BODIES)
+        return self._mapping(BODIES)
 
     @property
     def articulations(self) -> Mapping[str, Articulation]:
         """Records of articulations by name."""
-        return self._named(ARTICULATIONS)
+        return self._mapping(ARTICULATIONS)
 
     @property
     def data(self) -> Mapping[str, Any]:
         """Other data by name."""
-        return self._named(DATA)
+        return self._mapping(DATA)
 
     @property
     def constraints(self) -> Mapping[str, Constraint]:
         """Constraints by name, coordinates carried by their rates."""
-        return NamedMapping(self, CONSTRAINTS, self._carried)
+        return NamedMapping(self, CONSTRAINTS, self._carry_constraint)
 
     def plain_constraints(self) -> dict[str, Constraint]:
         """Return the constraints by name, as operations wrote them: coordinates are plain symbols."""
@@ -230,10 +230,10 @@ class SymbolicView:
             self._settle()
             return dict(self._head[RATES].values())
 
-    def _named(self, kind: str) -> Mapping[str, Any]:
+    def _mapping(self, kind: str) -> Mapping[str, Any]:
         return NamedMapping(self, kind, None)
 
-    def _carried(self, name: str, constraint: Constraint) -> Constraint:
+    def _carry_constraint(self, name: str, constraint: Constraint) -> Constraint:
         rates = self.rates
         if rates.is_empty:
             return constraint
@@ -247,7 +247,7 @@ class SymbolicView:
             self._carried_constraints[name] = known
         return known
 
-    def _followed(self, constraint: Constraint) -> Constraint:
+    def _eliminate_dependent(self, constraint: Constraint) -> Constraint:
         """Return a constraint in terms of independent coordinates and free speeds."""
         rates = self.rates
         if not any(s.position in rates.dependent for s in constraint.symbols):

@@ -145,7 +145,9 @@ def velocity_rows(
         if speeds is None:
             moving.update(s for row in limits.rows[known:] for s in row.weights)
     columns = tuple(speeds) if speeds is not None else tuple(sorted(moving, key=lambda s: s.sort_key))
-    rows = limits.rows + _position_rows(constraints, gaps, limits.of(moving), moving, gamma, dt, brakes)
+    rows = limits.rows + _position_rows(
+        constraints, gaps, limits.admissible_speeds(moving), moving, gamma, dt, brakes
+    )
     rows = [row for row in rows if any(s in row.weights for s in columns)]
     weights = [row.weights.get(s, ZERO) for row in rows for s in columns]
     return VelocityRows(

@@ -48,7 +48,7 @@ class ReadNode(Node):
     kind = "read"
 
     @classmethod
-    def standing_for(cls, expression: Expression, watcher: Tracer, question: int, part: int) -> Expression:
+    def from_expression(cls, expression: Expression, watcher: Tracer, question: int, part: int) -> Expression:
         """Return a placeholder that stands for an expression."""
         return cls.of((expression,), expression.shape, (watcher, question, part, ()))
 

@@ -151,7 +151,7 @@ class _RecordingReader(TracingReader):
     def _given(self, question: int, place: int, part: Expression | float) -> Expression | float:
         if self._plain_numbers and isinstance(part, float):
             return part
-        return ReadNode.standing_for(as_expression(part), self, question, place)
+        return ReadNode.from_expression(as_expression(part), self, question, place)
 
 
 def _detach(expression: Expression) -> Expression:
