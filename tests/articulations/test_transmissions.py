@@ -178,10 +178,10 @@ def test_exchanging_the_driver_runs_the_train_again_and_nothing_else() -> None:
         with model.edit() as edit:
             edit.replace("joint first", gear("first", "motor", -4))
         assert model.fk("rack")({d: 0.7})[0, 3] == pytest.approx(0.05 * 6 * 0.7)
-        assert heard[-1].runs == 4
+        assert heard[-1].reruns == 4
         with model.edit() as edit:  # the last wheel turns the same: the rack is left alone
             edit.replace("joint third", gear("third", "second", 0.5, upper=100))
-        assert heard[-1].runs == 1
+        assert heard[-1].reruns == 1
         with model.edit() as edit:  # a motor that is driven itself
             crank = kv.position("crank")
             edit.replace(

@@ -167,7 +167,7 @@ def outcome(code: Code, change: dict[str, Any]) -> bool:
 
 
 @pytest.mark.parametrize("code", DECIDING.values(), ids=DECIDING)
-def test_what_decides_is_noticed(code: Code) -> None:
+def test_accesses_that_decide_are_recorded(code: Code) -> None:
     outcomes = [outcome(code, change) for change in CHANGES.values()]
     assert not all(outcomes)
     assert any(outcomes)
@@ -222,7 +222,7 @@ def asking(ask: Callable[[kv.model.ReadRecorder], Any]) -> Code:
         lambda m: m.data.get("", 1) and m.frames["new"],
     ],
 )
-def test_what_was_missing_must_stay_away(ask: Callable[[kv.model.ReadRecorder], Any]) -> None:
+def test_a_name_that_was_missing_must_stay_missing(ask: Callable[[kv.model.ReadRecorder], Any]) -> None:
     read = reloaded(build(asking(ask)))
     changed(read, build(asking(ask), number=4.0))
     assert read.data["twice"] == 8.0

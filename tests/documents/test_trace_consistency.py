@@ -72,7 +72,7 @@ def with_more(content: dict[str, Any]) -> None:
 
 @pytest.mark.parametrize("prefix", [None, "a"])
 @pytest.mark.parametrize("tamper", [without_reads, existence_only, without_one, with_more])
-def test_what_is_asked_for_is_read_whatever_the_document_says(
+def test_queries_count_as_reads_even_if_the_document_omits_them(
     tamper: Callable[[dict[str, Any]], None], prefix: str | None
 ) -> None:
     content = tree()
@@ -90,7 +90,7 @@ def test_what_is_asked_for_is_read_whatever_the_document_says(
     assert float(model.data[f"{before}tall"]) == 9.25
 
 
-def test_names_that_were_listed_are_watched_whatever_the_document_says() -> None:
+def test_listed_names_count_as_reads_even_if_the_document_omits_them() -> None:
     content = tree()
     without_reads(content)
     model = read(content)
@@ -103,7 +103,7 @@ def test_names_that_were_listed_are_watched_whatever_the_document_says() -> None
         )
 
 
-def test_an_honest_document_reads_what_it_said() -> None:
+def test_a_consistent_document_has_its_recorded_reads() -> None:
     content = tree()
     assert to_json(read(content)) == to_json(build(placed))
     stripped = tree()

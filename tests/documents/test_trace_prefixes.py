@@ -102,14 +102,14 @@ def test_an_open_loop_is_refused_and_closed_anew() -> None:
     np.testing.assert_allclose(pose, model.fk("rocker_end")({str(crank): 0.4}), rtol=1e-12, atol=1e-12)
 
 
-def test_below_a_prefix_the_error_says_what_the_names_lack() -> None:
+def test_below_a_prefix_the_error_names_the_missing_prefix() -> None:
     read = kv.Model()
     _include(read, to_json(build(branching)), "shelf")
     with pytest.raises(kv.errors.EditError, match=r"in names that lack 'shelf/'"), read.edit() as edit:
         edit.replace("shelf/data number", kv.model.SetData("shelf/number", 0.5))
 
 
-def test_custom_is_what_it_says() -> None:
+def test_equal_operations_without_a_class_have_equal_hashes() -> None:
     """An operation without a class at hand equals itself read again, and hashes."""
     text = to_json(build(derived))
     one, other = ([o for _, o in read_operations(text)] for _ in range(2))

@@ -48,7 +48,7 @@ CHANGES: tuple[dict[str, Any], ...] = (
 
 
 @pytest.mark.parametrize("change", CHANGES)
-def test_it_follows_what_changes_upstream(change: dict[str, Any]) -> None:
+def test_a_trace_follows_upstream_changes(change: dict[str, Any]) -> None:
     read = reloaded(build(follower))
     live = build(follower, **change)
     changed(read, live)
@@ -57,7 +57,7 @@ def test_it_follows_what_changes_upstream(change: dict[str, Any]) -> None:
     assert type(read.data["twice"]) is float
 
 
-def test_what_it_follows_is_saved_and_follows_again() -> None:
+def test_a_followed_change_is_saved_and_followed_again() -> None:
     read = reloaded(build(follower))
     changed(read, build(follower, upper=4.5))
     again = reloaded(read)
@@ -160,7 +160,7 @@ def gambling(model: kv.model.ReadRecorder) -> kv.model.Writes:
     ("code", "change"),
     [(branching, {"number": 0.5}), (gambling, CHANGES[0])],
 )
-def test_what_it_decides_by_must_stay(code: Any, change: dict[str, Any]) -> None:
+def test_a_value_that_the_operation_depends_on_must_stay(code: Any, change: dict[str, Any]) -> None:
     read = reloaded(build(code))
     before = read.snapshot()
     with pytest.raises(
@@ -170,7 +170,7 @@ def test_what_it_decides_by_must_stay(code: Any, change: dict[str, Any]) -> None
     assert read.snapshot() == before
 
 
-def test_what_it_does_not_decide_by_may_change() -> None:
+def test_a_value_that_the_operation_does_not_depend_on_may_change() -> None:
     read = reloaded(build(branching))
     live = build(branching, car=kv.translation(0, 0, 7 * LIFT))
     changed(read, live)

@@ -33,7 +33,7 @@ def rocks(model):
 # -- which coordinates, which branch -----------------------------------------------------------------------
 
 
-def test_only_what_is_free_is_asked_for(model):
+def test_a_closed_loop_needs_values_of_free_coordinates_only(model):
     assert model.symbols == model.degrees_of_freedom == (crank,)
     assert (
         model.speeds == model.speeds_of("rocker_tip") == model.speeds_of("coupler") == (crank.derivative(),)
@@ -43,7 +43,7 @@ def test_only_what_is_free_is_asked_for(model):
     assert record(model, "four-bar")["mobility"] == 1
 
 
-def test_what_follows_is_chosen_from_the_ends_or_given():
+def test_dependent_coordinates_are_chosen_from_the_ends_or_given():
     assert record(four_bar(), "four-bar")["dependent"] == ("coupler", "rocker")
     driven = four_bar(
         dependent=("coupler", "crank"), within={"rocker": (1.6, 1.9)}, home={"rocker": 1.8, "crank": 0.5}
@@ -131,7 +131,7 @@ def test_a_weld_keeps_directions():
 # -- limits and speeds -------------------------------------------------------------------------------------
 
 
-def test_limits_of_what_follows_matter_for_the_crank(model):
+def test_limits_of_dependent_coordinates_are_relevant_for_the_crank(model):
     names = {"rocker/position", "rocker/velocity", "coupler/beside"}
     for subject in ([crank], model.fk("coupler_tip"), [crank.derivative()], [rocker], model.fk("rocker")):
         assert set(model.constraints_for(subject)) == names
@@ -180,13 +180,13 @@ def test_velocity_rows_keep_the_rocker_in_its_limits(model, rocks):
                 assert upper[i] <= (2 - position) / 0.01 + 1e-9
 
 
-def test_the_speed_of_what_follows_is_in_terms_of_the_crank(model, rocks):
+def test_the_speed_of_a_dependent_coordinate_is_in_terms_of_the_crank(model, rocks):
     speed = model.rates.eliminate(kv.velocity("rocker") + kv.velocity("crank"))
     assert set(speed.symbols) == {crank, crank.derivative()}
     assert speed({"crank": 0.7, "crank:velocity": 2.0}) == pytest.approx(2 * rocks([0.7])[1] + 2, abs=1e-12)
 
 
-def test_values_of_what_follows_are_not_asked(model):
+def test_values_of_dependent_coordinates_are_not_needed(model):
     """Joint states of machines name every joint; what follows follows from the others."""
     told = kv.State({crank: 0.4, rocker: 9.0, coupler: -9.0})
     pose = model.fk("rocker_tip")
@@ -308,7 +308,7 @@ def test_a_bound_without_a_value_holds_nothing():
     assert found[-1].excess == 0.5
 
 
-def test_limits_of_what_follows_by_name():
+def test_limits_of_a_dependent_coordinate_by_name():
     model = limited_four_bar()
     assert model.limits("rocker") == (1.0, 2.0)
     assert model.limits("rocker:velocity") == (-0.5, 0.5)
@@ -317,7 +317,7 @@ def test_limits_of_what_follows_by_name():
         model.limits("rokcer")
 
 
-def test_what_has_speeds_of_its_own_does_not_follow():
+def test_a_coordinate_with_free_speeds_is_not_chosen_as_dependent():
     """Neither wheels nor quaternions; and a loop begins where a ball is at rest, not where it is nothing."""
     model = kv.Model()
     with model.edit() as edit:
@@ -353,7 +353,7 @@ def test_many_inputs():
     assert_moves_as_its_jacobian_says(model, "bar_4", 20)
 
 
-def test_what_comes_back_after_a_turn_is_the_same():
+def test_the_guess_is_periodic_over_full_revolutions():
     """A guess that grew by what rounding leaves of 0 would have no period."""
     model = slider_crank()
     (loop,) = model.rates.dependent[kv.position("piston")]._nodes

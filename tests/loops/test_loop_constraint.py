@@ -50,7 +50,7 @@ def test_turns_count_and_half_a_turn_is_none():
     assert "four-bar/rz" not in {v.name for v in model.violations(half)}
 
 
-def test_what_never_closes_has_a_constraint_that_never_holds():
+def test_a_rigid_gap_becomes_a_constraint_that_never_holds():
     model = four_bar(close=False)
     with model.edit() as edit:
         edit.add_frame("lifted", "rocker_tip", kv.translation(0, 0, 0.2))
@@ -97,7 +97,7 @@ def test_options_that_do_not_fit(options, error, text):
     assert model.snapshot() == before
 
 
-def test_it_follows_edits_before_it_here_and_in_a_copy_without_its_code(tmp_path):
+def test_a_loop_constraint_follows_earlier_edits_also_without_its_code(tmp_path):
     model = kept(mask=AXES)
     model.save(tmp_path / "bars.kv.json")
     copy = kv.load(tmp_path / "bars.kv.json")

@@ -188,7 +188,7 @@ def test_the_domain_ends_before_a_dead_centre():
         model.fk("rocker_tip")({"crank": upper + 1e-6})
 
 
-def test_what_goes_round_has_no_domain():
+def test_an_angle_without_limits_has_no_domain():
     model = limited_four_bar()
     assert function_of(model, "rocker").domain == ()
     found = numbers(model.fk("rocker_tip")[:2, 3], np.array([0.3, 0.3 + 200 * math.pi]))

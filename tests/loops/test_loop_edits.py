@@ -94,7 +94,7 @@ def test_the_loop_is_replaced_by_its_other_branch(model):
     np.testing.assert_allclose(meeting(model), four_bar_by_circles(0.7, side=-1), rtol=0, atol=1e-11)
 
 
-def test_something_inserted_before_it(model):
+def test_a_loop_follows_an_operation_inserted_before(model):
     """A crank that is moved on the ground before the loop is closed: the loop is closed anew."""
     ground = kv.translation(0.1, 0, 0)
     attach = four_bar(close=False)
@@ -107,7 +107,7 @@ def test_something_inserted_before_it(model):
     np.testing.assert_allclose(meeting(model) - [0.1, 0], four_bar_by_circles(0.7, d=0.9), rtol=0, atol=1e-11)
 
 
-def test_what_comes_later_leaves_it_as_it_is(model):
+def test_later_operations_keep_a_loop_closed(model):
     solution = model.rates.dependent[rocker]
     with model.edit() as edit:
         edit.add_frame("hand", "world", kv.translation(0, 0, kv.position("lift")))

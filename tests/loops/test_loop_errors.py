@@ -132,7 +132,7 @@ def test_bars_that_are_too_short_or_too_long(lengths, text):
     refused(kv.errors.NoSolutionError, text, lambda: four_bar(*lengths))
 
 
-def test_where_it_stops_is_named():
+def test_the_error_names_the_place_at_which_a_loop_stops():
     """Closed at 0, until crank and coupler are stretched: 0.81 + 1 - 1.8 cos q = 1.2²."""
     stop = math.acos((0.9**2 + 1 - 1.2**2) / 1.8)
     text = rf"'four-bar' does not close on the way to .*crank = -?{str(stop)[:5]}"
@@ -152,7 +152,7 @@ def test_where_it_stops_is_named():
     assert narrow.degrees_of_freedom == (kv.position("crank"),)
 
 
-def test_where_its_range_ends_at_the_singularity():
+def test_the_error_names_the_singularity_at_the_end_of_the_range():
     """To the last stretched position itself, beyond which there is no margin."""
     stop = math.acos((0.9**2 + 1 - 1.2**2) / 1.8)
     refused(
@@ -177,7 +177,7 @@ def test_singular_where_it_begins():
     )
 
 
-def test_a_dead_centre_is_no_place_for_what_is_free():
+def test_a_free_coordinate_at_a_dead_centre_is_refused():
     refused(
         kv.errors.NoSolutionError,
         r"'slider-crank' .*piston = 0\.4",
@@ -196,7 +196,7 @@ def test_a_slide_needs_limits():
         )
 
 
-def test_what_is_closed_already(closed_bars):
+def test_loops_that_are_already_closed_are_refused(closed_bars):
     refused(
         InvalidValueError,
         "'again' is closed whatever its coordinates are",
@@ -216,7 +216,7 @@ def test_what_is_closed_already(closed_bars):
     )
 
 
-def test_what_moves_by_speeds_of_its_own_cannot_follow():
+def test_a_coordinate_with_free_speeds_cannot_be_dependent():
     def towed(**options):
         model = kv.Model()
         with model.edit() as edit:
@@ -279,7 +279,7 @@ def test_frames_that_stand_still_but_apart():
     )
 
 
-def test_a_weld_of_what_is_turned_half_round():
+def test_a_weld_is_not_closed_at_half_a_revolution():
     """The sine of half a turn is zero as well, but that closes nothing."""
     model = kv.Model()
     with model.edit() as edit:

@@ -69,12 +69,12 @@ def poses(model, frame, points, relative_to="world"):
 # -- all of them -------------------------------------------------------------------------------------------
 
 
-def test_it_is_closed_all_over_its_range(model):
+def test_a_loop_is_closed_over_its_range(model):
     assert_closed(model)
 
 
 @pytest.mark.parametrize("name", sorted(set(GALLERY) - GOES_ROUND))
-def test_it_is_closed_a_little_beyond_its_limits(name):
+def test_a_loop_is_closed_in_the_margin_beyond_its_limits(name):
     """Whoever oversteps a limit is told so by the limit, not by an error."""
     model = linkage(name)
     bounds = np.array([model.limits(s) for s in model.degrees_of_freedom])
@@ -89,7 +89,7 @@ def test_it_is_closed_a_little_beyond_its_limits(name):
         assert {f"{s}/position" for s in model.degrees_of_freedom} <= {v.name for v in broken}
 
 
-def test_what_is_free(model, name):
+def test_the_free_coordinates_of_a_loop(model, name):
     free = tuple(map(kv.position, FREE[name].split()))
     assert model.degrees_of_freedom == model.symbols == free
     assert model.speeds == tuple(s.derivative() for s in free)
@@ -133,7 +133,7 @@ def test_accelerations_of_the_delta_robot():
     np.testing.assert_allclose(np.einsum("ijk,j,k", hessian(q)[0], v, v), wanted, rtol=0, atol=1e-6)
 
 
-def test_it_stays_on_one_branch(model):
+def test_a_loop_stays_on_one_branch(model):
     """Along lines through the range, nothing moves further than its speed allows."""
     ends = configurations(model, 12, 3.0)
     lines = itertools.pairwise(ends) if ends.shape[1] > 1 else [(ends[0], ends[-1])]

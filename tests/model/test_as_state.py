@@ -96,7 +96,7 @@ def test_a_constraint_on_a_speed_alone() -> None:
     assert [(v.name, v.excess) for v in found] == [("a/speed", 2.0)]
 
 
-def test_what_the_default_state_gives_is_taken_by_shipped_models() -> None:
+def test_as_state_accepts_the_default_state_of_shipped_models() -> None:
     for name in ("kitchen", "fetch"):
         model = kv.load(name)
         state = model.default_state()

@@ -42,7 +42,7 @@ def test_a_document_is_its_model(tmp_path):
     assert kv.model.compare_models(model, kv.load(tmp_path / "arm.kv.json")).is_empty
 
 
-def test_it_is_what_a_commit_reports():
+def test_compare_models_equals_the_diff_of_a_commit():
     model = arm()
     before, heard = model.snapshot(), []
     model.listen(heard.append)
@@ -115,13 +115,13 @@ def test_a_motion_may_differ_away_from_the_default_state_only():
             )
     (delta,) = details(one, other)["frames/a"]
     assert delta.at_default == (0.0, 0.0)
-    states = StateSamples(one, other).of(kv.position("q"))
+    states = StateSamples(one, other).values_of(kv.position("q"))
     a_R_b = [kv.rotation_z(q)()[:3, :3].T @ kv.rotation_y(q)()[:3, :3] for q in states]
     expected = max(np.arccos((np.trace(R) - 1) / 2) for R in a_R_b)
     assert delta.angle == pytest.approx(expected)
 
 
-def test_what_is_written_in_another_way_is_no_distance_apart():
+def test_another_notation_has_distance_zero():
     q = kv.position("q")
     one, other = kv.Model(), kv.Model()
     for model, expression in ((one, np.sin(q) ** 2), (other, 1 - np.cos(q) ** 2)):
@@ -151,7 +151,7 @@ def test_gradients_count_as_well_as_values():
         (Mesh("a.stl", (2.0, 2.0, 2.0), "/here"), ["visuals[0].geometry.scale"]),
     ],
 )
-def test_where_a_mesh_lies_is_no_difference(mesh, parts):
+def test_the_folder_of_a_mesh_is_no_difference(mesh, parts):
     models = kv.Model(), kv.Model()
     for model, geometry in zip(models, (Mesh("a.stl", folder="/here"), mesh), strict=True):
         with model.edit() as edit:
@@ -163,8 +163,8 @@ def test_where_a_mesh_lies_is_no_difference(mesh, parts):
 def test_samples_are_the_same_for_all_models_and_within_limits():
     kitchen = kv.load("kitchen")
     door = kv.position("kitchen/fridge_door")
-    values = StateSamples(kitchen).of(door)
-    np.testing.assert_array_equal(values, StateSamples(kitchen, arm()).of(door))
+    values = StateSamples(kitchen).values_of(door)
+    np.testing.assert_array_equal(values, StateSamples(kitchen, arm()).values_of(door))
     assert values[0] == kitchen.default_state()[door]
     low, high = kitchen.limits(door)
     assert ((low <= values) & (values <= high)).all()

@@ -39,7 +39,7 @@ def test_bytes_are_a_path(tmp_path: Any) -> None:
     assert kv.load(tmp_path / "x.kv.json").symbols == (a,)
 
 
-def test_an_integer_that_nobody_reads_again() -> None:
+def test_an_integer_too_long_for_a_document_is_refused() -> None:
     for datum in (10**5000, -(10**5000), (1, (10**5000,))):
         long = model()
         with long.edit() as edit:

@@ -194,7 +194,7 @@ def test_bounds_that_agree_are_all_asked_for_at_full_speed() -> None:
     assert [row(rows, name, at)[2] for name in ("0", "1", "sum")] == [-1, -2, -6]
 
 
-def test_who_has_no_room_is_counted_on_with_help_only() -> None:
+def test_a_speed_without_room_recovers_only_with_the_help_of_others() -> None:
     speeds: Triples = {f"speed {k}": (-1, v[k], 1) for k in range(2)}
     rows = constrained(
         {**speeds, "sum": (2, q[0] + q[1], math.inf), "difference": (0, q[0] - q[1], 1)}
@@ -209,7 +209,7 @@ def test_who_has_no_room_is_counted_on_with_help_only() -> None:
     assert row(alone, "up", at | {q[1]: 0.05})[1] == pytest.approx(0.5)
 
 
-def test_who_is_pulled_both_ways_is_not_counted_on() -> None:
+def test_a_speed_requested_in_both_directions_is_zero() -> None:
     speeds: Triples = {f"speed {k}": (-1, v[k], 1) for k in range(2)}
     pulled = constrained({**speeds, "up": (2, q[0], 9), "down": (-9, q[0] - q[1], 1)}).velocity_rows(0.1)
     at = {q[0]: 1.0, q[1]: -9.0}
@@ -280,7 +280,7 @@ def test_other_factors_make_no_rows(expression: kv.Expression) -> None:
 
 
 @pytest.mark.parametrize("expression", [q[0] * q[1], kv.norm(kv.array([q[0], q[1]])), q[0] ** 3])
-def test_where_nothing_helps_nothing_is_asked_for(expression: kv.Expression) -> None:
+def test_a_row_with_vanishing_gradient_demands_nothing(expression: kv.Expression) -> None:
     """The gradient vanishes at the origin, outside of the bounds, and no speed has a limit."""
     rows = constrained({"n": (1, expression, 2)}).velocity_rows(0.01)
     at = {q[0]: 0.0, q[1]: 0.0}
@@ -318,7 +318,7 @@ def test_limits_that_forbid_to_stand_still_are_kept_as_they_are() -> None:
 # -- which speeds are columns ------------------------------------------------------------------------------------
 
 
-def test_who_is_no_column_stands_still() -> None:
+def test_a_speed_without_a_column_is_zero() -> None:
     speeds: Triples = {"0": (-1, v[0], 1), "1": (-10, v[1], 10)}
     at = {q[0]: 5.0, q[1]: 0.0}
     for triple in ((0, q[0] + q[1], 1), (-math.inf, q[0], q[1])):
@@ -357,7 +357,7 @@ def test_a_subject_brings_the_speed_limits_of_all_that_may_move() -> None:
     assert row(rows, "bound", at | {q[0]: -1.0})[2] == pytest.approx(math.sqrt(0.09 + 6) - 0.3)
 
 
-def test_a_subject_brings_the_speed_limits_of_what_wheels_move() -> None:
+def test_a_subject_adds_the_speed_limits_of_driven_coordinates() -> None:
     model = kv.Model()
     with model.edit() as edit:
         edit.apply(

@@ -257,7 +257,7 @@ def test_heuristics_are_no_part_of_how_things_move() -> None:
 # -- what is kept and what is refused --------------------------------------------------------------------------
 
 
-def test_what_is_free_moves_in_a_line_and_the_rest_stays() -> None:
+def test_integrate_moves_free_coordinates_linearly_and_keeps_others() -> None:
     model = with_arm("omni")
     state = kv.State({**dict.fromkeys(model.degrees_of_freedom, 0.25), kv.position("elsewhere"): 7.0})
     after = model.integrate(state, {"arm:velocity": 2.0, kv.velocity("base/x"): -1.0}, 0.5)
@@ -275,7 +275,7 @@ def test_time_goes_on() -> None:
     assert model.integrate(model.default_state(), {}, 0.5).stamp is None
 
 
-def test_no_speed_is_standing_still_whatever_the_rows() -> None:
+def test_integrate_at_zero_speed_keeps_the_state() -> None:
     model = model_of(rates={x: {u: 1 / y}, y: {v: 1.0}})
     state = {x: 1.0, y: 0.0}
     assert dict(model.integrate(state, {}, 5.0)) == state
@@ -331,7 +331,7 @@ def test_a_coordinate_without_a_value_is_named() -> None:
     ],
     ids=str,
 )
-def test_what_runs_away_is_an_error_and_no_number(row: kv.Expression, start: float, dt: float) -> None:
+def test_integrate_refuses_diverging_coordinates(row: kv.Expression, start: float, dt: float) -> None:
     model = model_of(rates={x: {u: row}})
     with warnings.catch_warnings():
         warnings.simplefilter("error")

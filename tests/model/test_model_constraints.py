@@ -43,7 +43,7 @@ def constrained(**triples: Any) -> kv.Model:
         ((None, a, 1), kv.KineverseError, None),
     ],
 )
-def test_what_is_no_constraint(triple: Any, error: type[Exception], words: str | None) -> None:
+def test_invalid_constraints_are_refused(triple: Any, error: type[Exception], words: str | None) -> None:
     with pytest.raises(error, match=words):
         kv.Constraint.of(*triple)
     model = constrained(known=(0, a, 1))
@@ -54,7 +54,7 @@ def test_what_is_no_constraint(triple: Any, error: type[Exception], words: str |
 
 
 @pytest.mark.parametrize("value", [a, (0, a), (0, a, 1, 2), 3, None])
-def test_what_is_no_triple(value: Any) -> None:
+def test_constraints_that_are_no_triples_are_refused(value: Any) -> None:
     with pytest.raises(kv.KineverseError):
         as_constraint(value)
 
@@ -96,7 +96,7 @@ def names(model: kv.Model, subject: Any, **options: bool) -> list[str]:
     return list(model.constraints_for(subject, **options))
 
 
-def test_coordinates_are_compared_whatever_their_order() -> None:
+def test_constraints_for_compares_coordinates_of_any_order() -> None:
     model = constrained(**LIMITS)
     about_a = ["a", "a_jerk", "a_speed", "ab"]
     assert (
@@ -180,7 +180,7 @@ def test_wrong_subjects(subject: Any) -> None:
 # -- violations ----------------------------------------------------------------------------------------
 
 
-def test_violations_say_what_is_broken_by_how_much_worst_first() -> None:
+def test_violations_are_sorted_by_excess() -> None:
     model = constrained(a=(0, a, 1), b=(-2, b, a), unbounded=(-INF, b, INF))
     found = model.violations({"a": 1.25, "b": -7})
     assert [tuple(v) for v in found] == [("b", -7, -2, 1.25, 5), ("a", 1.25, 0, 1, 0.25)]
@@ -205,7 +205,7 @@ def test_a_missing_position_is_an_error_a_missing_speed_is_not() -> None:
     assert [tuple(v) for v in found] == [("lock", -1, -0.25, 0.25, 0.75)]
 
 
-def test_who_lacks_a_position_and_a_speed_lacks_a_position() -> None:
+def test_a_missing_position_is_reported_before_a_missing_speed() -> None:
     model = constrained(lock=(-b, a.derivative(), b), sum=(0, a + c.derivative(), 1), far=(0, d, 1))
     with pytest.raises(kv.errors.UnknownNameError, match="No value for 'a', which constraint 'sum'"):
         model.violations({"b": 1.0, "c:velocity": 0.5})
@@ -230,7 +230,7 @@ def test_two_values_for_one_symbol_are_refused() -> None:
 
 
 @pytest.mark.parametrize("values", [None, 3, [0.5], "a", {("a", 1)}])
-def test_what_is_no_mapping_has_no_violations(values: Any) -> None:
+def test_violations_refuses_values_that_are_no_mapping(values: Any) -> None:
     with pytest.raises(kv.errors.ExpressionError, match="mapping"):
         constrained(a=(0, a, 1)).violations(values)
 
@@ -266,7 +266,7 @@ def test_a_value_that_is_none_is_a_violation() -> None:
     assert [v.name for v in model.violations({"a": -1})] == ["root"]
 
 
-def test_where_nothing_moves_nothing_has_to_be_given() -> None:
+def test_violations_without_symbols_needs_no_values() -> None:
     model = kv.Model()
     with model.edit() as edit:
         edit.add_frame("post", "world", kv.translation(1, 0, 0))

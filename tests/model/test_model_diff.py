@@ -53,7 +53,7 @@ def test_operations_that_were_run_again_are_named_and_heard_of() -> None:
         edit.replace("a", Put("a", 5))
     assert (all_of_it[-1].replaced, all_of_it[-1].rerun) == (("a",), ("c", "d"))
     assert all_of_it[-1].tags == {"a", "c", "d"}
-    assert all_of_it[-1].runs == 3
+    assert all_of_it[-1].reruns == 3
     assert (of_c[-1].replaced, of_c[-1].rerun, of_c[-1].changes) == ((), ("c",), ())
     assert of_b == []
     with model.edit() as edit:  # what was removed afterwards has not been run, as far as anybody can see
@@ -75,7 +75,7 @@ order = st.lists(st.tuples(st.integers(0, 20), st.integers(0, 20)), max_size=5)
 
 @given(order, st.booleans())
 @settings(max_examples=attempts(100))
-def test_what_has_moved_is_what_a_comparison_of_before_and_after_finds(steps: Any, with_others: bool) -> None:
+def test_moved_tags_of_a_commit_equal_those_of_a_comparison(steps: Any, with_others: bool) -> None:
     model = kv.Model()
     with model.edit() as edit:
         for k in range(6):

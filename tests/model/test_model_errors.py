@@ -277,7 +277,7 @@ def test_the_end_of_a_long_chain() -> None:
 # -- printing ----------------------------------------------------------------------------------------------
 
 
-def test_what_a_model_holds_is_printed_line_by_line() -> None:
+def test_mappings_of_a_model_print_one_line_for_each_value() -> None:
     model = room()
     texts = {
         "frames": [

@@ -211,7 +211,7 @@ def test_an_absence_is_read_too() -> None:
     assert (model.data["s"], model.data["e"]) == (0, 0)
 
 
-def test_something_behind_a_reader_does_not_concern_it() -> None:
+def test_a_write_after_a_reader_does_not_run_it_again() -> None:
     model = build(Sum("s", ("a",)), Listing("n"), Count("k"))
     before = model.history.runs
     with model.edit() as edit:
@@ -356,7 +356,7 @@ def test_a_failed_operation_does_not_burn_its_tag_and_leaves_no_trace_inside_the
     check(model, [("0", Put("a", 5)), ("t", Next("b", "a"))])
 
 
-def test_a_refused_edit_lists_every_operation_with_what_it_misses() -> None:
+def test_a_refused_edit_lists_every_failed_operation() -> None:
     model = build(
         Put("a", 1), Next("b", "a"), Next("c", "a"), Fragile("d", "e"), Place("f", "world"), Place("g", "f")
     )
@@ -374,7 +374,7 @@ def test_a_refused_edit_lists_every_operation_with_what_it_misses() -> None:
     assert runs(model, "0", Put("a", 2)) == 3
 
 
-def test_what_was_found_missing_inside_an_edit_can_be_mended_there_and_is_not_forgotten() -> None:
+def test_a_failure_inside_an_edit_can_be_corrected_and_else_fails_at_its_end() -> None:
     model = build(Put("a", 1), Next("b", "a"))
     before = state_of(model)
     with pytest.raises(kv.errors.EditError, match="no datum 'a'"), model.edit() as edit:
@@ -390,7 +390,7 @@ def test_what_was_found_missing_inside_an_edit_can_be_mended_there_and_is_not_fo
     assert dict(model.data) == {"a": 6, "b": 7}
 
 
-def test_constraints_may_change_names_with_what_they_read() -> None:
+def test_names_of_constraints_may_depend_on_reads() -> None:
     model = build(Put("a", 0), Put("b", 1), Limit("l", "a"), Limit("l", "b"))
     assert list(model.constraints) == ["l/0", "l/1"]
     with model.edit() as edit:

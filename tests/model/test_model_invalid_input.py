@@ -212,7 +212,7 @@ def test_a_question_that_is_wrong(case: str) -> None:
             question(asked)
 
 
-def test_what_is_missing_is_not_in_a_mapping_and_has_a_default() -> None:
+def test_a_missing_name_is_not_in_a_mapping_and_has_a_default() -> None:
     model = room()
     assert "dor" not in model.frames
     assert 3 not in model.frames

@@ -139,7 +139,7 @@ def cupboard() -> kv.Model:
     return model
 
 
-def test_what_is_picked_up_keeps_its_own_articulation() -> None:
+def test_an_attached_frame_keeps_its_articulation() -> None:
     model = cupboard()
     with model.edit() as edit:
         edit.attach("box", "gripper", kv.translation(0, 0, 0.1))
@@ -165,7 +165,7 @@ def test_frames_in_a_circle_are_refused_when_attached(parent: str) -> None:
     assert model.fk("box/lid")({"lid": 0})[0, 3] == 2
 
 
-def test_frames_in_a_circle_are_refused_by_whatever_edit_closes_it() -> None:
+def test_a_cycle_of_frames_is_refused_by_the_edit_that_closes_it() -> None:
     model = cupboard()
     before = model.snapshot()
     with model.edit() as edit:
@@ -249,7 +249,7 @@ def test_frames_placed_by_several_factors_or_one_matrix_are_the_same() -> None:
     np.testing.assert_allclose(model.frames["product"].transform(at), model.fk("product")(at), atol=1e-15)
 
 
-def test_editing_one_joint_changes_what_is_below_and_nothing_else() -> None:
+def test_editing_a_joint_changes_only_the_frames_below() -> None:
     model = cupboard()
     arm, lid = model.fk("gripper"), model.fk("box/lid")
     model.jacobian("box/lid")
@@ -300,7 +300,7 @@ def test_an_operation_may_write_frames_below_its_own() -> None:
         ((("a", "b"), ("b", "nowhere")), "parent of frame 'b' is missing. There is no frame 'nowhere'"),
     ],
 )
-def test_what_hangs_nowhere_is_refused(parents: tuple[tuple[str, str], ...], words: str) -> None:
+def test_fk_of_a_detached_frame_is_refused(parents: tuple[tuple[str, str], ...], words: str) -> None:
     model = kv.Model()
     with pytest.raises(kv.KineverseError, match=words), model.edit() as edit:
         edit.apply(Chain(parents))

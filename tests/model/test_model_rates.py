@@ -262,7 +262,7 @@ def test_one_coordinate_among_many_is_carried_without_the_others() -> None:
         {"x": {y.derivative(): 1.0}, "y": {z.derivative(): 2.0, u: 1.0}, "z": {x.derivative(): y}},
     ],
 )
-def test_cyclic_rates_are_refused_and_the_model_is_what_it_was(rows: dict[str, Any]) -> None:
+def test_cyclic_rates_are_refused_and_the_edit_undone(rows: dict[str, Any]) -> None:
     with pytest.raises(kv.errors.ModelError, match="Cyclic rates"):
         table(**rows)
     model = based(WHEELS)

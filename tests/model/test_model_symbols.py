@@ -24,7 +24,7 @@ BASES = [
 
 
 @pytest.mark.parametrize("order", [1, 2])
-def test_what_only_has_its_speed_limited_is_a_coordinate(order: int) -> None:
+def test_a_coordinate_with_only_a_speed_limit_is_a_symbol_of_the_model(order: int) -> None:
     model = kv.Model()
     with model.edit() as edit:
         edit.constrain("v", -1, kv.symbols.symbol("q", order), 1)
@@ -70,7 +70,7 @@ def test_a_wheel_that_is_somewhere_is_a_coordinate() -> None:
     assert kv.position("base/right_wheel") not in model.symbols
 
 
-def test_what_depends_on_others_is_none() -> None:
+def test_dependent_coordinates_are_no_symbols_of_the_model() -> None:
     model = kv.Model()
     with model.edit() as edit:
         edit.apply(Follows())

@@ -50,7 +50,7 @@ def test_an_edit_commits_whole_and_counts_a_version() -> None:
 
 
 @pytest.mark.parametrize("error", [ValueError, kv.errors.ModelError, KeyboardInterrupt, GeneratorExit])
-def test_whatever_is_raised_in_the_block_undoes_all_of_it(error: type[BaseException]) -> None:
+def test_any_exception_in_the_block_undoes_the_edit(error: type[BaseException]) -> None:
     model = door()
     before = state_of(model)
     with pytest.raises(error), model.edit() as edit:
@@ -62,7 +62,7 @@ def test_whatever_is_raised_in_the_block_undoes_all_of_it(error: type[BaseExcept
     assert state_of(model) == before
 
 
-def test_the_model_shows_the_edit_so_far_to_who_makes_it() -> None:
+def test_the_model_shows_the_edit_so_far_inside_the_block() -> None:
     model = door()
     x = kv.position("x")
     assert model.symbols == (a,)
@@ -111,7 +111,7 @@ def test_one_edit_at_a_time() -> None:
 # -- diffs ---------------------------------------------------------------------------------------------
 
 
-def test_a_diff_is_exactly_what_changed_structurally() -> None:
+def test_a_diff_has_exactly_the_structural_changes() -> None:
     model = kv.Model()
     heard = recorded(model)
     with model.edit() as edit:
@@ -139,7 +139,7 @@ def test_a_diff_is_exactly_what_changed_structurally() -> None:
         ("put z",),
         ("put x",),
     )
-    assert second.runs == 3
+    assert second.reruns == 3
 
 
 def test_an_equal_rewrite_changes_nothing() -> None:
@@ -171,7 +171,7 @@ def test_removing_and_adding_under_one_tag_is_a_replacement() -> None:
 # -- listeners -----------------------------------------------------------------------------------------
 
 
-def test_listeners_hear_of_what_they_asked_for_each_once() -> None:
+def test_listeners_get_each_relevant_diff_once() -> None:
     model = door()
     everything, root = recorded(model), recorded(model, paths=[""])
     handle, below = recorded(model, paths=["frames/door/handle"]), recorded(model, paths=["frames/door"])
@@ -434,7 +434,7 @@ def test_edits_in_many_threads_are_all_made_and_heard_of_in_order() -> None:
     assert heard == list(range(1, 161))
 
 
-def test_what_edit_returned_may_be_used_again() -> None:
+def test_an_edit_context_may_be_used_again() -> None:
     model = kv.Model()
     again = model.edit()
     for name in ("a", "b"):

@@ -79,7 +79,7 @@ OVERWRITTEN: dict[str, tuple[Callable[[kv.model.Edit], object], str]] = {
 
 
 @pytest.mark.parametrize("case", OVERWRITTEN)
-def test_what_another_operation_wrote_is_not_overwritten(case: str) -> None:
+def test_overwriting_another_operation_is_refused(case: str) -> None:
     step, message = OVERWRITTEN[case]
     model = room()
     before = state_of(model)
@@ -134,7 +134,7 @@ def test_on_purpose() -> None:
             edit.add_frame("door", "world", UP)
 
 
-def test_an_operation_may_write_over_what_it_has_looked_at() -> None:
+def test_an_operation_may_overwrite_a_value_that_it_has_read() -> None:
     @dataclass(frozen=True)
     class Raised(kv.Operation):
         frame: str

@@ -48,7 +48,7 @@ def test_they_are_those_of_the_pose(arm: kv.Model) -> None:
             assert set(model.symbols_of(frame)) == set(model.fk(frame).symbols)
 
 
-def test_a_loop_gives_what_it_follows() -> None:
+def test_symbols_of_a_loop_are_the_free_coordinates() -> None:
     model = kv.Model()
     with model.edit() as edit:
         edit.apply(

@@ -74,7 +74,7 @@ def test_a_projected_state_is_closed_within_limits_and_as_near_as_can_be(crank, 
     assert MODEL.project(state) == state
 
 
-def test_what_holds_already_stays_to_the_bit():
+def test_project_keeps_a_feasible_state_bit_for_bit():
     closed = MODEL.project(MODEL.default_state())
     assert MODEL.project(closed) is closed
     empty = kv.Model()
@@ -91,7 +91,7 @@ def test_fixed_coordinates_do_not_move():
         MODEL.project(start, fixed="cranc")
 
 
-def test_an_error_names_what_does_not_close_and_what_was_tried():
+def test_project_without_a_solution_names_the_closure_and_the_attempts():
     start = MODEL.default_state()
     text = (
         r"^The state cannot be projected: at best 'four-bar/\w' is off by 0\.\d+.*, from 13 starts\. Moved were "
@@ -118,7 +118,7 @@ def test_missing_and_unknown_names():
     assert len(MODEL.violations(MODEL.project({"crank": 0.1, "coupler": 0.2, "rocker": 1.0}))) == 0
 
 
-def test_what_has_nothing_to_do_with_it_stays():
+def test_project_keeps_unrelated_coordinates():
     model = MODEL.copy()
     with model.edit() as edit:
         bar(edit, "lamp", "world", 5.0, 0.1, lower=-0.1, upper=0.1)
@@ -133,7 +133,7 @@ def test_what_has_nothing_to_do_with_it_stays():
     assert apart["crank"] == model.project(start)["crank"]
 
 
-def test_other_constraints_on_what_moves_are_kept():
+def test_project_satisfies_other_constraints_on_moved_coordinates():
     model = MODEL.copy()
     with model.edit() as edit:
         edit.constrain("together", -math.inf, kv.position("crank") + kv.position("coupler"), 0.8)
@@ -207,7 +207,7 @@ def test_a_base_is_moved_sideways_by_its_coordinates():
     assert len(model.violations(state)) == 0
 
 
-def test_what_closes_outside_of_its_limits_is_led_inside():
+def test_project_moves_a_closed_state_inside_its_limits():
     inside = MODEL.project(MODEL.default_state(), fixed="crank")
     free = four_bar()
     outside = free.project(free.default_state().updated({"crank": 1.3}), fixed="crank")
@@ -258,7 +258,7 @@ def test_equalities_whose_bounds_are_expressions():
 
 
 @pytest.mark.parametrize(("one", "other"), list(combinations(("crank", "coupler", "rocker"), 2)))
-def test_it_follows_from_the_state_alone(one, other):
+def test_project_is_a_function_of_the_state_alone(one, other):
     start = MODEL.default_state().updated({one: 0.3, other: 0.6})
     assert MODEL.project(start) == four_bar(lower=-1.0, upper=1.0).project(start)
 

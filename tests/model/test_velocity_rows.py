@@ -91,7 +91,7 @@ JOINTS: Triples = {
 
 @settings(max_examples=attempts(12))
 @given(seed=st.integers(0, 10**6), dt=st.floats(0.01, 1), share=st.floats(0.05, 1))
-def test_who_is_inside_stays_inside(seed: int, dt: float, share: float) -> None:
+def test_velocity_rows_keep_a_feasible_state_feasible(seed: int, dt: float, share: float) -> None:
     rng = np.random.default_rng(seed)
     model = constrained(JOINTS)
     system = Controlled(model, dt, gain=share / dt)
@@ -192,7 +192,7 @@ SINGLE: dict[str, Triples] = {
 
 @pytest.mark.parametrize("name", SINGLE)
 @pytest.mark.parametrize("share", [1.0, 0.3])
-def test_who_is_outside_comes_back_without_turning_round(name: str, share: float) -> None:
+def test_velocity_rows_lead_back_monotonically_from_outside(name: str, share: float) -> None:
     model = constrained(SINGLE[name])
     system = Controlled(model, gain=share / DT)
     n = len(model.symbols)
@@ -280,7 +280,7 @@ def test_one_sided_limits_give_numbers() -> None:
     start=st.floats(0, 5),
 )
 @example(brake=1.0, weight=1.0, dt=0.125, start=5.0)  # there already
-def test_whoever_goes_as_fast_as_rows_allow_can_still_brake(
+def test_velocity_rows_leave_the_braking_distance(
     brake: float, weight: float, dt: float, start: float
 ) -> None:
     triples = {"range": (-5, weight * a, 5), "brake": (-brake, va.derivative(), 3 * brake)}
@@ -392,7 +392,7 @@ def test_a_norm_of_wheels_is_written_in_wheels() -> None:
         assert 0.3 * (1 - 0.01922) <= straight <= 0.3 + 1e-12
 
 
-def test_left_over_speeds_of_what_wheels_move_are_put_through_their_rows() -> None:
+def test_velocity_rows_eliminate_speeds_of_driven_coordinates() -> None:
     drive = kv.articulations.DifferentialDrive(
         name="base", parent="world", child="base", radius=0.1, track=0.5
     )
@@ -456,7 +456,7 @@ NO_ROWS: dict[str, tuple[tuple[Any, Any, Any], str]] = {
 
 
 @pytest.mark.parametrize("name", NO_ROWS)
-def test_what_has_no_row_says_why(name: str) -> None:
+def test_skipped_constraints_have_a_reason(name: str) -> None:
     triple, reason = NO_ROWS[name]
     rows = rows_of({name: triple, "a": (-1, a, 1)})
     assert rows.names == ("a",)

@@ -136,7 +136,7 @@ def count_reruns(large: Model) -> int:
     with large.edit() as edit:
         edit.replace("measured source", Measured("source", -1.0))
     listener.close()
-    return heard[0].runs
+    return heard[0].reruns
 
 
 NODES_PER_CONSTRAINT = 9

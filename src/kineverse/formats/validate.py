@@ -88,7 +88,7 @@ def _states_within_limits(model: ModelView, samples: StateSamples) -> list[int]:
     symbols = model.symbols
     found = [0]
     for k in range(1, samples.size) if symbols else ():
-        state = State({symbol: samples.of(symbol)[k] for symbol in symbols})
+        state = State({symbol: samples.values_of(symbol)[k] for symbol in symbols})
         # What cannot be evaluated is not broken: it is what is looked for.
         if all(isnan(violation.excess) for violation in model.violations(state)):
             found.append(k)

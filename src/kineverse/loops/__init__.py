@@ -1,4 +1,4 @@
-"""Closed loops: coordinates that follow others so that two frames stay together."""
+"""Closed kinematic loops: dependent coordinates, or equality constraints, that keep two frames together."""
 
 from kineverse.model import registry
 

@@ -1,9 +1,9 @@
 """Initial guess of the dependent coordinates, fitted to samples of one branch.
 
-Over inputs within limits they are Chebyshev polynomials, over whole turns Fourier series; over several inputs
-products of these, and over many inputs only those whose degrees add up to no more than the degree. They need
-not be exact, Newton's method makes them so; but from every point of the domain it has to arrive at this
-branch, and that is tried out before a seed is used.
+The basis functions are Chebyshev polynomials for inputs with limits and Fourier series for full revolutions,
+and their products for several inputs; for many inputs, products up to a total degree. The guess need not be
+exact, because Newton's method refines it. But Newton's method must converge to this branch from every point
+of the domain, which is checked on samples before a guess is used.
 """
 
 from __future__ import annotations
@@ -24,56 +24,56 @@ from .branches import continue_solution
 from .equations import Array, Equations
 
 FEW = 3
-"""Up to how many inputs all products are used, and samples lie on a grid."""
+"""Largest number of inputs with all products as basis, and samples on a grid."""
 
 MARGIN = 0.2
-"""How much further than its limits a loop is continued on each side: of their distance, and at least [m] or
-[rad]. Estimates and controllers overstep limits."""
+"""Margin of the domain beyond each limit: relative to the range, and at least this value [m], [rad].
+Estimates and controllers overstep limits."""
 
 
 @dataclass(frozen=True)
 class InputDomain:
-    """The domain of one input: limits, or a whole turn.
+    """Domain of one input: limits, or a full revolution.
 
     Attributes
     ----------
     lower, upper
-        [m] or [rad].
+        Limits [m] or [rad].
     whole
-        Whether it is an angle that goes round.
+        True for an angle without limits.
     """
 
     lower: float
     upper: float
     whole: bool = False
 
-    def wider(self, below: float = 1.0, above: float = 1.0) -> InputDomain:
-        """Return limits with parts of a margin around them; whole turns have none."""
+    def widen(self, below: float = 1.0, above: float = 1.0) -> InputDomain:
+        """Return the domain widened by fractions of the margin; a full revolution stays."""
         if self.whole:
             return self
         margin = MARGIN * max(self.upper - self.lower, 1.0)
         return InputDomain(self.lower - below * margin, self.upper + above * margin)
 
     def samples(self, count: int) -> Array:
-        """Return points at which fits are well behaved, in order."""
+        """Return sample points for well-conditioned fits, in order."""
         parts = np.arange(count) + (0.0 if self.whole else 0.5)
-        return self.spread(parts / count)
+        return self.place_points(parts / count)
 
-    def spread(self, parts: Array) -> Array:
-        """Return points for numbers in [0, 1): dense where fits need it."""
+    def place_points(self, parts: Array) -> Array:
+        """Map numbers in [0, 1) to the domain, with the density of the sample points."""
         width = self.upper - self.lower
         if self.whole:
             return self.lower + width * parts
         return (self.lower + self.upper) / 2 - width / 2 * np.cos(parts * np.pi)
 
     def orders(self, degree: int) -> list[int]:
-        """Return the degree of each of the basis functions up to one."""
+        """Return the degree of each basis function up to a degree."""
         if self.whole:
             return [(i + 1) // 2 for i in range(2 * degree + 1)]
         return [0] if self.upper == self.lower else list(range(degree + 1))
 
-    def numbers(self, u: Array, degree: int) -> Array:
-        """Return the basis functions at points, shape (N, size)."""
+    def evaluate_basis(self, u: Array, degree: int) -> Array:
+        """Evaluate the basis functions at points, shape (N, size)."""
         if self.whole:
             parts = [np.ones_like(u)]
             for k in range(1, degree + 1):
@@ -84,8 +84,8 @@ class InputDomain:
         t = np.clip((2 * u - self.lower - self.upper) / (self.upper - self.lower), -1, 1)
         return np.polynomial.chebyshev.chebvander(t, degree).astype(np.float64)
 
-    def functions(self, u: Symbol, degree: int) -> list[Expression]:
-        """Return the same as expressions."""
+    def basis_expressions(self, u: Symbol, degree: int) -> list[Expression]:
+        """Return the basis functions as expressions of an input."""
         one = array(1.0)
         if self.upper == self.lower:
             return [one]
@@ -105,18 +105,18 @@ class InputDomain:
 
 @dataclass(frozen=True)
 class BranchGuess:
-    """A fitted guess: Σ coefficients · products of basis functions, and what grows with every turn.
+    """Fitted guess: Σ coefficient · product of basis functions, plus a linear term in periodic inputs.
 
     Attributes
     ----------
     intervals
-        The domain of each input, shape (k,).
+        Domain of each input, shape (k,).
     degree
-        Of the basis functions in each of them.
+        Degree of the basis functions in each input.
     coefficients
         One column for each unknown, shape (P, n).
     winding
-        How unknowns grow with inputs that go round, shape (k, n).
+        Slopes of the unknowns over periodic inputs, shape (k, n).
     """
 
     intervals: tuple[InputDomain, ...]
@@ -128,26 +128,26 @@ class BranchGuess:
     def fit(
         intervals: Sequence[InputDomain], degree: int, inputs: Array, solutions: Array, winding: Array
     ) -> BranchGuess:
-        """Fit a seed to solutions (N, n) at inputs (N, k)."""
+        """Fit a guess to solutions (N, n) at inputs (N, k)."""
         basis = _evaluate_products(inputs, intervals, degree)
         coefficients = np.linalg.lstsq(basis, solutions - inputs @ winding, rcond=None)[0].astype(np.float64)
-        # What is far below the error of the fit is noise, and costs as much as any other term.
+        # Coefficients far below the error of the fit are noise, and cost as much as others.
         coefficients[np.abs(coefficients) < 1e-14 * np.abs(coefficients).max(initial=0.0)] = 0.0
         return BranchGuess(tuple(intervals), degree, coefficients, winding)
 
-    def at(self, inputs: Array) -> Array:
+    def evaluate(self, inputs: Array) -> Array:
         """Return the guesses at inputs (N, k), shape (N, n)."""
         basis = _evaluate_products(inputs, self.intervals, self.degree)
         return basis @ self.coefficients + inputs @ self.winding
 
     @property
     def terms(self) -> int:
-        """The number of terms that are summed."""
+        """Number of terms."""
         return int(np.count_nonzero(self.coefficients))
 
     def expression(self, inputs: Sequence[Symbol]) -> Expression:
         """Return the guesses as an expression of shape (n,)."""
-        bases = [i.functions(u, self.degree) for i, u in zip(self.intervals, inputs, strict=True)]
+        bases = [i.basis_expressions(u, self.degree) for i, u in zip(self.intervals, inputs, strict=True)]
         products = []
         for which in list_products(self.intervals, self.degree):
             product = array(1.0)
@@ -166,16 +166,16 @@ class BranchGuess:
 
 
 def _evaluate_products(inputs: Array, intervals: Sequence[InputDomain], degree: int) -> Array:
-    """Return the products of basis functions at points, shape (N, P)."""
+    """Evaluate the products of basis functions at points, shape (N, P)."""
     which = list_products(intervals, degree)
     result = np.ones((len(inputs), len(which)))
     for column, interval, i in zip(inputs.T, intervals, np.array(which, dtype=int).T, strict=True):
-        result *= interval.numbers(column, degree)[:, i]
+        result *= interval.evaluate_basis(column, degree)[:, i]
     return result
 
 
 def list_products(intervals: Sequence[InputDomain], degree: int) -> list[tuple[int, ...]]:
-    """Return which basis function of each input each product is made of."""
+    """Return the index of the basis function of each input for each product."""
     most = degree if len(intervals) > FEW else degree * len(intervals)
     found: list[tuple[tuple[int, ...], int]] = [((), 0)]
     for interval in intervals:
@@ -197,18 +197,18 @@ _SHOWN = 6
 
 
 class BranchSamples:
-    """One branch of solutions all over the domain, which contains the limits.
+    """Samples of one solution branch over the domain, which contains the limits.
 
     Attributes
     ----------
     inputs, solutions
-        Where fits look, (N, k) and (N, n).
+        Samples for the fit, shapes (N, k) and (N, n).
     tried, wanted
-        Where seeds are tried out.
+        Inputs and solutions of the samples for the check.
     winding
-        How unknowns grow with whole turns, (k, n).
+        Slopes of the unknowns over periodic inputs, shape (k, n).
     condition, worst
-        See :class:`SolvedLoop`; within the limits.
+        Conditioning within the limits, see :class:`SolvedLoop`.
     """
 
     def __init__(
@@ -229,16 +229,16 @@ class BranchSamples:
         lower = np.array([i.lower for i in intervals])
         upper = np.array([i.upper for i in intervals])
         home = np.clip(u[:k], lower, upper)
-        x = self._followed(x, u[:k], home)
+        x = self._continue(x, u[:k], home)
         if k <= FEW:
             grid = _grid([i.samples(_SAMPLES.get(k, 1)) for i in intervals])
-        else:  # a grid would have more points than anybody waits for
+        else:  # a grid would have too many points
             parts = generator.uniform(size=(_SCATTERED, k))
-            grid = np.column_stack([i.spread(p) for i, p in zip(intervals, parts.T, strict=True)])
+            grid = np.column_stack([i.place_points(p) for i, p in zip(intervals, parts.T, strict=True)])
         corners = np.vstack([_corners(limits, generator), _corners(intervals, generator)])
         tried = np.vstack([corners, generator.uniform(lower, upper, (_TRIED, k))])
         everywhere = np.vstack([home, grid, tried])
-        solutions = self._everywhere(x, everywhere)
+        solutions = self._continue_to(x, everywhere)
         self.inputs, self.solutions = everywhere[: len(grid) + 1], solutions[: len(grid) + 1]
         self.tried, self.wanted = everywhere[len(grid) + 1 :], solutions[len(grid) + 1 :]
         self.winding = self._winding(x, home)
@@ -253,16 +253,16 @@ class BranchSamples:
         self.worst = everywhere[inside][int(ratios.argmin())]
 
     def all_inputs(self, q: Array) -> Array:
-        """Return free coordinates with the parameters behind them."""
+        """Return the free coordinates, followed by the parameters."""
         return np.concatenate([q, self._given])
 
-    def turns_over(self, rows: Sequence[int]) -> bool:
-        """Whether det ∂r/∂x of these rows is zero somewhere in between: it has two signs."""
+    def changes_sign(self, rows: Sequence[int]) -> bool:
+        """Return whether det ∂r/∂x of these rows changes its sign, so that it is zero in between."""
         points = zip((*self.inputs, *self.tried), (*self.solutions, *self.wanted), strict=True)
         matrices = (self.equations(x, self.all_inputs(q))[1][list(rows)] for q, x in points)
         return len({float(np.linalg.slogdet(matrix)[0]) for matrix in matrices}) > 1
 
-    def _followed(self, x: Array, start: Array, end: Array) -> Array:
+    def _continue(self, x: Array, start: Array, end: Array) -> Array:
         reached = continue_solution(self.equations, x, self.all_inputs(start), self.all_inputs(end))
         if reached.part < 1.0:
             there = start + reached.part * (end - start)
@@ -276,39 +276,39 @@ class BranchSamples:
             )
         return reached.solution
 
-    def _everywhere(self, x: Array, points: Array) -> Array:
-        """Return the solutions at points, each followed from the nearest one that is known."""
+    def _continue_to(self, x: Array, points: Array) -> Array:
+        """Return the solutions at points, each continued from the nearest known one."""
         scale = np.array([max(i.upper - i.lower, 1e-12) for i in self.intervals])
         solutions = np.zeros((len(points), len(x)))
-        solutions[0] = self._followed(x, points[0], points[0])
+        solutions[0] = self._continue(x, points[0], points[0])
         left = np.arange(1, len(points))
         nearest = np.zeros(len(points), dtype=int)
         distance = np.abs((points - points[0]) / scale).max(axis=1, initial=0.0)
         while len(left):
             position = int(distance[left].argmin())
             i, left = left[position], np.delete(left, position)
-            solutions[i] = self._followed(solutions[nearest[i]], points[nearest[i]], points[i])
+            solutions[i] = self._continue(solutions[nearest[i]], points[nearest[i]], points[i])
             closer = np.abs((points - points[i]) / scale).max(axis=1, initial=0.0)
             better = closer < distance
             nearest[better], distance[better] = i, closer[better]
         return solutions
 
     def _winding(self, x: Array, home: Array) -> Array:
-        """Return how much the unknowns grow in a whole turn of each input that goes round, per radian."""
+        """Return the slopes of the unknowns over a full revolution of each periodic input, per radian."""
         winding = np.zeros((len(home), len(x)))
         for k, interval in enumerate(self.intervals):
             if not interval.whole:
                 continue
             end = home.copy()
             end[k] += 2 * np.pi
-            grown = (self._followed(x, home, end) - x) / (2 * np.pi)
+            grown = (self._continue(x, home, end) - x) / (2 * np.pi)
             whole = np.abs(grown - np.round(grown)) < 1e-6
             if not np.all(whole | ~self._angles):
                 raise NoSolutionError(
                     f"Loop '{self.name}' is on another branch after a turn of '{self.equations.inputs[k]}': "
                     "it goes through a singular configuration. Limit that coordinate."
                 )
-            # A length may grow, as a nut on a screw does; what rounding leaves of 0 would be no period.
+            # A length may grow with revolutions, as for a nut on a screw; rounding errors of 0 are removed.
             lengths = np.where(np.abs(grown) < 1e-9, 0.0, grown)
             winding[k] = np.where(self._angles, np.round(grown), lengths)
         return winding
@@ -319,14 +319,14 @@ class BranchSamples:
 
 
 def format_point(symbols: Sequence[Symbol], values: Array, named: bool = True) -> str:
-    """Return where some inputs are, the first few of them, for a message."""
+    """Format the values of the first few inputs for a message."""
     pairs = list(zip(symbols, values.tolist(), strict=False))
     shown = ", ".join(f"{s} = {v:.6g}" if named else f"{v:.6g}" for s, v in pairs[:_SHOWN])
     return shown + (", ..." if len(pairs) > _SHOWN else "")
 
 
 def _corners(intervals: Sequence[InputDomain], generator: np.random.Generator) -> Array:
-    """Return the corners of a box, or some of them if there are many."""
+    """Return the corners of a box, or a random selection of many."""
     ends = np.array([(i.lower, i.upper) for i in intervals]).reshape(-1, 2)
     if len(ends) <= _MOST_CORNERED:
         return _grid(list(ends))

@@ -22,25 +22,26 @@ def find_branches(
     reach: Array,
     upright: Callable[[Array], Array] | None = None,
 ) -> tuple[list[Array], float]:
-    """Return the solutions that were found, the nearest first, and the smallest gap of all attempts.
+    """Search solutions from several starts; return them, the nearest first, and the smallest residual.
 
     Parameters
     ----------
     equations
-        The loop.
+        Equations of the loop.
     near
-        Where to look first; solutions are sorted by their distance from it.
+        First start; solutions are sorted by their distance from it.
     u
-        The inputs.
+        Inputs.
     angles
-        Which unknowns are angles; solutions that differ by whole turns are one, the nearest to ``near``.
+        Flags of unknowns that are angles. Solutions that differ by full revolutions count once, the nearest
+        to ``near``.
     reach
-        How far from ``near`` to look, for each unknown.
+        Search range around ``near``, for each unknown.
     upright
-        Numbers at unknowns and inputs that are positive in a solution that counts; elsewhere the ends are
-        half a turn apart.
+        Functions of unknowns and inputs that are positive in a valid solution; in other solutions, the ends
+        differ by half a revolution.
     """
-    # The same attempts in every process: which branch is which has to be the same everywhere.
+    # Equal starts in every process, so that branches have equal numbers everywhere.
     generator = np.random.default_rng(0)
     starts = [near, *(near + generator.uniform(-1, 1, (_TRIES, len(near))) * reach)]
     found: list[Array] = []
@@ -65,9 +66,9 @@ def find_branches(
 
 
 def find_nearest_closed(equations: Equations, near: Array, u: Array) -> tuple[Array, float]:
-    """Return a solution near a point, and what is left of the residual, looking further and further away.
+    """Return a solution near a point and its residual, from starts at growing distance.
 
-    Where every coordinate is zero, all bars often lie in one line, and no direction leads downhill.
+    At zero coordinates the bars are often collinear, and the residual has no descent direction.
     """
     generator = np.random.default_rng(0)
     best, smallest = equations.close(near, u, 100)
@@ -93,14 +94,14 @@ _FIRST = 1 / 16
 
 @dataclass(frozen=True)
 class ContinuationResult:
-    """How far a solution could be followed.
+    """Result of a continuation.
 
     Attributes
     ----------
     solution
-        The unknowns there.
+        Unknowns at the last point.
     part
-        The part of the way that was made, 1 for all of it.
+        Completed fraction of the path, 1 for all of it.
     """
 
     solution: Array
@@ -108,10 +109,10 @@ class ContinuationResult:
 
 
 def continue_solution(equations: Equations, x: Array, start: Array, end: Array) -> ContinuationResult:
-    """Follow a solution along a straight line of inputs.
+    """Continue a solution along a straight line of inputs.
 
-    Each step predicts along the tangent and corrects; it counts if the correction is small beside the step,
-    so that it cannot have fallen on another branch.
+    Each step has a predictor along the tangent and a Newton corrector. It is accepted if the correction is
+    small relative to the step, so that it stays on the branch.
     """
     way = end - start
     done, step = 0.0, _FIRST
@@ -133,7 +134,7 @@ def continue_solution(equations: Equations, x: Array, start: Array, end: Array) 
         elif step > _SHORTEST:
             step /= 2
         elif gap < CLOSURE_TOLERANCE and wrong < 0.05:
-            # Beside a singularity the tangent says little; steps this short cannot jump far.
+            # Near a singularity the tangent is unreliable, but such short steps stay on the branch.
             x, done = found, done + step
             _, by_x, by_u = equations(x, u)
         else:

@@ -28,7 +28,7 @@ _Item = TypeVar("_Item", bound=tuple[Any, ...])
 
 @dataclass(frozen=True, kw_only=True)
 class CloseLoop(Operation):
-    """Two frames coincide: the coordinates of the loop between them follow the free ones.
+    """Closes a loop between two frames: coordinates of the loop become functions of the free ones.
 
     With ``to_T_frame = (R, p)``, the residual consists of the elements of p [m] and of the axis of R times
     the sine of its angle, ½(R - Rᵀ)^∨ [rad], that ``mask`` names, in axes of ``to``. Where they are zero, the
@@ -36,37 +36,37 @@ class CloseLoop(Operation):
 
         r(x(u), u) = 0,   ∂x/∂u = -(∂r/∂x)⁻¹ ∂r/∂u,
 
-    and everything that the model hands out is about u alone. Which solution it is follows from u, by a guess
-    that was fitted to one branch within the limits; outside of what closes, evaluation is an error.
+    and all expressions of the model are functions of u alone. A guess that is fitted to one branch within the
+    limits selects the solution. Outside the domain of the branch, evaluation is an error.
 
     Attributes
     ----------
     name
-        Of the loop.
+        Name of the loop.
     frame, to
-        The frames, which must be connected by other operations already.
+        Frames to keep together. Other operations must have connected them already.
     more
-        Further pairs (frame, to) that coincide in the same way, for loops that determine their coordinates
-        only together, as the three arms of a delta robot do.
+        Further pairs (frame, to) with the same mask, for loops that determine their coordinates only
+        together, such as the three arms of a delta robot.
     mask
-        What coincides, names out of ``x y z rx ry rz``: a pin ``("x", "y", "z")``, which is the default.
+        Constrained axes, names out of ``x y z rx ry rz``; the default ``("x", "y", "z")`` is a pin.
     dependent
-        The coordinates that follow, by name; by default the last ones along both chains that can.
+        Names of the dependent coordinates; by default the last possible ones along both chains.
     home
-        Pairs of coordinate and value, near which the loop closes at first; by default at rest, or the limit
-        next to it.
+        Pairs of coordinate and value near a closed configuration; by default the rest position, or the
+        nearest limit.
     branch
-        Which solution there: 0 is the nearest to ``home``, 1 the next.
+        Number of the solution at home: 0 for the nearest to ``home``, 1 for the next.
     within
-        Triples of free coordinate, lower and upper limit, in which the loop is used, which become the
-        constraints ``name/coordinate``; by default the coordinate's own position limits. An angle without
-        any goes round.
+        Triples of free coordinate, lower and upper limit. They limit the use of the loop, and become the
+        constraints ``name/coordinate``; by default the position limits of the coordinate. The domain of an
+        angle without limits is a full revolution.
 
     Raises
     ------
     NoSolutionError
-        If the loop does not close, or not within the limits, with what is left between its ends, or where it
-        stops; if there is no such branch.
+        If the loop does not close at home or everywhere within the limits, with the residual or the place; or
+        if the branch does not exist.
     InvalidValueError
         If mask, coordinates or limits do not fit.
     ModelError
@@ -123,7 +123,7 @@ class CloseLoop(Operation):
         return f"loop {self.name}"
 
     def apply(self, model: ReadRecorder) -> Writes:
-        """Write what the dependent coordinates are."""
+        """Write the expressions of the dependent coordinates."""
         if self.name in model.articulations:
             raise DuplicateNameError(
                 f"There is an articulation '{self.name}' already; give loop '{self.name}' another name."
@@ -137,7 +137,7 @@ class CloseLoop(Operation):
         moving = {s for s in residual.symbols if s.has_derivative}
         on_the_way = [s for frame, to in self._ends for s in model.coordinates_between(frame, to)]
         coordinates = list(dict.fromkeys([s for s in on_the_way if s in moving] + sorted(moving, key=str)))
-        # What has speeds of its own does not follow, so it is the first to be free.
+        # Coordinates with free speeds of their own cannot be dependent, so they come first.
         coordinates.sort(key=lambda s: model.carry(s) is s)
         by_name = {str(s): s for s in coordinates}
         limits = {s: found for s in coordinates if (found := self._limits(model, s)) is not None}
@@ -168,7 +168,7 @@ class CloseLoop(Operation):
         )
 
     def _check(self, model: ReadRecorder, closed: SolvedLoop) -> None:
-        """Look whether what follows is free to do so, and what has limits here is free."""
+        """Check that dependent coordinates have no rate yet, and that ``within`` names free ones."""
         for s in closed.dependent:
             if model.carry(s) is not s:
                 raise InvalidValueError(
@@ -187,7 +187,7 @@ class CloseLoop(Operation):
         return ((self.frame, self.to), *self.more)
 
     def _rows(self, model: ReadRecorder, frame: str, to: str) -> list[Expression]:
-        """Return the rows of the mask that are not zero anyway."""
+        """Return the rows of the mask that are not identically zero."""
         pose = model.resolve(model.fk(frame, to))
         if not any(s.has_derivative for s in pose.symbols):
             raise ModelError(f"Loop '{self.name}' cannot move: '{frame}' and '{to}' are rigidly connected.")
@@ -207,7 +207,7 @@ class CloseLoop(Operation):
         return kept
 
     def _limits(self, model: ReadRecorder, symbol: Symbol) -> tuple[float, float] | None:
-        """Return the position limits that the joint of a coordinate wrote, if they are numbers."""
+        """Return the position limits of the joint of a coordinate, if they are numbers."""
         constraint = model.constraints.get(f"{symbol.path}/position")
         if constraint is None or constraint.expression is not symbol:
             return None
@@ -216,7 +216,7 @@ class CloseLoop(Operation):
         return float(constraint.lower), float(constraint.upper)
 
     def _rest(self, model: ReadRecorder, symbol: Symbol) -> float:
-        """Return where the joint of a coordinate is at rest: 1 for a quaternion's scalar part, else 0."""
+        """Return the rest position of a coordinate: 1 for the scalar part of a quaternion, else 0."""
         joint = symbol.path.rpartition("/")[0]
         record = model.articulations.get(joint) if joint else None
         if record is None or symbol not in record.coordinates:
@@ -233,38 +233,38 @@ class CloseLoop(Operation):
 
 
 APART = 1e-9
-"""What a row may be that nothing changes [m], [rad]."""
+"""Largest residual of a satisfied constant row [m], [rad]."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class LoopConstraint(Operation):
-    """Two frames should coincide: an equality constraint for each row of what is left between them.
+    """Closes a loop between two frames by equality constraints, one for each row of the residual.
 
-    For loops that :class:`~kineverse.CloseLoop` cannot turn into a function of the free coordinates. All
-    coordinates stay free; :meth:`kineverse.Model.violations` and velocity rows see the closure, and
-    :meth:`kineverse.Model.project` moves a state to where it holds.
+    It serves for loops that :class:`~kineverse.CloseLoop` cannot solve for dependent coordinates. All
+    coordinates stay free. :meth:`kineverse.Model.violations` and velocity rows include the closure, and
+    :meth:`kineverse.Model.project` projects a state onto it.
 
     The constraints are ``0 <= row <= 0``, with the rows of :class:`~kineverse.CloseLoop`: elements of the
     position p [m] and of ½(R - Rᵀ)^∨ [rad] in axes of ``to``. They are called ``name/x``, ``name/ry`` and so
-    on, ``name/1/x`` for the second pair of frames. Where turns count, ``name/upright`` is a number that is
-    positive unless the frames are half a turn apart. A row that nothing moves has no constraint if it is
-    zero; otherwise ``name/apart`` is the distance of all rows from zero, which is never 0 then.
+    on, ``name/1/x`` for the second pair of frames. If the mask has rotations, ``name/upright`` is positive
+    unless the frames differ by half a revolution. A constant row has no constraint if it is zero; otherwise
+    ``name/apart`` is the distance of all rows from zero, which is then never 0.
 
     Attributes
     ----------
     name
-        Of the closure.
+        Name of the closure.
     frame, to
-        The frames, which must be connected by other operations already.
+        Frames to keep together. Other operations must have connected them already.
     mask
-        What coincides, names out of ``x y z rx ry rz``.
+        Constrained axes, names out of ``x y z rx ry rz``.
     more
-        Further pairs (frame, to) that coincide in the same way.
+        Further pairs (frame, to) with the same mask.
 
     Raises
     ------
     ModelError
-        If the frames are connected rigidly: nothing moves what is between them.
+        If the frames are connected rigidly.
     DuplicateNameError
         If there is an articulation of that name.
     """
@@ -280,7 +280,7 @@ class LoopConstraint(Operation):
         object.__setattr__(self, "more", as_ends(self.more, self.name))
 
     def default_tag(self) -> str:
-        """Return ``loop`` and the name, as of a loop that is solved."""
+        """Return ``loop`` and the name, as for :class:`CloseLoop`."""
         return f"loop {self.name}"
 
     def apply(self, model: ReadRecorder) -> Writes:
@@ -301,7 +301,7 @@ class LoopConstraint(Operation):
     def _between(self, model: ReadRecorder, frame: str, to: str, name: str) -> dict[str, Constraint]:
         pose = model.fk(frame, to)
         rows = residual_rows(pose, self.mask)
-        # Each by itself, so that a trace knows what is decided by: whether anything moves it.
+        # Row by row, so that a trace records the dependence on the symbols of each.
         alone = {axis: model.resolve(row) for axis, row in rows.items()}
         moving = [axis for axis, row in alone.items() if row.symbols] if pose.symbols else []
         if not moving:

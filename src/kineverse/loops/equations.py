@@ -18,7 +18,7 @@ AXES = ("x", "y", "z", "rx", "ry", "rz")
 
 
 def as_mask(given: Any, name: str) -> tuple[str, ...]:
-    """Return a mask, a sequence or text of different names out of :data:`AXES`, as a tuple."""
+    """Convert a mask, a sequence or text of distinct names out of :data:`AXES`, to a tuple."""
     mask = tuple(given) if isinstance(given, list | tuple | str) else ()
     if not mask or not all(axis in AXES for axis in mask) or len(set(mask)) < len(mask):
         raise InvalidValueError(
@@ -28,7 +28,7 @@ def as_mask(given: Any, name: str) -> tuple[str, ...]:
 
 
 def as_ends(given: Any, name: str) -> tuple[tuple[str, str], ...]:
-    """Return further pairs of frames that coincide as tuples."""
+    """Convert further pairs of frames to tuples."""
     pairs = tuple(given) if isinstance(given, list | tuple) else (given,)
     for pair in pairs:
         if not isinstance(pair, list | tuple) or [type(end) for end in pair] != [str, str]:
@@ -39,14 +39,14 @@ def as_ends(given: Any, name: str) -> tuple[tuple[str, str], ...]:
 
 
 def residual_rows(pose: Expression, mask: Sequence[str]) -> dict[str, Expression]:
-    """Return the elements of a residual that a mask names: of p [m], and of ½(R - Rᵀ)^∨ [rad].
+    """Return the rows of the loop-closure residual: elements of p [m] and of ½(R - Rᵀ)^∨ [rad].
 
     Parameters
     ----------
     pose
-        to_T_frame = (R, p), 4×4, where the frame coincides with ``to`` if all of it is zero.
+        Pose to_T_frame = (R, p), 4×4; the residual of the identity is zero.
     mask
-        Names out of :data:`AXES`.
+        Names of the rows out of :data:`AXES`.
     """
     p, r = pose[:3, 3], pose[:3, :3]
     axis = [(r[2, 1] - r[1, 2]) / 2, (r[0, 2] - r[2, 0]) / 2, (r[1, 0] - r[0, 1]) / 2]
@@ -55,9 +55,9 @@ def residual_rows(pose: Expression, mask: Sequence[str]) -> dict[str, Expression
 
 
 def upright_signs(pose: Expression, mask: Sequence[str]) -> list[Expression]:
-    """Return what is positive where the angles that a mask makes zero are not half a turn.
+    """Return expressions that are positive unless a masked angle is half a revolution.
 
-    The sine of an angle is zero there, too.
+    The sine in the residual is zero there as well.
     """
     turning = [axis for axis in "xyz" if f"r{axis}" in mask]
     if not turning:
@@ -74,38 +74,38 @@ def upright_signs(pose: Expression, mask: Sequence[str]) -> list[Expression]:
 Array: TypeAlias = npt.NDArray[np.float64]
 
 CLOSURE_TOLERANCE = 1e-11
-"""What is left of the residual where a loop counts as closed while it is analysed [m] or [rad]."""
+"""Largest residual of a closed loop during the analysis [m] or [rad]."""
 
 _NEWTON = 30
 _SINGULAR = 1e-9
 
 
 MOST_EFFORT = 150_000.0
-"""How much is spent on closing one loop: some ten seconds. Loops of usual size take a fifth of it."""
+"""Budget for the analysis of one loop, about ten seconds. Loops of usual size take a fifth of it."""
 
 
 @dataclass
 class WorkBudget:
-    """How much may still be spent on analysing a loop, the same in every process and on every machine.
+    """Budget of work for the analysis of a loop, independent of machine and process.
 
     Attributes
     ----------
     name
-        Of the loop.
+        Name of the loop.
     left
-        What is left; an evaluation of a few equations is 1.
+        Remaining work; an evaluation of a few equations is 1.
 
     Raises
     ------
     NoSolutionError
-        When nothing is left.
+        When the budget is spent.
     """
 
     name: str
     left: float = MOST_EFFORT
 
     def spend(self, amount: float) -> None:
-        """Take something from what is left."""
+        """Subtract an amount of work."""
         self.left -= amount
         if self.left < 0:
             raise NoSolutionError(
@@ -115,16 +115,16 @@ class WorkBudget:
 
 
 class Equations:
-    """A residual r(x, u) with its derivatives, at numbers.
+    """Numeric residual r(x, u) with its derivatives.
 
     Parameters
     ----------
     residual
-        Of shape (m,).
+        Residual, shape (m,).
     unknowns, inputs
-        The symbols x, shape (n,), and u, shape (k,).
+        Symbols x, shape (n,), and u, shape (k,).
     effort
-        What may be spent on evaluations.
+        Budget for evaluations.
     """
 
     def __init__(
@@ -137,7 +137,7 @@ class Equations:
         self._evaluate = function.bind()
 
     def __call__(self, x: Array, u: Array) -> tuple[Array, Array, Array]:
-        """Return r, ∂r/∂x and ∂r/∂u; r is infinite where they are not defined."""
+        """Return r, ∂r/∂x and ∂r/∂u; r is infinite if they are undefined."""
         self._effort.spend(self._size)
         n = len(self.unknowns)
         self._evaluate.input[:n] = x
@@ -145,21 +145,21 @@ class Equations:
         try:
             self._evaluate()
         except NoSolutionError:
-            # A loop that this one is built on does not close there.
+            # An earlier loop, which this one depends on, does not close there.
             m, n_all = self._evaluate.outputs[1].shape
             return np.full(m, np.inf), np.zeros((m, n)), np.zeros((m, n_all - n))
         residual, derivative = self._evaluate.outputs
         return residual.copy(), derivative[:, :n].copy(), derivative[:, n:].copy()
 
     def gap(self, x: Array, u: Array) -> float:
-        """Return the length of the residual."""
+        """Return the norm of the residual."""
         return float(np.linalg.norm(self(x, u)[0]))
 
     def close(self, x: Array, u: Array, steps: int = _NEWTON) -> tuple[Array, float]:
-        """Return a solution near x, and what is left of the residual there.
+        """Return a solution near x, and the norm of its residual.
 
-        Newton's method where it leads downhill, and shorter, more careful steps where it does not
-        (Levenberg, Marquardt); so it ends in the place where the loop comes closest to closing.
+        Newton steps that reduce the residual are accepted; otherwise the step is damped (Levenberg,
+        Marquardt). So the result is a local minimum of the residual if the loop does not close.
         """
         damping = 0.0
         residual, by_x, _ = self(x, u)
@@ -191,7 +191,7 @@ class Equations:
 def find_periodic(
     equations: Equations, x: Array, u: Array
 ) -> tuple[npt.NDArray[np.bool_], npt.NDArray[np.bool_]]:
-    """Return which unknowns and which inputs are angles: a whole turn changes nothing."""
+    """Return flags of the unknowns and inputs that are angles, with a residual of period 2π."""
     at = equations(x, u)[0]
 
     def same(dx: Array, du: Array) -> bool:

@@ -19,20 +19,20 @@ LOOP_KINDS = (SOLVED_LOOP, CONSTRAINED_LOOP)
 
 @dataclass(frozen=True)
 class LoopRecord:
-    """A loop of a model, however it came into it.
+    """Closed loop of a model.
 
     Attributes
     ----------
     name
-        Of the loop.
+        Name of the loop.
     ends
-        Pairs of frames (frame, to) that coincide, as far as the mask says.
+        Pairs of frames (frame, to) that coincide in the axes of the mask.
     mask
         Names out of ``x y z rx ry rz``.
     free, dependent
-        The names of the coordinates that move by themselves, and of those that follow.
+        Names of the free and of the dependent coordinates.
     constraints
-        The names of the constraints that keep it closed, where nothing follows.
+        Names of the equality constraints of a loop without dependent coordinates.
     """
 
     name: str
@@ -46,7 +46,7 @@ class LoopRecord:
 def make_loop_record(
     ends: tuple[tuple[str, str], ...], mask: tuple[str, ...], closed: SolvedLoop
 ) -> Articulation:
-    """Return what is put on record of a loop that was closed."""
+    """Return the record of a loop with dependent coordinates."""
     frame, to = ends[0]
     return Articulation(
         SOLVED_LOOP,
@@ -70,7 +70,7 @@ def make_loop_record(
 def make_constrained_record(
     ends: tuple[tuple[str, str], ...], mask: tuple[str, ...], constraints: tuple[str, ...]
 ) -> Articulation:
-    """Return what is put on record of a loop that constraints keep closed."""
+    """Return the record of a loop with equality constraints."""
     frame, to = ends[0]
     return Articulation(
         CONSTRAINED_LOOP, to, frame, dynamics=(("ends", ends), ("mask", mask), ("constraints", constraints))
@@ -78,10 +78,9 @@ def make_constrained_record(
 
 
 def find_loops(model: ModelView) -> Iterator[LoopRecord]:
-    """Yield the loops of a model in the order in which they were closed.
+    """Yield the loops of a model in the order of their operations.
 
-    Those of a document are among them, without the code that closed them; of one that says less about its
-    loops, as documents of earlier versions do, they are not.
+    Loops of a document are included, if it has complete records; documents of earlier versions have not.
     """
     followers = set(map(str, model.rates.dependent))
     for name, record in model.articulations.items():
@@ -95,7 +94,7 @@ def find_loops(model: ModelView) -> Iterator[LoopRecord]:
 
 
 def _is_complete(known: Mapping[str, Any], kind: str) -> bool:
-    """Whether a record has what it should have: documents may contain anything under these names."""
+    """Return whether a record is complete; documents may contain anything under these names."""
     ends = known.get("ends")
     said = ("mask", "free", "dependent") if kind == SOLVED_LOOP else ("mask", "constraints")
     texts = (known.get(key) for key in said)
@@ -112,9 +111,9 @@ def _is_texts(value: object) -> bool:
 
 
 def _as_named(name: str, record: Articulation, known: Mapping[str, Any]) -> LoopRecord:
-    """Return a record with the names that frames and coordinates have in the model.
+    """Return a record with the names of frames and coordinates in the model.
 
-    Texts are as they were saved, the frames of the record below the prefix that a document was loaded under.
+    A document stores texts without the prefix that its frames get when it is loaded.
     """
     frame, to = known["ends"][0]
     renamed, saved = (record.child, frame) if frame != WORLD else (record.parent, to)

@@ -20,40 +20,40 @@ from .branches import continue_solution, find_branches, find_nearest_closed
 from .equations import CLOSURE_TOLERANCE, Array, Equations, WorkBudget, find_periodic
 
 RANK = 1e-7
-"""What a singular value is, relative to the largest, below which a direction counts as free."""
+"""Singular value relative to the largest one, below which a direction counts as free."""
 
 _SMALL = 1e-3
-"""The size of bars [m] down to which derivatives can be told from rounding."""
+"""Smallest length of bars [m] with derivatives above rounding errors."""
 
 _DEGREES = (2, 3, 4, 6, 8, 10, 12, 16, 20, 24, 32)
 _MORE_STEPS = 4
 _STEPS = (1, 2, 3, 4, 5, 6, 8, 10)
 
 _PARTS = (1.0, 0.6, 0.3, 0.1, 0.03)
-"""Parts of the margin that are tried, largest first, where all of it is too much."""
+"""Fractions of the margin to try, largest first."""
 
 _BEFORE_MEETING, _BEFORE_ENDING = 0.9, 1 - 1e-4
-"""Which part of the way through the margin counts, up to where branches meet or loops below end."""
+"""Usable fraction of the path through the margin, up to a singularity or the end of an earlier loop."""
 
 
 @dataclass(frozen=True)
 class SolvedLoop:
-    """A loop that was closed.
+    """Solved loop.
 
     Attributes
     ----------
     function
-        The unknowns as a function of the inputs.
+        Dependent coordinates as a function of the inputs.
     free, dependent
-        The coordinates that move by themselves, and those that follow.
+        Free and dependent coordinates.
     mobility
-        How many coordinates are free in the configurations that were looked at.
+        Number of free coordinates in generic configurations.
     branches, branch
-        How many solutions there are at home, and which of them this is, 0 the nearest to the guess.
+        Number of solutions at home, and number of the chosen one, 0 for the nearest to ``home``.
     condition
-        The smallest singular value of ∂r/∂x over the largest one, where it is worst; 0 is singular.
+        Minimum over the samples of the smallest singular value of ∂r/∂x over the largest one; 0 is singular.
     worst
-        The free coordinates there.
+        Free coordinates at that minimum.
     """
 
     function: ImplicitFunction
@@ -77,33 +77,33 @@ def solve_loop(
     branch: int = 0,
     upright: Expression | None = None,
 ) -> SolvedLoop:
-    """Close a loop.
+    """Solve a loop for its dependent coordinates.
 
     Parameters
     ----------
     name
-        What errors call it.
+        Name of the loop for errors.
     residual
-        Of shape (m,); all of it is zero where the loop is closed [m], [rad].
+        Residual, shape (m,), zero if the loop is closed [m], [rad].
     coordinates
-        Those of the residual, the first to be free first.
+        Coordinates of the residual; earlier ones are preferred as free coordinates.
     home
-        A configuration near the one to begin with, which need not be closed; and the values of parameters.
+        Configuration near a closed one, and values of the parameters.
     limits
-        Of coordinates that have some. Free coordinates have them, or are angles that go round.
+        Limits by coordinate. Free coordinates without limits must be angles.
     dependent
-        The coordinates that follow; chosen if None.
+        Dependent coordinates; None to choose them.
     branch
-        Which solution at home, 0 the one nearest to ``home``.
+        Number of the solution at home, 0 for the nearest to ``home``.
     upright
-        Numbers that are positive in a solution that counts: rows about the sine of an angle are zero where it
-        is half a turn, too.
+        Expressions that are positive in a valid solution, because the sine of an angle is zero at half a
+        revolution as well.
 
     Raises
     ------
     NoSolutionError
-        If it does not close at home, or not within all of the limits; if there is no such branch; if finding
-        out takes too much work.
+        If the loop does not close at home or everywhere within the limits, the branch does not exist, or the
+        analysis takes too much work.
     InvalidValueError
         If the choice of coordinates does not fit the mobility, or limits are missing.
     """
@@ -121,7 +121,7 @@ def solve_loop(
     rank = _rank(unknown, start, given)
     if not rank:
         raise InvalidValueError(f"Loop '{name}' is closed whatever its coordinates are.")
-    followers = _followers(name, unknown, start, given, rank, dependent)
+    followers = _choose_dependent(name, unknown, start, given, rank, dependent)
     free = tuple(s for s in coordinates if s not in followers)
     inputs = (*free, *parameters)
     equations = Equations(residual, followers, inputs, effort)
@@ -148,7 +148,7 @@ def solve_loop(
     ]
     sampled, seed, steps, rows = _fit_guess(name, equations, intervals, found[branch], u, angles)
     if parameters:
-        # The seed knows one value of them only; from there it is further to others.
+        # The guess is fitted for one value of the parameters only, so others need more steps.
         steps += _MORE_STEPS
     domain = (*map(_domain, seed.intervals), *((-np.inf, np.inf) for _ in parameters))
     function = ImplicitFunction(name, followers, inputs, residual, rows, seed.expression(free), steps, domain)
@@ -159,7 +159,7 @@ def solve_loop(
 
 
 def _rank(equations: Equations, x: Array, given: Array) -> int:
-    """Return the rank of ∂r/∂q in general: the largest near a closed configuration, which may be singular."""
+    """Return the generic rank of ∂r/∂q: the largest near a closed configuration, which may be singular."""
     generator = np.random.default_rng(0)
     most = 0
     for scale in (0.0, 0.0, 1e-3, 1e-2, 0.05, 0.1, 0.2):
@@ -170,7 +170,7 @@ def _rank(equations: Equations, x: Array, given: Array) -> int:
     return most
 
 
-def _followers(
+def _choose_dependent(
     name: str,
     equations: Equations,
     x: Array,
@@ -178,7 +178,7 @@ def _followers(
     rank: int,
     dependent: Sequence[Symbol] | None,
 ) -> tuple[Symbol, ...]:
-    """Return the coordinates that follow: those given, or the last ones that can."""
+    """Return the dependent coordinates: the given ones, or the last possible ones."""
     by_q = equations(x, given)[1]
     coordinates = equations.unknowns
     if dependent is not None:
@@ -195,7 +195,7 @@ def _followers(
         return tuple(s for s in coordinates if s in set(dependent))
     chosen: list[int] = []
     largest = float(np.linalg.norm(by_q, 2))
-    # First such that all can be told apart well, then, if need be, whatever is not singular.
+    # First with a well-conditioned ∂r/∂x, then, if there is none, any that is not singular.
     for enough in (0.02, RANK):
         for i in reversed(range(len(coordinates))):
             if i in chosen or len(chosen) == rank:
@@ -223,7 +223,7 @@ def _interval(name: str, symbol: Symbol, limits: tuple[float, float] | None, ang
 
 
 def _domain(interval: InputDomain) -> tuple[float, float]:
-    """Return where an input may be; rounding at the edge is no reason to refuse it."""
+    """Return the domain of an input, widened by rounding errors."""
     if interval.whole:
         return -np.inf, np.inf
     slack = 1e-9 * max(1.0, interval.upper - interval.lower)
@@ -238,9 +238,9 @@ def _fit_guess(
     u: Array,
     angles: npt.NDArray[np.bool_],
 ) -> tuple[BranchSamples, BranchGuess, int, tuple[int, ...]]:
-    """Return what was sampled, and the seed for it with its steps and rows.
+    """Return the samples of the branch, and the guess with its number of steps and its rows.
 
-    It is good for more than the limits, by as much of the margin around them as the branch can be followed.
+    The domain is the limits and as much of the margin as the branch extends to.
     """
 
     def fitted(intervals: Sequence[InputDomain]) -> tuple[BranchSamples, BranchGuess, int, tuple[int, ...]]:
@@ -249,28 +249,31 @@ def _fit_guess(
 
     if all(i.whole for i in limits):
         return fitted(limits)
-    reaches = _reaches(equations, limits, x, u)
+    reaches = _margin_fractions(equations, limits, x, u)
     alone: tuple[BranchSamples, BranchGuess, int, tuple[int, ...]] | None = None
     for part in _PARTS:
-        wider = [i.wider(part * r[0], part * r[1]) for i, r in zip(limits, reaches, strict=True)]
+        wider = [i.widen(part * r[0], part * r[1]) for i, r in zip(limits, reaches, strict=True)]
         try:
             return fitted(wider)
         except NoSolutionError:
-            # If it cannot be closed within the limits, no margin is narrow enough: that is told at once.
+            # If the loop does not close within the limits, smaller margins do not help.
             alone = alone or fitted(limits)
     assert alone is not None
     return alone
 
 
-def _reaches(
+def _margin_fractions(
     equations: Equations, limits: Sequence[InputDomain], x: Array, u: Array
 ) -> list[tuple[float, float]]:
-    """Return in which parts of the margin below and above each limit the branch goes on, others at home."""
+    """Return the fractions of the margin below and above each limit that the branch extends to.
+
+    The other inputs are at home.
+    """
     home = u.copy()
     home[: len(limits)] = [min(max(v, i.lower), i.upper) for v, i in zip(u, limits, strict=False)]
     x = continue_solution(equations, x, u, home).solution
     reaches = []
-    for k, (limit, wide) in enumerate(zip(limits, [i.wider() for i in limits], strict=True)):
+    for k, (limit, wide) in enumerate(zip(limits, [i.widen() for i in limits], strict=True)):
         parts = []
         for edge, end in ((limit.lower, wide.lower), (limit.upper, wide.upper)):
             there, beyond = home.copy(), home.copy()
@@ -279,7 +282,7 @@ def _reaches(
             way = continue_solution(equations, at_edge, there, beyond)
             part = way.part
             if part < 1.0:
-                # Branches meet at a dead centre. What this loop is built on ends without one.
+                # Branches meet at a dead centre; an earlier loop may end without one.
                 stop = there + part * (beyond - there)
                 meet = _regularity(equations, way.solution, stop) < 0.5 * _regularity(
                     equations, at_edge, there
@@ -291,16 +294,16 @@ def _reaches(
 
 
 def _regularity(equations: Equations, x: Array, u: Array) -> float:
-    """Return the smallest singular value of ∂r/∂x over the largest."""
+    """Return the ratio of the smallest to the largest singular value of ∂r/∂x."""
     values = np.linalg.svd(equations(x, u)[1], compute_uv=False)
     return float(values[-1] / max(values[0], 1e-30))
 
 
 def _choose_guess(name: str, samples: BranchSamples) -> tuple[BranchGuess, int, tuple[int, ...]]:
-    """Return the cheapest seed and number of steps that always lead to the branch, and the rows used."""
+    """Return the cheapest guess and number of steps that converge at all samples, and the rows used."""
     rows = _rows(samples)
     n = len(samples.equations.unknowns)
-    if samples.turns_over(rows):
+    if samples.changes_sign(rows):
         raise _too_close(name, samples)
     best: tuple[float, BranchGuess, int] | None = None
     count = len(samples.inputs)
@@ -328,7 +331,7 @@ def _too_close(name: str, samples: BranchSamples) -> NoSolutionError:
 
 
 def _rows(samples: BranchSamples) -> tuple[int, ...]:
-    """Return as many equations as there are unknowns, the best ones where it matters most."""
+    """Return as many rows as unknowns, the best-conditioned ones at the worst sample."""
     equations = samples.equations
     n = len(equations.unknowns)
     every = max(1, len(samples.inputs) // 40)
@@ -348,10 +351,10 @@ def _rows(samples: BranchSamples) -> tuple[int, ...]:
 
 
 def _steps(samples: BranchSamples, seed: BranchGuess, rows: tuple[int, ...]) -> int | None:
-    """Return how many Newton steps lead from the seed to the branch everywhere; None if some never arrive."""
+    """Return the number of Newton steps that suffices at all samples; None without convergence."""
     needed = 0
     chosen = list(rows)
-    for q, x, wanted in zip(samples.tried, seed.at(samples.tried), samples.wanted, strict=True):
+    for q, x, wanted in zip(samples.tried, seed.evaluate(samples.tried), samples.wanted, strict=True):
         u = samples.all_inputs(q)
         for step in range(_STEPS[-1] + 1):  # noqa: B007 - how many it took
             residual, by_x, _ = samples.equations(x, u)

@@ -13,28 +13,28 @@ from kineverse.symbols import Symbol
 
 @dataclass(frozen=True, slots=True)
 class Articulation:
-    """A record for people and exporters; no algorithm needs it to move anything.
+    """Record of an articulation, for people and exporters. Kinematics does not depend on it.
 
     Attributes
     ----------
     kind
         Name of the operation that made it, such as ``revolute``.
     parent, child
-        The frames it connects.
+        Names of the frames that it connects.
     coordinates
-        Its own position symbols, with ``home`` the value each has when nothing else is known [m], [rad].
+        Position symbols of the articulation, with ``home`` as their default values [m], [rad].
     speeds
-        The free speeds that move it.
+        Free speeds that move it.
     dynamics
-        What is known beside kinematics, as (name, value) pairs: effort [N] or [N m], damping, friction ...
+        Dynamic parameters as (name, value) pairs: effort [N] or [N m], damping, friction ...
     follows
-        What its position is, if it has one but no coordinate of its own, as a mimic joint or a gearbox [m],
+        Position of an articulation without a coordinate of its own, such as a mimic joint or a gearbox [m],
         [rad].
 
     Raises
     ------
     InvalidValueError
-        If there are homes for other coordinates than it has.
+        If the number of homes differs from the number of coordinates.
     """
 
     kind: str
@@ -55,17 +55,17 @@ class Articulation:
 
     @property
     def position(self) -> Expression | None:
-        """How far it has moved: its one coordinate, or what it follows; None if it is not one number."""
+        """The joint position: the only coordinate, or ``follows``; None if the position is not one number."""
         return self.coordinates[0] if len(self.coordinates) == 1 else self.follows
 
 
 def check_home(name: str, record: Articulation) -> None:
-    """Look whether an articulation has a home in which its frames have a pose.
+    """Check the home of an articulation.
 
     Raises
     ------
     InvalidValueError
-        If a number of it is not finite, or its orientation is a quaternion of length zero.
+        If a value is not finite, or a quaternion has length zero.
     """
     for symbol, value in zip(record.coordinates, record.home, strict=False):
         if isinstance(value, float | int) and not math.isfinite(value):

@@ -1,7 +1,7 @@
-"""What a frame carries: shapes to look at, shapes to touch, and mass.
+"""Rigid bodies: visual shapes, collision shapes, inertia, and constant poses.
 
-Everything here is plain immutable data in the units [m], [kg] and [kg m²]. Meshes are references; no file
-is opened before somebody asks for it.
+Everything here is plain immutable data in the units [m], [kg] and [kg m²]. A mesh is a reference to a file,
+and nothing here opens it.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from kineverse.expressions.expression import Expression
 
 _RIGID = 2e-5
 _FARTHEST = 1e100
-"""A chain of poses within that does not overflow [m]."""
+"""Largest coordinate of a pose [m]. Products of a chain of such poses do not overflow."""
 
 Vector3: TypeAlias = tuple[float, float, float]
 AxisLike: TypeAlias = "Sequence[float] | npt.NDArray[Any]"
@@ -39,7 +39,7 @@ class Pose:
         squares = a * a + b * b + c * c - 1, d * d + e * e + f * f - 1, g * g + h * h + i * i - 1
         products = a * d + b * e + c * f, a * g + b * h + c * i, d * g + e * h + f * i
         turns = a * (e * i - f * h) - b * (d * i - f * g) + c * (d * h - e * g) > 0
-        # Written so that NaN fails every one of them.
+        # Each comparison is False for NaN.
         if not (
             turns
             and all(-_RIGID < v < _RIGID for v in (*squares, *products))
@@ -127,13 +127,13 @@ class Cone:
 
 @dataclass(frozen=True, slots=True)
 class Mesh:
-    """A reference to a mesh file.
+    """Reference to a mesh file.
 
-    ``uri`` is what the description says (``package://...``, ``file://...`` or a path), ``folder`` the folder
-    of the file that said so, from which it is resolved when somebody needs the triangles. ``root`` is the
-    folder that the path must not leave, a real path, empty for none that it may go to; None if the reference
-    is not that of a file but of a program, which may open what it likes. Documents do not carry it, and it
-    makes no difference.
+    ``uri`` is the reference in the description (``package://...``, ``file://...`` or a path). ``folder`` is
+    the folder of the description, from which the reference is resolved when its triangles are needed.
+    ``root`` is the folder that the resolved path must not leave, a real path: empty if no path is allowed,
+    None if a program made the reference, which may open any file. Documents do not contain ``root``, and
+    comparisons ignore it.
     """
 
     uri: str
@@ -147,7 +147,7 @@ Geometry: TypeAlias = Box | Cylinder | Capsule | Sphere | Ellipsoid | Cone | Mes
 
 @dataclass(frozen=True, slots=True)
 class Shape:
-    """A piece of geometry at a pose in the frame of its body, with a colour if it is meant to be seen."""
+    """Geometry at a pose in the frame of its body; visual shapes have a colour."""
 
     geometry: Geometry
     origin: Pose = Pose()
@@ -170,7 +170,7 @@ class Inertia:
 
 @dataclass(frozen=True, slots=True)
 class Body:
-    """Everything physical that is attached to one frame."""
+    """Rigid body that is attached to one frame."""
 
     visuals: tuple[Shape, ...] = ()
     collisions: tuple[Shape, ...] = ()
@@ -178,5 +178,5 @@ class Body:
 
 
 def is_empty_body(body: Body) -> bool:
-    """Return whether there is nothing to give."""
+    """Return whether a body has neither shapes nor inertia."""
     return not body.visuals and not body.collisions and body.inertia is None

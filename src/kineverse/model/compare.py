@@ -29,21 +29,21 @@ Array = npt.NDArray[np.float64]
 
 @dataclass(frozen=True, slots=True)
 class Delta:
-    """One part of a value that differs.
+    """Difference in one part of a value.
 
     Attributes
     ----------
     what
-        The part, as one would write it: ``parent``, ``upper``, ``visuals[0].geometry.size``; empty if it is
-        the value itself.
+        Path of the part within the value: ``parent``, ``upper``, ``visuals[0].geometry.size``; empty for the
+        value itself.
     before, after
-        What the part was and is; None where there is nothing.
+        Old and new content of the part; None if there is none.
     distance
-        How far apart they are. Numbers above one: relative to the larger; transforms: the distance of the
-        origins [m]. Expressions: the largest over all sampled states. Infinite where it is no matter of
-        numbers, 0 if only the way differs in which the same is written.
+        Distance between the two. Numbers: relative to the larger one if it is above one. Transforms: distance
+        of the origins [m]. Expressions: maximum over all sampled states. Infinite if the parts are not
+        numeric, 0 if they are the same in another notation.
     angle
-        Between transforms, the angle of the rotation from one to the other [rad]; 0 for the rest.
+        Angle of the rotation from one transform to the other [rad]; 0 for other parts.
     at_default
         Distance and angle at the default state.
     """
@@ -56,21 +56,21 @@ class Delta:
     at_default: tuple[float, float] = (inf, 0.0)
 
     def is_within(self, tolerance: float) -> bool:
-        """Return whether distance and angle are at most so large; never at 0: there, writing counts."""
+        """Return whether distance and angle are within a tolerance; False for a tolerance of 0."""
         return tolerance > 0.0 and max(self.distance, self.angle) <= tolerance
 
 
 def measure_deltas(changes: Sequence[Change], samples: StateSamples) -> list[tuple[Delta, ...]]:
-    """Return, for each change, the parts that differ; none for a value that is new or gone.
+    """Return the differing parts of each change; none for a value that was added or removed.
 
-    Where a mesh file lies is no difference, only what it is called; nor how a path leads to the same file.
+    Meshes are compared by file name. The folder, and the form of the path, make no difference.
     """
     parts = [_parts(change) for change in changes]
     pairs = [(a, b) for found in parts for _, a, b in found if _is_symbolic(a, b)]
     measured = iter(_measure_distance(pairs, samples))
     return [
         tuple(
-            Delta(what, a, b, *(next(measured) if _is_symbolic(a, b) else _measured(a, b)))
+            Delta(what, a, b, *(next(measured) if _is_symbolic(a, b) else _measure(a, b)))
             for what, a, b in found
         )
         for found in parts
@@ -89,7 +89,7 @@ def _parts(change: Change) -> list[tuple[str, Any, Any]]:
 
 
 def _walk(what: str, a: Any, b: Any) -> Iterator[tuple[str, Any, Any]]:
-    """Yield the innermost parts of two values that differ, with where they are."""
+    """Yield the innermost differing parts of two values: path, old and new content."""
     if a is b or (_is_number(a) and _is_number(b) and isnan(a) and isnan(b)):
         return
     if type(a) is not type(b) or isinstance(a, (Expression, Pose)):
@@ -120,7 +120,7 @@ def _walk(what: str, a: Any, b: Any) -> Iterator[tuple[str, Any, Any]]:
 
 
 def _file(mesh: Mesh) -> str:
-    """Return the file of a mesh as far as it can be told without looking for it."""
+    """Return the path of a mesh file, without access to the disk."""
     return mesh.uri if "://" in mesh.uri else os.path.normpath(os.path.join(mesh.folder, mesh.uri))
 
 
@@ -129,7 +129,7 @@ def _equal(a: Any, b: Any) -> bool:
 
 
 def _are_named(value: Any) -> bool:
-    """Return whether it is a table, or nothing: pairs whose first half is a name, each once."""
+    """Return whether a value is a table, possibly empty: pairs with unique names as first elements."""
     if not all(isinstance(pair, tuple) and len(pair) == 2 for pair in value):
         return False
     names = [str(name) for name, _ in value if isinstance(name, (str, Expression))]
@@ -180,8 +180,8 @@ def transform_of(frame: Frame) -> Pose | Expression:
 # -- measuring ---------------------------------------------------------------------------------------------
 
 
-def _measured(a: Any, b: Any) -> tuple[float, float, tuple[float, float]]:
-    """Return distance and angle, at worst and at the default state, of what no symbol is in."""
+def _measure(a: Any, b: Any) -> tuple[float, float, tuple[float, float]]:
+    """Return distance, angle, and both at the default state, of two parts without symbols."""
     if isinstance(a, Pose) and isinstance(b, Pose):
         distance, angle = (float(x[0]) for x in measure_pose_distances(a.matrix[None], b.matrix[None]))
         return distance, angle, (distance, angle)
@@ -194,7 +194,7 @@ def _measured(a: Any, b: Any) -> tuple[float, float, tuple[float, float]]:
 def _measure_distance(
     pairs: Sequence[tuple[Any, Any]], samples: StateSamples
 ) -> Iterator[tuple[float, float, tuple[float, float]]]:
-    """Yield distance and angle, at worst and at the default state, for each pair of expressions."""
+    """Yield maximum distance, maximum angle, and both at the default state, for pairs of expressions."""
     sides = [(as_expression(_matrix(a)), as_expression(_matrix(b))) for a, b in pairs]
     trends = [_trends(a, b) for a, b in sides]
     everything = [e for (a, b), trend in zip(sides, trends, strict=True) for e in (a, b, *trend)]
@@ -207,7 +207,7 @@ def _measure_distance(
         else:
             distances = _measure_number_distance(one, other)
         for _ in trend[::2]:
-            # Gradients may have been overridden: values alone do not say whether expressions are the same.
+            # Expressions with equal values differ if a gradient is overridden, so gradients are compared too.
             distances = np.maximum(distances, _measure_number_distance(next(numbers), next(numbers)))
         yield (
             float(distances.max()),
@@ -221,7 +221,7 @@ def _matrix(value: Any) -> Any:
 
 
 def _trends(a: Expression, b: Expression) -> list[Expression]:
-    """Return the gradients of two expressions, key by key one after the other, if they need a comparison."""
+    """Return the gradients of two expressions, alternating by key; empty if none is overridden."""
     if not (a._nodes or b._nodes):
         return []
     one, other = a.gradient(), b.gradient()
@@ -245,7 +245,7 @@ def measure_pose_distances(a: Array, b: Array) -> tuple[Array, Array]:
     both = np.isnan(a).any(axis=(1, 2)) & np.isnan(b).any(axis=(1, 2))
     with np.errstate(invalid="ignore"):
         distances = np.linalg.norm(a[:, :3, 3] - b[:, :3, 3], axis=1)
-        # The chord on the sphere of rotations is exact for small angles, where the trace of RᵀR is not.
+        # The chord |R₁ - R₂| is accurate for small angles, where the trace of R₁ᵀR₂ is not.
         chords = np.linalg.norm(a[:, :3, :3] - b[:, :3, :3], axis=(1, 2)) / np.sqrt(8.0)
         angles = 2.0 * np.arcsin(np.minimum(chords, 1.0))
     return tuple(  # type: ignore[return-value]
@@ -254,16 +254,16 @@ def measure_pose_distances(a: Array, b: Array) -> tuple[Array, Array]:
 
 
 def compare_models(before: Model | Snapshot, after: Model | Snapshot) -> Diff:
-    """Return what leads from one model to another: what a commit would report that did it.
+    """Compare two models structurally.
 
-    Values are compared structurally, name by name. Operations are compared by tag and by what they write, so
-    those of a document are those that it was made from. The tags in ``moved`` are as few as possible: the
-    others come in the same order on both sides.
+    The result is the diff of a commit that turns the first model into the second. Values are compared name by
+    name. Operations are compared by tag and by their writes, so operations read from a document equal the
+    original ones. ``moved`` is a smallest set of tags: the others have the same order in both models.
 
     Parameters
     ----------
     before, after
-        The models; they need not have a history in common.
+        The models. They need no common history.
     """
     old, new = _snapshot(before), _snapshot(after)
     entries = {entry.tag: entry for entry in old.entries}
@@ -284,7 +284,7 @@ def _snapshot(model: Model | Snapshot) -> Snapshot:
 
 
 def _changes(old: Snapshot, new: Snapshot) -> Iterator[Change]:
-    """Yield the changes kind by kind: what is gone or different in the old order, what is new in the new."""
+    """Yield the changes by kind: removed and changed values in the old order, then added ones in the new."""
     for kind in KINDS:
         before, after = old._ordered(kind), new._ordered(kind)
         for name, value in before.items():
@@ -306,32 +306,32 @@ SIGNS = {"+": "added", "-": "removed", "~": "changed"}
 
 @dataclass(frozen=True)
 class ValueDifference:
-    """A value that counts as different: ``sign`` is one of ``+ - ~``, ``parts`` what of a changed one is."""
+    """Difference between two values beyond the tolerance, with the differing parts of a changed value."""
 
     change: Change
     parts: tuple[Delta, ...] = ()
 
     @property
     def sign(self) -> str:
-        """How it differs."""
+        """``+`` for an added value, ``-`` for a removed one, ``~`` for a changed one."""
         if self.change.before is None:
             return "+"
         return "-" if self.change.after is None else "~"
 
 
 class ModelComparison:
-    """What two models differ in, by more than a tolerance.
+    """Differences between two models beyond a tolerance.
 
     Attributes
     ----------
     before, after
         The models.
     diff
-        All that differs structurally.
+        Structural differences.
     differences
-        Of the values in it, those that count.
+        Differences between values beyond the tolerance.
     alike
-        The paths of the others: the same but for rounding, or for how it is written.
+        Paths of the other values: equal up to rounding or notation.
     """
 
     def __init__(self, before: Model, after: Model, tolerance: float, operations: str = "auto") -> None:
@@ -347,14 +347,17 @@ class ModelComparison:
             if change.path in elsewhere:
                 found = (found[0], elsewhere[change.path])
             counting = tuple(delta for delta in found if not delta.is_within(tolerance))
-            alone = (change.before is None or change.after is None) and not self._says_nothing(change)
+            alone = (change.before is None or change.after is None) and not self._is_redundant_record(change)
             if counting or alone:
                 self.differences.append(ValueDifference(change, counting))
             else:
                 self.alike.append(change.path)
 
     def _reparented(self, samples: StateSamples) -> dict[str, Delta]:
-        """Return how far apart frames are in the world that have another parent, as theirs says nothing."""
+        """Return the difference in world pose of all frames with a new parent.
+
+        Their poses in the old and the new parent cannot be compared.
+        """
         changes = [
             c
             for c in self.diff.changes
@@ -376,8 +379,8 @@ class ModelComparison:
             )
         return found
 
-    def _says_nothing(self, change: Change) -> bool:
-        """Return whether it is the record of a fixed joint between frames that both have."""
+    def _is_redundant_record(self, change: Change) -> bool:
+        """Return whether a change is the record of a fixed joint between frames of both models."""
         record = change.after if change.before is None else change.before
         return (
             isinstance(record, Articulation)
@@ -388,16 +391,16 @@ class ModelComparison:
 
     @property
     def equal(self) -> bool:
-        """Whether nothing that counts differs."""
+        """True if there are no differences beyond the tolerance."""
         return not (self.differences or any(self.operations.values()))
 
-    def of(self, kind: str) -> list[ValueDifference]:
+    def of_kind(self, kind: str) -> list[ValueDifference]:
         """Return the differences of one kind of data."""
         return [found for found in self.differences if found.change.kind == kind]
 
     @cached_property
     def operations(self) -> dict[str, tuple[str, ...]]:
-        """The tags of operations by sign: ``>`` for those that moved. Empty if they are not compared."""
+        """Tags of operations by sign, ``>`` for moved ones; empty if operations are not compared."""
         if not self.operations_compared:
             return {}
         diff = self.diff
@@ -410,9 +413,9 @@ class ModelComparison:
 
     @cached_property
     def operations_compared(self) -> bool:
-        """Whether operations are compared: as asked for, or if most of them have a counterpart.
+        """True if operations are compared: on request, or if most of them have a counterpart.
 
-        Descriptions in different formats become different operations, and that is no difference in the robot.
+        Descriptions of one robot in different formats become different operations.
         """
         if self._asked != "auto":
             return self._asked == "yes"
@@ -420,7 +423,7 @@ class ModelComparison:
         return 2 * len(tags & others) >= max(len(tags), len(others))
 
     def _counts(self, tag: str) -> bool:
-        """Return whether an operation that writes otherwise does so by more than rounding."""
+        """Return whether the writes of an operation differ by more than rounding."""
         old, new = (model.history.entry(tag).writes for model in (self.before, self.after))
         different = [cell for cell in {*old, *new} if old.get(cell) != new.get(cell)]
         return any(
@@ -434,11 +437,11 @@ class ModelComparison:
 
     @property
     def counts(self) -> dict[str, int]:
-        """How many values were added, removed and changed."""
+        """Numbers of added, removed and changed values."""
         signs = [found.sign for found in self.differences]
         return {word: signs.count(sign) for sign, word in SIGNS.items()}
 
 
 def _is_last(history: History, tag: str, path: str) -> bool:
-    """Return whether what an operation writes there is what the model has."""
+    """Return whether an operation is the last writer of a path."""
     return history.writers(path)[-1:] in ([tag], [])

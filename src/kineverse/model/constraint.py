@@ -18,9 +18,9 @@ ConstraintLike: TypeAlias = "Constraint | Sequence[ExpressionLike]"
 
 @dataclass(frozen=True)
 class Constraint:
-    """A dual inequality between scalars; the bounds may be expressions, ±infinity means unbounded.
+    """Two-sided inequality between scalars; bounds may be expressions, ±infinity means unbounded.
 
-    What is limited shows in the symbols of ``expression``: positions, velocities, or several of them.
+    The symbols of ``expression`` determine its type: a limit on positions, on velocities, or on several.
     """
 
     lower: Expression
@@ -44,7 +44,7 @@ class Constraint:
                 if part.shape:
                     raise ShapeError(f"The {name} of a constraint is a scalar, not of shape {part.shape}.")
         if any(access_listener(part) is not None for part in (low, middle, high)):
-            return Constraint(low, middle, high)  # a trace looks when it knows what was read
+            return Constraint(low, middle, high)  # a trace checks it once the values are known
         if not middle.symbols:
             raise InvalidValueError(
                 f"The constrained expression ({middle!r}) depends on no symbol. "
@@ -60,13 +60,13 @@ class Constraint:
 
     @cached_property
     def symbols(self) -> tuple[Symbol, ...]:
-        """All free symbols, those of the bounds included; sorted."""
+        """Free symbols of expression and bounds, sorted."""
         found = {*self.lower.symbols, *self.expression.symbols, *self.upper.symbols}
         return tuple(sorted(found, key=lambda s: s.sort_key))
 
     @cached_property
     def line(self) -> tuple[float, float] | None:
-        """Slope and offset of an expression that is a straight line over one symbol; None for any other."""
+        """Slope and offset of an expression that is linear in one symbol; None for any other."""
         if isinstance(self.expression, Symbol):
             return 1.0, 0.0
         if not self.expression._nodes and len(self.expression.symbols) == 1:
@@ -78,19 +78,19 @@ class Constraint:
         return None
 
     def nearest(self, value: float, lower: float, upper: float) -> float:
-        """Return the value of the one symbol nearest to a given one at which the bounds hold."""
+        """Return the feasible value of the only symbol that is nearest to a given value."""
         slope, offset = self.line or (1.0, 0.0)
         low, high = sorted(((lower - offset) / slope, (upper - offset) / slope))
         return min(max(value, low), high)
 
     @property
     def order(self) -> int:
-        """The highest order of a symbol in the expression: 0 limits positions, 1 speeds."""
+        """Highest order of a symbol in the expression: 0 for limits on positions, 1 for limits on speeds."""
         return max(s.order for s in self.expression.symbols)
 
 
 def as_constraint(value: ConstraintLike) -> Constraint:
-    """Return a constraint given as such or as a triple (lower, expression, upper)."""
+    """Convert a constraint, or a triple (lower, expression, upper), to a constraint."""
     if isinstance(value, Constraint):
         if all(isinstance(part, Expression) for part in (value.lower, value.expression, value.upper)):
             return value

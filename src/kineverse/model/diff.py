@@ -13,7 +13,7 @@ from .constraint import Constraint, coordinates
 
 @dataclass(frozen=True, slots=True)
 class Change:
-    """One value that is structurally different; ``before`` or ``after`` is None where there is nothing."""
+    """Structural change of one value; ``before`` is None for an added value, ``after`` for a removed one."""
 
     kind: str
     name: str
@@ -27,31 +27,31 @@ class Change:
 
     @property
     def coordinates(self) -> frozenset[str]:
-        """The coordinates that a changed constraint is or was about; empty for everything else."""
+        """Coordinates of a constraint before and after the change; empty for other kinds of data."""
         sides = [v for v in (self.before, self.after) if isinstance(v, Constraint)]
         return frozenset().union(*(coordinates(c.lower, c.expression, c.upper) for c in sides))
 
 
 @dataclass(frozen=True, slots=True)
 class Diff:
-    """The difference between two versions of a model.
+    """Difference between two versions of a model.
 
     Attributes
     ----------
     version
-        The version this leads to; that of a commit comes from ``version - 1``.
+        Version after the change. A commit starts from ``version - 1``.
     changes
         Values that changed, in no particular order.
     added, removed, replaced
         Tags of operations, in the order of the edit.
-    runs
-        How many times operations were applied to get there.
+    reruns
+        Number of times that an operation was applied.
     moved
-        Tags of operations that come earlier or later than before, relative to the others; in a commit, those
-        that were removed and added again elsewhere, which are among ``replaced`` as well.
+        Tags of operations with a new position relative to the others. In a commit, these were removed and
+        added again elsewhere, and are in ``replaced`` as well.
     rerun
-        Tags of operations that were run again because what they read had changed, in their order; whether
-        they wrote something else than before shows in ``changes``. Not known between models.
+        Tags of operations that were applied again because a value that they read had changed, in order.
+        ``changes`` shows if their writes changed. Empty in comparisons of models.
     """
 
     version: int
@@ -59,13 +59,13 @@ class Diff:
     added: tuple[str, ...] = ()
     removed: tuple[str, ...] = ()
     replaced: tuple[str, ...] = ()
-    runs: int = 0
+    reruns: int = 0
     moved: tuple[str, ...] = ()
     rerun: tuple[str, ...] = ()
 
     @property
     def is_empty(self) -> bool:
-        """Whether nothing differs."""
+        """True if there are no differences."""
         return not (self.changes or self.tags)
 
     @property
@@ -75,17 +75,17 @@ class Diff:
 
     @property
     def tags(self) -> frozenset[str]:
-        """Every tag that was added, removed, replaced, moved or run again."""
+        """Tags that were added, removed, replaced, moved or run again."""
         return frozenset((*self.added, *self.removed, *self.replaced, *self.moved, *self.rerun))
 
 
 def find_moved_tags(before: Sequence[str], after: Sequence[str], among: Container[str]) -> tuple[str, ...]:
-    """Return the tags that stand elsewhere among the others, as few as possible, in the new order.
+    """Return a smallest set of tags whose removal makes both orders equal, in the new order.
 
     Parameters
     ----------
     before, after
-        Tags in their old and in their new order, each once; those that are in one of them only do not count.
+        Tags in their old and in their new order, without duplicates. Tags in only one of them are ignored.
     among
         The tags that may have been moved; all others are known to stand as they did.
     """

@@ -19,7 +19,7 @@ _HTML_ROWS = 50
 
 
 def format_line(value: object) -> str:
-    """Return one line about a value of a model."""
+    """Return a value of a model as one line of text."""
     if isinstance(value, Frame):
         moving = {str(s) for f in value.factors if isinstance(f, Expression) for s in f.symbols}
         return f"in {value.parent}" + (f", moved by {', '.join(sorted(moving))}" if moving else ", fixed")
@@ -52,7 +52,7 @@ def _factor(factor: object) -> str:
 
 
 def as_lines(title: str, rows: Iterable[tuple[str, object]], count: int) -> str:
-    """Return a title and a line for each of the first rows, of bounded width."""
+    """Return a title and the first rows as lines of bounded width."""
     lines = [f"{title}{':' if count else ''}"]
     for name, value in islice(rows, _ROWS):
         line = f"  {name}: {format_line(value)}"
@@ -63,7 +63,7 @@ def as_lines(title: str, rows: Iterable[tuple[str, object]], count: int) -> str:
 
 
 def as_html(title: str, rows: Iterable[tuple[str, object]], count: int) -> str:
-    """Return a table of the first rows."""
+    """Return the first rows as an HTML table."""
     shown = [(name, format_line(value)) for name, value in islice(rows, _HTML_ROWS)]
     more = f", the first {_HTML_ROWS}" if count > _HTML_ROWS else ""
     return html_table(f"{title}{more}", ("name", "value"), shown)

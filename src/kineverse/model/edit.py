@@ -28,9 +28,9 @@ if TYPE_CHECKING:
 
 
 class Edit:
-    """A transaction on a model; made by :meth:`Model.edit`, used in a ``with`` block.
+    """Transaction on a model, opened by :meth:`Model.edit` in a ``with`` block.
 
-    Leaving the block commits, an exception leaves the model as it was. Reading the model inside the block
+    The end of the block commits the edit. An exception in it restores the model. In the block, the model
     shows the edit so far; other threads wait.
     """
 
@@ -44,7 +44,7 @@ class Edit:
         self._again: dict[str, None] = {}
         self._order: list[HistoryEntry] = []
 
-    if not TYPE_CHECKING:  # a type checker says so on its own
+    if not TYPE_CHECKING:  # type checkers report unknown names themselves
 
         def __getattr__(self, name):
             raise unknown_attribute_error("An edit", name, dir(self), EDIT_SYNONYMS)
@@ -52,28 +52,28 @@ class Edit:
     # -- operations ----------------------------------------------------------------------------------------
 
     def apply(self, operation: Operation, tag: str | None = None, *, override: bool = False) -> str:
-        """Append an operation; returns its tag.
+        """Append an operation, and return its tag.
 
         Parameters
         ----------
         operation, tag
-            What is appended under which tag.
+            Operation and its tag; by default its ``default_tag()``.
         override
-            Whether it may write over frames, bodies, articulations and rates of operations before it.
+            True if it may overwrite frames, bodies, articulations and rates of earlier operations.
 
         Raises
         ------
         DuplicateNameError
-            If the tag is taken, or the name of something that it writes; data may be written anew. An
-            operation that has looked at what is there, as :class:`Attach` does, may write over it.
+            If the tag exists, or an earlier operation wrote the same name. Data may be overwritten. An
+            operation that has read the old value, such as :class:`Attach`, may overwrite it as well.
         EditError
-            If the operation raises something that is not an error of this package; those pass as they are.
+            If the operation raises an error that is not of this package. Errors of this package pass.
         """
         check_flag("override", override)
         if override and isinstance(operation, Operation):
             operation = Override(operation)
         chosen = self._tag(operation, tag)
-        self._changing().append(chosen, operation)
+        self._check_open().append(chosen, operation)
         return self._note_added(chosen)
 
     def insert(
@@ -85,21 +85,21 @@ class Edit:
         after: str | None = None,
         to_affect: str | None = None,
     ) -> str:
-        """Insert an operation before or after another one; returns its tag.
+        """Insert an operation before or after another one, and return its tag.
 
         Parameters
         ----------
         operation, tag
-            What is inserted under which tag.
+            Operation and its tag; by default its ``default_tag()``.
         before, after
-            Tag of a neighbour.
+            Tag of the neighbour.
         to_affect
-            Tag of an operation, or name of a frame (then of the operation that last wrote it): the new one is
-            put right before it, so that everything it reads from the new one reaches it (2022 paper, III-A3).
+            Tag of an operation, or name of a frame, which stands for its last writer. The new operation is
+            inserted directly before it, so that it reads the new values (2022 paper, III-A3).
         """
         if sum(x is not None for x in (before, after, to_affect)) != 1:
             raise EditError("Say where to insert: exactly one of before=, after= and to_affect=.")
-        history = self._changing()
+        history = self._check_open()
         if to_affect is not None:
             before = to_affect
             writers = history.cells.get(("frames", to_affect))
@@ -111,14 +111,14 @@ class Edit:
         return self._note_added(chosen)
 
     def replace(self, tag: str, operation: Operation) -> None:
-        """Exchange an operation at its place and under its tag; what depends on it is run again."""
-        self._changing().replace(tag, operation)
+        """Replace an operation under its tag; operations that depend on it are applied again."""
+        self._check_open().replace(tag, operation)
         if tag not in self._added:
             self._replaced[tag] = None
 
     def remove(self, tag: str) -> None:
-        """Take an operation out, with its constraints and everything else it wrote."""
-        history = self._changing()
+        """Remove an operation, with its constraints and all its other writes."""
+        history = self._check_open()
         before = [] if self._order else list(history.sequence)
         history.remove(tag)
         self._order = self._order or before
@@ -141,11 +141,10 @@ class Edit:
         *,
         override: bool = False,
     ) -> str:
-        """Place a frame in its parent by a 4×4 transform parent_T_frame, or by several (their product).
+        """Add a frame at a 4×4 transform parent_T_frame, or at the product of several.
 
-        Without a transform it is where its parent is.
-
-        A frame that is there already is refused unless ``override`` is given; :meth:`attach` moves it.
+        The default is the identity. The name of an existing frame is refused unless ``override`` is given;
+        :meth:`attach` moves an existing frame.
         """
         return self.apply(AddFrame(name, Frame.of(parent, transform), body), tag, override=override)
 
@@ -157,7 +156,7 @@ class Edit:
         upper: ExpressionLike,
         tag: str | None = None,
     ) -> str:
-        """Require ``lower <= expression <= upper``: three scalars; bounds may be expressions or ±inf."""
+        """Add a constraint ``lower <= expression <= upper``; bounds may be expressions or ±inf."""
         return self.apply(Constrain(name, Constraint.of(lower, expression, upper)), tag)
 
     def close_loop(
@@ -169,7 +168,7 @@ class Edit:
         tag: str | None = None,
         **options: Any,
     ) -> str:
-        """Let two frames coincide, see :class:`kineverse.CloseLoop`, which also says what the options are."""
+        """Close a loop between two frames; see :class:`kineverse.CloseLoop` for the options."""
         name = name or f"{frame} to {to}"
         loop = registry.make_shorthand("close_loop", name=name, frame=frame, to=to, mask=mask, **options)
         return self.apply(loop, tag)
@@ -182,9 +181,9 @@ class Edit:
         *,
         override: bool = False,
     ) -> str:
-        """Say that the coordinate's rate is ``Σ expression·speed`` over the row.
+        """Set the rate of a coordinate to ``Σ expression·speed`` over a row.
 
-        A rate that is there already is refused unless ``override`` is given.
+        A second rate of one coordinate is refused unless ``override`` is given.
         """
         return self.apply(SetRate(coordinate, as_row(coordinate, row)), tag, override=override)
 
@@ -195,11 +194,11 @@ class Edit:
         transform: TransformLike | Sequence[TransformLike],
         tag: str | None = None,
     ) -> str:
-        """Put an existing frame, with everything below it, into another parent: something is picked up."""
+        """Attach a frame, with all frames below it, to another parent, as when a gripper grasps an object."""
         return self.apply(Attach(frame, Frame.of(parent, transform)), tag)
 
     def write(self, name: str, value: Any, tag: str | None = None) -> str:
-        """Store an immutable value under ``data``; the last one written under a name counts."""
+        """Store an immutable value under ``data``, in place of an earlier one of that name."""
         return self.apply(SetData(name, value), tag)
 
     def include(
@@ -222,7 +221,7 @@ class Edit:
 
     @property
     def model(self) -> ModelView:
-        """The model that is edited, which shows the edit so far."""
+        """The edited model, which shows the edit so far."""
         return self._model
 
     # -- inside --------------------------------------------------------------------------------------------
@@ -236,8 +235,8 @@ class Edit:
             )
         return operation.default_tag()
 
-    def _diff(self, version: int, changes: Iterable[Change], runs: int) -> Diff:
-        """Return what the edit did, at its end."""
+    def _diff(self, version: int, changes: Iterable[Change], reruns: int) -> Diff:
+        """Return the difference that the edit made."""
         moved: tuple[str, ...] = ()
         if self._again:
             old = [entry.tag for entry in self._order if entry.tag not in self._added]
@@ -251,12 +250,12 @@ class Edit:
             tuple(self._added),
             tuple(self._removed),
             tuple(self._replaced),
-            runs,
+            reruns,
             moved,
             tuple(entry.tag for entry in sorted(rerun, key=lambda entry: entry.place)),
         )
 
-    def _changing(self) -> History:
+    def _check_open(self) -> History:
         if not self._open:
             raise EditError("This edit is over; start another one with model.edit().")
         return self._history

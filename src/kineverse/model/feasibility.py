@@ -1,23 +1,24 @@
 """Recovery speeds that keep all velocity rows jointly feasible.
 
-Rows are seen from inside: ``a·v >= -r``, where r is the room left, negative outside. What a row outside asks
-for has to be within reach. So one motion v* is built that everything allows, and no row asks for more than v*
-gives it; then v* obeys all rows at once, wherever the state is, if only speeds may be zero:
+A row is ``a·v >= -r``. Its room r is negative if the state violates the constraint; such a row demands a
+recovery speed. The demands must be jointly feasible. So a motion v* is constructed that all rows and limits
+allow, and each demand is reduced to the speed that v* gives to its row. Then v* satisfies all rows together
+at every state, provided that zero speed is allowed:
 
-1. *Wish.* Each speed goes for each row outside as fast as this row would need it if there were no others,
-   within the speed's own limits; p upwards, n downwards.
-2. *Harm.* What these wishes take of the room of a row is at most ``h = Σ max(a·n, -a·p)``. A norm of speeds
-   grows by at most the norm of its components' largest values.
-3. *Share.* Speeds that do a row harm get the share r/h of their wishes, the least over all rows. A row
-   outside has no room, so no one does it any harm. Who does good is not slowed down, and is not counted on.
+1. *Request.* For each violated row, each speed is requested as if the row were the only one, within the
+   limits of that speed: p upwards, n downwards.
+2. *Consumption.* The requests consume at most ``h = Σ max(a·n, -a·p)`` of the room of a row. A norm of
+   speeds grows by at most the norm of the largest values of its components.
+3. *Scaling.* Each speed that consumes room of a row is scaled by r/h, the minimum over all rows. A violated
+   row has no room, so all speeds that consume its room are zero. Other speeds are not scaled.
 
-This is done twice. First those move who make room where wishes want more than there is; then, with the room
-and the limits that this leaves, the wishes themselves.
+The steps run twice: first for rows whose consumption exceeds their room, to make room; then for the violated
+rows, within the remaining room and limits.
 
-v* is not the fastest of all motions, but safe and cheap: sums, products and comparisons of the rows' own
-coefficients. It is the fastest for a row outside if only limits of single speeds are in its way. A speed that
-rows outside want to go different ways stands still in v*, and so does one that needs room which others could
-make only by turns; a row that depends on these asks for nothing until something has changed.
+v* is not optimal, but safe and cheap: sums, products and comparisons of coefficients. It is optimal for a row
+that is restricted by limits of single speeds only. A speed that violated rows request in both directions is
+zero in v*, and so is a speed whose room takes more than two steps to make. A row that depends on such speeds
+demands nothing until the state has changed.
 """
 
 from __future__ import annotations
@@ -51,9 +52,9 @@ from .speed_limits import (
 
 _ONE = as_expression(1.0)
 _ROUNDING = as_expression(1e-12)
-"""Harm that is none: coefficients like cos(π/2) are not 0."""
+"""Consumption that counts as zero: in floating point, coefficients such as cos(π/2) are not 0."""
 _FLAT = as_expression(1e-8)
-"""Square of the coefficient below which a speed is wished for in proportion to it, no longer inversely."""
+"""Square of the coefficient below which the requested speed is proportional to it instead of inverse."""
 
 
 RequestedSpeeds: TypeAlias = tuple[Mapping[Symbol, Expression], Mapping[Symbol, Expression]]
@@ -61,14 +62,14 @@ RequestedSpeeds: TypeAlias = tuple[Mapping[Symbol, Expression], Mapping[Symbol, 
 
 @dataclass(frozen=True)
 class RecoveryBound:
-    """One bound of a constraint on positions: ``away·v >= -room`` keeps it.
+    """Bound of a position constraint as a velocity row ``away·v >= -room``.
 
     Attributes
     ----------
     away
-        How fast each speed leads away from the bound, to the inside.
+        Coefficients of the speeds in the rate of the distance to the bound, positive inwards.
     room
-        How fast one may come nearer, negative outside.
+        Largest speed towards the bound; negative if the bound is violated.
     """
 
     away: Weights
@@ -77,43 +78,43 @@ class RecoveryBound:
 
 @dataclass(frozen=True)
 class RecoveryBounds:
-    """The bounds of one constraint; ``apart`` says that there is always room at one of them."""
+    """Bounds of one constraint; ``apart`` is True if at most one of them can be violated."""
 
-    sides: tuple[RecoveryBound, ...]
+    bounds: tuple[RecoveryBound, ...]
     apart: bool
 
 
 def limit_recovery(constraints: Sequence[RecoveryBounds], limits: AdmissibleSpeeds) -> list[list[Expression]]:
-    """Return the rooms of the sides of constraints, made so large that one motion keeps them all."""
-    users = Counter(s for c in constraints for s in {s for side in c.sides for s in side.away})
+    """Return the rooms of all bounds, enlarged until one motion satisfies all rows."""
+    users = Counter(s for c in constraints for s in {s for bound in c.bounds for s in bound.away})
     users.update(s for row in limits.coupled for s in row.weights)
     users.update(s for ball in limits.balls for component in ball.components for s in component)
     alone = [_is_alone(c, users) for c in constraints]
-    rest = [side for c, own in zip(constraints, alone, strict=True) if not own for side in c.sides]
+    rest = [bound for c, own in zip(constraints, alone, strict=True) if not own for bound in c.bounds]
     motion = _find_common_motion(rest, limits)
     return [
         _clip_single(c, limits.box)
         if own
-        else [clamp_below(s.room, -_project_speed(s.away, motion)) for s in c.sides]
+        else [clamp_below(s.room, -_project_speed(s.away, motion)) for s in c.bounds]
         for c, own in zip(constraints, alone, strict=True)
     ]
 
 
 def _is_alone(constraint: RecoveryBounds, users: Mapping[Symbol, int]) -> bool:
-    """Return whether a constraint is about one speed that nothing else is about, its own limits aside."""
-    moving = [(s, w) for side in constraint.sides for s, w in side.away.items()]
-    if len(moving) > len(constraint.sides) or any(w.symbols for _, w in moving):
+    """Return whether a constraint has one speed, which no other row has, apart from its own limits."""
+    moving = [(s, w) for bound in constraint.bounds for s, w in bound.away.items()]
+    if len(moving) > len(constraint.bounds) or any(w.symbols for _, w in moving):
         return False
     weights = [float(w) for _, w in moving]
     return users[moving[0][0]] == 1 and weights in ([weights[0]], [weights[0], -weights[0]])
 
 
 def _clip_single(constraint: RecoveryBounds, box: SpeedBox) -> list[Expression]:
-    """Return the rooms of a constraint on one speed: its limits and the other side are all that counts."""
-    rooms = [side.room for side in constraint.sides]
+    """Return the rooms of a constraint on one speed, limited by that speed's limits and the other bound."""
+    rooms = [bound.room for bound in constraint.bounds]
     result = []
-    for k, side in enumerate(constraint.sides):
-        ((speed, weight),) = side.away.items()
+    for k, bound in enumerate(constraint.bounds):
+        ((speed, weight),) = bound.away.items()
         reach = INFINITE
         if speed in box:
             low, high = box[speed]
@@ -123,53 +124,55 @@ def _clip_single(constraint: RecoveryBounds, box: SpeedBox) -> list[Expression]:
         if len(rooms) == 2 and not constraint.apart:
             beyond = raw_max(rooms[1 - k], ZERO)
             reach = beyond if is_infinite(reach) else raw_min(reach, beyond)
-        result.append(side.room if is_infinite(reach) else clamp_below(side.room, -reach))
+        result.append(bound.room if is_infinite(reach) else clamp_below(bound.room, -reach))
     return result
 
 
-def _find_common_motion(sides: Sequence[RecoveryBound], limits: AdmissibleSpeeds) -> dict[Symbol, Expression]:
-    """Return v*, the speeds that are not always zero."""
-    wishes = _request_speeds([(side.away, raw_max(-side.room, ZERO)) for side in sides], limits.box)
+def _find_common_motion(
+    bounds: Sequence[RecoveryBound], limits: AdmissibleSpeeds
+) -> dict[Symbol, Expression]:
+    """Return the motion v*, without speeds that are always zero."""
+    requested = _request_speeds([(bound.away, raw_max(-bound.room, ZERO)) for bound in bounds], limits.box)
     missing = []
-    for side in sides:
-        # One of a single speed has nobody to help it.
-        harm = _consume_room(side.away, wishes) if len(side.away) > 1 else []
-        if harm:
-            missing.append((side.away, raw_max(sum(harm, ZERO) - raw_max(side.room, ZERO), ZERO)))
+    for bound in bounds:
+        # No other speed can make room in a row with a single speed.
+        consumed = _consume_room(bound.away, requested) if len(bound.away) > 1 else []
+        if consumed:
+            missing.append((bound.away, raw_max(sum(consumed, ZERO) - raw_max(bound.room, ZERO), ZERO)))
     if not missing:
-        return _limit_motion(wishes, sides, limits)
-    first = _limit_motion(_request_speeds(missing, limits.box), sides, limits)
-    sides = [RecoveryBound(side.away, side.room + _project_speed(side.away, first)) for side in sides]
+        return _limit_motion(requested, bounds, limits)
+    first = _limit_motion(_request_speeds(missing, limits.box), bounds, limits)
+    bounds = [RecoveryBound(bound.away, bound.room + _project_speed(bound.away, first)) for bound in bounds]
     limits = _subtract_motion(first, limits)
-    wishes = _request_speeds([(side.away, raw_max(-side.room, ZERO)) for side in sides], limits.box)
-    second = _limit_motion(wishes, sides, limits)
+    requested = _request_speeds([(bound.away, raw_max(-bound.room, ZERO)) for bound in bounds], limits.box)
+    second = _limit_motion(requested, bounds, limits)
     return {s: first.get(s, ZERO) + second.get(s, ZERO) for s in {**first, **second}}
 
 
 def _limit_motion(
-    wishes: RequestedSpeeds, sides: Sequence[RecoveryBound], limits: AdmissibleSpeeds
+    requested: RequestedSpeeds, bounds: Sequence[RecoveryBound], limits: AdmissibleSpeeds
 ) -> dict[Symbol, Expression]:
-    """Return wishes up and down as far as everything allows."""
-    shares = _Shares(wishes)
-    for side in sides:
-        shares.keep(side.away, side.room)
+    """Return the requested speeds, scaled to satisfy all rows and limits."""
+    scales = _SpeedScales(requested)
+    for bound in bounds:
+        scales.limit_row(bound.away, bound.room)
     for row in limits.coupled:
         if not is_infinite(row.lower):
-            shares.keep(row.weights, -row.lower)
+            scales.limit_row(row.weights, -row.lower)
         if not is_infinite(row.upper):
-            shares.keep({s: -w for s, w in row.weights.items()}, row.upper)
+            scales.limit_row({s: -w for s, w in row.weights.items()}, row.upper)
     for ball in limits.balls:
-        shares.keep_ball(ball)
+        scales.limit_norm(ball)
     motion: dict[Symbol, Expression] = {}
-    for wished, least, sign in zip(wishes, (shares.up, shares.down), (1, -1), strict=True):
-        for speed, wish in wished.items():
-            share = reduce(raw_min, least.get(speed, []), _ONE)
-            motion[speed] = motion.get(speed, ZERO) + sign * wish * share
+    for speeds, least, sign in zip(requested, (scales.up, scales.down), (1, -1), strict=True):
+        for speed, request in speeds.items():
+            scale = reduce(raw_min, least.get(speed, []), _ONE)
+            motion[speed] = motion.get(speed, ZERO) + sign * request * scale
     return motion
 
 
 def _subtract_motion(motion: Mapping[Symbol, Expression], limits: AdmissibleSpeeds) -> AdmissibleSpeeds:
-    """Return what limits leave to be added to a motion within them."""
+    """Return the limits on speeds that are added to a motion."""
     box = dict(limits.box)
     for speed, done in motion.items():
         if speed in box:
@@ -191,7 +194,7 @@ def _subtract_motion(motion: Mapping[Symbol, Expression], limits: AdmissibleSpee
 
 
 def _request_speeds(needs: Sequence[tuple[Weights, Expression]], box: SpeedBox) -> RequestedSpeeds:
-    """Return how fast speeds would go up, and how fast down, if each need were met by each of its speeds."""
+    """Return the largest requested speeds upwards and downwards, each row meeting its need by each speed."""
     up: dict[Symbol, list[Expression]] = {}
     down: dict[Symbol, list[Expression]] = {}
     for away, need in needs:
@@ -208,77 +211,77 @@ def _request_speeds(needs: Sequence[tuple[Weights, Expression]], box: SpeedBox) 
     )
 
 
-def _consume_room(away: Weights, wishes: RequestedSpeeds) -> list[Expression]:
-    """Return how fast wishes lead to a bound at most, by speed."""
-    up, down = wishes
-    harm = []
+def _consume_room(away: Weights, requested: RequestedSpeeds) -> list[Expression]:
+    """Return the room that each requested speed consumes at most."""
+    up, down = requested
+    consumed = []
     for speed, weight in away.items():
         if not weight.symbols:
-            wished = down if float(weight) > 0 else up
-            harm += [abs(float(weight)) * wished[speed]] if speed in wished else []
+            opposing = down if float(weight) > 0 else up
+            consumed += [abs(float(weight)) * opposing[speed]] if speed in opposing else []
             continue
-        harm += [raw_max(weight, ZERO) * down[speed]] if speed in down else []
-        harm += [raw_max(-weight, ZERO) * up[speed]] if speed in up else []
-    return harm
+        consumed += [raw_max(weight, ZERO) * down[speed]] if speed in down else []
+        consumed += [raw_max(-weight, ZERO) * up[speed]] if speed in up else []
+    return consumed
 
 
-class _Shares:
-    """What share of its wishes each speed may have, upwards and downwards: the least of several."""
+class _SpeedScales:
+    """Scale factors of the requested speeds, upwards and downwards; the minimum of each list counts."""
 
-    def __init__(self, wishes: RequestedSpeeds) -> None:
+    def __init__(self, requested: RequestedSpeeds) -> None:
         self.up: dict[Symbol, list[Expression]] = {}
         self.down: dict[Symbol, list[Expression]] = {}
-        self._wishes = wishes
+        self._wishes = requested
 
-    def keep(self, away: Weights, room: Expression) -> None:
-        """Take care that speeds keep ``away·v >= -room``."""
+    def limit_row(self, away: Weights, room: Expression) -> None:
+        """Add the scale factors that satisfy ``away·v >= -room``."""
         up, down = self._wishes
-        harm = _consume_room(away, self._wishes)
-        if not harm:
+        consumed = _consume_room(away, self._wishes)
+        if not consumed:
             return
-        share = _share(room, sum(harm, ZERO))
+        scale = _scale(room, sum(consumed, ZERO))
         for speed, weight in away.items():
             if not weight.symbols:
-                wanted, shares = (down, self.down) if float(weight) > 0 else (up, self.up)
+                wanted, scales = (down, self.down) if float(weight) > 0 else (up, self.up)
                 if speed in wanted:
-                    shares.setdefault(speed, []).append(share)
+                    scales.setdefault(speed, []).append(scale)
                 continue
-            # Only speeds that do harm: a comparison that holds is 1.
+            # A comparison that holds is 1: speeds that consume no room are not scaled.
             if speed in up:
-                share_up = raw_max(share, binary(ca.OP_LE, 0, weight))
-                self.up.setdefault(speed, []).append(share_up)
+                scale_up = raw_max(scale, binary(ca.OP_LE, 0, weight))
+                self.up.setdefault(speed, []).append(scale_up)
             if speed in down:
-                share_down = raw_max(share, binary(ca.OP_LE, weight, 0))
-                self.down.setdefault(speed, []).append(share_down)
+                scale_down = raw_max(scale, binary(ca.OP_LE, weight, 0))
+                self.down.setdefault(speed, []).append(scale_down)
 
-    def keep_ball(self, ball: NormBound) -> None:
-        """Take care that speeds stay within a norm."""
+    def limit_norm(self, ball: NormBound) -> None:
+        """Add the scale factors that satisfy a norm bound."""
         up, down = self._wishes
         sizes = []
         for component in ball.components:
             terms = []
             for speed, weight in component.items():
-                wishes = [w[speed] for w in (up, down) if speed in w]
-                if wishes:
-                    terms.append(abs(weight) * reduce(raw_max, wishes))
+                requested = [w[speed] for w in (up, down) if speed in w]
+                if requested:
+                    terms.append(abs(weight) * reduce(raw_max, requested))
             sizes += [sum(terms, ZERO)] if terms else []
         if not sizes:
             return
-        share = _share(ball.radius, norm(sizes))
+        scale = _scale(ball.radius, norm(sizes))
         for speed in {s for component in ball.components for s in component}:
-            for wishes_of, shares in ((up, self.up), (down, self.down)):
-                if speed in wishes_of:
-                    shares.setdefault(speed, []).append(share)
+            for requests, scales in ((up, self.up), (down, self.down)):
+                if speed in requests:
+                    scales.setdefault(speed, []).append(scale)
 
 
-def _share(room: Expression, harm: Expression) -> Expression:
-    """Return room over harm, 1 or more where there is no harm to speak of; never 0/0."""
-    harmless = binary(ca.OP_LT, harm, _ROUNDING)
-    return (raw_max(room, ZERO) + harmless) / raw_max(harm, _ROUNDING)
+def _scale(room: Expression, consumed: Expression) -> Expression:
+    """Return room / consumed, at least 1 if the consumption is negligible; never 0/0."""
+    negligible = binary(ca.OP_LT, consumed, _ROUNDING)
+    return (raw_max(room, ZERO) + negligible) / raw_max(consumed, _ROUNDING)
 
 
-def _clip_request(wish: Expression, limit: Expression) -> Expression:
-    return wish if is_infinite(limit) else raw_min(wish, limit)
+def _clip_request(request: Expression, limit: Expression) -> Expression:
+    return request if is_infinite(limit) else raw_min(request, limit)
 
 
 def _project_speed(weights: Weights, motion: Mapping[Symbol, Expression]) -> Expression:

@@ -27,25 +27,24 @@ TransformLike: TypeAlias = "Expression | Pose | npt.ArrayLike"
 
 @dataclass(frozen=True)
 class Frame:
-    """A frame and where it is in its parent.
+    """Frame with its parent and its pose in the parent.
 
     Attributes
     ----------
     parent
         Name of the parent frame; ``world`` is the root of all.
     factors
-        Transforms whose product is parent_T_frame: constants as :class:`Pose`, the rest as 4×4 expressions.
-        Kept apart because the geometric Jacobian of a product is far shorter than that of the multiplied
-        matrix.
+        Transforms whose product is parent_T_frame: constants as :class:`Pose`, others as 4×4 expressions. The
+        geometric Jacobian of separate factors is far shorter than that of the multiplied matrix.
     """
 
     parent: str
     factors: tuple[Pose | Expression, ...]
-    # Where this was last found to be in the world: shared by all models that share the frame.
+    # Last world pose, shared by all models that share the frame.
     placement: Placement | None = field(default=None, init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
-        # Those that are asked for one by one, while an operation is traced, are not looked at here.
+        # The lazy factors of a traced operation are not queried here.
         if type(self.factors) is tuple:
             object.__setattr__(self, "factors", tuple(map(_as_motion, self.factors)))
 
@@ -54,7 +53,7 @@ class Frame:
 
     @staticmethod
     def of(parent: str, transform: TransformLike | Sequence[TransformLike]) -> Frame:
-        """Build a frame from a 4×4 transform, or from a sequence of them whose product it is.
+        """Build a frame from a 4×4 transform, or from the factors of one.
 
         Raises
         ------
@@ -68,7 +67,7 @@ class Frame:
         if isinstance(transform, (list, tuple)) and not (transform and np.isscalar(transform[0])):
             parts: Sequence[Any] = transform
             if not all(map(_is_transform, parts)):
-                parts = [as_expression(transform)]  # a nested list of rows is one matrix
+                parts = [as_expression(transform)]  # rows of one matrix
         else:
             parts = [transform]
         return Frame(parent, tuple(_factor(part) for part in parts))

@@ -1,8 +1,8 @@
-"""The sequence of operations and its fold, kept up to date by recorded reads.
+"""Sequence of operations and its fold, kept up to date incrementally by recorded reads.
 
-Every operation has a place in the sequence. A read is resolved at the reader's place: by the last writer
-before it. When what a writer wrote changes, exactly the operations whose reads resolve to it are run again,
-in order, and it stops where writes come out equal. Every change can be undone until it is committed.
+Every operation has a place in the sequence. A read resolves to the last writer before the reader. When a
+write changes, exactly the operations whose reads resolve to it are applied again, in order, until writes no
+longer change. Every change can be undone until it is committed.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ _PLACE = attrgetter("place")
 
 
 class HistoryEntry:
-    """An operation at its place, with what its last run read and wrote; never changed, only exchanged."""
+    """Operation at its place, with the reads and writes of its last run; immutable."""
 
     __slots__ = ("operation", "place", "reads", "tag", "writes")
 
@@ -51,7 +51,7 @@ class HistoryEntry:
 
 
 class History:
-    """Operations, cells and readers; the heart of a model. Not thread-safe by itself."""
+    """Operations of a model, with the writers and readers of each cell. Not thread-safe."""
 
     def __init__(self, entries: Iterable[HistoryEntry] = ()) -> None:
         self.entries: dict[str, HistoryEntry] = {}
@@ -73,10 +73,10 @@ class History:
             self._fill(entries)
 
     def _fill(self, entries: Iterable[HistoryEntry]) -> None:
-        """Take over operations that have been applied, in their order."""
+        """Insert operations that have been applied, in their order."""
         cells, reading, head = self.cells, self.reading, self.head
         for i, given in enumerate(entries):
-            # Placed anew: these may come from several models.
+            # New places, because the entries may come from several models.
             entry = HistoryEntry(given.tag, given.operation, i * _GAP, given.reads, given.writes)
             self.entries[entry.tag] = entry
             self.sequence.append(entry)
@@ -95,7 +95,7 @@ class History:
                 self.listing[kind].add(entry.tag)
 
     def copy(self) -> History:
-        """Return a history that goes on from here by itself, without running anything; entries are shared."""
+        """Return an independent history that shares the entries; no operation is applied."""
         other = History()
         other.entries = self.entries.copy()
         other.sequence = self.sequence.copy()
@@ -105,7 +105,7 @@ class History:
         other.head = {kind: self.ordered(kind).copy() for kind in self.head}
         return other
 
-    # -- questions -----------------------------------------------------------------------------------------
+    # -- queries -------------------------------------------------------------------------------------------
 
     @property
     def tags(self) -> list[str]:
@@ -150,12 +150,12 @@ class History:
     # -- changes of the sequence ---------------------------------------------------------------------------
 
     def append(self, tag: str, operation: Operation) -> None:
-        """Add an operation at the end."""
+        """Append an operation."""
         place = self.sequence[-1].place + _GAP if self.sequence else 0
         self._add(tag, operation, place)
 
     def insert(self, tag: str, operation: Operation, index: int) -> None:
-        """Add an operation in front of the one at ``index``."""
+        """Insert an operation before the one at ``index``."""
         if index >= len(self.sequence):
             self.append(tag, operation)
             return
@@ -172,23 +172,23 @@ class History:
         return bisect_left(self.sequence, self.entry(tag).place, key=_PLACE)
 
     def replace(self, tag: str, operation: Operation) -> None:
-        """Exchange an operation, at its place and under its tag."""
+        """Replace an operation, at its place and under its tag."""
         old = self.entry(tag)
         _check_operation(operation)
         with self._step():
             self._exchange(HistoryEntry(tag, operation, old.place, old.reads, old.writes))
             if self._dirty:
-                self._soil(tag)
+                self._mark_outdated(tag)
             else:
                 self._run(tag)
-                self._check_free(self.entries[tag])
+                self._check_overwrite(self.entries[tag])
 
     def remove(self, tag: str) -> None:
-        """Take an operation out, with everything it wrote."""
+        """Remove an operation and its writes."""
         entry = self.entry(tag)
         self._unlink(entry)
         for cell, value in entry.writes.items():
-            self._touched(cell, value, ABSENT, entry.place)
+            self._mark_readers(cell, value, ABSENT, entry.place)
 
     def _add(self, tag: str, operation: Operation, place: int) -> None:
         if not isinstance(tag, str) or not tag:
@@ -202,17 +202,17 @@ class History:
             entry = HistoryEntry(tag, operation, place, Reads(), {})
             if self._dirty:
                 self._link(entry)
-                self._soil(tag)
+                self._mark_outdated(tag)
             else:
-                entry = self._applied(entry)
-                self._check_free(entry)
+                entry = self._apply(entry)
+                self._check_overwrite(entry)
                 self._link(entry)
                 for cell, value in entry.writes.items():
-                    self._touched(cell, ABSENT, value, place)
+                    self._mark_readers(cell, ABSENT, value, place)
 
     @contextmanager
     def _step(self) -> Iterator[None]:
-        """Undo a single step if it raises, so that whoever catches the error can go on."""
+        """Undo a single step if it raises, so that the edit can continue after the error."""
         mark, dirty = len(self._undo), list(self._dirty)
         try:
             yield
@@ -224,12 +224,12 @@ class History:
     # -- running -------------------------------------------------------------------------------------------
 
     def settle(self) -> None:
-        """Run again whatever has to be.
+        """Apply all operations again whose reads have changed.
 
         Raises
         ------
         EditError
-            Listing every operation that could not be run, with what it misses.
+            Listing every operation that failed, with the reason.
         """
         failures: dict[str, KineverseError] = {}
         failed: list[tuple[int, str]] = []
@@ -252,17 +252,17 @@ class History:
         if self._moved_frames:
             self._check_frames(failures)
         if failures:
-            # Whoever catches this inside an edit may mend it; what is not mended fails again at the end.
+            # The edit may still correct this; if not, it fails again at the end.
             self._dirty = failed
-            raise EditError(self._refusal(failures), failures)
+            raise EditError(self._edit_error(failures), failures)
         self._contested.clear()
         self._moved_frames.clear()
 
-    def _refusal(self, failures: Mapping[str, KineverseError]) -> str:
+    def _edit_error(self, failures: Mapping[str, KineverseError]) -> str:
         lines = [f"  {tag!r}: {error}" for tag, error in list(failures.items())[:_LISTED]]
         if len(failures) > _LISTED:
             lines.append(f"  and {len(failures) - _LISTED} more operations.")
-        needing = self._needing(failures)
+        needing = self._dependents(failures)
         if needing:
             some = ", ".join(map(repr, needing[:_FEW]))
             more = f" and {len(needing) - _FEW} more" if len(needing) > _FEW else ""
@@ -270,8 +270,8 @@ class History:
         listed = "\n".join(lines)
         return f"The edit is refused, because these operations cannot be applied:\n{listed}"
 
-    def _needing(self, tags: Iterable[str]) -> list[str]:
-        """Return the tags of the operations that read what others write, and so on, in order."""
+    def _dependents(self, tags: Iterable[str]) -> list[str]:
+        """Return the tags of all operations that depend on others, directly or indirectly, in order."""
         waiting = list(tags)
         found = set(waiting)
         first = len(found)
@@ -288,13 +288,13 @@ class History:
 
     def _run(self, tag: str) -> None:
         old = self.entries[tag]
-        new = self._applied(old)
+        new = self._apply(old)
         self._exchange(new)
         for cell in {**old.writes, **new.writes}:
-            self._touched(cell, old.writes.get(cell, ABSENT), new.writes.get(cell, ABSENT), new.place)
+            self._mark_readers(cell, old.writes.get(cell, ABSENT), new.writes.get(cell, ABSENT), new.place)
 
-    def _applied(self, entry: HistoryEntry) -> HistoryEntry:
-        """Run an operation at its place; return its entry with what it read and wrote."""
+    def _apply(self, entry: HistoryEntry) -> HistoryEntry:
+        """Apply an operation at its place, and return its entry with its reads and writes."""
         self.runs += 1
         tag = entry.tag
         reads = Reads()
@@ -339,16 +339,16 @@ class History:
             error = unknown_name_error(FRAMES, parent, self.names_at(FRAMES, place))
             raise UnknownNameError(f"The parent of frame '{name}' is missing. {error}")
 
-    def _check_free(self, entry: HistoryEntry) -> None:
-        """Refuse an operation that silently writes over what one before it wrote."""
+    def _check_overwrite(self, entry: HistoryEntry) -> None:
+        """Refuse an operation that overwrites a value of an earlier one without having read it."""
         for cell in entry.writes:
             writers = self.cells.get(cell)
-            # One that comes later may yet be called something else when it is run again.
+            # A later operation may write another name when it is applied again.
             if writers and writers[0].place < entry.place and not may_override(entry, cell):
                 raise overwrite_error(cell, entry, writers[0].tag)
 
     def _check_names(self, failures: dict[str, KineverseError]) -> None:
-        """Look for what has two writers of which the second does not know about the first."""
+        """Report cells with a second writer that has not read the value of the first."""
         for cell in self._contested:
             first, *others = self.cells.get(cell, (None,))
             for entry in others:
@@ -356,17 +356,17 @@ class History:
                     failures.setdefault(entry.tag, overwrite_error(cell, entry, first.tag))
 
     def _check_frames(self, failures: dict[str, KineverseError]) -> None:
-        """Look for circles, at any place of the sequence; only frames that were written anew close them."""
+        """Report cycles of frames at any place of the sequence; only frames with new writes can close one."""
         for name, place in self._moved_frames:
-            circle = self._circle(name, place)
+            circle = self._find_cycle(name, place)
             if circle is not None:
                 tag, names = circle
                 failures.setdefault(tag, ModelError(f"Cyclic frames: {' -> '.join([*names, names[0]])}."))
 
-    def _circle(self, name: str, place: int) -> tuple[str, list[str]] | None:
-        """Return the first circle through a frame, from a place on to where it is written again.
+    def _find_cycle(self, name: str, place: int) -> tuple[str, list[str]] | None:
+        """Return the first cycle through a frame, between a place and the frame's next write.
 
-        It comes with the tag of the operation that closes it.
+        The result is the tag of the operation that closes the cycle, and the names of its frames.
         """
         end = None if place == _BEFORE_ALL else self._next_writer(name, place)
         while True:
@@ -379,7 +379,7 @@ class History:
                 if index < len(writers) and (until is None or writers[index].place < until):
                     until = writers[index].place
                 if not index:
-                    break  # it is not there yet
+                    break  # the frame does not exist yet
                 chain[link] = writers[index - 1]
                 link = writers[index - 1].writes[FRAMES, link].parent
             if link == name and chain:
@@ -393,16 +393,16 @@ class History:
         index = bisect_right(writers, place, key=_PLACE)
         return writers[index].place if index < len(writers) else None
 
-    def _touched(self, cell: Cell, old: Any, new: Any, place: int) -> None:
-        """Note that a write at ``place`` changed, for those who read it."""
+    def _mark_readers(self, cell: Cell, old: Any, new: Any, place: int) -> None:
+        """Mark the readers of a write at ``place`` as outdated."""
         kind, name = cell
         writers = self.cells.get(cell, ())
         if old is ABSENT and len(writers) == 1 and cell not in self.reading and not self.listing[kind]:
-            # The first to write what nobody asked for: most of what loading a description does.
+            # First write of a cell without readers, the usual case while a description is loaded.
             self._set_head(cell, new)
             return
         if old is ABSENT or new is ABSENT:
-            # What readers find instead is what was written before.
+            # Readers then find the value of the previous writer.
             earlier = self.value_at(cell, place)
             old, new = (earlier if value is ABSENT else value for value in (old, new))
         if old is new or (old is not ABSENT and new is not ABSENT and old == new):
@@ -422,18 +422,18 @@ class History:
                 and (following is None or reader <= following)
                 and (how & Read.VALUE or existence)
             ):
-                self._soil(tag)
+                self._mark_outdated(tag)
         if existence:
             for tag in self.listing[kind]:
                 reader = self.entries[tag].place
                 if reader > place and (following is None or reader <= following):
-                    self._soil(tag)
+                    self._mark_outdated(tag)
 
-    def _soil(self, tag: str) -> None:
+    def _mark_outdated(self, tag: str) -> None:
         heapq.heappush(self._dirty, (self.entries[tag].place, tag))
 
     def value_at(self, cell: Cell, place: int) -> Any:
-        """Return what the last writer before ``place`` wrote into a cell, or ABSENT."""
+        """Return the value that the last writer before ``place`` wrote into a cell, or ABSENT."""
         writers = self.cells.get(cell)
         if not writers:
             return ABSENT
@@ -459,10 +459,10 @@ class History:
             self._disordered.discard(kind)
         return names
 
-    # -- bookkeeping that can be undone --------------------------------------------------------------------
+    # -- undo log ------------------------------------------------------------------------------------------
 
     def begin(self) -> None:
-        """Start a transaction: forget how to undo what was before."""
+        """Start a transaction, and clear the undo log."""
         self._undo.clear()
         self._before.clear()
         self._dirty.clear()
@@ -477,7 +477,7 @@ class History:
 
     def _undo_to(self, mark: int) -> None:
         if len(self._undo) > mark:
-            # Who looked in between has the values in the order that is now undone.
+            # The cached order may be that of the transaction that is now undone.
             self._disordered.update(KINDS)
         while len(self._undo) > mark:
             function, arguments = self._undo.pop()
@@ -568,7 +568,7 @@ class History:
             self._disordered.update(kind for kind, _ in (*old.writes, *new.writes))
 
     def _renumber(self) -> None:
-        # Entries may be shared with copies and snapshots, so others are put in their place.
+        # Copies and snapshots may share the entries, so they are replaced and not modified.
         anew = [
             HistoryEntry(e.tag, e.operation, i * _GAP, e.reads, e.writes) for i, e in enumerate(self.sequence)
         ]
@@ -583,7 +583,7 @@ class History:
         self.entries = {entry.tag: entry for entry in sequence}
         for writers in self.cells.values():
             writers[:] = [self.entries[entry.tag] for entry in writers]
-        # Where frames were moved is not known any more, so they are looked at from the beginning on.
+        # The places of moved frames are no longer known, so cycles are searched from the beginning.
         self._moved_frames = {(name, _BEFORE_ALL): None for name, _ in self._moved_frames}
 
 
@@ -593,7 +593,7 @@ def as_cell(path: str) -> Cell:
     Raises
     ------
     UnknownNameError
-        If it does not begin with a kind.
+        If the path does not begin with a kind.
     """
     kind, _, name = str(path).partition("/")
     if kind not in KINDS or not name:

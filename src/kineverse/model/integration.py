@@ -1,6 +1,7 @@
-"""Moving a state along constant speeds: q̇ = R(q) u, exactly enough that nobody writes a rule by hand.
+"""Numeric integration of a state at constant speeds: q̇ = R(q) u, close to floating-point accuracy.
 
-Limits and other constraints stop nothing here; ``model.integrate(..., clip=True)`` brings coordinates back.
+Limits and other constraints are ignored here; ``model.integrate(..., clip=True)`` clips coordinates
+afterwards.
 """
 
 from __future__ import annotations
@@ -34,7 +35,7 @@ Vector: TypeAlias = npt.NDArray[np.float64]
 # Substeps of the modified midpoint rule; the extrapolation over their squares is of order 12.
 _SUBSTEPS = (2, 4, 6, 8, 10, 12)
 _LONGEST = 0.5
-# What a step may be wrong by, relative to the coordinates, and its least part of the whole time.
+# Error tolerance of a step relative to the coordinates, and smallest step relative to the whole time.
 _ERROR = 1e-13
 _SHORTEST = 1e-9
 
@@ -55,20 +56,20 @@ def integrate(
     Parameters
     ----------
     coordinates, rates
-        What moves, and how.
+        Coordinates to integrate, and their rate table.
     state
         Values of at least all coordinates that move.
     speeds
-        From free speeds or their names to numbers; those not given are 0.
+        Values by free speed or its name; the default is 0.
     dt
-        [s]; may be negative.
+        Duration [s]; may be negative.
 
     Raises
     ------
     UnknownNameError
-        For a speed that moves nothing here.
+        For a speed that moves none of the coordinates.
     InvalidValueError
-        For NaN or an infinite step, or if coordinates run to infinity on the way.
+        For NaN or an infinite step, or if coordinates diverge.
     """
     step = finite_number(dt)
     if step is None:
@@ -85,7 +86,7 @@ def integrate(
         speed = by_name.get(str(key))
         if speed is None:
             if isinstance(speeds, State):
-                continue  # it may know more
+                continue  # a state may have further values
             raise UnknownNameError(f"Nothing moves with '{key}'. {suggest(str(key), by_name, 'speed')}")
         if speed in given:
             raise duplicate_value_error(speed)
@@ -111,21 +112,21 @@ def integrate(
 
 
 class Flow:
-    """What driven coordinates do at constant speeds: a compiled function of where they are.
+    """Flow of the driven coordinates at constant speeds, as a compiled function of the coordinates.
 
     Parameters
     ----------
     rates
-        The table.
+        Rate table.
 
     Attributes
     ----------
     driven
-        The coordinates that have rows.
+        Coordinates with rows.
     beside
-        The free coordinates and parameters that rows look at.
+        Free coordinates and parameters in the rows.
     speeds
-        The speeds that rows have.
+        Speeds of the rows.
     """
 
     def __init__(self, rates: Rates) -> None:
@@ -136,7 +137,7 @@ class Flow:
         zero = Expression(0.0)
         rows = [sum((g * v for v, g in rates[x].items()), zero) for x in self.driven]
         entries = [g for x in self.driven for g in rates[x].values()]
-        # Speeds that rows look at as well as go with: each is an input once.
+        # A speed may be a column of a row and occur in its entries; it is one input.
         inputs = dict.fromkeys((*self.driven, *self.beside, *self.speeds))
         self._inputs = tuple(inputs)
         self._function = compile([array(rows), array(entries)], self._inputs)
@@ -147,7 +148,7 @@ class Flow:
         Raises
         ------
         _StuckError
-            If they run to infinity on the way.
+            If they diverge.
         """
         known = {s: value for s in self._inputs if (value := state.given(s)) is not None}
         known.update({v: speeds.get(v, 0.0) for v in self.speeds})
@@ -163,7 +164,7 @@ class Flow:
             evaluator()
             return np.concatenate([flow, pace])
 
-        # A row's scale of change: its rate where it starts, per radian or metre.
+        # Scale of change of a row: its rate at the start, per radian or metre.
         rate(start)
         fastest = max((abs(speeds.get(v, 0.0)) for v in self.speeds), default=0.0)
         scale = fastest * float(np.abs(gains).sum())
@@ -173,24 +174,24 @@ class Flow:
 
 @functools.lru_cache(maxsize=32)
 def make_flow(rates: Rates) -> Flow:
-    """Return the flow of a table; tables are immutable, and filters ask at every step."""
+    """Return the flow of a rate table; cached, because filters integrate at every step."""
     return Flow(rates)
 
 
 class _StuckError(Exception):
-    """Steps became too short to get anywhere."""
+    """Step length below the smallest one."""
 
     def __init__(self, done: float) -> None:
         self.done = done
 
 
 def _follow_flow(rate: Callable[[Vector], Vector], q: Vector, dt: float, longest: float) -> Vector:
-    """Return q after dt, in steps of a length that the estimated error allows."""
+    """Integrate q over dt with adaptive steps, controlled by the estimated error."""
     done, step = 0.0, longest
     while abs(done) < abs(dt):
         left = dt - done
         step = step if abs(step) < abs(left) else left
-        with np.errstate(all="ignore"):  # a step that is too long may lead anywhere; it is not taken
+        with np.errstate(all="ignore"):  # a step that is too long may overflow; it is rejected
             after, error = _extrapolated_step(rate, q, step)
             size = max(1.0, float(np.abs([q, after]).max()))
         close = math.isfinite(error) and error <= _ERROR * size
@@ -206,10 +207,10 @@ def _follow_flow(rate: Callable[[Vector], Vector], q: Vector, dt: float, longest
 
 
 def _extrapolated_step(rate: Callable[[Vector], Vector], q: Vector, dt: float) -> tuple[Vector, float]:
-    """Return q after dt, and an estimate of its error.
+    """Integrate q over one step, and estimate the error (Gragg, Bulirsch, Stoer).
 
-    They are modified midpoint rules with more and more substeps, extrapolated to steps of no length. The last
-    two extrapolations differ by the error of the worse one.
+    Modified midpoint rules with increasing numbers of substeps are extrapolated to substep length zero. The
+    difference of the last two extrapolations estimates the error.
     """
     table: list[Vector] = []
     for k, n in enumerate(_SUBSTEPS):

@@ -1,8 +1,7 @@
 """Forward kinematics and geometric Jacobians along chains of frames.
 
-A frame's pose is kept as an *anchor*, the product up to its last moving factor, and a constant offset behind
-it. Constants are multiplied as numbers before they meet an expression, so rigidly attached frames cost
-nothing.
+The pose of a frame is stored as an *anchor*, the product up to the last moving factor, and a constant offset.
+Constants are multiplied numerically before they enter an expression, so rigidly attached frames add no cost.
 """
 
 from __future__ import annotations
@@ -29,7 +28,7 @@ FrameLookup = Callable[[str], Frame]
 
 @dataclass(frozen=True, slots=True)
 class ChainStep:
-    """A moving factor, and rotation and position of the place in front of it."""
+    """Moving factor of a chain, with the rotation and position of the chain before it."""
 
     rotation: SX
     position: SX
@@ -39,9 +38,9 @@ class ChainStep:
 
 @dataclass(frozen=True, slots=True)
 class Placement:
-    """Where a frame is in the root of a chain.
+    """Pose of a frame in the root of a chain.
 
-    Rotation and position of the anchor (None for the identity), then a constant.
+    Rotation and position of the anchor (None for the identity), and the constant offset.
     """
 
     rotation: SX | None
@@ -88,7 +87,7 @@ class Placement:
         )
 
     def all_steps(self) -> list[ChainStep]:
-        """Return the moving factors of the whole chain, from the root on."""
+        """Return the moving factors of the chain, from the root outwards."""
         steps: list[ChainStep] = []
         placement: Placement | None = self
         while placement is not None:
@@ -105,7 +104,7 @@ _EYE3 = np.eye(3)
 
 
 def _with_offset(rotation: SX | None, position: SX | None, offset: npt.NDArray[np.float64]) -> tuple[SX, SX]:
-    """Return rotation and position of anchor @ offset; constants that do nothing cost nothing."""
+    """Return rotation and position of anchor @ offset; identities are skipped."""
     if rotation is None or position is None:
         return _sparse(offset[:3, :3]), ca.SX(ca.DM(offset[:3, 3]))
     if offset is IDENTITY:
@@ -122,12 +121,12 @@ def _sparse(numbers: npt.NDArray[np.float64]) -> SX:
 
 
 def ancestors(name: str, lookup: FrameLookup) -> list[str]:
-    """Return the frame and its ancestors, up to but without the world.
+    """Return the frame and its ancestors, without the world.
 
     Raises
     ------
     ModelError
-        If the chain runs in a circle.
+        If the chain is cyclic.
     """
     chain: list[str] = []
     seen: set[str] = set()
@@ -150,7 +149,7 @@ def branches(frame: str, relative_to: str, lookup: FrameLookup) -> tuple[list[st
 
 
 def compose_chain(chain: Sequence[str], lookup: FrameLookup, start: Placement = ROOT) -> Placement:
-    """Compose a chain of frames."""
+    """Return the placement of the last frame of a chain."""
     placement = start
     for name in chain:
         placement = placement.then(lookup(name))
@@ -158,12 +157,12 @@ def compose_chain(chain: Sequence[str], lookup: FrameLookup, start: Placement = 
 
 
 def place_in_world(name: str, lookup: FrameLookup) -> Placement:
-    """Return where a frame is in the world; what is composed on the way is kept with the frames."""
+    """Return the placement of a frame in the world; frames cache the placements of all ancestors."""
     placement = ROOT
     for link in reversed(ancestors(name, lookup)):
         frame = lookup(link)
         known = frame.placement
-        # Valid as long as it was composed from this very parent.
+        # A cached placement is valid while it refers to the same parent placement.
         if known is None or known.parent is not placement:
             known = placement.then(frame)
             object.__setattr__(frame, "placement", known)
@@ -183,7 +182,7 @@ def relative_pose(frame: str, relative_to: str, lookup: FrameLookup) -> Expressi
 
 @dataclass(slots=True)
 class Twist:
-    """How one speed moves a frame: velocity of its origin and angular velocity."""
+    """Twist of a frame per unit of one speed: velocity of the origin and angular velocity."""
 
     linear: SX
     angular: SX
@@ -191,14 +190,14 @@ class Twist:
 
 
 def compute_twists(base: Placement, tip: Placement, heuristic: bool) -> tuple[SX, SX, dict[Symbol, Twist]]:
-    """Return rotation and position of the tip in the base, and its twist by each speed, in axes of the base.
+    """Return rotation and position of the tip in the base, and its twist per speed, in axes of the base.
 
-    Both placements are relative to a common ancestor. Every moving factor contributes the twist it makes in
-    front of itself, carried to the tip by a cross product; so the cost is linear in the length of the chain.
+    Both placements are relative to a common ancestor. Every moving factor contributes its own twist,
+    transformed to the tip by a cross product. So the cost is linear in the length of the chain.
     """
     rotation, position = tip.parts()
     found: dict[Symbol, Twist] = {}
-    # In the common ancestor, the tip moves with its own factors, and against those of the base.
+    # Relative to the base, the tip moves with its own factors and opposite to the factors of the base.
     for sign, placement in ((1, tip), (-1, base)):
         for step in placement.all_steps():
             _add_step(found, step, position, sign, heuristic)
@@ -213,7 +212,7 @@ def compute_twists(base: Placement, tip: Placement, heuristic: bool) -> tuple[SX
 
 
 def _add_step(found: dict[Symbol, Twist], step: ChainStep, tip: SX, sign: int, heuristic: bool) -> None:
-    """Add the twists that a moving factor makes at the tip, against them where the sign is negative."""
+    """Add the twists of a moving factor at the tip, with a sign."""
     moves = _axis_twists if isinstance(step.factor, OneAxisTransform) else _twists
     for key, velocity, omega, entry_nodes in moves(step, tip, heuristic):
         if sign < 0:
@@ -230,7 +229,7 @@ def _add_step(found: dict[Symbol, Twist], step: ChainStep, tip: SX, sign: int, h
 def _axis_twists(
     step: ChainStep, tip: SX, heuristic: bool
 ) -> Iterator[tuple[Symbol, SX, SX, frozenset[Node]]]:
-    """Yield speed, linear and angular velocity and nodes of a motion about or along a direction."""
+    """Yield speed, linear and angular velocity, and nodes of a motion about or along an axis."""
     motion = step.factor
     assert isinstance(motion, OneAxisTransform)
     if sum(d != 0 for d in motion.direction) == 1:
@@ -248,7 +247,7 @@ def _axis_twists(
 
 
 def _twists(step: ChainStep, tip: SX, heuristic: bool) -> Iterator[tuple[Symbol, SX, SX, frozenset[Node]]]:
-    """Yield the same of any rigid motion."""
+    """Yield speed, linear and angular velocity, and nodes of any rigid motion."""
     factor = step.factor
     entries = factor.gradient(heuristic)
     if not entries:

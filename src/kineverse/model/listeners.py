@@ -1,4 +1,4 @@
-"""Hearing of changes, each once, after they are committed."""
+"""Notification of listeners about committed changes, once for each commit."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ Callback = Callable[[Diff], None]
 
 @dataclass(frozen=True, eq=False)
 class Listener:
-    """A callback and what it wants to hear of; :meth:`close` ends it."""
+    """Callback with its filter; :meth:`close` unregisters it."""
 
     callback: Callback
     paths: tuple[str, ...] | None
@@ -31,7 +31,7 @@ class Listener:
     registry: Listeners
 
     def close(self) -> None:
-        """Stop listening; closing twice is fine."""
+        """Unregister the callback; a second call has no effect."""
         self.registry.remove(self)
 
     def __enter__(self) -> Listener:
@@ -41,7 +41,7 @@ class Listener:
         self.close()
 
     def relevant(self, diff: Diff) -> Diff | None:
-        """Return the part of a diff this listener asked for, None if there is nothing in it."""
+        """Return the part of a diff that passes the filter; None if it is empty."""
         if self.paths is None and self.coordinates is None and self.tags is None:
             return diff
         changes = tuple(c for c in diff.changes if self._wants(c))
@@ -60,7 +60,7 @@ class Listener:
 
 
 class Listeners:
-    """The listeners of one model, called in the order they came, in the order of versions."""
+    """Listeners of one model, called in the order of registration and of versions."""
 
     def __init__(self) -> None:
         self._listeners: list[Listener] = []
@@ -75,11 +75,11 @@ class Listeners:
         symbols: Iterable[Symbol] | None,
         tags: Iterable[str] | None,
     ) -> Listener:
-        """Register a callback; with no filter at all it hears of everything."""
+        """Register a callback; without a filter it gets every diff."""
         if not callable(callback):
             raise ExpressionError(f"A listener is called with a diff, and {callback!r} cannot be called.")
         for path in () if paths is None else _names(paths):
-            if path and str(path).partition("/")[0] not in KINDS:  # the empty path is that of everything
+            if path and str(path).partition("/")[0] not in KINDS:  # everything is below the empty path
                 raise unknown_path_error(path)
         listener = Listener(
             callback,
@@ -92,20 +92,20 @@ class Listeners:
         return listener
 
     def remove(self, listener: Listener) -> None:
-        """Forget a listener."""
+        """Unregister a listener."""
         self._listeners = [known for known in self._listeners if known is not listener]
 
     def post(self, diff: Diff) -> None:
-        """Note a diff for those who listen now; called in the order of versions."""
+        """Queue a diff for the present listeners; called in the order of versions."""
         if self._listeners:
             with self._lock:
                 self._waiting.append((diff, tuple(self._listeners)))
 
     def deliver(self) -> None:
-        """Tell everyone concerned what is waiting; one that raises is logged and stops nobody else.
+        """Call the listeners with the queued diffs. An exception of a listener is logged; the others go on.
 
-        One thread does it at a time, so diffs arrive in order. Whoever comes meanwhile, a callback that edits
-        the model among them, leaves its diff to that thread and goes on.
+        One thread delivers at a time, so diffs arrive in order. If another thread, or a callback that edits
+        the model, posts a diff meanwhile, the delivering thread takes it over.
         """
         while True:
             with self._lock:

@@ -21,7 +21,7 @@ from .registry import LoopTreatment
 
 
 class EditContext(AbstractContextManager["Edit"]):
-    """What :meth:`Model.edit` returns: a new edit is opened whenever a ``with`` block of it begins."""
+    """Context manager of :meth:`Model.edit`; each ``with`` block opens a new edit."""
 
     def __init__(self, begin: Callable[[], AbstractContextManager[Edit]]) -> None:
         self._begin = begin
@@ -29,13 +29,13 @@ class EditContext(AbstractContextManager["Edit"]):
     def __enter__(self) -> Edit:
         transaction = self._begin()
         edit = transaction.__enter__()
-        self._transaction = transaction  # once it is open: an edit inside of this one is refused
+        self._transaction = transaction  # after it is open, because a nested edit is refused
         return edit
 
     def __exit__(self, *raised: Any) -> bool | None:
         return self._transaction.__exit__(*raised)
 
-    if not TYPE_CHECKING:  # a type checker says so on its own
+    if not TYPE_CHECKING:  # type checkers report unknown names themselves
 
         def __getattr__(self, name: str) -> Any:
             raise UnknownAttributeError(
@@ -45,9 +45,9 @@ class EditContext(AbstractContextManager["Edit"]):
 
 
 class Model(ModelView):
-    """Named data and constraints, as the fold of a sequence of operations over the empty model.
+    """Articulation model: named data and constraints, the fold of a sequence of operations.
 
-    The model holds no state: values are given to whatever evaluates it. It is changed in transactions::
+    A model contains no state; values are passed to its queries. It is changed in transactions::
 
         with model.edit() as edit:
             edit.add_frame("door", parent="world", transform=kv.rotation_z(kv.position("door")))
@@ -77,19 +77,19 @@ class Model(ModelView):
 
     @property
     def history(self) -> History:
-        """The operations: ``tags``, ``entry(tag)``, ``writers(path)``, ``readers(path)``, ``runs``."""
+        """Operations: ``tags``, ``entry(tag)``, ``writers(path)``, ``readers(path)``, ``runs``."""
         return self._history
 
     # -- editing -------------------------------------------------------------------------------------------
 
     def edit(self) -> AbstractContextManager[Edit]:
-        """Open a transaction: it is committed at the end of the ``with`` block, or nothing has happened.
+        """Open a transaction, committed as a whole at the end of its ``with`` block.
 
         Raises
         ------
         EditError
-            At the end of the block, if operations cannot be run after the edit: the first ones are listed,
-            and all of them are in its ``failures``.
+            At the end of the block, if operations fail after the edit. The message lists the first ones, and
+            the attribute ``failures`` has all.
         """
         return EditContext(self._transaction)
 
@@ -104,7 +104,7 @@ class Model(ModelView):
             try:
                 yield edit
                 self._history.settle()
-                self.rates  # noqa: B018 - cyclic rates are found now, not at the next question
+                self.rates  # noqa: B018 - cyclic rates are an error of the edit, not of a later query
             except BaseException:
                 self._history.roll_back()
                 raise
@@ -121,7 +121,7 @@ class Model(ModelView):
             self._history.settle()
         events = self._history.take_events()
         if events:
-            self._changed(events)
+            self._invalidate(events)
 
     def _writers(self, path: str) -> list[str]:
         return self._history.writers(path)
@@ -129,12 +129,12 @@ class Model(ModelView):
     def _ordered(self, kind: str) -> dict[str, Any]:
         return self._history.ordered(kind)
 
-    def _commit(self, edit: Edit, runs: int) -> Diff:
+    def _commit(self, edit: Edit, reruns: int) -> Diff:
         changes = [
             Change(kind, name, None if before is ABSENT else before, None if after is ABSENT else after)
             for (kind, name), before, after in self._history.changes()
         ]
-        diff = edit._diff(self._version + 1, changes, runs)
+        diff = edit._diff(self._version + 1, changes, reruns)
         self._history.begin()
         self._version += 1
         return diff
@@ -148,7 +148,7 @@ class Model(ModelView):
         strict: bool = False,
         loops: LoopTreatment = "solve",
     ) -> list[str]:
-        """Add a file or a shipped model in one edit; returns the tags. See :func:`kineverse.load`."""
+        """Include a file or a shipped model in one edit, and return the tags; see :func:`kineverse.load`."""
         with self.edit() as edit:
             return edit.include(source, prefix, root=root, strict=strict, loops=loops)
 
@@ -160,34 +160,34 @@ class Model(ModelView):
         symbols: Iterable[Symbol] | None = None,
         tags: Iterable[str] | None = None,
     ) -> Listener:
-        """Have ``callback(diff)`` called after every commit that concerns it, with that part of the diff.
+        """Register a callback for commits; it gets the part of each diff that passes the filter.
 
         Parameters
         ----------
         callback
-            Called once per commit, in the order of versions, after the edit is over. It may edit the model
-            itself: of that is heard when everybody has heard of the first. If it raises, that is logged.
+            Function of a diff, called once per commit after the edit, in the order of versions. It may edit
+            the model; its own commit is delivered after the present one. Exceptions are logged.
         paths
-            Paths such as ``frames/kitchen``: everything at or below them.
+            Paths such as ``frames/kitchen``, for all values at or below them.
         symbols
-            Constraints about the coordinates of these symbols, in their expression, bounds or gradient.
+            Symbols, for constraints with their coordinates in expression, bounds or gradient.
         tags
-            Operations that are added, removed, replaced, moved or run again.
+            Tags of operations that are added, removed, replaced, moved or run again.
         """
         return self._listeners.add(callback, paths, symbols, tags)
 
     # -- copies --------------------------------------------------------------------------------------------
 
     def snapshot(self) -> Snapshot:
-        """Return the model as it is now; it never changes and can be kept, compared and sent."""
+        """Return an immutable snapshot of the model, which can be stored, compared and pickled."""
         with self._lock, no_collection():
             self._settle()
             head = {kind: dict(self._history.ordered(kind)) for kind in self._history.head}
             return Snapshot(head, tuple(self._history.sequence), self._version)
 
     def copy(self) -> Model:
-        """Return an independent model with the same operations, without running them again."""
-        # The collector would look again and again at what is made here, all of which is kept.
+        """Return an independent model with the same operations, without applying them again."""
+        # No object made here is garbage, so the collector would only cost time.
         with self._lock, no_collection():
             self._settle()
             return Model(self._history.copy(), self._version)
@@ -202,7 +202,7 @@ class Model(ModelView):
 
 
 class Snapshot(ModelView):
-    """A model at one version: everything can be asked, nothing changed. Equal if all values are equal."""
+    """Immutable model at one version, with all queries. Snapshots are equal if all values are equal."""
 
     def __init__(
         self, head: dict[str, dict[str, Any]], entries: tuple[HistoryEntry, ...], version: int
@@ -212,16 +212,16 @@ class Snapshot(ModelView):
 
     @property
     def entries(self) -> tuple[HistoryEntry, ...]:
-        """The operations in order, each with its tag, its reads and its writes."""
+        """Operations in order, each with its tag, its reads and its writes."""
         return self._entries
 
     def model(self) -> Model:
-        """Return a model that goes on from here."""
+        """Return a new model with the content of the snapshot."""
         return Model(self._entries, self._version)
 
     @property
     def tags(self) -> list[str]:
-        """The tags of the operations, in order."""
+        """Tags of the operations, in order."""
         return [e.tag for e in self._entries]
 
     def __eq__(self, other: object) -> bool:

@@ -1,4 +1,7 @@
-"""Queries on a model: constraints, limits, default state, velocity rows, integration, projection."""
+"""Numeric queries on a model: constraints, limits, default state, velocity rows, integration, projection.
+
+Data and symbolic kinematics are in :mod:`kineverse.model.symbolic_view`.
+"""
 
 from __future__ import annotations
 
@@ -28,7 +31,10 @@ from .violations import Checks, Violations, find_violations
 
 
 class ModelView(SymbolicView):
-    """Read access to a model: data, kinematics, constraints. Base of :class:`Model` and :class:`Snapshot`."""
+    """Read access to a model: data, kinematics, constraints. Base of :class:`Model` and :class:`Snapshot`.
+
+    This class adds the queries that take or return numbers to those of :class:`SymbolicView`.
+    """
 
     # -- constraints ---------------------------------------------------------------------------------------
 
@@ -39,32 +45,33 @@ class ModelView(SymbolicView):
         bounds: bool = False,
         closure: bool = False,
     ) -> dict[str, Constraint]:
-        """Return the constraints that matter for an expression or for symbols, by name.
+        """Return the constraints relevant for an expression or for symbols, by name.
 
-        Coordinates are compared, whatever their order: those of the subject and of every key of its gradient
-        against those of the constrained expressions. So a lock on a velocity is found from a pose.
+        A constraint is relevant if its expression shares a coordinate, of any order, with the subject or a
+        key of the subject's gradient. So a pose finds the lock on a velocity.
 
         Parameters
         ----------
         subject
-            An expression, or several, or symbols; the name of a frame stands for its pose.
+            One or several expressions, symbols, or names of frames, which stand for their poses.
         exact
-            The papers' formula, ``V(φ_c) ∩ V(ψ) ≠ ∅``: symbols rather than coordinates, values only.
+            True for the formula of the papers, ``V(φ_c) ∩ V(ψ) ≠ ∅``: symbols instead of coordinates, without
+            gradients.
         bounds
-            Also compare what the bounds are about.
+            True to compare the symbols of bounds as well.
         closure
-            Go on with the symbols of what was found, until nothing new turns up.
+            True to repeat the search with the symbols of the result until it is closed.
         """
         with self._lock:
             self._catch_up()
             head = self._head[CONSTRAINTS]
-            names = self._relevance.of(
+            names = self._relevance.find(
                 self._expressions(subject), head, exact=exact, bounds=bounds, closure=closure
             )
-            return {name: self._carried(name, head[name]) for name in names}
+            return {name: self._carry_constraint(name, head[name]) for name in names}
 
     def _expressions(self, subject: Expression | str | Iterable[Symbol | Expression | str]) -> Any:
-        """Return what a subject is, with poses in place of the names of frames."""
+        """Return a subject with poses in place of names of frames."""
         if isinstance(subject, str):
             subject = [subject]
         if isinstance(subject, Expression) or not isinstance(subject, Iterable):
@@ -83,31 +90,31 @@ class ModelView(SymbolicView):
             raise error
 
     def violations(self, values: StateLike, tolerance: float = 1e-9) -> Violations:
-        """Return the constraints that values break: (name, value, lower, upper, excess) each, worst first.
+        """Return the violated constraints as (name, value, lower, upper, excess), the largest excess first.
 
-        Constraints about none of the given symbols, or about speeds that are not given, are listed as
-        ``unchecked``. A closed loop that does not close here is listed by its name, and like any constraint
-        without a value before all others: NaN, off by NaN.
+        Constraints without any of the given symbols, or with speeds that are not given, are listed as
+        ``unchecked``. A loop that does not close is listed by its name. Like any constraint without a value
+        it comes first, with NaN as value and excess.
 
         Parameters
         ----------
         values
             A state, or a mapping from symbols or names to numbers.
         tolerance
-            An excess up to this is none, in the unit of the constraint.
+            Largest excess of a satisfied constraint, in the unit of the constraint.
 
         Raises
         ------
         UnknownNameError
-            If a constraint is about a given symbol and a position that is missing, a name is unknown, or a
-            state has no value for anything in the model.
+            If a constraint has a given symbol and a missing position, a name is unknown, or a state has no
+            value of any symbol of the model.
         DuplicateNameError
-            If a symbol has two values, by name and as such, or a name is that of several symbols.
+            If a symbol has two values, by name and by symbol, or several symbols have one name.
         """
         with self._lock:
             self._catch_up()
             if self._checks is None:
-                followed = {name: self._followed(c) for name, c in self._head[CONSTRAINTS].items()}
+                followed = {name: self._eliminate_dependent(c) for name, c in self._head[CONSTRAINTS].items()}
                 self._checks = Checks(followed, self.rates.dependent.values())
             found = find_violations(self._checks, values, self._known(values), tolerance)
             if isinstance(values, State) and 0 < len(found.unchecked) == len(self._checks.names):
@@ -115,7 +122,7 @@ class ModelView(SymbolicView):
             return found
 
     def _known(self, values: object) -> tuple[Symbol, ...]:
-        """Return the symbols that plain values may be about; a state may be about anything."""
+        """Return the symbols allowed in a plain mapping; a state may have any."""
         if isinstance(values, State):
             return ()
         self._catch_up()
@@ -124,10 +131,10 @@ class ModelView(SymbolicView):
         return tuple(found)
 
     def limits(self, symbol: Symbol | str, values: StateLike | None = None) -> tuple[float, float]:
-        """Return the bounds that constraints put on a single symbol, ±inf where there are none.
+        """Return the limits of a single symbol; ±inf for none.
 
-        Bounds that are expressions are evaluated at ``values``, by default at :meth:`default_state`; those
-        that cannot be evaluated are left out.
+        Bounds that are expressions are evaluated at ``values``, by default at :meth:`default_state`. Bounds
+        that cannot be evaluated are ignored.
         """
         with self._lock:
             self._catch_up()
@@ -153,7 +160,7 @@ class ModelView(SymbolicView):
         return float(bound(known))
 
     def symbol(self, name: str) -> Symbol:
-        """Return the symbol of a text name, if the model knows its coordinate, be it free or dependent.
+        """Return the symbol of a name; its coordinate is a free or dependent coordinate of the model.
 
         Raises
         ------
@@ -173,10 +180,11 @@ class ModelView(SymbolicView):
         )
 
     def default_state(self) -> State:
-        """Return a value for every symbol: 0, or its home, clipped into limits; parameters keep theirs.
+        """Return the default value of every symbol: its home or 0, clipped to the limits.
 
-        Limits are constraints on a straight line over one symbol, such as those of a joint and of what
-        follows it. Others, as on the sum of two, are not looked at: :meth:`violations` says which hold.
+        Parameters have their own default values. Limits are constraints on a linear function of one symbol,
+        such as those of a joint and of a mimic joint. Other constraints, such as those on a sum of two
+        symbols, are ignored; see :meth:`violations`.
         """
         with self._lock:
             symbols = self.symbols
@@ -187,13 +195,13 @@ class ModelView(SymbolicView):
                         values[symbol] = home
             self._clip(values, symbols)
             wrong = [s for s, value in values.items() if not math.isfinite(value)]
-            if wrong:  # parameters first, as others follow from them
+            if wrong:  # parameters first, because bounds may depend on them
                 symbol = min(wrong, key=lambda s: s.value is None)
                 raise self._no_default(symbol, values[symbol])
             return State(values, source="default")
 
     def _clip(self, values: dict[Symbol, float], symbols: Iterable[Symbol]) -> None:
-        """Bring values within the limits of each symbol alone."""
+        """Clip values to the limits of each symbol."""
         self._catch_up()
         later = []
         for symbol in symbols:
@@ -205,7 +213,7 @@ class ModelView(SymbolicView):
                     later.append((symbol, c))
                 else:
                     values[symbol] = c.nearest(values[symbol], float(c.lower), float(c.upper))
-        # Bounds may be about symbols that have such bounds too: at most so many rounds until all fit.
+        # Bounds may depend on symbols with bounds of their own, so the clipping is repeated.
         for _ in later:
             before = dict(values)
             for symbol, c in later:
@@ -217,7 +225,7 @@ class ModelView(SymbolicView):
                 break
 
     def _no_default(self, symbol: Symbol, value: float) -> InvalidValueError:
-        """Return the error for a default that is not finite, with who is to blame."""
+        """Return the error for a default value that is not finite, with the operations that cause it."""
         names = [n for n, a in self._head[ARTICULATIONS].items() if symbol in a.coordinates]
         paths = [f"{ARTICULATIONS}/{name}" for name in names]
         paths += [f"{CONSTRAINTS}/{name}" for name in self._relevance.about(symbol)]
@@ -233,7 +241,7 @@ class ModelView(SymbolicView):
         )
 
     def _writers(self, path: str) -> list[str]:
-        """Return the tags that write a path, as far as that is known here."""
+        """Return the tags that write a path; empty if unknown."""
         return []
 
     def velocity_rows(
@@ -244,10 +252,11 @@ class ModelView(SymbolicView):
         speeds: Sequence[Symbol] | None = None,
         gain: float | None = None,
     ) -> VelocityRows:
-        """Return the linear rows in speeds that keep the constraints over a step of ``dt`` seconds.
+        """Return linear rows in the speeds that enforce constraints over a step of ``dt`` seconds.
 
-        Of the constraints relevant for ``subject`` and of the speed limits of whatever they let move, or of
-        all; see :meth:`constraints_for` and :mod:`kineverse.model.velocity_rows`.
+        With a subject, these are the constraints relevant for it and the speed limits of all coordinates that
+        they involve; without one, all constraints. See :meth:`constraints_for` and
+        :mod:`kineverse.model.velocity_rows`.
         """
         with self._lock:
             every = dict(self.constraints)
@@ -257,10 +266,10 @@ class ModelView(SymbolicView):
             )
 
     def integrate(self, state: StateLike, speeds: StateLike, dt: float, *, clip: bool = False) -> State:
-        """Return the state ``dt`` seconds later, at constant speeds: :mod:`kineverse.model.integration`.
+        """Return the state after ``dt`` seconds at constant speeds; see :mod:`kineverse.model.integration`.
 
-        Surprise first: **limits and other constraints stop nothing**. At 100 rad/s a door of 1.57 rad is at
-        100 rad after one second, and :meth:`violations` says so.
+        **Limits and other constraints are ignored.** At 100 rad/s, a door with a limit of 1.57 rad is at 100
+        rad after one second, and :meth:`violations` reports it.
 
         Parameters
         ----------
@@ -268,20 +277,20 @@ class ModelView(SymbolicView):
             Values of at least all coordinates that move: a state, or a mapping from symbols or names of this
             model to numbers.
         speeds
-            From free speeds or their names to numbers [m/s], [rad/s]; those not given are 0.
+            Values by free speed or its name [m/s], [rad/s]; the default is 0.
         dt
-            [s]; may be negative.
+            Duration [s]; may be negative.
         clip
-            Whether each coordinate is brought back to the nearest end of its limits afterwards, as in
-            :meth:`default_state`: constraints on a straight line over it alone. Others, as on the sum of two,
-            or locks of speeds, are not looked at.
+            True to clip each coordinate to its limits afterwards, as in :meth:`default_state`: constraints on
+            a linear function of one coordinate. Other constraints, such as those on a sum of two coordinates
+            or locks of speeds, are ignored.
 
         Raises
         ------
         UnknownNameError
-            For a speed that moves nothing here, and a value of something that is not in the model.
+            For a speed that moves no coordinate, or a symbol that is not in the model.
         InvalidValueError
-            For NaN or an infinite step, or if coordinates run to infinity on the way.
+            For NaN or an infinite step, or if coordinates diverge.
         """
         with self._lock:
             coordinates, rates = self.degrees_of_freedom, self.rates
@@ -297,26 +306,26 @@ class ModelView(SymbolicView):
     def project(
         self, state: StateLike, *, fixed: Iterable[Symbol | str] = (), tolerance: float = TOLERANCE
     ) -> State:
-        """Return the state with coordinates moved as little as it takes for equality constraints to hold.
+        """Project a state onto the equality constraints with the least change of coordinates.
 
-        These are constraints on positions whose bounds are the same, such as closures of loops, see
-        :mod:`kineverse.model.projection`. Coordinates that they are about are moved to where they hold, with
-        whatever else limits these coordinates. What holds already and all other values stay.
+        These are position constraints with equal bounds, such as loop closures; see
+        :mod:`kineverse.model.projection`. The result satisfies them and the other constraints on their
+        coordinates. Coordinates of satisfied constraints and all other values stay.
 
         Parameters
         ----------
         state
             A state, or a mapping from symbols or names to numbers.
         fixed
-            Names, or symbols, of coordinates and articulations that do not move.
+            Coordinates and articulations that stay fixed, as symbols or names.
         tolerance
-            How far an equality may be off, in its unit.
+            Largest residual of a satisfied equality, in its unit.
 
         Raises
         ------
         NoSolutionError
-            If no such place is found, naming what does not hold, by how much, and what was tried; or if a
-            loop does not close at the state.
+            If no solution is found, naming the violated constraints, their residuals and the attempts; or if
+            a loop does not close at the state.
         UnknownNameError
             If a value is missing, or a name is unknown.
         """
@@ -327,7 +336,7 @@ class ModelView(SymbolicView):
             return project(self._equalities, as_state(state, self._known(state)), fixed, tolerance)
 
     def select_equalities(self, names: Collection[str] | None) -> EqualityConstraints:
-        """Return the equalities of these names, or all."""
+        """Return the equality constraints of some names, or all."""
         self._catch_up()
         return EqualityConstraints(
             dict(self._head[CONSTRAINTS]), self.rates, self._head[ARTICULATIONS], names
@@ -343,25 +352,26 @@ class ModelView(SymbolicView):
     ) -> SaveResult:
         """Write the model to a file: a document (.kv.json), URDF (.urdf) or MJCF (.xml).
 
-        A document says all of it. Motions that the others cannot say are refused by name; constraints are
-        left out with a remark, see :func:`kineverse.formats.saver.save`.
+        A document contains the whole model. URDF and MJCF cannot express all motions and constraints: motions
+        are refused by name, constraints are left out with a remark; see :func:`kineverse.formats.saver.save`.
 
         Parameters
         ----------
         path
-            Of the file.
+            Path of the file.
         tolerance
-            How far frames may be off in URDF and MJCF, in position [m] and angle [rad], with proof; None for
-            nowhere.
+            Largest error of a frame in URDF and MJCF, in position [m] and angle [rad], guaranteed; None for
+            no error.
         leave_out
-            Names of constraints and articulations.
+            Names of constraints and articulations to leave out.
         strict
-            Whether constraints that the format cannot say are refused, too.
+            True to refuse constraints that the format cannot express.
 
         Raises
         ------
         FormatError
-            If the name has another ending, the file cannot be written, or naming what the format cannot say.
+            If the name has another ending, the file cannot be written, or the format cannot express the
+            model.
         """
         names = (leave_out,) if isinstance(leave_out, str) else leave_out
         return registry.save_model(self, path, tolerance=tolerance, leave_out=names, strict=strict)

@@ -1,8 +1,7 @@
-"""Operations, what they write, and the rules of overwriting.
+"""Operations, their writes, and the rules of overwriting.
 
-An operation is a frozen value. Its ``apply`` reads from the model as it is at the operation's place in the
-sequence and returns its :class:`Writes`; what it read is recorded, so it is run again when, and only when,
-that changes.
+An operation is a frozen value. Its ``apply`` reads the model at the operation's place in the sequence and
+returns :class:`Writes`. The reads are recorded, so the operation is applied again if and only if they change.
 """
 
 from __future__ import annotations
@@ -49,22 +48,21 @@ FRAMES, BODIES, ARTICULATIONS, CONSTRAINTS, RATES, DATA = KINDS = (
 
 @dataclass(frozen=True)
 class Writes:
-    """What an operation writes, by name.
+    """Values that an operation writes, by name.
 
     Attributes
     ----------
     frames
-        :class:`Frame` values, or pairs (parent, transform) with anything :meth:`Frame.of` takes.
+        :class:`Frame` values, or pairs (parent, transform) for :meth:`Frame.of`.
     constraints
-        :class:`Constraint` values or triples (lower, expression, upper). They live and die with the
-        operation.
+        :class:`Constraint` values or triples (lower, expression, upper). They are removed with the operation.
     rates
-        From coordinates to rows ``{speed: expression}``, or to the expression that a coordinate is which
-        depends on others, see :mod:`kineverse.model.rates`.
+        Rows ``{speed: expression}`` by coordinate; for a dependent coordinate, its expression. See
+        :mod:`kineverse.model.rates`.
     bodies, articulations
-        What the frames carry, and records for people and exporters.
+        Bodies by frame, and records for people and exporters.
     data
-        Anything else: immutable values that can be compared.
+        Other immutable values that can be compared.
     """
 
     frames: Mapping[str, Frame | tuple[str, TransformLike | Sequence[TransformLike]]] = field(
@@ -78,7 +76,7 @@ class Writes:
 
     @staticmethod
     def of(writes: Mapping[tuple[str, str], Any]) -> Writes:
-        """Return the effects that have these writes, by kind and name."""
+        """Build writes from values by kind and name."""
         kinds: dict[str, dict[Any, Any]] = {kind: {} for kind in KINDS}
         for (kind, name), value in writes.items():
             if kind == RATES:
@@ -91,7 +89,7 @@ class Writes:
         return Writes(**kinds)
 
     def writes(self) -> dict[tuple[str, str], Any]:
-        """Return all of it in canonical form, by kind and name, in plain coordinates."""
+        """Return all values in canonical form, by kind and name, in plain coordinates."""
         result: dict[tuple[str, str], Any] = {}
         for name, frame in self.frames.items():
             value = _as_frame(name, frame)
@@ -158,9 +156,9 @@ def _check_value(kind: str, name: str, value: object) -> None:
 
 
 class Operation(ABC):
-    """A step in building a model; subclass it as a frozen dataclass.
+    """Step in building a model; subclass it as a frozen dataclass.
 
-    Ten lines make a new kind of articulation::
+    A new type of articulation takes ten lines::
 
         @dataclass(frozen=True)
         class Slide(kv.Operation):
@@ -176,27 +174,27 @@ class Operation(ABC):
     """
 
     traceable: ClassVar[bool] = True
-    """Whether what it computes can be written down as expressions of what it reads; False saves the try."""
+    """True if the writes may be expressions of the reads; False skips the attempt to trace them."""
 
     overrides: ClassVar[bool] = False
-    """Whether it may write over frames, bodies, articulations and rates that it has not looked at."""
+    """True if the operation may overwrite frames, bodies, articulations and rates that it has not read."""
 
     if not TYPE_CHECKING:  # a type checker knows the keywords
 
         def __new__(cls, *args, **keywords):
-            """Make an operation; wrong arguments are answered with the right ones."""
+            """Create an operation; an error for wrong arguments lists the right ones."""
             check_keywords(cls, args, keywords)
             return object.__new__(cls)
 
     @abstractmethod
     def apply(self, model: ReadRecorder) -> Writes:
-        """Return what the operation writes, given the model before it.
+        """Return the writes of the operation, given the model before it.
 
-        Must be a pure function of its fields and of what it reads from ``model``.
+        The result must be a pure function of the fields and of the values read from ``model``.
         """
 
     def default_tag(self) -> str:
-        """Return the tag used when none is given: the class and the operation's name, if it has one."""
+        """Return the default tag: the class, and the name of the operation if it has one."""
         kind = type(self).__name__
         words = "".join(f" {c.lower()}" if c.isupper() else c for c in kind).strip()
         name = getattr(self, "name", "")
@@ -204,23 +202,23 @@ class Operation(ABC):
 
 
 class Keywords(NamedTuple):
-    """The names that a class is made with: those that have to be given, and all."""
+    """Keywords of a class: the required ones, and all."""
 
     required: frozenset[str]
     known: tuple[str, ...]
 
 
 def check_keywords(made: type, arguments: tuple[Any, ...], given: dict[str, Any]) -> None:
-    """Look whether an operation that takes keywords only is given those that it takes.
+    """Check the arguments of an operation that takes keywords only.
 
     Raises
     ------
     ExpressionError
-        With the keywords, if one is missing or not known, or a value stands without one.
+        Listing the keywords, if one is missing or unknown, or a value is positional.
     """
     keywords = find_keywords(made)
     if keywords is None or not (arguments or given):
-        return  # pickle gives nothing, and to everybody else Python says what is missing
+        return  # pickle passes no arguments; in other cases Python reports the missing ones
     if not arguments and keywords.required <= given.keys() and given.keys() <= set(keywords.known):
         return
     name = made.__name__
@@ -241,7 +239,7 @@ def check_keywords(made: type, arguments: tuple[Any, ...], given: dict[str, Any]
 
 @cache
 def find_keywords(made: type) -> Keywords | None:
-    """Return the keywords of a dataclass that takes nothing else; None for any other class."""
+    """Return the keywords of a keyword-only dataclass; None for any other class."""
     maker = next(base for base in made.__mro__ if "__init__" in vars(base))
     parameters = vars(maker).get("__dataclass_params__")
     if parameters is None or not parameters.init:
@@ -257,17 +255,17 @@ ExpressionMap = Callable[[Expression], Any]
 
 
 def map_expressions(kind: str, value: Any, f: ExpressionMap) -> Any:
-    """Return a written value with ``f(e)`` in place of each expression; symbols of records stay.
+    """Apply a function to each expression of a written value; symbols of records stay.
 
     Parameters
     ----------
     kind
-        The kind of data that it is, one of :data:`kineverse.model.operation.KINDS`.
+        Kind of data, one of :data:`kineverse.model.operation.KINDS`.
     value
-        The value in canonical form, see :meth:`kineverse.model.Writes.writes`.
+        Value in canonical form, see :meth:`kineverse.model.Writes.writes`.
     f
-        Returns a transform for those of frames, a scalar for those of constraints and rates; among data and
-        in records numbers may take the place of expressions.
+        Function that maps a transform of a frame to a transform, and a scalar of a constraint or rate to a
+        scalar. In data and records it may return numbers.
     """
     if kind == FRAMES:
         return Frame(value.parent, tuple(f(x) if isinstance(x, Expression) else x for x in value.factors))
@@ -284,7 +282,7 @@ def map_expressions(kind: str, value: Any, f: ExpressionMap) -> Any:
 
 
 def find_expressions(kind: str, value: Any) -> list[Expression]:
-    """Return the expressions of a written value, symbols of records left out."""
+    """Return the expressions of a written value, without symbols of records."""
     found: list[Expression] = []
 
     def note(expression: Expression) -> Expression:
@@ -312,7 +310,7 @@ _NOUNS = {
 
 
 def may_override(entry: HistoryEntry, cell: Cell) -> bool:
-    """Return whether an operation may write over what is there: data, and what it knows to be there."""
+    """Return whether an operation may overwrite a cell: data, or a cell that it has read."""
     kind = cell[0]
     if kind == CONSTRAINTS:
         return False
@@ -320,7 +318,7 @@ def may_override(entry: HistoryEntry, cell: Cell) -> bool:
 
 
 def overwrite_error(cell: Cell, entry: HistoryEntry, maker: str) -> DuplicateNameError:
-    """Return the error for a name that an operation before has written."""
+    """Return the error for a name that an earlier operation has written."""
     kind, name = cell
     what = f"{_NOUNS[kind]} '{name}'"
     if kind == CONSTRAINTS:

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class SetBody(Operation):
-    """Gives a frame its body: what of it is seen and touched, and its inertia."""
+    """Sets the body of a frame: visual and collision shapes, and inertia."""
 
     name: str
     body: Body
@@ -38,13 +38,13 @@ class SetBody(Operation):
 
 @dataclass(frozen=True)
 class SetHome(Operation):
-    """Gives the coordinates of an articulation the values they have at home [m], [rad]."""
+    """Sets the home of an articulation: default values of its coordinates [m], [rad]."""
 
     name: str
     home: tuple[float, ...]
 
     def apply(self, model: ReadRecorder) -> Writes:
-        """Write the record of the articulation anew."""
+        """Write the record of the articulation with the new home."""
         return Writes(articulations={self.name: replace(model.articulations[self.name], home=self.home)})
 
     def default_tag(self) -> str:
@@ -54,14 +54,14 @@ class SetHome(Operation):
 
 @dataclass(frozen=True)
 class AddFrame(Operation):
-    """Places a frame in its parent, with what it carries."""
+    """Adds a frame to a parent, with an optional body."""
 
     name: str
     frame: Frame
     body: Body | None = None
 
     def apply(self, model: ReadRecorder) -> Writes:
-        """Write the frame, and its body if there is one."""
+        """Write the frame, and the body if it is not empty."""
         bodies = {} if self.body is None else {self.name: self.body}
         return Writes(frames={self.name: self.frame}, bodies=bodies)
 
@@ -88,7 +88,7 @@ class Constrain(Operation):
 
 @dataclass(frozen=True)
 class SetRate(Operation):
-    """Says how a coordinate moves with speeds."""
+    """Sets the rate of a coordinate as a linear function of speeds."""
 
     coordinate: Symbol
     row: RateRow
@@ -120,13 +120,13 @@ class SetData(Operation):
 
 @dataclass(frozen=True)
 class Attach(Operation):
-    """Puts an existing frame, with everything below it, into another parent."""
+    """Attaches an existing frame, with all frames below it, to another parent."""
 
     name: str
     frame: Frame
 
     def apply(self, model: ReadRecorder) -> Writes:
-        """Write the frame anew."""
+        """Write the frame with the new parent."""
         if self.name not in model.frames:
             model.frames[self.name]  # raises, with similar names
         return Writes(frames={self.name: self.frame})
@@ -138,7 +138,7 @@ class Attach(Operation):
 
 @dataclass(frozen=True)
 class Override(Operation):
-    """Applies an operation that may write over what operations before it wrote."""
+    """Applies an operation with permission to overwrite values of earlier ones."""
 
     overrides = True
 
@@ -146,30 +146,30 @@ class Override(Operation):
 
     @property
     def traceable(self) -> bool:  # type: ignore[override]
-        """Whether what the operation computes can be written down as expressions of what it reads."""
+        """True if the operation is traceable."""
         return self.operation.traceable
 
     def apply(self, model: ReadRecorder) -> Writes:
-        """Write what the operation writes."""
+        """Return the writes of the operation."""
         return self.operation.apply(model)
 
     def default_tag(self) -> str:
-        """Return ``override`` and the tag of the operation, which what it writes over may have."""
+        """Return ``override`` and the tag of the operation."""
         return f"override {self.operation.default_tag()}"
 
 
 @dataclass(frozen=True)
 class SoftLimits(Operation):
-    """Keeps a joint within the range its safety controller defends, which lies inside its end stops.
+    """Limits a joint to the range of its safety controller, which is inside the hard limits.
 
     Attributes
     ----------
     name
-        Of the articulation; the constraint is called ``name/soft_limits``.
+        Name of the articulation; the constraint is called ``name/soft_limits``.
     q
-        The coordinate, or the expression that stands for it [rad] or [m].
+        Coordinate, or expression of the joint position [rad] or [m].
     lower, upper
-        The soft limits [rad] or [m].
+        Soft limits [rad] or [m].
     """
 
     name: str

@@ -1,14 +1,13 @@
 """Projection of a state onto the manifold of equality constraints.
 
-Of the free coordinates q that equalities are about, those are moved for which something does not hold, and
-what shares equalities with these. With rows c(q) = 0 for the equalities and h(q) <= 0 for all other
-constraints on positions, Gauss-Newton steps of least change,
+The unknowns q are the free coordinates of violated equalities, and those of equalities that share coordinates
+with them. With rows c(q) = 0 for the equalities and h(q) <= 0 for the other position constraints,
+Gauss-Newton steps of minimum norm,
 
     min ‖Δq‖  subject to  J Δq = -(c, max(h, 0)),  lower <= q + Δq <= upper,
 
-lead to where they hold; coordinates that would leave their limits stay at them, and the rest makes up for it.
-From there, steps along the manifold lead to the place on it nearest to where the state was. Quaternions stay
-of unit length.
+lead to a feasible point. Coordinates at a limit stay there, and the others compensate. From there, steps
+along the manifold minimise the distance to the original state. Quaternions stay of unit length.
 """
 
 from __future__ import annotations
@@ -39,7 +38,7 @@ _QUATERNION = ("qx", "qy", "qz", "qw")
 
 @dataclass(frozen=True)
 class ResidualRow:
-    """What a constraint asks for: that an expression is zero, or that it is not positive."""
+    """Residual of a constraint: an expression that has to be zero, or not positive."""
 
     name: str
     value: Expression
@@ -47,27 +46,28 @@ class ResidualRow:
 
 
 class EqualityConstraints:
-    """The equalities of a model and what else its coordinates have to keep, as functions of numbers.
+    """Equality constraints of a model, and the other constraints on their coordinates, as numeric functions.
 
     Parameters
     ----------
     constraints
-        All of a model's, plain.
+        All constraints of the model, in plain coordinates.
     rates
-        Its table.
+        Rate table of the model.
     articulations
-        Its records, which know quaternions.
+        Records of the model, which name the coordinates of quaternions.
     wanted
-        The names of the equalities that are to hold; None for all.
+        Names of the equalities to satisfy; None for all.
 
     Attributes
     ----------
     rows
-        The equalities, and behind them other constraints on what they are about, but for limits.
+        Residuals of the equalities, followed by those of other constraints on their coordinates, without
+        limits on single coordinates.
     count
-        How many equalities there are.
+        Number of equalities.
     symbols, coordinates
-        What the rows are about, and which of it is theirs to move.
+        Symbols of the rows, and the coordinates among them that may move.
     """
 
     def __init__(
@@ -79,11 +79,13 @@ class EqualityConstraints:
     ) -> None:
         self.rates, self.articulations = rates, articulations
         rows = list(_make_rows(constraints, rates, wanted))
-        self._simple = [row for row in rows if not row.equality and _about_one(row)]
+        self._simple = [row for row in rows if not row.equality and _limits_single(row)]
         equal = [row for row in rows if row.equality]
         moved = {s for row in equal for s in row.value.symbols if s.has_derivative}
         self.rows: Sequence[ResidualRow] = equal + [
-            row for row in rows if not row.equality and not _about_one(row) and moved & set(row.value.symbols)
+            row
+            for row in rows
+            if not row.equality and not _limits_single(row) and moved & set(row.value.symbols)
         ]
         self.count = len(equal)
         self.symbols = tuple(
@@ -93,12 +95,12 @@ class EqualityConstraints:
 
     @cached_property
     def evaluate(self) -> Any:
-        """An evaluator of all rows, shape (m,), and their derivatives by the coordinates, (m, n)."""
+        """Evaluator of all rows, shape (m,), and their derivatives by the coordinates, shape (m, n)."""
         values = array([row.value for row in self.rows])
         return compile([values, values.partial(self.coordinates)], self.symbols, tier="interpreter").bind()
 
-    def evaluated(self, at: Array) -> tuple[Array, Array] | None:
-        """Return all rows and their derivatives; None where a closed loop among them does not close."""
+    def evaluate_rows(self, at: Array) -> tuple[Array, Array] | None:
+        """Return all rows and their derivatives; None if a closed loop among them does not close."""
         try:
             self.evaluate(at)
         except NoSolutionError:
@@ -108,7 +110,7 @@ class EqualityConstraints:
 
     @cached_property
     def limits(self) -> tuple[Array, Array]:
-        """Lower and upper limits of the coordinates, ±inf where there are none."""
+        """Lower and upper limits of the coordinates; ±inf for none."""
         lower, upper = np.full(len(self.coordinates), -np.inf), np.full(len(self.coordinates), np.inf)
         for row in self._simple:
             (symbol,) = row.value.symbols
@@ -125,7 +127,7 @@ class EqualityConstraints:
 
     @cached_property
     def quaternions(self) -> list[list[int]]:
-        """Where the four numbers of each quaternion are among the coordinates."""
+        """Indices of the four coordinates of each quaternion."""
         place = {s: i for i, s in enumerate(self.coordinates)}
         found = []
         for record in self.articulations.values():
@@ -136,7 +138,7 @@ class EqualityConstraints:
 
 
 def is_equality(constraint: Constraint) -> bool:
-    """Return whether a constraint is one on positions whose bounds are the same."""
+    """Return whether a constraint is a position constraint with equal bounds."""
     if constraint.order or constraint.lower != constraint.upper:
         return False
     return bool(constraint.lower.symbols) or abs(float(constraint.lower)) < np.inf
@@ -166,17 +168,17 @@ def _line(value: Expression) -> tuple[float, float] | None:
     return Constraint(value, value, value).line
 
 
-def _about_one(row: ResidualRow) -> bool:
+def _limits_single(row: ResidualRow) -> bool:
     """Return whether a row limits a single coordinate."""
     return len(row.value.symbols) == 1 and _line(row.value) is not None
 
 
 TOLERANCE = 1e-9
-"""How far from holding a constraint may be, as in :meth:`kineverse.Model.violations`."""
+"""Largest residual of a satisfied constraint, as in :meth:`kineverse.Model.violations`."""
 
 _STEPS, _NEARER = 100, 40
 _LONGEST = 0.5
-"""How far a step goes at most [m], [rad]: farther away, derivatives say little."""
+"""Longest step [m], [rad]. Linearisations are not valid beyond."""
 _STARTS = 12
 _SINGULAR, _AT_BOUND = 1e-9, 1e-9
 
@@ -187,9 +189,9 @@ def project(
     fixed: Iterable[Symbol | str] = (),
     tolerance: float = TOLERANCE,
 ) -> State:
-    """Move coordinates so that equalities hold, and return the state, see :meth:`ModelView.project`."""
+    """Project a state onto the manifold of equality constraints, see :meth:`ModelView.project`."""
     tolerance = as_tolerance(tolerance)
-    held = _held(equalities, fixed)
+    held = _fixed_coordinates(equalities, fixed)
     symbols = equalities.symbols
     given = [state.given(s) for s in symbols]
     missing = [s for s, value in zip(symbols, given, strict=True) if value is None and s.value is None]
@@ -207,8 +209,8 @@ def project(
     return state.updated(moved) if moved else state
 
 
-def _held(equalities: EqualityConstraints, fixed: Iterable[Symbol | str]) -> frozenset[Symbol]:
-    """Return the coordinates that stay, those behind what depends on others among them."""
+def _fixed_coordinates(equalities: EqualityConstraints, fixed: Iterable[Symbol | str]) -> frozenset[Symbol]:
+    """Return the fixed coordinates; a dependent coordinate stands for those that determine it."""
     dependent = {str(s): e for s, e in equalities.rates.dependent.items()}
     records = equalities.articulations
     by_name = {str(s): s for s in equalities.symbols}
@@ -235,7 +237,7 @@ def _held(equalities: EqualityConstraints, fixed: Iterable[Symbol | str]) -> fro
 def _search(
     equalities: EqualityConstraints, at: Array, held: frozenset[Symbol], tolerance: float
 ) -> _Search | None:
-    """Return what is to be solved: what is broken, with all equalities about the same coordinates."""
+    """Return the problem to solve: the violated rows, and all equalities that share their coordinates."""
     count = equalities.count
     if not count:
         return None
@@ -259,7 +261,7 @@ def _search(
 
 
 class _Search:
-    """The search for one state: some rows, and some of the coordinates."""
+    """Search for one state: a subset of the rows and of the coordinates."""
 
     def __init__(
         self,
@@ -284,50 +286,50 @@ class _Search:
         ]
 
     def nearest(self) -> Array:
-        """Return all numbers where everything holds, as near as can be to where they were.
+        """Return all values at the feasible point nearest to the original state.
 
         Raises
         ------
         NoSolutionError
-            Naming what does not hold, by how much, and what was tried.
+            Naming the violated constraints, their residuals, and the attempts.
         """
         start = self._unit(np.clip(self._at[self._places], self._lower, self._upper))
         best, found = start, []
         least = np.inf
         generator = np.random.default_rng(0)
         for attempt in range(_STARTS + 1):
-            begin = start if not attempt else self._elsewhere(start, generator, attempt)
-            x, off = self._restored(begin)
+            begin = start if not attempt else self._random_start(start, generator, attempt)
+            x, off = self._restore(begin)
             if off <= self._tolerance:
-                found.append(self._drawn_back(x, start))
+                found.append(self._minimize_distance(x, start))
                 if not attempt or len(found) == 3:
                     break
             elif off < least:
                 best, least = x, off
         if not found:
-            raise self._unsolved(best)
+            raise self._no_solution_error(best)
         x = min(found, key=lambda x: float(np.linalg.norm(x - start)))
         return self._all(x)
 
-    def _restored(self, x: Array) -> tuple[Array, float]:
-        """Return where rows hold, or where it goes on nowhere, and by how much the worst is off there."""
+    def _restore(self, x: Array) -> tuple[Array, float]:
+        """Return a feasible point, or the point without further progress, and the largest residual there."""
         damping = 0.0
-        there = self._look(x)
+        there = self._evaluate_rows(x)
         if there is None:
             return x, np.inf
-        wrong, by_x = self._off(there[0]), there[1]
+        wrong, by_x = self._residuals(there[0]), there[1]
         for _ in range(_STEPS):
             if not wrong.any():
                 break
             step = self._step(x, wrong, by_x, damping)
             for scale in (1.0, 0.5, 0.1):
                 tried = self._unit(np.clip(x + scale * step, self._lower, self._upper))
-                there = self._look(tried)
-                if there is not None and np.linalg.norm(self._off(there[0])) < np.linalg.norm(wrong):
+                there = self._evaluate_rows(tried)
+                if there is not None and np.linalg.norm(self._residuals(there[0])) < np.linalg.norm(wrong):
                     break
                 there = None
             if there is not None:
-                x, wrong, by_x = tried, self._off(there[0]), there[1]
+                x, wrong, by_x = tried, self._residuals(there[0]), there[1]
                 damping = damping / 10 if damping > 1e-8 else 0.0
             elif np.abs(wrong).max() <= 0.1 * self._tolerance or damping > 1e4:
                 break
@@ -336,7 +338,7 @@ class _Search:
         return x, float(np.abs(wrong).max(initial=0.0))
 
     def _step(self, x: Array, wrong: Array, by_x: Array, damping: float) -> Array:
-        """Return the shortest step that mends rows to first order; who would leave limits stops there."""
+        """Return the shortest step that zeroes the rows to first order, clipped to the limits."""
         step = np.zeros(len(x))
         free = np.ones(len(x), dtype=bool)
         rows = wrong != 0.0
@@ -362,23 +364,23 @@ class _Search:
             free &= ~left
         return step
 
-    def _drawn_back(self, x: Array, start: Array) -> Array:
-        """Return where rows hold as well, and nearer to where the search began: along the manifold."""
+    def _minimize_distance(self, x: Array, start: Array) -> Array:
+        """Return a feasible point nearer to the start, by steps along the manifold."""
         pull = 1.0
         for _ in range(_NEARER):
-            there = self._look(x)
+            there = self._evaluate_rows(x)
             if there is None or pull < 1e-3:
                 break
             way, (values, by_x) = start - x, there
             free = ~(((x <= self._lower) & (way < 0)) | ((x >= self._upper) & (way > 0)))
             along = np.zeros(len(x))
-            # What is at a bound may leave it, and not go on.
+            # A coordinate at a bound may only move inwards.
             kept = self._equal | ((by_x @ way > 0) & (values > -_AT_BOUND))
             matrix = by_x[kept][:, free]
             along[free] = way[free] - np.linalg.lstsq(matrix, matrix @ way[free], rcond=_SINGULAR)[0]
             if np.linalg.norm(along) <= 1e-9:
                 break
-            tried, off = self._restored(self._unit(np.clip(x + pull * along, self._lower, self._upper)))
+            tried, off = self._restore(self._unit(np.clip(x + pull * along, self._lower, self._upper)))
             nearer = np.linalg.norm(tried - start) < np.linalg.norm(x - start) - 1e-14
             if off <= self._tolerance and nearer:
                 x, pull = tried, min(1.0, 2 * pull)
@@ -386,18 +388,18 @@ class _Search:
                 pull /= 2
         return x
 
-    def _look(self, x: Array) -> tuple[Array, Array] | None:
-        """Return the values of rows and their derivatives; None where something has none."""
-        found = self._equalities.evaluated(self._all(x))
+    def _evaluate_rows(self, x: Array) -> tuple[Array, Array] | None:
+        """Return the values of the rows and their derivatives; None if one is undefined."""
+        found = self._equalities.evaluate_rows(self._all(x))
         if found is None:
             return None
         values, by_x = found[0][self._rows], found[1][self._rows][:, self._columns]
         return (values, by_x) if np.isfinite(values).all() and np.isfinite(by_x).all() else None
 
-    def _off(self, values: Array) -> Array:
-        """Return by how much rows are off: bounds that are kept by nothing."""
+    def _residuals(self, values: Array) -> Array:
+        """Return the residuals of the rows; satisfied inequalities have none."""
         off = np.where(self._equal | (values > 0), values, 0.0)
-        return np.where(np.abs(off) < 1e-15, 0.0, off)  # what rounding leaves is no reason to move
+        return np.where(np.abs(off) < 1e-15, 0.0, off)  # rounding errors are no residuals
 
     def _all(self, x: Array) -> Array:
         at = self._at.copy()
@@ -413,21 +415,21 @@ class _Search:
     def _names(self, columns: Iterable[int]) -> list[str]:
         return [str(self._equalities.coordinates[self._columns[k]]) for k in columns]
 
-    def _elsewhere(self, start: Array, generator: np.random.Generator, attempt: int) -> Array:
-        """Return another place to begin at, first near by, then anywhere within limits."""
+    def _random_start(self, start: Array, generator: np.random.Generator, attempt: int) -> Array:
+        """Return another start, first near the state, later anywhere within the limits."""
         reach = np.where(np.isfinite(self._upper - self._lower), (self._upper - self._lower) / 2, np.pi)
         reach = np.minimum(reach, np.pi) * min(1.0, 0.1 * attempt)
         moved = start + generator.uniform(-1, 1, len(start)) * reach
         return self._unit(np.clip(moved, self._lower, self._upper))
 
-    def _unsolved(self, x: Array) -> NoSolutionError:
-        there = self._look(x)
+    def _no_solution_error(self, x: Array) -> NoSolutionError:
+        there = self._evaluate_rows(x)
         if there is None:
             return NoSolutionError(
                 "The state cannot be projected: a closed loop that the equalities are about has no solution "
                 "there. Begin where it closes."
             )
-        off = np.abs(self._off(there[0]))
+        off = np.abs(self._residuals(there[0]))
         worst = [i for i in np.argsort(-off) if off[i] > self._tolerance]
         sizes = {self._equalities.rows[self._rows[i]].name: off[i] for i in worst}
         listed = ", ".join(f"'{n}' is off by {size:.3g}" for n, size in list(sizes.items())[:4])
@@ -437,15 +439,15 @@ class _Search:
         )
         moved, stopped = self._names(range(len(x))), self._names(np.flatnonzero(ends).tolist())
         held = sorted(str(s) for s in self._held if s in self._equalities.coordinates)
-        tried = [f"moved were {_some(moved)}" if moved else "nothing was free to move"]
-        tried += [f"at their limits are {_some(stopped)}"] if stopped else []
-        tried += [f"fixed were {_some(held)}"] if held else []
+        tried = [f"moved were {_format_names(moved)}" if moved else "nothing was free to move"]
+        tried += [f"at their limits are {_format_names(stopped)}"] if stopped else []
+        tried += [f"fixed were {_format_names(held)}"] if held else []
         return NoSolutionError(
             f"The state cannot be projected: at best {listed}{more}, from {_STARTS + 1} starts. "
             f"{'; '.join(tried).capitalize()}. Begin nearer to where it closes, or let more coordinates move."
         )
 
 
-def _some(names: Sequence[str]) -> str:
+def _format_names(names: Sequence[str]) -> str:
     shown = ", ".join(f"'{name}'" for name in names[:6])
     return shown + (f" and {len(names) - 6} more" if len(names) > 6 else "")

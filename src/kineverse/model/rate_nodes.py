@@ -17,14 +17,14 @@ if TYPE_CHECKING:
 
 
 class Carried(Node):
-    """A coordinate whose gradient is its row."""
+    """Carried coordinate: a coordinate with its row as gradient."""
 
     __slots__ = ()
     kind = "carried"
 
     @property
     def rates(self) -> Rates:
-        """The table, closed over what the row is made of."""
+        """Part of the rate table that the row depends on."""
         table: Rates = self.options[0]
         return table
 
@@ -37,12 +37,12 @@ class Carried(Node):
 
     @property
     def parts(self) -> tuple[Expression, ...]:
-        """What the rows are made of; the coordinate itself is no part."""
+        """Expressions of the rows; the coordinate itself is not among them."""
         return tuple(entry for row in self.rates.values() for entry in row.values())
 
     @property
     def label(self) -> str:
-        """What errors and printing call it."""
+        """Name in errors and in printed expressions."""
         return "carried"
 
     @classmethod
@@ -64,14 +64,14 @@ class Carried(Node):
         return any(s in self.rates.symbols for s in substitution)
 
     def substitute(self, substitution: Substitution) -> Expression:
-        """Return what the node becomes under a substitution."""
+        """Return the node after a substitution."""
         relevant = {s: e for s, e in substitution.items() if s in self.rates.symbols}
         itself = _expression_of(self)
         return Composed.from_arguments((itself, *relevant.values()), (), tuple(relevant))
 
 
 class Dependent(Node):
-    """A coordinate that depends on others: its value and gradient are those of an expression."""
+    """Dependent coordinate: value and gradient are those of an expression in other coordinates."""
 
     __slots__ = ()
     kind = "dependent"
@@ -98,19 +98,19 @@ class Dependent(Node):
         return self.arguments[0].gradient(heuristic)
 
     def substitute(self, substitution: Substitution) -> Expression:
-        """Return the expression after a substitution, which is the coordinate of this model no more."""
+        """Return the expression after a substitution; it no longer stands for the coordinate."""
         return apply_substitution(self.arguments[0], substitution)
 
 
 class Composed(Node):
-    """A carried coordinate after a substitution, unfolded one derivative at a time."""
+    """Carried coordinate after a substitution, unfolded one derivative at a time."""
 
     __slots__ = ()
     kind = "composed"
 
     @property
     def substitution(self) -> dict[Symbol, Expression]:
-        """What was replaced by what."""
+        """Replacements by symbol."""
         return dict(zip(self.options, self.arguments[1:], strict=True))
 
     @classmethod
@@ -136,14 +136,12 @@ class Composed(Node):
         return super().depends_on(substitution) or self._inner().depends_on(substitution)
 
     def substitute(self, substitution: Substitution) -> Expression:
-        """Return what the node becomes under a substitution."""
-        return Composed.from_arguments(
-            (_expression_of(self), *substitution.values()), (), tuple(substitution)
-        )
+        """Return the node after a substitution."""
+        return Composed.from_arguments((_expression_of(self), *substitution.values()), (), tuple(substitution))
 
 
 def to_plain(expression: Expression) -> Expression:
-    """Return the expression with carried coordinates put back to plain ones, looking into nodes."""
+    """Replace carried coordinates by plain symbols, inside nodes as well."""
     if not expression._nodes:
         return expression
     images: dict[Node, Expression] = {}
@@ -155,12 +153,12 @@ def to_plain(expression: Expression) -> Expression:
 
 
 def _parts(node: Node) -> tuple[Expression, ...]:
-    """Return what has to be plain before a node can be."""
+    """Return the expressions that are converted before a node is."""
     return () if isinstance(node, Carried | Dependent) else node.arguments
 
 
 def _plain_image(node: Node, plain_part: Callable[[Expression], Expression]) -> Expression | None:
-    """Return what a node becomes, None if it stays what it is."""
+    """Return the plain form of a node; None if it is plain already."""
     if isinstance(node, Carried | Dependent):
         return node.coordinate
     if isinstance(node, Composed):
@@ -172,7 +170,7 @@ def _plain_image(node: Node, plain_part: Callable[[Expression], Expression]) -> 
 
 
 def _recompose(node: Composed, plain_part: Callable[[Expression], Expression]) -> Expression | None:
-    """Return a composition over plain replacements, None if they are plain already."""
+    """Return a composition over plain replacements; None if they are plain already."""
     given = node.substitution
     inner = node.arguments[0]
     source = inner if isinstance(node._inner(), Carried) else plain_part(inner)
@@ -180,12 +178,12 @@ def _recompose(node: Composed, plain_part: Callable[[Expression], Expression]) -
     if source is inner and all(replacements.get(s) is e for s, e in given.items()):
         return None
     composed = apply_substitution(source, replacements) if replacements else source
-    # What the replacements leave as it is, is a carried coordinate like any other.
+    # A coordinate without a replacement is an ordinary carried coordinate.
     return plain_part(inner) if composed is source else composed
 
 
 def collect_symbols(expression: Expression) -> set[Symbol]:
-    """Return the symbols of values and of given gradients."""
+    """Return the symbols of an expression, those of overridden gradients included."""
     symbols, nodes = leaves(expression)
     found = set(symbols)
     for node in topological_order(nodes, _subjects, lambda _: False):
@@ -194,8 +192,8 @@ def collect_symbols(expression: Expression) -> set[Symbol]:
 
 
 def _subjects(node: Node) -> tuple[Expression, ...]:
-    """Return what a node is about."""
-    # What was replaced in a composition is inside it, but it is not about that any more.
+    """Return the arguments of a node that its value depends on."""
+    # The first argument of a composition is the expression before the substitution.
     return node.arguments[isinstance(node, Composed) :]
 
 

@@ -1,16 +1,16 @@
-"""Rates: how coordinates move with speeds, q̇ = R(q) u.
+"""Rates of coordinates as linear functions of speeds, q̇ = R(q) u.
 
-A coordinate x without a row is free, ``{ẋ: 1}``. A row ``{v: expression}`` says ``ẋ = Σ expression·v``: the
-wheels of a differential drive, the angular velocity of a quaternion. What a model hands out has such
-coordinates *carried*: each is an opaque node whose value is x and whose gradient is its row, so every
-gradient shows the wheels.
+A coordinate x without a row is free, ``{ẋ: 1}``. A row ``{v: expression}`` stands for ``ẋ = Σ expression·v``,
+as for the wheels of a differential drive or the angular velocity of a quaternion. In the expressions of a
+model such coordinates are *carried*: an opaque node with the value x and the row as gradient. So every
+gradient is in terms of the wheels.
 
-A coordinate may also *depend* on others, as the angles of a closed loop do on its crank: then its entry is an
-expression. What the model hands out has that expression in its place, and moves with its gradient.
+A coordinate may also *depend* on others, as the angles of a closed loop on its crank. Then its entry is an
+expression, which replaces the coordinate in the expressions of the model, with its gradient.
 
-Rows use the carried coordinates themselves (the heading in a wheel's row turns, or accelerations are wrong),
-which may well be circular: a quaternion's rate is made of the quaternion. A carried coordinate therefore
-refers to its table and unfolds one derivative at a time.
+Rows contain carried coordinates themselves, because accelerations need the rate of the heading in a wheel's
+row. This may be circular: the rate of a quaternion is a function of the quaternion. A carried coordinate
+therefore refers to its table and unfolds one derivative at a time.
 """
 
 from __future__ import annotations
@@ -41,14 +41,14 @@ RateEntry: TypeAlias = RateRow | Expression
 
 
 def as_entry(coordinate: Symbol, value: Mapping[Symbol, ExpressionLike] | ExpressionLike) -> RateEntry:
-    """Return a row, or what a dependent coordinate is, in plain coordinates.
+    """Return the row, or the expression of a dependent coordinate, in plain coordinates.
 
     Raises
     ------
     ModelError
         If the coordinate is not a position, or a key of the row not a velocity.
     InvalidValueError
-        If the expression is no scalar, or is about speeds.
+        If the expression is not scalar, or contains speeds.
     """
     if isinstance(value, Mapping):
         return as_row(coordinate, value)
@@ -68,7 +68,7 @@ def _check_coordinate(coordinate: Symbol) -> None:
 
 
 def as_row(coordinate: Symbol, row: Mapping[Symbol, ExpressionLike]) -> RateRow:
-    """Return a row in canonical order, carried coordinates put back to plain ones.
+    """Return a row in canonical order and plain coordinates.
 
     Raises
     ------
@@ -92,20 +92,20 @@ def as_row(coordinate: Symbol, row: Mapping[Symbol, ExpressionLike]) -> RateRow:
 
 
 class Rates(Mapping[Symbol, Mapping[Symbol, Expression]]):
-    """An immutable rate table: from driven coordinates to rows over free speeds, in plain coordinates.
+    """Immutable rate table: rows over free speeds by driven coordinate, in plain coordinates.
 
-    Rows that name the speed of a coordinate with an entry of its own are resolved through it. What depends on
-    others is no part of the mapping; :meth:`row` knows how that moves, too.
+    Speeds of coordinates with entries of their own are resolved in all rows. Dependent coordinates are not in
+    the mapping; :meth:`row` returns their rows as well.
 
     Attributes
     ----------
     dependent
-        What coordinates are that depend on others, in plain coordinates that do not.
+        Expressions of the dependent coordinates, in independent plain coordinates.
 
     Raises
     ------
     ModelError
-        For rows that never end in free speeds, and coordinates that depend on themselves, with the circle.
+        For cyclic rows and cyclic dependent coordinates, with the cycle.
     """
 
     dependent: Mapping[Symbol, Expression]
@@ -116,23 +116,23 @@ class Rates(Mapping[Symbol, Mapping[Symbol, Expression]]):
         self._carried: dict[Symbol, Expression] = {}
         expressions = {x: e for x, e in self._given.items() if isinstance(e, Expression)}
         self.dependent = dict[Symbol, Expression]()
-        # Symbols of gradients count, too: what is carried is carried in them.
+        # Symbols of overridden gradients count, because these are carried as well.
         made_of = {
             x: sorted(collect_symbols(e) & expressions.keys(), key=str) for x, e in expressions.items()
         }
         for x in _sort_topologically(expressions, made_of.__getitem__, _DEPENDING):
             self.dependent[x] = self.resolve(expressions[x])
-        rows = {x: self._expanded(e) for x, e in self._given.items() if not isinstance(e, Expression)}
+        rows = {x: self._expand(e) for x, e in self._given.items() if not isinstance(e, Expression)}
         paths = {x.path for x in rows}
 
         def through(x: Symbol) -> list[Symbol]:
             return [v.position for v, _ in rows[x] if v.path in paths and v.position in rows]
 
         for x in _sort_topologically(rows, through, _CYCLIC):
-            self._rows[x] = self._combined(rows[x])
+            self._rows[x] = self._combine(rows[x])
 
-    def _expanded(self, row: RateRow) -> RateRow:
-        """Return a row with everything about dependent coordinates put in terms of others."""
+    def _expand(self, row: RateRow) -> RateRow:
+        """Return a row in terms of independent coordinates."""
         if not self.dependent:
             return row
         result: dict[Symbol, Expression] = {}
@@ -143,7 +143,7 @@ class Rates(Mapping[Symbol, Mapping[Symbol, Expression]]):
             _add(result, {v: factor * g for v, g in gradient.items()})
         return tuple(result.items())
 
-    def _combined(self, row: Iterable[tuple[Symbol, Expression]]) -> dict[Symbol, Expression]:
+    def _combine(self, row: Iterable[tuple[Symbol, Expression]]) -> dict[Symbol, Expression]:
         """Return a row over free speeds."""
         result: dict[Symbol, Expression] = {}
         for speed, factor in row:
@@ -152,12 +152,12 @@ class Rates(Mapping[Symbol, Mapping[Symbol, Expression]]):
         return dict(sorted(result.items(), key=lambda item: item[0].sort_key))
 
     def resolve(self, expression: Expression) -> Expression:
-        """Return a plain expression in coordinates that do not depend on others."""
+        """Return an expression in independent plain coordinates."""
         wanted = {s: self.dependent[s] for s in collect_symbols(expression) if s in self.dependent}
         return apply_substitution(expression, wanted)
 
     def row(self, coordinate: Symbol | str) -> Mapping[Symbol, Expression] | None:
-        """Return how a coordinate moves with free speeds, in plain coordinates; None if it is free itself."""
+        """Return the row of a coordinate over free speeds, in plain coordinates; None if it is free."""
         if isinstance(coordinate, str):
             named = {str(symbol): symbol for symbol in (*self._rows, *self.dependent)}
             if coordinate not in named:
@@ -165,12 +165,12 @@ class Rates(Mapping[Symbol, Mapping[Symbol, Expression]]):
             coordinate = named[coordinate]
         itself = self.dependent.get(coordinate)
         if itself is not None:
-            return self._combined(itself.gradient(False).items())
+            return self._combine(itself.gradient(False).items())
         return self._rows.get(coordinate)
 
     @property
     def is_empty(self) -> bool:
-        """Whether all coordinates are free."""
+        """True if all coordinates are free."""
         return not self._given
 
     def __getitem__(self, coordinate: Symbol | str) -> Mapping[Symbol, Expression]:
@@ -227,7 +227,7 @@ class Rates(Mapping[Symbol, Mapping[Symbol, Expression]]):
         return hash(self.key)
 
     def closure(self, coordinate: Symbol) -> Rates:
-        """Return the part of the table that the row of one coordinate is made of."""
+        """Return the part of the table that the row of one coordinate depends on."""
         wanted, found = [coordinate], set[Symbol]()
         while wanted:
             x = wanted.pop()
@@ -240,7 +240,7 @@ class Rates(Mapping[Symbol, Mapping[Symbol, Expression]]):
 
     @cached_property
     def key(self) -> bytes:
-        """A digest of the content, the same in every process."""
+        """Digest of the content, equal in every process."""
         digest = hashlib.blake2b(digest_size=16)
         for x in sorted(self._given, key=lambda s: s.sort_key):
             digest.update(repr(x.sort_key).encode())
@@ -254,7 +254,7 @@ class Rates(Mapping[Symbol, Mapping[Symbol, Expression]]):
 
     @cached_property
     def symbols(self) -> frozenset[Symbol]:
-        """Every driven coordinate, every symbol of a row, and the coordinates of the speeds."""
+        """Driven coordinates, symbols of rows, and coordinates of speeds."""
         found = set(self._rows)
         for row in self._rows.values():
             for speed, value in row.items():
@@ -273,7 +273,7 @@ class Rates(Mapping[Symbol, Mapping[Symbol, Expression]]):
         return known
 
     def carry(self, expression: Expression) -> Expression:
-        """Return the expression in carried coordinates; carried twice is carried once."""
+        """Return the expression in carried coordinates; the function is idempotent."""
         if not self._given:
             return expression
         expression = to_plain(expression)
@@ -283,7 +283,7 @@ class Rates(Mapping[Symbol, Mapping[Symbol, Expression]]):
         return apply_substitution(expression, wanted)
 
     def eliminate(self, expression: Expression) -> Expression:
-        """Return the expression with every left-over ẋ replaced by ``Σ R[x][v]·v``."""
+        """Replace every remaining ẋ in an expression by ``Σ R[x][v]·v``."""
         wanted = {}
         for s in expression.symbols:
             row = self.row(s.position) if s.order == 1 else None
@@ -302,10 +302,10 @@ _DEPENDING = "Coordinates that depend on themselves"
 def _sort_topologically(
     coordinates: Iterable[Symbol], through: Callable[[Symbol], list[Symbol]], problem: str
 ) -> Iterator[Symbol]:
-    """Yield coordinates, and before each of them those it leads to; a circle is a problem."""
+    """Yield coordinates in topological order; raise for a cycle."""
     done: set[Symbol] = set()
     for coordinate in coordinates:
-        # A path by hand: chains may be longer than Python's stack.
+        # Iterative search, because chains may be longer than Python's stack.
         path = {} if coordinate in done else {coordinate: None}
         while path:
             x = next(reversed(path))

@@ -28,16 +28,16 @@ _MANY = 100
 
 
 class Read(IntFlag):
-    """How closely something was looked at."""
+    """Strength of a read: existence of a name only, or its value."""
 
     EXISTENCE = 1
     VALUE = 2
 
 
 class Reads:
-    """The recorded reads of one run: cells with how closely they were read, and listings by kind.
+    """Recorded reads of one run: cells with the strength of the read, and listed kinds.
 
-    What is found out about the run from them, its trace, is kept here, and gone with the next run.
+    The trace of the run, once it is made, is stored here as well.
     """
 
     __slots__ = ("cells", "listings", "trace")
@@ -48,15 +48,15 @@ class Reads:
         self.trace: object = None
 
     def add(self, cell: Cell, how: Read) -> None:
-        """Remember a look at a cell."""
+        """Record a read of a cell."""
         known = self.cells.get(cell)
         self.cells[cell] = how if known is None else known | how
 
 
 class ReadRecorder:
-    """The model before an operation: the same names as on :class:`~kineverse.Model`, every read recorded.
+    """Model before an operation, with the names of :class:`~kineverse.Model` and recorded reads.
 
-    Expressions are in plain coordinates, save those of :meth:`fk` and :meth:`carry`.
+    Expressions are in plain coordinates, except those of :meth:`fk` and :meth:`carry`.
     """
 
     def __init__(
@@ -124,10 +124,10 @@ class ReadRecorder:
         return _RecordedMapping(kind, self._value_at, self._names_at, self._reads)
 
     def fk(self, frame: str, relative_to: str = WORLD) -> Expression:
-        """Return relative_to_T_frame, 4×4, coordinates carried by the rates that hold here."""
+        """Return relative_to_T_frame, 4×4, with coordinates carried by the rates before the operation."""
         recorded = self.frames.__getitem__
         try:
-            # Frames above the last common ancestor are walked but do not matter, so they are not remembered.
+            # Frames above the last common ancestor do not affect the result, so their reads are not recorded.
             base, down = branches(frame, relative_to, self._peek)
         except (KineverseError, KeyError):
             base, down = branches(frame, relative_to, recorded)
@@ -144,9 +144,10 @@ class ReadRecorder:
         return value
 
     def coordinates_between(self, frame: str, relative_to: str = WORLD) -> tuple[Symbol, ...]:
-        """Return the coordinates that move a frame relative to another: from the last common ancestor down.
+        """Return the coordinates between two frames, from the last common ancestor downwards.
 
-        Those on the way to ``frame`` come first. In place of one that depends on others are these.
+        Coordinates of the branch of ``frame`` come first. Dependent coordinates are replaced by independent
+        ones.
         """
         base, down = branches(frame, relative_to, self.frames.__getitem__)
         found: dict[Symbol, None] = {}
@@ -159,12 +160,12 @@ class ReadRecorder:
         return tuple(found)
 
     def resolve(self, expression: Expression) -> Expression:
-        """Return an expression in plain coordinates that do not depend on others."""
+        """Return an expression in independent plain coordinates."""
         expression = to_plain(expression)
         return self._rates_for(expression).resolve(expression)
 
     def carry(self, expression: Expression) -> Expression:
-        """Return an expression with its coordinates carried by the rates that hold here."""
+        """Return an expression with coordinates carried by the rates before the operation."""
         return self._rates_for(expression).carry(expression)
 
     def _rates_for(self, expression: Expression) -> Rates:
@@ -188,7 +189,7 @@ class ReadRecorder:
 
 
 class _RecordedMapping(Mapping[str, V], Generic[V]):
-    """One kind of data by name; reading is recorded."""
+    """Mapping of one kind of data by name, with recorded reads."""
 
     def __init__(
         self, kind: str, value_at: Callable[[Cell], Any], names_at: Callable[[str], list[str]], reads: Reads
@@ -228,14 +229,14 @@ class _RecordedMapping(Mapping[str, V], Generic[V]):
 
 
 def unknown_path_error(path: object) -> UnknownNameError:
-    """Return the error for what is no path into a model."""
+    """Return the error for an invalid path into a model."""
     return UnknownNameError(
         f"{path!r} is not a path into a model; it begins with one of {', '.join(KINDS)}, then '/'."
     )
 
 
 def unknown_name_error(kind: str, name: str, available: Any) -> UnknownNameError:
-    """Return the error for something that is not there."""
+    """Return the error for an unknown name, with similar names."""
     noun = {BODIES: "body", RATES: "rate", DATA: "datum"}.get(kind, kind[:-1])
     if not isinstance(name, str):
         return UnknownNameError(f"A {noun} is asked for by its name, a text, not by {name!r}.")
@@ -247,7 +248,7 @@ def unknown_name_error(kind: str, name: str, available: Any) -> UnknownNameError
             )
         names.append(WORLD)
     if len(names) > _MANY:
-        # An edit may miss thousands of things at once, and comparing letters with every name takes long.
+        # An edit may miss thousands of names at once, and the search for similar ones is slow.
         start, end = name[: len(name) // 2 + 1], name[-len(name) // 2 :]
         names = [n for n in names if n.startswith(start) or n.endswith(end)][:_MANY]
         if not names:

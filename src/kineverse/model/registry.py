@@ -207,7 +207,7 @@ def register_collection(name: str, collection: ModelCollection) -> None:
 
 
 def register_scheme(scheme: str, include: str) -> None:
-    """Register the reader of addresses ``scheme:…``: a function with the signature of :func:`include_source`."""
+    """Register the reader of addresses ``scheme:…``, with the signature of :func:`include_source`."""
     _SCHEMES[scheme] = include
 
 

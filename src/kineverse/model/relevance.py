@@ -1,7 +1,7 @@
 """Constraints relevant for an expression, and the symbols of a model.
 
-An index from coordinates to constraints, so that a question costs what its answer is long, not what the model
-is.
+An index from coordinates to constraints makes the cost of a query proportional to its result, independent of
+the size of the model.
 """
 
 from __future__ import annotations
@@ -19,16 +19,16 @@ from .frame import Frame
 
 
 class Relevance:
-    """Constraints by the coordinates in their expressions and in their bounds.
+    """Index of constraints by the coordinates of their expressions and bounds.
 
     Parameters
     ----------
     dependent
-        What coordinates are that depend on others.
+        Expressions of the dependent coordinates.
     """
 
     def __init__(self, dependent: Mapping[Symbol, Expression]) -> None:
-        # A limit on what depends on other coordinates is a limit on these.
+        # A limit on a dependent coordinate limits the coordinates that determine it.
         self._behind = {x.path: {s.path for s in e.symbols} for x, e in dependent.items()}
         self._by_expression: defaultdict[str, dict[str, None]] = defaultdict(dict)
         self._by_bounds: defaultdict[str, dict[str, None]] = defaultdict(dict)
@@ -36,7 +36,7 @@ class Relevance:
         self._lines: dict[Symbol, dict[str, None]] = {}
 
     def add(self, name: str, constraint: Constraint) -> None:
-        """Take a constraint into the index."""
+        """Add a constraint to the index."""
         for path in self._paths(constraint):
             self._by_expression[path][name] = None
         for path in self._with_behind(_bounds(constraint)):
@@ -47,7 +47,7 @@ class Relevance:
             self._lines.setdefault(constraint.expression.symbols[0], {})[name] = None
 
     def remove(self, name: str, constraint: Constraint) -> None:
-        """Take a constraint out."""
+        """Remove a constraint from the index."""
         for path in self._paths(constraint):
             self._by_expression[path].pop(name, None)
         for path in self._with_behind(_bounds(constraint)):
@@ -64,14 +64,14 @@ class Relevance:
         return paths.union(*(self._behind.get(path, ()) for path in paths)) if self._behind else paths
 
     def on(self, symbol: Symbol) -> list[str]:
-        """Return the names of the constraints whose expression is just this symbol."""
+        """Return the names of the constraints whose expression is this symbol."""
         return list(self._alone.get(symbol, ()))
 
     def about(self, symbol: Symbol) -> list[str]:
-        """Return the names of the constraints whose expression has this symbol in it and no other."""
+        """Return the names of the constraints whose expression has this symbol and no other."""
         return [*self._alone.get(symbol, ()), *self._lines.get(symbol, ())]
 
-    def of(
+    def find(
         self,
         subject: Expression | Iterable[Symbol | Expression],
         constraints: Mapping[str, Constraint],
@@ -138,13 +138,13 @@ def _bounds(constraint: Constraint) -> set[str]:
 
 
 class SymbolIndex:
-    """Which symbols the values of a model are about, counted so that changes are cheap."""
+    """Symbols of the frames and constraints of a model, with counts for incremental updates."""
 
     def __init__(self) -> None:
         self._count: dict[Symbol, int] = {}
 
     def add(self, value: Any, sign: int) -> None:
-        """Count the symbols of a value, which comes (1) or goes (-1)."""
+        """Count the symbols of a value that is added (1) or removed (-1)."""
         for symbol in _symbols_of(value):
             count = self._count.get(symbol, 0) + sign
             if count:

@@ -16,7 +16,7 @@ COMPARED_STATES = 100
 
 @dataclass(frozen=True, slots=True)
 class PoseDifference:
-    """A frame that is elsewhere: at worst, by how much [m], [rad]; infinite if on one side it is nowhere."""
+    """Largest pose difference of one frame [m], [rad]; infinite if one of the poses does not exist."""
 
     frame: str
     distance: float
@@ -25,7 +25,7 @@ class PoseDifference:
 
 @dataclass(frozen=True, slots=True)
 class LimitDifference:
-    """Limits (lower, upper) that differ, of a position [m], [rad] or a speed [m/s], [rad/s]."""
+    """Different limits (lower, upper) of a position [m], [rad] or a speed [m/s], [rad/s]."""
 
     name: str
     before: tuple[float, float]
@@ -33,22 +33,22 @@ class LimitDifference:
 
 
 class BehaviourComparison:
-    """What two models do differently, by more than a tolerance.
+    """Differences in poses and limits between two models, beyond a tolerance.
 
     Attributes
     ----------
     frames, freedoms
-        Names of frames and degrees of freedom, by whether they are ``added``, ``removed`` or ``common``.
+        Names of frames and degrees of freedom by ``added``, ``removed`` and ``common``.
     helpers
-        Frames that only one has because of its format, which are not counted: neither added nor removed.
+        Frames that a format adds to one of the models; they count as neither added nor removed.
     apart
-        Frames of both that are elsewhere in the world in one of the sampled states, the worst first.
+        Common frames with different world poses in a sampled state, the largest difference first.
     ranges
-        Limits that differ, of degrees of freedom that both have.
+        Different limits of common degrees of freedom.
     largest
-        The largest distance [m] and angle [rad] of any frame, in the tolerance or not.
+        Largest distance [m] and angle [rad] of any frame, within the tolerance or not.
     states
-        In how many states poses were compared.
+        Number of sampled states.
     """
 
     def __init__(self, before: ModelView, after: ModelView, tolerance: float) -> None:
@@ -87,7 +87,7 @@ class BehaviourComparison:
 
     @property
     def equal(self) -> bool:
-        """Whether they do the same."""
+        """True if there are no differences beyond the tolerance."""
         sides = (self.frames, self.freedoms)
         return not (self.apart or self.ranges or any(s["added"] or s["removed"] for s in sides))
 
@@ -104,7 +104,7 @@ def _partition_names(before: list[str], after: list[str]) -> dict[str, list[str]
 def _paired_poses(
     samples: StateSamples, before: ModelView, after: ModelView, frames: list[str]
 ) -> list[tuple[Array, ...]]:
-    """Return, for each frame, its poses in both models, (states, 4, 4) each."""
+    """Return the poses of each frame in both models, shape (states, 4, 4) each."""
     poses = samples.values([model.fk(frame) for frame in frames for model in (before, after)])
     return list(zip(poses[::2], poses[1::2], strict=True))
 
@@ -129,11 +129,11 @@ def _limits_equal(one: tuple[float, float], other: tuple[float, float], toleranc
 
 
 def find_helper_frames(model: ModelView, original: ModelView) -> list[str]:
-    """Return the frames of a model that a writer, or a reader, had to add to what the original has.
+    """Return the frames that a writer or a reader had to add to the original model.
 
-    They carry nothing, and either lie between two frames of which one hangs directly below the other in the
-    original, called as what moves them or below the name of the lower one; or nothing is below them, and they
-    are called as the one coordinate that moves them.
+    They have no body. Either they are between two frames that are parent and child in the original, with the
+    name of their coordinate or a name below that of the child; or they are leaves with the name of their only
+    coordinate.
     """
     candidates = {name for name in model.frames if name not in original.frames and name not in model.bodies}
     found = set(_find_links_between(model, original, candidates)) if candidates else set()

@@ -19,24 +19,24 @@ from .model_view import ModelView
 Array = npt.NDArray[np.float64]
 
 REACH = np.pi
-"""How far from its default value a symbol without limits goes [rad], [m] and their rates."""
+"""Half width of the range of a symbol without limits, around its default value [rad], [m] and their rates."""
 
 
 class StateSamples:
-    """States of one or several models: the default state first, then random ones within limits.
+    """Samples of states of one or several models: the default state first, then random ones within limits.
 
-    What a symbol is worth follows from its name alone, so models that share names are looked at in the same
-    states. Of several models, the first that knows a symbol says where it may go. Limits of single symbols
-    are kept, other constraints not necessarily.
+    The values of a symbol are a function of its name alone, so models with the same names get the same
+    states. Of several models, the first one with a symbol determines its range. Limits of single symbols
+    hold; other constraints may be violated.
 
     Parameters
     ----------
     models
-        The models.
+        Models to sample.
     count
-        How many states there are beside the default one.
+        Number of random states.
     seed
-        Another one gives other random states.
+        Seed of the random states.
     """
 
     def __init__(self, *models: ModelView, count: int = 16, seed: int = 0) -> None:
@@ -47,20 +47,20 @@ class StateSamples:
 
     @cached_property
     def _known(self) -> dict[Symbol, tuple[ModelView, float]]:
-        """Where each symbol comes from, and its default value."""
+        """Model and default value of each symbol."""
         found: dict[Symbol, tuple[ModelView, float]] = {}
         for model in self._models:
             for symbol, value in model.default_state().items():
                 found.setdefault(symbol, (model, value))
         return found
 
-    def of(self, symbol: Symbol) -> Array:
+    def values_of(self, symbol: Symbol) -> Array:
         """Return the values of a symbol, one for each state."""
         if symbol not in self._columns:
-            self._columns[symbol] = self._drawn(symbol)
+            self._columns[symbol] = self._draw(symbol)
         return self._columns[symbol]
 
-    def _drawn(self, symbol: Symbol) -> Array:
+    def _draw(self, symbol: Symbol) -> Array:
         if symbol.value is not None:
             return np.full(self.size, symbol.value)
         model, default = self._known.get(symbol.position) or (None, 0.0)
@@ -76,16 +76,16 @@ class StateSamples:
         return values
 
     def values(self, expressions: Sequence[Expression]) -> list[Array]:
-        """Return, for each expression, an array (states, *shape); NaN where a closed loop does not close."""
+        """Return the values of each expression, shape (states, *shape); NaN where a loop does not close."""
         if not expressions:
             return []
         stacked = ca.vertcat(*lower(expressions))
-        # Not from each expression: in a long chain, nearly every pose is about nearly every joint.
+        # One set for all expressions: in a long chain, most poses contain most joints.
         symbols = [SYMBOLS[leaf.element_hash()] for leaf in ca.symvar(stacked)]
         vector = ca.vertcat(*(symbol._sx for symbol in symbols)) if symbols else ca.SX(0, 1)
         function = ca.Function("samples", [vector], [stacked])
         if symbols:
-            numbers = np.array(function(np.array([self.of(symbol) for symbol in symbols]))).T
+            numbers = np.array(function(np.array([self.values_of(symbol) for symbol in symbols]))).T
         else:
             numbers = np.tile(np.array(function(ca.DM(0, 1))).T, (self.size, 1))
         ends = np.cumsum([e.size for e in expressions])[:-1]

@@ -23,7 +23,7 @@ SIDES = 16
 
 
 def find_norm_components(expression: Expression) -> tuple[float, list[Expression]] | None:
-    """Return factor and components of ``factor·norm(components)``, None if it is something else."""
+    """Return factor and components of ``factor·norm(components)``; None for any other expression."""
     if len(expression._nodes) != 1:
         return None
     (node,) = expression._nodes
@@ -37,11 +37,11 @@ def find_norm_components(expression: Expression) -> tuple[float, list[Expression
 
 
 def facet_normals(dimensions: int) -> list[tuple[float, ...]]:
-    """Return the normals of a regular polygon, or of its faces turned about to cover a sphere.
+    """Return the normals of a regular polygon, or of a polyhedron with faces along latitudes and longitudes.
 
-    The nearest normal is at most at half a step from any direction in the plane, π/16, and at half a step in
-    latitude and in longitude in space. So the cosine between the two is at least :func:`inscribed_radius`: a
-    polyhedron at that distance from 0 lies inside the unit sphere.
+    In the plane, the angle from any direction to the nearest normal is at most half a step, π/16. In space it
+    is at most half a step in latitude and in longitude. So the cosine of the angle is at least
+    :func:`inscribed_radius`, and a polyhedron with faces at that distance from 0 lies inside the unit sphere.
     """
     if dimensions == 1:
         return [(1.0,), (-1.0,)]
@@ -54,7 +54,7 @@ def facet_normals(dimensions: int) -> list[tuple[float, ...]]:
 
 
 def inscribed_radius(dimensions: int) -> float:
-    """Return the radius of the ball inside the body that has these directions, and whose corners touch 1."""
+    """Return the radius of the inscribed ball of the body with these normals whose corners have radius 1."""
     return math.cos(math.pi / SIDES) ** (dimensions - 1)
 
 
@@ -67,7 +67,7 @@ INFINITE = as_expression(math.inf)
 
 @dataclass(frozen=True)
 class SpeedRow:
-    """One row ``lower <= Σ weight·speed <= upper``, with the name of the constraint it came from."""
+    """Row ``lower <= Σ weight·speed <= upper``, with the name of its constraint."""
 
     name: str
     weights: Weights
@@ -77,7 +77,7 @@ class SpeedRow:
 
 @dataclass(frozen=True)
 class NormBound:
-    """Components ``Σ weight·speed``, whose norm is at most the radius."""
+    """Upper bound on the norm of components ``Σ weight·speed``."""
 
     components: tuple[Weights, ...]
     radius: Expression
@@ -85,7 +85,7 @@ class NormBound:
 
 @dataclass(frozen=True)
 class AdmissibleSpeeds:
-    """What speeds may do of which some move and the others stand still, which is taken to be allowed.
+    """Set of admissible speeds while all other speeds are zero; zero speed is assumed to be admissible.
 
     Attributes
     ----------
@@ -94,7 +94,7 @@ class AdmissibleSpeeds:
     coupled
         Rows that the box does not imply.
     balls
-        Norms, of which rows are the polygon inside.
+        Norm bounds; rows describe their inscribed polygons.
     """
 
     box: SpeedBox
@@ -103,7 +103,7 @@ class AdmissibleSpeeds:
 
 
 class SpeedLimits:
-    """Rows of the constraints on speeds, collected one by one."""
+    """Rows and norm bounds of the speed constraints of a model."""
 
     def __init__(self, rates: Rates) -> None:
         self.rows: list[SpeedRow] = []
@@ -112,7 +112,7 @@ class SpeedLimits:
         self._balls: list[NormBound] = []
 
     def add(self, name: str, constraint: Constraint) -> str | None:
-        """Append the rows of a constraint of order 1; return why not, if it has none."""
+        """Append the rows of a constraint of order 1, or return the reason if it has none."""
         lower, upper = constraint.lower, constraint.upper
         if any(s.order for s in (*lower.symbols, *upper.symbols)):
             return "its bounds depend on speeds"
@@ -136,15 +136,15 @@ class SpeedLimits:
         self._affine.append(row)
         return None
 
-    def of(self, moving: Collection[Symbol]) -> AdmissibleSpeeds:
-        """Return the limits of speeds that move while all others stand still."""
+    def admissible_speeds(self, moving: Collection[Symbol]) -> AdmissibleSpeeds:
+        """Return the limits of some speeds while all others are zero."""
         box: SpeedBox = {}
         coupled = []
         for row in self._affine:
             weights = select_moving(row.weights, moving)
             for speed, weight in weights.items():
                 if not weight.symbols:
-                    # Alone it gets that far at most; more would need the help of others.
+                    # The row bounds a single speed while the other speeds are zero.
                     ends = [e if is_infinite(e) else e / weight for e in (row.lower, row.upper)]
                     _tighten(box, speed, *(ends if float(weight) > 0 else reversed(ends)))
             if len(weights) > 1 or any(w.symbols for w in weights.values()):
@@ -192,32 +192,32 @@ class SpeedLimits:
 
 
 def is_infinite(bound: Expression) -> bool:
-    """Return whether a bound is infinite whatever the state."""
+    """Return whether a bound is infinite at all states."""
     return not bound.symbols and math.isinf(float(bound))
 
 
 def select_moving(weights: Weights, moving: Collection[Symbol]) -> dict[Symbol, Expression]:
-    """Return the weights of speeds that move and have one."""
+    """Return the nonzero weights of moving speeds."""
     return {s: w for s, w in weights.items() if s in moving and (w.symbols or float(w))}
 
 
 def raw_min(a: Expression, b: Expression) -> Expression:
-    """Return the minimum of two; nobody takes gradients of what rows are compared with."""
+    """Return the minimum, as CasADi's fmin: without a gradient, which bounds of rows do not need."""
     return binary(ca.OP_FMIN, a, b)
 
 
 def raw_max(a: Expression, b: Expression) -> Expression:
-    """Return the maximum of two."""
+    """Return the maximum, as CasADi's fmax: without a gradient."""
     return binary(ca.OP_FMAX, a, b)
 
 
 def clamp_below(value: Expression, least: Expression) -> Expression:
-    """Return the maximum, or NaN where the value is NaN; that shall show, which CasADi's would hide."""
+    """Return the maximum, or NaN if the value is NaN; CasADi's fmax would hide NaN."""
     return _replace_where(value, binary(ca.OP_LT, value, least), least)
 
 
 def clamp_above(value: Expression, most: Expression) -> Expression:
-    """Return the minimum, or NaN where the value is NaN."""
+    """Return the minimum, or NaN if the value is NaN."""
     return _replace_where(value, binary(ca.OP_LT, most, value), most)
 
 
@@ -239,7 +239,7 @@ def _divide_bound(bound: Expression, factor: float) -> Expression:
 
 
 def subtract_offset(bound: Expression, offset: Expression) -> Expression:
-    """Return a bound less an offset; what is infinite stays a plain infinity."""
+    """Subtract an offset from a bound; an infinite bound stays a constant."""
     return bound if is_infinite(bound) else bound - offset
 
 

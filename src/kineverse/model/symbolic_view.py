@@ -1,4 +1,7 @@
-"""Read-only data and symbolic kinematics of a model."""
+"""Read-only data and symbolic kinematics of a model.
+
+Numeric queries are in :mod:`kineverse.model.model_view`.
+"""
 
 from __future__ import annotations
 
@@ -30,7 +33,7 @@ from .violations import Checks
 
 
 class NamedMapping(Mapping[str, Any]):
-    """One kind of a model's data by name, live; a wrong name lists the right ones."""
+    """Live mapping of one kind of data by name; errors for unknown names list similar ones."""
 
     def __init__(self, view: SymbolicView, kind: str, present: Any) -> None:
         self._view = view
@@ -56,12 +59,12 @@ class NamedMapping(Mapping[str, Any]):
             return iter(list(self._view._ordered(self._kind)))
 
     def items(self) -> ItemsView[str, Any]:
-        """Return names and values as they are now."""
+        """Return the present names and values."""
         with self._view._lock:
             return {name: self[name] for name in self}.items()
 
     def values(self) -> ValuesView[Any]:
-        """Return the values as they are now."""
+        """Return the present values."""
         with self._view._lock:
             return {name: self[name] for name in self}.values()
 
@@ -95,7 +98,7 @@ JacobianForm = Literal["world_aligned", "world", "body"]
 
 
 class SymbolicView:
-    """What a model is made of, as data and expressions. Base of what answers with numbers as well."""
+    """Read-only data and symbolic kinematics of a model. Base of :class:`.ModelView`."""
 
     def __init__(self, head: dict[str, dict[str, Any]], version: int) -> None:
         self._head = head
@@ -104,7 +107,7 @@ class SymbolicView:
         self._forget_index({})
         self._forget_all()
 
-    if not TYPE_CHECKING:  # a type checker says so on its own
+    if not TYPE_CHECKING:  # type checkers report unknown names themselves
 
         def __getattr__(self, name):
             if name in EDIT_METHODS:
@@ -130,8 +133,8 @@ class SymbolicView:
         self._checks: Checks | None = None
         self._equalities: EqualityConstraints | None = None
 
-    def _changed(self, changes: Sequence[tuple[Cell, Any, Any]]) -> None:
-        """Drop what no longer holds."""
+    def _invalidate(self, changes: Sequence[tuple[Cell, Any, Any]]) -> None:
+        """Invalidate the caches that changes affect."""
         kinds = {cell[0] for cell, _, _ in changes}
         if self._is_indexed:
             self._pending += changes
@@ -153,7 +156,7 @@ class SymbolicView:
                     self._carried_constraints.pop(name, None)
 
     def _settle(self) -> None:
-        """Bring an edit in progress up to date before it is read; there is none here."""
+        """Apply the pending operations of an open edit; a snapshot has none."""
 
     def _ordered(self, kind: str) -> dict[str, Any]:
         """Return the values of a kind in the order in which operations write them."""
@@ -187,33 +190,33 @@ class SymbolicView:
 
     @property
     def version(self) -> int:
-        """Counts committed edits."""
+        """Number of committed edits."""
         return self._version
 
     @property
     def frames(self) -> Mapping[str, Frame]:
-        """Frames by name; the world itself is not among them. Transforms are in plain coordinates."""
-        return self._named(FRAMES)
+        """Frames by name, without the world. Transforms are in plain coordinates."""
+        return self._mapping(FRAMES)
 
     @property
     def bodies(self) -> Mapping[str, Body]:
-        """Bodies by the name of the frame they are attached to."""
-        return self._named(BODIES)
+        """Bodies by the name of their frame."""
+        return self._mapping(BODIES)
 
     @property
     def articulations(self) -> Mapping[str, Articulation]:
         """Records of articulations by name."""
-        return self._named(ARTICULATIONS)
+        return self._mapping(ARTICULATIONS)
 
     @property
     def data(self) -> Mapping[str, Any]:
-        """Whatever else operations wrote, by name."""
-        return self._named(DATA)
+        """Other data by name."""
+        return self._mapping(DATA)
 
     @property
     def constraints(self) -> Mapping[str, Constraint]:
         """Constraints by name, coordinates carried by their rates."""
-        return NamedMapping(self, CONSTRAINTS, self._carried)
+        return NamedMapping(self, CONSTRAINTS, self._carry_constraint)
 
     def plain_constraints(self) -> dict[str, Constraint]:
         """Return the constraints by name, as operations wrote them: coordinates are plain symbols."""
@@ -227,10 +230,10 @@ class SymbolicView:
             self._settle()
             return dict(self._head[RATES].values())
 
-    def _named(self, kind: str) -> Mapping[str, Any]:
+    def _mapping(self, kind: str) -> Mapping[str, Any]:
         return NamedMapping(self, kind, None)
 
-    def _carried(self, name: str, constraint: Constraint) -> Constraint:
+    def _carry_constraint(self, name: str, constraint: Constraint) -> Constraint:
         rates = self.rates
         if rates.is_empty:
             return constraint
@@ -244,8 +247,8 @@ class SymbolicView:
             self._carried_constraints[name] = known
         return known
 
-    def _followed(self, constraint: Constraint) -> Constraint:
-        """Return a constraint in terms of what does not depend on anything, speeds included."""
+    def _eliminate_dependent(self, constraint: Constraint) -> Constraint:
+        """Return a constraint in terms of independent coordinates and free speeds."""
         rates = self.rates
         if not any(s.position in rates.dependent for s in constraint.symbols):
             return constraint
@@ -254,7 +257,7 @@ class SymbolicView:
 
     @property
     def rates(self) -> Rates:
-        """The rate table, see :mod:`kineverse.model.rates`."""
+        """Rate table, see :mod:`kineverse.model.rates`."""
         with self._lock:
             self._settle()
             if self._rates is None:
@@ -263,10 +266,10 @@ class SymbolicView:
 
     @property
     def symbols(self) -> tuple[Symbol, ...]:
-        """The coordinates and parameters of all frames and constraints, sorted: what a configuration is.
+        """Coordinates and parameters of all frames and constraints, sorted: the symbols of a configuration.
 
-        A coordinate of which only the speed occurs is among them, unless that speed is one of those that move
-        other coordinates: the wheels of a base, the angular velocity of a ball joint.
+        A coordinate is included if only its speed occurs, unless that speed moves other coordinates, as the
+        wheels of a base or the angular velocity of a ball joint do.
         """
         with self._lock:
             self._settle()
@@ -279,7 +282,7 @@ class SymbolicView:
                     found.add(coordinate)
                     found.update(s for value in row.values() for s in value.symbols if s.order == 0)
                     wheels.update(speed.position for speed in row)
-                # What only has its speed limited is somewhere, too; a wheel that drives others need not be.
+                # A coordinate with a speed limit has a position; the speed of a wheel needs none.
                 found.update({s.position for s in mentioned if s.order} - wheels)
                 for itself in self.rates.dependent.values():
                     found.update(itself.symbols)
@@ -289,12 +292,12 @@ class SymbolicView:
 
     @property
     def degrees_of_freedom(self) -> tuple[Symbol, ...]:
-        """The coordinates among :attr:`symbols`; no parameters."""
+        """Coordinates among :attr:`symbols`, without parameters."""
         return tuple(s for s in self.symbols if s.has_derivative)
 
     @property
     def speeds(self) -> tuple[Symbol, ...]:
-        """The free speeds that move the coordinates, sorted."""
+        """Free speeds that move the coordinates, sorted."""
         with self._lock:
             rates = self.rates
             found: set[Symbol] = set()
@@ -336,15 +339,15 @@ class SymbolicView:
         Parameters
         ----------
         frame, relative_to
-            What moves and with respect to what.
+            Moving frame and reference frame.
         form
             ``world_aligned``: velocity of the frame's origin in axes of ``relative_to``; ``world``: the
             spatial twist there; ``body``: in the frame itself.
         symbols
-            One column for each: positions or their velocities. By default the speeds that move the frame,
-            sorted (:meth:`speeds_of`).
+            Positions or velocities, one for each column. By default the speeds that move the frame, sorted
+            (:meth:`speeds_of`).
         heuristic
-            Whether heuristic gradient entries count; a Jacobian is about facts, so by default they do not.
+            True to include heuristic gradient entries. The default is the exact Jacobian.
         """
         if form not in ("world_aligned", "world", "body"):
             raise UnknownNameError(
@@ -422,10 +425,10 @@ class SymbolicView:
     def symbols_of(self, frame: str, relative_to: str = WORLD) -> tuple[Symbol, ...]:
         """Return the symbols of a pose in the order of the chain, from ``relative_to`` to ``frame``.
 
-        They are those of :meth:`fk`, parameters included: joints come as one meets them on the way, the
-        coordinates of one joint in its own order, and instead of what follows others, as a mimic joint or a
-        closed loop does, what it follows. Give them to :func:`kineverse.compile` as inputs for vectors in
-        this order, rather than sorted by name.
+        They are the symbols of :meth:`fk`, parameters included. Joints are in the order of the chain, the
+        coordinates of a joint in its own order. A dependent coordinate, as of a mimic joint or a closed loop,
+        is replaced by those that determine it. Pass them to :func:`kineverse.compile` for input vectors in
+        this order instead of sorted by name.
 
         Raises
         ------

@@ -4,18 +4,18 @@ For a constraint on positions, ``l <= φ <= u``, at rate γ <= 1/Δt and without
 
     (D(φ) - D(u))·v <= γ (u - φ)        (D(φ) - D(l))·v >= γ (l - φ)
 
-so one step of Δt never crosses a bound. Outside a bound the right side asks for the way back, as fast as γ
-says but never faster than one motion can go that keeps all other rows as well: :mod:`.way_back`. So all rows
-together can always be obeyed, from anywhere, where speeds may be zero; limits on speeds that exclude zero are
-kept as they are, and may then leave no way. Where accelerations are limited, the speed towards a bound stays
-below what can be braked within the distance left, on the way back as well.
+so one step of Δt never crosses a bound. Outside a bound, the right side demands a recovery speed of γ times
+the violation, reduced until one motion satisfies all rows: :mod:`.feasibility`. So all rows together are
+feasible at every state, if zero speed is allowed. Limits on speeds that exclude zero are kept, and may make
+the rows infeasible. With limits on accelerations, the speed towards a bound is at most the one that can be
+braked within the remaining distance, also during recovery.
 
-A constraint that is affine in speeds is the row itself. A limited norm of two speeds becomes the 16 sides of
-the polygon inscribed in the circle, which gives away 1.9 % at most and never exceeds the limit; one of three
-becomes the 128 faces of a polyhedron inscribed in the sphere, which gives away 3.8 %.
+A constraint that is affine in speeds is a row itself. A bound on the norm of two speeds becomes the 16 sides
+of the polygon inscribed in the circle, which loses at most 1.9 % and never exceeds the limit; of three
+speeds, the 128 faces of a polyhedron inscribed in the sphere, which loses at most 3.8 %.
 
-Farther out than a closed loop is known, what it determines has the rows that it has where that begins: the
-way back needs no value from there.
+Outside the domain of a closed loop, its dependent coordinates have the rows of the boundary of the domain, so
+recovery needs no value outside.
 """
 
 from __future__ import annotations
@@ -55,13 +55,13 @@ class VelocityRows:
     Attributes
     ----------
     speeds
-        The n speeds, in the order of the columns.
+        Speeds in the order of the n columns.
     matrix, lower, upper
         Expressions of positions (and parameters), shapes (m, n), (m,) and (m,).
     names
-        For each row the name of the constraint it came from.
+        Name of the constraint of each row.
     skipped
-        Pairs (name, reason) of constraints that are no rows in speeds; never silently empty-handed.
+        Constraints that cannot be rows, as pairs (name, reason).
     """
 
     speeds: tuple[Symbol, ...]
@@ -81,23 +81,23 @@ def velocity_rows(
     gain: float | None = None,
     speed_limits: Mapping[str, Constraint] | None = None,
 ) -> VelocityRows:
-    """Return the rows that keep constraints over the next step, see the module.
+    """Return the rows that enforce constraints over the next step; see the module for the equations.
 
     Parameters
     ----------
     constraints
-        As a model hands them out: :attr:`Model.constraints` or :meth:`Model.constraints_for`.
+        Constraints by name, from :attr:`Model.constraints` or :meth:`Model.constraints_for`.
     dt
-        Length of a control step Δt [s].
+        Control period Δt [s].
     rates
-        The model's rate table, to eliminate left-over speeds of coordinates that wheels move.
+        Rate table of the model, to eliminate the speeds of driven coordinates.
     speeds
-        Columns; by default the speeds that occur, sorted. Others count as standing still.
+        Columns; by default the speeds of the constraints, sorted. All other speeds are assumed to be zero.
     gain
-        γ [1/s], at most 1/Δt, which is the default.
+        Gain γ [1/s], at most 1/Δt, which is the default.
     speed_limits
-        More constraints, of which those on speeds and accelerations of columns are kept as well, and so are
-        those of the columns that these bring in. Others are passed over.
+        Further constraints. Those on speeds and accelerations of columns are enforced as well, and so are
+        those of the columns that they add. Others are ignored.
 
     Raises
     ------
@@ -145,7 +145,9 @@ def velocity_rows(
         if speeds is None:
             moving.update(s for row in limits.rows[known:] for s in row.weights)
     columns = tuple(speeds) if speeds is not None else tuple(sorted(moving, key=lambda s: s.sort_key))
-    rows = limits.rows + _position_rows(constraints, gaps, limits.of(moving), moving, gamma, dt, brakes)
+    rows = limits.rows + _position_rows(
+        constraints, gaps, limits.admissible_speeds(moving), moving, gamma, dt, brakes
+    )
     rows = [row for row in rows if any(s in row.weights for s in columns)]
     weights = [row.weights.get(s, ZERO) for row in rows for s in columns]
     return VelocityRows(
@@ -168,19 +170,19 @@ def _checked(value: float, what: str) -> float:
 def _about_speeds(
     name: str, constraint: Constraint, limits: SpeedLimits, brakes: dict[Symbol, Expression]
 ) -> list[tuple[str, str]]:
-    """Take in a constraint of order 1 or more; return the reason if it cannot be."""
+    """Add a constraint of order 1 or 2, or return the reason if it cannot be a row."""
     reason = limits.add(name, constraint) if constraint.order == 1 else _note_brake(constraint, brakes)
     return [] if reason is None else [(name, reason)]
 
 
 def _note_brake(constraint: Constraint, brakes: dict[Symbol, Expression]) -> str | None:
-    """Keep what one speed can be braked with; return why not, if it is something else."""
+    """Record the deceleration limit of one speed, or return the reason if the constraint is none."""
     expression, lower, upper = constraint.expression, constraint.lower, constraint.upper
     if not isinstance(expression, Symbol) or expression.order != 2:
         return "it limits derivatives beyond speeds, other than a single acceleration"
     if is_infinite(lower) and is_infinite(upper):
         return "it has no bounds"
-    # The weaker side is what can be relied on for braking in either direction.
+    # The smaller of the two limits holds for braking in both directions.
     deceleration = raw_min(-lower, upper)
     speed = expression.integral()
     brakes[speed] = raw_min(brakes[speed], deceleration) if speed in brakes else deceleration
@@ -188,7 +190,7 @@ def _note_brake(constraint: Constraint, brakes: dict[Symbol, Expression]) -> str
 
 
 def _speeds_of(constraint: Constraint, rates: Rates) -> set[Symbol]:
-    """Return the free speeds that a constraint on speeds or on accelerations is about."""
+    """Return the free speeds of a constraint on speeds or accelerations."""
     found: set[Symbol] = set()
     for s in constraint.expression.symbols:
         if s.order:
@@ -199,7 +201,7 @@ def _speeds_of(constraint: Constraint, rates: Rates) -> set[Symbol]:
 
 @dataclass(frozen=True)
 class _Gap:
-    """The distance to one bound on positions, an upper one if the sign is 1, and how speeds widen it."""
+    """Distance to one position bound, an upper bound if the sign is 1, and its rate by speed."""
 
     sign: int
     distance: Expression
@@ -226,7 +228,7 @@ def _position_rows(
     dt: float,
     brakes: Mapping[Symbol, Expression],
 ) -> list[SpeedRow]:
-    """Return the rows of constraints on positions; who is no column stands still and brakes nothing."""
+    """Return the rows of position constraints; speeds that are no columns are zero."""
     named: list[tuple[str, list[int]]] = []
     bounds = []
     for name, found in gaps.items():
@@ -239,7 +241,7 @@ def _position_rows(
             deceleration = _total(away, brakes)
             if deceleration is not None:
                 braked = True
-                # Of a step at speed s, with s - a·dt in the next one and so on, s²/2a + s·dt is left to go.
+                # Braking distance of steps at speeds s, s - a·dt, ...: at most s²/2a + s·dt.
                 step = deceleration * dt
                 left = 2 * deceleration * raw_max(gap.distance, ZERO)
                 room = clamp_above(room, sqrt(step * step + left) - step)
@@ -252,8 +254,8 @@ def _position_rows(
     rows = []
     for (name, signs), both, rooms in zip(named, bounds, limit_recovery(bounds, limits), strict=True):
         ends = []
-        for sign, side, room in zip(signs, both.sides, rooms, strict=True):
-            weights = side.away if sign < 0 else {s: -w for s, w in side.away.items()}
+        for sign, bound, room in zip(signs, both.bounds, rooms, strict=True):
+            weights = bound.away if sign < 0 else {s: -w for s, w in bound.away.items()}
             low, high = (-room, INFINITE) if sign < 0 else (-INFINITE, room)
             ends.append(SpeedRow(name, weights, low, high))
         if len(ends) == 2 and ends[0].weights == ends[1].weights:
@@ -263,7 +265,7 @@ def _position_rows(
 
 
 def _over_free_speeds(gradient: Mapping[Symbol, Expression], rates: Rates) -> dict[Symbol, Expression]:
-    """Return a gradient with the speeds of coordinates that others move replaced by their rows."""
+    """Return a gradient in terms of free speeds."""
     result: dict[Symbol, Expression] = {}
     for key, entry in gradient.items():
         row = rates.row(key.position) if key.order == 1 else None

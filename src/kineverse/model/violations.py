@@ -1,4 +1,4 @@
-"""Which constraints a configuration breaks."""
+"""Violated constraints at a configuration."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from .constraint import Constraint
 
 
 class Violation(NamedTuple):
-    """A broken constraint: what it is worth, its bounds there, and by how much it is outside."""
+    """Violated constraint: value, bounds at the configuration, and excess."""
 
     name: str
     value: float
@@ -32,12 +32,12 @@ class Violation(NamedTuple):
 
 
 class Violations(tuple[Violation, ...]):
-    """Broken constraints, worst first, with the names of those that could not be checked."""
+    """Violated constraints, largest excess first, with the names of unchecked ones."""
 
     unchecked: tuple[str, ...]
 
     def __new__(cls, broken: Iterable[Violation], unchecked: Iterable[str] = ()) -> Violations:
-        """Sort the violations by excess, what has no value first."""
+        """Sort the violations by excess, those without a value first."""
         order = [(-math.inf if math.isnan(v.excess) else -v.excess, v.name, v) for v in broken]
         self = super().__new__(cls, (v for _, _, v in sorted(order, key=lambda item: item[:2])))
         self.unchecked = tuple(unchecked)
@@ -60,15 +60,15 @@ class Violations(tuple[Violation, ...]):
 
 
 class Checks:
-    """All constraints of a model in one function over all of their symbols.
+    """Constraints of a model as one function of all their symbols.
 
     Parameters
     ----------
     constraints
-        By name.
+        Constraints by name.
     dependent
-        What coordinates are that depend on others. A loop among them that does not close is a broken
-        constraint of its name, without a value.
+        Expressions of the dependent coordinates. A loop among them that does not close is a violation without
+        a value, under its name.
     """
 
     def __init__(self, constraints: Mapping[str, Constraint], dependent: Iterable[Expression] = ()) -> None:
@@ -81,7 +81,7 @@ class Checks:
         )
         parts = [e for c in constraints.values() for e in (c.lower, c.expression, c.upper)]
         for loop in loops:
-            # All of a solution is NaN where there is none, and that is all that is asked of it.
+            # All elements of a missing solution are NaN, so one element suffices.
             parts += [as_expression(-math.inf), loop.value[0], as_expression(math.inf)]
         stacked = ca.vertcat(*lower(parts)) if parts else ca.SX(0, 1)
         inputs = ca.vertcat(*(s._sx for s in self.symbols)) if self.symbols else ca.SX(0, 1)
@@ -124,7 +124,7 @@ def find_violations(
     broken = []
     for i in checked:
         low, value, high = (float(v) for v in rows[i])
-        # NaN is no valid value, and no bound either: it compares false with everything.
+        # NaN violates every constraint, as value and as bound: comparisons with it are False.
         excess = max(low - value, value - high) if not np.isnan(rows[i]).any() else math.nan
         if not excess <= tolerance:
             broken.append(Violation(checks.names[i], value, low, high, excess))

@@ -1,8 +1,8 @@
-"""Traces: what an operation computes, as expressions of what it read.
+"""Traces of operations: writes as expressions of the values read.
 
-An operation is code, and code does not travel. Its trace does: the questions it asked of the model, and its
-writes as expressions of the answers. Whoever has the trace can run the operation again on other answers,
-without its class.
+Documents contain no code of operations. They contain traces instead: the queries of an operation to the
+model, and its writes as expressions of the results. A trace can be evaluated on another model without the
+class.
 """
 
 from .placeholder import ReadNode

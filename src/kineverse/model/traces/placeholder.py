@@ -24,63 +24,63 @@ GradientPath = tuple[tuple["Symbol", bool], ...]
 
 
 class Tracer(AccessListener, Protocol):
-    """Who wants to know how closely an answer is looked at."""
+    """Receiver of the accesses to query results."""
 
     serial: int
 
     def look(self, question: int, how: Access) -> None:
-        """Note it."""
+        """Record an access to the result of a query."""
 
 
 class ReadNode(Node):
-    """An expression that the model gave, kept apart from what is made of it.
+    """Placeholder for an expression in a query result.
 
-    While an operation is traced it behaves as what it stands for, and what an operation may decide by is
-    noted: which symbols there are, and the value itself, which is also what comparing and printing show.
-    In a trace that comes from elsewhere it stands for nothing yet (it has no arguments).
+    While an operation is traced, the node behaves as the expression it stands for, and records accesses that
+    an operation can base decisions on: to the symbols, and to the value, which comparing and printing also
+    show. In a trace from a document it is empty: it has no arguments.
 
-    The options are who watches (None for nobody), the place of the question, the place of the expression in
-    its answer, and the *path*: the gradient entries that lead from there to this one, each with whether
-    trends count.
+    The options are the tracer (None for none), the index of the query, the index of the expression in its
+    result, and the *path*: the gradient entries that lead from that expression to this one, each with a flag
+    for heuristic entries.
     """
 
     __slots__ = ()
     kind = "read"
 
     @classmethod
-    def standing_for(cls, expression: Expression, listener: Tracer, question: int, part: int) -> Expression:
-        """Return the place of an expression, of its shape."""
+    def from_expression(cls, expression: Expression, listener: Tracer, question: int, part: int) -> Expression:
+        """Return a placeholder that stands for an expression."""
         return cls.from_arguments((expression,), expression.shape, (listener, question, part, ()))
 
     @classmethod
     def empty(cls, shape: ArrayShape, question: int, part: int, path: GradientPath) -> Expression:
-        """Return a place that stands for nothing yet."""
+        """Return an empty placeholder."""
         return cls.from_arguments((), shape, (None, question, part, path))
 
     @property
     def question(self) -> int:
-        """The place of the question."""
+        """Index of the query."""
         return int(self.options[1])
 
     @property
     def part(self) -> int:
-        """The place of the expression in the answer."""
+        """Index of the expression in the query result."""
         return int(self.options[2])
 
     @property
     def path(self) -> GradientPath:
-        """The gradient entries that were followed, each with whether trends count."""
+        """Gradient entries from the result to this expression, each with a flag for heuristic entries."""
         path: GradientPath = self.options[3]
         return path
 
     @property
     def parts(self) -> tuple[Expression, ...]:
-        """Nothing: what it stands for is not part of what is made of it."""
+        """Empty: the expression it stands for is not part of expressions with the placeholder."""
         return ()
 
     @property
     def is_constant(self) -> bool:
-        """Never, so that what works for expressions is done also where a number would do."""
+        """False, so that code takes its path for expressions and not for numbers."""
         return False
 
     def _initialise(
@@ -96,26 +96,26 @@ class ReadNode(Node):
         return repr((listener and listener.serial, question, part, steps))
 
     def _look(self, how: Access) -> Expression:
-        """Return what it stands for, and let it be known."""
+        """Record an access, and return the expression it stands for."""
         if not self.arguments:
             raise ModelError("A trace has no value before it is run.")
-        # How the entries of a gradient depend on symbols does not show in what it stands for.
+        # The symbols of gradient entries do not follow from those of the expression.
         self.options[0].look(self.question, Access.VALUE if self.path else how)
         return self.arguments[0]
 
     @property
     def symbols(self) -> frozenset[Symbol]:
-        """The symbols of what it stands for."""
+        """Symbols of the expression it stands for."""
         return frozenset(self._look(Access.SYMBOLS).symbols)
 
     @property
     def value(self) -> Expression:
-        """What it stands for."""
+        """Expression it stands for."""
         return self._look(Access.VALUE)
 
     def gradient(self, heuristic: bool) -> Mapping[Symbol, Expression]:
-        """Return D, whose entries are places, too."""
-        listener, question, part, path = self.options
+        """Return the gradient, with placeholders as entries."""
+        watcher, question, part, path = self.options
         return {
             key: ReadNode.from_arguments(
                 (entry,), self.shape, (listener, question, part, (*path, (key, heuristic)))
@@ -124,11 +124,11 @@ class ReadNode(Node):
         }
 
     def gradient_keys(self, heuristic: bool) -> frozenset[Symbol]:
-        """Return the keys of D."""
+        """Return the keys of the gradient."""
         return frozenset(self._look(Access.SYMBOLS).gradient(heuristic))
 
     def differentiated(self, heuristic: bool) -> tuple[Expression, ...]:
-        """Return nothing: the entries are asked for one by one."""
+        """Return nothing, because gradient entries are queried one by one."""
         return ()
 
     def depends_on(self, substitution: Substitution) -> bool:
@@ -136,7 +136,7 @@ class ReadNode(Node):
         return substitution.changes(self._look(Access.VALUE))
 
     def substitute(self, substitution: Substitution) -> Expression:
-        """Return what it stands for after a substitution, and so no place any more."""
+        """Return the expression it stands for after a substitution."""
         return apply_substitution(self._look(Access.VALUE), substitution)
 
     def _value(self) -> NoReturn:
@@ -147,7 +147,7 @@ class ReadNode(Node):
 
 
 def follow_gradient_path(expression: Expression, path: GradientPath) -> Expression:
-    """Return the gradient entry that a path leads to; zero where there is none."""
+    """Return the gradient entry at the end of a path; zero if there is none."""
     for key, heuristic in path:
         entry = expression.gradient(heuristic).get(key)
         expression = as_expression(np.zeros(expression.shape)) if entry is None else entry
@@ -155,10 +155,10 @@ def follow_gradient_path(expression: Expression, path: GradientPath) -> Expressi
 
 
 def fill_read_nodes(expression: Expression, put: Callable[[ReadNode], Expression]) -> Expression:
-    """Return an expression in which places are exchanged for what belongs there.
+    """Replace the placeholders of an expression.
 
-    What was made of a place is made again of what is there now, which is not a substitution: an entry of a
-    gradient that was overridden stays overridden.
+    Nodes are built again from their new arguments. Unlike in a substitution, overridden gradient entries stay
+    overridden.
     """
     if not expression._nodes:
         return expression
@@ -174,7 +174,7 @@ def fill_read_nodes(expression: Expression, put: Callable[[ReadNode], Expression
 
 
 def find_read_nodes(expression: Expression) -> list[ReadNode]:
-    """Return the places in an expression, at every depth."""
+    """Return the placeholders in an expression, at every depth."""
     nodes = topological_order(leaves(expression)[1], lambda n: n.parts, lambda _: False)
     return [node for node in nodes if isinstance(node, ReadNode)]
 

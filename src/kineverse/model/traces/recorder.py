@@ -20,22 +20,22 @@ _SERIAL = count(1)
 
 
 def record_trace(operation: Operation, model: ReadRecorder, writes: Mapping[Cell, Any]) -> Trace:
-    """Return what an operation computes.
+    """Record the trace of an operation.
 
     Parameters
     ----------
     operation
-        An operation that was applied.
+        Operation that was applied.
     model
-        The model before it.
+        Model before the operation.
     writes
-        What it wrote. What its trace writes is compared with it, and then with what the code does where
-        answers are others, as code may look at what it is given in ways that no one notices.
+        Writes of the operation. The trace must reproduce them. It must also agree with the code on perturbed
+        query results, because code can inspect values in ways that are not recorded.
 
     Raises
     ------
     UntraceableError
-        If its code cannot do without the values that it read.
+        If the code needs the values that it reads.
     """
     if not operation.traceable:
         raise UntraceableError("what it computes follows from numbers that it reads")
@@ -45,7 +45,7 @@ def record_trace(operation: Operation, model: ReadRecorder, writes: Mapping[Cell
     except UntraceableError as error:
         if not reader.gave_numbers:
             raise
-        try:  # much code needs its numbers and yet only computes with poses
+        try:  # much code needs its numbers, but only computes with its poses
             return _run_traced(operation, _RecordingReader(model, plain_numbers=True), writes)
         except UntraceableError:
             raise error from None
@@ -61,7 +61,7 @@ def _run_traced(operation: Operation, reader: _RecordingReader, writes: Mapping[
         again = reader.trace(traced).written(reader.replies).writes()
     except UntraceableError:
         raise
-    except Exception as error:  # it is anybody's code, and was written for other values
+    except Exception as error:  # user code, written for other types of values
         first = str(error).partition("\n")[0]
         raise UntraceableError(f"its code needs values: {type(error).__name__}: {first[:200]}") from error
     if not writes_agree(again, writes):
@@ -84,9 +84,10 @@ def _run_traced(operation: Operation, reader: _RecordingReader, writes: Mapping[
 
 
 class _RecordingReader(TracingReader):
-    """The model before an operation, with answers in place of expressions, every question written down.
+    """Model before an operation, with placeholders for expressions; it records all queries.
 
-    With ``plain_numbers``, data and records have numbers where they have, all of which count as looked at.
+    With ``plain_numbers``, numbers of data and records are passed as they are, and count as accessed by
+    value.
     """
 
     def __init__(self, model: ReadRecorder, plain_numbers: bool = False) -> None:
@@ -100,15 +101,15 @@ class _RecordingReader(TracingReader):
 
     @property
     def gave_numbers(self) -> bool:
-        """Whether there are numbers among the answers."""
+        """True if a query result has a number."""
         return any(isinstance(part, float) for reply in self.replies for part in reply.parts)
 
     def trace(self, writes: tuple[tuple[Cell, Any], ...]) -> Trace:
-        """Return what was asked, with what is written."""
+        """Return the trace of the recorded queries and of given writes."""
         return Trace(self.steps(), writes)
 
     def steps(self) -> tuple[TraceStep, ...]:
-        """Return what was asked."""
+        """Return the recorded queries with their accesses."""
         return tuple(TraceStep(_apart(q), look) for q, look in zip(self._questions, self._looks, strict=True))
 
     def look(self, question: int, how: Access) -> None:
@@ -116,7 +117,7 @@ class _RecordingReader(TracingReader):
             self._looks[question] = max(self._looks[question], how)
 
     def decided_by(self, question: int) -> None:
-        """Note that the value of an answer matters."""
+        """Record that the operation depends on the value of a query result."""
         self._looks[question] = Access.VALUE
 
     def notify(self, expression: Expression) -> Expression:
@@ -150,11 +151,11 @@ class _RecordingReader(TracingReader):
     def _given(self, question: int, place: int, part: Expression | float) -> Expression | float:
         if self._plain_numbers and isinstance(part, float):
             return part
-        return ReadNode.standing_for(as_expression(part), self, question, place)
+        return ReadNode.from_expression(as_expression(part), self, question, place)
 
 
 def _detach(expression: Expression) -> Expression:
-    """Return an expression whose places stand for nothing any more, and are the same in every process."""
+    """Return an expression with empty placeholders, equal in every process."""
     result = fill_read_nodes(expression, lambda a: ReadNode.empty(a.shape, a.question, a.part, a.path))
     if any(answer.arguments for answer in find_read_nodes(result)):
         raise UntraceableError("what it read is inside of an implicit function")

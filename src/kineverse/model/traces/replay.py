@@ -1,8 +1,8 @@
 """Replay of a trace on synthetic inputs, and comparison of what operations write.
 
-Code may look at what it is given in ways that no one notices, as ``isinstance`` does. So it is run once more
-on answers of other types: constants in place of what moves, symbols and whole numbers in place of numbers.
-Where it then does what the trace does not, it decides by that answer.
+Code can inspect values in ways that are not recorded, such as ``isinstance``. So an operation is applied once
+more to query results of other types: constants instead of moving expressions, symbols and integers instead of
+numbers. If its writes then differ from those of the trace, the operation depends on that result.
 """
 
 from __future__ import annotations
@@ -46,10 +46,10 @@ def writes_agree(
     other: Mapping[Cell, Any],
     affordable: Callable[[list[ExpressionPair]], bool] = lambda _: True,
 ) -> bool:
-    """Return whether the same is written, in the same order, expressions compared by a few values.
+    """Return whether writes agree, in order; expressions are compared at a few states.
 
-    A number and a constant expression are the same. What is not structurally equal, and not ``affordable``,
-    is not compared.
+    A number equals a constant expression. Expressions that are not structurally equal are compared only if
+    they are ``affordable``.
     """
     if list(one) != list(other):
         return False
@@ -64,7 +64,7 @@ def writes_agree(
 
 
 def _pairs(kind: str, a: Any, b: Any) -> list[ExpressionPair] | None:
-    """Return the expressions at the same places of two values; None if something else differs."""
+    """Return the expressions at equal places of two values; None if the values differ otherwise."""
     if a is b:
         return []
     if kind == FRAMES:
@@ -132,7 +132,7 @@ def replay_agrees(
     replies: Sequence[QueryResult],
     free: Collection[int],
 ) -> bool:
-    """Return whether a trace does what the code does where the answers to these questions are others."""
+    """Return whether a trace agrees with the code while the results of some queries are perturbed."""
     for change in (_perturb_value, partial(_perturb_motion, symbol=_symbol_of(trace))):
         others: list[QueryResult] = []
         try:
@@ -143,7 +143,7 @@ def replay_agrees(
                     others.append(_perturb(change, step.question, reply) if place in free else reply)
             traced = trace.written(others).writes()
         except KineverseError:
-            continue  # nobody follows such a change
+            continue  # the perturbation is not valid for the trace
         reader = _ReplayReader(model, trace, others)
         try:
             effects = operation.apply(reader)
@@ -151,7 +151,7 @@ def replay_agrees(
             written = effects.writes()
         except UntraceableError:
             return False
-        except Exception:  # it is anybody's code, and such answers may be none for it
+        except Exception:  # user code, which may not accept perturbed results
             continue
         if not writes_agree(traced, written):
             return False
@@ -163,11 +163,11 @@ def _perturb(change: Perturbation, question: Query, reply: QueryResult) -> Query
 
 
 def _perturb_value(question: Query, place: int, part: Expression | float) -> Expression | float:
-    """Return another number in place of a number, and a constant for what moves."""
+    """Replace a number by another one, and a moving expression by a constant."""
     if isinstance(part, float):
         return math.floor(part) + 2 if question.kind == "datum" else 1.25 * part + 0.5
     if question.kind == "constraint" and place == 1:
-        return 2 * part  # what is limited is never constant
+        return 2 * part  # the expression of a constraint is never constant
     random = np.random.default_rng(_PERTURBATION_SEED)
     try:
         value = part({s: random.uniform(0.1, 0.9) for s in part.symbols if s.value is None})
@@ -181,7 +181,7 @@ def _perturb_value(question: Query, place: int, part: Expression | float) -> Exp
 def _perturb_motion(
     question: Query, place: int, part: Expression | float, symbol: Symbol
 ) -> Expression | float:
-    """Return something that is, or is made of, nothing but one symbol."""
+    """Replace a part by an expression in one symbol."""
     symbol = symbol if isinstance(part, float) or not part.symbols else part.symbols[0]
     if isinstance(part, float) or not part.shape:
         return symbol
@@ -191,14 +191,14 @@ def _perturb_motion(
 
 
 def _symbol_of(trace: Trace) -> Symbol:
-    """Return a symbol that the code uses itself, as it may compare what it reads with that."""
+    """Return a symbol that the code uses itself, because it may compare reads with that symbol."""
     written = (e for (kind, _), value in trace.writes for e in find_expressions(kind, value))
     symbols = (s for e in written for s in leaves(e)[0] if not s.order and s.has_derivative)
     return next(symbols, position(_STRANGER))
 
 
 class _ReplayReader(TracingReader):
-    """A model that answers the questions of a trace in its own way, and no others."""
+    """Reader with given results for the queries of a trace; it refuses other queries."""
 
     def __init__(self, model: ReadRecorder, trace: Trace, replies: Sequence[QueryResult]) -> None:
         super().__init__(model)

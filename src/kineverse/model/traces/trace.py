@@ -19,16 +19,16 @@ from .placeholder import ReadNode, fill_read_nodes, find_read_nodes, follow_grad
 from .trace_queries import FAILED, Access, Query, QueryResult, ResultPart
 
 MAX_ANSWER = 200_000
-"""How many nodes an answer may be made of."""
+"""Largest number of nodes in a query result."""
 
 
 class UntraceableError(ModelError):
-    """An operation decides by what it read in a way that its trace cannot follow."""
+    """Operation that depends on values it reads in a way that a trace cannot represent."""
 
 
 @dataclass(frozen=True)
 class TraceStep:
-    """A question, and how closely its answer was looked at."""
+    """Query of an operation, with the access to its result."""
 
     question: Query
     look: Access
@@ -36,35 +36,35 @@ class TraceStep:
 
 @dataclass(frozen=True)
 class Trace:
-    """What an operation computes.
+    """Computation of an operation as expressions.
 
     Attributes
     ----------
     steps
-        The questions in the order in which they were asked; one may be about the answers before it.
+        Queries in order. The arguments of a query may contain results of earlier ones.
     writes
-        What is written, by cell, with :class:`.placeholder.ReadNode` nodes where answers belong.
+        Written values by cell, with :class:`.placeholder.ReadNode` nodes for query results.
     """
 
     steps: tuple[TraceStep, ...]
     writes: tuple[tuple[Cell, Any], ...]
 
     def run(self, model: ReadRecorder, before: ReadRecorder) -> Writes:
-        """Return what the operation writes, given a model.
+        """Evaluate the trace on a model, and return the writes.
 
         Parameters
         ----------
         model
-            The model as it is now.
+            Present model.
         before
-            The model as it was when the operation was traced.
+            Model at the time of the trace.
 
         Raises
         ------
         UntraceableError
-            If something has changed that the operation decided by.
+            If a value has changed that the operation depends on.
         UnknownNameError
-            If something that it asked for does not exist any more.
+            If the name in a query no longer exists.
         """
         old: list[QueryResult] = []
         new: list[QueryResult] = []
@@ -86,11 +86,11 @@ class Trace:
         return self.written(new)
 
     def written(self, replies: Sequence[QueryResult]) -> Writes:
-        """Return what the operation writes, given the answers to its questions."""
+        """Return the writes for given query results."""
         put = _into(replies)
 
         def put_datum(expression: Expression) -> Expression | float:
-            # What is made of numbers alone is a number again.
+            # An expression of numbers is converted back to a number.
             parts = [replies[a.question].parts[a.part] for a in find_read_nodes(expression)]
             result = put(expression)
             of_numbers = bool(parts) and all(isinstance(part, float) for part in parts)
@@ -108,18 +108,18 @@ class Trace:
         }
         for (kind, _), value in written.items():
             if kind == CONSTRAINTS:
-                Constraint.of(value.lower, value.expression, value.upper)  # raises where there is no range
+                Constraint.of(value.lower, value.expression, value.upper)  # raises for an empty range
         return Writes.of(written)
 
 
 def _check_size(reply: QueryResult) -> None:
-    """Refuse what has no end: each of some dozen substitutions in one another doubles what there is."""
+    """Refuse results of exponential size: each of several nested substitutions can double the size."""
     if sum(ca.n_nodes(part._sx) for part in reply.parts if isinstance(part, Expression)) > MAX_ANSWER:
         raise UntraceableError(f"an answer on the way to it is made of more than {MAX_ANSWER:,} nodes.")
 
 
 def run_query(question: Query, model: ReadRecorder) -> QueryResult:
-    """Return the answer to a question, :data:`.trace_queries.FAILED` where asking is an error."""
+    """Return the result of a query; :data:`.trace_queries.FAILED` if it raises an error."""
     return _reply(_ask(question, model))
 
 
@@ -135,13 +135,13 @@ def _reply(answered: QueryResult | KineverseError) -> QueryResult:
 
 
 def _like(reply: QueryResult, before: QueryResult) -> QueryResult:
-    """Return a reply with a whole number as a number, if that was one that is not whole."""
+    """Return a result with integers as floats, if it had floats at the time of the trace."""
     is_whole = type(reply.rest) is int and isinstance(before.rest, ResultPart)
     return QueryResult(before.rest, (float(reply.rest),)) if is_whole else reply
 
 
 def substitute_results(question: Query, replies: Sequence[QueryResult]) -> Query:
-    """Return a question with earlier answers put into it."""
+    """Return a query with earlier results in its arguments."""
     if not any(isinstance(a, Expression) for a in question.arguments):
         return question
     put = _into(replies)

@@ -25,28 +25,28 @@ from kineverse.symbols import Symbol
 
 
 class Access(IntEnum):
-    """How closely an operation looked at the expressions of an answer."""
+    """Access of an operation to the expressions of a query result."""
 
     NOT = 0
-    """It computed with them, whatever they are."""
+    """It computed with the expressions only."""
     SYMBOLS = 1
-    """It saw which symbols they and their gradients have."""
+    """It read the symbols of the expressions and their gradients."""
     VALUE = 2
-    """It saw the expressions themselves."""
+    """It read the expressions themselves."""
 
 
 class ResultPart(NamedTuple):
-    """Where, in the rest of an answer, one of its expressions belongs."""
+    """Position of an expression in the rest of a query result."""
 
     place: int
 
 
 FAILED = "there is none"
-"""In place of an answer, where asking is an error."""
+"""Result of a query that raises an error."""
 
 
 class QueryResult(NamedTuple):
-    """An answer in two: what an operation may have decided by, and expressions."""
+    """Result of a query in two parts: data that the operation may depend on, and expressions."""
 
     rest: Any
     parts: tuple[Expression | float, ...]
@@ -54,14 +54,14 @@ class QueryResult(NamedTuple):
 
 @dataclass(frozen=True)
 class Query:
-    """A question to a model.
+    """Query to a model.
 
     Attributes
     ----------
     kind
         One of :data:`QUERY_KINDS`.
     arguments
-        Names, or an expression.
+        Names or expressions.
     """
 
     kind: str
@@ -69,31 +69,31 @@ class Query:
 
     @property
     def key(self) -> tuple[object, ...]:
-        """What tells it from others, without looking at expressions closely."""
+        """Identity of the query, without access to the values of expressions."""
         return self.kind, *(structural_hash(a) if isinstance(a, Expression) else a for a in self.arguments)
 
     def ask(self, model: ReadRecorder) -> QueryResult:
-        """Return the model's answer.
+        """Return the result of the query on a model.
 
         Raises
         ------
         UnknownNameError
-            If what is asked for does not exist.
+            If the queried name does not exist.
         """
         return QUERY_KINDS[self.kind].ask(model, *self.arguments)
 
     def answer(self, rest: Any, parts: Sequence[Expression | float]) -> Any:
-        """Return an answer as the reader gives it, of these expressions."""
+        """Assemble the result for the caller from these expressions."""
         return QUERY_KINDS[self.kind].join(rest, parts)
 
 
 class QueryKind(NamedTuple):
-    """How a kind of question is asked, and how its answer is put together."""
+    """Type of query: function that runs it, and function that assembles its result."""
 
     ask: Callable[..., QueryResult]
     join: Callable[[Any, Sequence[Any]], Any]
     arguments: int
-    """How many arguments it has."""
+    """Number of arguments."""
 
 
 def _split(datum: Any, parts: list[Expression | float]) -> Any:
@@ -160,7 +160,7 @@ def _names(model: ReadRecorder, kind: str) -> QueryResult:
 
 
 def _homogeneous(upper: Expression) -> Expression:
-    # The last row of a transform is no answer of the model, and zeros are worth keeping apart.
+    # The last row of a transform is constant, and its zeros should stay structural.
     return as_expression(np.concatenate([upper, as_expression([[0.0, 0.0, 0.0, 1.0]])]))
 
 
@@ -212,7 +212,7 @@ QUERY_KINDS: dict[str, QueryKind] = {
 }
 
 EXPRESSION_QUERIES = ("resolve", "carry", "jacobian", "facts", "partial", "substitute", "unit", "quaternion")
-"""Questions whose arguments are expressions; the last six look at these, and not into the model."""
+"""Queries with expressions as arguments. The last six do not depend on the model."""
 
 DATA_QUERIES = {
     FRAMES: "frame",
@@ -221,18 +221,18 @@ DATA_QUERIES = {
     CONSTRAINTS: "constraint",
     DATA: "datum",
 }
-"""Which question asks for one of a kind of data by its name."""
+"""Query for one value by name, by kind of data."""
 
 
 class TracingReader(ReadRecorder, ABC):
-    """The model before an operation, for code that is to be followed in what it reads.
+    """Model before an operation that turns every read into a query.
 
     Attributes
     ----------
     model
-        The model itself.
+        Model itself.
     done
-        Whether the code has run; who looks at its writes then is the same for all.
+        True after the operation has returned; later accesses to its writes are not recorded.
     """
 
     def __init__(self, model: ReadRecorder) -> None:
@@ -242,35 +242,35 @@ class TracingReader(ReadRecorder, ABC):
 
     @abstractmethod
     def ask(self, kind: str, *arguments: Any) -> Any:
-        """Return the answer to a question, see :data:`.trace_queries.QUERY_KINDS`."""
+        """Return the result of a query, see :data:`.trace_queries.QUERY_KINDS`."""
 
     def by_kind(self, kind: str) -> Mapping[str, Any]:
         """Return one kind of data by name."""
         return _QueriedData(self, kind)
 
     def fk(self, frame: str, relative_to: str = WORLD) -> Expression:
-        """Ask where a frame is in another."""
+        """Query the pose of a frame in another."""
         result: Expression = self.ask("fk", frame, relative_to)
         return result
 
     def coordinates_between(self, frame: str, relative_to: str = WORLD) -> tuple[Symbol, ...]:
-        """Ask which coordinates move a frame relative to another."""
+        """Query the coordinates that move a frame relative to another."""
         result: tuple[Symbol, ...] = self.ask("between", frame, relative_to)
         return result
 
     def resolve(self, expression: Expression) -> Expression:
-        """Ask for an expression without coordinates that depend on others."""
+        """Query an expression in independent coordinates."""
         result: Expression = self.ask("resolve", expression)
         return result
 
     def carry(self, expression: Expression) -> Expression:
-        """Ask for an expression with coordinates carried by their rates."""
+        """Query an expression with coordinates carried by their rates."""
         result: Expression = self.ask("carry", expression)
         return result
 
 
 class _QueriedData(Mapping[str, Any]):
-    """One kind of data by name; reading is a question."""
+    """Mapping of one kind of data by name, with a query for each read."""
 
     def __init__(self, reader: TracingReader, kind: str) -> None:
         self._reader = reader
@@ -297,14 +297,14 @@ class _QueriedData(Mapping[str, Any]):
 
 
 def _with_factors(frame: Frame, reader: TracingReader, name: str) -> Frame:
-    """Return a frame of one factor whose own are asked for by whoever wants to see them."""
+    """Return a frame with its product as one factor; access to the factors is a query."""
     result = replace(frame, factors=_Factors(frame.factors, reader, name))
-    vars(result)["transform"] = frame.transform  # a cached property, or it would ask for the factors
+    vars(result)["transform"] = frame.transform  # set the cached property, which would query the factors
     return result
 
 
 class _Factors(tuple["Pose | Expression", ...]):
-    """The factors of a frame, of which most code only wants the product."""
+    """Factors of a frame, queried on demand because most code needs their product only."""
 
     _reader: TracingReader
     _name: str
