@@ -80,7 +80,7 @@ class Base(Joint):
 
 
 @dataclass(frozen=True, kw_only=True)
-class OmniBase(Base):
+class OmniBase(Base, document_kind="OmniBase"):
     """An omnidirectional base: its coordinates x, y [m] and θ [rad] are all free.
 
     Attributes
@@ -106,7 +106,7 @@ class OmniBase(Base):
 
 
 @dataclass(frozen=True, kw_only=True)
-class DifferentialDrive(Base):
+class DifferentialDrive(Base, document_kind="DifferentialDrive"):
     """A base on two driven wheels, which cannot go sideways.
 
     Its coordinates x, y [m] and θ [rad] move by the wheels' speeds only (2022 paper, III-A1): with radius r
@@ -176,7 +176,7 @@ class DifferentialDrive(Base):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Ackermann(Base):
+class Ackermann(Base, document_kind="Ackermann"):
     """A car: the child is the middle of its rear axle, x forward, and its front wheels steer.
 
     Coordinates are x, y [m], θ [rad] and the steering angle ``name/steering``, δ [rad], that of a wheel in
@@ -245,7 +245,7 @@ class Ackermann(Base):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Mecanum(Base):
+class Mecanum(Base, document_kind="Mecanum"):
     """A base on four wheels with oblique rollers, which goes sideways too.
 
     Its coordinates x, y [m] and θ [rad] move by four speeds, those of the wheels, front left, front right,

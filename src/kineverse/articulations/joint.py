@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import re
 from abc import abstractmethod
 from collections.abc import Container, Iterable
 from dataclasses import dataclass
@@ -16,7 +15,7 @@ from kineverse.lie import normalize
 from kineverse.model.articulation import Articulation
 from kineverse.model.body import AxisLike, Pose, Vector3
 from kineverse.model.frame import TransformLike
-from kineverse.model.operation import Operation, Writes
+from kineverse.model.operation import Operation, Writes, split_words
 from kineverse.model.read_recorder import ReadRecorder
 from kineverse.symbols import Symbol, position
 
@@ -57,13 +56,13 @@ class PlacedOperation(Operation):
 
     @property
     def kind(self) -> str:
-        """The name of the class in lower case."""
-        return type(self).__name__.lower()
+        """Kind of the articulation: that of documents, in lower case."""
+        return self.document_kind.lower()
 
     @property
     def noun(self) -> str:
-        """What errors call it: the name of the class in words."""
-        return re.sub("(?<=.)(?=[A-Z])", " ", type(self).__name__).lower()
+        """Name in errors: the kind in words."""
+        return split_words(self.document_kind)
 
     def lengths(self, *fields: str) -> None:
         """Look whether fields are lengths [m].
@@ -168,7 +167,7 @@ class Joint(PlacedOperation):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Fixed(Joint):
+class Fixed(Joint, document_kind="Fixed"):
     """A rigid connection: parent_T_child = origin."""
 
     def apply(self, model: ReadRecorder) -> Writes:

@@ -29,7 +29,7 @@ _PERPENDICULAR = 1e-6
 
 
 @dataclass(frozen=True, kw_only=True)
-class Planar(Joint):
+class Planar(Joint, document_kind="Planar"):
     """Motion in a plane: parent_T_child = origin · A · translation(x, y, 0) · rotation_z(θ) · Aᵀ.
 
     The columns of A are two directions in the plane and its normal, the axis. Coordinates are ``name/x``,
@@ -76,7 +76,7 @@ class Planar(Joint):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Universal(Joint):
+class Universal(Joint, document_kind="Universal"):
     """A Cardan joint: parent_T_child = origin · rotation(first, α) · rotation(second, β).
 
     Coordinates ``name/first``, α, and ``name/second``, β [rad]. The first axis stands still in the parent,
@@ -133,7 +133,7 @@ class Universal(Joint):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Ball(Joint):
+class Ball(Joint, document_kind="Ball"):
     """A ball in a socket: parent_T_child = origin · rotation(quaternion).
 
     Four coordinates ``name/qx|qy|qz|qw`` and three speeds, the angular velocity ω of the child in its own
@@ -213,7 +213,7 @@ class Ball(Joint):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Floating(Joint):
+class Floating(Joint, document_kind="Floating"):
     """Free motion: parent_T_child = origin · translation(x, y, z) · rotation(quaternion).
 
     Seven coordinates ``name/x|y|z`` [m] and ``name/qx|qy|qz|qw``, six speeds: the velocities of x, y, z

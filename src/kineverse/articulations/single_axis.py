@@ -21,7 +21,7 @@ from .limits import FREE, Limits, check_limits
 
 
 @dataclass(frozen=True, kw_only=True)
-class Revolute(OneDofJoint):
+class Revolute(OneDofJoint, document_kind="Revolute"):
     """A hinge: parent_T_child = origin · rotation(axis, q), q in [rad]."""
 
     def motion(self, q: Expression) -> tuple[Pose | Expression, ...]:
@@ -30,12 +30,12 @@ class Revolute(OneDofJoint):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Continuous(Revolute):
+class Continuous(Revolute, document_kind="Continuous"):
     """A hinge without end stops, q in [rad]; usually without position limits."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class Prismatic(OneDofJoint):
+class Prismatic(OneDofJoint, document_kind="Prismatic"):
     """A slider: parent_T_child = origin · translation(axis · q), q in [m]."""
 
     def motion(self, q: Expression) -> tuple[Pose | Expression, ...]:
@@ -44,7 +44,7 @@ class Prismatic(OneDofJoint):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Screw(OneDofJoint):
+class Screw(OneDofJoint, document_kind="Screw"):
     """A thread: parent_T_child = origin · translation(axis · p q/2π) · rotation(axis, q), q in [rad].
 
     Attributes
@@ -84,7 +84,7 @@ class Screw(OneDofJoint):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Cylindrical(Joint):
+class Cylindrical(Joint, document_kind="Cylindrical"):
     """A rod in a sleeve: parent_T_child = origin · translation(axis · s) · rotation(axis, φ).
 
     Coordinates ``name/slide``, s [m], and ``name/turn``, φ [rad], independent of each other.

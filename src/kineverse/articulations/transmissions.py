@@ -88,7 +88,7 @@ class Transmission(OneAxisMotion):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Gearbox(Transmission):
+class Gearbox(Transmission, document_kind="Gearbox"):
     """A gear or a belt: parent_T_child = origin · rotation(axis, q) with q = ratio · d + offset [rad].
 
     Attributes
@@ -123,7 +123,7 @@ class Gearbox(Transmission):
 
 
 @dataclass(frozen=True, kw_only=True)
-class RackAndPinion(Transmission):
+class RackAndPinion(Transmission, document_kind="RackAndPinion"):
     """A rack that a pinion moves: parent_T_child = origin · translation(axis · q), q = radius · d + offset.
 
     Attributes
@@ -157,7 +157,7 @@ class RackAndPinion(Transmission):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Cam(Transmission):
+class Cam(Transmission, document_kind="Cam"):
     """A follower on a cam: parent_T_child = origin · translation(axis · q), q = profile(d) [m].
 
     Where it turns, it is origin · rotation(axis, q), q = profile(d) [rad]. The profile is a cubic spline

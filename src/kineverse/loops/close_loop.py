@@ -27,7 +27,7 @@ _Item = TypeVar("_Item", bound=tuple[Any, ...])
 
 
 @dataclass(frozen=True, kw_only=True)
-class CloseLoop(Operation):
+class CloseLoop(Operation, document_kind="CloseLoop"):
     """Two frames coincide: the coordinates of the loop between them follow the free ones.
 
     With ``to_T_frame = (R, p)``, the residual consists of the elements of p [m] and of the axis of R times
@@ -237,7 +237,7 @@ APART = 1e-9
 
 
 @dataclass(frozen=True, kw_only=True)
-class LoopConstraint(Operation):
+class LoopConstraint(Operation, document_kind="LoopConstraint"):
     """Two frames should coincide: an equality constraint for each row of what is left between them.
 
     For loops that :class:`~kineverse.CloseLoop` cannot turn into a function of the free coordinates. All

@@ -181,6 +181,14 @@ class Operation(ABC):
     overrides: ClassVar[bool] = False
     """Whether it may write over frames, bodies, articulations and rates that it has not looked at."""
 
+    document_kind: ClassVar[str]
+    """Name of the class in documents, in the kinds of articulations and in tags, whatever the class is called."""
+
+    def __init_subclass__(cls, *, document_kind: str = "", **keywords: Any) -> None:
+        """Name a class in documents: frozen for those that ship, else its own name."""
+        super().__init_subclass__(**keywords)
+        cls.document_kind = document_kind or cls.__name__
+
     if not TYPE_CHECKING:  # a type checker knows the keywords
 
         def __new__(cls, *args, **keywords):
@@ -196,11 +204,15 @@ class Operation(ABC):
         """
 
     def default_tag(self) -> str:
-        """Return the tag used when none is given: the class and the operation's name, if it has one."""
-        kind = type(self).__name__
-        words = "".join(f" {c.lower()}" if c.isupper() else c for c in kind).strip()
+        """Return the tag used when none is given: the kind and the operation's name, if it has one."""
+        words = split_words(self.document_kind)
         name = getattr(self, "name", "")
         return f"{words} {name}" if name else words
+
+
+def split_words(kind: str) -> str:
+    """Return a name like ``DoorWithHandle`` in words, ``door with handle``."""
+    return "".join(f" {c.lower()}" if c.isupper() else c for c in kind).strip()
 
 
 class Keywords(NamedTuple):

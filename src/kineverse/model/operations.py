@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class SetBody(Operation):
+class SetBody(Operation, document_kind="SetBody"):
     """Gives a frame its body: what of it is seen and touched, and its inertia."""
 
     name: str
@@ -37,7 +37,7 @@ class SetBody(Operation):
 
 
 @dataclass(frozen=True)
-class SetHome(Operation):
+class SetHome(Operation, document_kind="SetHome"):
     """Gives the coordinates of an articulation the values they have at home [m], [rad]."""
 
     name: str
@@ -53,7 +53,7 @@ class SetHome(Operation):
 
 
 @dataclass(frozen=True)
-class AddFrame(Operation):
+class AddFrame(Operation, document_kind="AddFrame"):
     """Places a frame in its parent, with what it carries."""
 
     name: str
@@ -71,7 +71,7 @@ class AddFrame(Operation):
 
 
 @dataclass(frozen=True)
-class Constrain(Operation):
+class Constrain(Operation, document_kind="Constrain"):
     """Adds a constraint."""
 
     name: str
@@ -87,7 +87,7 @@ class Constrain(Operation):
 
 
 @dataclass(frozen=True)
-class SetRate(Operation):
+class SetRate(Operation, document_kind="SetRate"):
     """Says how a coordinate moves with speeds."""
 
     coordinate: Symbol
@@ -103,7 +103,7 @@ class SetRate(Operation):
 
 
 @dataclass(frozen=True)
-class SetData(Operation):
+class SetData(Operation, document_kind="Write"):
     """Stores data."""
 
     name: str
@@ -119,7 +119,7 @@ class SetData(Operation):
 
 
 @dataclass(frozen=True)
-class Attach(Operation):
+class Attach(Operation, document_kind="Attach"):
     """Puts an existing frame, with everything below it, into another parent."""
 
     name: str
@@ -137,7 +137,7 @@ class Attach(Operation):
 
 
 @dataclass(frozen=True)
-class Override(Operation):
+class Override(Operation, document_kind="Override"):
     """Applies an operation that may write over what operations before it wrote."""
 
     overrides = True
@@ -159,7 +159,7 @@ class Override(Operation):
 
 
 @dataclass(frozen=True)
-class SoftLimits(Operation):
+class SoftLimits(Operation, document_kind="SoftLimits"):
     """Keeps a joint within the range its safety controller defends, which lies inside its end stops.
 
     Attributes

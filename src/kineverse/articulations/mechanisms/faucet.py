@@ -16,7 +16,7 @@ from .simple_bodies import STEEL, rod_shape, shift
 
 
 @dataclass(frozen=True, kw_only=True)
-class Faucet(Mechanism):
+class Faucet(Mechanism, document_kind="Faucet"):
     """A tap whose lever is lifted for more water and turned for warmer water.
 
         base_T_lever = translation(0, 0, height) · rotation_z(t) · rotation_y(l)

@@ -22,7 +22,7 @@ Point: TypeAlias = tuple[float, float]
 
 
 @dataclass(frozen=True, kw_only=True)
-class FoldingDoor(Mechanism):
+class FoldingDoor(Mechanism, document_kind="FoldingDoor"):
     """A cupboard's door of two panels that fold while they rise; an arm guides the lower one.
 
     Everything moves in the (x, z) plane of the base, which is the middle of the cupboard; it opens towards

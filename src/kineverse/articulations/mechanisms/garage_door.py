@@ -19,7 +19,7 @@ from .simple_bodies import DARK, STEEL, WOOD, box_shape, rod_shape, shift
 
 
 @dataclass(frozen=True, kw_only=True)
-class GarageDoor(Mechanism):
+class GarageDoor(Mechanism, document_kind="GarageDoor"):
     """A door whose lower edge rises along a vertical rail, and its upper edge along one under the ceiling.
 
     2022 paper, Eqs. 11-13. With its length l and its angle α, 0 when closed,
@@ -99,7 +99,9 @@ class GarageDoor(Mechanism):
     def locks(self) -> Mapping[str, BoundedExpression]:
         """Return the lock, c2 of Eq. 13."""
         raised = self.q("bolt") > self.catch
-        return {"lock": speed_lock(self.q("door"), raised, at=self.closed, speed=self.speed)}
+        return {
+            "lock": speed_lock(self.q("door"), open_if=raised, engaged_if=self.closed, max_speed=self.speed)
+        }
 
     def parts(self) -> Mapping[str, MechanismPart]:
         """Return rails, door and bolt."""

@@ -62,7 +62,7 @@ class HingedDoor(Mechanism):
 
 
 @dataclass(frozen=True, kw_only=True)
-class DoorWithHandle(HingedDoor):
+class DoorWithHandle(HingedDoor, document_kind="DoorWithHandle"):
     """A room's door: shut, it opens only while the handle is pressed; once open, it moves freely.
 
     ================  ======================================================================
@@ -119,7 +119,11 @@ class DoorWithHandle(HingedDoor):
         """Return the lock."""
         q = self.q("door")
         pressed = self.q("handle") > self.threshold
-        return {"lock": speed_lock(q, pressed, at=q < self.shut, speed=self.speed, blocks="forward")}
+        return {
+            "lock": speed_lock(
+                q, open_if=pressed, engaged_if=q < self.shut, max_speed=self.speed, blocks="forward"
+            )
+        }
 
     def parts(self) -> Mapping[str, MechanismPart]:
         """Return posts, door and handle."""
@@ -184,7 +188,7 @@ class SprungDoor(HingedDoor):
     def locks(self) -> Mapping[str, BoundedExpression]:
         """Return what the spring's end does."""
         away = self.q(self.sprung) > self.catch
-        return {"latch": position_lock(self.q("door"), away, upper=0.0, margin=self.play)}
+        return {"latch": position_lock(self.q("door"), open_if=away, upper=0.0, margin=self.play)}
 
     def known(self) -> tuple[tuple[str, Any], ...]:
         """Return the spring."""
@@ -192,7 +196,7 @@ class SprungDoor(HingedDoor):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Latch(SprungDoor):
+class Latch(SprungDoor, document_kind="Latch"):
     """A door that a sprung bolt holds.
 
     ================  ======================================================================
@@ -228,7 +232,7 @@ class Latch(SprungDoor):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Microwave(SprungDoor):
+class Microwave(SprungDoor, document_kind="Microwave"):
     """An oven whose door stays shut unless its button is pressed; the button comes back by a spring.
 
     ================  ======================================================================

@@ -21,7 +21,7 @@ HALF_TURN = Pose((1.0, 0.0, 0.0, 0.0, 0.0, -1.0, 0.0, 0.0, 0.0, 0.0, -1.0, 0.0))
 
 
 @dataclass(frozen=True, kw_only=True)
-class ScissorLift(Mechanism):
+class ScissorLift(Mechanism, document_kind="ScissorLift"):
     """A platform on n pairs of crossed arms, one on top of the other.
 
     Its coordinate ``name`` is the angle q of the arms above the horizontal [rad]. With arms of length L,
@@ -101,7 +101,7 @@ class ScissorLift(Mechanism):
 
 
 @dataclass(frozen=True, kw_only=True)
-class DeskLamp(Mechanism):
+class DeskLamp(Mechanism, document_kind="DeskLamp"):
     """A lamp on two parallelograms: wherever it is put, its head keeps its orientation.
 
     The lower arm leans by α from the vertical and the upper one rises by β from the horizontal. Beside each

@@ -20,7 +20,7 @@ from .simple_bodies import DARK, RED, STEEL, box_shape, rod_shape, shift
 
 
 @dataclass(frozen=True, kw_only=True)
-class Ratchet(Mechanism):
+class Ratchet(Mechanism, document_kind="Ratchet"):
     """A wheel with a pawl, which does not turn back unless the pawl is lifted.
 
     ================  ======================================================================
@@ -79,7 +79,7 @@ class Ratchet(Mechanism):
     def locks(self) -> Mapping[str, ConstraintLike]:
         """Return what the pawl does."""
         lifted = self.q("pawl") > self.release
-        return {"lock": speed_lock(self.q("wheel"), lifted, speed=self.speed, blocks="backward")}
+        return {"lock": speed_lock(self.q("wheel"), open_if=lifted, max_speed=self.speed, blocks="backward")}
 
     def known(self) -> tuple[tuple[str, Any], ...]:
         """Return the teeth."""

@@ -16,7 +16,7 @@ from .simple_bodies import DARK, STEEL, YELLOW, box_shape, rod_shape
 
 
 @dataclass(frozen=True, kw_only=True)
-class ScrewAndNut(Mechanism):
+class ScrewAndNut(Mechanism, document_kind="ScrewAndNut"):
     """A screw that turns in its place, and a nut that cannot turn and so slides along it.
 
     By the screw's angle ``name``, q [rad], with its pitch p and the nut's travel t:

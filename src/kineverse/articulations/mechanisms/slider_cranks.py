@@ -17,7 +17,7 @@ from .simple_bodies import BLUE, DARK, PALE, RED, STEEL, box_shape, rod_shape, s
 
 
 @dataclass(frozen=True, kw_only=True)
-class PistonAndRod(Mechanism):
+class PistonAndRod(Mechanism, document_kind="PistonAndRod"):
     """A slider-crank: a piston that a crank moves by a rod, over the whole turn.
 
     By the crank's angle ``name``, q [rad], with the crank's radius r and the rod's length l > r:
@@ -106,7 +106,7 @@ class PistonAndRod(Mechanism):
 
 
 @dataclass(frozen=True, kw_only=True)
-class PedalBin(Mechanism):
+class PedalBin(Mechanism, document_kind="PedalBin"):
     """A bin whose lid a pedal opens; the lid's angle is no multiple of the pedal's.
 
     By the pedal's angle ``name``, p [rad], 0 when nobody steps on it. The pedal is a lever about a pivot

@@ -66,27 +66,27 @@ class Mounted(Joint):
 
 
 @dataclass(frozen=True, kw_only=True)
-class MountedRevolute(Mounted, Revolute):
+class MountedRevolute(Mounted, Revolute, document_kind="MountedRevolute"):
     """A hinge and a part on it: parent_T_child = origin · rotation(axis, q) · mount."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class MountedScrew(Mounted, Screw):
+class MountedScrew(Mounted, Screw, document_kind="MountedScrew"):
     """A thread and a part on it: parent_T_child = origin · screw(axis, q) · mount."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class MountedCylindrical(Mounted, Cylindrical):
+class MountedCylindrical(Mounted, Cylindrical, document_kind="MountedCylindrical"):
     """A rod in a sleeve and a part on it: parent_T_child = origin · cylindrical(axis, s, φ) · mount."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class MountedBall(Mounted, Ball):
+class MountedBall(Mounted, Ball, document_kind="MountedBall"):
     """A ball in a socket and a part on it: parent_T_child = origin · rotation(quaternion) · mount."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class SlidingPoint(Joint):
+class SlidingPoint(Joint, document_kind="SlidingPoint"):
     """A point in a plane, or anywhere: parent_T_child = origin · translation(x, y, z).
 
     Coordinates are ``name/x``, ``name/y`` and, anywhere, ``name/z`` [m].
@@ -117,7 +117,7 @@ class SlidingPoint(Joint):
 
 
 @dataclass(frozen=True, kw_only=True)
-class FamilyJoint(Joint):
+class FamilyJoint(Joint, document_kind="FamilyJoint"):
     """A joint of a family of one's own: parent_T_child = origin · transform.
 
     Its coordinate is ``name``; of several, each is called like the joint of the family, below the name.

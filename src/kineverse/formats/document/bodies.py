@@ -29,9 +29,7 @@ from kineverse.model.body import (
 from .schema import InvalidDocumentError, check_keys, check_list, check_number, check_numbers, check_text
 
 _ROUND: dict[str, Callable[[float, float], Geometry]] = {
-    "cylinder": Cylinder,
-    "capsule": Capsule,
-    "cone": Cone,
+    kind.kind: kind for kind in (Cylinder, Capsule, Cone)
 }
 GEOMETRIES = ("box", *_ROUND, "sphere", "ellipsoid", "mesh")
 INERTIA_NUMBERS = 6
@@ -73,8 +71,8 @@ def _encode_geometry(geometry: Geometry) -> dict[str, Any]:
     if type(geometry) is Box:
         return {"box": {"size": encode_numbers(geometry.size)}}
     if type(geometry) is Cylinder or type(geometry) is Capsule or type(geometry) is Cone:
-        kind = type(geometry).__name__.lower()
-        return {kind: {"radius": encode_number(geometry.radius), "length": encode_number(geometry.length)}}
+        sizes = {"radius": encode_number(geometry.radius), "length": encode_number(geometry.length)}
+        return {geometry.kind: sizes}
     if type(geometry) is Sphere:
         return {"sphere": {"radius": encode_number(geometry.radius)}}
     if type(geometry) is Ellipsoid:

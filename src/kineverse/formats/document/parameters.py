@@ -14,8 +14,7 @@ from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Any
 
-from kineverse import articulations
-from kineverse.articulations.limits import Limits
+from kineverse import articulations as a
 from kineverse.errors import FormatError, KineverseError
 from kineverse.expressions.expression import Expression
 from kineverse.loops import CloseLoop, LoopConstraint
@@ -69,9 +68,18 @@ class UnsupportedParameter:
     kind: str
 
 
+_OPERATIONS: tuple[type[Operation], ...] = (
+    *(AddFrame, Attach, Constrain, SetRate, SetData, CloseLoop, LoopConstraint),
+    *(a.Fixed, a.Revolute, a.Continuous, a.Prismatic, a.Screw, a.Cylindrical),
+    *(a.Planar, a.Universal, a.Ball, a.Floating, a.Gearbox, a.RackAndPinion, a.Cam),
+    *(a.OmniBase, a.DifferentialDrive, a.Ackermann, a.Mecanum),
+    *(a.DeskLamp, a.DoorWithHandle, a.Faucet, a.FoldingDoor, a.GarageDoor, a.Latch, a.Microwave),
+    *(a.PedalBin, a.PistonAndRod, a.Ratchet, a.ScissorLift, a.ScrewAndNut),
+)
+
 RECORDS: Mapping[str, type] = MappingProxyType(
     {
-        "Limits": Limits,
+        "Limits": a.Limits,
         "Frame": Frame,
         "Constraint": Constraint,
         "Articulation": Articulation,
@@ -85,53 +93,20 @@ RECORDS: Mapping[str, type] = MappingProxyType(
         "Ellipsoid": Ellipsoid,
         "Mesh": Mesh,
         "Sphere": Sphere,
-        "AddFrame": AddFrame,
-        "Attach": Attach,
-        "Constrain": Constrain,
-        "SetRate": SetRate,
-        "Write": SetData,
-        "CloseLoop": CloseLoop,
-        "LoopConstraint": LoopConstraint,
-        "Ackermann": articulations.Ackermann,
-        "Ball": articulations.Ball,
-        "Cam": articulations.Cam,
-        "Continuous": articulations.Continuous,
-        "Cylindrical": articulations.Cylindrical,
-        "DeskLamp": articulations.DeskLamp,
-        "DifferentialDrive": articulations.DifferentialDrive,
-        "DoorWithHandle": articulations.DoorWithHandle,
-        "Faucet": articulations.Faucet,
-        "Fixed": articulations.Fixed,
-        "Floating": articulations.Floating,
-        "FoldingDoor": articulations.FoldingDoor,
-        "GarageDoor": articulations.GarageDoor,
-        "Gearbox": articulations.Gearbox,
-        "Latch": articulations.Latch,
-        "Mecanum": articulations.Mecanum,
-        "Microwave": articulations.Microwave,
-        "OmniBase": articulations.OmniBase,
-        "PedalBin": articulations.PedalBin,
-        "PistonAndRod": articulations.PistonAndRod,
-        "Planar": articulations.Planar,
-        "Prismatic": articulations.Prismatic,
-        "RackAndPinion": articulations.RackAndPinion,
-        "Ratchet": articulations.Ratchet,
-        "Revolute": articulations.Revolute,
-        "ScissorLift": articulations.ScissorLift,
-        "Screw": articulations.Screw,
-        "ScrewAndNut": articulations.ScrewAndNut,
-        "Universal": articulations.Universal,
+        **{operation.document_kind: operation for operation in _OPERATIONS},
     }
 )
-"""Classes of operations and of their parameters by the frozen names that documents have for them."""
+"""Classes that a record in a document is rebuilt as, by the frozen name that documents have for them.
 
-_KIND_OF = {kind: name for name, kind in RECORDS.items()}
+Operations are among them, because :class:`kineverse.model.Override` has one as its parameter.
+"""
+
+_NAMES = {kind: name for name, kind in RECORDS.items()}
 
 
 def document_kind(kind: type) -> str:
     """Return the name that documents have for a class: frozen for those that ship, else that of the class."""
-    own: str = getattr(kind, "document_kind", kind.__name__)
-    return _KIND_OF.get(kind, own)
+    return kind.document_kind if issubclass(kind, Operation) else _NAMES.get(kind, kind.__name__)
 
 
 def operation_parameters(operation: Operation) -> dict[str, Any]:
