@@ -242,7 +242,7 @@ BROKEN: list[tuple[Any, str]] = [
     (lambda: kv.articulations.tabulated_limit(door, [(0, 1), (0, 2)], smooth=True), "Knots increase"),
     (lambda: kv.articulations.tabulated_limit(door, {0: 1, 1: nan}), "number .* is nan"),
     (lambda: kv.articulations.tabulated_limit(door, {0: 1, nan: 2}), "number 1 is nan"),
-    (lambda: kv.articulations.tabulated_limit(door, 5), r"points \{driver: limit\}, which is not so in 5"),
+    (lambda: kv.articulations.tabulated_limit(door, 5), r"points \{driver: limit\}, and is not 5"),
     (lambda: kv.articulations.tabulated_limit(1.0, {0: 1, 1: 2}), "driver of a table of limits is an expression, not 1.0"),
 ]  # fmt: skip
 

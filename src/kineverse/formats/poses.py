@@ -8,18 +8,27 @@ from __future__ import annotations
 
 import math
 from functools import lru_cache
+from struct import Struct
 
 from kineverse.lie import snap
 from kineverse.model.body import Pose, Vector3
 
 
-@lru_cache(maxsize=8192)
+_KEY = Struct("6d")
+
+
 def pose_from_rpy(xyz: tuple[float, ...], rpy: tuple[float, ...]) -> Pose:
     """Return the pose with offset ``xyz`` [m] and angles ``rpy`` [rad] about the fixed x, y and z axes."""
-    x, y, z = xyz
-    if rpy == (0.0, 0.0, 0.0):
+    return _cached_pose(_KEY.pack(*xyz, *rpy))
+
+
+@lru_cache(maxsize=8192)
+def _cached_pose(key: bytes) -> Pose:
+    # As bytes, -0.0 is not 0.0: what another file says does not change the pose that this one gets.
+    x, y, z, *angles = _KEY.unpack(key)
+    if angles == [0.0, 0.0, 0.0]:
         return Pose((1.0, 0.0, 0.0, x, 0.0, 1.0, 0.0, y, 0.0, 0.0, 1.0, z))
-    roll, pitch, yaw = rpy
+    roll, pitch, yaw = angles
     cr, sr = snap(math.cos(roll)), snap(math.sin(roll))
     cp, sp = snap(math.cos(pitch)), snap(math.sin(pitch))
     cy, sy = snap(math.cos(yaw)), snap(math.sin(yaw))

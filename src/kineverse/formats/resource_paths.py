@@ -142,7 +142,7 @@ def _locate_packaged(uri: str, rest: str, folder: Folder, search: Sequence[Folde
                 path = package.joinpath(*parts)
                 if not os.path.isfile(path):
                     continue
-                if trail.trusted or root is None or _stays(path, root, package):
+                if trail.trusted or root is None or _may_open(path, root, package):
                     return path
                 raise outside_root_error(uri, root)
             trail.without_file.append(package)
@@ -151,11 +151,22 @@ def _locate_packaged(uri: str, rest: str, folder: Folder, search: Sequence[Folde
     raise FormatError(_not_found_message(uri, name, inside, trail))
 
 
-def _stays(path: Path, root: str, package: Path | None = None) -> bool:
-    """Return whether the real path of a file is in the root, in its package, or where a variable points."""
+def _may_open(path: Folder, root: str, package: Path | None = None) -> bool:
+    """Return whether a path leads into the root, into its package, or into a folder that a variable names."""
     real = os.path.realpath(path)
-    places = (root, *declared_roots(), *declared_folders(), *([os.path.realpath(package)] if package else ()))
-    return any(is_below(real, place) for place in places if place)
+    return any(is_below(real, folder) for folder in _allowed_folders(root, package))
+
+
+def _allowed_folders(root: str, package: Path | None) -> Iterator[str]:
+    """Yield the real paths of the folders in which files may be opened, the usual one first.
+
+    Each real path costs system calls, and most meshes lie below the root.
+    """
+    yield root
+    if package is not None:
+        yield os.path.realpath(package)
+    yield from declared_roots()
+    yield from declared_folders()
 
 
 def find_root_violation(uri: str, folder: Folder, root: str | None) -> FormatError | None:
@@ -172,12 +183,12 @@ def find_root_violation(uri: str, folder: Folder, root: str | None) -> FormatErr
         if colon
         else Path(folder).absolute() / uri
     )
-    return None if "\0" in uri or _stays(path, root) else outside_root_error(uri, root)
+    return None if "\0" in uri or _may_open(path, root) else outside_root_error(uri, root)
 
 
 def _outside_package(uri: str, folder: Folder, root: str) -> FormatError | None:
     """Return the error for a package that is only found from a folder outside of the root."""
-    if root == NOWHERE or _may_lie_in(os.path.realpath(folder), root):
+    if root == NOWHERE or _may_open(folder, root):
         return None
     for bound in (root, None):
         try:
@@ -188,11 +199,6 @@ def _outside_package(uri: str, folder: Folder, root: str) -> FormatError | None:
         else:
             break
     return None if bound is not None else outside_root_error(uri, root)
-
-
-def _may_lie_in(real: str, root: str) -> bool:
-    """Return whether a folder is in the root, or in one that a variable declares."""
-    return any(is_below(real, place) for place in (root, *declared_roots(), *declared_folders()))
 
 
 def declared_folders() -> Iterator[str]:
@@ -274,7 +280,7 @@ def counts_as_package(package: Path, folder: Path, root: str) -> bool:
     real, here = os.path.realpath(package), os.path.realpath(folder)
     if is_below(real, root):
         return True
-    if not _may_lie_in(here, root):
+    if not _may_open(here, root):
         return False
     if any(os.path.isfile(os.path.join(real, mark)) for mark in _MARKS):
         return True
@@ -371,7 +377,7 @@ def _locate_plain(uri: str, text: str, folder: Folder, search: Sequence[Folder],
     left = False
     for candidate in tried:
         # What is outside is not even looked at.
-        if root is not None and candidate is tried[0] and "\0" not in text and not _stays(candidate, root):
+        if root is not None and candidate is tried[0] and "\0" not in text and not _may_open(candidate, root):
             left = True
         elif os.path.isfile(candidate):  # which is no for a name that is too long, and no error
             return candidate
