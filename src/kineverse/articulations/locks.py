@@ -1,9 +1,9 @@
 """State-dependent limits: speed locks, position locks and tabulated limits.
 
-Bounds of constraints may be expressions anyway. :func:`speed_lock` and :func:`position_lock` return the
+Locks are constraints with expressions as bounds. :func:`speed_lock` and :func:`position_lock` return the
 triple (lower, expression, upper), for ``edit.constrain(name, *triple)`` and for the constraints of an
-operation's :class:`Writes`; :func:`tabulated_limit` returns a bound. Conditions are expressions of logic, such
-as ``bolt > 0.3``.
+operation's :class:`Writes`; :func:`tabulated_limit` returns a bound. Conditions are expressions of logic,
+such as ``bolt > 0.3``.
 """
 
 from __future__ import annotations
@@ -141,9 +141,9 @@ def tabulated_limit(
 ) -> Expression:
     """Return a bound interpolated in a table of the driver, for ``lower=`` or ``upper=`` of any constraint.
 
-    It is linear between the points and constant beyond them; its gradient at a point is that after the point.
-    A velocity row follows the slope at its start, so a step across a point may pass the bound by the change of
-    slope times the rest of the step.
+    It is linear between the points and constant beyond them; its gradient at a point is that after the
+    point. A velocity row follows the slope at its start, so a step across a point may pass the bound by the
+    change of slope times the rest of the step.
 
     Parameters
     ----------

@@ -106,7 +106,7 @@ class SlidingPoint(Joint, document_kind="SlidingPoint"):
         q = tuple(position(name) for name in names)
         constraints: dict[str, Constraint] = {}
         for name, coordinate, (low, high) in zip(names, q, self.ranges, strict=True):
-            constraints.update(Limits(low, high).on(name, coordinate))
+            constraints.update(Limits(low, high).constraints(name, coordinate))
         home = tuple(0.5 * (low + high) for low, high in self.ranges)
         place = translation(*q, *([0.0] * (3 - len(q))))
         return Writes(
@@ -141,7 +141,7 @@ class FamilyJoint(Joint, document_kind="FamilyJoint"):
         home = tuple(0.5 * (low + high) for low, high in self.ranges)
         constraints: dict[str, Constraint] = {}
         for name, coordinate, (low, high) in zip(names, q, self.ranges, strict=True):
-            constraints.update(Limits(low, high).on(name, coordinate))
+            constraints.update(Limits(low, high).constraints(name, coordinate))
         return Writes(
             frames={self.child: (self.parent, (self.origin, self.motion.expression(q)))},
             constraints=constraints,

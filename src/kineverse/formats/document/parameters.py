@@ -1,9 +1,9 @@
-"""What an operation was made with, as JSON values and back; for people, for differences, and to make it anew.
+"""Parameters of operations as JSON values, and the frozen names of classes in documents.
 
-Parameters are data as under ``data``, and beside these poses (``{"pose": [12 numbers]}``), mappings
-(``{"mapping": [[key, value], ...]}``), values of dataclasses (``{"record": name, "fields": {...}}``), what
-the operation also wrote (``{"written": "frames/door"}``), and, for all else, its type
-(``{"unwritten": name}``).
+Parameters document an operation, are compared in differences, and rebuild it. They are data as under
+``data``, poses (``{"pose": [12 numbers]}``), mappings (``{"mapping": [[key, value], ...]}``), dataclasses
+(``{"record": name, "fields": {...}}``), references to the writes of the operation
+(``{"written": "frames/door"}``), and, for everything else, the name of its type (``{"unwritten": name}``).
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ TAGS = ("pose", "mapping", "record", "written", "unwritten", *DATUM_TAGS)
 
 @dataclass(frozen=True)
 class OpaqueRecord:
-    """A value of a dataclass that is not at hand."""
+    """Fields of a dataclass, without the class."""
 
     kind: str
     fields: tuple[tuple[str, Any], ...]
@@ -56,14 +56,14 @@ class OpaqueRecord:
 
 @dataclass(frozen=True)
 class WrittenReference:
-    """A parameter that is among the operation's writes, under ``kind/name``."""
+    """Reference of a parameter to one of the operation's writes, ``kind/name``."""
 
     path: str
 
 
 @dataclass(frozen=True)
 class UnsupportedParameter:
-    """A parameter that a document has no place for; only its type is known."""
+    """Parameter that a document cannot carry, of which only the type is known."""
 
     kind: str
 
@@ -110,14 +110,14 @@ def document_kind(kind: type) -> str:
 
 
 def operation_parameters(operation: Operation) -> dict[str, Any]:
-    """Return what an operation was made with, by name; empty for one that is no dataclass."""
+    """Return the constructor arguments of an operation by name; none for one that is no dataclass."""
     if not dataclasses.is_dataclass(operation):
         return {}
     return {f.name: getattr(operation, f.name) for f in dataclasses.fields(operation) if f.init}
 
 
 def expressions_in_parameter(parameter: Any, writes: Mapping[Cell, Any]) -> list[Expression]:
-    """Return the expressions that :func:`encode_parameter` needs."""
+    """Return the expressions in a parameter that :func:`encode_parameter` encodes."""
     found: list[Expression] = []
 
     def note(expression: Expression) -> int:
@@ -129,7 +129,19 @@ def expressions_in_parameter(parameter: Any, writes: Mapping[Cell, Any]) -> list
 
 
 def encode_parameter(value: Any, writes: Mapping[Cell, Any], ref: Ref, depth: int = 0) -> Any:
-    """Return a parameter as JSON has it, which lies in so many others."""
+    """Encode a parameter as a JSON value.
+
+    Parameters
+    ----------
+    value
+        Constructor argument of an operation, or a part of one.
+    writes
+        Writes of the operation.
+    ref
+        Returns the place of an expression in the node table.
+    depth
+        Nesting depth of the value.
+    """
 
     def inner(item: Any) -> Any:
         return encode_parameter(item, writes, ref, depth + 1)
@@ -165,14 +177,14 @@ def encode_parameter(value: Any, writes: Mapping[Cell, Any], ref: Ref, depth: in
 
 
 def rebuild_parameter(value: Any, writes: Mapping[str, Any]) -> Any:
-    """Return a parameter that was read as what an operation takes.
+    """Rebuild a constructor argument from a decoded parameter.
 
     Parameters
     ----------
     value
-        As :func:`decode_parameter` returns it.
+        Result of :func:`decode_parameter`.
     writes
-        What the operation wrote, by ``kind/name``.
+        Writes of the operation, by ``kind/name``.
     """
     if isinstance(value, tuple):
         return tuple(rebuild_parameter(item, writes) for item in value)
@@ -187,7 +199,7 @@ def rebuild_parameter(value: Any, writes: Mapping[str, Any]) -> Any:
             return RECORDS[value.kind](
                 **{name: rebuild_parameter(item, writes) for name, item in value.fields}
             )
-        except (TypeError, KineverseError):  # it is somebody else's class of the same name
+        except (TypeError, KineverseError):  # a user's class of the same name
             return value
     return value
 
@@ -200,27 +212,27 @@ def decode_parameter(
     written: Collection[str],
     depth: int = 0,
 ) -> Any:
-    """Return a parameter as it was given, and lies in so many others.
+    """Decode a parameter from its JSON value.
 
     Parameters
     ----------
     value
-        What stands in the document.
+        JSON value.
     graph
-        The expressions.
+        Expressions of the document.
     rename
-        Puts the document's prefix in front of a name.
+        Prepends the document's prefix to a name.
     path
-        Does so with that of a cell, ``kind/name``.
+        Prepends it to the name of a cell, ``kind/name``.
     written
-        The cells that the operation writes, so named.
+        Cells that the operation writes, as ``kind/name``.
     depth
-        In how many others it lies.
+        Nesting depth of the value.
 
     Raises
     ------
-    RefusedError
-        For what is none, or said to be among the writes and is not.
+    InvalidDocumentError
+        For an invalid value, or a reference to a write that does not exist.
     """
 
     def inner(item: Any) -> Any:
