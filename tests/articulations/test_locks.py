@@ -49,7 +49,7 @@ def trend(e: kv.Expression, at: dict[str, float]) -> dict[str, float]:
     ("blocks", "locked"), [("both", (0, 0)), ("forward", (-0.5, 0)), ("backward", (0, 0.5))]
 )
 def test_a_lock_holds_the_speed_in_its_directions(blocks: Any, locked: tuple[float, float]) -> None:
-    model = model_with(kv.articulations.speed_lock(door, BACK, speed=0.5, blocks=blocks))
+    model = model_with(kv.articulations.speed_lock(door, open_if=BACK, max_speed=0.5, blocks=blocks))
     for q in (0.0, 1.0):
         assert row(model, {"door": q, "bolt": 0.0}) == locked
         assert row(model, {"door": q, "bolt": 0.02}) == (-0.5, 0.5)
@@ -57,7 +57,7 @@ def test_a_lock_holds_the_speed_in_its_directions(blocks: Any, locked: tuple[flo
 
 def test_a_lock_is_the_one_of_the_papers() -> None:
     """Values and trends of Eq. 13, written with & and ~."""
-    lower, speed, upper = kv.articulations.speed_lock(door, bolt > 0.3, at=door > 1.99)
+    lower, speed, upper = kv.articulations.speed_lock(door, open_if=bolt > 0.3, engaged_if=door > 1.99)
     unlocked = ~((bolt < 0.3) & (door > 1.99))
     assert speed is door.derivative()
     for q in (1.0, 1.99, 2.0):
@@ -69,14 +69,14 @@ def test_a_lock_is_the_one_of_the_papers() -> None:
 
 
 def test_what_moves_may_be_a_speed_or_any_position() -> None:
-    of_speed = kv.articulations.speed_lock(door.derivative(), BACK)
-    assert of_speed == kv.articulations.speed_lock(door, BACK)
-    _, rate, _ = kv.articulations.speed_lock(door**2, BACK)
+    of_speed = kv.articulations.speed_lock(door.derivative(), open_if=BACK)
+    assert of_speed == kv.articulations.speed_lock(door, open_if=BACK)
+    _, rate, _ = kv.articulations.speed_lock(door**2, open_if=BACK)
     assert rate({"door": 3.0, "door:velocity": 0.5}) == 3.0
 
 
 def test_bounds_of_locks_tell_what_would_unlock() -> None:
-    lower, _, upper = kv.articulations.speed_lock(door, BACK, at=door < 0.01, speed=2.0)
+    lower, _, upper = kv.articulations.speed_lock(door, open_if=BACK, engaged_if=door < 0.01, max_speed=2.0)
     shut = {"door": 0.0, "bolt": 0.0}
     assert trend(upper, shut) == {"bolt:velocity": 2.0, "door:velocity": 2.0}
     assert trend(lower, shut) == {"bolt:velocity": -2.0, "door:velocity": -2.0}
@@ -87,7 +87,7 @@ def test_bounds_of_locks_tell_what_would_unlock() -> None:
 
 # -- blocked unless ------------------------------------------------------------------------------------
 
-BLOCK = kv.articulations.position_lock(door, BACK, upper=0)
+BLOCK = kv.articulations.position_lock(door, open_if=BACK, upper=0)
 
 
 def test_a_block_holds_who_is_inside_and_nobody_else() -> None:
@@ -105,7 +105,7 @@ def test_a_block_holds_who_is_inside_and_nobody_else() -> None:
 
 
 def test_both_bounds_have_a_margin() -> None:
-    model = model_with(kv.articulations.position_lock(door, BACK, lower=0.5, upper=0.7, margin=0.01))
+    model = model_with(kv.articulations.position_lock(door, open_if=BACK, lower=0.5, upper=0.7, margin=0.01))
     for q, left in (
         (0.495, (0.05, 2.05)),
         (0.705, (-2.05, -0.05)),
@@ -119,7 +119,7 @@ def test_both_bounds_have_a_margin() -> None:
 @pytest.mark.parametrize("q", [0.0, 1e-12, 5e-4, 9.99e-4, 1e-3, 0.2, 1.5, 2.0])
 @pytest.mark.parametrize("b", [0.0, 0.005, 0.01, 0.02])
 def test_rows_are_feasible_wherever_the_part_is(q: float, b: float) -> None:
-    model = model_with(kv.articulations.position_lock(door, BACK, lower=0, upper=0))
+    model = model_with(kv.articulations.position_lock(door, open_if=BACK, lower=0, upper=0))
     low, high = -inf, inf
     rows = model.velocity_rows(0.1)
     at = {"door": q, "bolt": b}
@@ -143,7 +143,7 @@ def test_a_blocked_door_stays_and_a_free_one_opens() -> None:
 
 
 def test_bounds_of_blocks_tell_what_would_free_it() -> None:
-    lower, _, upper = kv.articulations.position_lock(door, BACK, lower=-0.1, upper=0.1)
+    lower, _, upper = kv.articulations.position_lock(door, open_if=BACK, lower=-0.1, upper=0.1)
     at = {"door": 0.0, "bolt": 0.0}
     # Above and below are as near: only the bolt helps.
     assert trend(upper, at) == {"bolt:velocity": 1.0}
@@ -157,7 +157,7 @@ def test_bounds_of_blocks_tell_what_would_free_it() -> None:
 
 
 def test_a_block_may_follow_something() -> None:
-    model = model_with(kv.articulations.position_lock(door, bolt > 0.015, upper=10 * bolt))
+    model = model_with(kv.articulations.position_lock(door, open_if=bolt > 0.015, upper=10 * bolt))
     rows = model.velocity_rows(0.1)
     i = rows.names.index("lock")
     at = {"door": 0.02, "bolt": 0.01}
@@ -200,7 +200,7 @@ def test_rows_keep_a_limit_that_follows_a_table() -> None:
 
 
 def test_locks_are_data(tmp_path: Path) -> None:
-    model = model_with(kv.articulations.speed_lock(door, BACK, at=door < 0.01))
+    model = model_with(kv.articulations.speed_lock(door, open_if=BACK, engaged_if=door < 0.01))
     with model.edit() as edit:
         edit.constrain("block", *BLOCK)
         edit.constrain("table", -inf, door, kv.articulations.tabulated_limit(bolt, POINTS))
@@ -217,32 +217,32 @@ def test_locks_are_data(tmp_path: Path) -> None:
 
 VECTOR = kv.array([door, bolt])
 BROKEN: list[tuple[Any, str]] = [
-    (lambda: kv.articulations.speed_lock(door, True), "condition of a lock is an expression, not True"),
-    (lambda: kv.articulations.speed_lock("door", BACK), "unlocked is an expression, not 'door'"),
-    (lambda: kv.articulations.speed_lock(VECTOR, BACK), r"scalar, not of shape \(2,\)"),
-    (lambda: kv.articulations.speed_lock(kv.parameter("p", 1.0), BACK), "What is unlocked moves"),
-    (lambda: kv.articulations.speed_lock(door, BACK, at=3), "Where a lock catches is an expression, not 3"),
-    (lambda: kv.articulations.speed_lock(door, BACK, speed=0), "speed .* positive and finite, not 0"),
-    (lambda: kv.articulations.speed_lock(door, BACK, speed=inf), "not inf"),
-    (lambda: kv.articulations.speed_lock(door, BACK, speed=nan), "not nan"),
-    (lambda: kv.articulations.speed_lock(door, BACK, speed=None), "is a number, not None"),
-    (lambda: kv.articulations.speed_lock(door, BACK, blocks="left"), "'both', 'forward' or 'backward', not 'left'"),
-    (lambda: kv.articulations.position_lock(door, BACK), "neither is given"),
-    (lambda: kv.articulations.position_lock(door, BACK, lower=1, upper=0.5), "lower bound 1 and the upper bound 0.5"),
-    (lambda: kv.articulations.position_lock(door, BACK, upper=nan), "upper bound .* finite number, not nan"),
-    (lambda: kv.articulations.position_lock(door, BACK, lower=inf), "lower bound .* finite number, not inf"),
-    (lambda: kv.articulations.position_lock(door, BACK, lower=VECTOR), r"lower bound .* not of shape \(2,\)"),
-    (lambda: kv.articulations.position_lock(door, BACK, lower="low"), "lower bound .* is a number, not 'low'"),
-    (lambda: kv.articulations.position_lock(door, BACK, upper=0, margin=0), "margin .* positive and finite, not 0"),
-    (lambda: kv.articulations.position_lock(door, BACK, upper=0, margin=nan), "not nan"),
-    (lambda: kv.articulations.position_lock(door.derivative(), BACK, upper=0), "expression of positions, not door:velocity"),
-    (lambda: kv.articulations.tabulated_limit(door, {0: 1}), "table of limits is none. There are at least two knots, not 1"),
+    (lambda: kv.articulations.speed_lock(door, open_if=True), "open_if of a lock is an expression, not True"),
+    (lambda: kv.articulations.speed_lock("door", open_if=BACK), "speed of a lock is an expression, not 'door'"),
+    (lambda: kv.articulations.speed_lock(VECTOR, open_if=BACK), r"scalar, not of shape \(2,\)"),
+    (lambda: kv.articulations.speed_lock(kv.parameter("p", 1.0), open_if=BACK), "The speed of a lock depends on coordinates"),
+    (lambda: kv.articulations.speed_lock(door, open_if=BACK, engaged_if=3), "engaged_if of a lock is an expression, not 3"),
+    (lambda: kv.articulations.speed_lock(door, open_if=BACK, max_speed=0), "speed .* positive and finite, not 0"),
+    (lambda: kv.articulations.speed_lock(door, open_if=BACK, max_speed=inf), "not inf"),
+    (lambda: kv.articulations.speed_lock(door, open_if=BACK, max_speed=nan), "not nan"),
+    (lambda: kv.articulations.speed_lock(door, open_if=BACK, max_speed=None), "is a number, not None"),
+    (lambda: kv.articulations.speed_lock(door, open_if=BACK, blocks="left"), "'both', 'forward' or 'backward', not 'left'"),
+    (lambda: kv.articulations.position_lock(door, open_if=BACK), "neither is given"),
+    (lambda: kv.articulations.position_lock(door, open_if=BACK, lower=1, upper=0.5), "lower bound 1 and the upper bound 0.5"),
+    (lambda: kv.articulations.position_lock(door, open_if=BACK, upper=nan), "upper bound .* finite number, not nan"),
+    (lambda: kv.articulations.position_lock(door, open_if=BACK, lower=inf), "lower bound .* finite number, not inf"),
+    (lambda: kv.articulations.position_lock(door, open_if=BACK, lower=VECTOR), r"lower bound .* not of shape \(2,\)"),
+    (lambda: kv.articulations.position_lock(door, open_if=BACK, lower="low"), "lower bound .* is a number, not 'low'"),
+    (lambda: kv.articulations.position_lock(door, open_if=BACK, upper=0, margin=0), "margin .* positive and finite, not 0"),
+    (lambda: kv.articulations.position_lock(door, open_if=BACK, upper=0, margin=nan), "not nan"),
+    (lambda: kv.articulations.position_lock(door.derivative(), open_if=BACK, upper=0), "expression of positions, not door:velocity"),
+    (lambda: kv.articulations.tabulated_limit(door, {0: 1}), "table of limits is not valid. There are at least two knots, not 1"),
     (lambda: kv.articulations.tabulated_limit(door, {}), "at least two knots, not 0"),
     (lambda: kv.articulations.tabulated_limit(door, {0: 1, 2: 3, 1: 4}), "Knots increase: knot 2 is 1, and knot 1 is 2"),
     (lambda: kv.articulations.tabulated_limit(door, [(0, 1), (0, 2)], smooth=True), "Knots increase"),
     (lambda: kv.articulations.tabulated_limit(door, {0: 1, 1: nan}), "number .* is nan"),
     (lambda: kv.articulations.tabulated_limit(door, {0: 1, nan: 2}), "number 1 is nan"),
-    (lambda: kv.articulations.tabulated_limit(door, 5), r"points \{driver: limit\}, which is not so in 5"),
+    (lambda: kv.articulations.tabulated_limit(door, 5), r"points \{driver: limit\}, and is not 5"),
     (lambda: kv.articulations.tabulated_limit(1.0, {0: 1, 1: 2}), "driver of a table of limits is an expression, not 1.0"),
 ]  # fmt: skip
 

@@ -135,3 +135,14 @@ def test_it_is_about_what_models_are_made_of() -> None:
             edit.add_frame("a", parent="world", transform=np.eye(4), body=body, tag=tag)
         made.append(kv.formats.document_hash(model))
     assert made[0] == made[1] != made[2]
+
+
+def test_hash_does_not_depend_on_files_loaded_before(tmp_path: Path) -> None:
+    """Here since poses were remembered by numbers, of which -0.0 and 0.0 are equal."""
+    robot = '<robot name="r"><link name="a"/><link name="b"/><joint name="j" type="fixed"><origin xyz="{}"/>'
+    robot += '<parent link="a"/><child link="b"/></joint></robot>'
+    hashes = []
+    for k, xyz in enumerate(("-0 0.25 7.125", "0 0.25 7.125")):
+        (tmp_path / f"{k}.urdf").write_text(robot.format(xyz))
+        hashes.append(kv.formats.document_hash(kv.load(tmp_path / f"{k}.urdf")))
+    assert hashes[0] != hashes[1]

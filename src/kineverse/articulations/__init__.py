@@ -1,4 +1,4 @@
-"""The library of articulations: operations that connect frames."""
+"""Library of articulations: joints, transmissions, mobile bases, mechanisms and locks."""
 
 from kineverse._synonyms import MODULE_SYNONYMS, unknown_attribute_error
 

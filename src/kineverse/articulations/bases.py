@@ -1,10 +1,10 @@
-"""Mobile bases: a frame that moves over the floor.
+"""Mobile bases: omnidirectional, differential drive, Ackermann steering, mecanum wheels.
 
-All of them have the coordinates ``name/x``, ``name/y`` [m] and ``name/angle``, θ [rad], and
+All bases have the coordinates ``name/x``, ``name/y`` [m] and ``name/angle``, θ [rad], and the pose
 
     parent_T_child = origin · translation(x, y, 0) · rotation_z(θ),
 
-x forward and y to the left at θ = 0. They differ in the speeds that move these.
+x forward and y to the left at θ = 0. They differ in the speeds that move these coordinates.
 """
 
 from __future__ import annotations
@@ -31,29 +31,29 @@ from .limits import check_speed_limit, limit_constraints
 
 @dataclass(frozen=True, kw_only=True)
 class Base(Joint):
-    """What mobile bases have in common: where they are on the floor."""
+    """Base of the mobile bases: planar pose on the floor, limits of speeds."""
 
     @property
     def coordinates(self) -> tuple[Symbol, Symbol, Symbol]:
-        """x, y [m] and the angle [rad]."""
+        """Coordinates x, y [m] and θ [rad]."""
         x, y, angle = (position(f"{self.name}/{c}") for c in ("x", "y", "angle"))
         return x, y, angle
 
     @property
     def frames(self) -> dict[str, Frame]:
-        """The child frame."""
+        """Frame of the base, by its name."""
         x, y, angle = self.coordinates
         return {
             self.child: Frame.of(self.parent, (self.origin, translation(x, y, 0), rotation_z(angle))),
         }
 
     def check_wheels(self, paths: object, count: int) -> None:
-        """Look whether paths are those of so many wheels.
+        """Check that paths are different names, one for each wheel.
 
         Raises
         ------
         InvalidValueError
-            If they are more or less, the same twice, or no texts.
+            If their number is wrong, one occurs twice, or is no text.
         """
         given = paths if isinstance(paths, (tuple, list)) else ()
         texts = {path for path in given if isinstance(path, str) and path}
@@ -62,33 +62,35 @@ class Base(Joint):
                 f"The wheels of the {self.noun} '{self.name}' are {count} different paths, not {paths!r}."
             )
 
-    def limit(self, field: str) -> float | None:
-        """Return a limit among the fields, None if there is none."""
+    def speed_bound(self, field: str) -> float | None:
+        """Return the limit of a speed in a field, None if there is none."""
         return check_speed_limit(getattr(self, field), f"'{field}' of the {self.noun} '{self.name}'")
 
-    def within(self, field: str, speed: Expression, name: str = "") -> dict[str, Constraint]:
-        """Return the constraint that keeps a speed within a limit either way, if there is one."""
-        most = self.limit(field)
+    def speed_limit(self, field: str, speed: Expression, name: str = "") -> dict[str, Constraint]:
+        """Return the constraint -limit <= speed <= limit, if the field has a limit."""
+        most = self.speed_bound(field)
         return {} if most is None else {f"{self.name}/{name or field}": Constraint.of(-most, speed, most)}
 
-    def slower(self, field: str, components: tuple[Expression, Expression]) -> dict[str, Constraint]:
-        """Return the constraint that keeps the length of a velocity below a limit, if there is one."""
-        most = self.limit(field)
+    def speed_norm_limit(
+        self, field: str, components: tuple[Expression, Expression]
+    ) -> dict[str, Constraint]:
+        """Return the constraint |velocity| <= limit, if the field has a limit."""
+        most = self.speed_bound(field)
         return (
             {} if most is None else {f"{self.name}/{field}": Constraint.of(0, norm(array(components)), most)}
         )
 
 
 @dataclass(frozen=True, kw_only=True)
-class OmniBase(Base):
-    """An omnidirectional base: its coordinates x, y [m] and θ [rad] are all free.
+class OmniBase(Base, document_kind="OmniBase"):
+    """Omnidirectional base: its coordinates x, y [m] and θ [rad] are all free.
 
     Attributes
     ----------
     speed
-        Limit of the speed √(ẋ² + ẏ²) [m/s], whatever the direction; None for no limit.
+        Limit of the speed √(ẋ² + ẏ²) [m/s]; None for no limit.
     turn
-        Limit of the turning speed, either way [rad/s]; None for no limit.
+        Limit of the angular speed |θ̇| [rad/s]; None for no limit.
     """
 
     speed: float | None = 1.0
@@ -100,22 +102,22 @@ class OmniBase(Base):
         dx, dy, turning = speeds = tuple(c.derivative() for c in (x, y, angle))
         return Writes(
             frames=self.frames,
-            constraints={**self.slower("speed", (dx, dy)), **self.within("turn", turning)},
+            constraints={**self.speed_norm_limit("speed", (dx, dy)), **self.speed_limit("turn", turning)},
             articulations={self.name: self.record((x, y, angle), (0.0, 0.0, 0.0), speeds)},
         )
 
 
 @dataclass(frozen=True, kw_only=True)
-class DifferentialDrive(Base):
-    """A base on two driven wheels, which cannot go sideways.
+class DifferentialDrive(Base, document_kind="DifferentialDrive"):
+    """Differential drive: a base on two driven wheels, which cannot move sideways.
 
-    Its coordinates x, y [m] and θ [rad] move by the wheels' speeds only (2022 paper, III-A1): with radius r
-    and track b, ẋ = r/2 cos θ (ω_l + ω_r), ẏ = r/2 sin θ (ω_l + ω_r), θ̇ = r/b (ω_r - ω_l).
+    The coordinates x, y [m] and θ [rad] move by the wheels' speeds (2022 paper, III-A1): with radius r and
+    track b, ẋ = r/2 cos θ (ω_l + ω_r), ẏ = r/2 sin θ (ω_l + ω_r), θ̇ = r/b (ω_r - ω_l).
 
     Attributes
     ----------
     radius, track
-        Of the wheels, and the distance between them [m].
+        Radius of the wheels, and the distance between them [m].
     left, right
         Paths of the wheels' degrees of freedom; by default ``name/left_wheel`` and ``name/right_wheel``.
     wheel_speed
@@ -123,7 +125,7 @@ class DifferentialDrive(Base):
     speed
         Limit of the speed √(ẋ² + ẏ²) = r/2 |ω_l + ω_r| [m/s]; None for no limit.
     turn
-        Limit of the turning speed |θ̇|, either way [rad/s]; None for no limit.
+        Limit of the angular speed |θ̇| [rad/s]; None for no limit.
 
     Raises
     ------
@@ -141,13 +143,13 @@ class DifferentialDrive(Base):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        self.lengths("radius", "track")
+        self.check_lengths("radius", "track")
         self.check_wheels(self.wheels, 2)
 
     @property
     def wheels(self) -> tuple[str, str]:
-        """The paths of the left and the right wheel."""
-        # Compared with "" and not asked for its truth, which not everything has that is no text.
+        """Paths of the left and the right wheel."""
+        # Compared with "", because a wrong argument such as an array may have no truth value.
         return (
             f"{self.name}/left_wheel" if self.left == "" else self.left,
             f"{self.name}/right_wheel" if self.right == "" else self.right,
@@ -161,10 +163,10 @@ class DifferentialDrive(Base):
         return Writes(
             frames=self.frames,
             constraints={
-                **self.within("wheel_speed", left, "left_wheel_speed"),
-                **self.within("wheel_speed", right, "right_wheel_speed"),
-                **self.within("speed", along * (left + right)),
-                **self.within("turn", about * (right - left)),
+                **self.speed_limit("wheel_speed", left, "left_wheel_speed"),
+                **self.speed_limit("wheel_speed", right, "right_wheel_speed"),
+                **self.speed_limit("speed", along * (left + right)),
+                **self.speed_limit("turn", about * (right - left)),
             },
             rates={
                 x: {left: along * np.cos(angle), right: along * np.cos(angle)},
@@ -176,11 +178,11 @@ class DifferentialDrive(Base):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Ackermann(Base):
-    """A car: the child is the middle of its rear axle, x forward, and its front wheels steer.
+class Ackermann(Base, document_kind="Ackermann"):
+    """Ackermann steering: the child frame is the middle of the rear axle, x forward; the front wheels steer.
 
-    Coordinates are x, y [m], θ [rad] and the steering angle ``name/steering``, δ [rad], that of a wheel in
-    the middle of the front axle, positive to the left. Speeds are that of the rear axle, v = ``name/drive``
+    Coordinates are x, y [m], θ [rad] and the steering angle ``name/steering``, δ [rad], of a wheel in the
+    middle of the front axle, positive to the left. Speeds are that of the rear axle, v = ``name/drive``
     [m/s], and δ̇. With the wheelbase L,
 
         ẋ = v cos θ,        ẏ = v sin θ,        θ̇ = v tan(δ)/L.
@@ -190,8 +192,7 @@ class Ackermann(Base):
     wheelbase
         L, the distance between the axles [m].
     steering
-        Limit of the steering angle, either way, in (0, π/2) [rad]: the car turns on a circle of radius
-        L/tan(steering) at least.
+        Limit of |δ| in (0, π/2) [rad]; the smallest turning radius is L/tan(steering).
     steering_speed
         Limit of |δ̇| [rad/s]; None for no limit.
     speed
@@ -212,7 +213,7 @@ class Ackermann(Base):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        self.lengths("wheelbase")
+        self.check_lengths("wheelbase")
         text = f"The steering angle of the {self.noun} '{self.name}'"
         if not 0 < check_joint_number(self.steering, text) < math.pi / 2:
             raise InvalidValueError(f"{text} is limited to something in (0, π/2) rad, not {self.steering!r}.")
@@ -222,14 +223,14 @@ class Ackermann(Base):
         self.check_free(model)
         x, y, angle = self.coordinates
         steering, drive = position(f"{self.name}/steering"), velocity(f"{self.name}/drive")
-        bound = self.limit("steering_speed")
+        bound = self.speed_bound("steering_speed")
         return Writes(
             frames=self.frames,
             constraints={
                 **dict(
                     limit_constraints(f"{self.name}/steering", steering, -self.steering, self.steering, bound)
                 ),
-                **self.within("speed", drive),
+                **self.speed_limit("speed", drive),
             },
             rates={
                 x: {drive: np.cos(angle)},
@@ -245,25 +246,25 @@ class Ackermann(Base):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Mecanum(Base):
-    """A base on four wheels with oblique rollers, which goes sideways too.
+class Mecanum(Base, document_kind="Mecanum"):
+    """Base on four mecanum wheels, which moves sideways too.
 
-    Its coordinates x, y [m] and θ [rad] move by four speeds, those of the wheels, front left, front right,
-    rear left, rear right, each positive where it drives forward. With the radius r, the track b and the
-    wheelbase L, velocity and turning speed in the base's own axes are
+    The coordinates x, y [m] and θ [rad] move by the speeds of the four wheels, front left, front right, rear
+    left, rear right, each positive where it drives forward. With the radius r, the track b and the wheelbase
+    L, the velocity and the angular speed in the axes of the base are
 
         v_x = r/4 ( ω_fl + ω_fr + ω_rl + ω_rr)
         v_y = r/4 (-ω_fl + ω_fr + ω_rl - ω_rr)
         θ̇   = r/(2(b + L)) (-ω_fl + ω_fr - ω_rl + ω_rr)
 
-    and ẋ, ẏ are (v_x, v_y) turned by θ. Four speeds move three coordinates: (1, 1, -1, -1) moves nothing, the
-    wheels slip. Rolling without slip is ω_fl + ω_fr = ω_rl + ω_rr, which whoever picks speeds should keep to;
-    of all speeds for a motion, those are the smallest.
+    and (ẋ, ẏ) is (v_x, v_y) rotated by θ. Four speeds move three coordinates: (1, 1, -1, -1) moves nothing,
+    the wheels slip. Without slip, ω_fl + ω_fr = ω_rl + ω_rr; among all speeds for a motion, these have the
+    smallest norm.
 
     Attributes
     ----------
     radius
-        Of the wheels [m].
+        Radius of the wheels [m].
     track, wheelbase
         Distance between left and right wheels, and between front and rear ones [m].
     wheels
@@ -272,9 +273,9 @@ class Mecanum(Base):
     wheel_speed
         Limit of the wheels' speeds [rad/s]; None for no limit.
     speed
-        Limit of the speed √(ẋ² + ẏ²) [m/s], whatever the direction; None for no limit.
+        Limit of the speed √(ẋ² + ẏ²) [m/s]; None for no limit.
     turn
-        Limit of the turning speed, either way [rad/s]; None for no limit.
+        Limit of the angular speed |θ̇| [rad/s]; None for no limit.
 
     Raises
     ------
@@ -294,7 +295,7 @@ class Mecanum(Base):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        self.lengths("radius", "track", "wheelbase")
+        self.check_lengths("radius", "track", "wheelbase")
         if not isinstance(self.wheels, tuple) or self.wheels:
             self.check_wheels(self.wheels, 4)
             object.__setattr__(self, "wheels", tuple(self.wheels))
@@ -311,9 +312,9 @@ class Mecanum(Base):
         turning = {wheel: sign * about for wheel, sign in zip(wheels, (-1, 1, -1, 1), strict=True)}
         constraints: dict[str, Constraint] = {}
         for corner, wheel in zip(_CORNERS, wheels, strict=True):
-            constraints |= self.within("wheel_speed", wheel, f"{corner}_wheel_speed")
-        constraints |= self.slower("speed", (_total(forward), _total(sideways)))
-        constraints |= self.within("turn", _total(turning))
+            constraints |= self.speed_limit("wheel_speed", wheel, f"{corner}_wheel_speed")
+        constraints |= self.speed_norm_limit("speed", (_total(forward), _total(sideways)))
+        constraints |= self.speed_limit("turn", _total(turning))
         c, s = np.cos(angle), np.sin(angle)
         return Writes(
             frames=self.frames,
@@ -331,5 +332,6 @@ _CORNERS = ("front_left", "front_right", "rear_left", "rear_right")
 
 
 def _total(row: Mapping[Symbol, float]) -> Expression:
+    """Return the linear combination of speeds with the factors of a row."""
     terms = [factor * wheel for wheel, factor in row.items()]
     return sum(terms[1:], terms[0])

@@ -1,9 +1,8 @@
-"""What the ordinary joints have in common: a child frame, a place in its parent, limits."""
+"""Base classes of the joints: a child frame, its origin in a parent frame, limits."""
 
 from __future__ import annotations
 
 import math
-import re
 from abc import abstractmethod
 from collections.abc import Container, Iterable
 from dataclasses import dataclass
@@ -16,7 +15,7 @@ from kineverse.lie import normalize
 from kineverse.model.articulation import Articulation
 from kineverse.model.body import AxisLike, Pose, Vector3
 from kineverse.model.frame import TransformLike
-from kineverse.model.operation import Operation, Writes
+from kineverse.model.operation import Operation, Writes, split_words
 from kineverse.model.read_recorder import ReadRecorder
 from kineverse.symbols import Symbol, position
 
@@ -25,16 +24,16 @@ from .limits import limit_constraints
 
 @dataclass(frozen=True, kw_only=True)
 class PlacedOperation(Operation):
-    """Base of what has a name and a place in a parent frame.
+    """Base of operations with a name and an origin in a parent frame.
 
     Attributes
     ----------
     name
-        Name of the articulation and, where it has one coordinate, of its degree of freedom.
+        Name of the articulation and, if it has one coordinate, of its degree of freedom.
     parent
-        The frame it stands in.
+        Parent frame.
     origin
-        Where it is in there.
+        Pose of the articulation in the parent frame.
     """
 
     name: str
@@ -57,16 +56,16 @@ class PlacedOperation(Operation):
 
     @property
     def kind(self) -> str:
-        """The name of the class in lower case."""
-        return type(self).__name__.lower()
+        """Kind of the articulation: that of documents, in lower case."""
+        return self.document_kind.lower()
 
     @property
     def noun(self) -> str:
-        """What errors call it: the name of the class in words."""
-        return re.sub("(?<=.)(?=[A-Z])", " ", type(self).__name__).lower()
+        """Name in errors: the kind in words."""
+        return split_words(self.document_kind)
 
-    def lengths(self, *fields: str) -> None:
-        """Look whether fields are lengths [m].
+    def check_lengths(self, *fields: str) -> None:
+        """Check that fields are positive lengths [m].
 
         Raises
         ------
@@ -79,7 +78,7 @@ class PlacedOperation(Operation):
             )
 
     def check_texts(self, *fields: str) -> None:
-        """Look whether fields are names.
+        """Check that fields are names.
 
         Raises
         ------
@@ -93,12 +92,12 @@ class PlacedOperation(Operation):
                 raise InvalidValueError(f"{what} is a path like 'kitchen/door', not {given!r}.")
 
     def check_names(self, model: ReadRecorder, frames: Iterable[str]) -> None:
-        """Look whether the names of the articulation and of its frames are free.
+        """Check that the names of the articulation and of its frames are free.
 
         Raises
         ------
         DuplicateNameError
-            If they are not.
+            If one is taken.
         """
         wanted: list[tuple[str, str, Container[str]]] = [("an articulation", self.name, model.articulations)]
         wanted += [("a frame", frame, model.frames) for frame in frames]
@@ -111,7 +110,7 @@ class PlacedOperation(Operation):
 
 
 def _place(given: object) -> str:
-    """Return how a place is written, if that is what was given."""
+    """Return the code of a translation for an error; a general example unless three numbers are given."""
     try:
         x, y, z = map(real_number, given)  # type: ignore[call-overload]
     except (TypeError, ValueError, OverflowError):
@@ -126,11 +125,11 @@ class Joint(PlacedOperation):
     Attributes
     ----------
     child
-        The frame that is created.
+        Name of the child frame, which the joint writes.
     origin
-        parent_T_joint, the place of the child at coordinate 0.
+        parent_T_joint, the pose of the child at coordinate 0.
     dynamics
-        What is known beside kinematics, as (name, value) pairs: effort [N] or [N m], damping, friction ...
+        Dynamic parameters as (name, value) pairs: effort [N] or [N m], damping, friction, …
     """
 
     child: str
@@ -151,25 +150,35 @@ class Joint(PlacedOperation):
         speeds: tuple[Symbol, ...] = (),
         follows: Expression | None = None,
     ) -> Articulation:
-        """Return the record of this joint."""
+        """Return the record of the articulation.
+
+        Parameters
+        ----------
+        coordinates, home
+            Coordinates and their values at home.
+        speeds
+            Speeds that move them.
+        follows
+            The position as an expression, for a joint without a coordinate of its own.
+        """
         return Articulation(
             self.kind, self.parent, self.child, coordinates, home, speeds, self.dynamics, follows
         )
 
     def check_free(self, model: ReadRecorder) -> None:
-        """Look whether the names of the articulation and of its child are free.
+        """Check that the names of the articulation and of its child are free.
 
         Raises
         ------
         DuplicateNameError
-            If they are not.
+            If one is taken.
         """
         self.check_names(model, [self.child])
 
 
 @dataclass(frozen=True, kw_only=True)
-class Fixed(Joint):
-    """A rigid connection: parent_T_child = origin."""
+class Fixed(Joint, document_kind="Fixed"):
+    """Fixed joint: parent_T_child = origin."""
 
     def apply(self, model: ReadRecorder) -> Writes:
         """Write the child frame."""
@@ -180,7 +189,7 @@ class Fixed(Joint):
 
 @dataclass(frozen=True, kw_only=True)
 class OneAxisMotion(Joint):
-    """Base of what moves by one number q along or about an axis, whatever that number is.
+    """Base of motions along or about one axis by a scalar q, a coordinate or a function of others.
 
     Attributes
     ----------
@@ -189,7 +198,7 @@ class OneAxisMotion(Joint):
     lower, upper
         Limits of q [m] or [rad], numbers or expressions; None leaves that side open.
     velocity
-        Limit of the speed, either way [m/s] or [rad/s]; None for no limit.
+        Limit of |q̇| [m/s] or [rad/s]; None for no limit.
     """
 
     axis: AxisLike = (1.0, 0.0, 0.0)
@@ -203,10 +212,13 @@ class OneAxisMotion(Joint):
 
     @abstractmethod
     def motion(self, q: Expression) -> tuple[Pose | Expression, ...]:
-        """Return joint_T_child as factors."""
+        """Return the factors of joint_T_child."""
 
-    def moved_by(self, q: Expression) -> Writes:
-        """Return the child frame, the limits and the record for a coordinate of its own or another number."""
+    def joint_writes(self, q: Expression) -> Writes:
+        """Return the child frame, the limits and the record for a position q.
+
+        The coordinate ``name`` is on record as the joint's own; any other q as an expression that it follows.
+        """
         own = (q,) if isinstance(q, Symbol) and q == position(self.name) else ()
         record = self.record(own, (0.0,) * len(own), tuple(s.derivative() for s in own), None if own else q)
         return Writes(
@@ -223,8 +235,8 @@ class OneDofJoint(OneAxisMotion):
     Attributes
     ----------
     position
-        The expression to use for q instead of a degree of freedom of its own, about any coordinates: a mimic
-        joint, linear or not. Its limits are constraints on that expression.
+        Expression for q in place of a degree of freedom: a mimic joint, linear or not. The limits are
+        constraints on that expression.
     """
 
     position: Expression | None = None
@@ -236,12 +248,12 @@ class OneDofJoint(OneAxisMotion):
 
     @property
     def q(self) -> Expression:
-        """The coordinate, or the expression that stands for it."""
+        """The coordinate, or the expression in its place."""
         return position(self.name) if self.position is None else self.position
 
     def apply(self, model: ReadRecorder) -> Writes:
         """Write the child frame and the limits."""
-        return self.moved_by(self.q)
+        return self.joint_writes(self.q)
 
 
 def check_axis(axis: AxisLike, name: str) -> Vector3:
@@ -250,7 +262,7 @@ def check_axis(axis: AxisLike, name: str) -> Vector3:
     Raises
     ------
     InvalidValueError
-        If it is not three numbers with a direction.
+        If it is not three numbers, or has no direction.
     """
     try:
         x, y, z = map(real_number, axis)
@@ -263,12 +275,12 @@ def check_axis(axis: AxisLike, name: str) -> Vector3:
 
 
 def check_position_expression(expression: object, what: str) -> Expression:
-    """Return a scalar expression of positions.
+    """Return a scalar expression of positions after checking that it is one.
 
     Raises
     ------
     InvalidValueError
-        If it is something else.
+        If it is no expression, not a scalar, or depends on speeds.
     """
     if not isinstance(expression, Expression):
         raise InvalidValueError(f"{what} is an expression, not {expression!r}.")
@@ -281,12 +293,12 @@ def check_position_expression(expression: object, what: str) -> Expression:
 
 
 def check_joint_number(number: object, what: str, *, positive: bool = False) -> float:
-    """Return a finite number.
+    """Return a finite number after checking that it is one.
 
     Raises
     ------
     InvalidValueError
-        If it is none, or not positive where it has to be.
+        If it is no finite number, or not positive although required.
     """
     try:
         value = real_number(number)

@@ -20,17 +20,17 @@ class Limits:
     Attributes
     ----------
     lower, upper
-        Of the coordinate [m] or [rad], numbers or expressions; None leaves that side open.
+        Limits of the coordinate [m] or [rad], numbers or expressions; None leaves that side open.
     velocity
-        Of its speed, either way [m/s] or [rad/s]; None for no limit.
+        Limit of the magnitude of its speed [m/s] or [rad/s]; None for no limit.
     """
 
     lower: ExpressionLike | None = None
     upper: ExpressionLike | None = None
     velocity: float | None = None
 
-    def on(self, name: str, q: Expression) -> Iterator[tuple[str, Constraint]]:
-        """Yield the constraints ``name/position`` and ``name/velocity``, as far as there are any."""
+    def constraints(self, name: str, q: Expression) -> Iterator[tuple[str, Constraint]]:
+        """Yield the constraints ``name/position`` and ``name/velocity``, if there are such limits."""
         return limit_constraints(name, q, self.lower, self.upper, self.velocity)
 
 
@@ -39,12 +39,12 @@ FREE = Limits()
 
 
 def check_limits(given: object, what: str) -> None:
-    """Look whether limits are given as such.
+    """Check that limits are given as :class:`Limits`.
 
     Raises
     ------
     InvalidValueError
-        If they are something else.
+        If they are not.
     """
     if not isinstance(given, Limits):
         raise InvalidValueError(f"{what} is kv.Limits(lower, upper, velocity), not {given!r}.")
@@ -57,21 +57,21 @@ def limit_constraints(
     upper: ExpressionLike | None,
     velocity: float | None,
 ) -> Iterator[tuple[str, Constraint]]:
-    """Yield the constraints ``name/position`` and ``name/velocity``, as far as there are any.
+    """Yield the constraints ``name/position`` and ``name/velocity``, if there are such limits.
 
     Raises
     ------
     InvalidValueError
-        Naming the limits that leave nothing between them, are NaN, or a negative speed.
+        For limits that leave nothing between them or are NaN, and for a negative speed.
     """
     if (lower is not None or upper is not None) and q.symbols:
         try:
-            range_of = Constraint.of(
+            position_range = Constraint.of(
                 -math.inf if lower is None else lower, q, math.inf if upper is None else upper
             )
         except KineverseError as error:
             raise InvalidValueError(f"The limits of '{name}' are no range. {error}") from None
-        yield f"{name}/position", range_of
+        yield f"{name}/position", position_range
     bound = check_speed_limit(velocity, f"The velocity limit of '{name}'")
     if bound is not None:
         rate = total_derivative(q)
@@ -80,7 +80,7 @@ def limit_constraints(
 
 
 def check_speed_limit(limit: object, what: str) -> float | None:
-    """Return a limit of a speed, None where there is none.
+    """Return the limit of a speed as a number, None if it is absent or infinite.
 
     Raises
     ------

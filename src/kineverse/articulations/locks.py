@@ -1,9 +1,9 @@
 """State-dependent limits: speed locks, position locks and tabulated limits.
 
-Bounds of constraints may be expressions anyway. :func:`speed_lock` and :func:`position_lock` return the
+Locks are constraints with expressions as bounds. :func:`speed_lock` and :func:`position_lock` return the
 triple (lower, expression, upper), for ``edit.constrain(name, *triple)`` and for the constraints of an
-operation's :class:`Writes`; :func:`tabulated_limit` returns a bound. Conditions are expressions of logic, such
-as ``bolt > 0.3``.
+operation's :class:`Writes`; :func:`tabulated_limit` returns a bound. Conditions are expressions of logic,
+such as ``bolt > 0.3``.
 """
 
 from __future__ import annotations
@@ -24,94 +24,95 @@ BoundedExpression: TypeAlias = tuple[Expression, Expression, Expression]
 
 
 def speed_lock(
-    moving: Expression,
-    condition: Expression,
+    speed: Expression,
     *,
-    at: Expression | None = None,
-    speed: float = 1.0,
+    open_if: Expression,
+    engaged_if: Expression | None = None,
+    max_speed: float = 1.0,
     blocks: Literal["both", "forward", "backward"] = "both",
 ) -> BoundedExpression:
-    """Return the lock of a speed: -c·speed <= q̇ <= c·speed with c the condition (2022 paper, Eq. 13).
+    """Return the lock of a speed: -c·max_speed <= q̇ <= c·max_speed with c = open_if (2022 paper, Eq. 13).
 
-    The speed is 0 while the condition does not hold, and the gradients of the bounds tell what would unlock
-    it: they are those of c.
+    The speed is 0 while the lock is closed. The gradients of the bounds are those of c, so they show the
+    direction in which the lock opens.
 
     Parameters
     ----------
-    moving
-        What is locked: a speed, or a position q, whose speed is meant.
-    condition
-        The truth of its being unlocked.
-    at
-        The truth of being where the lock catches, usually something about q; elsewhere it moves freely, which
-        makes c = condition | ~at.
     speed
-        How fast it may move [m/s] or [rad/s].
+        The speed to lock; for an expression of positions q, its speed q̇.
+    open_if
+        Condition under which the lock is open.
+    engaged_if
+        Condition under which the lock catches, usually on q; elsewhere the speed is free, so that
+        c = open_if | ~engaged_if.
+    max_speed
+        Limit of the speed while the lock is open [m/s] or [rad/s].
     blocks
-        The directions that are locked. With ``"forward"``, going back is free: -speed <= q̇ <= c·speed.
+        The directions that are locked. With ``"forward"``, the way back is free:
+        -max_speed <= q̇ <= c·max_speed.
 
     Raises
     ------
     InvalidValueError
-        For something that is not one number, a speed that is not positive, or another direction.
+        For an expression that is not a scalar, a limit that is not positive, or another direction.
     """
-    rate = _scalar(moving, "What is unlocked")
+    rate = _scalar(speed, "The speed of a lock")
     if not any(s.order for s in rate.symbols):
         rate = total_derivative(rate)
     if not rate.symbols:
-        raise InvalidValueError(f"What is unlocked moves, and {moving!r} does not.")
-    if not _number(speed, "The speed of what is unlocked") > 0 or math.isinf(speed):
-        raise InvalidValueError(f"The speed of what is unlocked is positive and finite, not {speed!r}.")
-    free = _open_condition(condition, at)
+        raise InvalidValueError(f"The speed of a lock depends on coordinates, and {speed!r} does not.")
+    if not _number(max_speed, "The max_speed of a lock") > 0 or math.isinf(max_speed):
+        raise InvalidValueError(f"The max_speed of a lock is positive and finite, not {max_speed!r}.")
+    free = _open_condition(open_if, engaged_if)
     if blocks not in ("both", "forward", "backward"):
         raise InvalidValueError(f"A lock blocks 'both', 'forward' or 'backward', not {blocks!r}.")
-    most, open_ = as_expression(float(speed)), free * speed
+    most, open_ = as_expression(float(max_speed)), free * max_speed
     return -(most if blocks == "forward" else open_), rate, (most if blocks == "backward" else open_)
 
 
 def position_lock(
-    coordinate: Expression,
-    condition: Expression,
+    q: Expression,
     *,
+    open_if: Expression,
     lower: ExpressionLike | None = None,
     upper: ExpressionLike | None = None,
     margin: float = 1e-3,
 ) -> BoundedExpression:
-    """Return the block of a position: it stays within [lower, upper] unless the condition holds.
+    """Return the lock of a position: q stays within [lower, upper] unless the lock is open.
 
-    Surprise first: who is *outside* already is free, and free to come back. A bolt that springs out while the
-    door stands open holds nothing; it holds the door once that is shut. With c the condition, the bounds are
+    Surprise first: a position that is *outside* already is free, and free to return. A bolt that springs out
+    while the door stands open holds nothing; it holds the door once that is shut. With c = open_if, the
+    bounds are
 
-        held  = ~c & (lower - margin < q) & (q < upper + margin)
-        lower = where(held, lower, -∞),     upper = where(held, upper, ∞)
+        locked = ~c & (lower - margin < q) & (q < upper + margin)
+        lower  = where(locked, lower, -∞),     upper = where(locked, upper, ∞)
 
-    so the constraint can be satisfied wherever the part is, and its velocity row asks for no jump. What has
-    got into the margin, by rounding or play, still counts as held and is led back. The gradients of the
-    bounds, as advice, are those of "not held": what would free it.
+    so the constraint can be satisfied at every q, and its velocity row asks for no jump. A position within
+    the margin, by rounding or play, still counts as locked and is led back. The heuristic gradients of the
+    bounds are those of ~locked: the direction in which the lock opens.
 
     Parameters
     ----------
-    coordinate
-        q, an expression of positions.
-    condition
-        The truth of its being free.
+    q
+        The position to lock, an expression of positions.
+    open_if
+        Condition under which the lock is open.
     lower, upper
-        Where it is held [m] or [rad], numbers or expressions; None leaves that side open. The same twice
-        holds it at a place.
+        Bounds while it is locked [m] or [rad], numbers or expressions; None leaves that side open. Equal
+        bounds lock one position.
     margin
-        How far outside it is still held [m] or [rad].
+        Distance outside of the bounds up to which it is still locked [m] or [rad].
 
     Raises
     ------
     InvalidValueError
-        For something that is not one number, bounds that leave nothing between them, NaN, or a margin that is
-        not positive.
+        For an expression that is not a scalar, bounds that leave nothing between them, NaN, or a margin that
+        is not positive.
     """
-    q = _scalar(coordinate, "What is blocked")
-    if not q.symbols or any(s.order for s in q.symbols):
-        raise InvalidValueError(f"What is blocked is an expression of positions, not {coordinate!r}.")
-    if not _number(margin, "The margin of what is blocked") > 0 or math.isinf(margin):
-        raise InvalidValueError(f"The margin of what is blocked is positive and finite, not {margin!r}.")
+    if not _scalar(q, "The position of a lock").symbols or any(s.order for s in q.symbols):
+        raise InvalidValueError(f"The position of a lock is an expression of positions, not {q!r}.")
+    if not _number(margin, "The margin of a lock") > 0 or math.isinf(margin):
+        raise InvalidValueError(f"The margin of a lock is positive and finite, not {margin!r}.")
     low, high = (
         None if bound is None else _bound(bound, name) for name, bound in (("lower", lower), ("upper", upper))
     )
@@ -121,14 +122,14 @@ def position_lock(
     if high is not None:
         inside.append(q < high + margin)
     if not inside:
-        raise InvalidValueError("What is blocked has a lower or an upper bound, and neither is given.")
+        raise InvalidValueError("The lock of a position has a lower or an upper bound, and neither is given.")
     if low is not None and high is not None and not low.symbols and not high.symbols:
         if float(low) > float(high):
             raise InvalidValueError(
-                f"What is blocked has no place between the lower bound {float(low):g} "
+                f"The lock of a position leaves nothing between the lower bound {float(low):g} "
                 f"and the upper bound {float(high):g}."
             )
-    free = _open_condition(condition, logic_and(*inside))
+    free = _open_condition(open_if, logic_and(*inside))
     return _bound_while_locked(free, low, -1), q, _bound_while_locked(free, high, 1)
 
 
@@ -138,33 +139,32 @@ def tabulated_limit(
     *,
     smooth: bool = False,
 ) -> Expression:
-    """Return a bound that follows a driver through points, for ``lower=`` or ``upper=`` of anything.
+    """Return a bound interpolated in a table of the driver, for ``lower=`` or ``upper=`` of any constraint.
 
-    It is straight between the points, and stays at the first and the last value beyond them; its gradient at
-    a point is that after it. A velocity row follows the slope where it starts, so a step across a point may
-    pass the bound by the change of slope times the rest of the step.
+    It is linear between the points and constant beyond them; its gradient at a point is that after the
+    point. A velocity row follows the slope at its start, so a step across a point may pass the bound by the
+    change of slope times the rest of the step.
 
     Parameters
     ----------
     driver
-        What the bound depends on, an expression of positions.
+        The argument of the table, an expression of positions.
     points
-        From values of the driver, increasing, to those of the bound: at least two.
+        Increasing values of the driver with the values of the bound, at least two.
     smooth
-        A cubic spline (:func:`kineverse.spline`) instead, which has no corners but may swing a little beyond
-        the values.
+        True for a cubic spline (:func:`kineverse.spline`), which has no corners but may overshoot the values.
 
     Raises
     ------
     InvalidValueError
-        For a driver that is not one number, or points that do not increase, are too few or NaN.
+        For a driver that is not a scalar, or points that do not increase, are too few or NaN.
     """
     x = _scalar(driver, "The driver of a table of limits")
     try:
         pairs = [(float(t), float(y)) for t, y in (points.items() if isinstance(points, Mapping) else points)]
     except (TypeError, ValueError):
         raise InvalidValueError(
-            f"A table of limits has points {{driver: limit}}, which is not so in {points!r:.80}."
+            f"A table of limits has points {{driver: limit}}, and is not {points!r:.80}."
         ) from None
     knots, values = [t for t, _ in pairs], [y for _, y in pairs]
     try:
@@ -174,19 +174,19 @@ def tabulated_limit(
         ends = [values[0], *values] if values else []
         return piecewise(x, False, knots, list(zip(ends, [0.0, *slopes, 0.0], strict=False)))
     except InvalidValueError as error:
-        raise InvalidValueError(f"The table of limits is none. {error}") from None
+        raise InvalidValueError(f"The table of limits is not valid. {error}") from None
 
 
-def _open_condition(condition: Expression, at: Expression | None) -> Expression:
-    free = _scalar(condition, "The condition of a lock")
-    return free if at is None else free | ~_scalar(at, "Where a lock catches")
+def _open_condition(open_if: Expression, engaged_if: Expression | None) -> Expression:
+    free = _scalar(open_if, "The condition open_if of a lock")
+    return free if engaged_if is None else free | ~_scalar(engaged_if, "The condition engaged_if of a lock")
 
 
 def _bound_while_locked(free: Expression, bound: Expression | None, sign: int) -> Expression:
-    """Return the bound where it is not free, with the trend of being free as advice."""
+    """Return the bound while the lock is closed, with the trend of ``free`` as its heuristic gradient."""
     if bound is None:
         return as_expression(sign * math.inf)
-    # Held in doubt: at equality a truth is 0.5.
+    # At equality a condition is 0.5, which counts as locked.
     choice = where(1 - free, bound, sign * math.inf)
     out = {key: sign * entry for key, entry in free.gradient().items()}
     return choice.augment(out, heuristic=True) if out else choice
@@ -201,7 +201,7 @@ def _scalar(given: object, what: str) -> Expression:
 
 
 def _bound(given: ExpressionLike, name: str) -> Expression:
-    what = f"The {name} bound of what is blocked"
+    what = f"The {name} bound of a lock"
     if isinstance(given, Expression) and given.symbols:
         return _scalar(given, what)
     if not math.isfinite(_number(given, what)):

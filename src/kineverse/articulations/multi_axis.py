@@ -24,26 +24,26 @@ from .joint import Joint, check_axis, check_joint_number
 from .limits import FREE, Limits, check_limits, check_speed_limit, limit_constraints
 from .single_axis import rotation_factors, unit_axis
 
-# How far from perpendicular axes may be: the cosine between them.
+# Largest cosine between axes that count as perpendicular.
 _PERPENDICULAR = 1e-6
 
 
 @dataclass(frozen=True, kw_only=True)
-class Planar(Joint):
-    """Motion in a plane: parent_T_child = origin · A · translation(x, y, 0) · rotation_z(θ) · Aᵀ.
+class Planar(Joint, document_kind="Planar"):
+    """Planar joint: parent_T_child = origin · A · translation(x, y, 0) · rotation_z(θ) · Aᵀ.
 
     The columns of A are two directions in the plane and its normal, the axis. Coordinates are ``name/x``,
     ``name/y`` [m] and ``name/angle`` [rad], all free. For the axis z, A is the identity; for another axis n,
-    A is the smallest rotation that turns z into n (about z × n), and a half turn about x for -z.
+    A is the smallest rotation that takes z to n (about z × n), and a half turn about x for -z.
 
     Attributes
     ----------
     axis
-        The normal of the plane in the joint's frame.
+        Normal of the plane in the joint's frame.
     lower, upper
-        Limits of x and y alike [m]; None leaves that side open.
+        Limits of both x and y [m]; None leaves that side open.
     velocity
-        Limit of the speeds of x and y alike [m/s]; None for no limit.
+        Limit of both |ẋ| and |ẏ| [m/s]; None for no limit.
     """
 
     axis: AxisLike = (0.0, 0.0, 1.0)
@@ -76,11 +76,11 @@ class Planar(Joint):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Universal(Joint):
-    """A Cardan joint: parent_T_child = origin · rotation(first, α) · rotation(second, β).
+class Universal(Joint, document_kind="Universal"):
+    """Universal (Cardan) joint: parent_T_child = origin · rotation(first, α) · rotation(second, β).
 
-    Coordinates ``name/first``, α, and ``name/second``, β [rad]. The first axis stands still in the parent,
-    the second in the child.
+    Coordinates ``name/first``, α, and ``name/second``, β [rad]. The first axis is fixed in the parent, the
+    second in the child.
 
     Attributes
     ----------
@@ -125,41 +125,41 @@ class Universal(Joint):
         return Writes(
             frames={self.child: (self.parent, (self.origin, *motion))},
             constraints={
-                **dict(self.first_limits.on(f"{self.name}/first", a)),
-                **dict(self.second_limits.on(f"{self.name}/second", b)),
+                **dict(self.first_limits.constraints(f"{self.name}/first", a)),
+                **dict(self.second_limits.constraints(f"{self.name}/second", b)),
             },
             articulations={self.name: self.record(angles, (0.0, 0.0), (a.derivative(), b.derivative()))},
         )
 
 
 @dataclass(frozen=True, kw_only=True)
-class Ball(Joint):
-    """A ball in a socket: parent_T_child = origin · rotation(quaternion).
+class Ball(Joint, document_kind="Ball"):
+    """Ball (spherical) joint: parent_T_child = origin · rotation(quaternion).
 
     Four coordinates ``name/qx|qy|qz|qw`` and three speeds, the angular velocity ω of the child in its own
     axes, ``name/wx|wy|wz`` [rad/s], with q̇ = ½ q ⊗ (ω, 0) as for :class:`Floating`.
 
-    Limits are written so that they are smooth at rest. With the quaternion q = (v, w), its part p = v·a along
-    the axis and its part v - pa across it:
+    The limits are smooth at rest (swing-twist decomposition). With the quaternion q = (v, w), its component
+    p = v·a along the axis a and its component v - pa perpendicular to it:
 
-    - the axis leaves its direction at rest by an angle γ with 1 - cos γ = 2|v - pa|²/|q|², which the cone
-      bounds by 1 - cos(cone);
-    - the turn τ that remains about the axis has tan(τ/2) = p/w, so |τ| <= twist is
+    - the swing angle γ between the axis and its direction at rest has 1 - cos γ = 2|v - pa|²/|q|², which the
+      cone bounds by 1 - cos(cone);
+    - the twist angle τ about the axis has tan(τ/2) = p/w, so |τ| <= twist is
       (p² cos²(twist/2) - w² sin²(twist/2))/|q|² <= 0.
 
-    Both grow with the square of the angle near rest, so a row in speeds that keeps them to first order lets a
-    step of Δt pass them by (|ω|Δt)²/2 at most.
+    Both grow with the square of the angle near rest. A velocity row enforces them to first order, so a step
+    of Δt violates them by (|ω|Δt)²/2 at most.
 
     Attributes
     ----------
     axis
-        The child's axis that cone and twist are about, in the joint's frame at rest.
+        The child's axis that cone and twist refer to, in the joint's frame at rest.
     cone
         The largest angle between the axis and its direction at rest, in (0, π] [rad]; None for no limit.
     twist
-        The largest turn about the axis, either way, in (0, π] [rad]; None for no limit.
+        Limit of |τ| in (0, π] [rad]; None for no limit.
     velocity
-        Limit of |ω|, whatever its direction [rad/s]; None for no limit.
+        Limit of |ω| [rad/s]; None for no limit.
 
     Raises
     ------
@@ -213,13 +213,12 @@ class Ball(Joint):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Floating(Joint):
-    """Free motion: parent_T_child = origin · translation(x, y, z) · rotation(quaternion).
+class Floating(Joint, document_kind="Floating"):
+    """Floating joint (free motion): parent_T_child = origin · translation(x, y, z) · rotation(quaternion).
 
     Seven coordinates ``name/x|y|z`` [m] and ``name/qx|qy|qz|qw``, six speeds: the velocities of x, y, z
     [m/s], and the angular velocity ω of the child in its own axes, ``name/wx|wy|wz`` [rad/s]. The quaternion
-    moves by q̇ = ½ q ⊗ (ω, 0), which keeps its length; a quaternion of another length is normalised where it
-    is used.
+    has the rate q̇ = ½ q ⊗ (ω, 0), which preserves its length. The pose normalises the quaternion.
     """
 
     def apply(self, model: ReadRecorder) -> Writes:
@@ -235,7 +234,7 @@ class Floating(Joint):
 
 
 class Orientation(NamedTuple):
-    """A quaternion (x, y, z, w), the angular velocity in the child's axes, and q̇ = ½ q ⊗ (ω, 0) by rows."""
+    """Quaternion (x, y, z, w), angular velocity ω in the child's axes, and q̇ = ½ q ⊗ (ω, 0) by rows."""
 
     coordinates: tuple[Symbol, ...]
     speeds: tuple[Symbol, ...]
@@ -243,7 +242,7 @@ class Orientation(NamedTuple):
 
 
 def orientation(name: str) -> Orientation:
-    """Return the coordinates and speeds of a quaternion below a name."""
+    """Return the coordinates, speeds and rates of a quaternion with names below a name."""
     x, y, z, w = q = tuple(position(f"{name}/q{c}") for c in "xyzw")
     wx, wy, wz = omega = tuple(velocity(f"{name}/w{c}") for c in "xyz")
     rows = {
@@ -256,6 +255,6 @@ def orientation(name: str) -> Orientation:
 
 
 def rotation_from_z(axis: AxisLike) -> np.ndarray[tuple[int, int], np.dtype[np.float64]]:
-    """Return the smallest rotation that turns z into the axis, 4×4."""
+    """Return the smallest rotation that takes z to the axis, 4×4."""
     rotation = smallest_rotation_from_z(np.array(unit_axis(axis)))
     return transform(round_exact(rotation), np.zeros(3))

@@ -21,37 +21,37 @@ from .limits import FREE, Limits, check_limits
 
 
 @dataclass(frozen=True, kw_only=True)
-class Revolute(OneDofJoint):
-    """A hinge: parent_T_child = origin · rotation(axis, q), q in [rad]."""
+class Revolute(OneDofJoint, document_kind="Revolute"):
+    """Revolute joint (hinge): parent_T_child = origin · rotation(axis, q), q in [rad]."""
 
     def motion(self, q: Expression) -> tuple[Pose | Expression, ...]:
-        """Return joint_T_child as factors."""
+        """Return the factors of joint_T_child."""
         return rotation_factors(self.axis, q)
 
 
 @dataclass(frozen=True, kw_only=True)
-class Continuous(Revolute):
-    """A hinge without end stops, q in [rad]; usually without position limits."""
+class Continuous(Revolute, document_kind="Continuous"):
+    """Revolute joint without end stops, q in [rad]; usually without position limits."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class Prismatic(OneDofJoint):
-    """A slider: parent_T_child = origin · translation(axis · q), q in [m]."""
+class Prismatic(OneDofJoint, document_kind="Prismatic"):
+    """Prismatic joint (slider): parent_T_child = origin · translation(axis · q), q in [m]."""
 
     def motion(self, q: Expression) -> tuple[Pose | Expression, ...]:
-        """Return joint_T_child as factors."""
+        """Return the factors of joint_T_child."""
         return (translation_along(unit_axis(self.axis), q),)
 
 
 @dataclass(frozen=True, kw_only=True)
-class Screw(OneDofJoint):
-    """A thread: parent_T_child = origin · translation(axis · p q/2π) · rotation(axis, q), q in [rad].
+class Screw(OneDofJoint, document_kind="Screw"):
+    """Screw joint: parent_T_child = origin · translation(axis · p q/2π) · rotation(axis, q), q in [rad].
 
     Attributes
     ----------
     pitch
-        How far it moves in one revolution, p [m]: along the axis for a right-handed thread, which is
-        positive, and against it for a left-handed one, which is negative.
+        Displacement along the axis in one revolution, p [m]: positive for a right-handed thread, negative
+        for a left-handed one.
 
     Raises
     ------
@@ -72,7 +72,7 @@ class Screw(OneDofJoint):
             )
 
     def motion(self, q: Expression) -> tuple[Pose | Expression, ...]:
-        """Return joint_T_child as factors."""
+        """Return the factors of joint_T_child."""
         return translation_along(unit_axis(self.axis), self.pitch / math.tau * q), *rotation_factors(
             self.axis, q
         )
@@ -84,8 +84,8 @@ class Screw(OneDofJoint):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Cylindrical(Joint):
-    """A rod in a sleeve: parent_T_child = origin · translation(axis · s) · rotation(axis, φ).
+class Cylindrical(Joint, document_kind="Cylindrical"):
+    """Cylindrical joint: parent_T_child = origin · translation(axis · s) · rotation(axis, φ).
 
     Coordinates ``name/slide``, s [m], and ``name/turn``, φ [rad], independent of each other.
 
@@ -120,8 +120,8 @@ class Cylindrical(Joint):
         return Writes(
             frames={self.child: (self.parent, (self.origin, *motion))},
             constraints={
-                **dict(self.slide.on(f"{self.name}/slide", s)),
-                **dict(self.turn.on(f"{self.name}/turn", angle)),
+                **dict(self.slide.constraints(f"{self.name}/slide", s)),
+                **dict(self.turn.constraints(f"{self.name}/turn", angle)),
             },
             articulations={
                 self.name: self.record((s, angle), (0.0, 0.0), (s.derivative(), angle.derivative()))
@@ -130,18 +130,18 @@ class Cylindrical(Joint):
 
 
 def unit_axis(axis: AxisLike) -> tuple[float, float, float]:
-    """Return the axis at length one."""
+    """Return the unit vector along an axis."""
     numbers = normalize(axis)
-    assert numbers is not None  # joints check their axis when they are made
+    assert numbers is not None  # joints check their axis at construction
     x, y, z = numbers
     return x, y, z
 
 
 def rotation_factors(axis: AxisLike, q: Expression) -> tuple[Pose | Expression, ...]:
-    """Return the rotation about any axis as constants around one about x, y or z.
+    """Return the rotation about an axis as factors: A · rotation_z(q) · Aᵀ, the axis as last column of A.
 
-    Such factors keep the Jacobian constant in q and the chain short: A · rotation_z(q) · Aᵀ with A's last
-    column the axis.
+    Only the middle factor depends on q, so the expressions of a chain stay small. A rotation about x, y or z
+    is one factor.
     """
     x, y, z = unit_axis(axis)
     for component, about in ((x, X), (y, Y), (z, Z)):

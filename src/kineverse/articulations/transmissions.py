@@ -21,23 +21,22 @@ from .single_axis import rotation_factors, unit_axis
 
 @dataclass(frozen=True, kw_only=True)
 class Transmission(OneAxisMotion):
-    """Base of the joints whose number q is a function of a driver d, and no coordinate of its own.
+    """Base of the transmissions: joints whose position q is a function of the position d of a driver.
 
-    Limits of q and of its speed are constraints on that function of the driver. Couplings may drive
-    couplings: what the driver's position is, is read from the model, so a train of gears follows when the
-    first of them is exchanged.
+    Limits of q and of its speed are constraints on that function. A transmission may drive another one. The
+    driver's position is read from the model, so a gear train follows when its first gear is replaced.
 
     Attributes
     ----------
     driver
-        Name of an articulation whose position is one number, or an expression of positions [rad].
+        Name of an articulation with one coordinate, or an expression of positions [rad].
 
     Raises
     ------
     UnknownNameError
         For a driver that does not exist, with similar names.
     InvalidValueError
-        For a driver without a position or with several coordinates, or one that nothing moves.
+        For a driver without a position or with several coordinates, or a constant one.
     DuplicateNameError
         For an articulation or a frame that exists.
     """
@@ -50,31 +49,32 @@ class Transmission(OneAxisMotion):
             return
         if not isinstance(self.driver, Expression):
             raise InvalidValueError(
-                f"{self._its_driver} is the name of an articulation or an expression, not {self.driver!r}."
+                f"{self._driver_noun} is the name of an articulation or an expression, not {self.driver!r}."
             )
-        if not check_position_expression(self.driver, self._its_driver).symbols:
-            raise InvalidValueError(f"{self._its_driver} is constant: {self.driver!r}.")
+        if not check_position_expression(self.driver, self._driver_noun).symbols:
+            raise InvalidValueError(f"{self._driver_noun} is constant: {self.driver!r}.")
 
     @abstractmethod
     def transmit(self, driver: Expression) -> Expression:
-        """Return q where the driver is at d."""
+        """Return q as a function of the driver's position."""
 
     def apply(self, model: ReadRecorder) -> Writes:
         """Write the child frame and the limits."""
         self.check_free(model)
-        return self.moved_by(self.transmit(self._driver_in(model)))
+        return self.joint_writes(self.transmit(self._find_driver(model)))
 
     @property
-    def _its_driver(self) -> str:
+    def _driver_noun(self) -> str:
         return f"The driver of the {self.noun} '{self.name}'"
 
-    def _driver_in(self, model: ReadRecorder) -> Expression:
+    def _find_driver(self, model: ReadRecorder) -> Expression:
+        """Return the position of the driver in a model."""
         if isinstance(self.driver, Expression):
             return self.driver
         try:
             record = model.articulations[self.driver]
         except UnknownNameError as error:
-            raise UnknownNameError(f"{self._its_driver} is missing. {error}") from None
+            raise UnknownNameError(f"{self._driver_noun} is missing. {error}") from None
         if record.position is None:
             names = ", ".join(f"'{s}'" for s in record.coordinates)
             has = (
@@ -83,20 +83,20 @@ class Transmission(OneAxisMotion):
                 if names
                 else "no position"
             )
-            raise InvalidValueError(f"{self._its_driver}, '{self.driver}', has {has}.")
+            raise InvalidValueError(f"{self._driver_noun}, '{self.driver}', has {has}.")
         return record.position
 
 
 @dataclass(frozen=True, kw_only=True)
-class Gearbox(Transmission):
-    """A gear or a belt: parent_T_child = origin · rotation(axis, q) with q = ratio · d + offset [rad].
+class Gearbox(Transmission, document_kind="Gearbox"):
+    """Gearbox or belt: parent_T_child = origin · rotation(axis, q) with q = ratio · d + offset [rad].
 
     Attributes
     ----------
     ratio
-        Turns of the child for one of the driver; negative where they turn against each other.
+        Revolutions of the child per revolution of the driver; negative for opposite senses.
     offset
-        q where the driver is at 0 [rad].
+        q at d = 0 [rad].
 
     Raises
     ------
@@ -114,24 +114,24 @@ class Gearbox(Transmission):
         check_joint_number(self.offset, f"The offset of the gearbox '{self.name}'")
 
     def transmit(self, driver: Expression) -> Expression:
-        """Return the child's angle [rad]."""
+        """Return the angle of the child [rad]."""
         return self.ratio * driver + self.offset
 
     def motion(self, q: Expression) -> tuple[Pose | Expression, ...]:
-        """Return joint_T_child as factors."""
+        """Return the factors of joint_T_child."""
         return rotation_factors(self.axis, q)
 
 
 @dataclass(frozen=True, kw_only=True)
-class RackAndPinion(Transmission):
-    """A rack that a pinion moves: parent_T_child = origin · translation(axis · q), q = radius · d + offset.
+class RackAndPinion(Transmission, document_kind="RackAndPinion"):
+    """Rack and pinion: parent_T_child = origin · translation(axis · q), q = radius · d + offset.
 
     Attributes
     ----------
     radius
-        Of the pinion's pitch circle [m]. Which way the rack goes is said by its axis.
+        Radius of the pinion's pitch circle [m]. The axis gives the direction of the rack.
     offset
-        q where the driver is at 0 [m].
+        q at d = 0 [m].
 
     Raises
     ------
@@ -148,39 +148,39 @@ class RackAndPinion(Transmission):
         check_joint_number(self.offset, f"The offset of the rack and pinion '{self.name}'")
 
     def transmit(self, driver: Expression) -> Expression:
-        """Return how far the rack is [m]."""
+        """Return the position of the rack [m]."""
         return self.radius * driver + self.offset
 
     def motion(self, q: Expression) -> tuple[Pose | Expression, ...]:
-        """Return joint_T_child as factors."""
+        """Return the factors of joint_T_child."""
         return (translation_along(unit_axis(self.axis), q),)
 
 
 @dataclass(frozen=True, kw_only=True)
-class Cam(Transmission):
-    """A follower on a cam: parent_T_child = origin · translation(axis · q), q = profile(d) [m].
+class Cam(Transmission, document_kind="Cam"):
+    """Cam with a follower: parent_T_child = origin · translation(axis · q), q = profile(d) [m].
 
-    Where it turns, it is origin · rotation(axis, q), q = profile(d) [rad]. The profile is a cubic spline
+    With ``turns`` it is origin · rotation(axis, q), q = profile(d) [rad]. The profile is a cubic spline
     through points, see :func:`kineverse.spline`: twice continuously differentiable, so the follower's
-    acceleration has no jumps.
+    acceleration is continuous.
 
     Attributes
     ----------
     angles
-        Angles of the cam that increase [rad].
+        Increasing angles of the cam [rad].
     values
-        Where the follower is there [m], or [rad] if it turns.
+        Positions of the follower at these angles [m], or [rad] if it turns.
     periodic
-        Whether the profile goes round: the last angle is the first one after a revolution, with the same
+        True if the profile is periodic: the last angle is the first one after a revolution, with the same
         value. Otherwise the follower rests before the first angle and after the last.
     turns
-        Whether the follower turns about the axis rather than slides along it.
+        True if the follower rotates about the axis, False if it slides along it.
 
     Raises
     ------
     InvalidValueError
-        For angles that do not increase, as many values as there are not angles, NaN, or a periodic profile
-        that does not end where it begins.
+        For angles that do not increase, different numbers of angles and values, NaN, or a periodic profile
+        whose ends differ.
     """
 
     angles: tuple[float, ...]
@@ -211,9 +211,9 @@ class Cam(Transmission):
             object.__setattr__(self, what, tuple(map(float, getattr(self, what))))
 
     def transmit(self, driver: Expression) -> Expression:
-        """Return where the follower is [m] or [rad]."""
+        """Return the position of the follower [m] or [rad]."""
         return spline(driver, self.angles, self.values, self.periodic)
 
     def motion(self, q: Expression) -> tuple[Pose | Expression, ...]:
-        """Return joint_T_child as factors."""
+        """Return the factors of joint_T_child."""
         return rotation_factors(self.axis, q) if self.turns else (translation_along(unit_axis(self.axis), q),)

@@ -1,4 +1,4 @@
-"""Whole files: read up to a size, written in one step."""
+"""Reading of files up to a size, and atomic replacement."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from pathlib import Path
 from kineverse.errors import FormatError
 
 MAX_BYTES = 1 << 28
-"""The largest file that is read [byte]: 256 MiB, some hundred times the largest robot we have met."""
+"""Largest size of a file to read [byte]: 256 MiB, some hundred times the largest known robot."""
 
 
 def read_file(path: Path) -> bytes:
@@ -38,7 +38,7 @@ def read_file(path: Path) -> bytes:
 
 
 def replace_file(path: Path, content: bytes) -> None:
-    """Put a file in the place of another in one step: it is there whole, or what was there stays.
+    """Replace a file atomically: after an error, the old file is unchanged.
 
     Raises
     ------
@@ -47,13 +47,13 @@ def replace_file(path: Path, content: bytes) -> None:
     """
     try:
         _replace(Path(os.path.realpath(path)), content)
-    except (OSError, ValueError) as error:  # a name with a zero byte is a ValueError
+    except (OSError, ValueError) as error:  # a name with a zero byte raises a ValueError
         reason = getattr(error, "strerror", None) or error
         raise FormatError(f"{path} cannot be written: {reason}.") from None
 
 
 def _replace(target: Path, content: bytes) -> None:
-    # Beside the target, since only within one file system does a file take another's place in one step.
+    # In the folder of the target, because replacement is atomic only within one file system.
     beside = target.with_name(f".{target.name[:100]}.{uuid.uuid4().hex}")
     try:
         with open(beside, "xb") as file:

@@ -1,4 +1,4 @@
-"""Loading of models from files and names, with a memory of the last ones."""
+"""Loading of models from files and by name, with a cache of the latest ones."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ _ADVICE = {
 
 
 def unsupported_format(path: Path) -> FormatError:
-    """Return the error for a file of another format: what it is, and what to do."""
+    """Return the error for a file of another format, with the format and the remedy."""
     if path.suffix.lower() == ".xacro":
         plain = path.name[: -len(path.suffix)]
         plain = plain if "." in plain else f"{plain}.urdf"
@@ -68,9 +68,9 @@ def unsupported_format(path: Path) -> FormatError:
 
 MOST_REMEMBERED = 16
 LARGEST_REMEMBERED = 1 << 22
-"""Models whose files are larger than this [byte] are not remembered, they would take too much memory."""
+"""Largest file whose model is cached [byte]; larger models would take too much memory."""
 
-# Models loaded by this process and remarks on them, the latest last, by everything that they follow from.
+# Models loaded by this process and the warnings about them, the latest last, by all inputs of the load.
 _Key: TypeAlias = "tuple[Source, str | None, bytes, str, bool, str]"
 _REMEMBERED: OrderedDict[_Key, tuple[Snapshot, list[str]]] = OrderedDict()
 
@@ -88,34 +88,32 @@ def load(
     Parameters
     ----------
     source
-        The path of a ``.urdf``, ``.sdf``, ``.xml`` (MJCF, or URDF), ``.kv.json`` or ``.kv.msgpack`` file, or
-        a name such as ``kitchen``, ``pr2`` or ``articulations/screw``, see
+        Path of a ``.urdf``, ``.sdf``, ``.xml`` (MJCF, or URDF), ``.kv.json`` or ``.kv.msgpack`` file, or a
+        name such as ``kitchen``, ``pr2`` or ``articulations/screw``, see
         :func:`kineverse.formats.locate.locate_model`.
     prefix
-        Put in front of the names of all frames and degrees of freedom, with a slash. A model that ships has
-        its own name as prefix unless another is given (``screw`` for ``articulations/screw``); ``""`` means
-        none.
+        Prefix of the names of all frames and degrees of freedom, without the slash. A shipped model has its
+        own name as prefix unless another is given (``screw`` for ``articulations/screw``); ``""`` means none.
     root
-        The folder below which the files that it names may be opened, meshes and included ones. By default the
-        folder of ``KINEVERSE_ROOT`` that holds it, else the repository or package around it, else its own
+        Folder below which the description may open files: meshes and included descriptions. By default the
+        folder of ``KINEVERSE_ROOT`` that contains it, else the repository or package around it, else its own
         folder.
     strict
-        Whether mistakes that move nothing, or that others read past, are refused. Otherwise there is a remark
-        on each, which :func:`kineverse.formats.reader_warnings.collect_warnings` hears and the logger ``kineverse.formats``
-        gets.
+        True to refuse mistakes that affect no motion, or that other parsers accept. Otherwise each is a
+        warning, which :func:`kineverse.formats.reader_warnings.collect_warnings` collects and the logger
+        ``kineverse.formats`` receives.
     loops
-        What becomes of loops that an SDF or MJCF closes. ``"solve"``: coordinates follow others, see
-        :class:`kineverse.CloseLoop`; where that cannot be done, the closure is kept as an equality
-        constraint, :class:`kineverse.loops.LoopConstraint`, with a remark. ``"constraint"``: all are kept so.
-        ``"refuse"``: what cannot be solved is an error.
+        Treatment of loops that an SDF or MJCF closes. ``"solve"``: dependent coordinates become functions of
+        the free ones, see :class:`kineverse.CloseLoop`; if that fails, the closure is kept as an equality
+        constraint, :class:`kineverse.loops.LoopConstraint`, with a warning. ``"constraint"``: all are kept as
+        constraints. ``"refuse"``: a loop that cannot be solved is an error.
 
     Raises
     ------
     UnknownNameError
         If there is no such model.
     FormatError
-        If the file is not what it should be, with file, line, element and reason; or if the prefix or the
-        root is not.
+        If the file is invalid, with file, line, element and reason; or for an invalid prefix or root.
     InvalidValueError
         If ``loops`` is none of these.
     """
@@ -150,7 +148,7 @@ def load(
 
 @contextmanager
 def _blaming(path: Path) -> Iterator[None]:
-    """Make it the fault of a document if its operations cannot be applied to the empty model."""
+    """Turn the error of a document whose operations cannot be applied into a FormatError."""
     try:
         yield
     except (FormatError, MissingDependencyError):
@@ -170,7 +168,7 @@ def include(
     strict: bool = False,
     loops: LoopTreatment = "solve",
 ) -> list[str]:
-    """Append the operations of a file or shipped model to an edit, see :func:`load`; return their tags."""
+    """Append the operations of a file or shipped model to an edit and return their tags; see :func:`load`."""
     check_prefix(prefix)
     check_loops(loops)
     found = locate_model(source)

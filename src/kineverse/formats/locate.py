@@ -1,4 +1,4 @@
-"""Search of the file that belongs to the name of a model."""
+"""Search for the file of a model by its name."""
 
 from __future__ import annotations
 
@@ -27,34 +27,35 @@ GALLERY = "articulations"
 
 @dataclass(frozen=True, slots=True)
 class Source:
-    """File of a model, with its name if the package has it; or a model of a collection, without a file."""
+    """File of a model, with its name if it ships; or a model of a collection, without a file."""
 
     path: Path
     shipped: str | None = None
     scene: bool = False
     folder: Path | None = field(default=None, compare=False)
-    """The folder of models in which it was found by its name."""
+    """Folder of models that was searched by name."""
 
 
 def shipped_models() -> tuple[str, ...]:
-    """Return the names of the models that come with the package."""
+    """Return the names of the models that ship with the package."""
     return tuple(sorted(file.stem for file in shipped.FOLDER.glob("*.urdf")))
 
 
 def locate_model(name: str | os.PathLike[str]) -> Source:
     """Return the file of a model given by path or by name.
 
-    A shipped model is found under its name everywhere, and so is a scene of the gallery,
-    ``articulations/screw``; a file of that name is ``./kitchen``. Then a path to a file is taken as it is.
-    Any other name is looked for below the folders of ``KINEVERSE_MODEL_PATH``, then in installed packages
-    that carry robots; the first place that has it counts, and there the file closest to the top. It may have
-    folders in front (``urdf_obj/kitchen``) to tell files of the same name apart, and its suffix may be left
-    out.
+    Shipped models and scenes of the gallery (``articulations/screw``) have priority over files of the same
+    name; such a file is ``./kitchen``. A path to a file is used as it is. Any other name is searched below
+    the folders of ``KINEVERSE_MODEL_PATH``, then in installed packages with robots. The first folder that has
+    it counts, and in it the file closest to the top. The name may include folders (``urdf_obj/kitchen``) to
+    select among files of the same name, and its suffix is optional.
 
     Raises
     ------
     UnknownNameError
-        If there is none, with similar names, what was searched and how to get more; or if there are several.
+        If there is no such model, with similar names and the folders searched; or if there are several.
+    FormatError
+        If the name is no text or path, or no regular file.
     """
     if not isinstance(name, (str, os.PathLike)):
         hint = (
@@ -129,7 +130,7 @@ def _no_scene(name: str) -> str:
 
 
 def model_folders() -> Iterator[tuple[str, Path]]:
-    """Yield the folders in which names are looked for, with what each is."""
+    """Yield the folders in which models are searched by name, each with its origin."""
     for entry in os.environ.get(MODEL_PATH, "").split(os.pathsep):
         if entry and Path(entry).is_dir():
             yield MODEL_PATH, Path(entry)
@@ -158,7 +159,13 @@ def _is_called(file: str, name: str) -> bool:
 
 
 def _only(found: list[str], name: str, folder: Path) -> str:
-    """Return the file closest to the top, if there is one such file."""
+    """Return the file closest to the top.
+
+    Raises
+    ------
+    UnknownNameError
+        If there are several.
+    """
     top = min(f.count("/") for f in found)
     found = sorted(f for f in found if f.count("/") == top)
     if len(found) > 1:
@@ -178,11 +185,11 @@ def _similar(name: str, files: list[str]) -> str:
 
 
 def _alike(name: str, files: list[str]) -> list[str]:
-    """Return what could have been meant and can be typed: spelt alike, or with the name in its path."""
+    """Return similar names of models: spelt alike, or with the name in their path."""
     wanted = name.casefold().strip("/ ")
     paths = sorted({_stem(f) for f in files})
     ends = Counter(_end(p) for p in paths)
-    # Where the last part is enough to find it, the folders in front are not shown.
+    # Folders are left out if the last part of the path is unique.
     shown = {p: _end(p) if ends[_end(p)] == 1 else p for p in paths} | {s: s for s in shipped_models()}
     shown |= {f"{GALLERY}/{scene}": f"{GALLERY}/{scene}" for scene in _scenes()}
     alike = difflib.get_close_matches(wanted, {_end(p).casefold() for p in shown}, n=_LISTED, cutoff=0.7)
@@ -218,7 +225,7 @@ def _more_robots(searched: list[str]) -> str:
 
 
 def _beside(path: Path) -> str:
-    """Return what is at a path that is no file, or next to it."""
+    """Return a hint about a path that is no file: the models in that folder, or similar files beside it."""
     if _is(path, Path.is_dir):
         inside = [p.relative_to(path).as_posix() for p in islice(_files(path, 2), _LISTED)]
         return f" It is a folder; models in it: {', '.join(inside) or 'none'}."
@@ -233,14 +240,14 @@ def _beside(path: Path) -> str:
 def _expanded(text: str) -> Path:
     try:
         return Path(text).expanduser()
-    except RuntimeError:  # "~name", and nobody has that name
+    except RuntimeError:  # "~name" of an unknown user
         return Path(text)
 
 
 def _is(path: Path, kind: Callable[[Path], bool]) -> bool:
     try:
         return kind(path)
-    except OSError:  # too long for a name, or not for us to see
+    except OSError:  # a name that is too long, or a folder without permission
         return False
 
 

@@ -26,7 +26,7 @@ from kineverse.symbols import Symbol
 from .reader_warnings import warn
 
 CLOSED = 1e-6
-"""How far apart ends may be that nothing moves [m], [rad]: files have six digits."""
+"""Largest gap of a loop that counts as closed [m], [rad]: files have six digits."""
 
 _LOOKED_AT = 12
 _MOVED = 1e-6
@@ -35,19 +35,24 @@ _SHOWN = 6
 
 @dataclass
 class LoopClosures:
-    """Applies the operations of a description, and what it closes in the way that was asked for.
+    """Application of the operations of a description, with the requested treatment of its loops.
 
     Attributes
     ----------
     edit, model
-        The edit, and the model that is edited.
+        The edit, and the model that it edits.
     source
-        The name of the file, for remarks.
+        Name of the file, for warnings.
     element
-        What closes a loop there: ``joint`` or ``equality``.
+        Element that closes a loop in the format: ``joint`` or ``equality``.
     loops
-        ``"solve"``: what follows becomes a function of what is free; where that cannot be done, the closure
-        is kept as a constraint. ``"constraint"``: all are. ``"refuse"``: what cannot be solved is an error.
+        ``"solve"``: dependent coordinates become a function of the free ones; if that fails, the closure is
+        kept as a constraint. ``"constraint"``: all are kept. ``"refuse"``: a loop that cannot be solved is an
+        error.
+    kept
+        Names of the loops that are kept as constraints.
+    homes
+        Articulations with their coordinates at home, as the description gives them.
     """
 
     edit: Edit
@@ -59,7 +64,7 @@ class LoopClosures:
     homes: list[tuple[str, tuple[float, ...]]] = field(default_factory=list)
 
     def apply(self, tag: str, operation: Operation) -> Iterator[str]:
-        """Apply an operation, and yield its tag if anything is left of it."""
+        """Apply an operation, and yield its tag unless it is left out."""
         if isinstance(operation, SetHome):
             self.homes.append((operation.name, operation.home))
         if not isinstance(operation, CloseLoop):
@@ -73,10 +78,10 @@ class LoopClosures:
                 yield from self._not_solved(tag, operation, error)
 
     def _not_solved(self, tag: str, loop: CloseLoop, error: KineverseError) -> Iterator[str]:
-        """Close a loop without the rows that nothing moves, as far as files are exact, or keep it."""
-        mended = self._mended(loop)
-        if mended and mended != loop.mask:
-            loop = replace(loop, mask=mended)
+        """Close a loop without constant rows that rounding leaves open, or keep it as a constraint."""
+        mask = self._moving_rows(loop)
+        if mask and mask != loop.mask:
+            loop = replace(loop, mask=mask)
             try:
                 yield self.edit.apply(loop, tag)
             except KineverseError as other:
@@ -87,6 +92,7 @@ class LoopClosures:
         yield from self._keep(tag, loop, error)
 
     def _keep(self, tag: str, loop: CloseLoop, error: KineverseError | None) -> Iterator[str]:
+        """Keep a loop as a constraint; leave it out if it is redundant or can never hold."""
         gaps = self._gaps(loop)
         name = _shown(loop.name)
         if len(gaps) and gaps.max() <= CLOSED:
@@ -105,7 +111,7 @@ class LoopClosures:
                 "between its ends",
             )
             return
-        mask = self._mended(loop) or loop.mask
+        mask = self._moving_rows(loop) or loop.mask
         yield self.edit.apply(
             LoopConstraint(name=loop.name, frame=loop.frame, to=loop.to, mask=mask, more=loop.more), tag
         )
@@ -120,9 +126,9 @@ class LoopClosures:
             self._tell(loop, f"closes a loop, and is the constraint '{loop.name}', as asked for")
 
     def finish(self) -> Iterator[str]:
-        """Have the default state fulfil what was kept, where it can; yield the tags of what that takes.
+        """Move the default state to where the kept loops close, if possible; yield the tags of these edits.
 
-        Tells what is not where the file says that it is at home.
+        Warns about coordinates that differ from the home of the description.
         """
         moved: dict[Symbol, tuple[float, float]] = {}
         if self.kept:
@@ -135,10 +141,10 @@ class LoopClosures:
                     if now is not None and abs(now - value) > _MOVED:
                         moved[symbol] = value, now
         if moved:
-            warn(self._moved(moved))
+            warn(self._format_moved(moved))
 
     def _close_home(self, moved: dict[Symbol, tuple[float, float]]) -> Iterator[str]:
-        """Move the home of coordinates to where kept loops close; note from where and to where."""
+        """Move the home of coordinates to where kept loops close; add old and new values to ``moved``."""
         state = self.model.default_state()
         wanted = {
             name for loop in find_loops(self.model) if loop.name in self.kept for name in loop.constraints
@@ -160,7 +166,7 @@ class LoopClosures:
         moved |= {s: ends for s, ends in changed.items() if abs(ends[1] - ends[0]) > _MOVED}
 
     def _at_home(self, symbol: Symbol, state: State) -> float | None:
-        """Return where a coordinate is at the default state; None if a loop does not close there."""
+        """Return the value of a coordinate at the default state; None if a loop does not close there."""
         if symbol in state:
             return state[symbol]
         follows = self.model.rates.dependent.get(symbol)
@@ -169,25 +175,26 @@ class LoopClosures:
         except NoSolutionError:
             return None
 
-    def _moved(self, moved: dict[Symbol, tuple[float, float]]) -> list[str]:
+    def _format_moved(self, moved: dict[Symbol, tuple[float, float]]) -> list[str]:
         listed = [f"'{s}' from {a:.6g} to {b:.6g}" for s, (a, b) in list(moved.items())[:_SHOWN]]
         more = f" and {len(moved) - _SHOWN} more" if len(moved) > _SHOWN else ""
         return [
             f"{self.source}: its home is moved to where limits and loops hold: {', '.join(listed)}{more}."
         ]
 
-    def _mended(self, loop: CloseLoop) -> tuple[str, ...]:
-        """Return the mask of a loop without axes along which nothing moves, and rounding is left over."""
+    def _moving_rows(self, loop: CloseLoop) -> tuple[str, ...]:
+        """Return the mask of a loop without rows that are constant and zero but for rounding in the file."""
         all_rows = self._rows(loop)
-        still = [
+        constant = [
             axis
             for axis in loop.mask
             if not any(rows[axis].symbols for rows in all_rows)
             and APART < max(abs(float(rows[axis])) for rows in all_rows) <= CLOSED
         ]
-        return tuple(axis for axis in loop.mask if axis not in still)
+        return tuple(axis for axis in loop.mask if axis not in constant)
 
     def _rows(self, loop: CloseLoop) -> list[dict[str, Expression]]:
+        """Return the rows of the residual by name, for each pair of frames."""
         rates = self.model.rates
         return [
             residual_rows(rates.resolve(self.model.fk(frame, to)), loop.mask)
@@ -195,7 +202,7 @@ class LoopClosures:
         ]
 
     def _gaps(self, loop: CloseLoop) -> npt.NDArray[np.float64]:
-        """Return what is left between the ends in states within limits, as far as other loops close there."""
+        """Return the norm of the residual in sampled states within limits, where other loops close."""
         rows = array([row for rows in self._rows(loop) for row in rows.values()])
         (values,) = StateSamples(self.model, count=_LOOKED_AT).values([rows])
         gaps = np.linalg.norm(values, axis=1)

@@ -18,7 +18,7 @@ K = TypeVar("K", bound=Hashable)
 
 @dataclass(frozen=True, slots=True)
 class MimicRelation(Generic[K]):
-    """A position that is ``multiplier * leader + offset``."""
+    """Position as an affine function of another one: ``multiplier * leader + offset``."""
 
     leader: K
     multiplier: float = 1.0
@@ -31,19 +31,19 @@ def resolve_mimic_chains(
     shown: Callable[[K], str] = str,
     check: Callable[[K, K], bool] | None = None,
 ) -> dict[K, MimicRelation[K]]:
-    """Return for each follower what it follows in the end, with the factors of its chain composed.
+    """Return the relation of each follower to the independent end of its chain, with composed factors.
 
     Parameters
     ----------
     following
-        What each follower follows; who is not in there moves by itself.
+        Relation of each follower to its leader; all others are independent.
     refuse
-        Called with a follower and the reason why it cannot be resolved; raises, or else it moves by itself.
+        Called with a follower that cannot be resolved and the reason. If it does not raise, the follower is
+        independent.
     shown
-        The name of a follower in that reason.
+        Returns the name of a follower in that reason.
     check
-        Called with each follower and its leader; returns whether the one follows the other, or it moves by
-        itself.
+        Called with each follower and its leader; a follower for which it returns False is independent.
     """
     resolved: dict[K, MimicRelation[K]] = {}
     free: set[K] = set()
@@ -83,5 +83,5 @@ def resolve_mimic_chains(
 
 
 def is_valid_factor(factor: float) -> bool:
-    """Return whether positions and limits stay finite when they go through a factor."""
+    """Return True if positions and limits times a factor stay finite."""
     return not factor or SMALLEST <= abs(factor) <= LARGEST

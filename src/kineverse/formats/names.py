@@ -1,8 +1,8 @@
-"""Names and prefixes: checked, without empty parts, and unique by numbers behind them."""
+"""Names and prefixes: validation, removal of empty parts, and unique names by numbers behind them."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Container, Iterable
 from typing import TypeAlias
 
 from kineverse.errors import ExpressionError, FormatError
@@ -11,12 +11,12 @@ from kineverse.symbols import position
 
 
 def check_prefix(prefix: object) -> None:
-    """Refuse what cannot be put in front of names.
+    """Check that a prefix can stand in front of names.
 
     Raises
     ------
     FormatError
-        With what is wrong with it.
+        If it is no text, or has an empty part, a control character or half of a surrogate pair.
     """
     if prefix is None or prefix == "":
         return
@@ -32,7 +32,7 @@ def check_prefix(prefix: object) -> None:
 
 
 NameFaultHandler: TypeAlias = Callable[[str, str, str], None]
-"""Called with the place of a mistake, what it is and what is taken instead; raises in a strict reader."""
+"""Handler of an invalid name, called with place, problem and replacement; raises in a strict reader."""
 
 
 def drop_empty_parts(name: str) -> str:
@@ -40,16 +40,56 @@ def drop_empty_parts(name: str) -> str:
     return "/".join(filter(None, name.split("/")))
 
 
-class UniqueNames:
-    """Names that are taken, with what has each of them."""
+class NumberedNames:
+    """Numbers behind names that are taken, from 2 on; the last one of each name is remembered."""
 
-    def __init__(self, mend: NameFaultHandler, *taken: str) -> None:
-        self._taken: dict[str, str] = dict.fromkeys(taken, "the world")
-        self._mend = mend
-        self._numbers: dict[str, int] = {}
+    def __init__(self) -> None:
+        self._next: dict[str, int] = {}
+
+    def first_free(self, name: str, taken: Container[str]) -> str:
+        """Return the name if it is free, else with the first number behind it that is."""
+        if name not in taken:
+            return name
+        number = self._next.get(name, 2)
+        while f"{name}_{number}" in taken:
+            number += 1
+        self._next[name] = number + 1
+        return f"{name}_{number}"
+
+
+class TakenNames:
+    """Set of names that are taken."""
+
+    def __init__(self, taken: Iterable[str] = ()) -> None:
+        self._taken = set(taken)
+        self._numbers = NumberedNames()
+
+    def take(self, *wishes: str) -> str:
+        """Take and return the first wish that is free, else the last one with a number."""
+        free = next((wish for wish in wishes if wish not in self._taken), None)
+        name = self._numbers.first_free(wishes[-1], self._taken) if free is None else free
+        self._taken.add(name)
+        return name
+
+
+class UniqueNames:
+    """Names of the elements of a description, each with the element that has it.
+
+    Parameters
+    ----------
+    report
+        Handler of names that are replaced.
+    taken
+        Names that no element may have.
+    """
+
+    def __init__(self, report: NameFaultHandler, *taken: str) -> None:
+        self._owners: dict[str, str] = dict.fromkeys(taken, "the world")
+        self._report = report
+        self._numbers = NumberedNames()
 
     def take(self, name: str, where: str) -> str:
-        """Return the name of the file as it is here, another one if it cannot be a name, or is taken.
+        """Take the name of an element and return it, or another one if it is taken or no valid name.
 
         Raises
         ------
@@ -60,52 +100,27 @@ class UniqueNames:
         if not short or any(ord(character) < 32 for character in short):
             problem = "the name has nothing but slashes, or a control character. Rename it"
             short = "".join(c if ord(c) >= 32 else "_" for c in short) or "nameless"
-        elif self._taken.get(short, where) != where:
+        elif self._owners.get(short, where) != where:
             problem = (
-                f"it would be called {quote(short)} here, as {self._taken[short]} is. Rename one of them"
+                f"it would be called {quote(short)} here, as {self._owners[short]} is. Rename one of them"
             )
         if not problem:
-            self._taken[short] = where
+            self._owners[short] = where
             return short
         return self.replace(short, where, problem)
 
     def replace(self, name: str, where: str, problem: str) -> str:
-        """Return another name than the one that is wanted, which has a problem."""
+        """Report a problem with a name, and return the free name that the element has instead."""
         found = self.invent(name, where)
-        self._mend(where, problem, f"it is called {quote(found)}")
+        self._report(where, problem, f"it is called {quote(found)}")
         return found
 
     def invent(self, name: str, where: str, *more: str) -> str:
-        """Return the first name that is free: the one wanted, then others, then numbered ones."""
-        for candidate in (name, *more):
-            if candidate not in self._taken:
-                break
-        else:
-            number = self._numbers.get(name, 2)
-            while f"{name}_{number}" in self._taken:
-                number += 1
-            self._numbers[name] = number + 1
-            candidate = f"{name}_{number}"
-        self._taken[candidate] = where
-        return candidate
+        """Take and return the first of several names that is free, else the first one with a number."""
+        free = next((wish for wish in (name, *more) if wish not in self._owners), None)
+        found = self._numbers.first_free(name, self._owners) if free is None else free
+        self._owners[found] = where
+        return found
 
     def __contains__(self, name: str) -> bool:
-        return name in self._taken
-
-
-class TakenNames:
-    """Names of one kind that are taken."""
-
-    def __init__(self, taken: Iterable[str] = ()) -> None:
-        self._taken = set(taken)
-
-    def take(self, *wishes: str) -> str:
-        """Return the first wish that is free, else the last with a number behind it; it is taken then."""
-        for wish in wishes:
-            if wish not in self._taken:
-                self._taken.add(wish)
-                return wish
-        count = 2
-        while f"{wishes[-1]}_{count}" in self._taken:
-            count += 1
-        return self.take(f"{wishes[-1]}_{count}")
+        return name in self._owners

@@ -1,6 +1,6 @@
 """Constant poses: from roll-pitch-yaw and quaternions, their products and inverses.
 
-URDF and SDF both turn by roll about x, then pitch about y, then yaw about z, all about the fixed axes:
+URDF and SDF both rotate by roll about x, then pitch about y, then yaw about z, all about the fixed axes:
 ``a_R_b = Rz(yaw) Ry(pitch) Rx(roll)``.
 """
 
@@ -8,18 +8,27 @@ from __future__ import annotations
 
 import math
 from functools import lru_cache
+from struct import Struct
 
 from kineverse.lie import snap
 from kineverse.model.body import Pose, Vector3
 
 
-@lru_cache(maxsize=8192)
+_KEY = Struct("6d")
+
+
 def pose_from_rpy(xyz: tuple[float, ...], rpy: tuple[float, ...]) -> Pose:
     """Return the pose with offset ``xyz`` [m] and angles ``rpy`` [rad] about the fixed x, y and z axes."""
-    x, y, z = xyz
-    if rpy == (0.0, 0.0, 0.0):
+    return _cached_pose(_KEY.pack(*xyz, *rpy))
+
+
+@lru_cache(maxsize=8192)
+def _cached_pose(key: bytes) -> Pose:
+    # As bytes, -0.0 is not 0.0: the pose does not depend on files read before.
+    x, y, z, *angles = _KEY.unpack(key)
+    if angles == [0.0, 0.0, 0.0]:
         return Pose((1.0, 0.0, 0.0, x, 0.0, 1.0, 0.0, y, 0.0, 0.0, 1.0, z))
-    roll, pitch, yaw = rpy
+    roll, pitch, yaw = angles
     cr, sr = snap(math.cos(roll)), snap(math.sin(roll))
     cp, sp = snap(math.cos(pitch)), snap(math.sin(pitch))
     cy, sy = snap(math.cos(yaw)), snap(math.sin(yaw))
@@ -42,18 +51,18 @@ def pose_from_rpy(xyz: tuple[float, ...], rpy: tuple[float, ...]) -> Pose:
 
 
 SHORTEST = 1e-9
-"""The length below which a quaternion says nothing."""
+"""Smallest length of a valid quaternion."""
 
 
 def is_valid_quaternion(xyzw: tuple[float, ...]) -> bool:
-    """Return whether a quaternion is long enough to say a rotation."""
+    """Return True if a quaternion is long enough to define a rotation."""
     return math.hypot(*xyzw) >= SHORTEST
 
 
 def pose_from_quaternion(xyz: tuple[float, ...], xyzw: tuple[float, ...]) -> Pose:
     """Return the pose with offset ``xyz`` [m] and the rotation of a quaternion (x, y, z, w), normalised.
 
-    One of length zero turns nothing, as for MuJoCo and libsdformat.
+    A quaternion of length zero is the identity, as in MuJoCo and libsdformat.
     """
     if not is_valid_quaternion(xyzw):
         xyzw = (0.0, 0.0, 0.0, 1.0)
@@ -83,7 +92,7 @@ _SAME = 1e-12
 
 
 def compose_poses(a_T_b: Pose, b_T_c: Pose) -> Pose:
-    """Return a_T_c."""
+    """Return the product a_T_c."""
     if b_T_c is IDENTITY:
         return a_T_b
     if a_T_b is IDENTITY:
@@ -98,7 +107,7 @@ def compose_poses(a_T_b: Pose, b_T_c: Pose) -> Pose:
 
 
 def invert_pose(a_T_b: Pose) -> Pose:
-    """Return b_T_a."""
+    """Return the inverse b_T_a."""
     if a_T_b is IDENTITY:
         return a_T_b
     a, b, c, x, d, e, f, y, g, h, i, z = a_T_b.rows
@@ -112,12 +121,12 @@ def invert_pose(a_T_b: Pose) -> Pose:
 
 
 def rotate_direction(a_T_b: Pose, b_v: Vector3) -> Vector3:
-    """Return a_v, a direction in the axes of a."""
+    """Return a direction in the axes of a, a_v."""
     a, b, c, _, d, e, f, _, g, h, i, _ = a_T_b.rows
     x, y, z = b_v
     return (snap(a * x + b * y + c * z), snap(d * x + e * y + f * z), snap(g * x + h * y + i * z))
 
 
 def is_identity(pose: Pose) -> bool:
-    """Return whether a pose is none, but for rounding on the way there."""
+    """Return True if a pose is the identity up to rounding."""
     return all(abs(a - b) <= _SAME for a, b in zip(pose.rows, IDENTITY.rows, strict=True))

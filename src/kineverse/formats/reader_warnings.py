@@ -1,4 +1,4 @@
-"""Warnings of readers: logged, and collected by whoever asks for them."""
+"""Warnings of readers: logged, and collected within a block."""
 
 from __future__ import annotations
 
@@ -16,33 +16,43 @@ _listeners: ContextVar[tuple[list[str], ...]] = ContextVar("listeners", default=
 
 
 class Fault(str):
-    """A remark on a mistake that a strict reader refuses, and what was taken instead."""
+    """Warning about a mistake that a strict reader refuses, with the value used instead."""
 
     __slots__ = ()
 
 
 @dataclass(slots=True)
 class ReaderWarnings:
-    """A growing list of remarks on one document; where it is read strictly, mistakes are no remarks."""
+    """Warnings about one document; with ``strict``, mistakes raise instead.
+
+    Attributes
+    ----------
+    source
+        Name of the document.
+    texts
+        The warnings so far.
+    strict
+        True if mistakes are errors.
+    """
 
     source: str
     texts: list[str] = field(default_factory=list)
     strict: bool = False
 
     def add(self, element: Element, text: str, owner: Element | None = None) -> None:
-        """Note something about an element, which is part of ``owner``."""
+        """Add a warning about an element, which is part of ``owner``."""
         of = "" if owner is None or owner is element else f"{label(owner)}: "
         remark = f"line {element[3]}, {of}{label(element)} {text}"
         self.texts.append(remark)
         warn([f"{self.source}, {remark}"])
 
     def mend(self, mistake: ElementError, taken: str, owner: Element | None = None) -> None:
-        """Note a mistake in a part of ``owner``, and what is taken instead.
+        """Add a warning about a mistake in a part of ``owner``, with the value used instead.
 
         Raises
         ------
         ElementError
-            The mistake, where the document is read strictly.
+            The mistake, if the document is read strictly.
         """
         if self.strict:
             raise mistake
@@ -52,14 +62,14 @@ class ReaderWarnings:
         self.fault(element[3], f"{label(owner)}: {of}{mistake.message.rstrip('. ')}; {taken}.")
 
     def fault(self, line: int, text: str) -> None:
-        """Note a mistake in a line, which is not refused."""
+        """Add a warning about a mistake in a line."""
         fault = Fault(f"line {line}, {text}")
         self.texts.append(fault)
         warn([Fault(f"{self.source}, {fault}")])
 
 
 def warn(remarks: Iterable[str]) -> None:
-    """Log remarks, each with its source in front, and give them to whoever listens."""
+    """Log warnings, each with its source in front, and add them to the lists of :func:`collect_warnings`."""
     for remark in remarks:
         _log.info("%s", remark)
         for heard in _listeners.get():
@@ -68,7 +78,7 @@ def warn(remarks: Iterable[str]) -> None:
 
 @contextmanager
 def collect_warnings() -> Iterator[list[str]]:
-    """Yield a list that takes every remark of any reader, with its source, made within the block."""
+    """Yield a list that collects the warnings of all readers within the block, with their sources."""
     heard: list[str] = []
     token = _listeners.set((*_listeners.get(), heard))
     try:

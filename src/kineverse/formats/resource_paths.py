@@ -1,8 +1,8 @@
 """Resolution of package://, model:// and file URIs to paths below the root folder.
 
-Nothing here opens a file it finds, and nothing searches the whole disk: the places are few, listed in
-:func:`locate_resource`, and the two kinds of folders that are searched in depth are searched within ``MAX_DEPTH`` and
-``MAX_FOLDERS``. Below which folder a description may open files is said in :mod:`.roots`.
+Files are located and not opened. The folders to search are few, listed in :func:`locate_resource`, and
+recursive searches end at ``MAX_DEPTH`` and ``MAX_FOLDERS``. :mod:`.root_folder` defines the folder below
+which a description may open files.
 """
 
 from __future__ import annotations
@@ -32,10 +32,10 @@ from kineverse.model.body import Body, Mesh, Shape
 from .reader_warnings import warn
 
 MAX_DEPTH = 4
-"""How deep below a folder of a workspace variable packages are looked for."""
+"""Depth of the search for packages below a folder of a workspace variable."""
 
 MAX_FOLDERS = 20_000
-"""How many folders below one such folder are visited at most."""
+"""Most folders to visit below one such folder."""
 
 _WORKSPACES = ("KINEVERSE_PACKAGE_PATH", "ROS_PACKAGE_PATH")
 _PREFIXES = ("AMENT_PREFIX_PATH", "COLCON_PREFIX_PATH", "CMAKE_PREFIX_PATH")
@@ -47,50 +47,51 @@ _LISTED = 3
 
 
 def locate_mesh(mesh: Mesh) -> Path:
-    """Return the path of the file of a mesh, within the root of its description; see :func:`locate_resource`."""
+    """Return the path of a mesh file, within the root of its description; see :func:`locate_resource`."""
     return locate_resource(mesh.uri, mesh.folder, root=mesh.root)
 
 
 def locate_resource(
     uri: str, folder: Folder = "", search: Sequence[Folder] = (), root: str | None = None
 ) -> Path:
-    """Return the path of the file that a description names.
+    """Return the path of a file from its URI in a description.
 
     ``package://name/rest`` and ``model://name/rest`` are the file ``rest`` of the first folder for ``name``
     that has it, among
 
-    1. the folders of ``search``: each is the package, or holds it;
-    2. those of ``KINEVERSE_PACKAGE_PATH`` and ``ROS_PACKAGE_PATH``: each is the package, or holds it at most
-       ``MAX_DEPTH`` deep;
+    1. the folders of ``search``: each is the package, or contains it;
+    2. those of ``KINEVERSE_PACKAGE_PATH`` and ``ROS_PACKAGE_PATH``: each is the package, or contains it at
+       most ``MAX_DEPTH`` deep;
     3. ``share/name`` below those of ``AMENT_PREFIX_PATH``, ``COLCON_PREFIX_PATH`` and ``CMAKE_PREFIX_PATH``;
        models of ``GZ_SIM_RESOURCE_PATH``, ``IGN_GAZEBO_RESOURCE_PATH``, ``GAZEBO_MODEL_PATH``, ``SDF_PATH``;
-    4. ``folder`` and those above it: each is the package, or holds it;
+    4. ``folder`` and its parents: each is the package, or contains it;
     5. packages of robots that are installed for this Python (example-robot-data, the cache of
        robot_descriptions).
 
-    A folder is the package ``name`` if it is called so or has a ``package.xml`` with that name. Other paths
-    are relative to ``folder``, then to the folders of ``search``.
+    A folder is the package ``name`` if that is its name or the name in its ``package.xml``. Other paths are
+    relative to ``folder``, then to the folders of ``search``.
 
-    With a root, paths have to lie below it, below ``search``, or below a folder that one of these variables
-    or ``KINEVERSE_ROOT`` names. Of the folders above a description in the root, those outside of the root
-    count if they have a manifest, or if they are neither the home folder nor above it.
+    With a root, paths have to lie below it, below ``search``, or below a folder in one of these variables or
+    ``KINEVERSE_ROOT``. Parents of a description's folder that lie outside of the root count if they have a
+    manifest, or if they are neither the home folder nor above it.
 
     Parameters
     ----------
     uri
-        What the description says.
+        URI or path in the description.
     folder
-        The folder of the description.
+        Folder of the description.
     search
-        Folders to try first.
+        Folders to search first.
     root
-        The folder that the description must not leave, as :func:`.root_folder.find_root` returns it; None for none.
+        Folder that the description must not leave, as :func:`.root_folder.find_root` returns it; None for no
+        restriction.
 
     Raises
     ------
     FormatError
-        If there is no such file (the message lists where it was looked for and which variable to set), if the
-        path leaves its package or the root, or if it is to be fetched from a network.
+        If there is no such file (the message lists the folders searched and the variable to set), if the path
+        leaves its package or the root, or if the URI is one of a network.
     """
     scheme, colon, rest = uri.partition("://")
     if not colon:
@@ -106,7 +107,7 @@ def locate_resource(
 
 
 def model_paths() -> Iterator[tuple[str, Path]]:
-    """Yield the folders of models that environment variables name, each with its variable."""
+    """Yield the folders of models in environment variables, each with its variable."""
     for variable in _MODELS:
         for place in os.environ.get(variable, "").split(os.pathsep):
             if place:
@@ -114,89 +115,103 @@ def model_paths() -> Iterator[tuple[str, Path]]:
 
 
 @dataclass
-class _Trail:
-    """Where a package was looked for, for the message when it is not there."""
+class _SearchLog:
+    """Log of the search for a package, for the error message.
+
+    Attributes
+    ----------
+    places
+        Folders searched, as text.
+    without_file
+        Folders of the package that lack the file.
+    outside
+        True if a folder of that name may not count as a package, because it lies outside of the root.
+    trusted
+        True while the folders come from the user rather than the description.
+    """
 
     places: list[str] = field(default_factory=list)
     without_file: list[Path] = field(default_factory=list)
     outside: bool = False
-    """Whether there is such a folder, and the description may not take it for a package."""
     trusted: bool = True
-    """Whether the user has named the place that is looked at, rather than the description."""
 
 
 def _locate_packaged(uri: str, rest: str, folder: Folder, search: Sequence[Folder], root: str | None) -> Path:
     name, _, inside = rest.partition("/")
     if not name or name in (".", "..") or "\\" in name:
         raise FormatError(f"{quote(uri)}: names no package; expected package://name/path/in/the/package.")
-    # The literal path comes first: a file may well be called "50%25.stl".
+    # The literal path comes first: "50%25.stl" is a valid file name.
     insides = [_inside(uri, text) for text in dict.fromkeys((inside, unquote(inside)))]
     for fresh in (False, True):
         if fresh:
-            # A package may have been made since its workspace was last listed.
+            # A package may be newer than the last listing of its workspace.
             _packages_below.cache_clear()
             _manifest_name.cache_clear()
-        trail = _Trail()
-        for package in _folders_of(name, Path(folder), search, trail, root):
+        log = _SearchLog()
+        for package in _folders_of(name, Path(folder), search, log, root):
             for parts in insides:
                 path = package.joinpath(*parts)
                 if not os.path.isfile(path):
                     continue
-                if trail.trusted or root is None or _stays(path, root, package):
+                if log.trusted or root is None or _may_open(path, root, package):
                     return path
                 raise outside_root_error(uri, root)
-            trail.without_file.append(package)
-    if trail.outside and root is not None and not trail.without_file:
+            log.without_file.append(package)
+    if log.outside and root is not None and not log.without_file:
         raise outside_root_error(uri, root)
-    raise FormatError(_not_found_message(uri, name, inside, trail))
+    raise FormatError(_not_found_message(uri, name, inside, log))
 
 
-def _stays(path: Path, root: str, package: Path | None = None) -> bool:
-    """Return whether the real path of a file is in the root, in its package, or where a variable points."""
+def _may_open(path: Folder, root: str, package: Path | None = None) -> bool:
+    """Return True if a path leads into the root, into its package, or into a folder of a variable."""
     real = os.path.realpath(path)
-    places = (root, *declared_roots(), *declared_folders(), *([os.path.realpath(package)] if package else ()))
-    return any(is_below(real, place) for place in places if place)
+    return any(is_below(real, folder) for folder in _allowed_folders(root, package))
+
+
+def _allowed_folders(root: str, package: Path | None) -> Iterator[str]:
+    """Yield the real paths of the folders in which files may be opened."""
+    # Most meshes lie below the root, and each further real path costs system calls.
+    yield root
+    if package is not None:
+        yield os.path.realpath(package)
+    yield from declared_roots()
+    yield from declared_folders()
 
 
 def find_root_violation(uri: str, folder: Folder, root: str | None) -> FormatError | None:
-    """Return the error for a path or a package that leads out of the root; None for others."""
+    """Return the error for a path or a package outside of the root; None for any other."""
     scheme, colon, rest = uri.partition("://")
     if root is None:
         return None
     if colon and scheme.lower() != "file":
         return _outside_package(uri, folder, root) if scheme.lower() in ("package", "model") else None
     if root == NOWHERE and not colon and not os.path.isabs(uri):
-        return None  # whoever gave the text knows that it lies nowhere
+        return None  # a text without a folder: relative paths lead nowhere
     path = (
         Path(folder).absolute() / unquote(rest.removeprefix("localhost"))
         if colon
         else Path(folder).absolute() / uri
     )
-    return None if "\0" in uri or _stays(path, root) else outside_root_error(uri, root)
+    return None if "\0" in uri or _may_open(path, root) else outside_root_error(uri, root)
 
 
 def _outside_package(uri: str, folder: Folder, root: str) -> FormatError | None:
     """Return the error for a package that is only found from a folder outside of the root."""
-    if root == NOWHERE or _may_lie_in(os.path.realpath(folder), root):
+    if root == NOWHERE or _may_open(folder, root):
         return None
     for bound in (root, None):
         try:
             locate_resource(uri, folder, root=bound)
         except FormatError:
             if bound is None:
-                return None  # it is nowhere
+                return None  # there is no such package
         else:
             break
     return None if bound is not None else outside_root_error(uri, root)
 
 
-def _may_lie_in(real: str, root: str) -> bool:
-    """Return whether a folder is in the root, or in one that a variable declares."""
-    return any(is_below(real, place) for place in (root, *declared_roots(), *declared_folders()))
-
-
 def declared_folders() -> Iterator[str]:
-    """Yield the real paths of the folders that hold packages and models, as environment variables say."""
+    """Yield the real paths of the folders of packages and models in environment variables."""
     for variables, inside in ((_WORKSPACES, ""), (_PREFIXES, "share"), (_MODELS, "")):
         for variable in variables:
             for place in os.environ.get(variable, "").split(os.pathsep):
@@ -205,7 +220,13 @@ def declared_folders() -> Iterator[str]:
 
 
 def _inside(uri: str, text: str) -> list[str]:
-    """Return the parts of a path in a package, which has to stay in there."""
+    """Return the parts of a path in a package.
+
+    Raises
+    ------
+    FormatError
+        If the path leads out of the package.
+    """
     parts = [part for part in re.split(r"[/\\]", text) if part not in ("", ".")]
     depth = 0
     for part in parts:
@@ -217,15 +238,15 @@ def _inside(uri: str, text: str) -> list[str]:
     return parts
 
 
-def _not_found_message(uri: str, name: str, inside: str, trail: _Trail) -> str:
-    """Return what is missing on the first line, then where it was looked for, a place a line."""
-    if trail.without_file:
-        places = [str(path) for path in dict.fromkeys(trail.without_file)]
+def _not_found_message(uri: str, name: str, inside: str, log: _SearchLog) -> str:
+    """Return the error message: on the first line what is missing, then the folders searched, one a line."""
+    if log.without_file:
+        places = [str(path) for path in dict.fromkeys(log.without_file)]
         return f"{quote(uri)}: package {quote(name)} has no file {quote(inside)}. It is at:{_lines(places)}"
     return (
         f"{quote(uri)}: there is no package {quote(name)}. "
         "Set KINEVERSE_PACKAGE_PATH or ROS_PACKAGE_PATH to the folder that holds it. "
-        f"Looked in:{_lines(list(dict.fromkeys(trail.places)))}"
+        f"Looked in:{_lines(list(dict.fromkeys(log.places)))}"
     )
 
 
@@ -235,46 +256,46 @@ def _lines(places: Sequence[str]) -> str:
 
 
 def _folders_of(
-    name: str, folder: Path, search: Sequence[Folder], trail: _Trail, root: str | None
+    name: str, folder: Path, search: Sequence[Folder], log: _SearchLog, root: str | None
 ) -> Iterator[Path]:
-    """Yield the folders that are the package, in the order in which they count."""
-    trail.places.append(f"{folder.absolute()} and the folders above it")
+    """Yield the folders of a package by priority."""
+    log.places.append(f"{folder.absolute()} and the folders above it")
     for place in search:
-        trail.places.append(str(place))
+        log.places.append(str(place))
         yield from _at_or_in(Path(place), name)
     for variable in _WORKSPACES:
-        for place in _paths_in(variable, trail):
+        for place in _paths_in(variable, log):
             yield from _packages_below(place).get(name, ())
     for variable in _PREFIXES:
-        for place in _paths_in(variable, trail):
+        for place in _paths_in(variable, log):
             yield from _existing((place / "share" / name, place / name / "share" / name))
     for variable in _MODELS:
-        for place in _paths_in(variable, trail):
+        for place in _paths_in(variable, log):
             yield from _at_or_in(place, name)
     here = folder.absolute()
-    trail.trusted = False
+    log.trusted = False
     for place in (here, *here.parents):
         for package in _at_or_in(place, name):
             if root is None or counts_as_package(package, here, root):
                 yield package
             else:
-                trail.outside = True
-    trail.trusted = True
+                log.outside = True
+    log.trusted = True
     for place in _installed():
-        trail.places.append(str(place))
+        log.places.append(str(place))
         yield from _at_or_in(place, name)
 
 
 def counts_as_package(package: Path, folder: Path, root: str) -> bool:
-    """Return whether a description may take a folder for a package; it has found it above its own folder.
+    """Return True if a folder that was found above a description may count as a package.
 
-    Otherwise ``package://etc/passwd`` were a file of the package ``etc``. A document says itself in which
-    folder its meshes lie, so a folder counts for what is above it only where files may be opened anyway.
+    Otherwise ``package://etc/passwd`` would be a file of the package ``etc``. A document states the folder of
+    its meshes itself, so its parents count only if files may be opened in that folder anyway.
     """
     real, here = os.path.realpath(package), os.path.realpath(folder)
     if is_below(real, root):
         return True
-    if not _may_lie_in(here, root):
+    if not _may_open(here, root):
         return False
     if any(os.path.isfile(os.path.join(real, mark)) for mark in _MARKS):
         return True
@@ -282,15 +303,15 @@ def counts_as_package(package: Path, folder: Path, root: str) -> bool:
     return is_below(here, root) and not is_common(above)
 
 
-def _paths_in(variable: str, trail: _Trail) -> Iterator[Path]:
+def _paths_in(variable: str, log: _SearchLog) -> Iterator[Path]:
     for place in os.environ.get(variable, "").split(os.pathsep):
         if place:
-            trail.places.append(f"{place} (${variable})")
+            log.places.append(f"{place} (${variable})")
             yield Path(place).absolute()
 
 
 def _at_or_in(place: Path, name: str) -> Iterator[Path]:
-    """Yield ``place`` if it is the package, and the package directly inside of it."""
+    """Yield the folder ``place`` if it is the package, and the package directly inside of it."""
     if place.name == name or _manifest_name(place) == name:
         yield place
     yield from _existing((place / name,))
@@ -298,13 +319,13 @@ def _at_or_in(place: Path, name: str) -> Iterator[Path]:
 
 def _existing(places: Iterable[Path]) -> Iterator[Path]:
     for place in places:
-        if os.path.isdir(place):  # which is no for a name that is too long, and no error
+        if os.path.isdir(place):  # False, and no error, for a name that is too long
             yield place
 
 
 @lru_cache(maxsize=4096)
 def _manifest_name(folder: Path) -> str | None:
-    """Return the name a folder's ROS manifest gives it, or None."""
+    """Return the name in a folder's ROS manifest, None without one."""
     try:
         with (folder / "package.xml").open(encoding="utf-8", errors="replace") as manifest:
             match = re.search(r"<name>\s*([^<\s]+)\s*</name>", manifest.read(1 << 16))
@@ -315,7 +336,7 @@ def _manifest_name(folder: Path) -> str | None:
 
 @lru_cache(maxsize=64)
 def _packages_below(top: Path) -> dict[str, tuple[Path, ...]]:
-    """Return the packages at and below a folder, by the names they go by."""
+    """Return the packages at and below a folder, by the name of the folder and that of the manifest."""
     found: dict[str, tuple[Path, ...]] = {}
     ahead = deque([(top, 0)])
     for _ in range(MAX_FOLDERS):
@@ -327,7 +348,7 @@ def _packages_below(top: Path) -> dict[str, tuple[Path, ...]]:
         except OSError:
             continue
         is_package = any(manifest in entries for manifest in _MANIFESTS)
-        # A folder without manifest counts where it lies directly in a workspace: somebody copied it there.
+        # A folder without manifest counts if it lies directly in a workspace.
         if is_package or depth <= 1:
             for name in {folder.name, _manifest_name(folder) or folder.name}:
                 found[name] = (*found.get(name, ()), folder)
@@ -339,7 +360,7 @@ def _packages_below(top: Path) -> dict[str, tuple[Path, ...]]:
 
 
 def _installed() -> Iterator[Path]:
-    """Yield folders of this Python that hold packages of robots; nothing is imported for it."""
+    """Yield the folders of robot packages of this Python, without importing them."""
     for entry in dict.fromkeys(sys.path):
         share = Path(entry) / "cmeel.prefix" / "share"
         if entry and share.is_dir():
@@ -370,10 +391,10 @@ def _locate_plain(uri: str, text: str, folder: Folder, search: Sequence[Folder],
     tried = [Path(folder).absolute() / path, *(Path(place).absolute() / path for place in search)]
     left = False
     for candidate in tried:
-        # What is outside is not even looked at.
-        if root is not None and candidate is tried[0] and "\0" not in text and not _stays(candidate, root):
+        # No file outside is touched, not even to see if it exists.
+        if root is not None and candidate is tried[0] and "\0" not in text and not _may_open(candidate, root):
             left = True
-        elif os.path.isfile(candidate):  # which is no for a name that is too long, and no error
+        elif os.path.isfile(candidate):  # False, and no error, for a name that is too long
             return candidate
     if left and root is not None:
         raise outside_root_error(uri, root)
@@ -383,16 +404,16 @@ def _locate_plain(uri: str, text: str, folder: Folder, search: Sequence[Folder],
 
 
 def restrict_meshes(body: Body, root: str, where: str) -> Body:
-    """Return a body whose meshes do not leave a root; those that would are remarked on.
+    """Return a body whose meshes are restricted to a root; warn about meshes outside of it.
 
     Parameters
     ----------
     body
-        As the document says it.
+        Body as in the document.
     root
-        The folder, as :func:`.root_folder.find_root` returns it.
+        Root folder, as :func:`.root_folder.find_root` returns it.
     where
-        The document and the body, for remarks.
+        Document and body, for warnings.
     """
 
     def shape(given: Shape) -> Shape:

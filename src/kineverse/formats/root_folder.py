@@ -1,7 +1,7 @@
-"""Root folder below which the files that a description names may be opened.
+"""Root folder below which a description may open files.
 
-A description is somebody else's: what it includes, and the meshes it names by path, are opened below its
-*root* only. Real paths count, so a link does not lead out.
+Descriptions are not trusted: included files, and meshes given by path, are opened below the *root* only. Real
+paths are compared, so a link does not lead out.
 """
 
 from __future__ import annotations
@@ -17,10 +17,10 @@ from kineverse.formats.xml_reader import quote
 Folder: TypeAlias = "str | os.PathLike[str]"
 
 ROOT = "KINEVERSE_ROOT"
-"""The environment variable with folders whose files may be opened by any description."""
+"""Environment variable with folders whose files any description may open."""
 
 NOWHERE = ""
-"""The root of text that lies in no folder: no path leads below it."""
+"""Root of a text without a folder; no path lies below it."""
 
 _REPOSITORY = (".git", ".hg")
 _PACKAGE = ("package.xml", "manifest.xml", "model.config")
@@ -28,22 +28,22 @@ _PYTHON = "__init__.py"
 
 
 def find_root(folder: Folder, root: Folder | None = None, models: Folder | None = None) -> str:
-    """Return the real path of the root for a description that lies in a folder.
+    """Return the real path of the root for a description in a folder.
 
     Parameters
     ----------
     folder
-        The folder of the description.
+        Folder of the description.
     root
-        The root that is asked for. None for the innermost folder of ``KINEVERSE_ROOT`` that holds ``folder``,
-        else the repository or package around it, else ``models``, else ``folder`` itself.
+        Requested root. None for the innermost folder of ``KINEVERSE_ROOT`` that contains ``folder``, else the
+        repository or package around it, else ``models``, else ``folder`` itself.
     models
-        The folder of models in which the description was found by its name.
+        Folder of models in which the description was found by its name.
 
     Raises
     ------
     FormatError
-        If the root that is asked for is no folder.
+        If the requested root is no folder.
     """
     if root is not None:
         try:
@@ -63,7 +63,7 @@ def find_root(folder: Folder, root: Folder | None = None, models: Folder | None 
 
 
 def find_text_root(folder: Folder, root: Folder | None = None) -> str:
-    """Return the root of a description's text, which may lie in no folder: then no path leads below it."""
+    """Return the root of a description given as text: ``NOWHERE`` without a folder and a requested root."""
     return find_root(folder, root) if os.fspath(folder) or root is not None else NOWHERE
 
 
@@ -75,19 +75,19 @@ def declared_roots() -> Iterator[str]:
 
 
 def is_below(path: str, folder: str) -> bool:
-    """Return whether a path is a folder, or in it; both are real paths. Nothing is below ``NOWHERE``."""
+    """Return True if a real path is a folder or lies in it. Nothing lies below ``NOWHERE``."""
     if not folder:
         return False
     return path == folder or path.startswith(folder if folder.endswith(os.sep) else folder + os.sep)
 
 
 def is_common(folder: str) -> bool:
-    """Return whether a real path is too common a folder to be that of one project: home, and all above it."""
+    """Return True if a real path is the home folder or above it, and so no folder of one project."""
     return os.path.dirname(folder) == folder or is_below(os.path.realpath(os.path.expanduser("~")), folder)
 
 
 def outside_root_error(uri: str, root: str) -> FormatError:
-    """Return the error for a file outside of a root: it names the root, and how to give a wider one."""
+    """Return the error for a file outside of a root, with the root and how to give a wider one."""
     what = f"the root {root}" if root else "the text, which lies in no folder and so has no root"
     return FormatError(
         f"{quote(uri)}: leads out of {what}, and so is not opened. Give a wider root, if you trust the file: "

@@ -1,4 +1,4 @@
-"""Saving of models, in the format that the file name's ending says."""
+"""Saving of models, in the format of the file name's ending."""
 
 from __future__ import annotations
 
@@ -27,36 +27,36 @@ def save(
     leave_out: Iterable[str] = (),
     strict: bool = False,
 ) -> SaveResult:
-    """Write a model to a file, whose ending says what it becomes.
+    """Write a model to a file in the format of its ending.
 
-    The file is there whole or not at all; if it cannot be written, it is what it was before. URDF and MJCF
-    are read again first, MJCF by MuJoCo where it is installed. Meshes that MuJoCo cannot read are converted,
-    into a folder beside the file.
+    The file is replaced atomically; after an error, the old file is unchanged. URDF and MJCF are read again
+    before that, MJCF by MuJoCo if it is installed. Meshes that MuJoCo cannot read are converted, into a
+    folder beside the file.
 
     Parameters
     ----------
     model
-        The model.
+        Model to save.
     path
-        A name that ends in ``.kv.json`` for a document, which says all of the model, ``.kv.msgpack`` for the
-        same in msgpack, ``.urdf`` for URDF, or ``.xml`` or ``.mjcf`` for MJCF.
+        Path that ends in ``.kv.json`` for a document, which preserves the whole model, ``.kv.msgpack`` for
+        the same in msgpack, ``.urdf`` for URDF, or ``.xml`` or ``.mjcf`` for MJCF.
     tolerance
-        How far any frame may be from where it should be, in position [m] and in angle [rad], wherever
-        coordinates are within their limits. Then motions by curves are approximated. None for none.
+        Largest deviation of any frame in position [m] and in angle [rad] over all values of coordinates
+        within their limits. Motions along curves are approximated then. None for exact motions only.
     leave_out
-        Names of constraints that URDF or MJCF need not say, and of articulations that have speeds other than
-        those of their coordinates, which it need not say either.
+        Names of constraints that may be left out of URDF or MJCF, and of articulations with speeds other than
+        those of their coordinates, whose rates may be left out.
     strict
-        Whether constraints, and ties between speeds, that URDF or MJCF cannot say are refused. Otherwise they
-        are left out, with a remark. Motions that it cannot say are always refused.
+        True to refuse constraints, and ties between speeds, that URDF or MJCF cannot express. Otherwise they
+        are left out, with a remark. Motions that it cannot express are always refused.
 
     Raises
     ------
     FormatError
-        If the name has another ending, the file cannot be written, what would be written cannot be read
-        again, or naming everything that the format cannot say, with the reason.
+        If the name has another ending, the file cannot be written or could not be read again; or with all
+        parts of the model that the format cannot express, and the reasons.
     UnknownNameError
-        If something that is to be left out does not exist.
+        If a name in ``leave_out`` does not exist.
     InvalidValueError
         For a tolerance that is no positive number.
     """
@@ -79,7 +79,7 @@ def save(
 
 
 def _put(target: Path, written: WrittenFile) -> None:
-    """Write a file and those that belong to it: all of them, or none."""
+    """Write a file and its mesh files: all of them, or none."""
     new = [path for path in written.beside if not path.exists()]
     folders = [folder for folder in dict.fromkeys(path.parent for path in new) if not folder.exists()]
     try:
@@ -133,7 +133,7 @@ def _checked(tolerance: object) -> float | None:
 
 
 def _named(target: Path, error: FormatError) -> FormatError:
-    """Return an error with the name of the file in front, once."""
+    """Return an error with the name of the file in front, unless it is there already."""
     text = str(error)
     return (
         error if text.startswith(f"{target.name} ") else FormatError(f"{target.name} is not written. {text}")
@@ -143,5 +143,5 @@ def _named(target: Path, error: FormatError) -> FormatError:
 def _target(path: Any) -> Path:
     try:
         return Path(os.fsdecode(path)).expanduser()
-    except (TypeError, RuntimeError):  # "~name", and nobody has that name
+    except (TypeError, RuntimeError):  # no path, or "~name" of an unknown user
         raise FormatError(f"A model is saved to the path of a file, not to {path!r}.") from None

@@ -6,41 +6,42 @@ from collections.abc import Mapping
 
 
 class DisjointSets:
-    """Names that belong together."""
+    """Disjoint sets of names (union-find with path compression)."""
 
     def __init__(self) -> None:
-        self._above: dict[str, str] = {}
+        self._parents: dict[str, str] = {}
 
-    def of(self, name: str) -> str:
-        """Return the name that stands for the group of a name."""
-        above = self._above
-        top = name
-        while top in above:
-            top = above[top]
-        while name != top:
-            above[name], name = top, above[name]
-        return top
+    def find(self, name: str) -> str:
+        """Return the representative of the set that a name is in."""
+        parents = self._parents
+        root = name
+        while root in parents:
+            root = parents[root]
+        while name != root:
+            parents[name], name = root, parents[name]
+        return root
 
-    def unite(self, a: str, b: str) -> bool:
-        """Put two groups together; return whether they were two."""
-        first, second = self.of(a), self.of(b)
+    def union(self, a: str, b: str) -> bool:
+        """Merge the sets of two names; return True if they were different."""
+        first, second = self.find(a), self.find(b)
         if first == second:
             return False
-        self._above[second] = first
+        self._parents[second] = first
         return True
 
 
 def path_between(a: str, b: str, parents: Mapping[str, str]) -> list[str]:
-    """Return what lies on the way between two frames, below the last frame that both hang below.
+    """Return the frames on the path between two frames, without their lowest common ancestor.
 
     First from ``a`` upwards, then from ``b`` upwards. Roots have no parent.
     """
-    ways: list[list[str]] = []
+    chains: list[list[str]] = []
     for end in (a, b):
-        way: list[str] = []
+        chain: list[str] = []
         while end in parents:
-            way.append(end)
+            chain.append(end)
             end = parents[end]
-        ways.append(way)
-    first, second = map(set, ways)
-    return [name for name in ways[0] if name not in second] + [name for name in ways[1] if name not in first]
+        chains.append(chain)
+    first, second = chains
+    common = set(first) & set(second)
+    return [name for name in (*first, *second) if name not in common]

@@ -18,21 +18,31 @@ from kineverse.model.sampling import StateSamples
 from kineverse.state import State
 
 SAMPLED_STATES = 32
-"""In how many random states within the limits it is tried whether poses are finite and loops close."""
+"""Number of random states within the limits in which poses and loops are checked."""
 
 INERTIA_TOLERANCE = 1e-3
-"""By how much, relative to the largest, moments of inertia may miss the triangle inequality.
+"""Tolerance of the triangle inequality of moments of inertia, relative to the largest.
 
-Files have them in few digits, and of a thin plate the largest is just the sum of the others.
+Files have few digits, and for a thin plate the largest is exactly the sum of the others.
 """
 
 LEAST_INERTIA = 1e-12
-"""Moments of inertia below this are none [kg m²]: a grain of sand has more."""
+"""Moments of inertia below this count as zero [kg m²]: a grain of sand has more."""
 
 
 @dataclass(frozen=True, slots=True)
 class ModelProblem:
-    """Something that is wrong: with what ``kind`` of thing, ``where`` (its name), and what (``text``)."""
+    """Problem of a model.
+
+    Attributes
+    ----------
+    kind
+        Kind of the part: limit, loop, pose, inertia or mesh.
+    where
+        Name of the part.
+    text
+        Description of the problem.
+    """
 
     kind: str
     where: str
@@ -40,14 +50,14 @@ class ModelProblem:
 
 
 def find_problems(model: ModelView, meshes: bool = True) -> Iterator[ModelProblem]:
-    """Yield what is wrong with a model.
+    """Yield the problems of a model.
 
     Parameters
     ----------
     model
-        The model.
+        Model to check.
     meshes
-        Whether to look for the files of meshes.
+        True to check that mesh files exist.
     """
     yield from _find_limit_problems(model)
     samples = StateSamples(model, count=SAMPLED_STATES)
@@ -63,7 +73,7 @@ def find_problems(model: ModelView, meshes: bool = True) -> Iterator[ModelProble
 
 
 def _find_limit_problems(model: ModelView) -> Iterator[ModelProblem]:
-    """Yield the constraints that do not hold at the default state, and those that cannot hold there."""
+    """Yield the constraints that the default state violates, and those with crossed bounds there."""
     state = model.default_state()
     crossed = set()
     varying = {name: c for name, c in model.constraints.items() if c.lower.symbols or c.upper.symbols}
@@ -79,17 +89,18 @@ def _find_limit_problems(model: ModelView) -> Iterator[ModelProblem]:
         if isnan(violation.value):
             yield ModelProblem("limit", violation.name, "is about what is not finite at the default state")
             continue
-        bounds = f"{format_number(violation.value)} is not in [{format_number(violation.lower)}, {format_number(violation.upper)}]"
-        yield ModelProblem("limit", violation.name, f"is broken at the default state: {bounds}")
+        value, low, high = map(format_number, (violation.value, violation.lower, violation.upper))
+        text = f"is broken at the default state: {value} is not in [{low}, {high}]"
+        yield ModelProblem("limit", violation.name, text)
 
 
 def _states_within_limits(model: ModelView, samples: StateSamples) -> list[int]:
-    """Return which of the sampled states break no constraint; the default state counts in any case."""
+    """Return the indices of the sampled states that violate no constraint, and of the default state, 0."""
     symbols = model.symbols
     found = [0]
     for k in range(1, samples.size) if symbols else ():
         state = State({symbol: samples.values_of(symbol)[k] for symbol in symbols})
-        # What cannot be evaluated is not broken: it is what is looked for.
+        # Values that are not finite are the problem to find, and no violation.
         if all(isnan(violation.excess) for violation in model.violations(state)):
             found.append(k)
     return found
@@ -124,14 +135,14 @@ def _find_pose_problems(
 
 
 def _format_states(bad: Sequence[bool]) -> str:
-    """Return at which of the states that are allowed something is wrong; the first is the default state."""
+    """Return as text in which of the allowed states a check fails; the first is the default state."""
     if bad[0]:
         return "at the default state"
     return f"in {sum(bad)} of {len(bad)} states within the limits"
 
 
 def find_inertia_errors(inertia: Inertia) -> Iterator[str]:
-    """Yield why no body has this inertia."""
+    """Yield the reasons why an inertia is physically impossible."""
     ixx, ixy, ixz, iyy, iyz, izz = inertia.tensor
     if not isfinite(inertia.mass) or inertia.mass < 0.0:
         yield f"a mass of {format_number(inertia.mass)} kg"
@@ -168,7 +179,7 @@ def _find_missing_meshes(model: ModelView) -> Iterator[ModelProblem]:
                     locate_mesh(mesh)
                     found.add(mesh)
                 except (KineverseError, OSError) as error:
-                    # Where it was looked for is long, and for all meshes the same.
+                    # The folders searched are the same for all meshes.
                     missing[mesh] = _first_line(error)
             if mesh in missing:
                 yield ModelProblem("mesh", name, missing[mesh])

@@ -1,9 +1,9 @@
 """Hardened XML reader: elements with line numbers, limits on depth and size.
 
 An element is a plain tuple ``(tag, attributes, children, line)``: a file of 10^5 links becomes as many tuples
-in linear time. Document types, and with them all declarations of entities, are refused, so nothing expands
-and nothing is fetched. Nesting and size are bounded. Text between elements is dropped, and that inside of an
-element, too, unless it is asked for.
+in linear time. Document types, and with them all declarations of entities, are refused, so that nothing is
+expanded or fetched. Nesting and size are bounded. Text is dropped, unless the text of elements without
+children is requested.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from kineverse.errors import FormatError
 from .files import MAX_BYTES
 
 MAX_DEPTH = 200
-"""The deepest nesting of elements that is read. A URDF needs 5, however long its kinematic chains are."""
+"""Deepest nesting of elements. A URDF needs 5, however long its kinematic chains are."""
 
 Element: TypeAlias = "tuple[str, dict[str, str], list[Element], int]"
 """Tag, attributes, children, line."""
@@ -26,16 +26,16 @@ Element: TypeAlias = "tuple[str, dict[str, str], list[Element], int]"
 _CHUNK_BYTES = 1 << 12
 
 TEXT = ""
-"""The attribute that has the text of an element without children: no attribute of XML has an empty name."""
+"""Key of the text of an element among its attributes; no attribute of XML has an empty name."""
 
 Visit: TypeAlias = Callable[[Element], None]
 Begin: TypeAlias = Callable[[Element], Visit]
 XmlFaultHandler: TypeAlias = Callable[[int, str], None]
-"""Takes the line of what is no XML but can be read, and how it is."""
+"""Handler of faults in the XML that can be repaired, called with the line and a description."""
 
 
 class ElementError(Exception):
-    """What is wrong with an element, on its way to the reader that knows the file; no user ever sees it."""
+    """Mistake in an element; the reader that knows the file turns it into a FormatError."""
 
     def __init__(self, element: Element, message: str):
         super().__init__(message)
@@ -57,23 +57,21 @@ def parse_xml(
     Parameters
     ----------
     data
-        The document. Bytes are decoded as XML says (byte order mark, declaration, else UTF-8).
+        The document. Bytes are decoded by the rules of XML (byte order mark, declaration, else UTF-8).
     source
-        The name of the document in error messages.
+        Name of the document in errors.
     skipped
-        Children of the root with these tags are passed over.
+        Tags of children of the root to skip.
     begin
-        Called with the root as soon as it opens; what it returns is called with each child of the root as
-        soon as that is complete. The children are then not kept: a long document takes no more memory than
-        its longest part.
+        Called with the root when it opens; its result is called with each complete child of the root. The
+        children are not stored then, so memory is bounded by the largest child.
     texts
-        Whether to keep the text of elements that have any, as their attribute ``TEXT``.
+        True to store the text of elements, as their attribute ``TEXT``.
     depth
-        The deepest nesting of elements.
+        Deepest nesting of elements.
     mend
-        Called with what is read although XML forbids it, since the parsers of robots do: what comes before
-        the declaration, a declaration that is misspelt, comments with two hyphens. Without it, that is
-        refused.
+        Handler of faults that XML forbids and parsers of robots accept: content before the declaration, a
+        misspelt declaration, comments with two hyphens. Without it, these are refused.
 
     Raises
     ------
@@ -104,7 +102,7 @@ def parse_xml(
             visit = begin(document[0])
             parser.EndElementHandler = end_visiting
 
-    # These run for every element of the file: they do nothing that could wait.
+    # These run for every element of the file and are kept short for speed.
     def start(tag: str, attributes: dict[str, str]) -> None:
         if tag in skipped and len(open_lists) == 2:
             parser.StartElementHandler, parser.EndElementHandler = start_skipped, end_skipped
@@ -169,13 +167,13 @@ def parse_xml(
     except (ValueError, LookupError) as error:
         if document or isinstance(error, FormatError):
             raise
-        # An encoding that expat cannot have, or a str with lone surrogates.
+        # An encoding that expat lacks, or a str with lone surrogates.
         raise FormatError(f"{source}, line 1: cannot be decoded: {error}. Save it as UTF-8.") from None
     return document[0]
 
 
 def read_root_tag(data: bytes) -> str:
-    """Return the tag of the root element; empty where no element is found."""
+    """Return the tag of the root element; empty if there is none."""
     text, encoding = _declared(data, lambda *_: None)
     parser = expat.ParserCreate(encoding)
     found: list[str] = []
@@ -192,7 +190,7 @@ def read_root_tag(data: bytes) -> str:
             if found:
                 break
     except (expat.ExpatError, ValueError, LookupError):
-        pass  # whoever reads all of it says what is wrong
+        pass  # the reader of the whole document reports the error
     return found[0] if found else ""
 
 
@@ -206,12 +204,12 @@ _BYTE_ORDER_MARK = b"\xef\xbb\xbf"
 def _bytes(data: str | bytes) -> bytes:
     try:
         return data.encode() if isinstance(data, str) else data
-    except UnicodeEncodeError:  # which the parser says in its words
+    except UnicodeEncodeError:  # the parser reports it
         return b""
 
 
 def _declared(data: str | bytes, mend: XmlFaultHandler) -> tuple[str | bytes, str | None]:
-    """Return a document without a declaration that is not where, or what, it should be, and its encoding."""
+    """Return a document with blanks for a misplaced or misspelt declaration, and the encoding in it."""
     content = _bytes(data[: 1 << 16]).removeprefix(_BYTE_ORDER_MARK)
     good = _GOOD.match(content)
     if good and not _DECLARED.match(content, content.find(b">", good.end()) + 1):
@@ -260,7 +258,13 @@ def _commented(data: str | bytes, mend: XmlFaultHandler) -> str | bytes:
 
 
 def read_name(element: Element) -> str:
-    """Return the name of an element, which must have one."""
+    """Return the name of an element.
+
+    Raises
+    ------
+    ElementError
+        If it has none, or an empty one.
+    """
     name = element[1].get("name")
     if not name:
         raise ElementError(
@@ -270,7 +274,7 @@ def read_name(element: Element) -> str:
 
 
 def find_child(element: Element, tag: str) -> Element | None:
-    """Return the first child with that tag, or None."""
+    """Return the first child with a tag, None if there is none."""
     for candidate in element[2]:
         if candidate[0] == tag:
             return candidate
@@ -278,21 +282,21 @@ def find_child(element: Element, tag: str) -> Element | None:
 
 
 def label(element: Element) -> str:
-    """Return an element as its opening tag, with its name if it has one, for messages."""
+    """Return an element as its opening tag, with its name if it has one, for errors."""
     tag, attributes, _, _ = element
     name = attributes.get("name")
     return f"<{abbreviate(tag)}>" if name is None else f"<{abbreviate(tag)} name={quote(name)}>"
 
 
 def quote(text: str) -> str:
-    """Return a name in quotes, for messages."""
+    """Return a name in quotes, for errors."""
     return f'"{abbreviate(text)}"'
 
 
 def abbreviate(text: str, limit: int = 80) -> str:
-    """Return text for a message: on one line, printable and bounded."""
+    """Return text for an error: on one line, printable and of limited length."""
     if not text[:limit].isprintable():
-        text = text[:limit].encode("unicode_escape").decode("ascii")  # ten times as long, perhaps
+        text = text[:limit].encode("unicode_escape").decode("ascii")  # up to ten times as long
     return text if len(text) <= limit else text[: limit - 1] + "…"
 
 
@@ -322,7 +326,7 @@ _HINTS = {
 
 
 def _describe(error: expat.ExpatError, source: str, document: list[Element], depth: int) -> str:
-    """Return the message for text that is not XML: the line, the open element, the reason, what to do."""
+    """Return the error message for text that is not XML: line, open element, reason, remedy."""
     innermost: Element | None = None
     children = document
     for _ in range(depth):

@@ -1,13 +1,12 @@
 """Values of XML attributes and elements: names, numbers, vectors, truth values, poses.
 
-Those that come several at a time are coordinates, and no larger than ``LARGEST``: products of larger ones
-overflow, and a pose would not be finite. A single one may be a limit, and 1.8e308 says that there is none.
+Several numbers together are coordinates, at most ``LARGEST``: products of larger ones overflow, and a pose
+would not be finite. A single number may be a limit, and 1.8e308 stands for no limit.
 
-Descriptions repeat themselves ("0 0 0" by the hundred), so the results are remembered.
+Descriptions repeat the same values ("0 0 0" by the hundred), so results are cached.
 
-Every function raises :class:`ElementError` for what is missing or malformed; the reader adds file and line.
-
-Every function raises :class:`ElementError` for what is missing or malformed; the reader adds file and line.
+The ``parse_`` functions raise ``ValueError`` with the reason; the ``read_`` functions raise
+:class:`ElementError` for a missing or malformed value, to which the reader adds file and line.
 """
 
 from __future__ import annotations
@@ -26,52 +25,52 @@ from kineverse.model.body import Pose, Vector3
 from .xml_reader import abbreviate
 
 LARGEST = 1e50
-"""The largest magnitude of what poses are made of: coordinates, positions, and factors between positions."""
+"""Largest magnitude of coordinates, positions, and factors between positions."""
 
 SMALLEST = 1e-50
-"""The smallest factor between positions but 0: by a smaller one, limits of a follower are out of reach."""
+"""Smallest factor between positions except 0: with a smaller one, limits of a follower are out of reach."""
 
 _MAX_LENGTH = 1000
 
 
 @lru_cache(maxsize=8192)
 def parse_number(text: str) -> float:
-    """Return the one finite number that the text spells.
+    """Parse one finite number.
 
     Raises
     ------
     ValueError
-        With the reason, if the text is anything else.
+        With the reason, for any other text.
     """
     return _parse_words(text, 1)[0]
 
 
 @lru_cache(maxsize=8192)
 def parse_directions(text: str, count: int) -> tuple[float, ...]:
-    """Return ``count`` numbers of which no pose gets large: angles, or those of an axis or a quaternion.
+    """Parse ``count`` numbers of any magnitude: angles, or the components of an axis or a quaternion.
 
     Raises
     ------
     ValueError
-        With the reason, if the text is anything else.
+        With the reason, for any other text.
     """
     return _parse_words(text, count)
 
 
 def scale_to_bounds(values: tuple[float, ...]) -> tuple[float, ...]:
-    """Return a vector, made shorter where its length would overflow."""
+    """Return a vector, scaled down if its length would overflow."""
     largest = max(map(abs, values))
     return values if largest <= LARGEST else tuple(value / largest for value in values)
 
 
 @lru_cache(maxsize=8192)
 def parse_numbers(text: str, count: int) -> tuple[float, ...]:
-    """Return the ``count`` coordinates that the text spells, separated by white space.
+    """Parse ``count`` coordinates, separated by white space.
 
     Raises
     ------
     ValueError
-        With the reason, if the text is anything else.
+        With the reason, for any other text.
     """
     values = _parse_words(text, count)
     if values and max(map(abs, values)) > LARGEST:
@@ -90,7 +89,7 @@ def _parse_words(text: str, count: int) -> tuple[float, ...]:
 
 
 def _parse_word(word: str, count: int) -> float:
-    # Python reads more than a description may say: digits grouped by underscores and those of other scripts.
+    # Python accepts more than a description may contain: underscores between digits, and other scripts.
     if "_" in word or not word.isascii():
         raise ValueError(f"has '{abbreviate(word)}', where {_expected(count)}")
     try:
@@ -123,7 +122,7 @@ _IDENTITY = Pose()
 
 
 def read_attribute_number(element: Element, key: str, default: float | None = None) -> float:
-    """Return a number; without a default, the attribute is required."""
+    """Read a number; without a default, the attribute is required."""
     text = element[1].get(key)
     if text is None:
         return _require_default(element, key, default)
@@ -136,7 +135,7 @@ def read_attribute_number(element: Element, key: str, default: float | None = No
 def read_attribute_vector(
     element: Element, key: str, default: Vector3 | None = None, turns: bool = False
 ) -> Vector3:
-    """Return three numbers, coordinates or what only turns; without a default, the attribute is required."""
+    """Read three coordinates, or with ``turns`` an axis or angles; without a default, they are required."""
     text = element[1].get(key)
     if text is None:
         return _require_default(element, key, default)
@@ -151,12 +150,12 @@ def read_attribute_vector(
 def read_or_default(
     read: Callable[[], T], default: T, taken: str, remarks: ReaderWarnings, owner: Element | None = None
 ) -> T:
-    """Return what is read, or a default with a remark: for what moves nothing if it is wrong.
+    """Read a value that affects no motion; with a mistake, warn and return a default.
 
     Raises
     ------
     ElementError
-        Where the document is read strictly.
+        If the document is read strictly.
     """
     try:
         return read()
@@ -174,9 +173,9 @@ def _require_default(element: Element, key: str, default: T | None) -> T:
 def read_origin(
     origin: Element | None, owner: Element, version: tuple[int, int], remarks: ReaderWarnings
 ) -> Pose:
-    """Return the pose an ``<origin>`` gives; identity without one.
+    """Read the pose of an ``<origin>``; identity without one.
 
-    URDF 1.1 brought ``quat_xyzw`` as another way to say ``rpy``; in a file of version 1.0 it is ignored.
+    URDF 1.1 introduced ``quat_xyzw`` as an alternative to ``rpy``; in a file of version 1.0 it is ignored.
     """
     if origin is None:
         return _IDENTITY
@@ -210,7 +209,7 @@ def read_origin(
 
 
 def _read_origin_vector(origin: Element, key: str, owner: Element, remarks: ReaderWarnings) -> Vector3:
-    """Return three numbers of an origin, zeros where they are left out, or empty."""
+    """Read three numbers of an origin, zeros if they are left out or empty."""
     if not origin[1].get(key, "0").strip():
         return read_or_default(
             lambda: read_attribute_vector(origin, key), _ZERO, "zeros are taken", remarks, owner
@@ -221,28 +220,28 @@ def _read_origin_vector(origin: Element, key: str, owner: Element, remarks: Read
 _BOOLEANS = {"true": True, "1": True, "false": False, "0": False}
 _INFINITE = {"inf": math.inf, "+inf": math.inf, "-inf": -math.inf}
 _UNBOUNDED = 1e16
-"""Limits from this magnitude on bound nothing: older versions wrote so."""
+"""Magnitude from which a limit counts as none, as in older versions of SDF."""
 
 
 def read_text(element: Element) -> str:
-    """Return the text inside an element, without space around it."""
+    """Read the text inside an element, without space around it."""
     return element[1].get(TEXT, "").strip()
 
 
 def read_child_text(element: Element, tag: str) -> str:
-    """Return the text of a child, which is empty where there is none."""
+    """Read the text of a child; empty if there is none."""
     part = find_child(element, tag)
     return "" if part is None else read_text(part)
 
 
 def read_child_bool(element: Element, tag: str, default: bool = False) -> bool:
-    """Return a truth value: true, false, 1 or 0."""
+    """Read a child with a truth value: true, false, 1 or 0."""
     part = find_child(element, tag)
     return default if part is None else _parse_bool(part, read_text(part), default)
 
 
 def read_attribute_bool(element: Element, key: str) -> bool:
-    """Return a truth value that is an attribute, False where it is left out."""
+    """Read an attribute with a truth value, False if it is left out."""
     return _parse_bool(element, element[1].get(key, ""), False)
 
 
@@ -255,14 +254,14 @@ def _parse_bool(element: Element, said: str, default: bool) -> bool:
 
 
 def read_child_number(element: Element, tag: str, default: float | None = None) -> float:
-    """Return a finite number; without a default, the child is required."""
+    """Read a child with a finite number; without a default, it is required."""
     return read_child_numbers(element, tag, 1, None if default is None else (default,))[0]
 
 
 def read_child_numbers(
     element: Element, tag: str, count: int, default: tuple[float, ...] | None = None
 ) -> tuple[float, ...]:
-    """Return several finite numbers; without a default, the child is required."""
+    """Read a child with several finite numbers; without a default, it is required."""
     part = find_child(element, tag)
     if part is None:
         if default is None:
@@ -272,13 +271,13 @@ def read_child_numbers(
 
 
 def read_child_vector(element: Element, tag: str, default: Vector3 | None = None) -> Vector3:
-    """Return three finite numbers; without a default, the child is required."""
+    """Read a child with three finite numbers; without a default, it is required."""
     x, y, z = read_child_numbers(element, tag, 3, default)
     return x, y, z
 
 
 def read_numbers(element: Element, count: int) -> tuple[float, ...]:
-    """Return the finite numbers that an element spells."""
+    """Read the finite numbers in the text of an element."""
     said = read_text(element)
     try:
         return (parse_number(said),) if count == 1 else parse_numbers(said, count)
@@ -287,7 +286,7 @@ def read_numbers(element: Element, count: int) -> tuple[float, ...]:
 
 
 def read_child_limit(element: Element, tag: str) -> float | None:
-    """Return a limit, None where there is none: left out, infinite, or of magnitude 1e16 and more."""
+    """Read a limit; None if it is left out, infinite, or of magnitude 1e16 and more."""
     part = find_child(element, tag)
     if part is None or read_text(part).lower() in _INFINITE:
         return None
@@ -296,7 +295,7 @@ def read_child_limit(element: Element, tag: str) -> float | None:
 
 
 def read_axis_direction(axis: Element) -> Vector3:
-    """Return the unit vector of an ``<axis>``; the specification's default is z."""
+    """Read the unit vector of an ``<axis>``; the specification's default is z."""
     x, y, z = read_child_vector(axis, "xyz", (0.0, 0.0, 1.0))
     length = math.hypot(x, y, z)
     if length < 1e-9:
@@ -305,7 +304,7 @@ def read_axis_direction(axis: Element) -> Vector3:
 
 
 def read_element_pose(element: Element, remarks: ReaderWarnings) -> Pose:
-    """Return what a ``<pose>`` says, in whichever of the formats of SDF 1.9."""
+    """Read a ``<pose>``, in any of the rotation formats of SDF 1.9."""
     layout = element[1].get("rotation_format", "euler_rpy")
     degrees = read_attribute_bool(element, "degrees")
     if layout not in ("euler_rpy", "quat_xyzw"):

@@ -1,4 +1,4 @@
-"""XML writer: escaped text, and numbers that are read back to the last bit."""
+"""XML writer with escaped text and numbers that are read back to the last bit."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ _ESCAPES = {
     "<": "&lt;",
     ">": "&gt;",
     '"': "&quot;",
-    # Readers turn these into spaces where they are written as they are.
+    # Readers replace these by spaces unless they are escaped.
     "\t": "&#9;",
     "\n": "&#10;",
     "\r": "&#13;",
@@ -24,14 +24,14 @@ _ESCAPES = {
 
 @dataclass
 class Tag:
-    """An element: attributes in order, and elements inside."""
+    """Element of XML: attributes in order, and child elements."""
 
     name: str
     attributes: dict[str, str] = field(default_factory=dict)
     inside: list[Tag] = field(default_factory=list)
 
     def add(self, kind: str, /, **attributes: str | float | Iterable[float] | None) -> Tag:
-        """Add an element inside and return it; attributes that are None are left out."""
+        """Add a child element and return it; attributes that are None are left out."""
         tag = Tag(kind)
         for key, value in attributes.items():
             tag.give(key.rstrip("_"), value)
@@ -39,21 +39,21 @@ class Tag:
         return tag
 
     def give(self, key: str, value: str | float | Iterable[float] | None) -> None:
-        """Set an attribute: text, a number or several."""
+        """Set an attribute to text, a number or several, unless it is None."""
         if value is not None:
             self.attributes[key] = value if isinstance(value, str) else format_numbers(value)
 
 
 def format_xml(root: Tag, remarks: Iterable[str] = ()) -> bytes:
-    """Return the text of a document, remarks in front as comments.
+    """Return an element as the text of a document, after remarks as comments.
 
     Raises
     ------
     FormatError
-        For text that XML cannot carry.
+        For text that XML cannot contain.
     """
     lines = ['<?xml version="1.0" encoding="utf-8"?>']
-    # Two hyphens would end a comment.
+    # Two hyphens are forbidden in a comment.
     lines += [f"<!-- {re.sub('-(?=-|$)', '- ', _check_characters(remark))} -->" for remark in remarks]
     waiting: list[tuple[int, Tag | str]] = [(0, root)]
     while waiting:
@@ -79,7 +79,7 @@ def escape_attribute(text: str) -> str:
     Raises
     ------
     FormatError
-        For what XML cannot carry: control characters and the like.
+        For text that XML cannot contain: control characters and the like.
     """
     return "".join(_ESCAPES.get(c, c) for c in _check_characters(text))
 
@@ -92,12 +92,12 @@ def _check_characters(text: str) -> str:
 
 
 def format_numbers(values: float | Iterable[float]) -> str:
-    """Return numbers as text, each as short as it can be without being another one.
+    """Return numbers as text, each in the shortest form that is read back exactly.
 
     Raises
     ------
     FormatError
-        For NaN and infinities, which descriptions do not have.
+        For NaN and infinities, which descriptions cannot contain.
     """
     if isinstance(values, (int, float)):
         values = (values,)

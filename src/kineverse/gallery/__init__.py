@@ -1,13 +1,13 @@
-"""Every articulation of the library as a small scene that can be opened by name and moved.
+"""Gallery: a small scene for every articulation of the library, loaded by name.
 
 >>> import kineverse as kv
 >>> model = kv.load("articulations/screw")
 >>> model.degrees_of_freedom
 (screw/bolt,)
 
-``kineverse view articulations/screw`` shows it. Each module has scenes of one family: functions of a
-:class:`~kineverse.gallery.scene.SceneBuilder` that put joints and bodies into it, and whose docstring says in one
-line what it shows.
+``kineverse view articulations/screw`` shows it. Each module has the scenes of one family: functions that add
+joints and bodies to a :class:`~kineverse.gallery.scene.SceneBuilder`. Their name is that of the scene, and
+the first line of their docstring its summary.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ def names() -> tuple[str, ...]:
 
 
 def summary(name: str) -> str:
-    """Return one line that says what a scene shows."""
+    """Return the summary of a scene in one line."""
     shown = (_build(name).__doc__ or "").partition("\n")[0].removeprefix("Show ").rstrip(".")
     return shown[:1].upper() + shown[1:]
 
@@ -43,9 +43,9 @@ def operations(name: str, prefix: str | None = None) -> Iterator[Operation]:
     Parameters
     ----------
     name
-        Of the scene.
+        Name of the scene.
     prefix
-        Put in front of the names of frames, articulations and coordinates, with a slash.
+        Prefix of the names of frames, articulations and coordinates, without the slash.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""Scenes of bases that drive over a floor, with wheels that turn as they do."""
+"""Scenes of mobile bases with rolling wheels."""
 
 from __future__ import annotations
 
@@ -95,21 +95,21 @@ def mecanum(scene: SceneBuilder) -> None:
 
 
 def _floor(scene: SceneBuilder) -> None:
-    """Put a plate below everything, with the place of the start on it."""
+    """Add a floor with a mark at the start."""
     plate = box((2.2, 2.2, 0.02), (0, 0, -0.01), (0.84, 0.86, 0.87, 1.0))
     lines = box((0.5, 0.015, 0.002), (0, 0, 0), STEEL) + box((0.015, 0.5, 0.002), (0, 0, 0), STEEL)
     scene.frame("floor", plate + lines)
 
 
 def _oblique(radius: float, hand: int) -> Shapes:
-    """Return a wheel about y whose rollers lie at 45° to it, seen from above to one hand or the other."""
+    """Return a mecanum wheel about y with rollers at 45°; ``hand`` is 1 or -1 for the two directions."""
     shapes = disc(0.72 * radius, 0.07, axis=Y, color=DARK)
     for k in range(9):
         angle = math.tau * k / 9
         c, s = 0.8 * radius * math.cos(angle), 0.8 * radius * math.sin(angle)
-        way = 0.034 * np.array((-hand * math.sin(angle), 1.0, hand * math.cos(angle)))
+        half = 0.034 * np.array((-hand * math.sin(angle), 1.0, hand * math.cos(angle)))
         middle = np.array((c, 0.0, s))
-        shapes += bone(middle - way, middle + way, 0.2 * radius, RED if k == 0 else STEEL)
+        shapes += bone(middle - half, middle + half, 0.2 * radius, RED if k == 0 else STEEL)
     return shapes
 
 

@@ -1,6 +1,6 @@
 """Scenes of linkages with closed loops.
 
-The flat ones are drawn on a board that stands upright: x to the right, y up, z out of it.
+Planar linkages are on an upright board: x to the right, y up, z out of it.
 """
 
 from __future__ import annotations
@@ -151,7 +151,7 @@ def delta_robot(scene: SceneBuilder) -> None:
     )
 
 
-# Theo Jansen's numbers for the leg of a beach animal.
+# Lengths of Theo Jansen's linkage.
 _JANSEN = {
     "a": 38.0, "b": 41.5, "c": 39.3, "d": 40.1, "e": 55.8, "f": 39.4, "g": 36.7,
     "h": 65.7, "i": 49.0, "j": 50.0, "k": 61.9, "l": 7.8, "m": 15.0,
@@ -161,7 +161,7 @@ _JANSEN = {
 def jansen_leg(scene: SceneBuilder) -> None:
     """Show Theo Jansen's leg: one crank, and a foot that walks on a flat path."""
     s = {name: value / 200 for name, value in _JANSEN.items()}
-    # The crank turns at the origin, the other pin that stands still is at (-a, -l).
+    # The crank rotates at the origin; the other fixed pin is at (-a, -l).
     post = rod((0, 0, -0.06), (0, 0, 0.03), 0.016, DARK) + rod(
         (-s["a"], -s["l"], -0.06), (-s["a"], -s["l"], 0.03), 0.016, DARK
     )
@@ -179,7 +179,7 @@ def jansen_leg(scene: SceneBuilder) -> None:
         home: tuple[float, float],
         color: Rgba,
     ) -> None:
-        """Let two bars meet, each given by where it begins, its length and its layer."""
+        """Join the ends of two bars, each given by its start, its length and its layer."""
         for k, (start, bar, layer) in enumerate((first, second)):
             _bar(
                 scene,
@@ -203,12 +203,13 @@ def jansen_leg(scene: SceneBuilder) -> None:
 
 
 def _board(scene: SceneBuilder, height: float, shapes: Shapes, turn: Expression | None = None) -> None:
+    """Add the board with its shapes, upright at a height unless a transform is given."""
     upright = translation(0, 0, height) @ rotation_x(math.pi / 2) if turn is None else turn
     scene.frame("board", shapes, at=upright)
 
 
 def _foot(x: float, height: float) -> Shapes:
-    """Return a post below a pin that stands still."""
+    """Return a post below a fixed pin."""
     return box((0.05, height, 0.03), (x, -height / 2, -0.015), DARK) + disc(
         0.014, 0.08, (x, 0, 0.02), color=DARK
     )
@@ -236,7 +237,7 @@ def _bar(
     width: float = 0.034,
     **limits: Any,
 ) -> None:
-    """Put a bar with a hinge at its beginning and a frame at its end."""
+    """Add a bar with a hinge at its start and a frame at its end."""
     shapes = _between(length, layer, color, width)
     scene.joint(Revolute, name, shapes, parent=parent, at=(*at, 0), axis=Z, **limits)
     scene.frame(end or f"{name}_end", parent=name, at=(length, 0, 0))
@@ -252,7 +253,7 @@ def _cross(
     layer: int,
     **limits: Any,
 ) -> None:
-    """Put a bar of a scissor, with a frame in its middle; to the left for a negative length."""
+    """Add a bar of a scissor linkage, with a frame in its middle; to the left for a negative length."""
     start = (min(length, 0.0), 0.0, 0.0)
     shapes = _between(abs(length), layer, color, start=start)
     scene.joint(Revolute, f"bar_{name}", shapes, parent=parent, at=(*at, 0), axis=Z, **limits)
@@ -267,7 +268,7 @@ def _cross(
 def _triangle(
     scene: SceneBuilder, name: str, parent: str, base: float, near: float, far: float, layer: int, color: Rgba
 ) -> None:
-    """Put the third corner over a bar, left of it, at distances from its beginning and its end."""
+    """Add the third corner of a triangle over a bar, by its distances from the bar's start and end."""
     x = (base**2 + near**2 - far**2) / (2 * base)
     y = math.sqrt(near**2 - x * x)
     z = 0.022 * layer

@@ -1,4 +1,4 @@
-"""Scenes of the mechanisms, which bring their own bodies."""
+"""Scenes of the mechanisms."""
 
 from __future__ import annotations
 
@@ -87,7 +87,7 @@ def desk_lamp(scene: SceneBuilder) -> None:
 def ratchet(scene: SceneBuilder) -> None:
     """Show a wheel that turns one way only, until its pawl is lifted."""
     scene.mechanism(Ratchet, "winch")
-    # Of a disc alone one would not see that it turns.
+    # The rotation of a plain disc is invisible.
     scene.frame("mark", box((0.006, 0.016, 0.034), (0, 0, 0.025), RED), parent="winch/wheel")
 
 

@@ -1,4 +1,4 @@
-"""A scene in the making: joints, frames and loops with the bodies that show them, below a prefix."""
+"""Builder of scenes: joints, frames and loops with bodies, below a prefix."""
 
 from __future__ import annotations
 
@@ -20,25 +20,25 @@ from .shapes import Shapes
 
 
 class SceneBuilder:
-    """Collects operations whose names it puts below a prefix.
+    """Builder of a scene, whose names are below a prefix.
 
     Attributes
     ----------
     operations
-        What was put into it, in order.
+        Operations of the scene, in order.
     """
 
     def __init__(self, prefix: str | None = None) -> None:
         self._prefix = prefix
         self.operations: list[Operation] = []
 
-    def named(self, name: str) -> str:
-        """Return the full name of something; the world is the world."""
+    def full_name(self, name: str) -> str:
+        """Return a name with the prefix; the world has none."""
         return f"{self._prefix}/{name}" if self._prefix and name != WORLD else name
 
     def position(self, name: str) -> Symbol:
-        """Return the coordinate of a name."""
-        return position(self.named(name))
+        """Return the coordinate with a name."""
+        return position(self.full_name(name))
 
     def joint(
         self,
@@ -49,24 +49,24 @@ class SceneBuilder:
         at: Sequence[float] | Expression = (0.0, 0.0, 0.0),
         **fields: Any,
     ) -> None:
-        """Put a joint into the scene, whose child has its name and carries shapes.
+        """Add a joint, whose child frame has the name of the joint and carries shapes.
 
-        ``at`` is where it is in its parent: a point [m], or a transform.
+        ``at`` is its origin in the parent: a point [m], or a transform.
         """
         origin = Pose.of(at if isinstance(at, Expression) else translation(*at))
         for field in ("driver", "left", "right"):
             if isinstance(fields.get(field), str):
-                fields[field] = self.named(fields[field])
-        full = self.named(name)
+                fields[field] = self.full_name(fields[field])
+        full = self.full_name(name)
         self.operations.append(
-            kind(name=full, parent=self.named(parent), child=full, origin=origin, **fields)
+            kind(name=full, parent=self.full_name(parent), child=full, origin=origin, **fields)
         )
         if shapes:
             self.operations.append(SetBody(full, Body(visuals=sum(shapes, ()))))
 
     def mechanism(self, kind: type[Mechanism], name: str, **fields: Any) -> None:
-        """Put a mechanism into the scene, which brings its frames and bodies."""
-        self.operations.append(kind(name=self.named(name), parent=WORLD, **fields))
+        """Add a mechanism with its frames and bodies."""
+        self.operations.append(kind(name=self.full_name(name), parent=WORLD, **fields))
 
     def frame(
         self,
@@ -75,10 +75,10 @@ class SceneBuilder:
         parent: str = WORLD,
         at: Sequence[float] | Expression = (0.0, 0.0, 0.0),
     ) -> None:
-        """Put a frame into the scene that is fixed in its parent, with shapes."""
+        """Add a frame with shapes that is fixed in its parent."""
         where = at if isinstance(at, Expression) else translation(*at)
         body = Body(visuals=sum(shapes, ())) if shapes else None
-        self.operations.append(AddFrame(self.named(name), Frame.of(self.named(parent), where), body))
+        self.operations.append(AddFrame(self.full_name(name), Frame.of(self.full_name(parent), where), body))
 
     def loop(
         self,
@@ -92,19 +92,19 @@ class SceneBuilder:
         more: Sequence[tuple[str, str]] = (),
         **options: Any,
     ) -> None:
-        """Let two frames coincide, see :class:`kineverse.CloseLoop`."""
+        """Close a loop: two frames coincide, see :class:`kineverse.CloseLoop`."""
         loop = CloseLoop(
-            name=self.named(name),
-            frame=self.named(frame),
-            to=self.named(to),
+            name=self.full_name(name),
+            frame=self.full_name(frame),
+            to=self.full_name(to),
             mask=mask,
-            home=tuple((self.named(n), value) for n, value in (home or {}).items()),
-            dependent=None if dependent is None else tuple(map(self.named, dependent)),
-            more=tuple((self.named(a), self.named(b)) for a, b in more),
+            home=tuple((self.full_name(n), value) for n, value in (home or {}).items()),
+            dependent=None if dependent is None else tuple(map(self.full_name, dependent)),
+            more=tuple((self.full_name(a), self.full_name(b)) for a, b in more),
             **options,
         )
         self.operations.append(loop)
 
 
 Build: TypeAlias = Callable[[SceneBuilder], None]
-"""What puts everything into a scene; its name is that of the scene."""
+"""Function that builds a scene; its name is that of the scene."""

@@ -1,6 +1,6 @@
-"""What the bodies of the gallery are made of: bars, discs, gears, in a few colours.
+"""Shapes of the gallery: bars, discs and gears, in a few colours.
 
-Everything is in the frame of the body it is for [m] and returns a tuple of shapes, so that a body is a sum.
+Each function returns a tuple of shapes in the frame of their body [m], so that a body is a sum of shapes.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ ORANGE: Rgba = (0.93, 0.56, 0.17, 1.0)
 GREEN: Rgba = (0.35, 0.62, 0.38, 1.0)
 WHITE = simple_bodies.PALE
 RED = simple_bodies.RED
-"""The colour of marks, by which one sees what turns."""
+"""Colour of marks that make a rotation visible."""
 
 X, Y, Z = (1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)
 ORIGIN = (0.0, 0.0, 0.0)
@@ -59,12 +59,12 @@ ORIGIN = (0.0, 0.0, 0.0)
 def box(
     size: Point, at: Point = ORIGIN, color: Rgba = STEEL, *, axis: Point = Z, turn: float = 0.0
 ) -> Shapes:
-    """Return a box with its z along an axis, turned about that [rad]."""
+    """Return a box with its z along an axis, rotated about it by ``turn`` [rad]."""
     return (_placed(Box(_triple(size)), at, axis, color, turn),)
 
 
 def disc(radius: float, length: float, at: Point = ORIGIN, axis: Point = Z, color: Rgba = STEEL) -> Shapes:
-    """Return a cylinder around an axis, in the middle of which is the point."""
+    """Return a cylinder around an axis, centred at a point."""
     return (_placed(Cylinder(radius, length), at, axis, color),)
 
 
@@ -79,9 +79,9 @@ def rod(start: Point, end: Point, radius: float, color: Rgba = STEEL) -> Shapes:
 
 
 def bone(start: Point, end: Point, radius: float, color: Rgba = STEEL) -> Shapes:
-    """Return a capsule whose ends are round about two points."""
-    way, middle = np.subtract(end, start), np.add(start, end) / 2
-    return (_placed(Capsule(radius, float(np.linalg.norm(way))), middle, way, color),)
+    """Return a capsule between two points, the centres of its ends."""
+    axis, middle = np.subtract(end, start), np.add(start, end) / 2
+    return (_placed(Capsule(radius, float(np.linalg.norm(axis))), middle, axis, color),)
 
 
 def link(
@@ -92,11 +92,11 @@ def link(
     width: float = 0.04,
     thickness: float = 0.02,
 ) -> Shapes:
-    """Return a flat bar with round ends between two pins that are along an axis, and the pins."""
-    way, middle = np.subtract(end, start), np.add(start, end) / 2
-    along, normal = way / np.linalg.norm(way), np.asarray(axis) / np.linalg.norm(axis)
+    """Return a flat bar with round ends between two pins along an axis, and the pins."""
+    bar, middle = np.subtract(end, start), np.add(start, end) / 2
+    along, normal = bar / np.linalg.norm(bar), np.asarray(axis) / np.linalg.norm(axis)
     turn = np.column_stack([along, np.cross(normal, along), normal])
-    plate = Box((float(np.linalg.norm(way)), width, thickness))
+    plate = Box((float(np.linalg.norm(bar)), width, thickness))
     return (
         Shape(plate, _pose(turn, middle), color=color),
         *disc(width / 2, thickness, start, axis, color),
@@ -109,7 +109,7 @@ def link(
 def gear(
     radius: float, teeth: int, thickness: float, at: Point = ORIGIN, axis: Point = Z, color: Rgba = STEEL
 ) -> Shapes:
-    """Return a gear of a pitch radius; the first tooth, which has a mark, is where :func:`perpendicular` points."""
+    """Return a gear of a pitch radius; its first tooth, in direction :func:`perpendicular`, has a mark."""
     size = math.pi * radius / teeth
     turn = _frame(axis)
     shapes = disc(radius - 0.5 * size, thickness, at, axis, color)
@@ -134,7 +134,7 @@ def wheel(radius: float, width: float, axis: Point = Y, at: Point = ORIGIN) -> S
 
 
 def arrow(length: float, height: float, at: Point = ORIGIN, color: Rgba = RED) -> Shapes:
-    """Return a flat arrow along x, the middle of which is at a point."""
+    """Return a flat arrow along x, centred at a point."""
     x, y, z = at
     shaft = box((0.7 * length, 0.14 * length, height), (x - 0.1 * length, y, z), color)
     tips: Shapes = ()
@@ -145,7 +145,7 @@ def arrow(length: float, height: float, at: Point = ORIGIN, color: Rgba = RED) -
 
 
 def perpendicular(axis: Point) -> tuple[float, float, float]:
-    """Return the direction from which turning about an axis is counted in this module."""
+    """Return the direction of angle 0 about an axis in this module."""
     x, y, z = _frame(axis)[:, 0].tolist()
     return x, y, z
 
@@ -160,7 +160,7 @@ def _placed(geometry: Geometry, at: Point, axis: Point, color: Rgba, turn: float
 
 
 def _frame(axis: Point) -> npt.NDArray[np.float64]:
-    """Return a rotation whose last column is along an axis: turning the axes round for x, y and z."""
+    """Return a rotation whose last column is along an axis; a cyclic permutation for x, y and z."""
     n = np.asarray(axis, dtype=float) / np.linalg.norm(axis)
     if abs(n[2]) > 0.9 or abs(n[1]) > 0.9:
         first = np.array([1.0, 0.0, 0.0])

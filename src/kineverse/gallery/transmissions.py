@@ -42,7 +42,7 @@ def rack_and_pinion(scene: SceneBuilder) -> None:
     pitch = math.tau * radius / teeth
     bed = box((0.9, 0.12, 0.03), (0, 0, 0.015), DARK) + box((0.06, 0.03, 0.3), (0, 0.075, 0.15), DARK)
     scene.frame("bed", bed + rod((0, 0.075, 0.2), (0, -0.05, 0.2), 0.015, STEEL))
-    # Seen from y, where its axis points, a turn takes the lower side of the pinion to the left, which is -x.
+    # Seen from +y, along its axis, a positive rotation moves the lower side of the pinion to the left, to -x.
     scene.joint(
         Revolute,
         "pinion",

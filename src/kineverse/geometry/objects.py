@@ -78,7 +78,7 @@ class CollisionObject:
 
     def _described(self) -> str:
         geometry = self.shape.geometry
-        what = f"mesh {geometry.uri}" if isinstance(geometry, Mesh) else type(geometry).__name__.lower()
+        what = f"mesh {geometry.uri}" if isinstance(geometry, Mesh) else geometry.kind
         return f"Shape {self.number} of body '{self.body}', {what}"
 
 

@@ -27,7 +27,7 @@ _Item = TypeVar("_Item", bound=tuple[Any, ...])
 
 
 @dataclass(frozen=True, kw_only=True)
-class CloseLoop(Operation):
+class CloseLoop(Operation, document_kind="CloseLoop"):
     """Closes a loop between two frames: coordinates of the loop become functions of the free ones.
 
     With ``to_T_frame = (R, p)``, the residual consists of the elements of p [m] and of the axis of R times
@@ -237,7 +237,7 @@ APART = 1e-9
 
 
 @dataclass(frozen=True, kw_only=True)
-class LoopConstraint(Operation):
+class LoopConstraint(Operation, document_kind="LoopConstraint"):
     """Closes a loop between two frames by equality constraints, one for each row of the residual.
 
     It serves for loops that :class:`~kineverse.CloseLoop` cannot solve for dependent coordinates. All

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Any, TypeAlias
+from typing import Any, ClassVar, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
@@ -84,12 +84,16 @@ class Pose:
 class Box:
     """A box centred at its origin; ``size`` are the full edge lengths along x, y, z [m]."""
 
+    kind: ClassVar[str] = "box"
+
     size: Vector3
 
 
 @dataclass(frozen=True, slots=True)
 class Cylinder:
     """A cylinder around z, centred at its origin; radius and length [m]."""
+
+    kind: ClassVar[str] = "cylinder"
 
     radius: float
     length: float
@@ -99,6 +103,8 @@ class Cylinder:
 class Capsule:
     """A capsule around z, centred; ``length`` is that of the cylindrical part [m]."""
 
+    kind: ClassVar[str] = "capsule"
+
     radius: float
     length: float
 
@@ -107,6 +113,8 @@ class Capsule:
 class Sphere:
     """A sphere around its origin; radius [m]."""
 
+    kind: ClassVar[str] = "sphere"
+
     radius: float
 
 
@@ -114,12 +122,16 @@ class Sphere:
 class Ellipsoid:
     """An ellipsoid around its origin; ``radii`` are the half axes along x, y, z [m]."""
 
+    kind: ClassVar[str] = "ellipsoid"
+
     radii: Vector3
 
 
 @dataclass(frozen=True, slots=True)
 class Cone:
     """A cone around z, its base at -length/2 and its tip at +length/2; radius of the base and length [m]."""
+
+    kind: ClassVar[str] = "cone"
 
     radius: float
     length: float
@@ -136,6 +148,8 @@ class Mesh:
     comparisons ignore it.
     """
 
+    kind: ClassVar[str] = "mesh"
+
     uri: str
     scale: Vector3 = (1.0, 1.0, 1.0)
     folder: str = ""
@@ -143,6 +157,7 @@ class Mesh:
 
 
 Geometry: TypeAlias = Box | Cylinder | Capsule | Sphere | Ellipsoid | Cone | Mesh
+"""Each has the name of its ``kind``, which documents and other formats use."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -179,6 +179,14 @@ class Operation(ABC):
     overrides: ClassVar[bool] = False
     """True if the operation may overwrite frames, bodies, articulations and rates that it has not read."""
 
+    document_kind: ClassVar[str]
+    """Name of the class in documents, in the kinds of articulations and in tags, whatever the class is called."""
+
+    def __init_subclass__(cls, *, document_kind: str = "", **keywords: Any) -> None:
+        """Name a class in documents: frozen for those that ship, else its own name."""
+        super().__init_subclass__(**keywords)
+        cls.document_kind = document_kind or cls.__name__
+
     if not TYPE_CHECKING:  # a type checker knows the keywords
 
         def __new__(cls, *args, **keywords):
@@ -194,11 +202,15 @@ class Operation(ABC):
         """
 
     def default_tag(self) -> str:
-        """Return the default tag: the class, and the name of the operation if it has one."""
-        kind = type(self).__name__
-        words = "".join(f" {c.lower()}" if c.isupper() else c for c in kind).strip()
+        """Return the default tag: the kind, and the name of the operation if it has one."""
+        words = split_words(self.document_kind)
         name = getattr(self, "name", "")
         return f"{words} {name}" if name else words
+
+
+def split_words(kind: str) -> str:
+    """Return a name like ``DoorWithHandle`` in words, ``door with handle``."""
+    return "".join(f" {c.lower()}" if c.isupper() else c for c in kind).strip()
 
 
 class Keywords(NamedTuple):

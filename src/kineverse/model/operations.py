@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class SetBody(Operation):
+class SetBody(Operation, document_kind="SetBody"):
     """Sets the body of a frame: visual and collision shapes, and inertia."""
 
     name: str
@@ -37,7 +37,7 @@ class SetBody(Operation):
 
 
 @dataclass(frozen=True)
-class SetHome(Operation):
+class SetHome(Operation, document_kind="SetHome"):
     """Sets the home of an articulation: default values of its coordinates [m], [rad]."""
 
     name: str
@@ -53,7 +53,7 @@ class SetHome(Operation):
 
 
 @dataclass(frozen=True)
-class AddFrame(Operation):
+class AddFrame(Operation, document_kind="AddFrame"):
     """Adds a frame to a parent, with an optional body."""
 
     name: str
@@ -71,7 +71,7 @@ class AddFrame(Operation):
 
 
 @dataclass(frozen=True)
-class Constrain(Operation):
+class Constrain(Operation, document_kind="Constrain"):
     """Adds a constraint."""
 
     name: str
@@ -87,7 +87,7 @@ class Constrain(Operation):
 
 
 @dataclass(frozen=True)
-class SetRate(Operation):
+class SetRate(Operation, document_kind="SetRate"):
     """Sets the rate of a coordinate as a linear function of speeds."""
 
     coordinate: Symbol
@@ -103,7 +103,7 @@ class SetRate(Operation):
 
 
 @dataclass(frozen=True)
-class SetData(Operation):
+class SetData(Operation, document_kind="Write"):
     """Stores data."""
 
     name: str
@@ -119,7 +119,7 @@ class SetData(Operation):
 
 
 @dataclass(frozen=True)
-class Attach(Operation):
+class Attach(Operation, document_kind="Attach"):
     """Attaches an existing frame, with all frames below it, to another parent."""
 
     name: str
@@ -137,7 +137,7 @@ class Attach(Operation):
 
 
 @dataclass(frozen=True)
-class Override(Operation):
+class Override(Operation, document_kind="Override"):
     """Applies an operation with permission to overwrite values of earlier ones."""
 
     overrides = True
@@ -159,7 +159,7 @@ class Override(Operation):
 
 
 @dataclass(frozen=True)
-class SoftLimits(Operation):
+class SoftLimits(Operation, document_kind="SoftLimits"):
     """Limits a joint to the range of its safety controller, which is inside the hard limits.
 
     Attributes

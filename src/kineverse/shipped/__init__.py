@@ -1,6 +1,6 @@
-"""Models that come with the package, written for it."""
+"""Models that ship with the package."""
 
 from pathlib import Path
 
 FOLDER = Path(__file__).parent
-"""Where the descriptions lie, one ``.urdf`` each."""
+"""Folder of the descriptions, one ``.urdf`` each."""

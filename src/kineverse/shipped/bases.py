@@ -1,4 +1,4 @@
-"""The mobile bases of the robots that ship; a URDF cannot say how they move."""
+"""Mobile bases of the shipped robots, which a URDF cannot express."""
 
 from __future__ import annotations
 
@@ -7,14 +7,14 @@ from kineverse.model.frame import WORLD
 
 
 def mobile_base(model: str, prefix: str | None) -> Joint | None:
-    """Return the base that carries a shipped robot, None for what stands still.
+    """Return the mobile base of a shipped robot, None for a model without one.
 
     Parameters
     ----------
     model
         Name of the shipped model.
     prefix
-        The prefix it is loaded under.
+        Prefix of the model.
     """
 
     def named(name: str) -> str:

@@ -230,7 +230,7 @@ def test_limits_may_move_with_others():
     with model.edit() as edit:
         edit.constrain("a/position", 0, a, kv.articulations.tabulated_limit(b, {0.0: 0.2, 1.0: 1.0}))
         edit.constrain("b/position", 0, b, 1)
-        edit.constrain("held", *kv.articulations.position_lock(b, a < 0.9, upper=0.8))
+        edit.constrain("held", *kv.articulations.position_lock(b, open_if=a < 0.9, upper=0.8))
     seen = ObservedExpression("z", kv.array([a, b]), 0.01 * np.eye(2))
     tracker = Tracker(model, [seen], uncertainty={"a": 10.0, "b": 10.0})
     for _ in range(3):

@@ -1,4 +1,4 @@
-"""Mechanisms: doors, taps, lifts and lamps, each an operation that writes several frames."""
+"""Mechanisms such as doors, taps, lifts and lamps: operations that write several frames."""
 
 from .faucet import Faucet
 from .folding_door import FoldingDoor

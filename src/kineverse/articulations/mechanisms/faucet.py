@@ -1,4 +1,4 @@
-"""A mixer tap with one lever."""
+"""Mixer tap with one lever."""
 
 from __future__ import annotations
 
@@ -16,29 +16,29 @@ from .simple_bodies import STEEL, rod_shape, shift
 
 
 @dataclass(frozen=True, kw_only=True)
-class Faucet(Mechanism):
-    """A tap whose lever is lifted for more water and turned for warmer water.
+class Faucet(Mechanism, document_kind="Faucet"):
+    """Mixer tap: the lever is lifted for more water and turned for warmer water.
 
         base_T_lever = translation(0, 0, height) · rotation_z(t) · rotation_y(l)
 
     ================  ======================================================================
-    ``name/lift``     l [rad], shut at its lower end; raises the lever, which points to -x
-    ``name/turn``     t [rad], cold at its lower end and hot at its upper one
-    frames            ``base``, ``lever``, ``outlet`` (z up, where the water falls from)
-    data              ``name/flow``, flow·(l - l₀)/(l₁ - l₀) [m³/s], and ``name/hot``, the share of hot water
-                      (t - t₀)/(t₁ - t₀): expressions
+    ``name/lift``     l [rad], shut at its lower limit; raises the lever, which points to -x
+    ``name/turn``     t [rad], cold at its lower limit and hot at its upper one
+    frames            ``base``, ``lever``, ``outlet`` (at the mouth of the spout, z up)
+    data              ``name/flow``, flow·(l - l₀)/(l₁ - l₀) [m³/s], and ``name/hot``, the fraction of hot
+                      water (t - t₀)/(t₁ - t₀): expressions
     ================  ======================================================================
 
     Attributes
     ----------
     height, reach
-        Of the tap, and of its spout [m].
+        Height of the tap, and length of its spout [m].
     lift
         Limits of l, numbers from l₀ to l₁ within ±π/2.
     turn
         Limits of t, numbers from t₀ to t₁ within ±π.
     flow
-        Of the open tap [m³/s].
+        Flow of the open tap [m³/s].
 
     Raises
     ------
@@ -55,26 +55,27 @@ class Faucet(Mechanism):
     flow: float = 1.5e-4
 
     def __post_init__(self) -> None:
-        self.lengths("height", "reach", "flow")
-        self.range_of("lift", -math.pi / 2, math.pi / 2)
-        self.range_of("turn", -math.pi, math.pi)
+        self.check_lengths("height", "reach", "flow")
+        self.numeric_range("lift", -math.pi / 2, math.pi / 2)
+        self.numeric_range("turn", -math.pi, math.pi)
         super().__post_init__()
 
     @property
     def limits(self) -> Mapping[str, Limits]:
-        """Those of both."""
+        """Limits of l and t."""
         return {self.path("lift"): self.lift, self.path("turn"): self.turn}
 
     def data(self) -> Mapping[str, Expression]:
-        """Return how much flows, and how much of it is hot."""
-        return {"flow": self.flow * self._share("lift"), "hot": self._share("turn")}
+        """Return the flow, and the fraction of hot water."""
+        return {"flow": self.flow * self._fraction("lift"), "hot": self._fraction("turn")}
 
-    def _share(self, name: str) -> Expression:
-        lower, upper = self.range_of(name, -math.pi, math.pi)
+    def _fraction(self, name: str) -> Expression:
+        """Return the position of a coordinate in its range, from 0 to 1."""
+        lower, upper = self.numeric_range(name, -math.pi, math.pi)
         return (self.q(name) - lower) / (upper - lower)
 
     def parts(self) -> Mapping[str, MechanismPart]:
-        """Return the tap, its lever and where the water comes out."""
+        """Return the tap, its lever and its outlet."""
         spout = 0.6 * self.height
         mouth = (-self.reach, 0.0, 0.75 * self.height)
         return {

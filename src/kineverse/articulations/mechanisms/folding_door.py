@@ -22,40 +22,41 @@ Point: TypeAlias = tuple[float, float]
 
 
 @dataclass(frozen=True, kw_only=True)
-class FoldingDoor(Mechanism):
-    """A cupboard's door of two panels that fold while they rise; an arm guides the lower one.
+class FoldingDoor(Mechanism, document_kind="FoldingDoor"):
+    """Cupboard door of two panels that fold while they rise; an arm guides the lower panel.
 
-    Everything moves in the (x, z) plane of the base, which is the middle of the cupboard; it opens towards
-    -x. The upper panel turns about A by the coordinate ``name``, q [rad], 0 when shut. Along and outward of
-    it are e1 = (-sin q, -cos q) and e2 = (-cos q, sin q), and of the lower panel f1 and f2 = (f1z, -f1x). A
-    point (u, v) of a panel is u along and v outward. With points of the upper panel from A, and of the lower
-    one from the hinge B between them,
+    The motion is in the (x, z) plane of the base, the centre of the cupboard, which opens towards -x. The
+    upper panel rotates about A by the coordinate ``name``, q [rad], 0 when shut. The directions along it and
+    outward of it are e1 = (-sin q, -cos q) and e2 = (-cos q, sin q), those of the lower panel f1 and
+    f2 = (f1z, -f1x). A point (u, v) of a panel is u along and v outward. With points of the upper panel from
+    A, and of the lower one from the hinge B between them,
 
         B = A + (e1, e2)·panel_hinge,      C = B + (f1, f2)·arm_end,      |C - D| = arm
 
-    In the triangle of B, C and D, with c = |arm_end|, d = |D - B| and w = (D - B)/d, a circle meets another:
+    C is the intersection of two circles, about B and about D. With c = |arm_end|, d = |D - B| and
+    w = (D - B)/d:
 
         C - B = m w + h (w_z, -w_x),       m = (c² + d² - arm²)/2d,       h = √(c² - m²)
 
     which gives f1 = (u r + v (-r_z, r_x))/c² for r = C - B and (u, v) = arm_end. The arm reaches the lower
     panel from inside, so h is positive, and the panels hang one below the other at q = 0.
 
-    A spring holds the door open and, past a point, shuts it. Together with the weight of the panels it turns
-    the upper panel by
+    A spring opens the door beyond the angle ``tipping`` and shuts it before. Together with the weight of the
+    panels it exerts on the upper panel the torque
 
         τ = stiffness (q - tipping)      [N m],
 
-    which is the datum ``name/spring``, an expression; the record has its two numbers. They are no measured
-    ones, as the authors give none.
+    which is the datum ``name/spring``, an expression; the record has its two parameters. They are not
+    measured, as the authors give none.
 
-    Frames are ``base``, ``upper_panel`` and ``lower_panel`` (in their middles), ``panel_hinge`` (B, on the
-    upper panel), ``arm`` (at D, z towards C), ``arm_end`` (C, on the lower panel) and ``handle``. All of them
-    but the base, the arm and its end have x inward, y to the side and z up when shut.
+    Frames are ``base``, ``upper_panel`` and ``lower_panel`` (at their centres), ``panel_hinge`` (B, on the
+    upper panel), ``arm`` (at D, z towards C), ``arm_end`` (C, on the lower panel) and ``handle``. Except for
+    the base, the arm and its end, they have x inward, y to the side and z up when shut.
 
     Attributes
     ----------
     size, wall
-        Depth, width and height of the cupboard, and how thick its walls are [m].
+        Depth, width and height of the cupboard, and thickness of its walls [m].
     panel
         Width, height and thickness of the panels [m].
     top_hinge, arm_pivot
@@ -65,7 +66,7 @@ class FoldingDoor(Mechanism):
     lower_middle, arm_end
         Points of the lower panel (u, v) from B [m].
     handle
-        Point of the lower panel (u, v) from its middle [m].
+        Point of the lower panel (u, v) from its centre [m].
     handle_size
         Width, depth and thickness of the handle [m].
     arm
@@ -73,13 +74,13 @@ class FoldingDoor(Mechanism):
     opening
         Limits of q and of its speed; numbers.
     stiffness, tipping
-        Of the spring [N m/rad], [rad]: beyond ``tipping`` it opens the door, before it the door shuts.
+        Stiffness of the spring [N m/rad], and the angle at which its torque changes sign [rad].
 
     Raises
     ------
     InvalidValueError
-        For lengths that are not positive, or with which the arm does not reach at some angle; for a spring
-        that pushes nothing, or nowhere.
+        For lengths that are not positive, or with which the arm does not reach at some angle; for a stiffness
+        that is not positive.
     """
 
     main: ClassVar[str] = "lower_panel"
@@ -101,7 +102,7 @@ class FoldingDoor(Mechanism):
     tipping: float = 0.6
 
     def __post_init__(self) -> None:
-        self.lengths("wall", "arm", "stiffness")
+        self.check_lengths("wall", "arm", "stiffness")
         self.number("tipping")
         for field, count, positive in (
             *((field, 3, True) for field in ("size", "panel", "handle_size")),
@@ -114,11 +115,11 @@ class FoldingDoor(Mechanism):
 
     @property
     def limits(self) -> Mapping[str, Limits]:
-        """That of q."""
+        """Limits of q."""
         return {self.path(): self.opening}
 
-    def known(self) -> tuple[tuple[str, Any], ...]:
-        """Return the spring."""
+    def dynamics(self) -> tuple[tuple[str, Any], ...]:
+        """Return the parameters of the spring."""
         return (("spring/stiffness", self.stiffness), ("spring/tipping", self.tipping))
 
     def data(self) -> Mapping[str, Any]:
@@ -133,7 +134,7 @@ class FoldingDoor(Mechanism):
         bz = az - ux * cos(q) + uv * sin(q)
         x, z = self._arm_end_from(bx, bz)
         u, v = self.arm_end
-        # Of f1 = (-sin θ, -cos θ), like e1 of q; the division by c² does not turn it.
+        # The angle θ of f1 = (-sin θ, -cos θ), as q of e1; the division by c² does not change it.
         lower = arctan2(v * z - u * x, -u * z - v * x)
         width, height, thickness = self.panel
         leaf = box_shape((thickness, width, height), (0.0, 0.0, 0.0), WOOD)
@@ -169,26 +170,27 @@ class FoldingDoor(Mechanism):
         return along * to_x + across * to_z, along * to_z - across * to_x
 
     def _numbers(self, field: str, count: int, positive: bool) -> tuple[float, ...]:
+        """Return a field after checking that it is a tuple of so many numbers."""
         given = getattr(self, field)
         try:
             numbers = tuple(given)
         except TypeError:
             numbers = ()
         if len(numbers) != count:
-            raise InvalidValueError(f"{self.its(field)} has {count} numbers, which {given!r} has not.")
+            raise InvalidValueError(f"{self.describe(field)} has {count} numbers, which {given!r} has not.")
         return tuple(
-            check_joint_number(n, f"{self.its(field)}, each of it,", positive=positive) for n in numbers
+            check_joint_number(n, f"{self.describe(field)}, each of it,", positive=positive) for n in numbers
         )
 
     def _check_reach(self) -> None:
-        """Look whether the triangle of B, C and D closes at all angles, and never flattens."""
-        lower, upper = self.range_of("opening", -math.pi, math.pi)
+        """Check that the triangle of B, C and D closes at all angles without becoming flat."""
+        lower, upper = self.numeric_range("opening", -math.pi, math.pi)
         r, c = math.hypot(*self.panel_hinge), math.hypot(*self.arm_end)
         across, up = (d - a for a, d in zip(self.top_hinge, self.arm_pivot, strict=True))
         for what, length in (("panel hinge", r), ("arm end", c)):
             if not length:
                 raise InvalidValueError(
-                    f"{self.its(what)} is at (0, 0), which is no place for another hinge."
+                    f"{self.describe(what)} is at (0, 0), which is no place for another hinge."
                 )
         # B is nearest to D, or farthest from it, where the upper panel points along the line from A to D.
         u, v = self.panel_hinge
@@ -200,12 +202,12 @@ class FoldingDoor(Mechanism):
             d = math.hypot(x, z)
             if not abs(c - self.arm) < d < c + self.arm:
                 raise InvalidValueError(
-                    f"{self.its('arm')}, {self.arm:g}, does not reach at {q:.6g} rad: its pivot is "
+                    f"{self.describe('arm')}, {self.arm:g}, does not reach at {q:.6g} rad: its pivot is "
                     f"{d:.6g} from the hinge between the panels there, and its other end {c:.6g}."
                 )
 
 
 def _on(point: Point) -> Pose:
-    """Return the place of a point in the axes of a panel, which hangs along -z and looks along -x."""
+    """Return the pose of a point in the axes of a panel, which hangs along -z and faces -x."""
     along, outward = point
     return shift(-outward, 0.0, -along)

@@ -1,4 +1,4 @@
-"""The garage door of the papers."""
+"""Garage door of the papers."""
 
 from __future__ import annotations
 
@@ -19,38 +19,38 @@ from .simple_bodies import DARK, STEEL, WOOD, box_shape, rod_shape, shift
 
 
 @dataclass(frozen=True, kw_only=True)
-class GarageDoor(Mechanism):
-    """A door whose lower edge rises along a vertical rail, and its upper edge along one under the ceiling.
+class GarageDoor(Mechanism, document_kind="GarageDoor"):
+    """Garage door: the lower edge moves along a vertical rail, the upper edge along one under the ceiling.
 
-    2022 paper, Eqs. 11-13. With its length l and its angle α, 0 when closed,
+    2022 paper, Eqs. 11-13. With the length l and the angle α, 0 when closed,
 
         base_T_door = translation(0, 0, l (1 - cos α)) · rotation_y(α)
 
-    Surprise first: its coordinate is α, and not the papers' position a = l cos α, which is l when closed and
+    Surprise first: the coordinate is α, and not the papers' position a = l cos α, which is l when closed and
     0 when open. There α = arccos(a/l) has an infinite slope at a = l, exactly where the door is locked. With
-    ``form="published"`` it is the coordinate all the same; the height is l - a then, because the a that
-    Eq. 12 prints is not 0 at the floor when closed.
+    ``form="published"`` the coordinate is a, and the height is l - a, because the a that Eq. 12 prints is not
+    0 at the floor when closed.
 
     =================  ==================================================================
     ``name/door``      q = α in [0, π/2] [rad], or as published q = a in [0, l] [m]
-    ``name/bolt``      b, the lock's handle [rad]
+    ``name/bolt``      b, the handle of the lock [rad]
     frames             ``base``, ``door`` (lower edge, z along the door), ``upper_edge``, ``bolt``
     ``name/lock``      -speed·unlocked <= q̇ <= speed·unlocked
-    unlocked           ~((b < catch) & closed), closed where a > l - play
+    unlocked           ~((b < catch) & closed), closed if a > l - play
     =================  ==================================================================
 
     Attributes
     ----------
     length, width, thickness
-        Of the door [m].
+        Dimensions of the door [m].
     form
         ``"regular"``, or ``"published"`` with the coordinate of the papers.
     bolt
         Limits of b.
     catch
-        Below which b locks [rad].
+        Angle b below which the bolt locks [rad].
     play
-        How far a may be from l for the bolt still to catch [m].
+        Largest distance of a from l at which the bolt still catches [m].
     speed
         Limit of |q̇| while it is unlocked [rad/s], or as published [m/s].
 
@@ -73,25 +73,27 @@ class GarageDoor(Mechanism):
     speed: float = 1.0
 
     def __post_init__(self) -> None:
-        self.lengths("length", "width", "thickness", "play", "speed")
+        self.check_lengths("length", "width", "thickness", "play", "speed")
         if not isinstance(self.form, str) or self.form not in ("regular", "published"):
-            raise InvalidValueError(f"{self.its('form')} is 'regular' or 'published', not {self.form!r}.")
+            raise InvalidValueError(
+                f"{self.describe('form')} is 'regular' or 'published', not {self.form!r}."
+            )
         if not self.play < self.length:
             raise InvalidValueError(
-                f"{self.its('play')} is less than its length {self.length:g}, and not {self.play:g}."
+                f"{self.describe('play')} is less than its length {self.length:g}, and not {self.play:g}."
             )
         super().__post_init__()
-        self.check_within("catch", self.bolt)
+        self.check_threshold("catch", self.bolt)
 
     @property
     def limits(self) -> Mapping[str, Limits]:
-        """Those of the door and of the bolt."""
+        """Limits of the door and of the bolt."""
         most = self.length if self.form == "published" else math.pi / 2
         return {self.path("door"): Limits(0.0, most), self.path("bolt"): self.bolt}
 
     @property
     def closed(self) -> Expression:
-        """The truth of a > l - play."""
+        """Condition a > l - play."""
         if self.form == "published":
             return self.q("door") > self.length - self.play
         return self.q("door") < math.acos(1 - self.play / self.length)
@@ -99,7 +101,9 @@ class GarageDoor(Mechanism):
     def locks(self) -> Mapping[str, BoundedExpression]:
         """Return the lock, c2 of Eq. 13."""
         raised = self.q("bolt") > self.catch
-        return {"lock": speed_lock(self.q("door"), raised, at=self.closed, speed=self.speed)}
+        return {
+            "lock": speed_lock(self.q("door"), open_if=raised, engaged_if=self.closed, max_speed=self.speed)
+        }
 
     def parts(self) -> Mapping[str, MechanismPart]:
         """Return rails, door and bolt."""

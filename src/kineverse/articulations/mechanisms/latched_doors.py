@@ -1,4 +1,4 @@
-"""Hinged doors that something holds: a handle, a sprung bolt, a button."""
+"""Hinged doors with a handle, a spring-loaded bolt or a button."""
 
 from __future__ import annotations
 
@@ -20,13 +20,12 @@ from .simple_bodies import DARK, PALE, RED, STEEL, WOOD, box_shape, case, panel,
 class HingedDoor(Mechanism):
     """Base of doors about a vertical hinge at the base: base_T_door = rotation_z(q), q in [rad].
 
-    The door stands in the (y, z) plane when it is shut, q = 0, from the hinge to y = width, and opens towards
-    -x.
+    The shut door, q = 0, lies in the (y, z) plane from the hinge to y = width, and opens towards -x.
 
     Attributes
     ----------
     width, height, thickness
-        Of the door [m].
+        Dimensions of the door [m].
     door
         Limits of q.
     """
@@ -39,13 +38,13 @@ class HingedDoor(Mechanism):
     door: Limits = Limits(0.0, 1.9, 1.5)
 
     def __post_init__(self) -> None:
-        self.lengths("width", "height", "thickness")
+        self.check_lengths("width", "height", "thickness")
         super().__post_init__()
         if constant_value(self.door.lower) not in (None, 0.0) or self.door.lower is None:
-            raise InvalidValueError(f"{self.its('door')} is shut at 0, and not at {self.door.lower!r}.")
+            raise InvalidValueError(f"{self.describe('door')} is shut at 0, and not at {self.door.lower!r}.")
 
     def leaf(self, color: Rgba = WOOD, *shapes: Shape) -> MechanismPart:
-        """Return the door."""
+        """Return the moving part of the door."""
         return MechanismPart(
             "base",
             (rotation_about(Z, self.q("door")),),
@@ -53,7 +52,7 @@ class HingedDoor(Mechanism):
         )
 
     def posts(self) -> tuple[Shape, Shape]:
-        """Return what stands on both sides of it."""
+        """Return the posts on both sides of the door."""
         size = (self.thickness, 0.06, self.height)
         first, second = (
             box_shape(size, (0.0, y, self.height / 2), PALE) for y in (-0.035, self.width + 0.035)
@@ -62,8 +61,8 @@ class HingedDoor(Mechanism):
 
 
 @dataclass(frozen=True, kw_only=True)
-class DoorWithHandle(HingedDoor):
-    """A room's door: shut, it opens only while the handle is pressed; once open, it moves freely.
+class DoorWithHandle(HingedDoor, document_kind="DoorWithHandle"):
+    """Room door: shut, it opens only while the handle is pressed; once open, it moves freely.
 
     ================  ======================================================================
     ``name/door``     q [rad], see :class:`HingedDoor`
@@ -78,13 +77,13 @@ class DoorWithHandle(HingedDoor):
     handle
         Limits of h.
     threshold
-        How far the handle has to be pressed [rad].
+        Angle h beyond which the door is unlocked [rad].
     shut
-        Up to which q the latch catches [rad].
+        Angle q up to which the latch catches [rad].
     speed
-        How fast the door may turn [rad/s].
+        Limit of the angular speed of the door [rad/s].
     handle_height
-        Of the handle above the floor [m].
+        Height of the handle above the floor [m].
 
     Raises
     ------
@@ -102,24 +101,28 @@ class DoorWithHandle(HingedDoor):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        self.lengths("shut", "speed", "handle_height")
-        self.check_within("threshold", self.handle)
+        self.check_lengths("shut", "speed", "handle_height")
+        self.check_threshold("threshold", self.handle)
         if not self.handle_height < self.height:
             raise InvalidValueError(
-                f"{self.its('handle_height')} is below its height {self.height:g}, and not "
+                f"{self.describe('handle_height')} is below its height {self.height:g}, and not "
                 f"{self.handle_height:g}."
             )
 
     @property
     def limits(self) -> Mapping[str, Limits]:
-        """Those of door and handle."""
+        """Limits of door and handle."""
         return {self.path("door"): self.door, self.path("handle"): self.handle}
 
     def locks(self) -> Mapping[str, BoundedExpression]:
         """Return the lock."""
         q = self.q("door")
         pressed = self.q("handle") > self.threshold
-        return {"lock": speed_lock(q, pressed, at=q < self.shut, speed=self.speed, blocks="forward")}
+        return {
+            "lock": speed_lock(
+                q, open_if=pressed, engaged_if=q < self.shut, max_speed=self.speed, blocks="forward"
+            )
+        }
 
     def parts(self) -> Mapping[str, MechanismPart]:
         """Return posts, door and handle."""
@@ -136,29 +139,30 @@ class DoorWithHandle(HingedDoor):
 
 @dataclass(frozen=True, kw_only=True)
 class SprungDoor(HingedDoor):
-    """Base of doors that something on a spring holds: shut, they stay so unless it is moved away.
+    """Base of doors that a spring-loaded part locks while they are shut, unless that part is moved away.
 
-    The lock is a block of the position (:func:`kineverse.articulations.position_lock`): an open door is free, and so is
-    shutting it, because the bolt gives way.
+    The lock is one of the position (:func:`kineverse.articulations.position_lock`): an open door is free, and
+    can be shut, because the bolt gives way.
 
     Attributes
     ----------
     catch
-        How far the bolt or the button has to be moved [m].
+        Displacement of the bolt or the button that opens the lock [m].
     play
-        How far open the door still counts as shut [rad].
+        Largest angle at which the door counts as shut [rad].
     stiffness, rest
-        Of the spring [N/m], [m]: its force on a coordinate b is stiffness·(rest - b).
+        Stiffness of the spring [N/m] and its rest position [m]: the force on a coordinate b is
+        stiffness·(rest - b).
 
     Raises
     ------
     InvalidValueError
-        For lengths that are not positive, a door that is not shut at 0, a catch beyond the limits of what is
-        sprung, or a spring that does not push it back to 0.
+        For lengths that are not positive, a door that is not shut at 0, a catch beyond the limits of the
+        spring-loaded part, or a spring that does not push it back to 0.
     """
 
     sprung: ClassVar[str]
-    """Which of its parts the spring pushes."""
+    """Name of the spring-loaded part."""
 
     catch: float
     play: float = 0.003
@@ -167,37 +171,37 @@ class SprungDoor(HingedDoor):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        self.lengths("play")
-        self.check_within("catch", getattr(self, self.sprung))
+        self.check_lengths("play")
+        self.check_threshold("catch", getattr(self, self.sprung))
         self.number("stiffness", positive=True)
         if self.number("rest") > 0:
             raise InvalidValueError(
-                f"{self.its('rest')} is at 0 or before it, where the spring pushes to, and not at "
+                f"{self.describe('rest')} is at 0 or before it, where the spring pushes to, and not at "
                 f"{self.rest:g}."
             )
 
     @property
     def limits(self) -> Mapping[str, Limits]:
-        """Those of the door and of what is sprung."""
+        """Limits of the door and of the spring-loaded part."""
         return {self.path("door"): self.door, self.path(self.sprung): getattr(self, self.sprung)}
 
     def locks(self) -> Mapping[str, BoundedExpression]:
-        """Return what the spring's end does."""
+        """Return the lock."""
         away = self.q(self.sprung) > self.catch
-        return {"latch": position_lock(self.q("door"), away, upper=0.0, margin=self.play)}
+        return {"latch": position_lock(self.q("door"), open_if=away, upper=0.0, margin=self.play)}
 
-    def known(self) -> tuple[tuple[str, Any], ...]:
-        """Return the spring."""
+    def dynamics(self) -> tuple[tuple[str, Any], ...]:
+        """Return the parameters of the spring."""
         return ((f"{self.sprung}/stiffness", self.stiffness), (f"{self.sprung}/rest", self.rest))
 
 
 @dataclass(frozen=True, kw_only=True)
-class Latch(SprungDoor):
-    """A door that a sprung bolt holds.
+class Latch(SprungDoor, document_kind="Latch"):
+    """Door with a spring-loaded bolt.
 
     ================  ======================================================================
     ``name/door``     q [rad]: base_T_door = rotation_z(q)
-    ``name/bolt``     b [m]: door_T_bolt = translation(0, width - b, height/2), 0 where the spring pushes it
+    ``name/bolt``     b [m]: door_T_bolt = translation(0, width - b, height/2), 0 at rest
     frames            ``base``, ``door``, ``bolt``
     ``name/latch``    q <= 0 unless b > catch or q >= play
     record            ``bolt/stiffness`` [N/m], ``bolt/rest`` [m]
@@ -228,12 +232,12 @@ class Latch(SprungDoor):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Microwave(SprungDoor):
-    """An oven whose door stays shut unless its button is pressed; the button comes back by a spring.
+class Microwave(SprungDoor, document_kind="Microwave"):
+    """Microwave oven: its door stays shut unless the button is pressed; a spring returns the button.
 
     ================  ======================================================================
     ``name/door``     q [rad]: base_T_door = rotation_z(q)
-    ``name/button``   b [m]: base_T_button = translation(b, …), 0 where the spring pushes it
+    ``name/button``   b [m]: base_T_button = translation(b, …), 0 at rest
     frames            ``base`` (at the hinge, on the floor of the oven), ``door``, ``button``
     ``name/latch``    q <= 0 unless b > catch or q >= play
     record            ``button/stiffness`` [N/m], ``button/rest`` [m]
@@ -242,7 +246,7 @@ class Microwave(SprungDoor):
     Attributes
     ----------
     depth
-        Of the oven behind its door [m].
+        Depth of the oven behind its door [m].
     button
         Limits of b.
     """
@@ -260,7 +264,7 @@ class Microwave(SprungDoor):
     rest: float = -0.004
 
     def __post_init__(self) -> None:
-        self.lengths("depth")
+        self.check_lengths("depth")
         super().__post_init__()
 
     def parts(self) -> Mapping[str, MechanismPart]:

@@ -1,4 +1,4 @@
-"""What the mechanisms have in common: parts with bodies, coordinates with limits, one record."""
+"""Base class of the mechanisms: parts with bodies, coordinates with limits, one record."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ BASE = "base"
 
 
 class MechanismPart(NamedTuple):
-    """One frame of a mechanism: which other part it is placed in, where, and what is seen of it."""
+    """Frame of a mechanism: its parent part, the factors of its pose in there, and its shapes."""
 
     below: str
     place: tuple[TransformLike, ...]
@@ -36,59 +36,59 @@ class MechanismPart(NamedTuple):
 class Mechanism(PlacedOperation):
     """Base of the mechanisms: several frames ``name/…`` that move together by a few coordinates.
 
-    ``name/base`` stands still at ``origin`` in the parent; x points away from who uses it, y to the left, z
-    up. A mechanism with one coordinate has the degree of freedom ``name``, others ``name/…``. Limits of
+    ``name/base`` is fixed at ``origin`` in the parent; x points away from the user, y to the left, z up. A
+    mechanism with one coordinate has the degree of freedom ``name``, others have ``name/…``. Limits of
     coordinates are constraints ``…/position`` and ``…/velocity``.
 
     Raises
     ------
     InvalidValueError
-        For limits that contradict each other, and numbers that cannot be.
+        For limits that contradict each other, and dimensions that are impossible.
     DuplicateNameError
         For an articulation or a frame that exists.
     """
 
     main: ClassVar[str]
-    """The part that it is all for."""
+    """Name of the main part, the child frame of the record."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
         for path, limits in self.limits.items():
             check_limits(limits, f"What limits '{path}' of the {self.noun} '{self.name}'")
-            dict(limits.on(path, position(path)))
+            dict(limits.constraints(path, position(path)))
 
     @property
     def child(self) -> str:
-        """The frame of its main part."""
+        """Frame of the main part."""
         return self.path(self.main)
 
     @property
     @abstractmethod
     def limits(self) -> Mapping[str, Limits]:
-        """The paths of its coordinates, with their limits."""
+        """Limits of the coordinates, by path."""
 
     @abstractmethod
     def parts(self) -> Mapping[str, MechanismPart]:
-        """Return its frames by their names below ``name/``, the base first."""
+        """Return the parts by their names below ``name/``, the base first."""
 
     def locks(self) -> Mapping[str, ConstraintLike]:
-        """Return its other constraints by their names below ``name/``."""
+        """Return the constraints other than limits, by their names below ``name/``."""
         return {}
 
-    def known(self) -> tuple[tuple[str, Any], ...]:
-        """Return what is known beside kinematics: springs and the like."""
+    def dynamics(self) -> tuple[tuple[str, Any], ...]:
+        """Return dynamic parameters as (name, value) pairs: springs and the like."""
         return ()
 
     def data(self) -> Mapping[str, Any]:
-        """Return what else is written, by names below ``name/``."""
+        """Return further data, by their names below ``name/``."""
         return {}
 
     def path(self, part: str = "") -> str:
-        """Return the name of something that belongs to it."""
+        """Return the full name of a part or coordinate."""
         return f"{self.name}/{part}" if part else self.name
 
     def q(self, part: str = "") -> Symbol:
-        """Return one of its coordinates."""
+        """Return a coordinate of the mechanism."""
         return position(self.path(part))
 
     def apply(self, model: ReadRecorder) -> Writes:
@@ -97,7 +97,7 @@ class Mechanism(PlacedOperation):
         self.check_names(model, map(self.path, parts))
         constraints: dict[str, ConstraintLike] = {}
         for path, limits in self.limits.items():
-            constraints.update(limits.on(path, position(path)))
+            constraints.update(limits.constraints(path, position(path)))
         constraints.update({self.path(name): lock for name, lock in self.locks().items()})
         coordinates = tuple(map(position, self.limits))
         return Writes(
@@ -112,7 +112,7 @@ class Mechanism(PlacedOperation):
                     coordinates,
                     (0.0,) * len(coordinates),
                     tuple(q.derivative() for q in coordinates),
-                    self.known(),
+                    self.dynamics(),
                 )
             },
             data={self.path(n): value for n, value in self.data().items()},
@@ -122,64 +122,67 @@ class Mechanism(PlacedOperation):
         return self.path(part.below) if part.below else self.parent
 
     def base(self, *shapes: Shape) -> MechanismPart:
-        """Return the part that stands still."""
+        """Return the base, which is fixed in the parent."""
         return MechanismPart("", (self.origin,), shapes)
 
     def number(self, field: str, *, positive: bool = False) -> float:
-        """Return a field that is a finite number.
+        """Return a field after checking that it is a finite number.
 
         Raises
         ------
         InvalidValueError
-            If it is none, or not positive where it has to be.
+            If it is no finite number, or not positive although required.
         """
-        return check_joint_number(getattr(self, field), self.its(field), positive=positive)
+        return check_joint_number(getattr(self, field), self.describe(field), positive=positive)
 
-    def its(self, field: str) -> str:
-        """Return what errors call a field."""
+    def describe(self, field: str) -> str:
+        """Return the name of a field in errors."""
         return f"The {field.replace('_', ' ')} of the {self.noun} '{self.name}'"
 
-    def range_of(self, field: str, least: float, most: float) -> tuple[float, float]:
-        """Return the ends of limits that have to be numbers, because the geometry ends somewhere.
+    def numeric_range(self, field: str, least: float, most: float) -> tuple[float, float]:
+        """Return lower and upper limit in a field, which have to be numbers within a range.
 
         Raises
         ------
         InvalidValueError
-            If they are missing, no numbers, or beyond what the geometry allows.
+            If one is missing, no number, or outside of [least, most], the range that the geometry allows.
         """
         limits = getattr(self, field)
-        check_limits(limits, self.its(field))
+        check_limits(limits, self.describe(field))
         ends = []
         for name, end in (("lower", limits.lower), ("upper", limits.upper)):
             if end is None or (isinstance(end, Expression) and end.symbols):
-                raise InvalidValueError(f"{self.its(field)} has a number as its {name} end, not {end!r}.")
-            ends.append(check_joint_number(end, f"{self.its(field)}, its {name} end,"))
+                raise InvalidValueError(
+                    f"{self.describe(field)} has a number as its {name} end, not {end!r}."
+                )
+            ends.append(check_joint_number(end, f"{self.describe(field)}, its {name} end,"))
         lower, upper = ends
         if not least <= lower < upper <= most:
             raise InvalidValueError(
-                f"{self.its(field)} is a range within [{least:.6g}, {most:.6g}], not from {lower:g} to "
+                f"{self.describe(field)} is a range within [{least:.6g}, {most:.6g}], not from {lower:g} to "
                 f"{upper:g}."
             )
         return lower, upper
 
-    def check_within(self, field: str, limits: Limits) -> None:
-        """Look whether a threshold lies between the ends of a coordinate, as far as these are numbers.
+    def check_threshold(self, field: str, limits: Limits) -> None:
+        """Check that a threshold lies between the limits of a coordinate, if these are numbers.
 
         Raises
         ------
         InvalidValueError
-            If it does not, so the coordinate would never get to the other side of it.
+            If it does not: the coordinate would never reach the threshold, or never leave it.
         """
         value = self.number(field)
         lower, upper = constant_value(limits.lower), constant_value(limits.upper)
         if (lower is not None and value <= lower) or (upper is not None and value >= upper):
             raise InvalidValueError(
-                f"{self.its(field)} lies between {limits.lower!r} and {limits.upper!r}, and is not {value:g}."
+                f"{self.describe(field)} lies between {limits.lower!r} and {limits.upper!r}, "
+                f"and is not {value:g}."
             )
 
 
 def constant_value(bound: ExpressionLike | None) -> float | None:
-    """Return a bound that is there and constant, else None."""
+    """Return the value of a constant bound; None for no bound or one with symbols."""
     if bound is None:
         return None
     expression = as_expression(bound)

@@ -1,4 +1,4 @@
-"""Mechanisms of parallelograms and rhombi, whose last part keeps its orientation."""
+"""Mechanisms of parallelograms and rhombi: scissor lift and desk lamp."""
 
 from __future__ import annotations
 
@@ -21,15 +21,15 @@ HALF_TURN = Pose((1.0, 0.0, 0.0, 0.0, 0.0, -1.0, 0.0, 0.0, 0.0, 0.0, -1.0, 0.0))
 
 
 @dataclass(frozen=True, kw_only=True)
-class ScissorLift(Mechanism):
-    """A platform on n pairs of crossed arms, one on top of the other.
+class ScissorLift(Mechanism, document_kind="ScissorLift"):
+    """Scissor lift: a platform on n pairs of crossed arms, one on top of the other.
 
-    Its coordinate ``name`` is the angle q of the arms above the horizontal [rad]. With arms of length L,
+    The coordinate ``name`` is the angle q of the arms above the horizontal [rad]. With arms of length L,
 
         slider at L cos q,      crossing i = 1 … n at (L/2 cos q, L (i - ½) sin q),      height n L sin q
 
-    Surprise first: the coordinate is not the height h. As functions of the angle all of these are smooth at
-    every angle. As functions of the height they have infinite slopes where the arms stand upright,
+    Surprise first: the coordinate is not the height h. As functions of the angle all of these are smooth
+    everywhere. As functions of the height they have infinite slopes when the arms stand upright,
     dq/dh = 1/(n L cos q); there the slider is at its end as well. So limits of the height are limits of the
     angle, arcsin(h/(n L)).
 
@@ -48,7 +48,7 @@ class ScissorLift(Mechanism):
     Raises
     ------
     InvalidValueError
-        For lengths that are not positive, stages that are no such number, or limits beyond flat and upright.
+        For lengths that are not positive, a wrong number of stages, or limits beyond flat and upright.
     """
 
     main: ClassVar[str] = "platform"
@@ -59,21 +59,21 @@ class ScissorLift(Mechanism):
     angle: Limits = Limits(0.1, 1.2, 0.2)
 
     def __post_init__(self) -> None:
-        self.lengths("arm", "width")
+        self.check_lengths("arm", "width")
         if (
             isinstance(self.stages, bool)
             or not isinstance(self.stages, int)
             or not 1 <= self.stages <= MOST_STAGES
         ):
             raise InvalidValueError(
-                f"{self.its('stages')} are a whole number from 1 to {MOST_STAGES}, not {self.stages!r}."
+                f"{self.describe('stages')} are a whole number from 1 to {MOST_STAGES}, not {self.stages!r}."
             )
-        self.range_of("angle", 0.0, math.pi / 2)
+        self.numeric_range("angle", 0.0, math.pi / 2)
         super().__post_init__()
 
     @property
     def limits(self) -> Mapping[str, Limits]:
-        """That of q."""
+        """Limits of q."""
         return {self.path(): self.angle}
 
     def parts(self) -> Mapping[str, MechanismPart]:
@@ -101,17 +101,17 @@ class ScissorLift(Mechanism):
 
 
 @dataclass(frozen=True, kw_only=True)
-class DeskLamp(Mechanism):
-    """A lamp on two parallelograms: wherever it is put, its head keeps its orientation.
+class DeskLamp(Mechanism, document_kind="DeskLamp"):
+    """Desk lamp on two parallelograms, which keep the orientation of its head.
 
-    The lower arm leans by α from the vertical and the upper one rises by β from the horizontal. Beside each
-    there is a bar of the same length, so elbow and head do not turn:
+    The lower arm leans by α from the vertical and the upper one rises by β from the horizontal. Each has a
+    parallel bar of the same length, so elbow and head do not rotate:
 
         base_T_elbow = translation(L₁ sin α, 0, L₁ cos α)
         base_T_head  = base_T_elbow · translation(L₂ cos β, 0, L₂ sin β)
 
-    The pivots of the lower parallelogram are side by side, and those of the upper one above each other, so
-    they fall flat at α = ±π/2 and β = ±π/2, which is out of reach.
+    The pivots of the lower parallelogram are side by side, and those of the upper one above each other. Both
+    become flat at α = ±π/2 and β = ±π/2, which limits exclude.
 
     ================  ======================================================================
     ``name/lower``    α [rad]
@@ -125,14 +125,14 @@ class DeskLamp(Mechanism):
     lower_arm, upper_arm
         L₁ and L₂ [m].
     offset
-        Between an arm and its bar [m].
+        Distance between an arm and its bar [m].
     lower, upper
         Limits of α and β, numbers within ±π/2.
 
     Raises
     ------
     InvalidValueError
-        For lengths that are not positive, or limits at which a parallelogram falls flat.
+        For lengths that are not positive, or limits at which a parallelogram becomes flat.
     """
 
     main: ClassVar[str] = "head"
@@ -144,17 +144,17 @@ class DeskLamp(Mechanism):
     upper: Limits = Limits(-0.9, 0.9, 1.0)
 
     def __post_init__(self) -> None:
-        self.lengths("lower_arm", "upper_arm", "offset")
+        self.check_lengths("lower_arm", "upper_arm", "offset")
         for field in ("lower", "upper"):
-            if max(map(abs, self.range_of(field, -math.pi / 2, math.pi / 2))) >= math.pi / 2:
+            if max(map(abs, self.numeric_range(field, -math.pi / 2, math.pi / 2))) >= math.pi / 2:
                 raise InvalidValueError(
-                    f"{self.its(field)} ends before ±π/2, where its parallelogram falls flat."
+                    f"{self.describe(field)} ends before ±π/2, where its parallelogram falls flat."
                 )
         super().__post_init__()
 
     @property
     def limits(self) -> Mapping[str, Limits]:
-        """Those of both angles."""
+        """Limits of α and β."""
         return {self.path("lower"): self.lower, self.path("upper"): self.upper}
 
     def parts(self) -> Mapping[str, MechanismPart]:

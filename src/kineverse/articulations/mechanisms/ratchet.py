@@ -1,4 +1,4 @@
-"""A wheel that turns one way, until its pawl is lifted."""
+"""Ratchet: a wheel with a pawl."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ from .simple_bodies import DARK, RED, STEEL, box_shape, rod_shape, shift
 
 
 @dataclass(frozen=True, kw_only=True)
-class Ratchet(Mechanism):
-    """A wheel with a pawl, which does not turn back unless the pawl is lifted.
+class Ratchet(Mechanism, document_kind="Ratchet"):
+    """Ratchet: a wheel that turns one way only, unless its pawl is lifted.
 
     ================  ======================================================================
     ``name/wheel``    q [rad]: base_T_wheel = rotation_y(q), without end stops
@@ -31,22 +31,22 @@ class Ratchet(Mechanism):
     record            ``teeth``, ``pitch`` = 2π/teeth [rad]
     ================  ======================================================================
 
-    What is one-sided is the speed, so where the wheel may be depends on where it has been, and every position
-    is valid. The pawl is taken to hold anywhere; a real one gives way by up to a tooth. Teeth that pass below
-    the pawl lift it, but not as far as to release the wheel, which is left out of p.
+    The constraint is on the speed, so every position is valid, and the reachable positions depend on the
+    history. The pawl is assumed to hold at every angle; a real one gives way by up to a tooth. Teeth that
+    pass below the pawl lift it too little to release the wheel; p does not include that motion.
 
     Attributes
     ----------
     radius, thickness
-        Of the wheel [m].
+        Dimensions of the wheel [m].
     teeth
-        How many, at least 3.
+        Number of teeth, at least 3.
     speed
-        How fast it may turn [rad/s].
+        Limit of the angular speed [rad/s].
     lift
         Limits of p.
     release
-        The p beyond which the wheel is free [rad].
+        Angle p beyond which the wheel is free [rad].
 
     Raises
     ------
@@ -65,24 +65,26 @@ class Ratchet(Mechanism):
     release: float = 0.2
 
     def __post_init__(self) -> None:
-        self.lengths("radius", "thickness", "speed")
+        self.check_lengths("radius", "thickness", "speed")
         if isinstance(self.teeth, bool) or not isinstance(self.teeth, int) or self.teeth < 3:
-            raise InvalidValueError(f"{self.its('teeth')} are a whole number from 3, not {self.teeth!r}.")
+            raise InvalidValueError(
+                f"{self.describe('teeth')} are a whole number from 3, not {self.teeth!r}."
+            )
         super().__post_init__()
-        self.check_within("release", self.lift)
+        self.check_threshold("release", self.lift)
 
     @property
     def limits(self) -> Mapping[str, Limits]:
-        """That of the pawl; the wheel has none."""
+        """Limits of the pawl; the wheel has none."""
         return {self.path("wheel"): FREE, self.path("pawl"): self.lift}
 
     def locks(self) -> Mapping[str, ConstraintLike]:
-        """Return what the pawl does."""
+        """Return the lock of the wheel."""
         lifted = self.q("pawl") > self.release
-        return {"lock": speed_lock(self.q("wheel"), lifted, speed=self.speed, blocks="backward")}
+        return {"lock": speed_lock(self.q("wheel"), open_if=lifted, max_speed=self.speed, blocks="backward")}
 
-    def known(self) -> tuple[tuple[str, Any], ...]:
-        """Return the teeth."""
+    def dynamics(self) -> tuple[tuple[str, Any], ...]:
+        """Return the number and the pitch of the teeth."""
         return (("teeth", self.teeth), ("pitch", math.tau / self.teeth))
 
     def parts(self) -> Mapping[str, MechanismPart]:

@@ -1,4 +1,4 @@
-"""A screw that moves a nut."""
+"""Screw and nut."""
 
 from __future__ import annotations
 
@@ -16,27 +16,27 @@ from .simple_bodies import DARK, STEEL, YELLOW, box_shape, rod_shape
 
 
 @dataclass(frozen=True, kw_only=True)
-class ScrewAndNut(Mechanism):
-    """A screw that turns in its place, and a nut that cannot turn and so slides along it.
+class ScrewAndNut(Mechanism, document_kind="ScrewAndNut"):
+    """Screw that rotates in a fixed place, and a nut that slides along it without rotation.
 
-    By the screw's angle ``name``, q [rad], with its pitch p and the nut's travel t:
+    With the angle of the screw ``name``, q [rad], its pitch p and the travel t of the nut:
 
         base_T_screw = rotation_z(q),       base_T_nut = translation(0, 0, s)
         s = t - p q/2π  for p > 0,          s = -p q/2π  for p < 0
 
     both from q = 0 to 2πt/|p|. Surprise first: turned to the left, as seen from its end at +z, a right-handed
-    screw pulls the nut *towards* z = 0. So the nut of a right-handed one starts at the far end.
+    screw pulls the nut *towards* z = 0. So the nut of a right-handed screw starts at the far end.
 
     Frames are ``base``, ``screw`` and ``nut``.
 
     Attributes
     ----------
     pitch
-        p, how far the nut goes in one revolution [m]; negative for a left-handed thread.
+        p, displacement of the nut in one revolution [m]; negative for a left-handed thread.
     travel
-        t, from one end of the nut's way to the other [m].
+        t, length of the nut's path [m].
     radius
-        Of the screw [m].
+        Radius of the screw [m].
     velocity
         Limit of |q̇| [rad/s]; None for no limit.
 
@@ -54,15 +54,15 @@ class ScrewAndNut(Mechanism):
     velocity: float | None = 20.0
 
     def __post_init__(self) -> None:
-        self.lengths("travel", "radius")
+        self.check_lengths("travel", "radius")
         if not self.number("pitch"):
-            raise InvalidValueError(f"{self.its('pitch')} is 0, so nothing would move the nut.")
-        check_speed_limit(self.velocity, self.its("velocity"))
+            raise InvalidValueError(f"{self.describe('pitch')} is 0, so nothing would move the nut.")
+        check_speed_limit(self.velocity, self.describe("velocity"))
         super().__post_init__()
 
     @property
     def limits(self) -> Mapping[str, Limits]:
-        """That of q."""
+        """Limits of q."""
         return {self.path(): Limits(0.0, math.tau * self.travel / abs(self.pitch), self.velocity)}
 
     def parts(self) -> Mapping[str, MechanismPart]:

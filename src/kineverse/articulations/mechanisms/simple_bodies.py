@@ -1,4 +1,4 @@
-"""Boxes, rods and panels that mechanisms are drawn with and touched by."""
+"""Boxes, rods and panels for the bodies of mechanisms."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ YELLOW: Rgba = (0.95, 0.77, 0.20, 1.0)
 
 
 def box_shape(size: Vector3, at: Vector3, color: Rgba) -> Shape:
-    """Return a box of that size with its middle at a point [m]."""
+    """Return a box with its centre at a point [m]."""
     return Shape(Box(size), shift(*at), color=color)
 
 
@@ -32,12 +32,12 @@ def rod_shape(start: Vector3, end: Vector3, radius: float, color: Rgba) -> Shape
 
 
 def panel(width: float, height: float, thickness: float, color: Rgba) -> Shape:
-    """Return a panel that stands on the z = 0 plane, from a hinge along z to y = width."""
+    """Return a panel on the plane z = 0 that reaches from a hinge along z to y = width [m]."""
     return box_shape((thickness, width, height), (0.0, width / 2, height / 2), color)
 
 
 def case(size: Vector3, wall: float, color: Rgba, at: Vector3 = (0.0, 0.0, 0.0)) -> tuple[Shape, ...]:
-    """Return the five walls of a box around a point that is open towards -x [m]."""
+    """Return the five walls of a box that is centred at a point and open towards -x [m]."""
     depth, width, height = size
     x, y, z = at
     return (
@@ -53,5 +53,5 @@ def shift(x: float = 0.0, y: float = 0.0, z: float = 0.0) -> Pose:
 
 
 def solid_body(shapes: tuple[Shape, ...]) -> Body:
-    """Return a body that is touched where it is seen."""
+    """Return a body whose visual shapes are its collision shapes."""
     return Body(shapes, tuple(Shape(shape.geometry, shape.origin) for shape in shapes))

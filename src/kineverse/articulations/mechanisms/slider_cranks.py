@@ -17,19 +17,19 @@ from .simple_bodies import BLUE, DARK, PALE, RED, STEEL, box_shape, rod_shape, s
 
 
 @dataclass(frozen=True, kw_only=True)
-class PistonAndRod(Mechanism):
-    """A slider-crank: a piston that a crank moves by a rod, over the whole turn.
+class PistonAndRod(Mechanism, document_kind="PistonAndRod"):
+    """Slider-crank: a crank moves a piston by a rod, over the whole revolution.
 
-    By the crank's angle ``name``, q [rad], with the crank's radius r and the rod's length l > r:
+    With the angle of the crank ``name``, q [rad], its radius r and the length l > r of the rod:
 
         base_T_crank  = rotation_y(q)                                       (the pin is at r along z)
         base_T_piston = translation(0, 0, r cos q + √(l² - r² sin² q))
         rod's angle   = -arcsin(r/l sin q) about y, at the pin
 
-    The root never vanishes, so everything is smooth, dead centres included. The piston's position would not
-    do as a coordinate: it is the same for q and -q.
+    The root is positive, so all of it is smooth, dead centres included. The piston's position cannot be the
+    coordinate: it is the same for q and -q.
 
-    Frames are ``base``, ``crank``, ``rod_shape`` (at the pin, z towards the piston) and ``piston``.
+    Frames are ``base``, ``crank``, ``rod`` (at the pin, z towards the piston) and ``piston``.
 
     Attributes
     ----------
@@ -38,13 +38,13 @@ class PistonAndRod(Mechanism):
     bore
         Diameter of the piston [m].
     turn
-        Limits of q, none but a speed unless given.
+        Limits of q; by default of the speed only.
 
     Raises
     ------
     InvalidValueError
-        For lengths that are not positive, or a rod that is not longer than the crank, so it does not reach
-        half the way round.
+        For lengths that are not positive, or a rod that is not longer than the crank, which cannot complete
+        a revolution then.
     """
 
     main: ClassVar[str] = "piston"
@@ -55,17 +55,17 @@ class PistonAndRod(Mechanism):
     turn: Limits = Limits(velocity=10.0)
 
     def __post_init__(self) -> None:
-        self.lengths("crank", "rod", "bore")
+        self.check_lengths("crank", "rod", "bore")
         if not self.rod > self.crank:
             raise InvalidValueError(
-                f"{self.its('rod')} is longer than its crank, {self.crank:g}, and not {self.rod:g}: the "
+                f"{self.describe('rod')} is longer than its crank, {self.crank:g}, and not {self.rod:g}: the "
                 "crank could not go round."
             )
         super().__post_init__()
 
     @property
     def limits(self) -> Mapping[str, Limits]:
-        """That of q."""
+        """Limits of q."""
         return {self.path(): self.turn}
 
     def parts(self) -> Mapping[str, MechanismPart]:
@@ -106,28 +106,29 @@ class PistonAndRod(Mechanism):
 
 
 @dataclass(frozen=True, kw_only=True)
-class PedalBin(Mechanism):
-    """A bin whose lid a pedal opens; the lid's angle is no multiple of the pedal's.
+class PedalBin(Mechanism, document_kind="PedalBin"):
+    """Pedal bin: a pedal opens the lid, whose angle is a nonlinear function of the pedal's.
 
-    By the pedal's angle ``name``, p [rad], 0 when nobody steps on it. The pedal is a lever about a pivot
-    under the bin, and a rod in guides slides straight up. It has a level slot at either end: in the lower one
-    is a pin of the pedal, at a from its pivot, which lifts the rod by a sin p; in the upper one is a pin of
-    the lid, at b from its hinge, which the rod lifts by b sin of the lid's angle. So
+    The coordinate is the angle of the pedal ``name``, p [rad], 0 at rest. The pedal is a lever about a pivot
+    under the bin, and a guided rod slides straight up. The rod has a horizontal slot at either end. In the
+    lower one is a pin of the pedal, at distance a from its pivot, which lifts the rod by a sin p. In the
+    upper one is a pin of the lid, at distance b from its hinge, which the rod lifts by b sin l, where l is
+    the angle of the lid:
 
-        lid's angle = arcsin(a/b sin p)
+        l = arcsin(a/b sin p)
 
-    which gets steeper towards the end, and is regular as long as a sin p < b.
+    The slope grows towards the end, and is finite as long as a sin p < b.
 
-    Frames are ``base`` (on the floor under the middle), ``pedal``, ``rod_shape`` and ``lid`` (at its hinge).
+    Frames are ``base`` (on the floor under the centre), ``pedal``, ``rod`` and ``lid`` (at its hinge).
 
     Attributes
     ----------
     radius, height
-        Of the bin [m].
+        Dimensions of the bin [m].
     arm
-        a, from the pedal's pivot to the rod [m].
+        a, distance from the pedal's pivot to the rod [m].
     lever
-        b, from the lid's hinge to the rod [m].
+        b, distance from the lid's hinge to the rod [m].
     pedal
         Limits of p, numbers in [0, π/2).
 
@@ -146,19 +147,19 @@ class PedalBin(Mechanism):
     pedal: Limits = Limits(0.0, 0.25, 1.0)
 
     def __post_init__(self) -> None:
-        self.lengths("radius", "height", "arm", "lever")
-        _, upper = self.range_of("pedal", 0.0, math.pi / 2)
+        self.check_lengths("radius", "height", "arm", "lever")
+        _, upper = self.numeric_range("pedal", 0.0, math.pi / 2)
         lift = self.arm * math.sin(upper)
         if not lift < self.lever:
             raise InvalidValueError(
-                f"{self.its('lever')} is {self.lever:g}, and its pedal lifts the rod by {lift:.6g}, which is "
-                "as far or farther: the lid would have to open beyond a right angle."
+                f"{self.describe('lever')} is {self.lever:g}, and its pedal lifts the rod by {lift:.6g}, "
+                "which is as far or farther: the lid would have to open beyond a right angle."
             )
         super().__post_init__()
 
     @property
     def limits(self) -> Mapping[str, Limits]:
-        """That of p."""
+        """Limits of p."""
         return {self.path(): self.pedal}
 
     def parts(self) -> Mapping[str, MechanismPart]:

@@ -66,27 +66,27 @@ class Mounted(Joint):
 
 
 @dataclass(frozen=True, kw_only=True)
-class MountedRevolute(Mounted, Revolute):
+class MountedRevolute(Mounted, Revolute, document_kind="MountedRevolute"):
     """A hinge and a part on it: parent_T_child = origin · rotation(axis, q) · mount."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class MountedScrew(Mounted, Screw):
+class MountedScrew(Mounted, Screw, document_kind="MountedScrew"):
     """A thread and a part on it: parent_T_child = origin · screw(axis, q) · mount."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class MountedCylindrical(Mounted, Cylindrical):
+class MountedCylindrical(Mounted, Cylindrical, document_kind="MountedCylindrical"):
     """A rod in a sleeve and a part on it: parent_T_child = origin · cylindrical(axis, s, φ) · mount."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class MountedBall(Mounted, Ball):
+class MountedBall(Mounted, Ball, document_kind="MountedBall"):
     """A ball in a socket and a part on it: parent_T_child = origin · rotation(quaternion) · mount."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class SlidingPoint(Joint):
+class SlidingPoint(Joint, document_kind="SlidingPoint"):
     """A point in a plane, or anywhere: parent_T_child = origin · translation(x, y, z).
 
     Coordinates are ``name/x``, ``name/y`` and, anywhere, ``name/z`` [m].
@@ -106,7 +106,7 @@ class SlidingPoint(Joint):
         q = tuple(position(name) for name in names)
         constraints: dict[str, Constraint] = {}
         for name, coordinate, (low, high) in zip(names, q, self.ranges, strict=True):
-            constraints.update(Limits(low, high).on(name, coordinate))
+            constraints.update(Limits(low, high).constraints(name, coordinate))
         home = tuple(0.5 * (low + high) for low, high in self.ranges)
         place = translation(*q, *([0.0] * (3 - len(q))))
         return Writes(
@@ -117,7 +117,7 @@ class SlidingPoint(Joint):
 
 
 @dataclass(frozen=True, kw_only=True)
-class FamilyJoint(Joint):
+class FamilyJoint(Joint, document_kind="FamilyJoint"):
     """A joint of a family of one's own: parent_T_child = origin · transform.
 
     Its coordinate is ``name``; of several, each is called like the joint of the family, below the name.
@@ -141,7 +141,7 @@ class FamilyJoint(Joint):
         home = tuple(0.5 * (low + high) for low, high in self.ranges)
         constraints: dict[str, Constraint] = {}
         for name, coordinate, (low, high) in zip(names, q, self.ranges, strict=True):
-            constraints.update(Limits(low, high).on(name, coordinate))
+            constraints.update(Limits(low, high).constraints(name, coordinate))
         return Writes(
             frames={self.child: (self.parent, (self.origin, self.motion.expression(q)))},
             constraints=constraints,

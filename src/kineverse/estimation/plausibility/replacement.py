@@ -12,7 +12,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Any, ClassVar, TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
 
@@ -139,7 +139,7 @@ _FOLLOWS, _GEARED = 3.0, 4.0
 
 
 @dataclass(frozen=True)
-class ReplacedJoint(Operation):
+class ReplacedJoint(Operation, document_kind="Relearned"):
     """A joint that was learned, and what the operation that it stands in for wrote beside its joint.
 
     Attributes
@@ -155,8 +155,6 @@ class ReplacedJoint(Operation):
     before, after
         Where the joint stands in its parent, and the frame on what the joint moves.
     """
-
-    document_kind: ClassVar[str] = "Relearned"
 
     joint: Operation
     record: str | None = None

@@ -4,10 +4,10 @@ A document is one JSON object::
 
     {"format": "kineverse", "version": 1, "nodes": [...], "operations": [...], "sha256": "..."}
 
-``nodes`` holds all expressions of the model in one table, each node made of earlier ones
-(:mod:`.table` says which nodes there are); ``operations`` what every operation read and wrote;
-``sha256`` is the hash of all that (:mod:`.canonical`), and may be missing.
-Reading one runs no code and imports no name. In a ``.kv.msgpack`` file the same is packed (:mod:`.wire`).
+``nodes`` is the table of all expressions of the model, each node made of earlier ones (:mod:`.node_table`
+lists the types); ``operations`` has the reads and writes of every operation; ``sha256`` is the hash of the
+content (:mod:`.encoding`), and is optional. Reading a document runs no code and imports no name. A
+``.kv.msgpack`` file is the same in binary form.
 """
 
 from .opaque_operation import OpaqueOperation

@@ -1,4 +1,4 @@
-"""Bodies as JSON values: shapes, inertia, poses."""
+"""Bodies as JSON values: shapes, inertias, poses."""
 
 from __future__ import annotations
 
@@ -29,9 +29,7 @@ from kineverse.model.body import (
 from .schema import InvalidDocumentError, check_keys, check_list, check_number, check_numbers, check_text
 
 _ROUND: dict[str, Callable[[float, float], Geometry]] = {
-    "cylinder": Cylinder,
-    "capsule": Capsule,
-    "cone": Cone,
+    kind.kind: kind for kind in (Cylinder, Capsule, Cone)
 }
 GEOMETRIES = ("box", *_ROUND, "sphere", "ellipsoid", "mesh")
 INERTIA_NUMBERS = 6
@@ -43,7 +41,7 @@ _POSE = Struct(f"{POSE_NUMBERS}d")
 
 
 def encode_body(body: Body) -> dict[str, Any]:
-    """Return a body as JSON has it."""
+    """Encode a body as a JSON value."""
     result: dict[str, Any] = {
         "visuals": [_encode_shape(s) for s in body.visuals],
         "collisions": [_encode_shape(s) for s in body.collisions],
@@ -59,6 +57,7 @@ def encode_body(body: Body) -> dict[str, Any]:
 
 
 def _encode_shape(shape: Shape) -> dict[str, Any]:
+    """Encode a shape; members with their default values are left out."""
     result = {"geometry": _encode_geometry(shape.geometry), "origin": encode_pose(shape.origin)}
     if shape.name:
         result["name"] = encode_text(shape.name)
@@ -73,8 +72,8 @@ def _encode_geometry(geometry: Geometry) -> dict[str, Any]:
     if type(geometry) is Box:
         return {"box": {"size": encode_numbers(geometry.size)}}
     if type(geometry) is Cylinder or type(geometry) is Capsule or type(geometry) is Cone:
-        kind = type(geometry).__name__.lower()
-        return {kind: {"radius": encode_number(geometry.radius), "length": encode_number(geometry.length)}}
+        sizes = {"radius": encode_number(geometry.radius), "length": encode_number(geometry.length)}
+        return {geometry.kind: sizes}
     if type(geometry) is Sphere:
         return {"sphere": {"radius": encode_number(geometry.radius)}}
     if type(geometry) is Ellipsoid:
@@ -92,22 +91,22 @@ def _encode_geometry(geometry: Geometry) -> dict[str, Any]:
 
 
 def encode_pose(pose: Pose) -> list[float | str]:
-    """Return a pose as JSON has it: the first three rows of its matrix."""
+    """Encode a pose as the 12 numbers of the first three rows of its matrix."""
     return encode_numbers(pose.rows)
 
 
 def encode_numbers(values: Any) -> list[float | str]:
-    """Return numbers as JSON has them."""
+    """Encode numbers as a JSON list."""
     return [v if type(v) is float and -math.inf < v < math.inf else encode_number(v) for v in values]
 
 
 def encode_number(value: Any) -> float | str:
-    """Return a number as JSON has it; infinite ones are texts.
+    """Encode a number as a JSON value; infinities are texts.
 
     Raises
     ------
     FormatError
-        For NaN, and for what is no number.
+        For NaN, and for a value that is no number.
     """
     if isinstance(value, np.generic):
         value = value.item()
@@ -123,7 +122,13 @@ def encode_number(value: Any) -> float | str:
 
 
 def encode_text(value: Any) -> str:
-    """Return a text."""
+    """Return a text after checking that it is one.
+
+    Raises
+    ------
+    FormatError
+        For any other type.
+    """
     if type(value) is not str:
         raise FormatError(f"a text is wanted, not {value!r}")
     return value
@@ -133,12 +138,12 @@ def encode_text(value: Any) -> str:
 
 
 def decode_body(value: Any) -> Body:
-    """Return a body that was written.
+    """Decode a body from its JSON value.
 
     Raises
     ------
-    RefusedError
-        Where it is not what it should be.
+    InvalidDocumentError
+        If the value is no valid body.
     """
     given = check_keys(value, ("visuals", "collisions"), ("inertia",))
     return Body(
@@ -193,12 +198,12 @@ def _decode_vector(value: Any) -> tuple[float, float, float]:
 
 
 def decode_pose(value: Any) -> Pose:
-    """Return a pose that was written.
+    """Decode a pose from its 12 numbers.
 
     Raises
     ------
-    RefusedError
-        For what is none.
+    InvalidDocumentError
+        If the value is no rigid pose.
     """
     rows = check_numbers(value, POSE_NUMBERS)
     try:
@@ -209,5 +214,5 @@ def decode_pose(value: Any) -> Pose:
 
 @lru_cache(1024)
 def _pose(rows: bytes) -> Pose:
-    # The same ones come again and again, and to check a rotation takes a while. As bytes, -0.0 is not 0.0.
+    # Poses repeat, and checking a rotation is slow. As bytes, -0.0 is not 0.0.
     return Pose(_POSE.unpack(rows))

@@ -1,8 +1,9 @@
-"""Budget of work and sizes that a document may cost, checked before it is spent.
+"""Budget of work and limits of size for reading a document.
 
-A text of some kilobytes can ask for a lot of work: arrays of many elements that are repeated by each node
-above them, Newton steps that are made within Newton steps. So reading has a budget of steps, each about what
-one node of an expression costs, and what would go over it is refused. A robot takes some ten thousand.
+A document of some kilobytes can demand a lot of work: arrays of many elements that each node above repeats,
+Newton steps within Newton steps. So reading has a budget of steps, one for about the work of one expression
+node. The reader spends from it before it does the work, and refuses a document that exceeds it. A robot takes
+some ten thousand steps.
 """
 
 from __future__ import annotations
@@ -18,57 +19,57 @@ from .schema import InvalidDocumentError
 
 MAX_NODES = 1 << 22
 MAX_LISTS = 10_000_000
-"""Lists and objects in a document."""
+"""Most lists and objects in a document."""
 MAX_VALUES = 1 << 26
-"""All values in a document."""
+"""Most values in a document."""
 MAX_WORK = 30_000_000
 MAX_DEPTH = 100
-"""Lists and objects inside one another, among data and parameters."""
+"""Deepest nesting of lists and objects in data and parameters."""
 MAX_NESTING = 400
-"""Nodes with a gradient of their own inside one another; what works on them follows them down."""
+"""Deepest nesting of nodes with a gradient of their own; algorithms on them are recursive."""
 MAX_COMPOSITIONS = 12
-"""Compositions inside one another; each doubles what the gradient is made of."""
+"""Deepest nesting of compositions; each doubles the size of the gradient."""
 MAX_ORDER = 1000
 MAX_DIMENSIONS = 16
 MAX_LENGTH = 1 << 24
 MAX_STEPS = 100
-"""Newton steps."""
+"""Most Newton steps of an implicit function."""
 MAX_PATH = 16
-"""Gradient entries of gradient entries that a ``read`` node follows."""
+"""Longest path of nested gradient entries in a ``read`` node."""
 MAX_QUESTIONS = 10_000
 MAX_ELEMENTS = 10_000
-"""Elements of a node with a gradient of its own, those of all its arguments together."""
+"""Most elements in all arguments of a node with a gradient of its own."""
 MAX_NORM = 1000
-"""Elements under a norm, each of which may have a gradient by as many symbols."""
+"""Most elements of the argument of a norm, each of which may have a gradient by as many symbols."""
 MAX_PIECES = 100_000
-"""Coefficients of a piecewise polynomial, counted once for each element of its argument."""
+"""Most coefficients of a piecewise polynomial, times the elements of its argument."""
 COST_OF_SCALAR, COST_OF_ELEMENT = 5, 200
-"""What nodes with a gradient of their own cost, scalars and each element of an array."""
+"""Cost of a node with a gradient of its own: of a scalar, and of each element of an array."""
 COST_OF_NODE_BELOW = 20
-"""What a node costs each time that something made of it is looked at."""
+"""Cost of a node for each traversal of an expression that contains it."""
 COST_OF_RATE = 20
-"""What a rate costs for each coordinate whose rate leads to it."""
+"""Cost of a rate for each coordinate whose rate depends on it."""
 COST_OF_NAME = 10
-"""What a name costs for each operation that listed it."""
+"""Cost of a name for each operation that listed it."""
 COST_OF_FRAME = 5
-"""What a frame costs each time that a trace asks for a pose, and it is on the way."""
+"""Cost of a frame for each pose in a trace whose kinematic chain contains it."""
 COST_OF_STEP = 1000
-"""What a Newton step costs, beside what is in it."""
+"""Cost of a Newton step in addition to that of its residual."""
 
 
 class Budget:
-    """How much work the reading of one document may still be."""
+    """Work that remains for the reading of one document, in steps."""
 
     def __init__(self) -> None:
         self._left = MAX_WORK
 
     def spend(self, steps: int) -> None:
-        """Note work that is going to be done.
+        """Spend steps on work before it is done.
 
         Raises
         ------
-        RefusedError
-            If it is too much.
+        InvalidDocumentError
+            If fewer remain.
         """
         self._left -= steps
         if self._left < 0:
@@ -78,12 +79,12 @@ class Budget:
 
 
 def check_counts(content: bytes) -> None:
-    """Refuse a text of JSON that has too many parts, before it is parsed.
+    """Check the number of parts of a JSON text before it is parsed.
 
     Raises
     ------
-    RefusedError
-        If it has.
+    InvalidDocumentError
+        If there are too many.
     """
     lists = content.count(b"[") + content.count(b"{")
     if lists > MAX_LISTS:
@@ -95,24 +96,24 @@ def check_counts(content: bytes) -> None:
 
 
 def check_depth(depth: int) -> None:
-    """Refuse data that lie in too many others.
+    """Check the nesting depth of data.
 
     Raises
     ------
-    RefusedError
-        If they do.
+    InvalidDocumentError
+        If it exceeds ``MAX_DEPTH``.
     """
     if depth > MAX_DEPTH:
         raise InvalidDocumentError(f"data are nested too deeply, in more than {MAX_DEPTH} others")
 
 
 def spend_rate_coupling(rates: Iterable[tuple[Symbol, Any]], budget: Budget) -> None:
-    """Spend what it costs to carry every coordinate, each with all that its rate is made of.
+    """Spend the cost of carrying every coordinate, each with all rates that its own depends on.
 
     Raises
     ------
-    RefusedError
-        If it is too much.
+    InvalidDocumentError
+        If it exceeds the budget.
     """
     given = dict(rates)
     leads = {
@@ -128,6 +129,7 @@ def spend_rate_coupling(rates: Iterable[tuple[Symbol, Any]], budget: Budget) -> 
 
 
 def _symbols_of_rate(entry: Any) -> set[Symbol]:
+    """Return the symbols of a rate, with the positions of its speeds."""
     if isinstance(entry, Expression):
         return collect_symbols(entry)
     found = {speed.position for speed, _ in entry}

@@ -1,8 +1,9 @@
 """Canonical JSON text of a document, its hash, and its binary form (msgpack).
 
-A document is written in one way only. Its hash is SHA-256 over that text, in UTF-8, without the hash itself
-and without line breaks. Who lays the JSON out anew does not change what it says: then the hash is made of
-what was read. The order of names (of frames in what an operation writes, say) is part of the content.
+The text of a document is canonical. Its hash is SHA-256 over that text, in UTF-8, without the hash itself and
+without line breaks. Another layout of the same JSON keeps the content, so the reader then computes the hash
+from the parsed values. The order of names (of frames in the writes of an operation, say) is part of the
+content.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ HASH = "sha256"
 _LEAD, _TAIL = f',\n"{HASH}":"', '"}\n'
 _DIGITS = 64
 
-# The members that the format names, in the order in which they are written, whichever object they are in.
+# Members of the format in the order in which they are written, for all objects.
 _ORDER = (
     *("format", "version", "nodes", "operations"),
     *("tag", "kind", "parameters", "reads", "existence", "value", "listing", "questions", "writes"),
@@ -32,7 +33,7 @@ _ORDER = (
     *("size", "radius", "length", "radii", "uri", "scale", "folder"),
 )
 _RANK = {name: i for i, name in enumerate(_ORDER)}
-# Their members are names that somebody gave.
+# Objects whose members have names of the model.
 _NAMED = frozenset(("parameters", "fields", *KINDS))
 _WITHOUT_OBJECTS = frozenset(("nodes", "factors"))
 
@@ -40,12 +41,12 @@ dump_json = json.JSONEncoder(ensure_ascii=False, allow_nan=False, separators=(",
 
 
 def append_hash(body: str) -> str:
-    """Return the text of a document, given all of it but the hash and the closing brace."""
+    """Return the text of a document from its text without hash and closing brace."""
     return f"{body}{_LEAD}{_digest(body.encode())}{_TAIL}"
 
 
 def read_hash(text: str) -> str:
-    """Return the hash that stands in a text that was written here."""
+    """Return the hash in a canonical text."""
     return text[-len(_TAIL) - _DIGITS : -len(_TAIL)]
 
 
@@ -55,16 +56,16 @@ def check_hash(claim: Any, content: bytes, given: dict[str, Any]) -> None:
     Parameters
     ----------
     claim
-        What stands in the document.
+        Hash in the document.
     content
-        All of its text, or nothing if it was none.
+        Text of the document; empty for a packed one.
     given
-        What was read from it, an object.
+        Parsed document.
 
     Raises
     ------
-    RefusedError
-        If its content is not what it was when the hash was made.
+    InvalidDocumentError
+        If the hash is not that of the content.
     """
     if type(claim) is not str or len(claim) != _DIGITS or set(claim) - set("0123456789abcdef"):
         raise InvalidDocumentError(f"{HASH!r} is {_DIGITS} digits from 0 to f")
@@ -95,7 +96,7 @@ def _digest_of(tree: Any) -> str:
 
 
 def _order_members(value: Any) -> Any:
-    """Return a value of JSON with the members that the format names in the order of the writer."""
+    """Return a JSON value with the members of the format in canonical order."""
     if type(value) is list:
         return [_order_members(item) for item in value]
     if type(value) is not dict:
@@ -113,7 +114,7 @@ def _order_named(value: Any) -> Any:
     return {key: _order_members(item) for key, item in value.items()} if type(value) is dict else value
 
 
-# The first bytes of lists and maps; they also occur inside of numbers and texts, so this counts too many.
+# First bytes of lists and maps; they also occur inside of numbers and texts, so the count is an upper bound.
 _LISTS = bytes((*range(0x80, 0xA0), 0xDC, 0xDD, 0xDE, 0xDF))
 
 
@@ -130,12 +131,12 @@ def pack_document(text: str) -> bytes:
 
 
 def unpack_document(data: bytes) -> Any:
-    """Return the tree of a packed document.
+    """Return the JSON value of a packed document.
 
     Raises
     ------
-    RefusedError
-        If it is no msgpack, has too many parts, or is not packed as it should be.
+    InvalidDocumentError
+        If it is no msgpack, has too many parts, or is not packed in the shortest form.
     MissingDependencyError
         If the package for it is not installed.
     """
@@ -148,7 +149,7 @@ def unpack_document(data: bytes) -> Any:
         tree = msgpack.decode(data)
     except (ValueError, OverflowError) as error:
         raise InvalidDocumentError(f"it is not msgpack: {error}") from None
-    # A key that occurs twice is lost when it is read, so there is less then.
+    # A duplicate key is lost on decoding, so the text encoded again is shorter.
     if not isinstance(tree, dict) or msgpack.encode(tree) != data:
         raise InvalidDocumentError(
             "it is no map, or has a key twice, or numbers and lengths are not in their shortest form, or "

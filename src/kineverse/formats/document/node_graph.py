@@ -29,29 +29,28 @@ from .schema import InvalidDocumentError, check_integer, check_length, check_lis
 
 
 class NodeGraph:
-    """The expressions of a document, by their place in its table.
+    """Expressions of a document, by their place in its node table.
 
     Parameters
     ----------
     prefix
-        Put in front of the paths of all symbols, with a slash.
+        Prefix of the paths of all symbols, without the slash.
 
     Attributes
     ----------
     sx, shapes, depths
-        Of every node: its graph, its shape, and how many nodes with a gradient of their own are inside one
-        another there.
-    has_answers
-        Whether there are ``read`` nodes, which belong into traces.
+        CasADi graph and shape of every node, and the nesting depth of nodes with a gradient of their own.
+    has_read_nodes
+        True if there are ``read`` nodes, which belong into traces.
     budget
-        What all of them may cost.
+        Budget for the work of reading.
     work
-        What implicit functions cost when they are written out, by their key.
+        Cost of implicit functions with their Newton steps written out, by key.
     """
 
     def __init__(self, prefix: str | None) -> None:
         self.before = f"{prefix}/" if prefix else ""
-        self.has_answers = False
+        self.has_read_nodes = False
         self.budget = Budget()
         self.work: dict[bytes, int] = {}
         self.sx: list[Any] = []
@@ -62,15 +61,15 @@ class NodeGraph:
         self._below: dict[Node, int] = {}
         self._compositions: dict[Node, int] = {}
 
-    # -- what is there -------------------------------------------------------------------------------------
+    # -- access --------------------------------------------------------------------------------------------
 
     def expression(self, ref: Any) -> Expression:
         """Return the expression at a place of the table."""
-        place = self.at(ref)
+        place = self.check_ref(ref)
         known = self._expressions[place]
         if known is None:
             sx, nodes = self.sx[place], NO_NODES
-            # Whoever asks for its symbols, or compares it, follows all of it.
+            # Finding its symbols and comparing it traverse all of it.
             self.budget.spend(ca.n_nodes(sx))
             if self.depths[place]:
                 owners = self._owners
@@ -82,11 +81,11 @@ class NodeGraph:
 
     def scalar(self, ref: Any) -> Expression:
         """Return the scalar at a place of the table."""
-        return self.expression(self.scalar_at(ref))
+        return self.expression(self.check_scalar_ref(ref))
 
     def symbol(self, ref: Any, least: int = 0) -> Symbol:
         """Return the symbol at a place of the table, of order ``least`` or more."""
-        found = self._expressions[self.at(ref)]
+        found = self._expressions[self.check_ref(ref)]
         if not isinstance(found, Symbol) or found.order < least:
             what = "the derivative of a symbol" if least else "a symbol"
             raise InvalidDocumentError(f"node {ref} should be {what}")
@@ -104,24 +103,24 @@ class NodeGraph:
         return list(result.items())
 
     def owner(self, expression: Expression) -> Node | None:
-        """Return the node that a scalar expression is, None if it is anything else."""
+        """Return the node of a scalar expression that is one node, None for any other expression."""
         return None if expression.shape else self._owners.get(expression._sx.element_hash())
 
-    def at(self, ref: Any) -> int:
-        """Return the place of an earlier node."""
+    def check_ref(self, ref: Any) -> int:
+        """Return the place of an earlier node after checking that it is one."""
         if type(ref) is not int or not 0 <= ref < len(self.sx):
             raise InvalidDocumentError(f"{describe_value(ref)} is not the place of an earlier node")
         return ref
 
-    def scalar_at(self, ref: Any) -> int:
-        """Return the place of an earlier node that is a scalar."""
-        place = self.at(ref)
+    def check_scalar_ref(self, ref: Any) -> int:
+        """Return the place of an earlier node after checking that it is a scalar."""
+        place = self.check_ref(ref)
         if self.shapes[place]:
             raise InvalidDocumentError(f"node {place} should be a scalar, and has shape {self.shapes[place]}")
         return place
 
     def shape(self, given: Any) -> layout.ArrayShape:
-        """Return a shape, before anything has it."""
+        """Return a shape after checking its size against limits and budget."""
         if len(check_list(given, "a shape")) > MAX_DIMENSIONS:
             raise InvalidDocumentError(f"more than {MAX_DIMENSIONS} dimensions")
         shape = tuple(check_integer(length, MAX_LENGTH) for length in given)
@@ -132,7 +131,7 @@ class NodeGraph:
         self.budget.spend(math.prod(shape))
         return shape
 
-    # -- what comes ----------------------------------------------------------------------------------------
+    # -- construction --------------------------------------------------------------------------------------
 
     def add(
         self, sx: Any, shape: layout.ArrayShape, depth: int, expression: Expression | None = None
@@ -144,8 +143,8 @@ class NodeGraph:
         self._expressions.append(expression)
 
     def add_alike(self, kind: type[Node], refs: list[Any], options: tuple[Any, ...] = ()) -> None:
-        """Add a node with a gradient of its own, whose arguments and itself are of one shape."""
-        shapes = {self.shapes[self.at(ref)] for ref in refs}
+        """Add a node with a gradient of its own that has the shape of its arguments."""
+        shapes = {self.shapes[self.check_ref(ref)] for ref in refs}
         if len(shapes) != 1:
             raise InvalidDocumentError("all parts should be of one shape")
         self.add_opaque(kind, refs, shapes.pop(), options)
@@ -158,9 +157,9 @@ class NodeGraph:
         options: tuple[Any, ...],
         inside: Iterable[Any] = (),
     ) -> None:
-        """Add a node with a gradient of its own, in whose options there may be other nodes still."""
-        # Asked before it is made: what makes the node follows it down already.
-        parts = [self.at(ref) for ref in (*refs, *inside)]
+        """Add a node with a gradient of its own; ``inside`` are the nodes in its options."""
+        # Checked before construction, which already traverses the arguments.
+        parts = [self.check_ref(ref) for ref in (*refs, *inside)]
         depth = 1 + max((self.depths[part] for part in parts), default=0)
         if depth > MAX_NESTING:
             raise InvalidDocumentError(
@@ -175,7 +174,19 @@ class NodeGraph:
         self.keep(made, depth, 1 + self._count(below), compositions)
 
     def keep(self, expression: Expression, depth: int, below: int = 1, compositions: int = 0) -> None:
-        """Add what is a node with a gradient of its own, made of so many, with so many in one another."""
+        """Add the expression of a node with a gradient of its own.
+
+        Parameters
+        ----------
+        expression
+            The expression, of one node.
+        depth
+            Nesting depth of nodes with a gradient of their own.
+        below
+            Number of such nodes in it, itself included.
+        compositions
+            Nesting depth of compositions.
+        """
         (node,) = expression._nodes
         self._owners.update(dict.fromkeys(node.elements, node))
         self._below[node] = below
@@ -183,7 +194,7 @@ class NodeGraph:
         self.add(expression._sx, node.shape, depth, expression)
 
     def check_elements(self, shape: layout.ArrayShape, arguments: int = 1) -> None:
-        """Refuse a node with a gradient of its own that has too many elements in so many arguments."""
+        """Check the number of elements in all arguments of a node with a gradient of its own."""
         size = math.prod(shape) * max(arguments, 1)
         if size > MAX_ELEMENTS:
             raise InvalidDocumentError(
@@ -192,5 +203,5 @@ class NodeGraph:
         self.budget.spend((COST_OF_ELEMENT if shape else COST_OF_SCALAR) * size)
 
     def _count(self, nodes: Iterable[Node]) -> int:
-        """Return how many nodes there are in and below these, or a little more."""
+        """Return an upper bound of the number of nodes in and below these."""
         return min(sum(map(self._below.__getitem__, nodes)), len(self._below))

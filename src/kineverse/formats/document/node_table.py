@@ -5,11 +5,11 @@ Every node is a list that begins with its type; ``ref`` is the place of an earli
 ====================================================================  =====================================
 node                                                                  meaning
 ====================================================================  =====================================
-``["constant", encode_float]``                                              a number, ``"inf"`` or ``"-inf"``
+``["constant", number]``                                              a number, ``"inf"`` or ``"-inf"``
 ``["symbol", path, order, role]``                                     a symbol; a parameter has its value
                                                                       behind the role
 ``["elementary", name, ref, ...]``                                    a function of scalars
-                                                                      (:mod:`.elementary`)
+                                                                      (:mod:`.node_types`)
 ``["element", ref, index]``                                           an element of an array, in C order
 ``["matrix", shape, [ref, ...]]``                                     an array, in C order; null is a zero
                                                                       that is not stored
@@ -20,19 +20,17 @@ node                                                                  meaning
 ``["extremum", "min", ref, ref, ...]``
 ``["norm", ref]``                                                     the Euclidean norm of a vector
 ``["piecewise", ref, periodic, [knot, ...], [[c0, c1, ...], ...]]``   a piecewise polynomial, elementwise
-``["carried", symbol, [[symbol, [[speed, ref], ...]], ...]]``         a coordinate with the rate table that
-                                                                      says how it moves
+``["carried", symbol, [[symbol, [[speed, ref], ...]], ...]]``         a coordinate with its rate table
 ``["composed", ref, [[symbol, ref], ...]]``                           a carried coordinate after a
                                                                       substitution
 ``["dependent", ref, symbol]``                                        a coordinate that is an expression of
                                                                       others
 ``["implicit", name, [symbol, ...], [symbol, ...], ref, [row, ...],   unknowns as a function of inputs:
-ref, steps, [ref, ...], [[lower, upper], ...]]``                      residual, its rows that are solved,
-                                                                      seed, Newton steps, the inputs here, and
-                                                                      for each input where the function holds,
-                                                                      left out if that is everywhere
-``["read", question, part, shape, [[symbol, trends], ...]]``          in traces: a part of the answer to a
-                                                                      question, or an entry of its gradient
+ref, steps, [ref, ...], [[lower, upper], ...]]``                      residual, rows to solve, seed, Newton
+                                                                      steps, arguments, and the domain of
+                                                                      each input, left out if unbounded
+``["read", question, part, shape, [[symbol, trends], ...]]``          in traces: a part of the result of a
+                                                                      query, or an entry of its gradient
 ====================================================================  =====================================
 """
 
@@ -67,7 +65,7 @@ _Leaf = tuple["Symbol | Node", int]
 
 
 class NodeTable:
-    """The nodes of expressions, each followed by what is made of it; :meth:`ref` says where one is.
+    """Topologically sorted table of the nodes of expressions; :meth:`ref` returns the place of one.
 
     Equal parts are one node, in the order in which the expressions need them: equal models have equal texts.
 
@@ -92,7 +90,7 @@ class NodeTable:
         self._known: dict[int, int] = {}
 
     def ref(self, expression: Expression) -> int:
-        """Return the place of an expression that was announced, or of any symbol."""
+        """Return the place of an expression given to the constructor, or of any symbol."""
         if isinstance(expression, Symbol):
             return self._symbol(expression)
         known = self._known.get(id(expression))
@@ -213,7 +211,8 @@ class NodeTable:
             "[" + ",".join(str(self.ref(s)) for s in symbols) + "]" for symbols in (f.unknowns, f.inputs)
         )
         rows = "[" + ",".join(map(str, f.rows)) + "]"
-        return f"{encode_string(f.name)},{unknowns},{inputs},{self.ref(f.residual)},{rows},{self.ref(f.seed)},{f.steps}"
+        residual, seed = self.ref(f.residual), self.ref(f.seed)
+        return f"{encode_string(f.name)},{unknowns},{inputs},{residual},{rows},{seed},{f.steps}"
 
     def _pairs(self, symbols: Sequence[Symbol], refs: Sequence[int]) -> str:
         pairs = (f"[{self._symbol(s)},{ref}]" for s, ref in zip(symbols, refs, strict=True))
@@ -233,12 +232,12 @@ class NodeTable:
 
 
 class _Program:
-    """CasADi's own program for all elements of expressions, every shared part once.
+    """CasADi's program for all elements of expressions, with every common subexpression once.
 
     Attributes
     ----------
     steps
-        What is computed: a number, a leaf (symbol or node, element), or (function, earlier steps ...).
+        Steps of the program: a number, a leaf (symbol or node, element), or (function, earlier steps ...).
     elements
         By ``id`` of an expression: the places of its stored elements in C order, and their steps.
     """
@@ -270,7 +269,7 @@ class _Program:
             offset += len(places)
 
     def _run(self, function: ca.Function, leaf_of: list[_Leaf]) -> list[int]:
-        """Follow the program, whose memory is used over and over, and return the steps of its outputs."""
+        """Trace the program, which reuses its memory, and return the steps of its outputs."""
         operation, arguments = function.instruction_id, function.instruction_input
         results = function.instruction_output
         steps = self.steps
@@ -298,7 +297,7 @@ def _encode_floats(values: Sequence[float]) -> str:
 
 
 def encode_float(value: float) -> str:
-    """Return a number as JSON that is read back as the same bits.
+    """Encode a number as JSON text that is read back as the same bits.
 
     Raises
     ------

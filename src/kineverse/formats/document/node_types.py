@@ -104,15 +104,15 @@ ELEMENTARY_NAMES: dict[int, str] = {code: name for name, code in (*UNARY.items()
 
 
 def read_implicit(graph: NodeGraph, node: list[Any]) -> None:
-    """Add an implicit function at some inputs."""
-    # Where it holds is said by those that are known to hold within bounds, and by none of earlier versions.
+    """Add an implicit function applied to arguments."""
+    # Documents of earlier versions have no domain, and neither has a function that holds everywhere.
     _, label, unknowns, inputs, residual, rows, seed, steps, arguments, *domain = check_length(
         node, 10 if len(node) > 9 else 9
     )
     x = tuple(graph.symbol(ref) for ref in check_list(unknowns, "the unknowns"))
     u = tuple(graph.symbol(ref) for ref in check_list(inputs, "the inputs"))
     r, first = graph.expression(residual), graph.expression(seed)
-    # Asked before it is made, as who makes it asks for symbols, and so for values, and so takes the steps.
+    # Spent before construction, which evaluates the function and so takes the steps.
     work = _newton_work(graph, r, x, check_integer(steps, MAX_STEPS))
     graph.budget.spend(work)
     graph.check_elements(r.shape)
@@ -131,7 +131,7 @@ def read_implicit(graph: NodeGraph, node: list[Any]) -> None:
     graph.work[function.key] = work
     if len(check_list(arguments, "the arguments")) != len(u):
         raise InvalidDocumentError(f"{len(arguments)} arguments for {len(u)} inputs")
-    refs = [graph.scalar_at(ref) for ref in arguments]
+    refs = [graph.check_scalar_ref(ref) for ref in arguments]
     graph.add_opaque(Implicit, refs, (len(x),), (function,), (residual, seed))
 
 
@@ -141,10 +141,10 @@ def _domain_interval(ends: Any) -> tuple[float, float]:
 
 
 def _newton_work(graph: NodeGraph, residual: Expression, unknowns: tuple[Symbol, ...], steps: int) -> int:
-    """Return about how many nodes the value has when all Newton steps are written out.
+    """Estimate the number of nodes of an implicit function with all Newton steps written out.
 
-    Each step has the residual and its derivatives by the unknowns, and the solution of a linear system. An
-    implicit function inside of it that has the unknowns among its inputs is written out in each step again.
+    Each step has the residual, its derivatives by the unknowns and the solution of a linear system. An
+    implicit function inside, whose arguments contain the unknowns, is written out in each step again.
     """
     n = len(unknowns)
     size = ca.n_nodes(residual._sx)
@@ -161,12 +161,12 @@ def _arguments_of(node: Node) -> tuple[Expression, ...]:
 
 
 def read_node(graph: NodeGraph, node: Any) -> None:
-    """Add the next node of a table.
+    """Add the next node of a table to the graph.
 
     Raises
     ------
-    RefusedError
-        If it is not what it should be.
+    InvalidDocumentError
+        If the node is invalid.
     """
     if type(node) is not list or not node or type(node[0]) is not str:
         raise InvalidDocumentError("a node is a list that begins with its type")
@@ -199,13 +199,13 @@ def _elementary(graph: NodeGraph, node: list[Any]) -> None:
     sx, depths = graph.sx, graph.depths
     function = node[1] if len(node) > 2 and type(node[1]) is str else ""
     if function in BINARY:
-        a, b = map(graph.scalar_at, check_length(node, 4)[2:])
+        a, b = map(graph.check_scalar_ref, check_length(node, 4)[2:])
         if function == "pow" and Power.is_needed(sx[a], sx[b]):
             graph.add_alike(Power, node[2:])
             return
         result, depth = ca.SX.binary(BINARY[function], sx[a], sx[b]), max(depths[a], depths[b])
     elif function in UNARY:
-        a = graph.scalar_at(check_length(node, 3)[2])
+        a = graph.check_scalar_ref(check_length(node, 3)[2])
         result, depth = ca.SX.unary(UNARY[function], sx[a]), depths[a]
     else:
         raise InvalidDocumentError(
@@ -218,7 +218,7 @@ def _elementary(graph: NodeGraph, node: list[Any]) -> None:
 
 def _element(graph: NodeGraph, node: list[Any]) -> None:
     _, ref, index = check_length(node, 3)
-    place = graph.at(ref)
+    place = graph.check_ref(ref)
     shape = graph.shapes[place]
     size = math.prod(shape)
     if not shape or not size:
@@ -233,7 +233,7 @@ def _matrix(graph: NodeGraph, node: list[Any]) -> None:
     if math.prod(shape) != len(check_list(refs, "the elements")):
         raise InvalidDocumentError(f"{len(refs)} elements do not fill the shape {shape}")
     stored = [i for i, ref in enumerate(refs) if ref is not None]
-    places = [graph.scalar_at(refs[i]) for i in stored]
+    places = [graph.check_scalar_ref(refs[i]) for i in stored]
     elements = ca.vertcat(*(graph.sx[p] for p in places)) if places else ca.SX(0, 1)
     column = ca.SX(ca.Sparsity(len(refs), 1, [0, len(stored)], stored), elements)
     rows, columns = layout.rows_and_columns(shape)
@@ -284,7 +284,7 @@ def _extremum(graph: NodeGraph, node: list[Any]) -> None:
 
 def _norm(graph: NodeGraph, node: list[Any]) -> None:
     (ref,) = check_length(node, 2)[1:]
-    shape = graph.shapes[graph.at(ref)]
+    shape = graph.shapes[graph.check_ref(ref)]
     if len(shape) != 1 or not shape[0]:
         raise InvalidDocumentError(f"the norm is that of a vector, not of shape {shape}")
     if shape[0] > MAX_NORM:
@@ -296,8 +296,8 @@ def _piecewise(graph: NodeGraph, node: list[Any]) -> None:
     _, ref, periodic, knots, pieces = check_length(node, 5)
     table = [check_numbers(piece) for piece in check_list(pieces, "pieces")]
     options = check_pieces(check_type(bool, periodic, "true or false"), check_numbers(knots), table)
-    # All of the table is looked at for each element.
-    work = sum(map(len, table)) * math.prod(graph.shapes[graph.at(ref)])
+    # Each element evaluates the whole table.
+    work = sum(map(len, table)) * math.prod(graph.shapes[graph.check_ref(ref)])
     if work > MAX_PIECES:
         raise InvalidDocumentError(f"{work} coefficients, for all elements together, more than {MAX_PIECES}")
     graph.budget.spend(work)
@@ -317,7 +317,7 @@ def _carried(graph: NodeGraph, node: list[Any]) -> None:
     if coordinate not in rows:
         raise InvalidDocumentError(f"the table has no row for '{coordinate}'")
     inside = [entry for _, row in table for _, entry in row]
-    # As a model has it, and it is written: what other rows say is put into this one, and left out then.
+    # The form that models have and write: rows of other coordinates are substituted into this one.
     graph.add_opaque(Carried, [ref], (), (Rates(rows).closure(coordinate),), inside)
 
 
@@ -334,7 +334,7 @@ def _composed(graph: NodeGraph, node: list[Any]) -> None:
 
 def _dependent(graph: NodeGraph, node: list[Any]) -> None:
     _, ref, coordinate = check_length(node, 3)
-    graph.add_opaque(Dependent, [graph.scalar_at(ref)], (), (graph.symbol(coordinate),))
+    graph.add_opaque(Dependent, [graph.check_scalar_ref(ref)], (), (graph.symbol(coordinate),))
 
 
 def _read(graph: NodeGraph, node: list[Any]) -> None:
@@ -349,7 +349,7 @@ def _read(graph: NodeGraph, node: list[Any]) -> None:
     graph.check_elements(shape)
     question, part = check_integer(question, MAX_QUESTIONS), check_integer(part, MAX_QUESTIONS)
     graph.keep(ReadNode.empty(shape, question, part, tuple(path)), 1)
-    graph.has_answers = True
+    graph.has_read_nodes = True
 
 
 NODE_TYPES: Mapping[str, Callable[[NodeGraph, list[Any]], None]] = MappingProxyType(
@@ -375,4 +375,4 @@ NODE_TYPES: Mapping[str, Callable[[NodeGraph, list[Any]], None]] = MappingProxyT
         "read": _read,
     }
 )
-"""All types of nodes, and how they are read."""
+"""Readers of all node types, by the name of the type."""

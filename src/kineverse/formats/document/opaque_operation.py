@@ -17,35 +17,34 @@ from .parameters import rebuild_parameter
 
 @dataclass(frozen=True)
 class OpaqueOperation(Operation):
-    """An operation from a document.
+    """Operation from a document, without the class of the original.
 
-    While what it reads is what the original read, it writes what the original wrote, to the last bit. When
-    that changes, it is run again by its trace; if it has none, it is *frozen*, and such a change is refused.
-    Then, or when the change is one that the original decided by, replace it by an operation of its class, in
-    the same edit.
+    While its reads are unchanged, it writes what the original wrote, to the last bit. When a read changes, it
+    is run again by its trace. Without a trace it is *frozen*, and the change is refused. Then, or if the
+    original branched on the changed value, replace it by an operation of its class in the same edit.
 
     Attributes
     ----------
     kind
-        Name of the class that wrote this originally.
+        Frozen name of the original's class.
     given
-        What that was made with, by name, see :attr:`parameters`.
+        Encoded constructor arguments by name, see :attr:`parameters`.
     reads
-        The cells (kind, name) that were looked at, and how closely.
+        Cells (kind, name) that were read, with the kind of access.
     listings
-        Kinds of which all names were listed, with these.
+        Kinds of which all names were listed, with these names.
     writes
-        What it writes, by cell, in order.
+        Values it writes, by cell, in order.
     trace
-        What it computes from what it reads.
+        Writes as expressions of the reads.
     frozen
-        Why there is no trace though it read values; empty if there is one, or no need for one.
+        Reason for a missing trace of an operation that read values, else empty.
     seen
-        What the cells contained.
+        Values of the cells that were read.
     scope
-        What all names of the document begin with.
+        Prefix of all names of the document.
     overrides
-        Whether it writes over what operations before it in the document wrote.
+        True if it overwrites writes of operations before it in the document.
     """
 
     kind: str
@@ -61,22 +60,22 @@ class OpaqueOperation(Operation):
 
     @property
     def parameters(self) -> dict[str, Any]:
-        """What the original was made with, by name: ``kv.CloseLoop(**operation.parameters)`` makes it anew.
+        """Constructor arguments of the original: ``kv.CloseLoop(**operation.parameters)`` rebuilds it.
 
-        Names in it are as they were saved, without a prefix that the document was loaded under.
+        Names in them are as they were saved, without the prefix that the document was loaded under.
         """
         writes = {f"{kind}/{name}": value for (kind, name), value in self.writes}
         return {name: rebuild_parameter(value, writes) for name, value in self.given.items()}
 
     def apply(self, model: ReadRecorder) -> Writes:
-        """Write what the original wrote, or would write now.
+        """Write what the original wrote, or what its trace computes from changed reads.
 
         Raises
         ------
         UnknownNameError
-            If something it was made from does not exist any more.
+            If a value that the original read does not exist any more.
         ModelError
-            If something it was made from has changed in a way that it cannot follow.
+            If a read has changed in a way that the trace cannot follow.
         """
         model = self._in_scope(model)
         changed = self._changed(model)
@@ -102,13 +101,13 @@ class OpaqueOperation(Operation):
         return f" Its parameters say from what, in names that lack '{self.scope}'."
 
     def _in_scope(self, model: ReadRecorder) -> ReadRecorder:
-        """Return the reader without the names of others, if the document has a prefix of its own."""
+        """Return a reader that lists only names below the document's prefix, if it has one."""
         if not self.scope:
             return model
         return model.restricted(self.scope)
 
     def _changed(self, model: ReadRecorder) -> list[str]:
-        """Look at what the original looked at, and return what is different."""
+        """Read what the original read, and return the names of what has changed."""
         changed = []
         for kind, names in self.listings:
             if tuple(model.list_names(kind)) != names:
@@ -122,7 +121,7 @@ class OpaqueOperation(Operation):
         return changed
 
     def _before(self, model: ReadRecorder) -> ReadRecorder:
-        """Return a reader of what the original read; what it did not read cannot have mattered to it."""
+        """Return a reader with the values that the original read; the rest cannot have mattered to it."""
         return model.replaced(self.seen, dict(self.listings))
 
     @cached_property
@@ -130,5 +129,5 @@ class OpaqueOperation(Operation):
         return Writes.of(dict(self.writes))
 
     def default_tag(self) -> str:
-        """Return the kind and the first name it writes."""
+        """Return the kind and the name of the first write."""
         return f"{self.kind} {self.writes[0][0][1]}" if self.writes else self.kind

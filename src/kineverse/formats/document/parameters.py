@@ -1,9 +1,9 @@
-"""What an operation was made with, as JSON values and back; for people, for differences, and to make it anew.
+"""Parameters of operations as JSON values, and the frozen names of classes in documents.
 
-Parameters are data as under ``data``, and beside these poses (``{"pose": [12 numbers]}``), mappings
-(``{"mapping": [[key, value], ...]}``), values of dataclasses (``{"record": name, "fields": {...}}``), what
-the operation also wrote (``{"written": "frames/door"}``), and, for all else, its type
-(``{"unwritten": name}``).
+Parameters document an operation, are compared in differences, and rebuild it. They are data as under
+``data``, poses (``{"pose": [12 numbers]}``), mappings (``{"mapping": [[key, value], ...]}``), dataclasses
+(``{"record": name, "fields": {...}}``), references to the writes of the operation
+(``{"written": "frames/door"}``), and, for everything else, the name of its type (``{"unwritten": name}``).
 """
 
 from __future__ import annotations
@@ -14,8 +14,7 @@ from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Any
 
-from kineverse import articulations
-from kineverse.articulations.limits import Limits
+from kineverse import articulations as a
 from kineverse.errors import FormatError, KineverseError
 from kineverse.expressions.expression import Expression
 from kineverse.loops import CloseLoop, LoopConstraint
@@ -49,7 +48,7 @@ TAGS = ("pose", "mapping", "record", "written", "unwritten", *DATUM_TAGS)
 
 @dataclass(frozen=True)
 class OpaqueRecord:
-    """A value of a dataclass that is not at hand."""
+    """Fields of a dataclass, without the class."""
 
     kind: str
     fields: tuple[tuple[str, Any], ...]
@@ -57,21 +56,30 @@ class OpaqueRecord:
 
 @dataclass(frozen=True)
 class WrittenReference:
-    """A parameter that is among the operation's writes, under ``kind/name``."""
+    """Reference of a parameter to one of the operation's writes, ``kind/name``."""
 
     path: str
 
 
 @dataclass(frozen=True)
 class UnsupportedParameter:
-    """A parameter that a document has no place for; only its type is known."""
+    """Parameter that a document cannot carry, of which only the type is known."""
 
     kind: str
 
 
+_OPERATIONS: tuple[type[Operation], ...] = (
+    *(AddFrame, Attach, Constrain, SetRate, SetData, CloseLoop, LoopConstraint),
+    *(a.Fixed, a.Revolute, a.Continuous, a.Prismatic, a.Screw, a.Cylindrical),
+    *(a.Planar, a.Universal, a.Ball, a.Floating, a.Gearbox, a.RackAndPinion, a.Cam),
+    *(a.OmniBase, a.DifferentialDrive, a.Ackermann, a.Mecanum),
+    *(a.DeskLamp, a.DoorWithHandle, a.Faucet, a.FoldingDoor, a.GarageDoor, a.Latch, a.Microwave),
+    *(a.PedalBin, a.PistonAndRod, a.Ratchet, a.ScissorLift, a.ScrewAndNut),
+)
+
 RECORDS: Mapping[str, type] = MappingProxyType(
     {
-        "Limits": Limits,
+        "Limits": a.Limits,
         "Frame": Frame,
         "Constraint": Constraint,
         "Articulation": Articulation,
@@ -85,64 +93,31 @@ RECORDS: Mapping[str, type] = MappingProxyType(
         "Ellipsoid": Ellipsoid,
         "Mesh": Mesh,
         "Sphere": Sphere,
-        "AddFrame": AddFrame,
-        "Attach": Attach,
-        "Constrain": Constrain,
-        "SetRate": SetRate,
-        "Write": SetData,
-        "CloseLoop": CloseLoop,
-        "LoopConstraint": LoopConstraint,
-        "Ackermann": articulations.Ackermann,
-        "Ball": articulations.Ball,
-        "Cam": articulations.Cam,
-        "Continuous": articulations.Continuous,
-        "Cylindrical": articulations.Cylindrical,
-        "DeskLamp": articulations.DeskLamp,
-        "DifferentialDrive": articulations.DifferentialDrive,
-        "DoorWithHandle": articulations.DoorWithHandle,
-        "Faucet": articulations.Faucet,
-        "Fixed": articulations.Fixed,
-        "Floating": articulations.Floating,
-        "FoldingDoor": articulations.FoldingDoor,
-        "GarageDoor": articulations.GarageDoor,
-        "Gearbox": articulations.Gearbox,
-        "Latch": articulations.Latch,
-        "Mecanum": articulations.Mecanum,
-        "Microwave": articulations.Microwave,
-        "OmniBase": articulations.OmniBase,
-        "PedalBin": articulations.PedalBin,
-        "PistonAndRod": articulations.PistonAndRod,
-        "Planar": articulations.Planar,
-        "Prismatic": articulations.Prismatic,
-        "RackAndPinion": articulations.RackAndPinion,
-        "Ratchet": articulations.Ratchet,
-        "Revolute": articulations.Revolute,
-        "ScissorLift": articulations.ScissorLift,
-        "Screw": articulations.Screw,
-        "ScrewAndNut": articulations.ScrewAndNut,
-        "Universal": articulations.Universal,
+        **{operation.document_kind: operation for operation in _OPERATIONS},
     }
 )
-"""Classes of operations and of their parameters by the frozen names that documents have for them."""
+"""Classes that a record in a document is rebuilt as, by the frozen name that documents have for them.
 
-_KIND_OF = {kind: name for name, kind in RECORDS.items()}
+Operations are among them, because :class:`kineverse.model.Override` has one as its parameter.
+"""
+
+_NAMES = {kind: name for name, kind in RECORDS.items()}
 
 
 def document_kind(kind: type) -> str:
     """Return the name that documents have for a class: frozen for those that ship, else that of the class."""
-    own: str = getattr(kind, "document_kind", kind.__name__)
-    return _KIND_OF.get(kind, own)
+    return kind.document_kind if issubclass(kind, Operation) else _NAMES.get(kind, kind.__name__)
 
 
 def operation_parameters(operation: Operation) -> dict[str, Any]:
-    """Return what an operation was made with, by name; empty for one that is no dataclass."""
+    """Return the constructor arguments of an operation by name; none for one that is no dataclass."""
     if not dataclasses.is_dataclass(operation):
         return {}
     return {f.name: getattr(operation, f.name) for f in dataclasses.fields(operation) if f.init}
 
 
 def expressions_in_parameter(parameter: Any, writes: Mapping[Cell, Any]) -> list[Expression]:
-    """Return the expressions that :func:`encode_parameter` needs."""
+    """Return the expressions in a parameter that :func:`encode_parameter` encodes."""
     found: list[Expression] = []
 
     def note(expression: Expression) -> int:
@@ -154,7 +129,19 @@ def expressions_in_parameter(parameter: Any, writes: Mapping[Cell, Any]) -> list
 
 
 def encode_parameter(value: Any, writes: Mapping[Cell, Any], ref: Ref, depth: int = 0) -> Any:
-    """Return a parameter as JSON has it, which lies in so many others."""
+    """Encode a parameter as a JSON value.
+
+    Parameters
+    ----------
+    value
+        Constructor argument of an operation, or a part of one.
+    writes
+        Writes of the operation.
+    ref
+        Returns the place of an expression in the node table.
+    depth
+        Nesting depth of the value.
+    """
 
     def inner(item: Any) -> Any:
         return encode_parameter(item, writes, ref, depth + 1)
@@ -190,14 +177,14 @@ def encode_parameter(value: Any, writes: Mapping[Cell, Any], ref: Ref, depth: in
 
 
 def rebuild_parameter(value: Any, writes: Mapping[str, Any]) -> Any:
-    """Return a parameter that was read as what an operation takes.
+    """Rebuild a constructor argument from a decoded parameter.
 
     Parameters
     ----------
     value
-        As :func:`decode_parameter` returns it.
+        Result of :func:`decode_parameter`.
     writes
-        What the operation wrote, by ``kind/name``.
+        Writes of the operation, by ``kind/name``.
     """
     if isinstance(value, tuple):
         return tuple(rebuild_parameter(item, writes) for item in value)
@@ -212,7 +199,7 @@ def rebuild_parameter(value: Any, writes: Mapping[str, Any]) -> Any:
             return RECORDS[value.kind](
                 **{name: rebuild_parameter(item, writes) for name, item in value.fields}
             )
-        except (TypeError, KineverseError):  # it is somebody else's class of the same name
+        except (TypeError, KineverseError):  # a user's class of the same name
             return value
     return value
 
@@ -225,27 +212,27 @@ def decode_parameter(
     written: Collection[str],
     depth: int = 0,
 ) -> Any:
-    """Return a parameter as it was given, and lies in so many others.
+    """Decode a parameter from its JSON value.
 
     Parameters
     ----------
     value
-        What stands in the document.
+        JSON value.
     graph
-        The expressions.
+        Expressions of the document.
     rename
-        Puts the document's prefix in front of a name.
+        Prepends the document's prefix to a name.
     path
-        Does so with that of a cell, ``kind/name``.
+        Prepends it to the name of a cell, ``kind/name``.
     written
-        The cells that the operation writes, so named.
+        Cells that the operation writes, as ``kind/name``.
     depth
-        In how many others it lies.
+        Nesting depth of the value.
 
     Raises
     ------
-    RefusedError
-        For what is none, or said to be among the writes and is not.
+    InvalidDocumentError
+        For an invalid value, or a reference to a write that does not exist.
     """
 
     def inner(item: Any) -> Any:

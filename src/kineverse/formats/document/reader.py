@@ -1,4 +1,4 @@
-"""Reader of documents: every part checked, nothing run, mistakes named by place."""
+"""Reader of documents: checks every part, runs no code, and reports errors with their place."""
 
 from __future__ import annotations
 
@@ -46,14 +46,14 @@ def read_operations(
     Parameters
     ----------
     content
-        The document, as text or as bytes of UTF-8.
+        Text of the document, or its bytes in UTF-8.
     source
-        What errors call it.
+        Name of the document in errors.
     prefix
-        Put in front of all names, tags included, with a slash; the world stays the world.
+        Prefix of all names, tags included; the world stays the world.
     root
-        The folder below which its meshes may be opened, see :mod:`kineverse.formats.root_folder`; by default no
-        path leads to one.
+        Folder below which its meshes may be opened, see :mod:`kineverse.formats.root_folder`; by default
+        there is none.
 
     Raises
     ------
@@ -96,6 +96,8 @@ def packed_document_operations(file: FileContent) -> list[tuple[str, OpaqueOpera
 
 
 class _Document:
+    """Document that is being read."""
+
     def __init__(self, source: str, prefix: str | None, root: str) -> None:
         self._source, self._root = source, root
         self._place = ""
@@ -106,6 +108,7 @@ class _Document:
         self._consistency = TraceConsistency(self._graph, self._cells, self._names)
 
     def read(self, parse: Callable[[bytes], Any], content: bytes) -> list[tuple[str, OpaqueOperation]]:
+        """Parse and check the content, and return its operations with their tags."""
         try:
             with no_collection():
                 return self._read(parse(content), content)
@@ -131,7 +134,7 @@ class _Document:
 
     def _refuse(self, reason: str) -> NoReturn:
         place = f", {self._place}" if self._place else ""
-        if len(reason) > LONGEST_REASON:  # there are names in it, as long as the document has them
+        if len(reason) > LONGEST_REASON:  # it quotes names, which may be of any length
             reason = f"{reason[:LONGEST_REASON]} ..."
         raise FormatError(f"{self._source}{place}: {reason.removesuffix('.')}.") from None
 
@@ -249,8 +252,8 @@ class _Document:
         return Trace(steps, writes)
 
     def _expressions(self, writes: tuple[tuple[Cell, Any], ...]) -> Iterator[Expression]:
-        """Yield the expressions in which there may be read nodes."""
-        if self._graph.has_answers:
+        """Yield the expressions of writes, if the document has read nodes at all."""
+        if self._graph.has_read_nodes:
             for (kind, _), value in writes:
                 yield from find_expressions(kind, value)
 
@@ -258,7 +261,7 @@ class _Document:
         return "/".join(self._cell(*given.partition("/")[::2]))
 
     def _cell(self, kind: Any, given: Any) -> Cell:
-        kind, wanted = _kind(kind), check_text(given)  # not a name: an operation may look for anything
+        kind, wanted = _kind(kind), check_text(given)  # any text: an operation may look up anything
         if kind == RATES:
             before = f"{symbol_name(self._prefix, 0)}/" if self._prefix else ""
             return kind, before + wanted
@@ -276,7 +279,7 @@ def _check_size(content: str | bytes, source: str) -> None:
 
 
 def _parse_json(content: bytes) -> Any:
-    """Return what a text of JSON says."""
+    """Parse a JSON text."""
     check_counts(content)
     text = content.decode()
     try:
@@ -285,11 +288,12 @@ def _parse_json(content: bytes) -> Any:
         place = f"at line {error.lineno}, column {error.colno} (of {len(text)} characters)"
         raise InvalidDocumentError(f"it is not JSON: {error.msg} {place}") from None
     except ValueError as error:
-        # An integer of thousands of digits, which Python declines to read.
+        # An integer of thousands of digits, which Python refuses to read.
         raise InvalidDocumentError(str(error)) from None
 
 
 def _object(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    """Return a JSON object after checking that no key occurs twice."""
     result = dict(pairs)
     if len(result) != len(pairs):
         seen: set[str] = set()
@@ -324,12 +328,12 @@ def to_bytes(model: ModelView) -> bytes:
     Parameters
     ----------
     model
-        A model or a snapshot.
+        Model or snapshot.
 
     Raises
     ------
     FormatError
-        Naming what a document cannot carry.
+        For content that a document cannot carry.
     MissingDependencyError
         If msgspec is not installed, which the extra ``exchange`` brings.
     """
@@ -339,22 +343,21 @@ def to_bytes(model: ModelView) -> bytes:
 def from_bytes(
     data: bytes, prefix: str | None = None, *, root: str | os.PathLike[str] | None = None
 ) -> Model:
-    """Return the model that :func:`to_bytes` made bytes of. No code is run and no name imported.
+    """Return the model in the result of :func:`to_bytes`. Runs no code and imports no name.
 
     Parameters
     ----------
     data
-        The bytes, from anywhere.
+        The bytes, from any source.
     prefix
-        Put in front of all names, tags included, with a slash; the world stays the world.
+        Prefix of all names, tags included; the world stays the world.
     root
-        The folder below which meshes that it names by path may be opened. By default none is: those of
-        packages are.
+        Folder below which meshes given by path may be opened. By default only meshes of packages are.
 
     Raises
     ------
     FormatError
-        If they are no such document, with the place and the reason.
+        If they are no valid document, with the place and the reason.
     MissingDependencyError
         If msgspec is not installed, which the extra ``exchange`` brings.
     """

@@ -1,8 +1,8 @@
 """Traces of operations as JSON values, and their consistency with reads and writes.
 
-A trace is ``{"questions": [[kind, look, argument, ...], ...], "writes": {...}}``: what was asked, how closely
-the answer was looked at (0 not at all, 1 its symbols, 2 its value), and writes as those of the operation,
-whose expressions contain ``read`` nodes.
+A trace is ``{"questions": [[kind, access, argument, ...], ...], "writes": {...}}``: the queries, the access
+to each result (0 none, 1 its symbols, 2 its value), and writes like those of the operation, whose expressions
+contain ``read`` nodes.
 """
 
 from __future__ import annotations
@@ -36,13 +36,13 @@ _KIND_OF = {question: kind for kind, question in DATA_QUERIES.items()}
 
 
 def trace_expressions(trace: Trace) -> list[Expression]:
-    """Return the expressions of a trace."""
+    """Return the expressions in the queries and writes of a trace."""
     asked = [a for step in trace.steps for a in step.question.arguments if isinstance(a, Expression)]
     return asked + [e for (kind, _), value in trace.writes for e in find_expressions(kind, value)]
 
 
 def encode_queries(trace: Trace, ref: Ref) -> list[list[Any]]:
-    """Return the questions of a trace as JSON has them."""
+    """Encode the queries of a trace as JSON values."""
     return [
         [
             step.question.kind,
@@ -54,21 +54,21 @@ def encode_queries(trace: Trace, ref: Ref) -> list[list[Any]]:
 
 
 def decode_queries(value: Any, graph: NodeGraph, cell: Callable[[str, Any], Cell]) -> tuple[TraceStep, ...]:
-    """Return the questions of a trace.
+    """Decode the queries of a trace from their JSON value.
 
     Parameters
     ----------
     value
-        What stands in the document.
+        JSON value.
     graph
-        The expressions.
+        Expressions of the document.
     cell
-        Returns the cell of a kind and a name as the document gives it.
+        Returns the cell of a kind and a name in the document.
 
     Raises
     ------
-    RefusedError
-        For what is no question.
+    InvalidDocumentError
+        For an invalid query.
     """
     steps = []
     if len(check_list(value, "questions")) > MAX_QUESTIONS:
@@ -93,12 +93,12 @@ def decode_queries(value: Any, graph: NodeGraph, cell: Callable[[str, Any], Cell
 
 
 def check_read_nodes(expression: Expression, questions: int) -> None:
-    """Refuse an expression about answers that are not there.
+    """Check that the read nodes of an expression refer to earlier queries.
 
     Raises
     ------
-    RefusedError
-        If one is to a question that comes later, or never.
+    InvalidDocumentError
+        If one refers to a query that comes later, or never.
     """
     for answer in find_read_nodes(expression):
         if answer.question >= questions:
@@ -110,6 +110,7 @@ def check_read_nodes(expression: Expression, questions: int) -> None:
 def _decode_arguments(
     kind: str, given: list[Any], graph: NodeGraph, cell: Callable[[str, Any], Cell]
 ) -> tuple[Any, ...]:
+    """Decode the arguments of a query."""
     if kind == "exists":
         return cell(given[0], given[1])
     if kind == "names":
@@ -122,24 +123,24 @@ def _decode_arguments(
 
 
 _COST_OF_POSE = 1000
-"""What a frame on the way costs where poses are composed, in about as many products and sums."""
+"""Cost of a frame in a composed pose, about its number of products and sums."""
 
 
 class TraceConsistency:
-    """Compares the trace of each operation with what else the document says about it.
+    """Check of the trace of each operation against its reads and writes in the document.
 
-    Reads are derived from the questions of a trace, since an operation that is said to read less than it asks
-    for would stay as it is when that changes. What the trace writes is compared with the writes. Comparing is
-    work: what is beyond all that documents contain, a million nodes and more, is taken at its word.
+    Reads are derived from the queries of a trace: an operation with too few reads on record would not be run
+    again when one changes. The writes of the trace are compared with those on record. Comparing costs work;
+    beyond a budget far above that of all known documents, a million nodes and more, it is skipped.
 
     Parameters
     ----------
     graph
-        The expressions of the document.
+        Expressions of the document.
     cells
-        What the operations before the present one wrote; it grows.
+        Writes of the operations before the present one; the reader adds to it.
     names
-        The names of these, by kind.
+        Names of these cells, by kind.
     """
 
     def __init__(self, graph: NodeGraph, cells: Mapping[Cell, Any], names: Mapping[str, set[str]]) -> None:
@@ -147,68 +148,64 @@ class TraceConsistency:
         self._left = MAX_WORK
 
     def reads_of(self, trace: Trace, writes: tuple[tuple[Cell, Any], ...]) -> Reads:
-        """Return what the questions of a trace read.
+        """Return the reads of the queries of a trace.
 
         Parameters
         ----------
         trace
-            Of the operation that comes next.
+            Trace of the next operation.
         writes
-            What else is said that it writes.
+            Writes of that operation on record.
 
         Raises
         ------
-        RefusedError
-            If the trace leads to other writes, or to none.
+        InvalidDocumentError
+            If the trace leads to other writes, or fails.
         """
         if [cell for cell, _ in trace.writes] != [cell for cell, _ in writes]:
             raise InvalidDocumentError("it writes other things than the operation, and one of them is wrong")
         reads = Reads()
         try:
             replies = self._replies(trace, reads)
-            if replies is None or not self._affords(self._cost_of_writes(trace)):
+            if replies is None or not self._spend(self._cost_of_writes(trace)):
                 return reads
             again = trace.written(replies).writes()
         except KineverseError as error:
             raise InvalidDocumentError(f"it cannot be followed: {error}") from None
-        # Effects name kinds in an order of their own; that of the names of a kind counts.
+        # Writes have a fixed order of kinds; only the order of names within a kind counts.
         in_order = {cell: again[cell] for cell, _ in writes if cell in again}
-        if len(in_order) < len(again) or not writes_agree(in_order, dict(writes), self._affords_comparing):
+        if len(in_order) < len(again) or not writes_agree(in_order, dict(writes), self._spend_comparison):
             raise InvalidDocumentError("it leads to other values than the writes, and one of them is wrong")
         return reads
 
     def _replies(self, trace: Trace, reads: Reads) -> list[QueryResult] | None:
-        """Note what all questions read; return the answers, or None where these are too much work."""
+        """Record the reads of all queries; return their results, or None if these are too much work."""
         replies: list[QueryResult] | None = []
         for step in trace.steps:
             question = step.question
             if question.kind in EXPRESSION_QUERIES:
-                if replies is None or not self._affords(_size(question)):
+                if replies is None or not self._spend(_size(question)):
                     replies = None
                     continue
                 question = substitute_results(question, replies)
-                if not self._affords(_cost(question)):
+                if not self._spend(_cost(question)):
                     replies = None
                     continue
             elif question.kind == "fk":
-                names = self._way(*question.arguments)
-                if names and (replies is None or not self._affords(_COST_OF_POSE * len(names))):
-                    self._note(names, question.arguments, reads)
+                names = self._chain(*question.arguments)
+                if names and (replies is None or not self._spend(_COST_OF_POSE * len(names))):
+                    self._record_chain(names, question.arguments, reads)
                     replies = None
                     continue
-            reply = self._ask(question, reads)
+            reply = run_query(question, self._reader(reads))
             if replies is not None:
                 replies.append(reply)
-                if not self._affords(sum(_nodes(part) for part in reply.parts)):
+                if not self._spend(sum(_nodes(part) for part in reply.parts)):
                     replies = None
         return replies
 
-    def _ask(self, question: Query, reads: Reads) -> QueryResult:
-        """Return the answer to a question, and note what it reads."""
-        return run_query(question, self._reader(reads))
-
-    def _way(self, frame: str, relative_to: str) -> list[str]:
-        """Return the frames between two, from their last common ancestor down; none if there is no way."""
+    def _chain(self, frame: str, relative_to: str) -> list[str]:
+        """Return the frames between two, from their common ancestor down; none if they are not connected."""
         try:
             base, down = branches(frame, relative_to, lambda name: self._cells[FRAMES, name])
         except (KineverseError, KeyError):
@@ -216,8 +213,8 @@ class TraceConsistency:
         self._graph.budget.spend(COST_OF_FRAME * (len(base) + len(down)))
         return [*base, *down]
 
-    def _note(self, names: list[str], ends: Iterable[str], reads: Reads) -> None:
-        """Note what a pose reads without composing it: of long chains they are large."""
+    def _record_chain(self, names: list[str], ends: Iterable[str], reads: Reads) -> None:
+        """Record the reads of a pose without composing it, which is large for a long chain."""
         reader = self._reader(reads)
         self._graph.budget.spend(2 * COST_OF_FRAME * len(names))
         for name in names:
@@ -234,26 +231,27 @@ class TraceConsistency:
         self._graph.budget.spend(COST_OF_NAME * len(self._names[kind]))
         return sorted(self._names[kind])
 
-    def _affords(self, work: int) -> bool:
+    def _spend(self, work: int) -> bool:
+        """Spend work, and return False if the budget is exceeded."""
         self._left -= work
         return self._left >= 0
 
     def _cost_of_writes(self, trace: Trace) -> int:
         return sum(_nodes(e) for (kind, _), value in trace.writes for e in find_expressions(kind, value))
 
-    def _affords_comparing(self, pairs: list[ExpressionPair]) -> bool:
-        """Whether values and gradients can be compared: implicit functions are written out for that."""
+    def _spend_comparison(self, pairs: list[ExpressionPair]) -> bool:
+        """Spend the work of comparing values and gradients, which writes out implicit functions."""
         work = 0
         for expression in (e for pair in pairs for e in pair):
             inner = topological_order(leaves(expression)[1], lambda n: n.parts, lambda _: False)
             steps = sum(self._graph.work.get(n.function.key, 0) for n in inner if isinstance(n, Implicit))
             parts = _nodes(expression) + sum(_nodes(part) for node in inner for part in node.parts)
             work += (steps + parts) * (1 + len(expression.symbols))
-        return self._affords(work)
+        return self._spend(work)
 
 
 def merge_reads(cells: Mapping[Cell, Read], reads: Reads) -> dict[Cell, Read]:
-    """Return how closely cells were looked at by what is said and what is derived."""
+    """Return the union of the reads on record and derived ones, by cell."""
     result = dict(cells)
     for cell, how in reads.cells.items():
         result[cell] = result.get(cell, Read(0)) | how
@@ -265,7 +263,7 @@ def _size(question: Query) -> int:
 
 
 def _cost(question: Query) -> int:
-    """Return about what it takes to answer a question about expressions: a sweep for each derivative."""
+    """Estimate the work of a query about expressions: a sweep for each derivative."""
     first, *others = (a for a in question.arguments if isinstance(a, Expression))
     sweeps = min(math.prod(first.shape), max((math.prod(a.shape) for a in others), default=1))
     return _size(question) * max(sweeps, 1)

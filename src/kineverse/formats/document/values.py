@@ -1,6 +1,6 @@
-"""What operations write, as JSON values and back.
+"""Writes of operations as JSON values.
 
-A frame is ``{"parent": check_entity_name, "factors": [...]}``, each factor a pose (its 12 numbers) or the place of an
+A frame is ``{"parent": name, "factors": [...]}``, each factor a pose (its 12 numbers) or the place of an
 expression; a constraint the places of ``[lower, expression, upper]``; a rate
 ``[coordinate, [[speed, ref], ...]]``. Data are texts, numbers, true, false, null and lists of these; an
 expression is ``{"expression": ref}``.
@@ -49,9 +49,9 @@ Ref: TypeAlias = Callable[[Expression], int]
 Rename: TypeAlias = Callable[[str], str]
 
 MAX_BITS = 10_000
-"""The longest integer: Python reads no more than 4300 digits."""
+"""Length of the longest integer: Python reads no more than 4300 digits."""
 PLAIN_BITS = 63
-"""The longest integer that is written as a number, as other languages and msgpack have no longer ones."""
+"""Length of the longest integer that is written as a number; other languages and msgpack end there."""
 DATUM_TAGS = ("expression", "float", "integer")
 _INTEGER = re.compile("-?[0-9]{1,3011}")
 
@@ -60,12 +60,12 @@ _INTEGER = re.compile("-?[0-9]{1,3011}")
 
 
 def encode_value(kind: str, value: Any, ref: Ref) -> Any:
-    """Return a value as JSON has it.
+    """Encode a write of one kind as a JSON value.
 
     Raises
     ------
     FormatError
-        For what a document has no place for.
+        For a value that a document cannot carry.
     """
     if kind == FRAMES:
         factors = [encode_pose(f) if isinstance(f, Pose) else ref(f) for f in value.factors]
@@ -94,12 +94,12 @@ def encode_value(kind: str, value: Any, ref: Ref) -> Any:
 
 
 def encode_datum(value: Any, ref: Ref, depth: int = 0) -> Any:
-    """Return a datum as JSON has it, which lies in so many tuples.
+    """Encode a datum, nested in ``depth`` tuples, as a JSON value.
 
     Raises
     ------
     FormatError
-        For what is none.
+        For a value that is no datum.
     """
     if type(value) is int and value.bit_length() > MAX_BITS:
         raise FormatError(f"an integer of {value.bit_length()} bits is too long, of more than {MAX_BITS}")
@@ -107,7 +107,7 @@ def encode_datum(value: Any, ref: Ref, depth: int = 0) -> Any:
         return {"integer": str(value)}
     if value is None or type(value) in (bool, int, str):
         return value
-    if isinstance(value, float):  # numpy's is one, too
+    if isinstance(value, float):  # numpy's float64 is a subclass
         number = float(value)
         return number if math.isfinite(number) else {"float": encode_number(number)}
     if type(value) is tuple:
@@ -126,18 +126,18 @@ def encode_datum(value: Any, ref: Ref, depth: int = 0) -> Any:
 
 
 def decode_value(kind: str, value: Any, graph: NodeGraph, rename: Rename) -> Any:
-    """Return what JSON has as the value of an operation.
+    """Decode a write of one kind from its JSON value.
 
     Raises
     ------
-    RefusedError
-        Where it is not what it should be.
+    InvalidDocumentError
+        If the value is invalid.
     """
     return _DECODERS[kind](value, graph, rename)
 
 
 def decode_frame_name(value: Any, rename: Rename) -> str:
-    """Return the name of a frame that may be the world."""
+    """Decode the name of a frame; the world is not renamed."""
     given = check_entity_name(value)
     return given if given == WORLD else rename(given)
 
@@ -195,7 +195,7 @@ def _decode_articulation(value: Any, graph: NodeGraph, rename: Rename) -> Articu
 
 
 def decode_datum(value: Any, graph: NodeGraph, rename: Rename, depth: int = 0) -> Any:
-    """Return a datum that was written, and lies in so many lists."""
+    """Decode a datum, nested in ``depth`` lists, from its JSON value."""
     if type(value) is list:
         check_depth(depth)
         return tuple([decode_datum(item, graph, rename, depth + 1) for item in value])
@@ -211,6 +211,7 @@ def decode_datum(value: Any, graph: NodeGraph, rename: Rename, depth: int = 0) -
 
 
 def _decode_tagged(value: dict[str, Any], graph: NodeGraph) -> Any:
+    """Decode an expression, an infinity or a long integer."""
     given = check_keys(value, (), DATUM_TAGS)
     if len(given) != 1:
         raise InvalidDocumentError(f"an object among data has one of the keys {', '.join(DATUM_TAGS)}")

@@ -29,22 +29,21 @@ VERSION = 1
 
 
 def write_document(model: ModelView, target: Path) -> None:
-    """Write a model to a file, which is there whole or not at all.
+    """Write a model to a file atomically.
 
     Parameters
     ----------
     model
-        A model or a snapshot.
+        Model or snapshot.
     target
-        A name that ends in ``.kv.json`` or ``.kv.msgpack``.
+        Path that ends in ``.kv.json`` or ``.kv.msgpack``.
 
     Raises
     ------
     FormatError
-        If the file cannot be written, or the model contains what a document cannot carry; the file is then
-        what it was before.
+        If the file cannot be written, or for content that a document cannot carry; it is unchanged then.
     MissingDependencyError
-        If the package for msgpack is not installed and wanted.
+        If the package for msgpack is needed and not installed.
     """
     try:
         text = to_json(model)
@@ -54,12 +53,12 @@ def write_document(model: ModelView, target: Path) -> None:
 
 
 def to_json(model: ModelView) -> str:
-    """Return the text of a document, its hash at the end; equal for models made by the same operations.
+    """Return a model as the text of a document; equal for models made by the same operations.
 
     Raises
     ------
     FormatError
-        Naming what a document cannot carry.
+        For content that a document cannot carry.
     """
     snapshot = model.snapshot() if isinstance(model, Model) else model
     if not isinstance(snapshot, Snapshot):
@@ -74,7 +73,7 @@ def to_json(model: ModelView) -> str:
 def _write_text(snapshot: Snapshot) -> str:
     parts = [_Parts(entry, cells) for entry, cells in _with_cells_before(snapshot.entries)]
     table = NodeTable(e for part in parts for e in part.expressions)
-    operations = [_operation(part, table) for part in parts]
+    operations = [_encode_operation(part, table) for part in parts]
     body = "".join(
         (
             f'{{"format":"{FORMAT}","version":{VERSION},\n"nodes":[',
@@ -94,24 +93,24 @@ def _write_text(snapshot: Snapshot) -> str:
 def document_hash(model: ModelView) -> str:
     """Return the hash of a model's content, 64 hexadecimal digits.
 
-    It is equal for models made by the same operations, in any process, and stays what it is when a model is
-    saved and loaded, whatever it is saved as. Names are part of it, so a prefix changes it.
+    It is equal for models made by the same operations, in any process. Saving and loading a model as a
+    document preserves it, in either encoding. Names are part of the content, so a prefix changes it.
 
     Parameters
     ----------
     model
-        A model or a snapshot.
+        Model or snapshot.
 
     Raises
     ------
     FormatError
-        Naming what a document cannot carry.
+        For content that a document cannot carry.
     """
     return read_hash(to_json(model))
 
 
 def _with_cells_before(entries: Sequence[HistoryEntry]) -> Iterator[tuple[HistoryEntry, dict[Cell, Any]]]:
-    """Yield the operations, each with what the cells contain before it; one dictionary, which changes."""
+    """Yield the operations, each with the cells before it, in one dictionary that is updated in place."""
     cells: dict[Cell, Any] = {}
     for entry in entries:
         yield entry, cells
@@ -119,7 +118,7 @@ def _with_cells_before(entries: Sequence[HistoryEntry]) -> Iterator[tuple[Histor
 
 
 class _Parts:
-    """What a document says about an operation.
+    """Content of a document for one operation.
 
     Attributes
     ----------
@@ -146,7 +145,7 @@ class _Parts:
 
     @property
     def expressions(self) -> Iterator[Expression]:
-        """All expressions that are written down."""
+        """All expressions in writes, parameters and the trace."""
         for (kind, _), value in self.entry.writes.items():
             yield from find_expressions(kind, value)
         for parameter in self.parameters.values():
@@ -156,7 +155,7 @@ class _Parts:
 
 
 def _find_trace(entry: HistoryEntry, cells: dict[Cell, Any]) -> Trace | str:
-    """Return the trace of an operation, or why there is none."""
+    """Return the trace of an operation, or the reason for none."""
     before = ReadRecorder(
         lambda cell: cells.get(cell, ABSENT),
         lambda kind: sorted(name for k, name in cells if k == kind),
@@ -169,6 +168,7 @@ def _find_trace(entry: HistoryEntry, cells: dict[Cell, Any]) -> Trace | str:
 
 
 def _lines(items: list[str]) -> Iterator[str]:
+    """Yield the items of a JSON list, one a line."""
     for i, item in enumerate(items):
         yield ",\n" if i else "\n"
         yield item
@@ -176,7 +176,8 @@ def _lines(items: list[str]) -> Iterator[str]:
         yield "\n"
 
 
-def _operation(what: _Parts, table: NodeTable) -> str:
+def _encode_operation(what: _Parts, table: NodeTable) -> str:
+    """Encode an operation as JSON text."""
     entry = what.entry
     cells = sorted(entry.reads.cells.items())
     reads = {
@@ -192,10 +193,10 @@ def _operation(what: _Parts, table: NodeTable) -> str:
     if parameters:
         members["parameters"] = dump_json(parameters)
     members["reads"] = dump_json({how: names for how, names in reads.items() if names})
-    members["writes"] = dump_json(_writes(entry.tag, entry.writes, table))
+    members["writes"] = dump_json(_encode_writes(entry.tag, entry.writes, table))
     if what.trace is not None:
         questions = encode_queries(what.trace, table.ref)
-        writes = _writes(entry.tag, dict(what.trace.writes), table)
+        writes = _encode_writes(entry.tag, dict(what.trace.writes), table)
         members["trace"] = dump_json({"questions": questions, "writes": writes})
     if what.frozen:
         members["frozen"] = encode_string(what.frozen)
@@ -203,7 +204,8 @@ def _operation(what: _Parts, table: NodeTable) -> str:
     return f"{{{joined}}}"
 
 
-def _writes(tag: str, writes: Mapping[Cell, Any], table: NodeTable) -> dict[str, dict[str, Any]]:
+def _encode_writes(tag: str, writes: Mapping[Cell, Any], table: NodeTable) -> dict[str, dict[str, Any]]:
+    """Encode writes as a JSON value, by kind and name."""
     kinds: dict[str, dict[str, Any]] = {kind: {} for kind in KINDS}
     for (kind, name), value in writes.items():
         try:

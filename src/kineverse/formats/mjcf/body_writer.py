@@ -299,11 +299,11 @@ class MjcfBodyWriter:
         elif isinstance(form, Sphere):
             sizes[Sphere] = "sphere", (form.radius,)
         elif isinstance(form, (Cylinder, Capsule)):
-            sizes[type(form)] = type(form).__name__.lower(), (form.radius, form.length / 2)
+            sizes[type(form)] = form.kind, (form.radius, form.length / 2)
         elif isinstance(form, Ellipsoid):
             sizes[Ellipsoid] = "ellipsoid", form.radii
         if type(form) not in sizes:
-            self._remark(f"MJCF has no {type(form).__name__.lower()}: one of '{name}' is left out")
+            self._remark(f"MJCF has no {form.kind}: one of '{name}' is left out")
             return None
         kind, size = sizes[type(form)]
         if not all(s > 0 or math.isnan(s) for s in size):

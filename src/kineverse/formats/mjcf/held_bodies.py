@@ -64,7 +64,7 @@ class _HeldBodies:
         while not self.links[name].joints and name != WORLD:
             end, name = compose_poses(self.links[name].pose, end), self.links[name].parent
         link, (by, at) = self.links[name], holder
-        if not _is_free(link) or not self._together.unite(self._tops[by], name):
+        if not _is_free(link) or not self._together.union(self._tops[by], name):
             return False
         if closure.kind == "weld":
             self.links[name] = replace(link, parent=by, pose=compose_poses(at, invert_pose(end)), joints=())

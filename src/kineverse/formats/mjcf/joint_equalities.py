@@ -41,7 +41,7 @@ class FollowerJoints:
         groups = DisjointSets()
         for coupling in couplings:
             follower = coupling.follower
-            if follower not in self._by_follower and groups.unite(coupling.leader or _FIXED, follower):
+            if follower not in self._by_follower and groups.union(coupling.leader or _FIXED, follower):
                 self._by_follower[follower] = coupling
             else:
                 self.left_over.append(coupling)

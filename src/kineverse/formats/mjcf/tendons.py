@@ -19,7 +19,7 @@ LENGTH_KEY = "length"
 
 
 @dataclass(frozen=True, kw_only=True)
-class Tendon(Operation):
+class Tendon(Operation, document_kind="Tendon"):
     """A length that is a sum over joints, or that of a line through frames.
 
     L = Σ coef · q [m], where q are positions of articulations; or L = Σ |pₖ₊₁ - pₖ| / divisor [m] over the
@@ -69,7 +69,7 @@ class Tendon(Operation):
 
 
 @dataclass(frozen=True, kw_only=True)
-class TendonCoupling(Operation):
+class TendonCoupling(Operation, document_kind="TendonCoupling"):
     """One tendon's length as a polynomial of another's: L - L0 = Σ aₖ (M - M0)ᵏ, a constraint.
 
     Attributes

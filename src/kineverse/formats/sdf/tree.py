@@ -34,31 +34,31 @@ def build_spanning_tree(
     whole, rigid = DisjointSets(), DisjointSets()
     for link in links:
         if link.static:
-            whole.unite(WORLD, link.name)
-            rigid.unite(WORLD, link.name)
+            whole.union(WORLD, link.name)
+            rigid.union(WORLD, link.name)
     joints = list(joints)
     for joint in joints:
         if joint.kind == "fixed":
-            rigid.unite(joint.parent, joint.child)
+            rigid.union(joint.parent, joint.child)
     at: dict[str, list[SdfJoint]] = {}
     held: set[str] = {link.name for link in links if link.static}
     loops: list[SdfJoint] = []
     for joint in joints:
-        if whole.unite(joint.parent, joint.child):
+        if whole.union(joint.parent, joint.child):
             at.setdefault(joint.parent, []).append(joint)
             at.setdefault(joint.child, []).append(joint)
             held.add(joint.child)
-        elif rigid.of(joint.parent) != rigid.of(joint.child):
+        elif rigid.find(joint.parent) != rigid.find(joint.child):
             loops.append(joint)
         else:
             note(joint, "is left out: its links are rigidly connected anyway.")
     roots = [SdfRoot(link.name) for link in links if link.static]
     starts = [WORLD, *(root.link for root in roots)]
     ordered = _outwards(starts, at, note)
-    reached = {whole.of(WORLD)}
-    fixed = {whole.of(name) for name in standing}
+    reached = {whole.find(WORLD)}
+    fixed = {whole.find(name) for name in standing}
     for link in links:
-        group = whole.of(link.name)
+        group = whole.find(link.name)
         if group not in reached and link.name not in held:
             reached.add(group)
             roots.append(SdfRoot(link.name, free=group not in fixed))

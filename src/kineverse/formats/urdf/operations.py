@@ -22,6 +22,7 @@ from kineverse.articulations import (
 from kineverse.articulations import Joint as JointOperation
 from kineverse.errors import FormatError
 from kineverse.expressions.expression import Expression
+from kineverse.formats.names import NumberedNames, drop_empty_parts
 from kineverse.formats.reader_warnings import Fault, warn
 from kineverse.formats.urdf.description import UrdfJoint, UrdfLink, UrdfRobot
 from kineverse.formats.xml_reader import quote
@@ -184,7 +185,7 @@ def _assign_names(
     FormatError
         If there are such names, and the description is read strictly.
     """
-    again: dict[str, int] = {}
+    numbers = NumberedNames()
 
     def rename(
         what: str, thing: UrdfLink | UrdfJoint, problem: str, wanted: str, taken: Container[str]
@@ -192,11 +193,7 @@ def _assign_names(
         place = f"<{what} name={quote(thing.name)}>"
         if strict:
             raise FormatError(f"{robot.source}, line {thing.line}, {place}: {problem}. Rename it.")
-        k, name = again.get(wanted, 1), wanted
-        while name in taken:
-            k += 1
-            name = f"{wanted}_{k}"
-        again[wanted] = k
+        name = numbers.first_free(wanted, taken)
         warn([Fault(f"{robot.source}, line {thing.line}, {place}: {problem}; it is called {quote(name)}.")])
         return name
 
@@ -206,7 +203,8 @@ def _assign_names(
     )
     found: list[dict[str, str]] = []
     for what, things in parts:
-        plain = {thing.name: _strip_slashes(thing.name) for thing in things}
+        # Descriptions older than tf2 call links "/base_link".
+        plain = {thing.name: drop_empty_parts(thing.name) for thing in things}
         known: dict[str, UrdfLink | UrdfJoint] = {}
         every = set(plain.values())
         for thing in things:
@@ -251,8 +249,3 @@ class _TakenPrefixes:
 
     def __contains__(self, name: object) -> bool:
         return name in self._taken
-
-
-def _strip_slashes(name: str) -> str:
-    """Return a name without empty parts: descriptions older than tf2 call links ``/base_link``."""
-    return "/".join(filter(None, name.split("/"))) if "/" in name else name

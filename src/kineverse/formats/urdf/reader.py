@@ -14,6 +14,7 @@ from typing import TypeVar
 
 from kineverse.errors import FormatError
 from kineverse.formats.files import read_file
+from kineverse.formats.names import NumberedNames
 from kineverse.formats.reader_warnings import ReaderWarnings
 from kineverse.formats.root_folder import find_text_root
 from kineverse.formats.urdf.bodies import UrdfLinkReader
@@ -106,7 +107,7 @@ class _Document:
         self.remarks = remarks
         self._folder, self._root = folder, root
         self._strangers: list[Element] = []
-        self._again: dict[str, int] = {}
+        self._numbers = NumberedNames()
 
     def begin(self, root: Element) -> Visit:
         """Look at the root element, which has no children yet."""
@@ -154,17 +155,14 @@ class _Document:
         if other is None or "fixed" not in (joint.kind, other.kind):
             _add(self.joints, joint.name, joint, element)
             return
-        name, k = joint.name, self._again.get(joint.name, 2)
-        while f"{name}_{k}" in self.joints:
-            k += 1
-        self._again[name] = k + 1
+        name, fixed = joint.name, self._numbers.first_free(joint.name, self.joints)
         mistake = ElementError(
             element, f"has the name of the joint on line {other.line} again; names are unique."
         )
-        self.remarks.mend(mistake, f'the fixed one is called "{name}_{k}"')
+        self.remarks.mend(mistake, f'the fixed one is called "{fixed}"')
         if other.kind == "fixed" and joint.kind != "fixed":
             self.joints[name], joint = joint, other
-        self.joints[f"{name}_{k}"] = replace(joint, name=f"{name}_{k}")
+        self.joints[fixed] = replace(joint, name=fixed)
 
     def _error(self, mistake: ElementError, owner: Element) -> FormatError:
         """Return the error that people see; a mistake is often deep inside the element they know by name."""

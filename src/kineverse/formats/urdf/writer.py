@@ -93,8 +93,7 @@ class UrdfBodyWriter:
 
     def _shape(self, link: Tag, tag: str, shape: Shape, name: str) -> Tag | None:
         if isinstance(shape.geometry, (Ellipsoid, Cone)):
-            kind = type(shape.geometry).__name__.lower()
-            self._remark(f"URDF has no {kind}: one of '{name}' is left out ({tag})")
+            self._remark(f"URDF has no {shape.geometry.kind}: one of '{name}' is left out ({tag})")
             return None
         element = link.add(tag, name=shape.name or None)
         add_origin(element, shape.origin)
