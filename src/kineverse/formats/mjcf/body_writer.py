@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from kineverse.errors import FormatError, MissingDependencyError
-from kineverse.formats.export.mesh_paths import RemarkCallback, find_file, path_to
+from kineverse.formats.export.mesh_paths import RemarkCallback, file_reference, find_file
 from kineverse.formats.export.poses import unit_quaternion
 from kineverse.formats.resource_paths import locate_mesh
 from kineverse.formats.xml_writer import Tag
@@ -86,7 +86,7 @@ class MeshFiles:
             why = "it is not there" if there is None else "MuJoCo reads PNG"
             self._note(f"the texture {uri} is left out: {why}")
             return None
-        return path_to(there, self._folder, self._note)
+        return file_reference(there, self._folder, self._note)
 
     def _file(self, mesh: Mesh) -> str | None:
         try:
@@ -95,7 +95,7 @@ class MeshFiles:
             self._note(f"the mesh {mesh.uri} is left out. {error}")
             return None
         if there.suffix.lower() in (".obj", ".msh") or _is_binary_stl(there):
-            return path_to(there, self._folder, self._note)
+            return file_reference(there, self._folder, self._note)
         return self._convert(mesh, there)
 
     def _convert(self, mesh: Mesh, there: Path) -> str | None:

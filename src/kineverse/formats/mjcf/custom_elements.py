@@ -162,10 +162,10 @@ def add_speeds(custom: Tag, joints: Iterable[JointDescription]) -> bool:
     """Add the ranges of speeds of joints that have some; return whether there are any."""
     found = False
     for joint in joints:
-        slowest, fastest = joint.bounds.slowest, joint.bounds.fastest
-        if (slowest, fastest) != (-math.inf, math.inf):
+        min_velocity, max_velocity = joint.bounds.min_velocity, joint.bounds.max_velocity
+        if (min_velocity, max_velocity) != (-math.inf, math.inf):
             numeric = custom.add("numeric", name=f"{SPEED_PREFIX}{joint.name}")
-            numeric.attributes["data"] = format_range(slowest, fastest)
+            numeric.attributes["data"] = format_range(min_velocity, max_velocity)
             found = True
     return found
 

@@ -23,8 +23,8 @@ from kineverse.formats.description import (
     WrittenFile,
 )
 from kineverse.formats.export.capabilities import FormatCapabilities, UnsupportedFeatures
-from kineverse.formats.export.link_tree import LinkTreeBuilder
-from kineverse.formats.export.poses import ROTATION_TOLERANCE, rotation_deviation, unit_quaternion
+from kineverse.formats.export.link_tree import LinkTreeBuilder, check_rotation
+from kineverse.formats.export.poses import unit_quaternion
 from kineverse.formats.mjcf.body_writer import MjcfBodyWriter, add_pose
 from kineverse.formats.mjcf.custom_elements import (
     ENDS,
@@ -40,7 +40,9 @@ from kineverse.formats.xml_writer import Tag, format_xml
 from kineverse.model.frame import WORLD
 from kineverse.model.model_view import ModelView
 
-MJCF_CAPABILITIES = FormatCapabilities("MJCF", sums=True, one_way=True, loops=True, degree=4)
+MJCF_CAPABILITIES = FormatCapabilities(
+    "MJCF", sum_limits=True, one_way_speeds=True, loop_joints=True, polynomial_degree=4
+)
 
 _AXES = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 _MOST_SPEEDS = 6
@@ -83,21 +85,27 @@ def to_mjcf(
     FormatError
         Naming what MJCF cannot say, and why; or if MuJoCo, where it is installed, does not open the result.
     """
-    recognition = LinkTreeBuilder(model, MJCF_CAPABILITIES, leave_out, tolerance, strict)
-    plan = recognition.plan()
-    home = {s.path: v for s, v in recognition.home().items()}
-    refusals, remarks = recognition.refusals, plan.remarks
+    builder = LinkTreeBuilder(model, MJCF_CAPABILITIES, leave_out, tolerance, strict)
+    description = builder.build()
+    home = {s.path: v for s, v in builder.home_positions().items()}
+    unsupported, remarks = builder.unsupported, description.remarks
     without: dict[str, str] = {}
     while True:
-        plan.remarks = remarks + [
+        description.remarks = remarks + [
             f"the mesh {file} is left out: MuJoCo refuses it, {why}" for file, why in without.items()
         ]
-        writer = MjcfWriter(plan, path, refusals, home, without)
+        writer = MjcfWriter(description, path, unsupported, home, without)
         root = writer.root()
         complaint = find_load_error(root, path.absolute().parent, writer.converted)
         if complaint is None:
-            content = format_xml(root, [*plan.remarks, *plan.error_lines])
-            return WrittenFile(content, tuple(plan.remarks), plan.errors, refusals.left_out, writer.converted)
+            content = format_xml(root, [*description.remarks, *description.error_lines])
+            return WrittenFile(
+                content,
+                tuple(description.remarks),
+                description.errors,
+                unsupported.left_out,
+                writer.converted,
+            )
         file = find_blamed_mesh(complaint, root)
         if file is None or file in without:
             raise FormatError(f"MuJoCo does not open what would be written: {complaint}.")
@@ -105,7 +113,7 @@ def to_mjcf(
 
 
 class MjcfWriter:
-    """Writes one plan.
+    """Writes one description.
 
     ``home`` has a value for every coordinate, by its path, which becomes the key of that name; ``without``
     are files of meshes that are left out.
@@ -113,18 +121,18 @@ class MjcfWriter:
 
     def __init__(
         self,
-        plan: RobotDescription,
+        description: RobotDescription,
         path: Path,
-        refusals: UnsupportedFeatures,
+        unsupported: UnsupportedFeatures,
         home: Mapping[str, float],
         without: Collection[str] = (),
     ) -> None:
-        self._plan, self._path, self._refusals, self._home = plan, path, refusals, home
-        self._bodies = MjcfBodyWriter(path, plan.remarks, without)
+        self._description, self._path, self._unsupported, self._home = description, path, unsupported, home
+        self._bodies = MjcfBodyWriter(path, description.remarks, without)
         self._children: dict[str, list[LinkDescription]] = {}
-        for link in plan.links:
+        for link in description.links:
             self._children.setdefault(link.parent, []).append(link)
-        self._names = TakenNames([WORLD, *(link.name for link in plan.links)])
+        self._names = TakenNames([WORLD, *(link.name for link in description.links)])
         self._qpos: list[float] = []
         self._elements: dict[str, Tag] = {}
         self._joint_names: set[str] = set()
@@ -148,15 +156,15 @@ class MjcfWriter:
         compiler = root.add("compiler", angle="radian")
         world = Tag("worldbody")
         self._elements[WORLD] = world
-        self._bodies.write(world, self._plan.world, WORLD, moves=False)
+        self._bodies.write(world, self._description.world_body, WORLD, moves=False)
         # Depth first, as MuJoCo numbers its joints.
         waiting = self._children.get(WORLD, [])[::-1]
         while waiting:
             link = waiting.pop()
             self._link(link)
             waiting += self._children.get(link.name, [])[::-1]
-        self._refusals.check(self._path.name)
-        self._plan.remarks += self._refusals.remarks
+        self._unsupported.check(self._path.name)
+        self._description.remarks += self._unsupported.remarks
         equality, tendon, key = self._equalities(), self._tendons(), Tag("keyframe")
         for name, value in self._bodies.settings().items():
             compiler.give(name, value)
@@ -167,11 +175,7 @@ class MjcfWriter:
         return root
 
     def _link(self, link: LinkDescription) -> None:
-        if rotation_deviation(link.pose) > ROTATION_TOLERANCE:
-            self._refusals.add(
-                link.name,
-                f"is turned by a constant that is off by {rotation_deviation(link.pose):.2g} from any rotation",
-            )
+        check_rotation(link, self._unsupported)
         body = self._elements[link.parent]
         groups = _group_joints(link.joints)
         for k, joints in enumerate(groups):
@@ -202,7 +206,7 @@ class MjcfWriter:
                     self._qpos += [w, x, y, z]
                 else:
                     self._joint(body, joint)
-                    if len(link.joints) > 2 and not joint.leads and "armature" not in joint.dynamics:
+                    if len(link.joints) > 2 and not joint.is_independent and "armature" not in joint.dynamics:
                         body.inside[-1].give("armature", _ARMATURE)
                     self._qpos.append(self._at_home(joint))
 
@@ -216,12 +220,12 @@ class MjcfWriter:
         for joint, axis, c in zip(slides, _AXES, "xyz", strict=True):
             if (
                 not isinstance(joint, JointDescription)
-                or joint.turns
-                or not joint.leads
+                or joint.is_rotation
+                or not joint.is_independent
                 or joint.axis != axis
             ):
                 return None
-            if joint.name != f"{ball.name}/{c}" or not joint.bounds.open or joint.dynamics:
+            if joint.name != f"{ball.name}/{c}" or not joint.bounds.is_unbounded or joint.dynamics:
                 return None
         return ball.name
 
@@ -236,14 +240,14 @@ class MjcfWriter:
         self._qpos += [*pose[:3, 3].tolist(), w, a, b, c]
 
     def _joint(self, body: Tag, joint: JointDescription) -> None:
-        kind = "hinge" if joint.turns else "slide"
+        kind = "hinge" if joint.is_rotation else "slide"
         element = body.add(
             "joint", name=joint.name, type=kind, pos=_unless_zero(joint.point), axis=joint.axis
         )
         lower, upper = joint.bounds.lower, joint.bounds.upper
         if joint.bounds.soft is not None:
             lower, upper = max(lower, joint.bounds.soft[0]), min(upper, joint.bounds.soft[1])
-            self._plan.remarks.append(f"the soft limits of '{joint.name}' are written as its limits")
+            self._description.remarks.append(f"the soft limits of '{joint.name}' are written as its limits")
         if (lower, upper) != (-math.inf, math.inf):
             element.attributes["range"] = _range(lower, upper)
         known = joint.dynamics
@@ -255,17 +259,17 @@ class MjcfWriter:
             element.give("actuatorfrcrange", (-float(effort), float(effort)))
         for key, value in known.items():
             if key not in _DYNAMICS and (key != "effort" or not value) and value:
-                self._plan.remarks.append(f"MJCF has no {key}: that of '{joint.name}' is left out")
+                self._description.remarks.append(f"MJCF has no {key}: that of '{joint.name}' is left out")
 
     def _at_home(self, joint: JointDescription) -> float:
         x = self._home.get(joint.symbol.path, 0.0)
-        return float(np.polynomial.polynomial.polyval(x, joint.amount))
+        return float(np.polynomial.polynomial.polyval(x, joint.coefficients))
 
     def _equalities(self) -> Tag:
         equality, names = Tag("equality"), TakenNames()
-        for joint in self._plan.joints:
-            if not joint.leads:
-                coefficients = [*joint.amount, 0.0, 0.0, 0.0, 0.0][:5]
+        for joint in self._description.joints:
+            if not joint.is_independent:
+                coefficients = [*joint.coefficients, 0.0, 0.0, 0.0, 0.0][:5]
                 equality.add(
                     "joint",
                     name=names.take(joint.name),
@@ -273,9 +277,11 @@ class MjcfWriter:
                     joint2=joint.symbol.path,
                     polycoef=coefficients,
                 )
-        for frame in dict.fromkeys(end for loop in self._plan.loops for pair in loop.ends for end in pair):
+        for frame in dict.fromkeys(
+            end for loop in self._description.loops for pair in loop.ends for end in pair
+        ):
             self._elements[frame].add("site", name=self._ends.setdefault(frame, f"{frame}/end"))
-        for loop in self._plan.loops:
+        for loop in self._description.loops:
             for k, (frame, to) in enumerate(loop.ends):
                 name = names.take(f"{loop.name}/{k}" if k else loop.name)
                 self._ties.setdefault(loop.name, []).append(name)
@@ -285,7 +291,7 @@ class MjcfWriter:
 
     def _tendons(self) -> Tag:
         tendon = Tag("tendon")
-        for item in self._plan.sums:
+        for item in self._description.sum_limits:
             fixed = tendon.add("fixed", name=item.name)
             fixed.attributes["range"] = _range(item.lower, item.upper)
             for symbol, factor in item.factors.items():
@@ -295,11 +301,13 @@ class MjcfWriter:
     def _said(self) -> Tag:
         """Return what only the reader here understands, and MuJoCo ignores."""
         custom = Tag("custom")
-        if add_speeds(custom, self._plan.joints):
-            self._plan.remarks.append("MuJoCo knows no limits of speeds: they are custom numbers, <numeric>")
+        if add_speeds(custom, self._description.joints):
+            self._description.remarks.append(
+                "MuJoCo knows no limits of speeds: they are custom numbers, <numeric>"
+            )
         add_names(custom, MASSLESS, "body", self._bodies.massless)
         add_names(custom, ENDS, "site", self._ends.values())
-        for loop in self._plan.loops:
+        for loop in self._description.loops:
             add_loop(custom, loop, self._ties[loop.name], self._joint_names)
         return custom
 
