@@ -229,7 +229,7 @@ def test_joints_are_turned_where_the_root_is_at_the_other_end():
         joint("two", "revolute", "b", "c", pose("1 0 0 0 0 0") + Z),
     )
     scene = parse_sdf(text)
-    assert [j.turned for j in scene.joints] == [False, True]
+    assert [j.is_reversed for j in scene.joints] == [False, True]
     model = model_of(text)
     rest = np.linalg.inv(at(model, "b", one=0.2, two=0.0)) @ at(model, "c", one=0.2)
     np.testing.assert_allclose(rest, np.eye(4), atol=1e-15)

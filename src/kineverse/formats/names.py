@@ -31,6 +31,9 @@ def check_prefix(prefix: object) -> None:
         ) from None
 
 
+NameMap: TypeAlias = Callable[[str], str]
+"""Function that returns the name in the model for a name in a description."""
+
 NameFaultHandler: TypeAlias = Callable[[str, str, str], None]
 """Called with the place of a mistake, what it is and what is taken instead; raises in a strict reader."""
 

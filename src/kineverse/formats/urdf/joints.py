@@ -235,17 +235,17 @@ def _range(
     lower, upper = _end(limit, "lower", joint, remarks), _end(limit, "upper", joint, remarks)
     if math.isnan(lower) or math.isnan(upper):
         return None, None
-    mistake: ElementError | None = None
+    invalid: ElementError | None = None
     if lower > upper:
-        mistake = ElementError(
+        invalid = ElementError(
             limit, f"has lower={lower!r} above upper={upper!r}: no position would be valid."
         )
     elif lower > LARGEST or upper < -LARGEST:
-        mistake = ElementError(
+        invalid = ElementError(
             limit, f"has lower={lower!r} and upper={upper!r}: all positions would be beyond {LARGEST:g}."
         )
-    if mistake is not None:
-        remarks.mend(mistake, "the joint is not limited", joint)
+    if invalid is not None:
+        remarks.mend(invalid, "the joint is not limited", joint)
         return None, None
     return (lower if lower > -math.inf else None), (upper if upper < math.inf else None)
 
