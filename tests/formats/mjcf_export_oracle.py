@@ -1,4 +1,4 @@
-"""An MJCF file as MuJoCo understands it, moved by the coordinates of the model that it was written from."""
+"""Poses of an MJCF file in MuJoCo, by the coordinates of the model that it was written from."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ _BALL = int(mujoco.mjtJoint.mjJNT_BALL)
 _JOINT = int(mujoco.mjtEq.mjEQ_JOINT)
 
 
-class Reference:
-    """One model, moved by :meth:`place` to one configuration after the other; meshes are taken out of it."""
+class MujocoReference:
+    """Model in MuJoCo without its meshes, at the configuration set by :meth:`place`."""
 
     def __init__(self, file: Path) -> None:
         text = re.sub(r'<geom [^>]*type="mesh"[^>]*/>|<(mesh|texture|material) [^>]*/>', "", file.read_text())
@@ -26,7 +26,7 @@ class Reference:
         self.data = mujoco.MjData(self.model)
 
     def place(self, values: dict[str, float]) -> None:
-        """Move the joints that are coordinates, and those that follow them by an equality."""
+        """Set the joints that are coordinates, and those that follow them by an equality."""
         m, q = self.model, self.data.qpos
         for number in range(m.njnt):
             name, start, kind = m.joint(number).name, m.jnt_qposadr[number], m.jnt_type[number]
@@ -60,6 +60,6 @@ class Reference:
 
     @property
     def violation(self) -> float:
-        """How much is left of ties and equalities, at most."""
+        """Largest violation of an equality."""
         rows = self.data.efc_type == int(mujoco.mjtConstraint.mjCNSTR_EQUALITY)
         return float(np.abs(self.data.efc_pos[rows]).max(initial=0.0))

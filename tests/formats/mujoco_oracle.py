@@ -1,4 +1,4 @@
-"""An MJCF as MuJoCo moves it, beside the model that is made of it here.
+"""An MJCF in MuJoCo and in Kineverse, compared by poses and Jacobians.
 
 MuJoCo reads the file itself. Joints, bodies and sites correspond by their number, so that those without a name
 are compared, too.
@@ -30,7 +30,7 @@ def model_of(scene: MjcfScene, prefix: str | None = None) -> kv.Model:
 
 
 class Pair:
-    """One description, as MuJoCo has it and as it is here."""
+    """Description in MuJoCo and in Kineverse."""
 
     def __init__(self, text: str | bytes, engine: mujoco.MjModel, folder: str = "") -> None:
         self.scene = parse_mjcf(text, "x.xml", folder)
@@ -59,7 +59,7 @@ class Pair:
         return any(name == f"{link.name}/free" for link in self.scene.links)
 
     def _is_held(self, joint: str) -> bool:
-        """Return whether a free body hangs below what an equality ties it to."""
+        """Return True if a free body is attached to the link that an equality ties it to."""
         record = self.model.articulations.get(joint)
         return record is None or record.kind != "floating"
 
@@ -93,7 +93,7 @@ class Pair:
         return np.asarray(resolved({s: state[s] for s in resolved.symbols}))
 
     def place(self, state: dict[kv.Symbol, float]) -> None:
-        """Put MuJoCo's joints and mocap bodies where the state has them."""
+        """Set MuJoCo's joints and mocap bodies to a state."""
         for number, joint in enumerate(self.joints):
             at = int(self.engine.jnt_qposadr[number])
             if joint.kind == "free" and self._is_held(joint.name):
@@ -124,7 +124,7 @@ class Pair:
         mujoco.mj_comPos(self.engine, self.data)
 
     def _free(self, body: int, offset: Array, wxyz: Array) -> tuple[Array, Array]:
-        """Return where a body is by its pose in the file and what has moved it from there."""
+        """Return the pose of a free body: its pose in the file, and the motion from there."""
         turned, quat = np.zeros(3), np.zeros(4)
         mujoco.mju_rotVecQuat(turned, offset, self.engine.body_quat[body])
         mujoco.mju_mulQuat(quat, self.engine.body_quat[body], wxyz)
@@ -141,7 +141,7 @@ class Pair:
             np.testing.assert_allclose(here, pose, atol=tolerance, err_msg=name)
 
     def compare_jacobians(self, state: dict[kv.Symbol, float], tolerance: float = 1e-9) -> None:
-        """Compare columns: MuJoCo's speeds are a linear function of those here."""
+        """Compare the columns of Jacobians; MuJoCo's speeds are a linear function of the model's."""
         self.place(state)
         speeds = self.model.speeds
         to_engine = np.zeros((self.engine.nv, len(speeds)))

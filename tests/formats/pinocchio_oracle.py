@@ -1,8 +1,7 @@
-"""A URDF text as pinocchio understands it, asked in the coordinates and speeds of Kineverse.
+"""Poses and Jacobians of a URDF in pinocchio, by the coordinates and speeds of Kineverse.
 
-Pinocchio's own support for joints that mimic wants both joints of one type. So they are left free there, and
-what moves them is put in here: their positions by multiplier and offset, their columns by a matrix. What
-mimics what is read from the text once more, without Kineverse.
+Pinocchio supports mimic joints of one type only. So they are independent there, and follow by multiplier and
+offset here, their Jacobian columns by a matrix. The mimic relations are read from the text without Kineverse.
 """
 
 from __future__ import annotations
@@ -28,10 +27,10 @@ COORDINATES = {
 }
 
 
-class Reference:
-    """One robot, moved by :meth:`place` to one configuration after the other.
+class PinocchioReference:
+    """Robot in pinocchio, at the configuration set by :meth:`place`.
 
-    ``speeds`` are the names of the speeds of Kineverse. ``speed_map``, (nv, n), makes pinocchio's speeds of them.
+    ``speeds`` are the names of Kineverse's speeds. ``speed_map``, (nv, n), maps them to pinocchio's speeds.
     """
 
     def __init__(self, text: str) -> None:
@@ -62,7 +61,7 @@ class Reference:
         return values
 
     def place(self, values: dict[str, float]) -> None:
-        """Move everything to where the coordinates of Kineverse are."""
+        """Set pinocchio's configuration to the coordinates of Kineverse."""
         configuration: list[float] = []
         columns: dict[str, Matrix] = {}
         for name, moving in zip(self.model.names[1:], self.model.joints[1:], strict=True):
@@ -112,7 +111,7 @@ class Reference:
         return numbers, [f"{source}:velocity"], np.array([[factor]])
 
     def _source(self, name: str) -> tuple[str, float, float]:
-        """Return the joint at the end of a chain of mimicry, with the composed multiplier and offset."""
+        """Return the joint at the end of a mimic chain, with the composed multiplier and offset."""
         if name not in self._mimics:
             return name, 1.0, 0.0
         leader, factor, offset = self._mimics[name]

@@ -1,4 +1,4 @@
-"""Random trees of joints, couplings and frames of one's own, for hypothesis."""
+"""Random trees of joints, mimic joints and custom frames, for hypothesis."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The law of writers: what is read again has the frames, coordinates, poses and limits of what was written."""
+"""Comparison of a model with the one read back: frames, coordinates, poses and limits are the same."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ SHIPPED = list(shipped_models())
 
 
 @cache
-def described() -> list[Path | None]:
+def readable_urdf_files() -> list[Path | None]:
     """Return the URDF files of the shared data that can be read; None alone if there are no data."""
     found: list[Path | None] = []
     for file in sorted(SHARED.rglob("*.urdf")):
@@ -33,12 +33,12 @@ def described() -> list[Path | None]:
 
 
 @cache
-def loaded(name: str) -> kv.Model:
-    """Return a model that ships or a scene, which nobody changes: some take seconds."""
+def load_cached(name: str) -> kv.Model:
+    """Return a shipped model or a scene, loaded once since some take seconds; not to be changed."""
     return kv.load(name)
 
 
-def posing(model: kv.Model, frames: list[str]) -> Callable[[dict[str, float]], list[np.ndarray]]:
+def compile_poses(model: kv.Model, frames: list[str]) -> Callable[[dict[str, float]], list[np.ndarray]]:
     """Return a function from values of coordinates to the poses of frames."""
     symbols = model.degrees_of_freedom
     parameters = [s for s in model.symbols if not s.has_derivative]
@@ -48,11 +48,11 @@ def posing(model: kv.Model, frames: list[str]) -> Callable[[dict[str, float]], l
 
 
 def poses(model: kv.Model, frames: list[str], values: dict[str, float]) -> list[np.ndarray]:
-    return posing(model, frames)(values)
+    return compile_poses(model, frames)(values)
 
 
 def random_values(model: kv.Model, rng: np.random.Generator) -> dict[str, float]:
-    """Return a value for each coordinate, within its limits where there are any."""
+    """Return a random value for each coordinate, within its limits."""
     values = {}
     for s in model.degrees_of_freedom:
         low, high = model.limits(s)
@@ -62,12 +62,12 @@ def random_values(model: kv.Model, rng: np.random.Generator) -> dict[str, float]
 
 
 def assert_same_motion(written: kv.Model, read: kv.Model, tolerance: float = EXACT, count: int = 2) -> None:
-    """Compare frames, coordinates, poses and limits; what was read may have more frames."""
+    """Compare frames, coordinates, poses and limits; the model read back may have more frames."""
     frames = list(written.frames)
     assert set(frames) <= set(read.frames)
     assert written.degrees_of_freedom == read.degrees_of_freedom
     rng = np.random.default_rng(len(frames))
-    ours, theirs = posing(written, frames), posing(read, frames)
+    ours, theirs = compile_poses(written, frames), compile_poses(read, frames)
     for _ in range(count):
         values = random_values(written, rng)
         for name, a, b in zip(frames, ours(values), theirs(values), strict=True):
@@ -99,7 +99,7 @@ def assert_same_bodies(written: kv.Model, read: kv.Model) -> None:
 
 
 def _form(shape: object) -> object:
-    """Return the geometry, a mesh by its file: another folder calls it something else."""
+    """Return the geometry of a shape, a mesh by its file, since references depend on the folder."""
     geometry = shape.geometry  # type: ignore[attr-defined]
     if not hasattr(geometry, "uri"):
         return geometry

@@ -1,4 +1,4 @@
-"""What becomes of each SDF of the shared data: its frames and degrees of freedom, or what its refusal says."""
+"""Expected outcome of each SDF of the shared data: its frames and degrees of freedom, or its error message."""
 
 from __future__ import annotations
 
@@ -118,4 +118,4 @@ sdf_joint_types/sdformat_test/world_relative_to_nested_reference.sdf | 12 14
 sdf_joint_types/sdformat_test/world_valid_root_reference.sdf | 3 7
 """
 
-VERDICTS: dict[str, str] = dict(line.split(" | ", 1) for line in _TABLE.strip().splitlines())  # type: ignore[misc]
+OUTCOMES: dict[str, str] = dict(line.split(" | ", 1) for line in _TABLE.strip().splitlines())  # type: ignore[misc]

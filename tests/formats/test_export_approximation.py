@@ -1,4 +1,4 @@
-"""Motions approximated within a tolerance: the error that is promised holds, and is not much more than occurs."""
+"""Approximation of motions within a tolerance: error bounds hold, and are close to the errors."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from round_trip import posing, random_values
+from round_trip import compile_poses, random_values
 
 import kineverse as kv
 from hypothesis_profiles import attempts
@@ -44,7 +44,7 @@ def sampled_errors(model: kv.Model, read: kv.Model, count: int = 60) -> dict[str
     """Return the largest errors met at random configurations and at the ends of all limits."""
     rng, frames = np.random.default_rng(0), list(model.frames)
     found = dict.fromkeys(frames, FrameDeviation())
-    ours, theirs = posing(model, frames), posing(read, frames)
+    ours, theirs = compile_poses(model, frames), compile_poses(read, frames)
     for k in range(count):
         values = random_values(model, rng)
         if k < 2:
@@ -62,7 +62,7 @@ def sampled_errors(model: kv.Model, read: kv.Model, count: int = 60) -> dict[str
 @pytest.mark.parametrize("curve", CURVES, ids=[f"curve{k}" for k in range(len(CURVES))])
 @settings(max_examples=attempts(8), deadline=None)
 @given(low=st.floats(-1, 1), width=st.floats(1e-3, 0.3), part=st.floats(0, 1))
-def test_series_contain_the_function_and_those_of_all_points(
+def test_taylor_series_enclose_the_function_and_the_series_at_all_points(
     curve: kv.Expression, low: float, width: float, part: float
 ) -> None:
     terms = TermGraph({})
@@ -84,7 +84,7 @@ def test_series_contain_the_function_and_those_of_all_points(
         assert float(curve({Q: at + step})) == pytest.approx(near, abs=1e-8)
 
 
-def test_implicit_functions_are_enclosed() -> None:
+def test_taylor_series_enclose_implicit_functions() -> None:
     model = kv.load("articulations/four_bar")
     terms = TermGraph({})
     enclosures = Enclosures(terms)
@@ -122,7 +122,7 @@ CASES = {
     ("ending", "build", "tolerance"),
     [pytest.param(e, b, t, id=f"{n}.{e}") for e, cases in CASES.items() for n, b, t in cases],
 )
-def test_what_is_promised_holds_and_is_not_much_more(
+def test_error_bounds_hold_and_are_tight(
     ending: str, build: object, tolerance: float, tmp_path: Path
 ) -> None:
     model = build()  # type: ignore[operator]
@@ -145,7 +145,7 @@ def test_what_is_promised_holds_and_is_not_much_more(
     assert f"approximated: '{worst}' is off by {report.errors[worst]} at most" in file.read_text()
 
 
-def test_what_is_exact_stays_exact(tmp_path: Path) -> None:
+def test_exact_motions_have_no_error(tmp_path: Path) -> None:
     report = kv.load("articulations/desk_lamp").save(tmp_path / "m.urdf", tolerance=1e-3)
     assert report.errors == {}
     assert report.error == FrameDeviation()
@@ -158,7 +158,9 @@ def test_what_is_exact_stays_exact(tmp_path: Path) -> None:
         ("four_bar", "'four_bar/crank', which has no limits between which it is approximated"),
     ],
 )
-def test_what_cannot_be_met_is_refused_with_the_least_error(name: str, message: str, tmp_path: Path) -> None:
+def test_tolerance_that_cannot_be_met_is_refused_with_the_least_error(
+    name: str, message: str, tmp_path: Path
+) -> None:
     with pytest.raises(kv.errors.FormatError, match=message):
         kv.load(f"articulations/{name}").save(tmp_path / "m.urdf", tolerance=1e-3)
     assert not list(tmp_path.iterdir())
@@ -174,7 +176,7 @@ def test_curves_over_two_coordinates_are_refused(tmp_path: Path) -> None:
         model.save(tmp_path / "m.urdf", tolerance=0.1)
 
 
-def test_errors_grow_with_the_distance_from_where_they_arise(tmp_path: Path) -> None:
+def test_frame_errors_grow_with_the_distance_from_the_approximated_joint(tmp_path: Path) -> None:
     model = kv.Model()
     with model.edit() as edit:
         edit.apply(kv.Revolute(name="q", parent="world", child="q", lower=0, upper=1))
@@ -194,7 +196,7 @@ def test_errors_grow_with_the_distance_from_where_they_arise(tmp_path: Path) -> 
         model.save(tmp_path / "m.urdf", tolerance=0.2)
 
 
-def test_limits_of_what_follows_a_curve_hold_or_are_refused(tmp_path: Path) -> None:
+def test_limits_of_approximated_joints_are_implied_or_left_out(tmp_path: Path) -> None:
     def model(upper: float) -> kv.Model:
         result = kv.Model()
         with result.edit() as edit:
@@ -212,11 +214,11 @@ def test_limits_of_what_follows_a_curve_hold_or_are_refused(tmp_path: Path) -> N
 
 
 @pytest.mark.parametrize("tolerance", [0, -1, np.nan, np.inf, "small"])
-def test_a_tolerance_is_a_positive_number(tolerance: object, tmp_path: Path) -> None:
+def test_tolerance_that_is_not_positive_is_refused(tolerance: object, tmp_path: Path) -> None:
     with pytest.raises(kv.KineverseError, match="A tolerance is a positive number"):
         kv.Model().save(tmp_path / "m.urdf", tolerance=tolerance)
 
 
-def test_documents_are_exact(tmp_path: Path) -> None:
+def test_documents_have_no_tolerance(tmp_path: Path) -> None:
     with pytest.raises(kv.errors.FormatError, match="exactly"):
         kv.Model().save(tmp_path / "m.kv.json", tolerance=0.1)

@@ -1,4 +1,4 @@
-"""Meshes of what is written: found from where the file lies, and opened by whoever reads it."""
+"""Meshes of written files: references from the folder of the file, and conversion for MuJoCo."""
 
 from __future__ import annotations
 
@@ -8,9 +8,9 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import mesh_bytes
 import numpy as np
 import pytest
-import written_meshes as made
 
 import kineverse as kv
 from kineverse.formats.resource_paths import locate_mesh, locate_resource
@@ -24,12 +24,12 @@ REFERENCES = [
     "{folder}/{}",
 ]
 FILES = {
-    "cup.stl": made.tetrahedron(),
-    "cup.STL": made.tetrahedron(),
-    "text.stl": made.tetrahedron_as_text(),
-    "cup.ply": made.tetrahedron_as_ply(),
-    "cup.dae": made.tetrahedron_as_collada(),
-    "inches.dae": made.tetrahedron_as_collada(0.0254),
+    "cup.stl": mesh_bytes.tetrahedron(),
+    "cup.STL": mesh_bytes.tetrahedron(),
+    "text.stl": mesh_bytes.tetrahedron_as_text(),
+    "cup.ply": mesh_bytes.tetrahedron_as_ply(),
+    "cup.dae": mesh_bytes.tetrahedron_as_collada(),
+    "inches.dae": mesh_bytes.tetrahedron_as_collada(0.0254),
 }
 
 
@@ -73,12 +73,12 @@ def corners(file: Path) -> np.ndarray:
 
 @pytest.mark.parametrize("reference", REFERENCES)
 @pytest.mark.parametrize("name", FILES)
-def test_mujoco_opens_what_is_written(reference: str, name: str, package: Path, tmp_path: Path) -> None:
+def test_mujoco_loads_written_meshes(reference: str, name: str, package: Path, tmp_path: Path) -> None:
     (tmp_path / "out").mkdir()
     target = tmp_path / "out" / "r.xml"
     saved = robot(package, said(reference, name, package)).save(target)
     found = corners(target)
-    expected = np.array(made.CORNERS) * (1, 2, 1)
+    expected = np.array(mesh_bytes.CORNERS) * (1, 2, 1)
     distances = np.linalg.norm(found[:, None] - expected[None], axis=-1)
     assert distances.min(axis=1).max() < 1e-6
     assert distances.min(axis=0).max() < 1e-6
@@ -91,9 +91,7 @@ def test_mujoco_opens_what_is_written(reference: str, name: str, package: Path, 
     assert locate_resource(shape.geometry.uri, shape.geometry.folder).is_file()
 
 
-def test_what_is_not_there_or_no_mesh_is_left_out_and_the_rest_is_written(
-    package: Path, tmp_path: Path
-) -> None:
+def test_missing_and_invalid_meshes_are_left_out(package: Path, tmp_path: Path) -> None:
     pytest.importorskip("mujoco")
     (package / "meshes" / "noise.stl").write_bytes(b"\1" * 84 + os.urandom(16))
     (package / "meshes" / "noise.dae").write_bytes(b"<COLLADA")
@@ -120,7 +118,7 @@ def test_flat_meshes_are_written(package: Path, tmp_path: Path) -> None:
 def test_meshes_of_one_name_do_not_overwrite_each_other(package: Path, tmp_path: Path) -> None:
     pytest.importorskip("mujoco")
     (package / "more").mkdir()
-    (package / "more" / "cup.dae").write_bytes(made.tetrahedron_as_collada(0.5))
+    (package / "more" / "cup.dae").write_bytes(mesh_bytes.tetrahedron_as_collada(0.5))
     references = [f"package://cups/{name}/cup.dae" for name in ("meshes", "more", "meshes")]
     robot(package, *references).save(tmp_path / "r.xml")
     assert sorted(p.name for p in (tmp_path / "r_meshes").iterdir()) == ["cup.obj"]  # equal in metres
@@ -131,7 +129,7 @@ def test_meshes_of_one_name_do_not_overwrite_each_other(package: Path, tmp_path:
     assert not (tmp_path / "again_meshes").exists()
 
 
-def test_files_that_are_there_stay(package: Path, tmp_path: Path) -> None:
+def test_existing_mesh_files_are_not_overwritten(package: Path, tmp_path: Path) -> None:
     pytest.importorskip("mujoco")
     (tmp_path / "r_meshes").mkdir()
     (tmp_path / "r_meshes" / "cup.obj").write_text("precious")
@@ -140,7 +138,7 @@ def test_files_that_are_there_stay(package: Path, tmp_path: Path) -> None:
     assert 'file="r_meshes/cup_2.obj"' in (tmp_path / "r.xml").read_text()
 
 
-def test_what_fails_leaves_no_meshes_behind(
+def test_failed_save_leaves_no_converted_meshes(
     package: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     pytest.importorskip("mujoco")
@@ -158,7 +156,7 @@ def test_what_fails_leaves_no_meshes_behind(
     assert not list((tmp_path / "out").iterdir())
 
 
-def test_without_the_extra_what_needs_it_is_left_out_by_name(
+def test_without_mesh_reader_meshes_to_convert_are_left_out(
     package: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     from kineverse.geometry import mesh_files
@@ -175,12 +173,12 @@ def test_without_the_extra_what_needs_it_is_left_out_by_name(
     assert len(kv.load(tmp_path / "r.xml").bodies["b"].visuals) == 1
 
 
-def test_textures_that_are_not_there_cost_their_colour_only(tmp_path: Path) -> None:
+def test_missing_textures_are_left_out_and_shapes_kept(tmp_path: Path) -> None:
     pytest.importorskip("mujoco")
     from PIL import Image
 
     Image.new("RGB", (2, 2)).save(tmp_path / "wood.png")
-    (tmp_path / "cup.stl").write_bytes(made.tetrahedron())
+    (tmp_path / "cup.stl").write_bytes(mesh_bytes.tetrahedron())
     cup = Mesh("cup.stl", folder=str(tmp_path))
     shapes = [Shape(cup, texture=name, color=(1, 0, 0, 1)) for name in ("wood.png", "no.png", "wood.jpg")]
     model = kv.Model()
@@ -198,7 +196,7 @@ def test_textures_that_are_not_there_cost_their_colour_only(tmp_path: Path) -> N
 
 
 @pytest.mark.parametrize("ending", ["urdf", "xml"])
-def test_who_writes_elsewhere_is_told_the_root_to_read_it_with(
+def test_save_outside_of_the_root_warns_of_the_root_to_give(
     ending: str, package: Path, tmp_path: Path
 ) -> None:
     if ending == "xml":
@@ -216,7 +214,7 @@ def test_who_writes_elsewhere_is_told_the_root_to_read_it_with(
     assert not any("outside" in r for r in model.save(package / f"r.{ending}").remarks)
 
 
-def test_a_texture_is_not_taken_from_wherever_the_program_runs(
+def test_textures_are_not_searched_in_the_working_directory(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     pytest.importorskip("mujoco")
@@ -234,7 +232,7 @@ def test_a_texture_is_not_taken_from_wherever_the_program_runs(
     assert re.findall('<texture .*file="([^"]*)"', (tmp_path / "m.xml").read_text()) == ["wood.png"]
 
 
-def test_what_a_description_may_not_open_is_not_opened_to_be_written(
+def test_meshes_outside_of_the_root_are_not_read_for_conversion(
     package: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     pytest.importorskip("mujoco")
@@ -268,7 +266,9 @@ def _recording(function: Any, opened: list[str]) -> Any:
 
 @pytest.mark.parametrize("ending", ["urdf", "kv.json"])
 @pytest.mark.parametrize("reference", REFERENCES)
-def test_meshes_are_found_from_elsewhere(reference: str, ending: str, package: Path, tmp_path: Path) -> None:
+def test_mesh_references_are_relative_to_the_written_file(
+    reference: str, ending: str, package: Path, tmp_path: Path
+) -> None:
     there = tmp_path / "some" / "where"
     there.mkdir(parents=True)
     model = robot(package, said(reference, "cup.stl", package))
@@ -279,7 +279,7 @@ def test_meshes_are_found_from_elsewhere(reference: str, ending: str, package: P
     assert found.resolve() == package / "meshes" / "cup.stl"
 
 
-def test_addresses_stay_where_they_are_found_from_there_too(
+def test_mesh_addresses_stay_if_they_lead_to_the_same_file(
     package: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     model = robot(package, "package://cups/meshes/cup.stl")
@@ -297,7 +297,7 @@ def test_addresses_stay_where_they_are_found_from_there_too(
     assert "package://cups/meshes/cup.stl" in (tmp_path / "far.urdf").read_text()
 
 
-def test_what_is_nowhere_is_called_what_it_was_called(tmp_path: Path) -> None:
+def test_missing_meshes_keep_their_reference(tmp_path: Path) -> None:
     (tmp_path / "urdf").mkdir()
     model = robot(tmp_path, "package://nobody/a.stl")
     model.save(tmp_path / "r.urdf")

@@ -1,4 +1,4 @@
-"""Models written as MJCF: MuJoCo puts every body where they do, and read again they are the same."""
+"""Models written as MJCF: poses are those of MuJoCo, and the models read back are the same."""
 
 from __future__ import annotations
 
@@ -9,17 +9,25 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from mjcf_export_oracle import Reference, mujoco
+from mesh_bytes import tetrahedron
+from mjcf_export_oracle import MujocoReference, mujoco
 from random_trees import KINDS, trees
-from round_trip import SCENES, SHIPPED, assert_same_motion, described, loaded, posing, random_values
+from round_trip import (
+    SCENES,
+    SHIPPED,
+    assert_same_motion,
+    compile_poses,
+    load_cached,
+    random_values,
+    readable_urdf_files,
+)
 from urdf_texts import SHARED
-from written_meshes import tetrahedron
 
 import kineverse as kv
 from hypothesis_profiles import attempts
 from kineverse.model.body import Body, Box, Ellipsoid, Inertia, Mesh, Shape
 
-FILES = described()
+FILES = readable_urdf_files()
 
 # What cannot be said of a scene or a model that ships: a part of the refusal. All others are said exactly.
 REFUSED = {
@@ -46,8 +54,8 @@ REFUSED = {
 
 def assert_as_in_mujoco(model: kv.Model, file: Path, count: int = 2, tolerance: float = 1e-10) -> None:
     """Compare all frames, at configurations in which loops are closed."""
-    reference = Reference(file)
-    rng, there = np.random.default_rng(len(model.frames)), posing(model, list(model.frames))
+    reference = MujocoReference(file)
+    rng, there = np.random.default_rng(len(model.frames)), compile_poses(model, list(model.frames))
     for _ in range(count):
         values = random_values(model, rng)
         found = there(values)
@@ -66,7 +74,7 @@ def assert_as_in_mujoco(model: kv.Model, file: Path, count: int = 2, tolerance: 
 @pytest.mark.parametrize(
     "file", FILES[::2], ids=lambda f: "none" if f is None else str(f.relative_to(SHARED))
 )
-def test_every_urdf_becomes_mjcf(file: Path | None, tmp_path: Path) -> None:
+def test_urdf_files_saved_as_mjcf_move_alike(file: Path | None, tmp_path: Path) -> None:
     if file is None:
         pytest.skip(f"no {SHARED}")
     model = kv.load(file)
@@ -108,8 +116,8 @@ def turned(body: Body) -> np.ndarray:
 
 
 @pytest.mark.parametrize("name", [*SHIPPED, *SCENES])
-def test_what_ships_is_said_or_refused_by_name(name: str, tmp_path: Path) -> None:
-    model = loaded(name)
+def test_shipped_models_are_written_or_refused_by_name(name: str, tmp_path: Path) -> None:
+    model = load_cached(name)
     file = tmp_path / "m.xml"
     if name in REFUSED:
         with pytest.raises(kv.errors.FormatError) as info:
@@ -128,7 +136,7 @@ def test_what_ships_is_said_or_refused_by_name(name: str, tmp_path: Path) -> Non
 
 @settings(max_examples=attempts(6), deadline=None)
 @given(model=trees((*KINDS, "ball")), seed=st.integers(0, 99))
-def test_random_trees_against_mujoco(
+def test_random_trees_saved_as_mjcf_move_alike_in_mujoco(
     model: kv.Model, seed: int, tmp_path_factory: pytest.TempPathFactory
 ) -> None:
     file = tmp_path_factory.mktemp("trees") / "m.xml"
@@ -137,7 +145,7 @@ def test_random_trees_against_mujoco(
     assert_same_motion(model, kv.load(file))
 
 
-def test_what_follows_by_a_polynomial_is_exact_up_to_degree_four(tmp_path: Path) -> None:
+def test_polynomial_followers_are_exact_up_to_degree_four(tmp_path: Path) -> None:
     q = kv.position("q")
     model = kv.Model()
     with model.edit() as edit:
@@ -154,7 +162,7 @@ def test_what_follows_by_a_polynomial_is_exact_up_to_degree_four(tmp_path: Path)
         model.save(tmp_path / "m.xml")
 
 
-def test_sums_of_coordinates_are_tendons(tmp_path: Path) -> None:
+def test_limits_of_sums_become_fixed_tendons(tmp_path: Path) -> None:
     a, b = kv.position("a"), kv.position("b")
     model = kv.Model()
     with model.edit() as edit:
@@ -162,7 +170,7 @@ def test_sums_of_coordinates_are_tendons(tmp_path: Path) -> None:
             edit.apply(kv.Revolute(name=name, parent="world", child=name, lower=-1, upper=1))
         edit.constrain("together", -0.5, 2 * a - b + 1, 1.5)
     model.save(tmp_path / "m.xml")
-    compiled = Reference(tmp_path / "m.xml").model
+    compiled = MujocoReference(tmp_path / "m.xml").model
     assert compiled.ntendon == 1
     np.testing.assert_allclose(compiled.tendon_range[0], [-1.5, 0.5])
     again = kv.load(tmp_path / "m.xml")
@@ -170,7 +178,7 @@ def test_sums_of_coordinates_are_tendons(tmp_path: Path) -> None:
         assert bool(again.violations(values)) == bool(model.violations(values))
 
 
-def test_home_is_a_key(tmp_path: Path) -> None:
+def test_home_position_becomes_a_key(tmp_path: Path) -> None:
     model = kv.Model()
     with model.edit() as edit:
         edit.apply(kv.Revolute(name="q", parent="world", child="q", lower=0.5, upper=1))
@@ -178,18 +186,18 @@ def test_home_is_a_key(tmp_path: Path) -> None:
             kv.Floating(name="fly", parent="world", child="fly", origin=kv.model.Pose.of(kv.rotation_x(1.0)))
         )
     model.save(tmp_path / "m.xml")
-    compiled = Reference(tmp_path / "m.xml").model
+    compiled = MujocoReference(tmp_path / "m.xml").model
     assert compiled.key("home").qpos[0] == 0.5
     assert kv.load(tmp_path / "m.xml").default_state()["q"] == 0.5
 
 
-def test_loops_are_ties(tmp_path: Path) -> None:
+def test_loops_become_equalities(tmp_path: Path) -> None:
     kv.load("articulations/four_bar").save(tmp_path / "m.xml")
-    compiled = Reference(tmp_path / "m.xml").model
+    compiled = MujocoReference(tmp_path / "m.xml").model
     assert [int(kind) for kind in compiled.eq_type] == [int(mujoco.mjtEq.mjEQ_CONNECT)]
 
 
-def test_bodies(tmp_path: Path) -> None:
+def test_bodies_are_read_back_unchanged(tmp_path: Path) -> None:
     body = Body(
         (
             Shape(Box((1, 2, 3)), name="seen", color=(1, 0, 0.5, 1)),
@@ -212,7 +220,7 @@ def test_bodies(tmp_path: Path) -> None:
     np.testing.assert_allclose(turned(again), turned(body), atol=1e-12)
 
 
-def test_what_no_body_has_is_said(tmp_path: Path) -> None:
+def test_unphysical_inertia_and_flat_boxes_are_remarked_on(tmp_path: Path) -> None:
     flat = Body((Shape(Box((1, 0, 1))),), inertia=Inertia(1, (1, 0, 0, 1, 0, 5)))
     model = kv.Model()
     with model.edit() as edit:
@@ -220,11 +228,11 @@ def test_what_no_body_has_is_said(tmp_path: Path) -> None:
     report = model.save(tmp_path / "m.xml")
     assert any("the inertia of 'f' is that of no body" in remark for remark in report.remarks)
     assert any("MJCF has no box of size 0: one of 'f'" in remark for remark in report.remarks)
-    Reference(tmp_path / "m.xml")
+    MujocoReference(tmp_path / "m.xml")
 
 
-def test_one_coordinate_at_one_place(tmp_path: Path) -> None:
-    """A joint whose limits leave one value, which MuJoCo would not have."""
+def test_joint_with_equal_limits_is_written(tmp_path: Path) -> None:
+    """MuJoCo requires limits that differ."""
     model = kv.Model()
     with model.edit() as edit:
         edit.apply(kv.Revolute(name="q", parent="world", child="q", lower=0.25, upper=0.25))
@@ -233,9 +241,9 @@ def test_one_coordinate_at_one_place(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("name", ["mimic", "gearbox", "cam", "pedal_bin", "garage_door_as_published"])
-def test_documents_are_written_or_refused_as_what_they_were_saved_from(name: str, tmp_path: Path) -> None:
-    """They have the matrices of rotations only, and not the angles."""
-    model = loaded(f"articulations/{name}")
+def test_models_read_from_documents_are_written_alike(name: str, tmp_path: Path) -> None:
+    """Documents have only the matrices of rotations, and not the angles."""
+    model = load_cached(f"articulations/{name}")
     model.save(tmp_path / "m.kv.json")
     document = kv.load(tmp_path / "m.kv.json")
     for options in ({}, {"tolerance": 0.02}):

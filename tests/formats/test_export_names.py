@@ -1,4 +1,4 @@
-"""Names with anything in them, in every role: what is written is read again under the same names."""
+"""Names with special characters in every role are the same when they are read back."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ NAMES = [
 
 
 def named(name: str, formats: str) -> kv.Model:
-    """Return a model in which everything bears a name, or one below it."""
+    """Return a model in which all elements have a name, or a name below it."""
     q = kv.position(f"{name}/own")
     body = Body((Shape(Box((1, 1, 1)), name=name),), (Shape(Box((1, 2, 1))),), Inertia(1, (1, 0, 0, 1, 0, 1)))
     model = kv.Model()
@@ -51,7 +51,7 @@ def named(name: str, formats: str) -> kv.Model:
 
 @pytest.mark.parametrize("name", NAMES)
 @pytest.mark.parametrize("ending", ["urdf", "xml"])
-def test_names_in_every_role(name: str, ending: str, tmp_path: Path) -> None:
+def test_names_are_kept_in_every_role(name: str, ending: str, tmp_path: Path) -> None:
     if ending == "xml":
         pytest.importorskip("mujoco")
     model = named(name, "mjcf" if ending == "xml" else "urdf")
@@ -70,7 +70,7 @@ def test_names_in_every_role(name: str, ending: str, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("name", ["obj:joint", "50%", "ünï 码"])
-def test_names_of_loops_and_prefixes(name: str, tmp_path: Path) -> None:
+def test_names_of_loops_are_kept_below_prefixes(name: str, tmp_path: Path) -> None:
     pytest.importorskip("mujoco")
     model = kv.load("articulations/four_bar", prefix=name)
     model.save(tmp_path / "m.xml")
@@ -81,8 +81,8 @@ def test_names_of_loops_and_prefixes(name: str, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("name", ["obj:joint", "robot0:slide"])
 @pytest.mark.parametrize("kind", ["hinge", "slide", "ball", "free", "mocap"])
-def test_homes_of_names_with_colons(name: str, kind: str, tmp_path: Path) -> None:
-    """What MuJoCo's own suites are full of."""
+def test_home_positions_of_names_with_colons_are_kept(name: str, kind: str, tmp_path: Path) -> None:
+    """Such names are common in MuJoCo's own models."""
     pytest.importorskip("mujoco")
     inertia = '<inertial pos="0 0 0" mass="1" diaginertia="1 1 1"/>'
     joint = {"free": f'<freejoint name="{name}"/>', "mocap": ""}.get(
@@ -105,7 +105,7 @@ def test_homes_of_names_with_colons(name: str, kind: str, tmp_path: Path) -> Non
     np.testing.assert_allclose(poses[1], poses[0], atol=1e-12)
 
 
-def test_text_that_xml_cannot_carry_is_refused_by_what_it_is_part_of(tmp_path: Path) -> None:
+def test_text_invalid_in_xml_is_refused_with_its_element(tmp_path: Path) -> None:
     model = kv.Model()
     with model.edit() as edit:
         edit.add_frame("bell\a", parent="world", transform=kv.rotation_z(kv.position("q")))
@@ -117,8 +117,8 @@ def test_text_that_xml_cannot_carry_is_refused_by_what_it_is_part_of(tmp_path: P
     assert not list(tmp_path.iterdir())
 
 
-def test_mesh_paths_with_anything_in_them(tmp_path: Path) -> None:
-    """Also where the text of the path is no address: spaces, percents, umlauts."""
+def test_mesh_paths_with_special_characters_are_kept(tmp_path: Path) -> None:
+    """Also for paths that are no address: with spaces, percents, umlauts."""
     folder = tmp_path / "möbel 50% & co"
     folder.mkdir()
     (folder / "cup's.stl").write_bytes(b"\0" * 84)

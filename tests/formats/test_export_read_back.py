@@ -1,4 +1,4 @@
-"""What is written is read again before it is there; small and flat inertia is written as MuJoCo takes it."""
+"""Written files are read back before they are saved; small and flat inertia is written as MuJoCo reads it."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from round_trip import assert_same_motion, loaded
+from round_trip import assert_same_motion, load_cached
 
 import kineverse as kv
 from hypothesis_profiles import attempts
@@ -59,7 +59,7 @@ SMALL = [
     "turn", [None, kv.rpy(0.3, -1.1, 2.0), kv.rotation_x(1e-9)], ids=["plain", "turned", "nearly"]
 )
 @pytest.mark.parametrize(("mass", "moments"), SMALL)
-def test_small_inertia_is_opened_by_mujoco(
+def test_small_inertia_is_loaded_by_mujoco(
     mass: float, moments: tuple[float, ...], turn: kv.Expression | None, tmp_path: Path
 ) -> None:
     model = moving(mass, moments, turn)
@@ -78,7 +78,7 @@ def test_small_inertia_is_opened_by_mujoco(
     moments=st.tuples(*[st.floats(-20, 3).map(lambda x: 10.0**x)] * 3),
     angles=st.tuples(*[st.floats(-3, 3)] * 3),
 )
-def test_any_inertia_is_opened_by_mujoco(
+def test_any_inertia_is_loaded_by_mujoco(
     mass: float,
     moments: tuple[float, float, float],
     angles: tuple[float, float, float],
@@ -88,7 +88,7 @@ def test_any_inertia_is_opened_by_mujoco(
     in_mujoco(moving(mass, moments, kv.rpy(*angles)), folder)
 
 
-def test_ordinary_inertia_is_written_as_it_is(tmp_path: Path) -> None:
+def test_ordinary_inertia_is_written_unchanged(tmp_path: Path) -> None:
     for turn in (None, kv.rpy(0.3, -1.1, 2.0)):
         model = moving(2.0, (1e-6, 2e-6, 2.5e-6), turn)
         mass, tensor, remarks = in_mujoco(model, tmp_path)
@@ -99,7 +99,7 @@ def test_ordinary_inertia_is_written_as_it_is(tmp_path: Path) -> None:
         assert not remarks
 
 
-def test_what_mujoco_does_not_open_is_not_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_mjcf_that_mujoco_refuses_is_not_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("mujoco")
     monkeypatch.setattr(mjcf_writing, "_unless_zero", lambda point: (float(point[0]), 1.0))
     (tmp_path / "m.xml").write_text("precious")
@@ -112,7 +112,7 @@ def test_what_mujoco_does_not_open_is_not_written(tmp_path: Path, monkeypatch: p
     assert [p.name for p in tmp_path.iterdir()] == ["m.xml"]
 
 
-def test_without_mujoco_it_is_written_all_the_same(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_mjcf_is_written_without_mujoco(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def missing() -> None:
         raise kv.errors.MissingDependencyError("no MuJoCo")
 
@@ -121,8 +121,10 @@ def test_without_mujoco_it_is_written_all_the_same(tmp_path: Path, monkeypatch: 
     assert (tmp_path / "m.xml").is_file()
 
 
-def test_what_cannot_be_read_again_is_not_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Here since a writer is broken on purpose: all links bear one name."""
+def test_urdf_that_cannot_be_read_back_is_not_written(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The writer is broken on purpose: all links have one name."""
     model = moving(1.0, (1, 1, 1))
     with model.edit() as edit:
         edit.apply(kv.Planar(name="p", parent="f", child="p", lower=-1, upper=1))
@@ -136,9 +138,7 @@ def test_what_cannot_be_read_again_is_not_written(tmp_path: Path, monkeypatch: p
 
 
 @pytest.mark.parametrize("ending", ["urdf", "xml"])
-def test_constraints_that_cannot_be_said_are_left_out_and_motions_are_not(
-    ending: str, tmp_path: Path
-) -> None:
+def test_unsupported_constraints_are_left_out_and_motions_refused(ending: str, tmp_path: Path) -> None:
     q, bolt = kv.position("q"), kv.position("bolt")
     model = kv.Model()
     with model.edit() as edit:
@@ -180,10 +180,10 @@ DRIVEN = ("omni_base", "differential_drive", "mecanum")
 
 @pytest.mark.parametrize("ending", ["urdf", "xml"])
 @pytest.mark.parametrize("name", [*LOCKED, *DRIVEN])
-def test_scenes_with_locks_and_wheels_are_written_and_move_alike(
+def test_scenes_with_locks_and_wheels_move_alike_when_read_back(
     name: str, ending: str, tmp_path: Path
 ) -> None:
-    model = loaded(f"articulations/{name}")
+    model = load_cached(f"articulations/{name}")
     if (name, ending) == ("ball", "urdf"):
         with pytest.raises(kv.errors.FormatError, match="turns by a quaternion"):
             model.save(tmp_path / "m.urdf")
@@ -196,12 +196,12 @@ def test_scenes_with_locks_and_wheels_are_written_and_move_alike(
 
 
 @pytest.mark.parametrize("name", ["m.sdf", "m", "m.xml.txt"])
-def test_unknown_endings_are_told_before_anything_is_made(name: str, tmp_path: Path) -> None:
+def test_unknown_endings_are_refused_before_conversion(name: str, tmp_path: Path) -> None:
     with pytest.raises(kv.errors.FormatError, match=r"a model is saved to a name that ends in \.kv\.json"):
         kv.load("shelf_door").save(tmp_path / name)
 
 
-def test_a_folder_is_no_file(tmp_path: Path) -> None:
+def test_save_to_a_folder_is_refused(tmp_path: Path) -> None:
     (tmp_path / "m.urdf").mkdir()
     with pytest.raises(kv.errors.FormatError, match=r"m\.urdf is a folder; name a file in it"):
         kv.load("shelf_door").save(tmp_path / "m.urdf")

@@ -1,4 +1,4 @@
-"""Models written as URDF: read again they are the same, and pinocchio puts every link where they do."""
+"""Models written as URDF: the models read back are the same, and poses are those of pinocchio."""
 
 from __future__ import annotations
 
@@ -8,16 +8,24 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from pinocchio_oracle import Reference
+from pinocchio_oracle import PinocchioReference
 from random_trees import trees
-from round_trip import SCENES, SHIPPED, assert_same_bodies, assert_same_motion, described, loaded, poses
+from round_trip import (
+    SCENES,
+    SHIPPED,
+    assert_same_bodies,
+    assert_same_motion,
+    load_cached,
+    poses,
+    readable_urdf_files,
+)
 from urdf_texts import SHARED
 
 import kineverse as kv
 from hypothesis_profiles import attempts
 from kineverse.formats.urdf import read_urdf
 
-FILES = described()
+FILES = readable_urdf_files()
 
 # What cannot be said of a scene or a model that ships: a part of the refusal. All others are said exactly.
 REFUSED = {
@@ -56,7 +64,7 @@ def saved(model: kv.Model, folder: Path, **options: object) -> kv.Model:
 
 
 @pytest.mark.parametrize("file", FILES, ids=lambda f: "none" if f is None else str(f.relative_to(SHARED)))
-def test_every_urdf_survives(file: Path | None, tmp_path: Path) -> None:
+def test_urdf_files_are_read_back_unchanged(file: Path | None, tmp_path: Path) -> None:
     if file is None:
         pytest.skip(f"no {SHARED}")
     model = kv.load(file)
@@ -72,8 +80,8 @@ def test_every_urdf_survives(file: Path | None, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("name", [*SHIPPED, *SCENES])
-def test_what_ships_is_said_or_refused_by_name(name: str, tmp_path: Path) -> None:
-    model = loaded(name)
+def test_shipped_models_are_written_or_refused_by_name(name: str, tmp_path: Path) -> None:
+    model = load_cached(name)
     if name in REFUSED:
         with pytest.raises(kv.errors.FormatError) as info:
             model.save(tmp_path / "m.urdf", strict=True)
@@ -95,7 +103,9 @@ def test_what_ships_is_said_or_refused_by_name(name: str, tmp_path: Path) -> Non
         ("articulations/ratchet", ["ratchet/winch/lock"]),
     ],
 )
-def test_what_is_left_out_on_purpose(name: str, left_out: list[str], tmp_path: Path) -> None:
+def test_leave_out_removes_constraints_and_speed_relations(
+    name: str, left_out: list[str], tmp_path: Path
+) -> None:
     model = kv.load(name)
     report = model.save(tmp_path / "m.urdf", leave_out=left_out)
     assert f"'{left_out[0]}' is left out, as asked for" in report.remarks
@@ -105,12 +115,12 @@ def test_what_is_left_out_on_purpose(name: str, left_out: list[str], tmp_path: P
 
 @settings(max_examples=attempts(6), deadline=None)
 @given(model=trees(), seed=st.integers(0, 99))
-def test_random_trees_against_pinocchio(
+def test_random_trees_saved_as_urdf_move_alike_in_pinocchio(
     model: kv.Model, seed: int, tmp_path_factory: pytest.TempPathFactory
 ) -> None:
     folder = tmp_path_factory.mktemp("trees")
     assert_same_motion(model, saved(model, folder))
-    reference = Reference((folder / "m.urdf").read_text())
+    reference = PinocchioReference((folder / "m.urdf").read_text())
     values = reference.random_values(np.random.default_rng(seed))
     assert set(values) == {str(s) for s in model.degrees_of_freedom}
     reference.place(values)
@@ -119,7 +129,7 @@ def test_random_trees_against_pinocchio(
         np.testing.assert_allclose(reference.pose(name), pose, rtol=0, atol=1e-10, err_msg=name)
 
 
-def test_a_frame_of_ones_own_needs_no_joint_type(tmp_path: Path) -> None:
+def test_custom_frames_become_joints(tmp_path: Path) -> None:
     a = kv.position("lift")
     model = kv.Model()
     with model.edit() as edit:
@@ -132,7 +142,7 @@ def test_a_frame_of_ones_own_needs_no_joint_type(tmp_path: Path) -> None:
     assert "'lift' has a link of its own that carries nothing" in (tmp_path / "m.urdf").read_text()
 
 
-def test_circles_and_lines_made_of_waves_are_chains_of_turns(tmp_path: Path) -> None:
+def test_translations_along_ellipses_become_chains_of_rotations(tmp_path: Path) -> None:
     """A shelf that swings without turning, a slider by a cosine, and an ellipse."""
     q = kv.position("q")
     model = kv.Model()
@@ -147,7 +157,7 @@ def test_circles_and_lines_made_of_waves_are_chains_of_turns(tmp_path: Path) -> 
     assert_same_motion(model, saved(model, tmp_path), count=5)
 
 
-def test_products_in_one_matrix_are_taken_apart(tmp_path: Path) -> None:
+def test_transforms_in_one_matrix_are_decomposed(tmp_path: Path) -> None:
     a, b, c = (kv.position(n) for n in "abc")
     axis = np.array([1.0, 2.0, -2.0]) / 3
     motion = (
@@ -170,7 +180,7 @@ def test_products_in_one_matrix_are_taken_apart(tmp_path: Path) -> None:
         model.save(tmp_path / "m.urdf")
 
 
-def test_parameters_are_written_with_their_values(tmp_path: Path) -> None:
+def test_parameters_are_written_with_their_values_and_a_remark(tmp_path: Path) -> None:
     length = kv.parameter("length", 0.7)
     q = kv.position("q")
     model = kv.Model()
@@ -182,7 +192,7 @@ def test_parameters_are_written_with_their_values(tmp_path: Path) -> None:
     assert_same_motion(model, kv.load(report.path))
 
 
-def test_what_has_no_limits_has_none_when_it_is_read_again(tmp_path: Path) -> None:
+def test_missing_limits_are_missing_when_read_back(tmp_path: Path) -> None:
     model = kv.Model()
     with model.edit() as edit:
         edit.apply(kv.Prismatic(name="free", parent="world", child="free"))
@@ -196,7 +206,7 @@ def test_what_has_no_limits_has_none_when_it_is_read_again(tmp_path: Path) -> No
     assert not again.articulations["free"].dynamics
 
 
-def test_one_error_names_everything_that_cannot_be_said(tmp_path: Path) -> None:
+def test_error_names_all_unsupported_features(tmp_path: Path) -> None:
     a, b, c = (kv.position(n) for n in "abc")
     model = kv.Model()
     with model.edit() as edit:
@@ -222,7 +232,7 @@ def test_one_error_names_everything_that_cannot_be_said(tmp_path: Path) -> None:
     assert not list(tmp_path.iterdir())
 
 
-def test_what_loops_hold_is_refused_for_that(tmp_path: Path) -> None:
+def test_frames_held_by_loops_are_refused_with_that_reason(tmp_path: Path) -> None:
     model = kv.Model()
     with model.edit() as edit:
         for name, x in (("a", 0.0), ("b", 1.0)):
@@ -248,7 +258,7 @@ def test_contradicting_limits_are_refused(tmp_path: Path) -> None:
         model.save(tmp_path / "m.urdf")
 
 
-def test_names_that_xml_has_to_escape(tmp_path: Path) -> None:
+def test_names_with_xml_characters_are_escaped(tmp_path: Path) -> None:
     name = """a<b>&"c" 'd' 50% : é -- 漢"""
     model = kv.Model()
     with model.edit() as edit:
@@ -257,7 +267,7 @@ def test_names_that_xml_has_to_escape(tmp_path: Path) -> None:
     assert_same_motion(model, saved(model, tmp_path))
 
 
-def test_names_in_between_take_nobodys(tmp_path: Path) -> None:
+def test_intermediate_links_have_unique_names(tmp_path: Path) -> None:
     model = kv.Model()
     with model.edit() as edit:
         edit.apply(kv.articulations.Screw(name="s", parent="world", child="s", axis=(0, 1, 1), pitch=0.1))
@@ -266,13 +276,13 @@ def test_names_in_between_take_nobodys(tmp_path: Path) -> None:
     assert_same_motion(model, saved(model, tmp_path))
 
 
-def test_a_model_of_nothing(tmp_path: Path) -> None:
+def test_empty_model_is_read_back_empty(tmp_path: Path) -> None:
     again = saved(kv.Model(), tmp_path)
     assert not again.frames
     assert not again.degrees_of_freedom
 
 
-def test_bodies_and_meshes_from_another_folder(tmp_path: Path) -> None:
+def test_bodies_are_read_back_from_another_folder(tmp_path: Path) -> None:
     from kineverse.model.body import Body, Box, Cone, Inertia, Mesh, Shape
 
     (tmp_path / "meshes").mkdir()
@@ -290,7 +300,7 @@ def test_bodies_and_meshes_from_another_folder(tmp_path: Path) -> None:
     assert (mesh.uri, mesh.scale) == ("meshes/a.stl", (1.0, 1.0, -1.0))
 
 
-def test_numbers_that_are_none_are_refused(tmp_path: Path) -> None:
+def test_non_finite_numbers_are_refused(tmp_path: Path) -> None:
     from kineverse.model.body import Body, Shape, Sphere
 
     model = kv.Model()

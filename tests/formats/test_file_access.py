@@ -1,4 +1,4 @@
-"""Which files a description may open: those below its root, and no others."""
+"""Files that a description may open: those below its root, and no others."""
 
 from __future__ import annotations
 
@@ -75,14 +75,14 @@ def test_the_outermost_of_nested_python_packages_counts(put, tmp_path):
     assert find_root(put("site/robots/models/assets/arm/r.xml").parent) == str(tmp_path / "site/robots")
 
 
-def test_home_is_no_root_though_it_may_be_a_repository(put, tmp_path, monkeypatch):
+def test_home_folder_is_no_root_even_if_it_is_a_repository(put, tmp_path, monkeypatch):
     put("home/.git/HEAD")
     monkeypatch.setenv("HOME", str(tmp_path / "home"))
     folder = put("home/downloads/r.urdf").parent
     assert find_root(folder) == str(folder)
 
 
-def test_argument_then_variable_then_what_is_around(put, tmp_path, monkeypatch):
+def test_root_is_that_of_the_argument_then_variable_then_surroundings(put, tmp_path, monkeypatch):
     put("top/.git/HEAD")
     folder = put("top/a/r.urdf").parent
     monkeypatch.setenv("KINEVERSE_ROOT", os.pathsep.join([str(tmp_path), str(tmp_path / "elsewhere")]))
@@ -149,14 +149,14 @@ def test_meshes_outside_are_remarked_on_and_not_opened(inside, tmp_path, number,
     assert locate_mesh(mesh_of(model)).samefile(tmp_path / "secret.stl")
 
 
-def test_a_variable_opens_its_folders_to_all(inside, tmp_path, monkeypatch):
+def test_folders_of_the_variable_are_open_to_all_files(inside, tmp_path, monkeypatch):
     (inside / "r.urdf").write_text(robot("../secret.stl"))
     model = kv.load(inside / "r.urdf")
     monkeypatch.setenv("KINEVERSE_ROOT", str(tmp_path))
     assert locate_mesh(mesh_of(model)).samefile(tmp_path / "secret.stl")
 
 
-def test_documents_are_bounded_by_where_they_lie_whatever_they_say(inside, put, tmp_path):
+def test_root_of_a_document_is_that_of_its_own_folder(inside, put, tmp_path):
     (inside / "r.urdf").write_text(robot("a.stl"))
     (inside / "a.stl").write_text("solid")
     model = kv.load(inside / "r.urdf")
@@ -176,8 +176,8 @@ def test_documents_are_bounded_by_where_they_lie_whatever_they_say(inside, put, 
 
 
 @pytest.mark.parametrize("folder", ["robot/secret", "robot", "elsewhere"])
-def test_documents_cannot_say_that_a_folder_is_a_package_of_theirs(put, tmp_path, folder):
-    """A document says in which folder its meshes lie; that of somebody else stays closed, manifest or not."""
+def test_documents_cannot_declare_folders_as_packages(put, tmp_path, folder):
+    """A document names the folder of its meshes; a foreign folder stays closed, with a manifest or not."""
     secret = put("robot/secret/a.stl", "solid")
     put("robot/secret/package.xml", "<package><name>secret</name></package>")
     document = put("downloads/x").parent / "r.kv.json"
@@ -200,7 +200,7 @@ def test_documents_cannot_say_that_a_folder_is_a_package_of_theirs(put, tmp_path
             assert locate_mesh(mesh_of(wide)) == secret
 
 
-def test_text_that_lies_nowhere_takes_no_folder_for_a_package(put, tmp_path, monkeypatch):
+def test_text_without_file_has_no_package_folders(put, tmp_path, monkeypatch):
     secret = put("secret/a.stl", "solid")
     put("secret/model.sdf", MODEL)
     monkeypatch.chdir(secret.parent)
@@ -214,7 +214,7 @@ def test_text_that_lies_nowhere_takes_no_folder_for_a_package(put, tmp_path, mon
 
 
 @pytest.mark.parametrize(("kind", "text", "part"), [("xml", MJCF, PART), ("sdf", SDF, MODEL)])
-def test_includes_stay_in_the_root(put, tmp_path, kind, text, part, monkeypatch):
+def test_includes_outside_of_the_root_are_refused(put, tmp_path, kind, text, part, monkeypatch):
     outside = put(f"part.{kind}", part)
     path = put(f"robot/r.{kind}", text.format(f"../part.{kind}"))
     with pytest.raises(
@@ -242,7 +242,7 @@ def test_a_model_found_by_name_may_open_what_is_in_its_folder_of_models(put, tmp
     assert "b" in kv.load("arm/arm").frames
 
 
-def test_root_and_strictness_are_part_of_what_is_remembered(inside, tmp_path):
+def test_load_cache_distinguishes_root_and_strictness(inside, tmp_path):
     (inside / "r.urdf").write_text(robot("../secret.stl"))
     for _ in range(2):
         with pytest.raises(kv.errors.FormatError, match="leads out"):
@@ -250,8 +250,8 @@ def test_root_and_strictness_are_part_of_what_is_remembered(inside, tmp_path):
         assert locate_mesh(mesh_of(kv.load(inside / "r.urdf", root=tmp_path)))
 
 
-def test_what_an_environment_declares_may_be_named_by_path(put, tmp_path, monkeypatch):
-    """As the launch files of ROS 2 do: file:// and the folder where a package is installed."""
+def test_files_in_declared_folders_may_be_named_by_path(put, tmp_path, monkeypatch):
+    """Launch files of ROS 2 name file:// and the folder where a package is installed."""
     mesh = put("install/share/arm/meshes/a.stl")
     path = put("elsewhere/r.urdf", robot(f"file://{mesh}"))
     monkeypatch.setenv("AMENT_PREFIX_PATH", str(tmp_path / "install"))
@@ -282,7 +282,7 @@ def test_packages_around_a_description_are_found_without_a_manifest(put, tmp_pat
     assert locate_resource("package://hand/meshes/h.stl", folder, root=str(folder)) == beside
 
 
-def test_links_do_not_lead_out_of_a_package(put, tmp_path):
+def test_symbolic_links_do_not_lead_out_of_a_package(put, tmp_path):
     secret, folder = put("secret.stl"), put("arm/urdf/r.urdf").parent
     (tmp_path / "arm" / "a.stl").symlink_to(secret)
     with pytest.raises(kv.errors.FormatError, match="leads out of the root"):
@@ -302,7 +302,7 @@ def test_links_do_not_lead_out_of_a_package(put, tmp_path):
         ("notes.txt", "this version reads URDF"),
     ],
 )
-def test_files_that_are_no_models_say_what_to_do(put, name, expected):
+def test_error_for_other_files_suggests_a_remedy(put, name, expected):
     with pytest.raises(kv.errors.FormatError) as info:
         kv.load(put(name, "<robot/>"))
     assert expected in str(info.value)
@@ -316,20 +316,20 @@ def test_files_that_are_no_models_say_what_to_do(put, name, expected):
         (b"\x82\xa6" * 1000, "Bytes are read by kv.formats.from_bytes"),
     ],
 )
-def test_what_is_no_name_says_what_to_do(given, expected):
+def test_invalid_model_name_error_suggests_a_remedy(given, expected):
     with pytest.raises(kv.KineverseError, match=expected) as info:
         kv.load(given)
     assert len(str(info.value)) < 400
 
 
-def test_a_folder_says_what_is_in_it(put, tmp_path):
+def test_error_for_a_folder_lists_its_models(put, tmp_path):
     put("robots/arm.urdf", robot("a.stl"))
     with pytest.raises(kv.errors.UnknownNameError, match=r"It is a folder; models in it: arm.urdf"):
         kv.load(tmp_path / "robots")
 
 
 @pytest.mark.parametrize("root", ["", "nope", "a\0b", 5, b"nope", ["/"], Path("nope")])
-def test_what_is_no_root_is_said(put, root):
+def test_invalid_root_is_refused(put, root):
     shown = str(root) if isinstance(root, Path) else root
     with pytest.raises(kv.errors.FormatError) as info:
         kv.load(put("r.urdf", robot("a.stl")), root=root)
@@ -340,7 +340,7 @@ def test_what_is_no_root_is_said(put, root):
     "uri", ["package://{}/a.stl", "model://{}/a.stl", "package://a/{}", "{}.stl", "file:///{}"]
 )
 @pytest.mark.parametrize("name", ["x" * 5000, "a\0b"])
-def test_names_that_no_file_has_are_not_there(put, uri, name):
+def test_impossible_file_names_are_not_found(put, uri, name):
     folder = put("robot/r.urdf").parent
     for root in (None, NOWHERE, str(folder)):
         with pytest.raises(kv.errors.FormatError):

@@ -1,4 +1,4 @@
-"""The fuzzer of tools/fuzz itself: a short pass over every reader, and that it sees what is wrong."""
+"""The fuzzer of tools/fuzz: a short run over every reader, and its detection of violations."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def folder(tmp_path) -> Path:
 
 
 @pytest.mark.parametrize("name", TARGETS)
-def test_the_law_holds_for_a_while(name, folder):
+def test_fuzzing_finds_no_violation(name, folder):
     target, tally = TARGETS[name], Tally()
     count = COUNTS.get(name, 60)
     for data in islice(inputs(target, target.own_seeds(), Random(7)), count):
@@ -52,7 +52,7 @@ def test_the_law_holds_for_a_while(name, folder):
 
 
 @pytest.mark.parametrize("name", TARGETS)
-def test_seeds_are_models(name, folder):
+def test_all_seeds_load(name, folder):
     target, tally = TARGETS[name], Tally()
     seeds = target.own_seeds()
     assert seeds
@@ -62,7 +62,7 @@ def test_seeds_are_models(name, folder):
 
 
 @pytest.mark.parametrize("name", TARGETS)
-def test_inputs_repeat(name):
+def test_inputs_are_reproducible(name):
     target = TARGETS[name]
     once, again = (list(islice(inputs(target, target.own_seeds(), Random(3)), 20)) for _ in range(2))
     assert once == again
@@ -140,7 +140,7 @@ def far_away(text, folder):
         (opens_files_beside, None),
     ],
 )
-def test_what_breaks_the_law_is_seen(read, signature, folder):
+def test_violations_are_detected(read, signature, folder):
     finding = check(broken(read), b"", folder)
     assert (finding and finding.signature[: len(signature or "")]) == signature
 
@@ -153,13 +153,13 @@ def test_what_breaks_the_law_is_seen(read, signature, folder):
         ("sdf", "no <tree at all, and bad all the same", b"bad"),
     ],
 )
-def test_inputs_are_made_small(name, text, part):
+def test_failing_inputs_are_minimised(name, text, part):
     small = minimise(text.encode(), TARGETS[name], lambda data: part in data)
     assert part in small
     assert len(small) < 20
 
 
-def test_names_without_the_prefix_are_seen(folder):
+def test_names_without_the_prefix_are_detected(folder):
     target = TARGETS["urdf"]
     ignores = replace(target, operations=lambda data, folder, prefix: target.operations(data, folder, None))
     data = b'<robot name="r"><link name="a"/></robot>'
@@ -169,7 +169,7 @@ def test_names_without_the_prefix_are_seen(folder):
     assert finding.signature == "broken: a name without the prefix"
 
 
-def test_documents_by_grammar_have_all_nodes_and_questions():
+def test_grammar_documents_have_all_node_types_and_conditions():
     nodes, questions = set(), set()
     for seed in range(150):
         tree = json.loads(document.generate(Random(seed)))
@@ -180,8 +180,8 @@ def test_documents_by_grammar_have_all_nodes_and_questions():
     assert questions >= set(QUESTIONS)
 
 
-def test_edits_are_taken_and_taken_back():
-    """Some are followed by operations that have no code, some refused, and nothing remains of any."""
+def test_edits_are_applied_and_undone():
+    """Some edits are followed by operations without code, some are refused, and all are undone."""
     taken = 0
     for seed in range(12):
         model = kv.Model()

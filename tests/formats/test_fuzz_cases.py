@@ -1,4 +1,4 @@
-"""What fuzzing found, made small by hand: each input now gives a model, or one error that says why not."""
+"""Inputs found by fuzzing, minimised by hand: each gives a model, or one error with the reason."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ INVISIBLE = "\U000e0001"
 
 
 def loaded(tmp_path, text: str, name: str = "input.urdf", strict: bool = True) -> kv.Model | str:
-    """Return the model or the message of the one error there is."""
+    """Return the model or the message of the error."""
     path = tmp_path / name
     path.write_text(text, encoding="utf-8")
     try:
@@ -62,7 +62,7 @@ def follower(factors: str, kind: str) -> str:
         (follower('multiplier="1e200" offset="1e200"', "revolute"), "positions or limits overflow"),
     ],
 )
-def test_numbers_of_a_urdf_that_overflow(tmp_path, text, reason):
+def test_urdf_numbers_that_overflow_are_refused(tmp_path, text, reason):
     message = loaded(tmp_path, text)
     assert isinstance(message, str)
     assert message.startswith("input.urdf, line ")
@@ -87,7 +87,7 @@ def test_numbers_of_a_urdf_that_overflow(tmp_path, text, reason):
         ),
     ],
 )
-def test_large_numbers_that_only_turn(tmp_path, text):
+def test_large_numbers_in_directions_are_read(tmp_path, text):
     assert_finite(loaded(tmp_path, text))
 
 
@@ -130,28 +130,28 @@ def assert_finite(model) -> None:
         ),
     ],
 )
-def test_numbers_of_an_sdf_that_overflow(tmp_path, text, reason):
+def test_sdf_numbers_that_overflow_are_refused(tmp_path, text, reason):
     message = loaded(tmp_path, text, "input.sdf")
     assert isinstance(message, str)
     assert message.startswith("input.sdf, line ")
     assert reason in message
 
 
-def test_the_largest_double_is_no_limit_to_speak_of(tmp_path):
-    """Exporters write it for no limit at all, so it stays."""
+def test_largest_double_is_no_limit(tmp_path):
+    """Exporters write it for no limit."""
     model = loaded(tmp_path, pair(limited("-1.7976931348623157e308", "1.7976931348623157e308")))
     assert isinstance(model, kv.Model)
     assert np.isfinite(model.fk("l1")(model.default_state())).all()
 
 
-def test_poses_that_would_overflow_in_chains():
+def test_pose_with_too_large_numbers_is_refused():
     with pytest.raises(kv.errors.InvalidValueError, match=r"all numbers finite, of at most 1e\+100"):
         kv.model.Pose.of(kv.translation(1e200, 0, 0))
 
 
 @pytest.mark.parametrize("name", ["y" * 3000, INVISIBLE * 400, "é" * 100 + "\x85" * 100])
 @pytest.mark.parametrize("places", [("child",), ("link", "link"), ("joint", "joint"), ("mimic",), ("value",)])
-def test_messages_are_bounded_whatever_is_in_the_file(tmp_path, name, places):
+def test_messages_have_bounded_length(tmp_path, name, places):
     parts = {
         "child": joint("j", "l0", "nobody", "fixed") + f'<link name="{name}"/>',
         "link": f'<link name="{name}"/>',
@@ -180,7 +180,7 @@ def built(data: bytes | str) -> kv.Model:
     return model
 
 
-def test_a_parameter_that_is_no_pose_is_refused_with_its_place():
+def test_document_parameter_that_is_no_pose_is_refused():
     tree = json.loads(document([], {}))
     tree["operations"][0]["parameters"] = {"at": {"pose": [2, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0]}}
     with pytest.raises(
@@ -190,14 +190,14 @@ def test_a_parameter_that_is_no_pose_is_refused_with_its_place():
 
 
 @pytest.mark.parametrize("question", [[], ["datum"]])
-def test_a_question_without_its_parts_is_refused(question):
+def test_document_condition_without_operands_is_refused(question):
     tree = json.loads(document([], {}))
     tree["operations"][0]["trace"] = {"questions": [question], "writes": {}}
     with pytest.raises(kv.errors.FormatError, match="a question is its kind, how closely"):
         read_operations(json.dumps(tree))
 
 
-def test_reasons_are_bounded_whatever_symbols_are_called():
+def test_reasons_have_bounded_length_for_long_symbol_names():
     nodes = [
         ["symbol", "y" * 3000, 0, "dof"],
         ["symbol", "a", 0, "dof"],
@@ -228,7 +228,7 @@ def test_a_frame_without_factors_is_where_its_parent_is():
         ],  # a row by way of another, and another order of speeds by that
     ],
 )
-def test_rate_tables_are_the_same_once_they_are_written(rows):
+def test_rate_tables_are_read_back_unchanged(rows):
     """The digest of the node was another one, and so was the order of nodes in the next document."""
     nodes = [
         *(["symbol", name, order, "dof"] for order in (0, 1) for name in "abcd"),
@@ -248,8 +248,8 @@ def test_rate_tables_are_the_same_once_they_are_written(rows):
     assert to_json(built(text)) == text
 
 
-def test_a_carried_coordinate_that_a_composition_leaves_alone_is_plain_at_once():
-    """It was after the second time that a document was written."""
+def test_carried_coordinate_unchanged_by_composition_is_plain():
+    """It was plain only after a document was written twice."""
     nodes = [
         ["symbol", "b", 0, "dof"],
         ["symbol", "a", 0, "dof"],
@@ -264,7 +264,7 @@ def test_a_carried_coordinate_that_a_composition_leaves_alone_is_plain_at_once()
     assert to_json(built(text)) == text
 
 
-def test_a_loop_without_solution_is_to_blame_where_its_input_cancels():
+def test_loop_without_solution_is_named_where_its_input_cancels():
     """The Jacobian is NaN whatever b is, and so did not ask for b; looking for the reason did."""
     nodes = [
         ["symbol", "a", 0, "dof"],
@@ -297,13 +297,13 @@ def test_data_nested_deeper_than_arrays_can_be_overwritten_by_an_expression(dept
 
 
 @pytest.mark.parametrize("text", ["x" * 500, INVISIBLE * 500, INVISIBLE * 79, "x" * 79 + INVISIBLE, "\n"])
-def test_what_is_shown_of_a_text_is_printable_and_bounded(text):
+def test_quoted_text_is_printable_and_bounded(text):
     assert len(abbreviate(text)) <= 80
     assert abbreviate(text).isprintable()
     assert quote(text) == f'"{abbreviate(text)}"'
 
 
-def test_suggestions_are_bounded():
+def test_suggestions_have_bounded_length():
     names = [f"{i}{INVISIBLE * 3000}" for i in range(20)]
     assert len(suggest("a", names)) < 1500
     assert len(suggest(names[0][:-1], names)) < 1500
@@ -327,20 +327,20 @@ def test_suggestions_are_bounded():
         ('<replicate count="2" offset="1e50 0 0"><body pos="1e50 0 0"/></replicate>', "too large (body_pos)"),
     ],
 )
-def test_numbers_of_an_mjcf_that_overflow(tmp_path, text, reason):
+def test_mjcf_numbers_that_overflow_are_refused(tmp_path, text, reason):
     message = loaded(tmp_path, f"<mujoco><worldbody>{text}</worldbody></mujoco>", "input.xml")
     assert isinstance(message, str)
     assert message.startswith("input.xml")
     assert reason in message
 
 
-def test_a_model_to_attach_without_a_file(tmp_path):
-    """MuJoCo raised an exception that was unknown to itself."""
+def test_mjcf_model_without_file_is_refused(tmp_path):
+    """MuJoCo raised an exception of an unknown type."""
     message = loaded(tmp_path, "<mujoco><asset><model/></asset></mujoco>", "input.xml")
     assert message == "input.xml, line 1, <model>: names no file."
 
 
-def test_the_largest_double_is_no_range_to_speak_of(tmp_path):
+def test_largest_double_is_no_range(tmp_path):
     joint = '<joint type="slide" range="-1.7e308 1.7e308"/>'
     text = f"<mujoco><worldbody><body name='a'>{joint}<geom size='1'/></body></worldbody></mujoco>"
     model = loaded(tmp_path, text, "input.xml")
@@ -348,8 +348,8 @@ def test_the_largest_double_is_no_range_to_speak_of(tmp_path):
     assert (model.fk("a")(model.default_state()) == np.eye(4)).all()
 
 
-def test_a_tendon_of_infinite_length(tmp_path):
-    """What its length differs from that at rest was no number."""
+def test_tendon_of_infinite_length_is_refused(tmp_path):
+    """The difference to its length at rest was no number."""
     joint = '<body><joint name="{}"/><geom size="1"/></body>'
     text = (
         "<mujoco><worldbody>{}</worldbody><tendon><fixed name='t'><joint joint='{}' coef='{}'/></fixed></tendon>"
@@ -363,7 +363,7 @@ def test_a_tendon_of_infinite_length(tmp_path):
 
 
 def test_a_coordinate_that_depends_on_itself_in_a_gradient_only():
-    """To carry it never ended."""
+    """Carrying its rate did not terminate."""
     nodes = [
         ["symbol", "x", 0, "dof"],
         ["symbol", "y", 0, "dof"],
@@ -383,14 +383,14 @@ def test_a_coordinate_that_depends_on_itself_in_a_gradient_only():
         ("input.xml", '<mujoco><asset><model file="{}.xml"/></asset></mujoco>'),
     ],
 )
-def test_files_whose_names_are_too_long_for_any(tmp_path, name, text):
+def test_too_long_file_names_are_refused(tmp_path, name, text):
     message = loaded(tmp_path, text.format("9" * 300), name)
     assert isinstance(message, str)
     assert message.startswith(f"{name}, line 1, <")
     assert len(message) < 2000
 
 
-def test_a_mesh_file_whose_name_is_too_long_for_any(tmp_path):
+def test_too_long_mesh_file_name_is_not_found(tmp_path):
     mesh = f'<asset><mesh name="m" file="{"9" * 300}.stl"/></asset>'
     body = '<worldbody><body name="b"><geom type="mesh" mesh="m"/></body></worldbody>'
     assert isinstance(loaded(tmp_path, f"<mujoco>{mesh}{body}</mujoco>", "input.xml"), kv.Model)

@@ -1,4 +1,4 @@
-"""A file that is loaded again comes out of memory; nobody notices, save by the time it takes."""
+"""The cache of loaded files: a file that is loaded again is not parsed again."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def file(tmp_path):
     return path
 
 
-def test_a_file_is_read_once(file, parses):
+def test_load_reads_a_file_once(file, parses):
     first, second = kv.load(file), kv.load(file)
     assert parses == ["r.urdf"]
     assert first.snapshot() == second.snapshot()
@@ -45,7 +45,7 @@ def test_a_file_is_read_once(file, parses):
     assert np.array_equal(first.fk("l3")(state), second.fk("l3")(state))
 
 
-def test_every_model_is_its_own(file, parses):
+def test_cached_models_are_independent(file, parses):
     first = kv.load(file)
     pose = first.fk("l3")
     with first.edit() as edit:
@@ -60,7 +60,7 @@ def test_every_model_is_its_own(file, parses):
     assert len(first.degrees_of_freedom) == 1
 
 
-def test_what_was_written_since_is_read(file, parses):
+def test_changed_files_are_read_again(file, parses):
     kv.load(file)
     file.write_text(chain(2))
     assert len(kv.load(file).degrees_of_freedom) == 2
@@ -69,7 +69,7 @@ def test_what_was_written_since_is_read(file, parses):
     assert len(parses) == 2
 
 
-def test_prefix_and_place_make_a_difference(file, parses, tmp_path):
+def test_cache_distinguishes_prefix_and_folder(file, parses, tmp_path):
     other = tmp_path / "deeper"
     other.mkdir()
     (other / "r.urdf").write_text(chain(3))
@@ -79,7 +79,7 @@ def test_prefix_and_place_make_a_difference(file, parses, tmp_path):
     assert len(parses) == 3
 
 
-def test_few_and_small_ones_are_remembered(parses, tmp_path, monkeypatch):
+def test_cache_holds_few_and_small_files(parses, tmp_path, monkeypatch):
     monkeypatch.setattr(loader, "MOST_REMEMBERED", 2)
     files = [tmp_path / f"r{i}.urdf" for i in range(3)]
     for path in files:
@@ -95,7 +95,7 @@ def test_few_and_small_ones_are_remembered(parses, tmp_path, monkeypatch):
     assert parses[4:] == ["r1.urdf", "r1.urdf"]
 
 
-def test_what_fails_is_not_remembered(file, parses):
+def test_errors_are_not_cached(file, parses):
     file.write_text(chain(3)[:-20])
     for _ in range(2):
         with pytest.raises(kv.errors.FormatError):
@@ -103,8 +103,8 @@ def test_what_fails_is_not_remembered(file, parses):
     assert parses == ["r.urdf"] * 2
 
 
-def test_motions_are_expressions_like_any_other():
-    """Built late, a rotation or translation along an axis equals what it says, its pickle included."""
+def test_cached_motions_are_ordinary_expressions():
+    """A one-axis transform that is built lazily equals its expression, also when pickled."""
     q = kv.position("q")
     lazy = kv.rotation_y(q * 2)
     c, s = np.cos(q * 2), np.sin(q * 2)

@@ -1,4 +1,4 @@
-"""What is no file, and what is no prefix."""
+"""Errors for invalid files and prefixes."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ def file(tmp_path):
 
 
 @pytest.mark.parametrize("prefix", [5, b"x", ["x"], ("x",), 0, False])
-def test_a_prefix_is_a_text(file, prefix):
+def test_prefix_that_is_no_string_is_refused(file, prefix):
     for load in (kv.load, kv.Model().include):
         with pytest.raises(kv.errors.FormatError, match="A prefix is a text"):
             load(file, prefix=prefix)
 
 
 @pytest.mark.parametrize("prefix", ["a/", "/a", "a//b", "/", "a\n", "\ud800"])
-def test_a_prefix_is_a_path(file, tmp_path, prefix):
+def test_prefix_that_is_no_path_is_refused(file, tmp_path, prefix):
     kv.load(file).save(tmp_path / "r.kv.json")
     for source in (file, tmp_path / "r.kv.json", "shelf_door"):
         with pytest.raises(kv.errors.FormatError, match="The prefix") as caught:
@@ -33,13 +33,13 @@ def test_a_prefix_is_a_path(file, tmp_path, prefix):
         assert repr(prefix) in str(caught.value)
 
 
-def test_prefixes(file):
+def test_prefixes_are_put_before_names(file):
     assert kv.load(file, prefix="").symbols == kv.load(file).symbols
     assert all(s.path.startswith("a/b/") for s in kv.load(file, prefix="a/b").symbols)
 
 
 @pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="there are no pipes here")
-def test_what_is_no_regular_file(tmp_path, monkeypatch):
+def test_special_files_are_refused(tmp_path, monkeypatch):
     os.mkfifo(tmp_path / "pipe.urdf")
     (tmp_path / "circle.urdf").symlink_to(tmp_path / "circle.urdf")
     (tmp_path / "nowhere.urdf").symlink_to(tmp_path / "missing.urdf")

@@ -1,4 +1,4 @@
-"""From the name of a model to its file: what is looked at, in which order, and what a miss says."""
+"""The search for the file of a model by its name, and the errors for models that are not found."""
 
 from __future__ import annotations
 
@@ -195,7 +195,7 @@ def test_an_ambiguous_name_lists_paths_that_work(places: Places) -> None:
     assert locate_model("b/arm.urdf").path == locate_model("b/arm").path == places.first / "b/arm.urdf"
 
 
-def test_a_path_that_does_not_exist(places: Places) -> None:
+def test_missing_path_is_an_error(places: Places) -> None:
     places.put(places.here, "robots/arm.urdf", "robots/platform.urdf")
     (places.here / "robots/readme.txt").touch()
     for name in ("./robots/amr.urdf", places.here / "robots/amr.urdf"):
@@ -229,13 +229,13 @@ def test_the_text_of_a_description_is_not_its_name(places: Places) -> None:
 @pytest.mark.parametrize(
     "name", ["", " ", "*", "..", "a\0b", "a\nb", "~walrus-nobody/x.urdf", "/", "x" * 5000]
 )
-def test_nonsense_is_a_miss_like_any_other(places: Places, name: str) -> None:
+def test_nonsense_names_are_not_found(places: Places, name: str) -> None:
     assert len(miss(name)) < 2000
     with pytest.raises(kv.errors.UnknownNameError):
         kv.load(name)
 
 
-def test_a_folder_that_nobody_may_read_is_no_crash(places: Places, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_unreadable_folders_are_skipped(places: Places, monkeypatch: pytest.MonkeyPatch) -> None:
     def refuse(path: Path) -> bool:
         raise PermissionError(13, "Permission denied", str(path))
 

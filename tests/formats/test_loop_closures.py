@@ -1,4 +1,4 @@
-"""A robot always loads: loops that cannot be followed stay as constraints, what says nothing new is left out."""
+"""Loops of robots: unsolvable ones stay constraints, and redundant ones are left out."""
 
 from __future__ import annotations
 
@@ -114,7 +114,7 @@ def test_robots_with_loops_load_and_are_closed_by_projection(tmp_path, text, kep
         assert np.abs(left_in_mujoco(text, model, state)).max() < 1e-8
 
 
-def test_the_remark_says_which_loop_why_and_what_to_do(tmp_path):
+def test_unsolved_loop_warning_names_loop_reason_and_remedy(tmp_path):
     _, remarks = load(tmp_path, scene(LEG, '<connect name="rod" site1="rod_end" site2="horn"/>'))
     assert remarks[0].startswith(
         "x.xml: the equality 'rod' closes a loop, which cannot be followed here: Loop 'rod' "
@@ -126,7 +126,7 @@ def test_the_remark_says_which_loop_why_and_what_to_do(tmp_path):
     assert remarks[1].startswith("x.xml: its home is moved to where limits and loops hold: '")
 
 
-def test_refused_on_request(tmp_path):
+def test_loops_refuse_raises_for_unsolved_loops(tmp_path):
     text = scene(LEG, '<connect name="rod" site1="rod_end" site2="horn"/>')
     with pytest.raises(
         kv.errors.FormatError,
@@ -179,7 +179,7 @@ def test_two_pins_on_one_axis_are_a_hinge(tmp_path):
         )
 
 
-def test_what_is_nearly_in_one_plane_is_taken_to_be(tmp_path):
+def test_nearly_planar_loops_are_solved_as_planar(tmp_path):
     """Files have six digits."""
     off = BARS.replace('pos="1 0 0"', 'pos="1 3e-7 0"')
     tie = '<connect name="pin" site1="a" site2="b"/>'
@@ -198,7 +198,7 @@ def test_what_is_nearly_in_one_plane_is_taken_to_be(tmp_path):
     assert model.degrees_of_freedom == (kv.position("crank"),)
 
 
-def test_what_never_holds_is_told(tmp_path):
+def test_loop_that_never_closes_is_a_warning(tmp_path):
     rigid = body("a", "") + body("b", "", 'pos="1 0 0"') + body("c", hinge("j"))
     weld = '<weld name="w" body1="a" body2="b" relpose=".5 0 0 1 0 0 0"/>'
     model, remarks = load(tmp_path, scene(rigid, weld))
@@ -221,7 +221,7 @@ def test_what_never_holds_is_told(tmp_path):
     assert "tie/apart" in [v.name for v in model.violations(model.default_state())]
 
 
-def test_of_coupled_loops_those_are_solved_that_can_be(tmp_path):
+def test_solvable_loops_among_coupled_ones_are_solved(tmp_path):
     rod = body("rod", '<joint name="ball" type="ball"/><site name="rod_end" pos="0 0 .33"/>', 'pos="1 0 .3"')
     text = scene(BARS.replace('<inertial mass="1" pos="0 0 0" diaginertia=".1 .1 .1"/><joint name="rocker"', '<inertial mass="1" pos="0 0 0" diaginertia=".1 .1 .1"/><site name="lug" pos="0 .1 .6"/><joint name="rocker"') + rod, PIN.format("0") + '<connect name="rod" site1="rod_end" site2="lug"/>')  # fmt: skip
     model, remarks = load(tmp_path, text)
@@ -246,21 +246,21 @@ def key(qpos: str) -> str:
     ],
     ids=["limit", "zero", "follower", "loop"],
 )  # fmt: skip
-def test_a_home_that_is_moved_is_told(tmp_path, bodies, equality, qpos, told):
+def test_moved_home_position_is_a_warning(tmp_path, bodies, equality, qpos, told):
     _, remarks = load(tmp_path, scene(bodies, equality, key(qpos)))
     assert len(remarks) == 1
     assert remarks[0].startswith("x.xml: its home is moved to where ")
     assert told in remarks[0]
 
 
-def test_a_home_that_holds_is_not_told(tmp_path):
+def test_consistent_home_position_is_no_warning(tmp_path):
     _, remarks = load(tmp_path, scene(BARS, PIN.format("0"), key("0 0 0")))
     assert remarks == []
     _, remarks = load(tmp_path, scene(body("a", hinge("j")), "", key(".3")))
     assert remarks == []
 
 
-def test_equalities_that_contradict_each_other_are_told(tmp_path):
+def test_contradicting_equalities_are_a_warning(tmp_path):
     two = body("a", hinge("j")) + body("b", hinge("k"))
     both = '<joint joint1="j" polycoef=".1"/><joint joint1="j" polycoef=".3"/>'
     model, remarks = load(tmp_path, scene(two, both))
@@ -327,8 +327,8 @@ def test_a_gripper_in_sdf_loads_and_moves(tmp_path):
         np.testing.assert_allclose(a, b, atol=1e-8)
 
 
-def test_a_long_ring_is_kept_in_seconds(tmp_path):
-    """Its mobility is 18: a box of limits has more corners than anybody can look at."""
+def test_long_ring_is_projected_in_seconds(tmp_path):
+    """Its mobility is 18: a box of limits has too many corners to enumerate."""
     count, inner = 20, ""
     for k in reversed(range(count)):
         tip = '<site name="tip" pos=".1 0 0"/>' if k == count - 1 else ""

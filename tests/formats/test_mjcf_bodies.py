@@ -136,7 +136,7 @@ def test_files_are_where_the_compiler_settings_say():
         assert found.body.visuals[0].geometry.uri == uri
 
 
-def test_primitives():
+def test_primitive_geoms_become_shapes():
     geoms = """<geom type="box" size="1 2 3"/><geom type="sphere" size="1"/><geom type="capsule" size="1 2"/>
     <geom type="cylinder" size="1 2" name="c"/><geom type="ellipsoid" size="1 2 3" rgba="1 0 0 .5"/>"""
     found, _ = link(mjcf(f'<worldbody><body name="a">{geoms}</body></worldbody>'))
@@ -165,7 +165,7 @@ def test_primitives():
         ('rgba="0 0 0 0"', 0, 1),
     ],
 )
-def test_what_is_seen_and_what_is_touched(attributes, seen, touched):
+def test_geom_groups_and_contacts_decide_visuals_and_collisions(attributes, seen, touched):
     found, _ = link(mjcf(f'<worldbody><body name="a"><geom size="1" {attributes}/></body></worldbody>'))
     assert (len(found.body.visuals), len(found.body.collisions)) == (seen, touched)
 
@@ -221,7 +221,7 @@ def test_inertia_is_that_of_mujoco(inertial):
     np.testing.assert_allclose(about_origin, full, atol=1e-12)
 
 
-def test_data_of_joints():
+def test_joint_dynamics_are_data():
     joints = """<joint name="h" stiffness="3" springref="20" damping="2" frictionloss=".5" armature=".1"/>
     <joint name="s" type="slide" actuatorfrcrange="-5 8"/><joint name="m"/><joint name="p"/><joint name="u"/><joint name="b" type="slide"/>"""
     actuators = """<actuator><motor joint="s" gear="3" ctrlrange="-4 4"/><motor joint="m" gear="3" ctrlrange="-2 1"/>
@@ -247,7 +247,7 @@ HOMED = mjcf(
 )
 
 
-def test_home_is_where_the_file_places_the_bodies():
+def test_home_position_is_that_of_the_file():
     pair = Pair.of_text(HOMED.format(""))
     state = pair.model.default_state()
     assert state[kv.position("h")] == pytest.approx(np.radians(20))
@@ -255,14 +255,14 @@ def test_home_is_where_the_file_places_the_bodies():
     np.testing.assert_allclose(pair.data.qpos, pair.engine.qpos0, atol=1e-15)
 
 
-def test_home_is_the_key_of_that_name():
+def test_home_position_is_the_key_home():
     key = '<keyframe><key name="other" qpos="0 1 0 0 0 0 0 0 1 0 0 0"/><key name="home" qpos=".5 .6 .8 0 0 4 5 6 .5 .5 .5 .5" ctrl=""/></keyframe>'
     pair = Pair.of_text(HOMED.format(key))
     pair.place(dict(pair.model.default_state()))
     np.testing.assert_allclose(pair.data.qpos, [0.5, 0.6, 0.8, 0, 0, 4, 5, 6, 0.5, 0.5, 0.5, 0.5], atol=1e-15)
 
 
-def test_a_key_that_does_not_fit_what_is_read_is_left_out():
+def test_key_of_another_size_is_left_out():
     soft = '<worldbody><flexcomp name="f" type="grid" count="2 2 1" dim="2" mass="1" radius=".01"/><body><joint/><geom size="1"/></body></worldbody>'
     scene = parse_mjcf(mjcf(soft, '<keyframe><key name="home" qpos="' + "0 " * 13 + '"/></keyframe>'))
     assert scene.remarks[0] == 'line 2, <flexcomp name="f"> is left out: what bends has no frames here.'

@@ -34,15 +34,15 @@ furniture_sim/furniture_sim/slidecabinet/slidecabinet_body.xml | line 1, <mujoco
 furniture_sim/furniture_sim/slidecabinet.xml | 5 1
 """
 
-VERDICTS: dict[str, str] = dict(line.split(" | ", 1) for line in _TABLE.strip().splitlines())  # type: ignore[misc]
+OUTCOMES: dict[str, str] = dict(line.split(" | ", 1) for line in _TABLE.strip().splitlines())  # type: ignore[misc]
 """Every MJCF of the shared data has its frames and degrees of freedom, or is refused for its reason."""
 
-LOADED = [file for file, verdict in VERDICTS.items() if verdict[0].isdecimal()]
+LOADED = [file for file, outcome in OUTCOMES.items() if outcome[0].isdecimal()]
 
 
-@pytest.mark.parametrize("file", VERDICTS)
-def test_verdicts(file: str):
-    path, expected = shared(file), VERDICTS[file]
+@pytest.mark.parametrize("file", OUTCOMES)
+def test_dofs_or_errors_of_all_files(file: str):
+    path, expected = shared(file), OUTCOMES[file]
     if file in LOADED:
         model = kv.load(path, prefix="p")
         assert f"{len(model.frames)} {len(model.degrees_of_freedom)}" == expected
@@ -56,7 +56,7 @@ def test_no_file_is_left_out():
     folders = [shared(name) for name in ("furniture_sim", "articulated_objects", "kineverse_shelf_objects")]
     files = {path.relative_to(SHARED).as_posix() for folder in folders for path in folder.rglob("*.xml")}
     files = {file for file in files if b"<mujoco" in (SHARED / file).read_bytes()}
-    assert files == set(VERDICTS)
+    assert files == set(OUTCOMES)
 
 
 @pytest.mark.parametrize("file", LOADED)

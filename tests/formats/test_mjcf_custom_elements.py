@@ -1,4 +1,4 @@
-"""What the writer of MJCF says beside it: read again where it is right, and no harm where somebody edited it."""
+"""Custom elements of written MJCF files: read back if they are valid, and ignored in edited files."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from round_trip import assert_same_motion, loaded
+from round_trip import assert_same_motion, load_cached
 
 pytest.importorskip("mujoco")
 
@@ -31,7 +31,7 @@ def read(text: str, prefix: str | None = None) -> kv.Model:
     return model
 
 
-def test_limits_of_speeds_are_read_again(tmp_path: Path) -> None:
+def test_velocity_limits_are_read_back(tmp_path: Path) -> None:
     model = kv.Model()
     q = kv.position("q")
     with model.edit() as edit:
@@ -51,7 +51,7 @@ def test_limits_of_speeds_are_read_again(tmp_path: Path) -> None:
         assert broken == (["left/p/velocity"] if abs(speed) > 4 / 3 else [])
 
 
-def test_frames_without_mass_have_none_when_they_are_read_again(tmp_path: Path) -> None:
+def test_massless_frames_are_read_back_without_mass(tmp_path: Path) -> None:
     heavy = Body((Shape(Box((1, 1, 1))),), (), Inertia(2, (1, 0, 0, 1, 0, 1)))
     model = kv.Model()
     with model.edit() as edit:
@@ -71,8 +71,8 @@ def test_frames_without_mass_have_none_when_they_are_read_again(tmp_path: Path) 
 
 
 @pytest.mark.parametrize("saved", ["as it is", "from a document", "from a document, below a prefix"])
-def test_loops_are_solved_again_wherever_they_come_from(saved: str, tmp_path: Path) -> None:
-    model = loaded("articulations/parallel_gripper")
+def test_loops_are_solved_again_when_read_back(saved: str, tmp_path: Path) -> None:
+    model = load_cached("articulations/parallel_gripper")
     if saved != "as it is":
         model.save(tmp_path / "m.kv.json")
         prefix = "left/a:b" if "prefix" in saved else None
@@ -83,8 +83,8 @@ def test_loops_are_solved_again_wherever_they_come_from(saved: str, tmp_path: Pa
     assert_same_motion(model, again, tolerance=1e-10, count=4)
 
 
-def test_the_branch_is_that_of_the_model(tmp_path: Path) -> None:
-    """Both ways in which a four-bar closes, from the same bars at the same home."""
+def test_loops_read_back_keep_their_branch(tmp_path: Path) -> None:
+    """Both branches of a four-bar, from the same bars at the same home position."""
 
     def bars(branch: int) -> kv.Model:
         model = kv.Model()
@@ -117,10 +117,8 @@ def test_the_branch_is_that_of_the_model(tmp_path: Path) -> None:
         ('objtype="equality"', 'objtype="light"', "is not in the file as it says"),
     ],
 )
-def test_what_somebody_edited_is_read_as_in_other_files(
-    before: str, after: str, remark: str, tmp_path: Path
-) -> None:
-    text = written(loaded(LINKAGE), tmp_path)
+def test_edited_custom_loops_are_ignored(before: str, after: str, remark: str, tmp_path: Path) -> None:
+    text = written(load_cached(LINKAGE), tmp_path)
     assert before in text
     scene = parse_mjcf(text.replace(before, after))
     assert [r for r in scene.remarks if remark in r]
@@ -130,7 +128,7 @@ def test_what_somebody_edited_is_read_as_in_other_files(
 
 
 @pytest.mark.parametrize("data", ["1 -1", "nan nan", "inf inf", "1", "1 2 3", "one two", ""])
-def test_speeds_that_are_no_range_are_left_out(data: str) -> None:
+def test_invalid_velocity_ranges_are_left_out(data: str) -> None:
     text = f"""<mujoco><custom><numeric name="kineverse:speed:q" data="{data}"/></custom><worldbody>
     <body name="b"><joint name="q"/><geom size="1"/></body></worldbody></mujoco>"""
     scene = parse_mjcf(text)
@@ -138,8 +136,8 @@ def test_speeds_that_are_no_range_are_left_out(data: str) -> None:
     assert scene.links[1].joints[0].speed is None
 
 
-def test_custom_elements_of_others_mean_nothing(tmp_path: Path) -> None:
-    text = written(loaded(LINKAGE), tmp_path)
+def test_foreign_custom_elements_are_ignored(tmp_path: Path) -> None:
+    text = written(load_cached(LINKAGE), tmp_path)
     start, end = text.index("  <custom>"), text.index("</custom>\n") + len("</custom>\n")
     without = parse_mjcf(text[:start] + text[end:])
     other = parse_mjcf(text.replace("kineverse:", "someone:"))

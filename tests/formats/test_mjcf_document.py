@@ -1,4 +1,4 @@
-"""What was read from an MJCF is saved as a document and comes back without MuJoCo."""
+"""Models from MJCF are saved as documents, which are read without MuJoCo."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ TEXTS = {
 
 
 @pytest.mark.parametrize("what", TEXTS)
-def test_documents(what, tmp_path):
+def test_models_from_mjcf_are_written_as_documents(what, tmp_path):
     model = model_of(parse_mjcf(TEXTS[what]), "p")
     model.save(tmp_path / "x.kv.json")
     back = kv.load(tmp_path / "x.kv.json")

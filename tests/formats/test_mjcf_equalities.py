@@ -45,7 +45,7 @@ def test_a_joint_that_follows_is_the_quartic(coefficients):
     pair.compare()
 
 
-def test_a_joint_that_nothing_leads_stands_still():
+def test_joint_equality_without_leader_fixes_the_joint():
     pair = Pair.of_text(scene(TWO, '<joint joint1="y" polycoef=".3 1 0 0 0"/>'))
     check_closed(pair)
     pair.compare()
@@ -64,7 +64,7 @@ def test_chains_are_composed_whatever_their_order():
     pair.compare()
 
 
-def test_what_cannot_follow_stays_a_constraint():
+def test_equalities_of_joints_that_follow_already_stay_constraints():
     one = '<joint name="forth" joint1="y" joint2="x" polycoef="0 2"/>'
     back = '<joint name="back" joint1="x" joint2="y" polycoef="0 1"/>'
     model = model_of(parse_mjcf(scene(TWO.replace('ref="10"', "").replace('ref="-20"', ""), one + back)), "p")
@@ -73,7 +73,7 @@ def test_what_cannot_follow_stays_a_constraint():
     assert violation.value == pytest.approx(-0.5)  # x - y with y = 2x
 
 
-def test_what_stays_a_constraint_is_kept_by_controllers_as_mujoco_keeps_it():
+def test_controllers_keep_remaining_equalities_as_mujoco():
     three = "".join(body(b, f'<joint name="{j}"/>') for b, j in zip("abc", "xyz", strict=True))
     follows = '<joint joint1="y" joint2="x" polycoef=".1 .8 .3 0 0"/>'
     pair = Pair.of_text(
@@ -101,7 +101,7 @@ def test_what_stays_a_constraint_is_kept_by_controllers_as_mujoco_keeps_it():
         assert all(abs(v.value) <= left[1] ** 2 for v in after)
 
 
-def test_circles_that_agree_are_one():
+def test_consistent_cycles_of_equalities_are_redundant():
     one = '<joint joint1="y" joint2="x"/>'
     model = model_of(
         parse_mjcf(
@@ -112,7 +112,7 @@ def test_circles_that_agree_are_one():
     assert list(model.constraints) == ["x/position"]
 
 
-def test_joints_held_in_two_places_are_told():
+def test_joints_fixed_at_two_positions_are_a_warning():
     text = scene(TWO, '<joint joint1="y" polycoef=".1"/>\n<joint name="no" joint1="y" polycoef=".3"/>')
     with collect_warnings() as remarks:
         model = model_of(parse_mjcf(text, "x.xml"))
@@ -121,7 +121,7 @@ def test_joints_held_in_two_places_are_told():
     assert [str(s) for s in model.degrees_of_freedom] == ["x"]
 
 
-def test_inactive_ones_are_left_out_with_a_remark():
+def test_inactive_equalities_are_left_out_with_a_remark():
     found = parse_mjcf(scene(TWO, '<joint name="off" joint1="y" joint2="x" active="false"/>'))
     assert found.couplings == ()
     assert found.remarks == ('line 2, <joint name="off"> is left out: it is not active.',)
@@ -223,7 +223,7 @@ MORE = body("lid", '<joint name="y" axis="1 0 0"/>', 'pos="0 0 1"') + body(
     ],
 )
 @pytest.mark.parametrize("first", ["arm", "box"])
-def test_a_free_body_that_is_welded_is_carried(equality, first):
+def test_welded_free_body_is_attached_to_its_holder(equality, first):
     parts = [ARM, BOX.format(MORE)]
     pair = Pair.of_text(scene("".join(parts if first == "arm" else parts[::-1]), equality))
     assert [str(s) for s in pair.model.degrees_of_freedom] == ["x", "y"]
@@ -238,13 +238,13 @@ def test_a_free_body_that_is_welded_is_carried(equality, first):
         '<connect body1="knob" anchor="0 0 1"/>',
     ],
 )
-def test_a_free_body_that_is_pinned_turns(equality):
+def test_pinned_free_body_becomes_a_ball_joint(equality):
     pair = Pair.of_text(scene(ARM + BOX.format(MORE), equality))
     assert [str(s) for s in pair.model.degrees_of_freedom] == ["f/qw", "f/qx", "f/qy", "f/qz", "x", "y"]
     check_closed(pair, rows=3)
 
 
-def test_what_is_held_twice_is_closed_or_refused():
+def test_second_equality_of_a_held_body_closes_a_loop():
     boxes = BOX.format("") + BOX.format("").replace("box", "crate").replace('"f"', '"g"').replace(
         '"s"', '"t"'
     )
@@ -254,7 +254,7 @@ def test_what_is_held_twice_is_closed_or_refused():
         model_of(parse_mjcf(scene(boxes, chain + '<weld body1="crate" relpose="0 0 2 1 0 0 0"/>')))
 
 
-def test_loops_that_cannot_be_followed_are_refused_by_name(tmp_path):
+def test_unsolvable_loops_are_refused_by_name(tmp_path):
     hung = body(
         "a", '<joint type="ball" name="j"/>' + body("b", '<joint type="ball" name="k"/>', 'pos="1 0 0"')
     )
@@ -265,7 +265,7 @@ def test_loops_that_cannot_be_followed_are_refused_by_name(tmp_path):
         kv.load(tmp_path / "x.xml", loops="refuse")
 
 
-def test_what_is_rigid_is_left_out_or_closes_nothing():
+def test_equalities_between_rigidly_connected_bodies_are_left_out():
     fixed = body("a", "") + body("b", "", 'pos="1 0 0"')
     assert parse_mjcf(scene(fixed, '<weld name="w" body1="a" body2="b"/>')).remarks == (
         'line 2, <weld name="w"> is left out: it ties bodies that are rigidly connected anyway.',
@@ -276,7 +276,7 @@ def test_what_is_rigid_is_left_out_or_closes_nothing():
         model_of(apart)
 
 
-def test_a_loop_may_leave_nothing_free():
+def test_loop_without_free_coordinate_is_closed():
     pair = Pair.of_text(
         scene(body("a", '<joint name="j"/>', 'pos="1 0 0"'), '<connect body1="a" anchor=".5 .5 0"/>')
     )
@@ -284,7 +284,7 @@ def test_a_loop_may_leave_nothing_free():
     check_closed(pair, rows=3, samples=1)
 
 
-def test_handles_are_not_tied():
+def test_equalities_of_mocap_bodies_are_left_out():
     parts = body("hand", '<joint name="j" type="slide"/>') + body("handle", "", 'mocap="true"')
     found = parse_mjcf(scene(parts, '<weld name="w" body1="hand" body2="handle"/>'))
     assert found.closures == ()
@@ -313,7 +313,7 @@ def test_tendons_have_the_lengths_of_mujoco():
     assert (violation.name, violation.value) == ("f/length", pytest.approx(2.5))
 
 
-def test_tendons_of_what_follows():
+def test_tendons_over_followers_have_the_lengths_of_mujoco():
     pair = Pair.of_text(
         mjcf(
             f"<worldbody>{ROPED}</worldbody>",
@@ -342,7 +342,7 @@ def test_coupled_tendons_are_a_constraint(leader):
     )
 
 
-def test_tendons_round_a_geom_are_left_out():
+def test_tendons_around_geoms_are_left_out():
     text = mjcf(
         f'<worldbody>{ROPED}<geom name="w" size=".1"/></worldbody><tendon><spatial name="t"><site site="p"/><geom geom="w"/>'
         '<site site="q"/></spatial></tendon><equality><tendon name="e" tendon1="t"/></equality>'
@@ -355,7 +355,7 @@ def test_tendons_round_a_geom_are_left_out():
     )
 
 
-def test_a_ball_turns_as_far_as_mujoco_lets_it():
+def test_ball_joint_limit_is_that_of_mujoco():
     ball = body("a", '<joint name="j" type="ball" range="0 50"/>')
     pair = Pair.of_text(mjcf(f"<worldbody>{ball}</worldbody>"))
     axis = np.array([1.0, 2.0, -2.0]) / 3

@@ -1,4 +1,4 @@
-"""Files that are broken or mean harm: one error each, nothing printed, nothing opened outside of the folder."""
+"""Broken and malicious MJCF files: one error each, nothing printed, nothing opened outside of the folder."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ WORLD = f"<worldbody>{body('a', '<joint/>')}</worldbody>"
 
 @pytest.fixture(autouse=True)
 def _quiet(tmp_path, monkeypatch, capfd):
-    """Whatever is read, MuJoCo neither prints nor leaves a log in the current folder."""
+    """Check that MuJoCo neither prints nor leaves a log in the current folder."""
     here = tmp_path / "here"
     here.mkdir()
     monkeypatch.chdir(here)
@@ -77,7 +77,7 @@ def outcome(text: str | bytes, folder: object = "") -> str:
         (mjcf("<worldbody>" + "<body>" * 460 + "</body>" * 460 + "</worldbody>"), "x.xml, line 2, <body>", "nested more than 450 deep"),
     ],
 )  # fmt: skip
-def test_refusals(text, place, reason):
+def test_invalid_mjcf_is_refused_with_a_reason(text, place, reason):
     message = outcome(text)
     assert place in message
     assert reason in message
@@ -154,7 +154,7 @@ def test_comments_and_declarations_that_xml_forbids_are_read():
         parse_mjcf(text, "x.xml", strict=True)
 
 
-def test_what_a_part_includes_is_found_from_both_folders(tmp_path):
+def test_nested_includes_are_found_from_both_folders(tmp_path):
     top = tmp_path / "robot"
     write(
         top,
@@ -169,7 +169,7 @@ def test_what_a_part_includes_is_found_from_both_folders(tmp_path):
     assert [link.name for link in parse_mjcf(text, "x.xml", str(top)).links] == ["world", "a", "b", "c"]
 
 
-def test_includes_come_once(tmp_path):
+def test_second_include_of_a_file_is_refused(tmp_path):
     write(tmp_path, "a.xml", '<mujocoinclude>\n<include file="a.xml"/></mujocoinclude>')
     assert outcome(mjcf('<include file="a.xml"/>'), tmp_path).startswith(
         "a.xml, line 2, <include>: is there a second time"
@@ -186,7 +186,7 @@ PARENT = mjcf(
 )
 
 
-def test_attached_models(tmp_path):
+def test_attached_models_are_read_with_prefix(tmp_path):
     write(tmp_path, "sub/child.xml", CHILD.format(""))
     scene = parse_mjcf(
         PARENT.format(
@@ -208,7 +208,7 @@ def test_attached_models(tmp_path):
     )
 
 
-def test_models_that_attach_themselves_or_too_much(tmp_path):
+def test_recursive_and_too_large_attachments_are_refused(tmp_path):
     write(tmp_path, "sub/child.xml", '<mujoco>\n<asset><model name="m" file="child.xml"/></asset></mujoco>')
     assert outcome(PARENT.format("p_", ""), tmp_path).startswith(
         'child.xml, line 2, <model name="m">: attaches itself'
@@ -246,7 +246,7 @@ def test_no_plugin_no_texture_and_no_skin_is_loaded(tmp_path):
     ]
 
 
-def test_names_and_spellings_survive_the_way_to_mujoco():
+def test_names_and_numbers_reach_mujoco_unchanged():
     name = "a <&> \"é\" 'x'"
     escaped = name.replace("&", "&amp;").replace("<", "&lt;").replace('"', "&quot;")
     text = f'<?xml version="1.0" encoding="iso-8859-1"?><mujoco><worldbody><body name="{escaped}">{GEOM}<!-- <body/> --></body></worldbody></mujoco>'
@@ -255,13 +255,13 @@ def test_names_and_spellings_survive_the_way_to_mujoco():
     assert f"p/{name}" in model.frames
 
 
-def test_every_prefix_of_a_file_is_one_error():
+def test_truncated_files_are_format_errors():
     whole = shared("articulated_objects/robosuite_mit/objects/door.xml").read_bytes()
     for length in range(0, len(whole.rstrip()), 41):
         assert outcome(whole[:length]).startswith("x.xml, line ")
 
 
-def test_a_file_that_is_not_there(tmp_path):
+def test_missing_file_is_an_error(tmp_path):
     with pytest.raises(kv.errors.FormatError, match="there is no such file"):
         read_mjcf(tmp_path / "no.xml")
 
@@ -273,7 +273,7 @@ def test_without_mujoco_the_error_names_the_extra(monkeypatch, tmp_path):
         kv.load(tmp_path / "x.xml")
 
 
-def test_the_root_element_decides_what_an_xml_is(tmp_path):
+def test_root_element_decides_the_format_of_xml(tmp_path):
     write(tmp_path, "m.xml", f"<?xml version='1.0'?>\n<!-- <robot> -->\n{mjcf(WORLD)}")
     write(tmp_path, "u.xml", '<!-- <mujoco> --><robot name="r"><link name="l"/></robot>')
     assert list(kv.load(tmp_path / "m.xml", prefix="p").frames) == ["p/world", "p/a"]
@@ -284,14 +284,14 @@ def test_the_root_element_decides_what_an_xml_is(tmp_path):
     assert list(kv.load(tmp_path / "w.xml").frames) == ["a"]
 
 
-def test_what_is_included_may_change_while_the_file_does_not(tmp_path):
+def test_changed_includes_are_read_again(tmp_path):
     write(tmp_path, "x.xml", mjcf('<worldbody><include file="part.xml"/></worldbody>'))
     for name in ("one", "two"):
         write(tmp_path, "part.xml", f'<mujocoinclude><body name="{name}"/></mujocoinclude>')
         assert list(kv.load(tmp_path / "x.xml").frames) == [name]
 
 
-def test_warnings_of_mujoco_are_remarks():
+def test_mujoco_warnings_become_reader_warnings():
     joints = '<joint axis="1 0 0"/><joint axis="1 0 0"/>'
     scene = parse_mjcf(mjcf(f"<worldbody>{body('a', joints)}</worldbody>", '<statistic meanmass="1"/>'))
     assert all(remark.startswith("MuJoCo says: ") for remark in scene.remarks)

@@ -1,4 +1,4 @@
-"""Random trees, written as MJCF in every notation that it has, are where MuJoCo puts them."""
+"""Random trees in all notations of MJCF have the poses of MuJoCo."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def spelt(numbers) -> str:
 
 @st.composite
 def orientations(draw, degrees: bool) -> str:
-    """One of the ways to say an orientation, or none."""
+    """Return a strategy for all notations of an orientation."""
     way = draw(st.sampled_from(["", "quat", "axisangle", "euler", "xyaxes", "zaxis"]))
     angle = 1.0 if degrees else math.pi / 180
     if way == "quat":
@@ -101,5 +101,5 @@ def trees(draw) -> str:
 
 @settings(max_examples=attempts(12), deadline=None)
 @given(trees())
-def test_random_trees_are_where_mujoco_puts_them(text):
+def test_random_trees_have_the_poses_of_mujoco(text):
     Pair.of_text(text).compare(samples=2)

@@ -1,4 +1,4 @@
-"""What pinocchio and MuJoCo read is read: a short pass of ``tools/fuzz/peers.py``."""
+"""Files that pinocchio and MuJoCo read are read: a short run of ``tools/fuzz/peers.py``."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from fuzz.worker import place
 
 
 @pytest.mark.parametrize(("name", "tried", "read"), [("urdf", 400, 100), ("mjcf", 60, 1)])
-def test_what_others_read_is_refused_for_six_reasons_only(tmp_path, name, tried, read):
+def test_files_that_other_parsers_read_are_refused_for_six_reasons_only(tmp_path, name, tried, read):
     target, folder = TARGETS[name], place(tmp_path)
     with quiet():
         given = [
@@ -43,12 +43,12 @@ def test_what_others_read_is_refused_for_six_reasons_only(tmp_path, name, tried,
         ('<robot name="r"><link name="l"><visual><origin xyz="nan 0 0"/></visual></link>', ""),
     ],
 )
-def test_who_reads_what_is_known(text, by):
+def test_parsers_that_read_each_file_are_recorded(text, by):
     with quiet():
         assert reader_of("urdf", text.encode()) == by
 
 
-def test_a_refusal_without_a_reason_is_seen(tmp_path):
+def test_refusal_without_a_known_reason_is_detected(tmp_path):
     target = TARGETS["urdf"]
     assert "has the name of the link" in refusal(
         target, b'<robot name="r"><link name="l"/><link name="l"/></robot>', tmp_path

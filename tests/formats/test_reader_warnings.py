@@ -1,4 +1,4 @@
-"""Whoever loads a file can hear what its reader remarks, whether the file is read or remembered."""
+"""Warnings of readers are emitted at every load, whether the file is read or cached."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ TWICE = """<robot name="r"><link name="a"><inertial><mass value="1"/><mass value
 <inertia ixx="1" ixy="0" ixz="0" iyy="1" iyz="0" izz="1"/></inertial></link><part_joint/></robot>"""
 
 
-def test_remarks_are_heard_every_time_a_file_is_loaded(tmp_path):
+def test_warnings_are_emitted_at_every_load(tmp_path):
     path = tmp_path / "r.urdf"
     path.write_text(TWICE)
     heard = []
@@ -25,7 +25,7 @@ def test_remarks_are_heard_every_time_a_file_is_loaded(tmp_path):
     assert any("<part_joint>" in remark for remark in heard[0])
 
 
-def test_they_are_logged_as_well_and_blocks_may_be_nested(tmp_path, caplog):
+def test_warnings_are_logged_and_collectors_nest(tmp_path, caplog):
     path = tmp_path / "r.urdf"
     path.write_text(TWICE)
     with (

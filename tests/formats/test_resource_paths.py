@@ -1,4 +1,4 @@
-"""Where the files of a description are found."""
+"""The search for the files of a description: packages, models and paths."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def make(tmp_path):
     return make
 
 
-def test_folders_above_the_description(make):
+def test_folders_above_the_description_are_searched(make):
     file = make("ws/arm/meshes/a.stl")
     assert locate_resource("package://arm/meshes/a.stl", file.parent.parent / "urdf") == file
     assert locate_resource("package://arm/meshes/a.stl", make("ws/other/urdf/x.urdf").parent) == file
@@ -95,14 +95,14 @@ def test_the_number_of_folders_is_bounded(make, tmp_path, monkeypatch):
 
 @pytest.mark.parametrize("variable", resource_paths._PREFIXES)
 @pytest.mark.parametrize("layout", ["install/share/arm/a.stl", "install/arm/share/arm/a.stl"])
-def test_installed_workspaces(make, tmp_path, monkeypatch, variable, layout):
+def test_installed_workspaces_are_searched(make, tmp_path, monkeypatch, variable, layout):
     file = make(layout)
     monkeypatch.setenv(variable, str(tmp_path / "install"))
     assert locate_resource("package://arm/a.stl", tmp_path / "x") == file
 
 
 @pytest.mark.parametrize("variable", resource_paths._MODELS)
-def test_models(make, tmp_path, monkeypatch, variable):
+def test_model_addresses_are_found_in_gazebo_paths(make, tmp_path, monkeypatch, variable):
     file = make("models/arm/a.stl")
     monkeypatch.setenv(variable, str(tmp_path / "models"))
     assert locate_resource("model://arm/a.stl", tmp_path / "x") == file
@@ -126,14 +126,14 @@ def test_the_next_folder_is_tried_when_the_first_lacks_the_file(make, tmp_path):
     assert locate_resource("package://arm/a.stl", tmp_path / "urdf", search=[tmp_path / "mine"]) == file
 
 
-def test_escaped_characters(make, tmp_path):
+def test_percent_escapes_are_decoded(make, tmp_path):
     file = make("arm/a b.stl")
     assert locate_resource("package://arm/a%20b.stl", tmp_path) == file
     literal = make("arm/50%25.stl")
     assert locate_resource("package://arm/50%25.stl", tmp_path) == literal
 
 
-def test_paths_and_file_uris(make, tmp_path):
+def test_paths_and_file_uris_are_found(make, tmp_path):
     file = make("arm/meshes/a b.stl")
     make("arm/urdf/x.urdf")
     assert locate_resource("../meshes/a b.stl", tmp_path / "arm" / "urdf").samefile(file)
@@ -161,7 +161,7 @@ def test_an_absolute_path_inside_a_package_is_one_inside_the_package(make, tmp_p
         locate_resource("package://arm//etc/passwd", tmp_path)
 
 
-def test_dots_that_stay_inside_are_fine(make, tmp_path):
+def test_dots_that_stay_inside_of_a_package_are_allowed(make, tmp_path):
     file = make("arm/meshes/a.stl")
     make("arm/urdf/x.urdf")
     assert locate_resource("package://arm/urdf/../meshes/./a.stl", tmp_path).samefile(file)
@@ -211,7 +211,7 @@ def test_a_package_without_the_file_is_named(make, tmp_path):
         ("\0", "there is no such file"),
     ],
 )
-def test_misses(tmp_path, uri, expected):
+def test_missing_resources_are_errors(tmp_path, uri, expected):
     with pytest.raises(FormatError, match=expected):
         locate_resource(uri, tmp_path)
 

@@ -1,4 +1,4 @@
-"""Files are written whole or not at all, by the ending of their name."""
+"""Saving of models: files are written completely or not at all."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def model() -> kv.Model:
 
 
 @pytest.mark.parametrize("ending", ENDINGS)
-def test_every_ending_is_read_again(ending: str, model: kv.Model, tmp_path: Path) -> None:
+def test_every_ending_is_read_back(ending: str, model: kv.Model, tmp_path: Path) -> None:
     report = model.save(tmp_path / f"m{ending}")
     assert report.path == tmp_path / f"m{ending}"
     assert kv.load(report.path).limits("q") == (0, 1)
@@ -35,7 +35,7 @@ def test_other_endings_are_refused_with_those_there_are(model: kv.Model, tmp_pat
 
 
 @pytest.mark.parametrize("ending", ENDINGS)
-def test_a_refusal_leaves_the_file_that_was_there(ending: str, model: kv.Model, tmp_path: Path) -> None:
+def test_failed_save_leaves_the_existing_file(ending: str, model: kv.Model, tmp_path: Path) -> None:
     file = tmp_path / f"m{ending}"
     file.write_text("before")
     if ending == ".kv.json":
@@ -51,7 +51,7 @@ def test_a_refusal_leaves_the_file_that_was_there(ending: str, model: kv.Model, 
 
 
 @pytest.mark.parametrize("ending", ENDINGS)
-def test_a_folder_that_is_not_there(ending: str, model: kv.Model, tmp_path: Path) -> None:
+def test_save_to_a_missing_folder_is_refused(ending: str, model: kv.Model, tmp_path: Path) -> None:
     with pytest.raises(
         kv.errors.FormatError, match=r"cannot be written: the folder .*nowhere does not exist"
     ):
@@ -59,12 +59,12 @@ def test_a_folder_that_is_not_there(ending: str, model: kv.Model, tmp_path: Path
 
 
 @pytest.mark.skipif(os.geteuid() == 0, reason="root may write anywhere")
-def test_a_folder_that_may_not_be_written(model: kv.Model, tmp_path: Path) -> None:
+def test_save_to_a_read_only_folder_is_refused(model: kv.Model, tmp_path: Path) -> None:
     tmp_path.chmod(0o500)
     with pytest.raises(kv.errors.FormatError, match="cannot be written"):
         model.save(tmp_path / "m.urdf")
 
 
-def test_what_is_no_path(model: kv.Model) -> None:
+def test_save_to_no_path_is_refused(model: kv.Model) -> None:
     with pytest.raises(kv.errors.FormatError, match="is saved to the path of a file"):
         model.save(3)  # type: ignore[arg-type]

@@ -1,4 +1,4 @@
-"""What links of an SDF carry."""
+"""Shapes, colours and inertia of SDF links."""
 
 from __future__ import annotations
 
@@ -32,19 +32,19 @@ ROUND = "<radius>1</radius><length>2</length>"
         ),
     ],
 )
-def test_shapes(form, geometry):
+def test_sdf_shapes_are_read(form, geometry):
     body = parse_sdf(sdf(link("l", shape(form) + shape(form, tag="collision"))), folder="/f").links[0].body
     assert [s.geometry for s in (*body.visuals, *body.collisions)] == [geometry, geometry]
 
 
 @pytest.mark.parametrize("tag", ["plane", "heightmap", "polyline", "image"])
-def test_shapes_that_cannot_be_said_are_left_out(tag):
+def test_unsupported_sdf_shapes_are_left_out(tag):
     scene = parse_sdf(sdf(link("l", shape(f"<{tag}><size>1 1</size></{tag}>"))))
     assert not scene.links[0].body.visuals
     assert any(f"<{tag}> cannot be said here" in remark for remark in scene.remarks)
 
 
-def test_places_colours_and_inertia():
+def test_sdf_poses_colours_and_inertia_are_read():
     text = sdf(
         '<frame name="f">' + pose("5 0 0 0 0 0") + "</frame>",
         link(

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from sdf_outcomes import VERDICTS
+from sdf_outcomes import OUTCOMES
 from urdf_texts import SHARED, shared
 
 import kineverse as kv
@@ -17,10 +17,10 @@ import kineverse as kv
 DRAKE = json.loads((Path(__file__).parent / "sdf_poses_of_drake.json").read_text())
 
 
-@pytest.mark.parametrize("file", VERDICTS)
-def test_verdicts(file: str):
+@pytest.mark.parametrize("file", OUTCOMES)
+def test_frames_and_dofs_or_errors_of_all_files(file: str):
     path = shared(file)
-    expected = VERDICTS[file]
+    expected = OUTCOMES[file]
     if expected[0].isdecimal():
         model = kv.load(path, prefix="p")
         assert f"{len(model.frames)} {len(model.degrees_of_freedom)}" == expected
@@ -34,11 +34,11 @@ def test_verdicts(file: str):
 def test_no_file_is_left_out():
     folders = [shared("sdf_joint_types"), shared("articulated_objects")]
     files = {path.relative_to(SHARED).as_posix() for folder in folders for path in folder.rglob("*.sdf")}
-    assert files == set(VERDICTS)
+    assert files == set(OUTCOMES)
 
 
 def known(name: str, names: object) -> str:
-    """Return the name here of what Drake calls ``model::name``; a model alone in its file has no prefix."""
+    """Return the name of Drake's ``model::name``; a model alone in its file has no prefix."""
     parts = name.split("::")
     return next(n for n in ("/".join(parts[k:]) for k in range(len(parts))) if n in names)  # type: ignore[operator]
 

@@ -1,4 +1,4 @@
-"""Text that is cut off, malformed, deep, huge or meant to do harm gives one error of our own."""
+"""Truncated, malformed, deep, large and malicious SDF texts give one format error."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def outcome(data: str | bytes, strict: bool = False) -> SdfScene | str:
         return str(error)
 
 
-def test_cut_off_anywhere():
+def test_truncated_sdf_is_read_or_a_format_error():
     for length in range(0, len(WORLD.rstrip()), 7):
         message = outcome(WORLD[:length])
         assert isinstance(message, str), length
@@ -42,7 +42,7 @@ MESH = "<visual><geometry><mesh><uri>a.stl</uri><scale>{}</scale></mesh></geomet
 
 
 @given(st.integers(0, len(WORLD) - 1), st.binary(max_size=8))
-def test_bytes_replaced_anywhere(position, replacement):
+def test_corrupted_sdf_is_read_or_a_format_error(position, replacement):
     data = WORLD.encode()
     result = outcome(data[:position] + replacement + data[position + len(replacement) :])
     assert isinstance(result, SdfScene) or result.startswith("x.sdf")
@@ -144,7 +144,7 @@ def test_bytes_replaced_anywhere(position, replacement):
         (sdf(link("a", "<inertial><mass>heavy</mass></inertial>")), "a finite number"),
     ],
 )
-def test_refusals(text, reason):
+def test_invalid_sdf_is_refused_with_a_reason(text, reason):
     message = outcome(text, strict=True)
     assert isinstance(message, str)
     assert message.startswith("x.sdf, line ")
@@ -188,7 +188,7 @@ AXIS = "<axis>{}</axis>"
         (f"<!-- a -- b -->{sdf(link('a'))}", "<!--"),
     ],
 )
-def test_what_moves_nothing_is_read_with_a_remark(text, reason):
+def test_malformed_values_without_effect_on_motion_are_warnings(text, reason):
     assert isinstance(outcome(text, strict=True), str)
     scene = outcome(text)
     assert isinstance(scene, SdfScene)
@@ -221,7 +221,7 @@ def test_old_versions_are_read_as_1_4(version, root):
     assert len(new.links[0].body.visuals) == 1
 
 
-def test_a_world_takes_a_model_without_links_apart(tmp_path):
+def test_merged_model_without_links_becomes_part_of_the_world(tmp_path):
     inner = '<sdf version="1.10"><model name="m">{}<model name="n"><link name="l"/></model></model></sdf>'
     world = (
         '<sdf version="1.10"><world name="w"><include merge="true"><uri>m.sdf</uri>'
@@ -237,7 +237,7 @@ def test_a_world_takes_a_model_without_links_apart(tmp_path):
     assert "it is a model of its own" in scene.remarks[0]
 
 
-def test_what_the_specification_does_not_know_is_left_out_with_a_remark():
+def test_unknown_sdf_elements_are_left_out_with_a_remark():
     scene = parse_sdf(
         sdf(link("a", "<wheel/>") + "<drake:joint/>", version="1.7").replace("<sdf", "<sdf xmlns:drake='d'")
     )
@@ -247,7 +247,7 @@ def test_what_the_specification_does_not_know_is_left_out_with_a_remark():
     ]
 
 
-def test_names_that_clash_in_the_model():
+def test_clashing_names_are_refused():
     text = sdf(
         link("a"),
         link("b", pose("1 0 0 0 0 0")),
@@ -295,12 +295,12 @@ def turned_chain(n: int) -> str:
 
 
 @pytest.mark.parametrize("shape", [chain, turned_chain])
-def test_steps_grow_with_the_number_of_links(shape):
+def test_sdf_reading_takes_linear_time(shape):
     few, many = steps(shape(100)), steps(shape(400))
     assert many < 4.2 * few
 
 
-def test_long_chains():
+def test_long_sdf_chains_are_read():
     scene = parse_sdf(chain(5_000))
     assert len(scene.joints) == 5_000
     assert scene.links[-1].pose.matrix[0, 3] == 5_000

@@ -1,4 +1,4 @@
-"""Included models: where they are found, where they stand, and where nothing is looked for."""
+"""Included models: the search for their files, their poses, and refused addresses."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def file(folder: Path, text: str) -> Path:
 
 
 @pytest.mark.parametrize("uri", ["model://arm", "arm", "model://arm/arm.sdf", "package://arm"])
-def test_include(tmp_path, uri):
+def test_included_models_are_read(tmp_path, uri):
     inside = "<name>left</name>" + pose("0 2 0 0 0 0", 'relative_to="f"')
     text = sdf(link("l"), '<frame name="f">' + pose("1 0 0 0 0 0") + "</frame>", include(uri, inside))
     model = kv.load(file(tmp_path, text))
@@ -74,7 +74,7 @@ def test_static_and_placement_frame(tmp_path):
     assert at(model, "p/m/base")[:3, 3].tolist() == [-1, 0, 0]
 
 
-def test_merge(tmp_path):
+def test_merged_includes_have_the_names_of_their_parent(tmp_path):
     inside = pose("0 0 0 0 0 1.5707963267948966") + "<name>n</name>"
     text = sdf(link("l"), include("arm", inside, 'merge="true"')).replace(
         "</model>", '<joint name="k" type="fixed"><parent>l</parent><child>base</child></joint></model>'
@@ -84,7 +84,7 @@ def test_merge(tmp_path):
     np.testing.assert_allclose(at(model, "tip", j=0.0)[:3, 3], [0, 1, 0], atol=1e-15)
 
 
-def test_a_changed_file_is_read_again(tmp_path, models):
+def test_changed_included_files_are_read_again(tmp_path, models):
     path = file(tmp_path, sdf(link("l"), include("arm")))
     assert len(kv.load(path).frames) == 4
     (models / "arm" / "arm.sdf").write_text(sdf(link("only")))
@@ -105,13 +105,13 @@ def test_a_changed_file_is_read_again(tmp_path, models):
         ("", "has no <uri>"),
     ],
 )
-def test_what_is_not_looked_for(tmp_path, uri, reason):
+def test_network_addresses_are_refused(tmp_path, uri, reason):
     with pytest.raises(kv.errors.FormatError, match=reason) as info:
         kv.load(file(tmp_path, sdf(link("l"), include(uri))))
     assert str(info.value).startswith("x.sdf, line 1, <include>: ")
 
 
-def test_absolute_paths_stay_inside(tmp_path):
+def test_absolute_include_paths_stay_inside_the_root(tmp_path):
     outside = tmp_path / "outside.sdf"
     outside.write_text(ARM)
     for uri in (str(outside), f"file://{outside}"):
@@ -122,7 +122,7 @@ def test_absolute_paths_stay_inside(tmp_path):
         kv.load(file(tmp_path, sdf(link("l"), include("link.sdf"))))
 
 
-def test_circles(tmp_path, models):
+def test_cyclic_includes_are_refused(tmp_path, models):
     (models / "arm" / "arm.sdf").write_text(sdf(link("l"), include("model://arm")))
     with pytest.raises(kv.errors.FormatError, match="includes itself"):
         kv.load(file(tmp_path, sdf(link("l"), include("model://arm"))))

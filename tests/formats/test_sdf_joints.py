@@ -36,7 +36,7 @@ def one(kind: str, inside: str = Z) -> kv.Model:
         ("universal", Z + "<axis2><xyz>0 1 0</xyz></axis2>", kv.articulations.Universal, 2),
     ],
 )
-def test_kinds(kind, inside, operation, coordinates):
+def test_all_sdf_joint_types_are_read(kind, inside, operation, coordinates):
     model = one(kind, inside)
     record = model.articulations["j"]
     assert record.kind == operation.__name__.lower()
@@ -44,7 +44,7 @@ def test_kinds(kind, inside, operation, coordinates):
     assert at(model, "b", **{str(s): float(str(s).endswith("qw")) for s in record.coordinates})[0, 3] == 1
 
 
-def test_two_hinges_in_a_row():
+def test_revolute2_joint_becomes_two_hinges():
     model = one("revolute2", Z + "<axis2><xyz>0 1 1</xyz></axis2>")
     assert [str(s) for s in sorted(model.degrees_of_freedom, key=str)] == ["j/first", "j/second"]
     got = at(model, "b", **{"j/first": 0.3, "j/second": 0.4})
@@ -62,12 +62,12 @@ def test_two_hinges_in_a_row():
         ("<screw_thread_pitch>0.25</screw_thread_pitch><thread_pitch>9</thread_pitch>", 0.25),
     ],
 )
-def test_pitches(inside, pitch):
+def test_screw_pitches_are_read(inside, pitch):
     model = one("screw", Z + inside)
     assert at(model, "b", j=math.tau)[2, 3] == pytest.approx(pitch)
 
 
-def test_limits_and_dynamics():
+def test_sdf_limits_and_dynamics_are_read():
     axis = (
         "<axis><xyz>0 0 2</xyz><limit><lower>-1</lower><upper>1e16</upper><velocity>2</velocity><effort>3</effort>"
         "</limit><dynamics><damping>0.1</damping><friction>0.2</friction><spring_reference>0.3</spring_reference>"
@@ -88,7 +88,7 @@ def test_limits_and_dynamics():
     assert not one("continuous", axis.replace("<velocity>2</velocity>", "")).constraints
 
 
-def test_a_joint_away_from_its_link_has_a_frame():
+def test_joint_off_its_child_link_has_a_frame():
     model = model_of(
         sdf(
             link("a"),
@@ -109,7 +109,7 @@ def mimic(
     )
 
 
-def test_mimic():
+def test_sdf_mimic_joints_follow():
     links = "".join(link(name) for name in "abcd")
     model = model_of(
         sdf(
@@ -136,7 +136,7 @@ def test_an_axis_of_two_may_follow():
     assert model.articulations["u/second"].position({"u/first": 0.2}) == 0.4
 
 
-def test_nothing_follows_what_cannot_move():
+def test_mimic_of_a_joint_that_cannot_move_is_refused():
     static = f'<model name="s"><static>1</static>{link("x")}{link("y")}{joint("q", "revolute", "x", "y", Z)}</model>'
     text = sdf(
         link("a"), link("b"), static, joint("f", "revolute", "a", "b", Z.replace("</axis>", mimic("s::q", 2)))
@@ -180,7 +180,7 @@ def bar(name: str, x: float, y: float, angle: float) -> str:
     return link(name, pose(f"{x} {y} 0 0 0 {angle!r}"))
 
 
-def test_a_loop_is_closed():
+def test_sdf_loops_are_closed():
     # A parallelogram: crank and rocker of length 1 on a base of length 2, the coupler from one to the other.
     axis = "<axis><xyz>0 0 1</xyz><limit><lower>-0.5</lower><upper>0.5</upper></limit></axis>"
     text = sdf(
@@ -203,7 +203,7 @@ def test_a_loop_is_closed():
 
 
 @pytest.mark.parametrize("name", ["q2", "q:2"])
-def test_balls_in_loops_are_found_whatever_they_are_called(name):
+def test_home_positions_of_ball_joints_in_loops_are_set(name):
     axis = "<axis><xyz>0 0 1</xyz><limit><lower>-0.5</lower><upper>0.5</upper></limit></axis>"
     text = sdf(
         link("base"),
@@ -220,7 +220,7 @@ def test_balls_in_loops_are_found_whatever_they_are_called(name):
         model_of(text)
 
 
-def test_joints_are_turned_where_the_root_is_at_the_other_end():
+def test_joints_are_reversed_if_the_root_is_at_their_child():
     text = sdf(
         link("a"),
         link("b"),
@@ -229,7 +229,7 @@ def test_joints_are_turned_where_the_root_is_at_the_other_end():
         joint("two", "revolute", "b", "c", pose("1 0 0 0 0 0") + Z),
     )
     scene = parse_sdf(text)
-    assert [j.turned for j in scene.joints] == [False, True]
+    assert [j.is_reversed for j in scene.joints] == [False, True]
     model = model_of(text)
     rest = np.linalg.inv(at(model, "b", one=0.2, two=0.0)) @ at(model, "c", one=0.2)
     np.testing.assert_allclose(rest, np.eye(4), atol=1e-15)

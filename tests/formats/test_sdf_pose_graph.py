@@ -39,7 +39,7 @@ def at(model: kv.Model, frame: str, **positions: float) -> np.ndarray:
     return np.asarray(model.fk(frame)(positions))
 
 
-def test_a_chain_of_poses():
+def test_chained_poses_are_composed():
     text = sdf(
         pose("0 0 1 0 0 0"),
         link("a", pose("1 0 0 0 0 1.5707963267948966")),
@@ -65,13 +65,13 @@ def test_a_chain_of_poses():
         pose("1 2 3 1.5707963267948966 0 0", 'rotation_format="euler_rpy"'),
     ],
 )
-def test_formats_of_rotations(text: str):
+def test_rotation_formats_are_read(text: str):
     expected = [[1, 0, 0, 1], [0, 0, -1, 2], [0, 1, 0, 3]]
     np.testing.assert_allclose(at(model_of(sdf(link("a", text))), "a")[:3], expected, atol=1e-15)
 
 
 @pytest.mark.parametrize("frame", ["l", "f", "__model__", "inner", "inner::l"])
-def test_placement_frames(frame: str):
+def test_placement_frames_place_models(frame: str):
     text = sdf(
         pose("1 2 3 0.1 0.2 0.3"),
         link("l", pose("0 0 1 0.4 0 0")),
@@ -111,7 +111,7 @@ WORLD = f"""<sdf version="1.8"><world name="w">
 </model><frame name="mark" attached_to="cup">{pose("1 0 0 0 0 0")}</frame></world></sdf>"""
 
 
-def test_worlds():
+def test_first_world_is_read():
     scene = parse_sdf(WORLD)
     model = model_of(WORLD)
     assert set(model.frames) == {
@@ -142,7 +142,7 @@ def test_several_models_have_their_own_prefixes():
     assert at(model, "p/b/l")[0, 3] == 1
 
 
-def test_old_axes_are_in_the_model():
+def test_axes_before_version_1_5_are_in_the_model_frame():
     joint = '<joint name="j" type="revolute"><parent>a</parent><child>b</child><axis><xyz>1 0 0</xyz>{}</axis></joint>'
     turned = link("a") + link("b", pose("0 0 0 0 0 1.5707963267948966"))
     own, models = [0.0, 1.0, 0.0], [1.0, 0.0, 0.0]
@@ -181,7 +181,7 @@ def said(m: np.ndarray, relative: str) -> str:
 
 
 def written(tree: list, about: list[int]) -> str:
-    """Write a tree of hinges, each pose relative to whatever ``about`` says."""
+    """Write a tree of hinges, each pose relative to the frame that ``about`` returns."""
     places = {"__model__": np.eye(4), "l0": np.eye(4)}
     parts = [link("l0")]
     names = ["__model__", "l0"]
@@ -206,7 +206,7 @@ def written(tree: list, about: list[int]) -> str:
 
 @settings(max_examples=attempts(25), deadline=None)
 @given(TREE, st.lists(st.integers(0, 99), min_size=12, max_size=12), st.lists(NUMBER, min_size=5, max_size=5))
-def test_what_poses_are_relative_to_changes_nothing(tree, about, q):
+def test_relative_to_does_not_change_world_poses(tree, about, q):
     state = {f"j{n}": q[n - 1] for n in range(1, len(tree) + 1)}
     first, second = model_of(written(tree, [0] * 12)), model_of(written(tree, about))
     for n in range(len(tree) + 1):
@@ -218,7 +218,7 @@ def test_what_poses_are_relative_to_changes_nothing(tree, about, q):
 
 @settings(max_examples=attempts(25), deadline=None)
 @given(TREE, st.lists(NUMBER, min_size=5, max_size=5))
-def test_a_urdf_and_the_same_as_sdf(tree, q):
+def test_urdf_and_equivalent_sdf_move_alike(tree, q):
     urdf, parts = ['<robot name="r"><link name="l0"/>'], [link("l0")]
     for n, (above, joint, _, axis) in enumerate(tree, start=1):
         xyz, angles = " ".join(map(repr, joint[:3])), " ".join(map(repr, joint[3:]))

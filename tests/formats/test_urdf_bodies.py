@@ -22,7 +22,7 @@ def test_an_empty_link_has_an_empty_body():
     assert body("") == Body()
 
 
-def test_a_bit_of_everything():
+def test_small_robot_is_read():
     base = parse_urdf(SMALL, folder="/robots").links[0].body
     assert base.inertia.mass == 2.0
     assert base.inertia.origin.matrix[2, 3] == 0.1
@@ -43,14 +43,14 @@ def test_a_bit_of_everything():
         ('<mesh filename="a b.stl" scale="1 -1 1e-3"/>', Mesh("a b.stl", (1.0, -1.0, 1e-3))),
     ],
 )
-def test_shapes(text, geometry):
+def test_urdf_shapes_are_read(text, geometry):
     both = body(visual(text) + f'<collision><origin xyz="1 2 3"/><geometry>{text}</geometry></collision>')
     assert both.visuals[0].geometry == both.collisions[0].geometry == geometry
     assert np.array_equal(both.collisions[0].origin.matrix[:3, 3], [1, 2, 3])
 
 
 @pytest.mark.parametrize("text", ['<drake:ellipsoid a="1" b="2" c="3"/>', "", "<plane/>"])
-def test_a_shape_that_cannot_be_said_is_left_out_with_a_remark(text):
+def test_unsupported_urdf_shape_is_left_out_with_a_remark(text):
     sphere = visual('<sphere radius="1"/>')
     description = parse_urdf(robot(f'<link name="l">{visual(text)}{sphere}</link>'))
     assert [shape.geometry for shape in description.links[0].body.visuals] == [Sphere(1.0)]
@@ -108,7 +108,7 @@ def test_an_unknown_material_is_remarked():
     assert 'line 2, <link name="l">: <material name="mauve"> is defined nowhere' in description.remarks[0]
 
 
-def test_textures_colours_of_three_numbers_and_nameless_materials():
+def test_textures_rgb_colours_and_nameless_materials_are_read():
     textured = '<material name="t"><color rgba="1 0 0"/><texture filename="package://p/t.png"/></material>'
     nameless = "<material><color rgba='0 0 1 1'/></material>"
     shapes = body(visual(SPHERE, textured) + visual(SPHERE, nameless) + visual(SPHERE, "<material/>")).visuals
@@ -119,5 +119,5 @@ def test_textures_colours_of_three_numbers_and_nameless_materials():
     ]
 
 
-def test_saying_the_same_material_twice_is_harmless():
+def test_repeated_equal_material_is_accepted():
     assert parse_urdf(robot(colour("red", "1 0 0 1"), colour("red", "1.0 0 0 1"), links=1)).dof == 0

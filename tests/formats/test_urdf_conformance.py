@@ -6,7 +6,7 @@ import csv
 from pathlib import Path
 
 import pytest
-from urdf_outcomes import COUNT, verdict
+from urdf_outcomes import COUNT, expected_outcome
 from urdf_texts import SHARED, shared
 
 import kineverse as kv
@@ -20,10 +20,10 @@ DOCS = Path(__file__).parents[2] / "docs" / "urdf.md"
 
 @pytest.mark.parametrize("strict", [False, True], ids=["", "strict"])
 @pytest.mark.parametrize("file", FILES, ids=str)
-def test_verdicts(file: Path | None, strict: bool):
+def test_dofs_or_errors_of_all_files(file: Path | None, strict: bool):
     if file is None:
         pytest.skip(f"no {FOLDER}")
-    expected = verdict(file, strict)
+    expected = expected_outcome(file, strict)
     if isinstance(expected, str):
         with pytest.raises(kv.errors.FormatError) as info:
             kv.load(FOLDER / file, strict=strict)
@@ -31,7 +31,7 @@ def test_verdicts(file: Path | None, strict: bool):
     else:
         with collect_warnings() as remarks:
             model = kv.load(FOLDER / file, prefix="p", strict=strict)
-        refused = isinstance(verdict(file, strict=True), str)
+        refused = isinstance(expected_outcome(file, strict=True), str)
         assert any(isinstance(remark, Fault) for remark in remarks) == refused
         assert sum(len(record.speeds) for record in model.articulations.values()) == expected
         assert len(model.frames) == len(read_urdf(FOLDER / file).links)
@@ -47,31 +47,31 @@ def test_no_file_is_left_out():
     assert len(parsers()) == len(FILES) == COUNT
 
 
-def test_what_all_parsers_say_is_said_here():
+def test_files_on_which_all_parsers_agree_are_read_alike():
     for file, said in parsers().items():
         failures = sum(text.startswith("fail") for text in said)
-        loaded = isinstance(verdict(Path(file)), int)
+        loaded = isinstance(expected_outcome(Path(file)), int)
         if failures == 0:
             assert loaded, file
         if failures == 5:
-            assert isinstance(verdict(Path(file), strict=True), str), file
+            assert isinstance(expected_outcome(Path(file), strict=True), str), file
 
 
-def test_what_pinocchio_reads_is_read_here():
+def test_files_that_pinocchio_reads_are_read():
     """The second of the five is pinocchio."""
     for file, said in parsers().items():
-        assert said[1].startswith("fail") or isinstance(verdict(Path(file)), int), file
+        assert said[1].startswith("fail") or isinstance(expected_outcome(Path(file)), int), file
 
 
 def test_degrees_of_freedom_are_those_of_the_other_parsers():
     for file, said in parsers().items():
-        expected = verdict(Path(file))
+        expected = expected_outcome(Path(file))
         counts = {int(text.partition("=")[2]) for text in said if text.startswith(("nv=", "dof="))}
         if isinstance(expected, int) and counts:
             assert expected in counts, file
 
 
-def test_the_documentation_decides_every_disagreement():
+def test_documentation_lists_every_disagreement():
     text = DOCS.read_text()
     disagreed = [
         Path(file).name

@@ -23,7 +23,7 @@ def test_examples_run():
         exec(compile(code, "docs/urdf.md", "exec"), {})
 
 
-def test_messages_are_the_ones_that_are_given():
+def test_documented_messages_are_those_of_the_reader():
     (lamp,) = re.findall(r'parse_urdf\("""(.*?)"""\)', blocks("python")[0], flags=re.DOTALL)
     (messages,) = blocks("text")
     mistakes = [

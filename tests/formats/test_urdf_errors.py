@@ -1,4 +1,4 @@
-"""What is wrong is refused with source, line, element and reason, or remarked on where others read past it."""
+"""Mistakes are errors with source, line, element and reason, or warnings if other parsers accept them."""
 
 from __future__ import annotations
 
@@ -155,7 +155,7 @@ CASES = {
 
 
 @pytest.mark.parametrize("case", CASES)
-def test_refusals(case):
+def test_invalid_urdf_is_refused_with_a_reason(case):
     text, expected = CASES[case]
     message = refusal(text)
     assert message.startswith("r.urdf, line ")
@@ -169,11 +169,11 @@ REFUSED = frozenset(
         *("two numbers", "nan", "commas", "xacro number", "long number"),
     )
 )
-"""What nobody reads, or nothing could be made of."""
+"""Files that no parser reads, or that have no useful meaning."""
 
 
 @pytest.mark.parametrize("case", CASES)
-def test_what_others_read_is_read_with_a_remark(case):
+def test_mistakes_that_other_parsers_accept_are_warnings(case):
     text, expected = CASES[case]
     if case in REFUSED:
         with pytest.raises(FormatError):
@@ -192,7 +192,7 @@ def test_what_others_read_is_read_with_a_remark(case):
     assert all(np.isfinite(model.fk(name)(state)).all() for name in model.frames)
 
 
-def test_magnitudes_that_are_none_bound_nothing():
+def test_invalid_magnitudes_are_no_limits():
     (joint,) = parse_urdf(pair('<limit lower="-1" upper="2"/>')).joints
     assert (joint.limits.lower, joint.limits.upper) == (-1.0, 2.0)
     assert (joint.limits.velocity, joint.limits.effort) == (None, None)
@@ -207,7 +207,7 @@ def test_magnitudes_that_are_none_bound_nothing():
         '<limit lower="-inf" upper="inf"/>',
     ],
 )
-def test_ranges_that_are_none_leave_a_joint_free(limit):
+def test_invalid_ranges_leave_a_joint_unlimited(limit):
     (joint,) = parse_urdf(pair(limit)).joints
     assert (joint.limits.lower, joint.limits.upper) == (None, None)
 
@@ -216,13 +216,13 @@ def test_ranges_that_are_none_leave_a_joint_free(limit):
     ("inside", "scale"),
     [("0.001 0.001 0.002 1", (0.001, 0.001, 0.002)), ("2", (2.0, 2.0, 2.0)), ("a b c", (1.0, 1.0, 1.0))],
 )
-def test_scales_of_meshes(inside, scale):
+def test_mesh_scales_of_one_or_four_numbers_are_read(inside, scale):
     text = f'<link name="l"><visual><geometry><mesh filename="a.stl" scale="{inside}"/></geometry></visual></link>'
     (shape,) = parse_urdf(robot(text)).links[0].body.visuals
     assert shape.geometry.scale == scale
 
 
-def test_colours_of_five_numbers():
+def test_colours_of_five_numbers_are_read_as_four():
     look = '<material name="m"><color rgba="1 0.5 0 1 9"/></material>'
     text = f'<link name="l"><visual>{look}<geometry><sphere radius="1"/></geometry></visual></link>'
     (shape,) = parse_urdf(robot(text)).links[0].body.visuals
@@ -239,14 +239,14 @@ def test_a_bad_inertia_is_left_out_and_the_rest_of_the_body_stays():
     assert len(body.visuals) == 1
 
 
-def test_a_joint_along_nothing_is_fixed_and_a_plane_without_normal_that_of_x_and_y():
+def test_zero_axis_fixes_a_joint_and_makes_a_plane_horizontal():
     (joint,) = parse_urdf(pair('<axis xyz="0 0 0"/>' + LIMIT)).joints
     assert joint.kind == "fixed"
     (joint,) = parse_urdf(pair('<axis xyz="0 0 0"/>', "planar")).joints
     assert joint.axis == (0.0, 0.0, 1.0)
 
 
-def test_of_rpy_and_a_quaternion_rpy_counts_and_a_quaternion_of_zeros_turns_nothing():
+def test_rpy_precedes_quaternion_and_zero_quaternion_is_the_identity():
     attributes = 'name="r" version="1.1"'
     both = pair('<origin rpy="0 0 1" quat_xyzw="0 0 0 1"/>', "fixed", attributes)
     (joint,) = parse_urdf(both).joints
@@ -270,7 +270,7 @@ def test_names_in_messages_are_bounded_and_printable():
     assert "a\\nb" in message
 
 
-def test_files_that_cannot_be_read(tmp_path):
+def test_unreadable_files_are_errors(tmp_path):
     (tmp_path / "other.urdf").touch()
     with pytest.raises(FormatError, match=r"there is no such file. The folder has: other.urdf"):
         read_urdf(tmp_path / "robot.urdf")

@@ -1,4 +1,4 @@
-"""Text that is cut off, huge, deep, encoded strangely or meant to do harm gives one error of our own."""
+"""Truncated, large, deep, strangely encoded and malicious URDF texts give one format error."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def outcome(data: str | bytes) -> UrdfRobot | str:
 
 
 @pytest.mark.parametrize("kind", [str, bytes])
-def test_cut_off_anywhere(kind):
+def test_truncated_urdf_is_read_or_a_format_error(kind):
     text = SMALL if kind is str else SMALL.encode()
     end = len(text.rstrip())
     for length in range(end):
@@ -35,7 +35,7 @@ def test_cut_off_anywhere(kind):
     assert isinstance(outcome(text[:end]), UrdfRobot)
 
 
-def test_cut_off_names_what_is_open():
+def test_truncation_error_names_the_open_element():
     message = outcome(SMALL[: SMALL.index("<axis")])
     assert message == (
         'r.urdf, line 19, column 5, in <joint name="elbow"> of line 16: not well-formed XML: '
@@ -44,14 +44,14 @@ def test_cut_off_names_what_is_open():
 
 
 @given(st.integers(0, len(SMALL) - 1), st.binary(max_size=8))
-def test_bytes_replaced_anywhere(position, replacement):
+def test_corrupted_urdf_is_read_or_a_format_error(position, replacement):
     data = SMALL.encode()
     result = outcome(data[:position] + replacement + data[position + len(replacement) :])
     assert isinstance(result, UrdfRobot) or result.startswith("r.urdf")
 
 
 @given(st.binary(max_size=200) | st.text(max_size=200))
-def test_noise(data):
+def test_random_bytes_are_a_format_error(data):
     assert isinstance(outcome(data), str)
 
 
@@ -79,18 +79,18 @@ def test_external_entities_are_refused(uri):
 
 
 @pytest.mark.parametrize("encoding", ["utf-8", "utf-16", "utf-16-le", "utf-16-be"])
-def test_a_bomb_in_another_encoding_is_refused_too(encoding):
+def test_an_entity_bomb_in_another_encoding_is_refused(encoding):
     assert "<!DOCTYPE robot>" in outcome(BOMB.encode(encoding)) or "not well-formed" in outcome(
         BOMB.encode(encoding)
     )
 
 
-def test_unknown_entities():
+def test_unknown_entities_are_refused():
     assert "undefined entity. Only &lt;" in outcome('<robot name="&nbsp;"/>')
 
 
 @pytest.mark.parametrize("outer", ["{}", "<gazebo>{}</gazebo>", "<link name='l'>{}</link>"])
-def test_deep_nesting(outer):
+def test_deep_nesting_is_refused(outer):
     depth = 100_000
     text = "<robot name='r'>" + outer.format("<a>" * depth + "</a>" * depth) + "</robot>"
     assert outcome(text) == (
@@ -113,7 +113,7 @@ def test_size_is_bounded(tmp_path, monkeypatch):
     assert "larger than 100 bytes" in outcome(SMALL)
 
 
-def test_encodings():
+def test_encodings_are_read():
     name = "Gelenk_ä"
     text = pair().replace('"j"', f'"{name}"')
     declared = '<?xml version="1.0" encoding="{}"?>\n' + text
@@ -142,7 +142,7 @@ def test_encodings():
         b"\x80" * 100,
     ],
 )
-def test_text_that_cannot_be_decoded(data):
+def test_undecodable_text_is_refused(data):
     assert outcome(data).startswith("r.urdf, line ")
 
 
@@ -157,7 +157,7 @@ def test_text_that_cannot_be_decoded(data):
         ("no xml", "Is this XML at all?"),
     ],
 )
-def test_text_that_is_not_xml(text, expected):
+def test_text_that_is_not_xml_is_refused(text, expected):
     assert expected in outcome(text)
 
 
@@ -174,7 +174,7 @@ def test_text_that_is_not_xml(text, expected):
     ],
 )
 @pytest.mark.parametrize("kind", [str, bytes])
-def test_what_xml_forbids_and_others_read(text, line, expected, kind):
+def test_xml_mistakes_that_other_parsers_accept_are_warnings(text, line, expected, kind):
     whole = text.format(SMALL.removeprefix('<?xml version="1.0"?>\n'))
     data = whole if kind is str else whole.encode()
     read = parse_urdf(data)
@@ -187,16 +187,16 @@ def test_what_xml_forbids_and_others_read(text, line, expected, kind):
         parse_urdf(data, strict=True)
 
 
-def test_the_encoding_of_a_declaration_that_comes_late_counts():
+def test_encoding_of_a_late_declaration_is_used():
     text = "\n<?xml version='1.0' encoding='latin-1'?><robot name='r'><link name='\xe9'/></robot>"
     assert parse_urdf(text.encode("latin-1")).links[0].name == "\xe9"
     assert parse_urdf(text).links[0].name == "\xe9"
 
 
-def test_what_looks_like_a_comment_in_a_literal_section_is_none():
+def test_comment_marks_in_cdata_are_text():
     assert len(parse_urdf(SMALL.replace("<gazebo/>", "<a><![CDATA[ <!-- -- --> ]]></a>")).links) == 2
 
 
-def test_many_comments_take_time_in_proportion():
+def test_many_comments_take_linear_time():
     text = SMALL.replace("<gazebo/>", "<!-- -- -->" * 20_000 + "<!-- a -->" * 20_000)
     assert len(parse_urdf(text).remarks) == 20_000

@@ -1,4 +1,4 @@
-"""Joints of every type: what is read, what is the default, what is normalised."""
+"""URDF joints of all types: their elements, defaults and normalised axes."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def test_defaults_are_those_of_the_specification():
         ("floating", 6, None),
     ],
 )
-def test_every_type(kind, dof, axis):
+def test_all_urdf_joint_types_are_read(kind, dof, axis):
     robot = parse_urdf(pair('<axis xyz="0 0 2"/>' + LIMIT, kind))
     assert robot.dof == dof
     assert robot.joints[0].axis == axis
@@ -49,7 +49,7 @@ def test_a_continuous_joint_keeps_speed_and_effort_but_has_no_range():
     assert parse_urdf(pair(LIMIT, "continuous")).joints[0].limits == UrdfLimits(None, None, 3.0, 10.0)
 
 
-def test_a_missing_bound_is_zero():
+def test_a_missing_limit_is_zero():
     text = pair('<limit lower="-1" effort="1" velocity="1"/>')
     assert parse_urdf(text).joints[0].limits == UrdfLimits(-1.0, 0.0, 1.0, 1.0)
     robot = parse_urdf(pair('<limit effort="1" velocity="1"/>'))
@@ -58,7 +58,7 @@ def test_a_missing_bound_is_zero():
 
 
 @pytest.mark.parametrize("velocity", ["-1", "0"])
-def test_a_velocity_that_bounds_nothing_is_no_bound_and_remarked(velocity):
+def test_velocity_without_effect_is_no_limit_with_a_remark(velocity):
     robot = parse_urdf(pair(f'<limit lower="0" upper="1" effort="1" velocity="{velocity}"/>'))
     assert robot.joints[0].limits.velocity is None
     assert 'line 4, <joint name="j">: <limit> has velocity' in robot.remarks[0]
@@ -73,20 +73,20 @@ def test_efforts_are_magnitudes():
 V1_2 = 'name="r" version="1.2"'
 
 
-def test_limits_of_version_1_2_are_open_where_left_out():
+def test_missing_limits_of_version_1_2_are_no_limits():
     text = pair('<limit lower="-1" upper="1" velocity="0" acceleration="3" jerk="9"/>', attributes=V1_2)
     assert parse_urdf(text).joints[0].limits == UrdfLimits(-1.0, 1.0, 0.0, None, 3.0, 3.0, 9.0)
     text = pair('<limit deceleration="4"/>', "continuous", attributes=V1_2)
     assert parse_urdf(text).joints[0].limits == UrdfLimits(deceleration=4.0)
 
 
-def test_limits_of_version_1_2_are_ignored_before_with_a_remark():
+def test_limits_of_version_1_2_are_ignored_in_earlier_versions():
     robot = parse_urdf(pair('<limit upper="1" effort="1" velocity="1" acceleration="x" jerk="1"/>'))
     assert robot.joints[0].limits == UrdfLimits(0.0, 1.0, 1.0, 1.0)
     assert ["acceleration" in robot.remarks[0], "jerk" in robot.remarks[1]] == [True, True]
 
 
-def test_safety_mimic_and_dynamics():
+def test_safety_mimic_and_dynamics_are_read():
     text = robot(
         joint("a", "l0", "l1"),
         joint(
@@ -127,7 +127,7 @@ def test_axes_are_unit_vectors_in_their_direction(xyz):
     assert np.dot(axis, xyz) > 0.0
 
 
-def test_components_of_an_axis_that_are_noise_vanish():
+def test_axis_components_of_rounding_size_are_zero():
     assert parse_urdf(pair('<axis xyz="2.2e-16 0 1"/>' + LIMIT)).joints[0].axis == (0.0, 0.0, 1.0)
 
 
@@ -135,7 +135,7 @@ def test_an_axis_that_is_far_from_unit_length_is_remarked():
     assert "has length 2" in parse_urdf(pair('<axis xyz="0 0 2"/>' + LIMIT)).remarks[0]
 
 
-def test_what_a_fixed_joint_cannot_have_is_not_looked_at():
+def test_elements_without_meaning_for_fixed_joints_are_ignored():
     inside = '<axis xyz="0 0 0"/><limit effort="what"/><mimic joint="nobody"/><dynamics damping="a b"/>'
     assert parse_urdf(pair(inside, "fixed")).dof == 0
 
@@ -153,18 +153,18 @@ def test_quaternions_came_with_version_1_1():
     assert np.array_equal(j.origin.matrix, [[0, -1, 0, 1], [1, 0, 0, 2], [0, 0, 1, 3], [0, 0, 0, 1]])
 
 
-def test_quaternions_are_ignored_before_with_a_remark():
+def test_quaternions_are_ignored_in_version_1_0_with_a_remark():
     robot = parse_urdf(pair('<origin xyz="1 2 3" quat_xyzw="0 0 2 2"/>' + LIMIT))
     assert np.array_equal(robot.joints[0].origin.matrix[:3, :3], np.eye(3))
     assert '<joint name="j">: <origin> has quat_xyzw, which is ignored' in robot.remarks[0]
 
 
 @pytest.mark.parametrize("version", ["1.0", "1.1", "1.2"])
-def test_versions(version):
+def test_versions_are_read(version):
     assert parse_urdf(pair(attributes=f'name="r" version="{version}"')).dof == 1
 
 
-def test_gazebo_transmissions_sensors_and_strangers_are_ignored():
+def test_gazebo_transmissions_sensors_and_unknown_elements_are_ignored():
     text = robot(
         "<gazebo/>",
         '<gazebo reference="l0"><joint name="no" type="ball"><x><y/></x></joint><gazebo/></gazebo>',
@@ -186,7 +186,7 @@ def test_gazebo_transmissions_sensors_and_strangers_are_ignored():
     assert description.remarks == ()
 
 
-def test_macros_that_were_not_expanded_are_remarked_on_where_there_is_more():
+def test_unexpanded_macros_beside_joints_are_warnings():
     text = robot(
         "<m:arm/>",
         joint("j", "l0", "l1"),
@@ -205,14 +205,14 @@ def test_macros_that_were_not_expanded_are_remarked_on_where_there_is_more():
 @pytest.mark.parametrize(
     "left", ["<xacro:arm/>", '<xacro:include filename="arm.xacro"/>', "<xacro:macro name='a'/>"]
 )
-def test_a_file_of_which_only_macros_are_left_is_refused(left):
+def test_file_with_only_unexpanded_macros_is_refused(left):
     with pytest.raises(
         FormatError, match=r"<xacro:.*Run xacro first: xacro robot\.urdf\.xacro > robot\.urdf"
     ):
         parse_urdf(robot('<link name="world"/>', left))
 
 
-def test_macros_inside_of_links_and_joints_are_remarked_on():
+def test_unexpanded_macros_in_links_and_joints_are_warnings():
     text = robot(joint("j", "l0", "l1", "fixed", "<xacro:origin/>"), '<link name="${a}"/>', links=2)
     remarks = parse_urdf(text.replace("</robot>", joint("k", "l0", "${a}", "fixed", "") + "</robot>")).remarks
     assert [remark.partition(":")[0] for remark in remarks] == [

@@ -1,4 +1,4 @@
-"""Where links are and how they move, against pinocchio, for every robot at hand that both can read."""
+"""Poses and Jacobians of all URDF files at hand, against pinocchio."""
 
 from __future__ import annotations
 
@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 from _pytest.mark import ParameterSet
-from pinocchio_oracle import FORMS, Reference, pin
+from pinocchio_oracle import FORMS, PinocchioReference, pin
 from scipy.spatial.transform import Rotation
-from urdf_outcomes import verdict
+from urdf_outcomes import expected_outcome
 from urdf_texts import LIMIT, SHARED, robot
 from urdf_texts import joint as joint_text
 
@@ -42,7 +42,7 @@ ONLY_HERE = (
     "collada_urdf_pr2_blank_lines_before_xml_decl.urdf",
     "oems__xacro_generated__open-manipulator_robotis__open_manipulator_description__urdf__open_manipulator.urdf",
 )
-# Files of example-robot-data that break the specification; verdicts.py is about the shared ones.
+# Files of example-robot-data that break the specification; urdf_outcomes.py lists the shared ones.
 REFUSED = {
     "alex_description/urdf/alex_psyonic_hands.urdf": 'it mimics "index_q1", and there is no joint of that name',
     "ur_description/urdf/ur3.urdf": "line 6, <robot>: has no name",
@@ -50,7 +50,7 @@ REFUSED = {
 
 
 def files() -> list[ParameterSet]:
-    """Return the files that are to be read, each with the folder and the name it is known by."""
+    """Return the files to read, each with its folder and its name in the lists."""
     found = []
     for folder in (SHARED, INSTALLED):
         below = [(folder / f, str(f)) for f in sorted(p.relative_to(folder) for p in folder.rglob("*.urdf"))]
@@ -63,7 +63,7 @@ def files() -> list[ParameterSet]:
 
 def is_readable(file: Path, name: str) -> bool:
     if name.startswith("urdf_conformance"):
-        return isinstance(verdict(file), int) and file.name not in (*NOT_IN_PINOCCHIO, *ONLY_HERE)
+        return isinstance(expected_outcome(file), int) and file.name not in (*NOT_IN_PINOCCHIO, *ONLY_HERE)
     return name not in REFUSED
 
 
@@ -81,8 +81,8 @@ def assert_close(result: np.ndarray, expected: np.ndarray, what: str) -> None:
     np.testing.assert_allclose(result, expected, rtol=0, atol=TOLERANCE * size, err_msg=what)
 
 
-def assert_equal_to_pinocchio(reference: Reference, description: UrdfRobot, seed: int) -> None:
-    """Compare poses of all links, and Jacobians of some that carry nothing, at random configurations."""
+def assert_equal_to_pinocchio(reference: PinocchioReference, description: UrdfRobot, seed: int) -> None:
+    """Compare the poses of all links, and the Jacobians of some leaf links, at random configurations."""
     model = kv.Model()
     with model.edit() as edit:
         for operation in urdf_operations(description, "robot"):
@@ -114,16 +114,16 @@ def assert_equal_to_pinocchio(reference: Reference, description: UrdfRobot, seed
 
 
 @pytest.mark.parametrize("file", files())
-def test_links_are_and_move_where_pinocchio_puts_them(file: Path) -> None:
-    assert_equal_to_pinocchio(Reference(file.read_text()), read_urdf(file), seed=len(file.name))
+def test_poses_and_jacobians_are_those_of_pinocchio(file: Path) -> None:
+    assert_equal_to_pinocchio(PinocchioReference(file.read_text()), read_urdf(file), seed=len(file.name))
 
 
 @pytest.mark.parametrize("name", NOT_IN_PINOCCHIO)
-def test_what_pinocchio_cannot_read_is_known_by_name(name: str) -> None:
+def test_files_that_pinocchio_cannot_read_are_listed(name: str) -> None:
     file = with_name(name)
     with pytest.raises(ValueError, match=NOT_IN_PINOCCHIO[name]):
-        Reference(file.read_text())
-    assert read_urdf(file).dof == verdict(file)
+        PinocchioReference(file.read_text())
+    assert read_urdf(file).dof == expected_outcome(file)
 
 
 @pytest.mark.parametrize("name", REFUSED)
@@ -139,7 +139,7 @@ def test_robots_that_break_the_specification_are_read_with_a_remark(name: str) -
 
 
 @pytest.mark.parametrize("name", [*NOT_IN_PINOCCHIO, *REFUSED])
-def test_the_docs_name_what_cannot_be_compared(name: str) -> None:
+def test_docs_list_files_that_cannot_be_compared(name: str) -> None:
     rows = [row for row in DOCS.read_text().splitlines() if f"`{name.rsplit('__', 1)[-1]}`" in row]
     message = {**NOT_IN_PINOCCHIO, **REFUSED}[name]
     assert any(message in row for row in rows), rows
@@ -149,7 +149,7 @@ ORIGIN = '<origin xyz="0.{i} 0 .5" rpy="{i} -1.5707963267948966 .3"/>'
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_every_type_in_one_chain(seed: int) -> None:
+def test_chain_of_all_joint_types_moves_as_in_pinocchio(seed: int) -> None:
     kinds = [
         "floating",
         "revolute",
@@ -173,11 +173,11 @@ def test_every_type_in_one_chain(seed: int) -> None:
         ),
         links=len(kinds) + 1,
     )
-    assert_equal_to_pinocchio(Reference(text), parse_urdf(text), seed)
+    assert_equal_to_pinocchio(PinocchioReference(text), parse_urdf(text), seed)
 
 
 @pytest.mark.parametrize("normal", [(1, 0, 0), (0, -3, 0), (1, 2, -3), (0.3, -0.1, 2), (0, 0, -1)], ids=str)
-def test_a_plane_with_any_normal_is_one_with_z_turned(normal: tuple[float, ...]) -> None:
+def test_planar_joint_of_any_normal_is_a_rotated_one_about_z(normal: tuple[float, ...]) -> None:
     """The plane of the docs: A turns z into the normal, and the child is turned back by its transpose."""
     angle = np.arctan2(np.hypot(*normal[:2]), normal[2])
     about = np.array([-normal[1], normal[0], 0.0]) if any(normal[:2]) else np.array([1.0, 0, 0])
@@ -197,10 +197,10 @@ def test_a_plane_with_any_normal_is_one_with_z_turned(normal: tuple[float, ...])
         arm,
         links=5,
     )
-    assert_equal_to_pinocchio(Reference(theirs), parse_urdf(ours), seed=1)
+    assert_equal_to_pinocchio(PinocchioReference(theirs), parse_urdf(ours), seed=1)
 
 
-def test_mimicry_along_a_chain_and_between_kinds() -> None:
+def test_mimic_chains_between_joint_types_move_as_in_pinocchio() -> None:
     """A slide follows an axle that follows an axle; both columns add up in one speed."""
 
     def follow(source: str, factor: float, offset: float) -> str:
@@ -213,7 +213,7 @@ def test_mimicry_along_a_chain_and_between_kinds() -> None:
         joint_text("hand", "l3", "l4", "revolute", f'<origin xyz="1 0 0"/>{LIMIT}'),
         links=5,
     )
-    reference = Reference(text)
+    reference = PinocchioReference(text)
     assert_equal_to_pinocchio(reference, parse_urdf(text), seed=2)
     assert reference.speeds == ["arm:velocity", "hand:velocity"]
     np.testing.assert_allclose(reference.speed_map[:, 0], [-0.6, 2, 1, 0])

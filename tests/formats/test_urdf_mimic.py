@@ -25,7 +25,7 @@ def followers(factors, order):
 
 
 @given(st.data())
-def test_a_chain_says_what_its_links_say_one_by_one(data):
+def test_mimic_chain_is_the_composition_of_its_relations(data):
     factors = data.draw(st.lists(st.tuples(FACTOR, FACTOR), min_size=1, max_size=6))
     order = data.draw(st.permutations(range(len(factors) + 1)))
     q = data.draw(FACTOR)
@@ -39,7 +39,7 @@ def test_a_chain_says_what_its_links_say_one_by_one(data):
         assert math.isclose(mimic.multiplier * q + mimic.offset, value, rel_tol=1e-9, abs_tol=1e-9)
 
 
-def test_defaults():
+def test_mimic_defaults_are_multiplier_one_and_offset_zero():
     text = robot(
         joint("a", "l0", "l1", "continuous", ""),
         joint("b", "l1", "l2", "continuous", '<mimic joint="a"/>'),
@@ -61,7 +61,7 @@ def test_a_slider_may_follow_a_hinge():
     assert parse_urdf(text).dof == 1
 
 
-def test_circles_are_refused_and_shown():
+def test_mimic_cycles_are_refused_and_shown():
     def follow(name: str, i: int) -> str:
         return joint(name, "l0", f"l{i}", "continuous", f'<mimic joint="{"abc"[i % 3]}"/>')
 
@@ -78,7 +78,7 @@ def test_circles_are_refused_and_shown():
     assert read.remarks[0].endswith("; it moves by itself.")
 
 
-def test_a_chain_that_leads_nowhere_names_the_joint_that_breaks_it():
+def test_broken_mimic_chain_error_names_the_joint():
     text = robot(
         joint("a", "l0", "l1", "continuous", '<mimic joint="finger_jiont"/>'),
         joint("b", "l0", "l2", "continuous", '<mimic joint="a"/>'),
@@ -100,7 +100,7 @@ def test_factors_that_overflow_are_refused():
     assert all("overflow" in remark for remark in read.remarks)
 
 
-def test_many_circles_take_time_in_proportion():
+def test_many_mimic_cycles_take_linear_time():
     text = robot(
         *(joint(f"j{i}", "l0", f"l{i + 1}", "continuous", f'<mimic joint="j{i}"/>') for i in range(3000)),
         links=3001,

@@ -27,7 +27,7 @@ def bounds(model: kv.Model, name: str) -> tuple[float, float]:
     return float(constraint.lower), float(constraint.upper)
 
 
-def test_names_and_tags():
+def test_operations_have_prefixed_names_and_tags():
     model = model_of(SMALL, "a/b")
     assert set(model.frames) - {"world"} == {"a/b/base", "a/b/arm"}
     assert model.history.tags == ["frame a/b/base", "body a/b/base", "joint a/b/elbow"]
@@ -37,7 +37,7 @@ def test_names_and_tags():
     assert model.bodies["a/b/base"].collisions[0].name == "hull"
 
 
-def test_names_without_prefix():
+def test_names_without_prefix_are_those_of_the_file():
     model = model_of(SMALL)
     assert model.history.tags == ["frame base", "body base", "joint elbow"]
 
@@ -120,7 +120,7 @@ def test_names_that_cannot_be_names_are_replaced(links, message, frames):
     assert all("; it is called " in remark for remark in remarks)
 
 
-def test_coordinates_that_would_share_a_name_get_another():
+def test_clashing_coordinate_names_are_replaced():
     text = robot(joint("a", "l0", "l1", "planar", ""), joint("a/x", "l1", "l2"), links=3)
     with pytest.raises(
         kv.errors.FormatError, match=r'line 5, <joint name="a">: its coordinate "a/x" has the name'
@@ -157,7 +157,7 @@ def test_degrees_of_freedom_of_every_type(kind, symbols):
     assert sum(len(a.speeds) for a in model.articulations.values()) == parse_urdf(text).dof
 
 
-def test_limits():
+def test_urdf_limits_become_constraints():
     model = model_of(pair())
     assert bounds(model, "j/position") == (-1.0, 2.0)
     assert bounds(model, "j/velocity") == (-3.0, 3.0)
@@ -169,12 +169,12 @@ def test_a_continuous_joint_has_no_range():
     assert list(model_of(pair(LIMIT, "continuous")).constraints) == ["j/velocity"]
 
 
-def test_a_magnitude_that_bounds_nothing_makes_no_constraint():
+def test_magnitude_without_effect_makes_no_constraint():
     text = pair('<limit lower="0" upper="1" effort="1" velocity="-1"/>')
     assert list(model_of(text).constraints) == ["j/position"]
 
 
-def test_what_is_not_kinematics_is_on_record():
+def test_dynamics_are_in_the_articulation():
     inside = '<limit lower="0" upper="1" acceleration="3" jerk="9"/><dynamics damping="2"/>'
     model = model_of(pair(inside, attributes='name="r" version="1.2"'))
     assert dict(model.articulations["j"].dynamics) == {
@@ -188,7 +188,7 @@ def test_what_is_not_kinematics_is_on_record():
 SOFT = '<safety_controller k_velocity="5" k_position="7" soft_lower_limit="-.5" soft_upper_limit="1.5"/>'
 
 
-def test_soft_limits_are_a_constraint_of_their_own_that_can_be_taken_out():
+def test_soft_limits_are_a_separate_removable_constraint():
     model = model_of(pair(LIMIT + SOFT))
     assert bounds(model, "j/position") == (-1.0, 2.0)
     assert bounds(model, "j/soft_limits") == (-0.5, 1.5)
@@ -202,7 +202,7 @@ def test_soft_limits_are_a_constraint_of_their_own_that_can_be_taken_out():
 @pytest.mark.parametrize(
     "inside", [LIMIT + '<safety_controller k_velocity="5" k_position="7"/>', "<dynamics/>" + SOFT]
 )
-def test_soft_limits_that_leave_no_range_or_have_no_joint_to_limit(inside):
+def test_soft_limits_without_range_or_limited_joint_are_ignored(inside):
     text = pair(inside, "revolute" if "limit lower" in inside else "continuous")
     assert "j/soft_limits" not in model_of(text).constraints
 
@@ -231,7 +231,7 @@ def test_joints_that_follow_have_no_degree_of_freedom_and_keep_their_limits():
     assert {name for name, *_ in model.violations({"p/a": 0.0})} == {"p/c/position", "p/c/soft_limits"}
 
 
-def test_a_multiplier_of_zero_makes_a_joint_that_stands_still():
+def test_multiplier_of_zero_fixes_the_joint():
     text = robot(
         joint("a", "l0", "l1", "continuous", ""),
         joint("b", "l1", "l2", "prismatic", LIMIT + SOFT + FOLLOWING.format("a", 0, 0.25)),
@@ -242,7 +242,7 @@ def test_a_multiplier_of_zero_makes_a_joint_that_stands_still():
     assert model.fk("l2", "l1")({})[:3, 3].tolist() == [0.25, 0, 0]
 
 
-def test_bodies_go_with_their_frames():
+def test_frame_with_a_body_cannot_be_removed():
     model = model_of(SMALL)
     with pytest.raises(kv.errors.EditError, match="base"), model.edit() as edit:
         edit.remove("frame base")

@@ -47,7 +47,7 @@ def test_joints_come_from_the_root_outwards_in_the_order_of_the_file(tree):
 
 
 @given(trees(), st.data())
-def test_one_more_joint_is_one_too_many_for_a_strict_reader(tree, data):
+def test_additional_joint_is_refused_in_strict_mode(tree, data):
     parents, order = tree
     links = st.integers(0, len(parents))
     extra = joint("extra", f"l{data.draw(links)}", f"l{data.draw(links)}", "fixed", "")
@@ -57,7 +57,7 @@ def test_one_more_joint_is_one_too_many_for_a_strict_reader(tree, data):
 
 
 @given(trees().filter(lambda tree: tree[0]), st.data())
-def test_one_joint_less_leaves_two_roots(tree, data):
+def test_missing_joint_leaves_two_roots(tree, data):
     parents, order = tree
     gone = data.draw(st.sampled_from(order))
     with pytest.raises(FormatError, match=f"where one root is expected: .*l{gone + 1}"):
@@ -67,7 +67,7 @@ def test_one_joint_less_leaves_two_roots(tree, data):
     assert len(read.joints) == len(parents) - 1
 
 
-def test_links_that_do_not_exist():
+def test_joints_of_missing_links_are_refused():
     with pytest.raises(FormatError, match=r"its parent link \"l7\" does not exist; .* Available: l0, l1"):
         parse_urdf(robot(joint("j", "l7", "l1"), links=2))
     with pytest.raises(
@@ -89,7 +89,7 @@ def test_a_second_parent_names_the_first():
         assert read.remarks[0].endswith('; "a" is left out.')
 
 
-def test_a_circle_is_shown():
+def test_cycle_error_shows_its_joints():
     text = robot(*(joint(f"j{i}", f"l{i}", f"l{(i + 1) % 3}") for i in range(3)), links=3)
     with pytest.raises(
         FormatError, match='line 5, <joint name="j0">: the joints "j0" -> "j1" -> "j2" lead in a circle'
@@ -97,7 +97,7 @@ def test_a_circle_is_shown():
         parse_urdf(text)
 
 
-def test_a_circle_beside_a_tree_is_shown():
+def test_cycle_beside_a_tree_is_left_out_with_a_remark():
     text = robot(joint("a", "l1", "l2"), joint("b", "l2", "l1"), joint("c", "l2", "l3"), links=4)
     with pytest.raises(FormatError, match='<joint name="a">: the joints "a" -> "b" lead in a circle'):
         parse_urdf(text, strict=True)
@@ -106,13 +106,13 @@ def test_a_circle_beside_a_tree_is_shown():
     assert read.remarks[0].endswith("3 links that no root holds are left out.")
 
 
-def test_a_joint_that_mimics_one_of_a_circle_moves_by_itself():
+def test_joint_that_mimics_one_of_a_cycle_is_independent():
     circle = joint("a", "l1", "l1") + joint("b", "l0", "l2", "continuous", '<mimic joint="a"/>')
     (only,) = parse_urdf(robot(circle, links=3)).joints
     assert (only.name, only.mimic) == ("b", None)
 
 
-def test_links_and_joints_without_names_get_some():
+def test_nameless_links_and_joints_are_named():
     text = robot('<link name=""/>', joint("j", "l0", "l1", "fixed").replace('name="j" ', ""), links=2)
     model = kv.Model()
     with model.edit() as edit:
@@ -122,19 +122,19 @@ def test_links_and_joints_without_names_get_some():
     assert set(model.articulations) == {"l0_l1"}
 
 
-def test_a_link_that_is_its_own_parent():
+def test_link_that_is_its_own_parent_is_refused():
     with pytest.raises(FormatError, match="its child link is its own parent"):
         parse_urdf(robot(joint("j", "l0", "l0"), links=1))
 
 
-def test_joints_of_other_dialects_are_named_when_there_is_no_tree():
+def test_error_without_tree_names_joints_of_other_dialects():
     with pytest.raises(
         FormatError, match=r'Ignored, since URDF does not know it: <drake:joint name="j"> \(line 4\)'
     ):
         parse_urdf(robot('<drake:joint name="j" type="ball"/>', links=2), strict=True)
 
 
-def test_further_roots_stand_where_the_first_does():
+def test_further_roots_have_the_pose_of_the_first():
     text = robot(joint("j", "l0", "l1"), joint("k", "l2", "l3"), links=4)
     model = kv.Model()
     with model.edit() as edit:
@@ -145,7 +145,7 @@ def test_further_roots_stand_where_the_first_does():
     assert model.fk("p/l3", "p/l2").symbols == (kv.position("p/k"),)
 
 
-def test_of_joints_with_one_name_the_fixed_one_gets_another():
+def test_fixed_joint_with_a_repeated_name_is_renamed():
     for kinds in (("fixed", "revolute"), ("revolute", "fixed")):
         text = robot(*(joint("j", "l0", f"l{i + 1}", kind) for i, kind in enumerate(kinds)), links=3)
         read = parse_urdf(text)
@@ -155,7 +155,7 @@ def test_of_joints_with_one_name_the_fixed_one_gets_another():
 
 
 def work(text: str) -> int:
-    """Return how many calls and lines it takes to read a text."""
+    """Return the number of calls and lines that reading a text takes."""
     steps = 0
 
     def count(*_: object):
@@ -179,7 +179,7 @@ STAR = robot(*(joint(f"j{i}", "l0", f"l{i + 1}") for i in range(400)), links=401
 
 
 @pytest.mark.parametrize("inside", ['<limit effort="1" velocity="1"/>', MIMIC])
-def test_work_grows_with_the_length_of_a_chain_and_no_faster(inside):
+def test_tree_order_takes_linear_time(inside):
     def text(length: int) -> str:
         return chain(length, inside).replace('<mimic joint="j0"/>', "", 1)
 
@@ -188,12 +188,12 @@ def test_work_grows_with_the_length_of_a_chain_and_no_faster(inside):
     assert long < 4.2 * short
 
 
-def test_work_does_not_depend_on_the_shape():
+def test_tree_order_time_does_not_depend_on_the_shape():
     line, star = work(chain(400)), work(STAR)
     assert abs(star - line) < 0.1 * line
 
 
-def test_a_chain_of_thirty_thousand_links():
+def test_chain_of_thirty_thousand_links_is_read():
     length = 30_000
     text = chain(length, '<mimic joint="j{before}" multiplier="1" offset="1"/>', "continuous")
     text = text.replace('<mimic joint="j0" multiplier="1" offset="1"/>', "", 1)

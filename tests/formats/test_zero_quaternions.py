@@ -1,4 +1,4 @@
-"""A quaternion of zeros turns nothing, as in MuJoCo and libsdformat, and no state is without a pose for it."""
+"""A quaternion of zeros is the identity, as in MuJoCo and libsdformat, so every state has a pose."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ BALL = f'<body name="a" quat="{{}}">{GEOM}<body name="b"><joint type="ball"/>{GE
 @pytest.mark.parametrize("turn", ["0 0 0 0", "1e-17 0 0 0", "3 0 3 0", "0 0 -2 0", "1 0 0 0"])
 @pytest.mark.parametrize("rest", ["1 0 0 0", "0 1 0 0", "2 1 0 2"])
 @pytest.mark.parametrize(("body", "before"), [(FREE, "0 0 1 "), (BALL, "")])
-def test_homes_are_where_mujoco_has_them(turn, rest, body, before):
+def test_home_positions_with_zero_quaternions_are_those_of_mujoco(turn, rest, body, before):
     key = f'<keyframe><key name="home" qpos="{before}{turn}"/></keyframe>'
     text = f"<mujoco><worldbody>{body.format(rest)}</worldbody>{key}</mujoco>"
     model = kv.Model()
@@ -40,7 +40,7 @@ def test_homes_are_where_mujoco_has_them(turn, rest, body, before):
     np.testing.assert_allclose(pose[:3, :3].ravel(), data.body("b").xmat, atol=1e-12)
 
 
-def test_a_document_with_such_a_home_is_refused():
+def test_document_with_a_zero_quaternion_home_is_refused():
     model = kv.Model()
     with model.edit() as edit:
         edit.apply(kv.articulations.Ball(name="j", parent="world", child="b"))

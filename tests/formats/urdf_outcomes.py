@@ -1,6 +1,6 @@
-"""What becomes of each file of ``urdf_conformance``, read strictly: degrees of freedom, or what its refusal says.
+"""Expected outcome of each file of ``urdf_conformance``: its degrees of freedom, or its error message.
 
-``docs/urdf.md`` says why, where the parsers of ``verdicts.tsv`` disagree.
+``docs/urdf.md`` explains the files for which the parsers of ``verdicts.tsv`` disagree.
 """
 
 from __future__ import annotations
@@ -110,19 +110,19 @@ drake__atlas__urdf__robotiq_tendons.urdf | 10
 drake__pr2__pr2_description__urdf__pr2_simplified.urdf | line 112, <joint name="world_joint_for_rbt_compat">: its
 open_manipulator_description__urdf__open_manipulator.urdf | 5
 """
-"""Those of which another thing becomes when they are not read strictly."""
+"""Files with another outcome when they are not read strictly."""
 
-_VERDICTS = [tuple(line.split(" | ")) for line in _TABLE.strip().splitlines()]
-COUNT = len(_VERDICTS)
-
-
-_READ_VERDICTS = [tuple(line.split(" | ")) for line in _READ.strip().splitlines()]
+_OUTCOMES = [tuple(line.split(" | ")) for line in _TABLE.strip().splitlines()]
+COUNT = len(_OUTCOMES)
 
 
-def verdict(file: Path, strict: bool = False) -> int | str:
-    """Return the degrees of freedom of a file of the collection, or what its refusal says."""
-    found = [text for ending, text in _VERDICTS if file.as_posix().endswith(ending)]
+_READ_OUTCOMES = [tuple(line.split(" | ")) for line in _READ.strip().splitlines()]
+
+
+def expected_outcome(file: Path, strict: bool = False) -> int | str:
+    """Return the degrees of freedom of a file of the collection, or its error message."""
+    found = [text for ending, text in _OUTCOMES if file.as_posix().endswith(ending)]
     if not strict:
-        found = [text for ending, text in _READ_VERDICTS if file.as_posix().endswith(ending)] or found
+        found = [text for ending, text in _READ_OUTCOMES if file.as_posix().endswith(ending)] or found
     (text,) = found
     return int(text) if text.isdecimal() else text

@@ -1,4 +1,4 @@
-"""Small URDF texts for the tests, and where the data lies that is not ours."""
+"""Small URDF texts for the tests, and the folder of the shared data."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def joint(name: str, parent: str, child: str, kind: str = "revolute", inside: st
 
 
 def robot(*parts: str, links: int = 0, attributes: str = 'name="r"') -> str:
-    """Return a robot of links ``l0 l1 ...`` and what else is given, each on a line of its own."""
+    """Return a robot of links ``l0 l1 ...`` and further elements, each on a line of its own."""
     lines = [f"<robot {attributes}>", *(f'<link name="l{i}"/>' for i in range(links)), *parts, "</robot>"]
     return "\n".join(line.rstrip("\n") for line in lines)
 

@@ -25,63 +25,73 @@ NO_BODY = Body()
 
 @dataclass
 class JointBounds:
-    """What limits a joint: its position, its speed, and where a safety controller defends it.
+    """Limits of a joint's position and velocity, and the soft limits of its safety controller.
 
-    ``lower`` and ``upper`` are of the position [rad] or [m], ``slowest`` and ``fastest`` of the speed.
+    ``lower`` and ``upper`` bound the position [rad] or [m], ``min_velocity`` and ``max_velocity`` the
+    velocity [rad/s] or [m/s]. ``soft`` is the range that a safety controller keeps; None if there is none.
     """
 
     lower: float = -math.inf
     upper: float = math.inf
-    slowest: float = -math.inf
-    fastest: float = math.inf
+    min_velocity: float = -math.inf
+    max_velocity: float = math.inf
     soft: tuple[float, float] | None = None
 
-    def keep(self, lower: float, upper: float) -> None:
-        """Limit the position further."""
+    def intersect_positions(self, lower: float, upper: float) -> None:
+        """Intersect the limits of the position with a range."""
         self.lower, self.upper = max(self.lower, lower), min(self.upper, upper)
 
-    def slow(self, slowest: float, fastest: float) -> None:
-        """Limit the speed further."""
-        self.slowest, self.fastest = max(self.slowest, slowest), min(self.fastest, fastest)
+    def intersect_velocities(self, min_velocity: float, max_velocity: float) -> None:
+        """Intersect the limits of the velocity with a range."""
+        self.min_velocity, self.max_velocity = (
+            max(self.min_velocity, min_velocity),
+            min(self.max_velocity, max_velocity),
+        )
 
     @property
-    def open(self) -> bool:
-        """Whether the position is not limited."""
+    def is_unbounded(self) -> bool:
+        """True if the position has no limits."""
         return self.lower == -math.inf and self.upper == math.inf
 
 
 @dataclass
 class JointDescription:
-    """A rotation about, or a translation along, a line in the frame of its link.
+    """Rotation about, or translation along, a line in the frame of its link.
 
     Attributes
     ----------
     name
-        Unique among joints; the coordinate's own if the joint is one.
-    turns, axis, point
-        Whether it is a rotation, a unit vector, and a point of the line [m].
-    symbol, amount
-        The coordinate and the polynomial of it that is the joint's position [rad] or [m].
+        Unique name; that of the coordinate if the joint is independent.
+    is_rotation
+        True for a rotation, False for a translation.
+    axis, point
+        Direction of the line, a unit vector, and a point on it [m].
+    symbol, coefficients
+        Coordinate, and the coefficients of the polynomial in it that is the joint's position [rad] or [m].
+    bounds
+        Limits of position and velocity.
+    dynamics
+        Effort, damping, friction and the like, by name.
     """
 
     name: str
-    turns: bool
+    is_rotation: bool
     axis: Vector3
     point: Vector3
     symbol: Symbol
-    amount: Coefficients = IDENTITY_COEFFICIENTS
+    coefficients: Coefficients = IDENTITY_COEFFICIENTS
     bounds: JointBounds = field(default_factory=JointBounds)
     dynamics: Mapping[str, Any] = field(default_factory=dict)
 
     @property
-    def leads(self) -> bool:
-        """Whether the joint is a coordinate, rather than what follows one."""
-        return self.amount == IDENTITY_COEFFICIENTS and self.name == self.symbol.path
+    def is_independent(self) -> bool:
+        """True if the joint's position is a coordinate, False if it follows one."""
+        return self.coefficients == IDENTITY_COEFFICIENTS and self.name == self.symbol.path
 
 
 @dataclass
 class BallJointDescription:
-    """A rotation by a quaternion: coordinates ``name/qx`` and so on."""
+    """Rotation by a unit quaternion with the coordinates ``name/qx`` … ``name/qw``."""
 
     name: str
     point: Vector3
@@ -90,22 +100,36 @@ class BallJointDescription:
 
 @dataclass
 class LinkDescription:
-    """A frame: where it is in its parent while all of its joints are at 0, and what moves it from there."""
+    """Link of a robot description: its pose in its parent, and the joints that move it from there.
+
+    Attributes
+    ----------
+    name, parent
+        Names of the frame and of its parent.
+    pose
+        parent_T_frame while all of its joints are at 0.
+    joints
+        Joints between parent and link, from the parent outwards.
+    body
+        Inertia, visuals and collision shapes.
+    fixed_joint_name
+        Name of the fixed joint to the parent, if nothing moves.
+    is_articulation
+        True if an articulation of the model has that name.
+    """
 
     name: str
     parent: str
     pose: Matrix
     joints: list[JointDescription | BallJointDescription] = field(default_factory=list)
     body: Body = NO_BODY
-    label: str = ""
-    """What the connection to the parent is called, if nothing moves."""
-    recorded: bool = False
-    """Whether that is the name of an articulation."""
+    fixed_joint_name: str = ""
+    is_articulation: bool = False
 
 
 @dataclass(frozen=True)
 class SumLimit:
-    """A constraint on a sum of multiples of coordinates: lower <= Σ factor · coordinate <= upper."""
+    """Constraint on a linear combination of coordinates: lower <= Σ factor · coordinate <= upper."""
 
     name: str
     factors: Mapping[Symbol, float]
@@ -115,10 +139,10 @@ class SumLimit:
 
 @dataclass(frozen=True)
 class LoopJoint:
-    """Pairs of frames that are tied: their origins coincide (``connect``), or all of them does (``weld``).
+    """Joint that closes a loop: pairs of frames with equal origins (``connect``) or equal poses (``weld``).
 
-    ``free`` and ``dependent`` are the names of the coordinates in the loop, those that follow last, or
-    ``constraints`` those of what keeps it closed where none follows.
+    ``free`` and ``dependent`` are the names of the independent and the dependent coordinates in the loop.
+    ``constraints`` are the names of the constraints that keep it closed, where no coordinate is dependent.
     """
 
     name: str
@@ -131,61 +155,61 @@ class LoopJoint:
 
 @dataclass
 class RobotDescription:
-    """A model as links, parents first, and what else is to be said.
+    """Robot as a tree of links and joints, with constraints between its coordinates.
 
     Attributes
     ----------
     links
-        Without the world.
-    world
-        What is attached to the world itself.
-    sums
-        Constraints on sums of several coordinates.
+        Links, parents first, without the world.
+    world_body
+        Body of the world frame.
+    sum_limits
+        Constraints on linear combinations of coordinates.
     loops
-        Ties that close loops.
+        Joints that close loops.
     remarks
-        What is written other than it was, or left out: for people.
+        Differences between the model and its description, as sentences.
     errors
-        Of frames that are not quite where they should be.
+        Bounds of the pose errors of approximated frames, by frame.
     """
 
     links: list[LinkDescription]
-    world: Body
-    sums: list[SumLimit] = field(default_factory=list)
+    world_body: Body
+    sum_limits: list[SumLimit] = field(default_factory=list)
     loops: list[LoopJoint] = field(default_factory=list)
     remarks: list[str] = field(default_factory=list)
     errors: dict[str, FrameDeviation] = field(default_factory=dict)
 
     @property
     def error_lines(self) -> list[str]:
-        """The errors as lines for the file, the largest position first."""
+        """Bounds of the pose errors as lines for the file, the largest position first."""
         order = sorted(self.errors, key=lambda name: -self.errors[name].position)
         return [f"approximated: '{name}' is off by {self.errors[name]} at most" for name in order]
 
     @property
     def joints(self) -> list[JointDescription]:
-        """The joints that move along or about a line."""
+        """All rotational and translational joints."""
         return [joint for link in self.links for joint in link.joints if isinstance(joint, JointDescription)]
 
 
 @dataclass(frozen=True)
 class WrittenFile:
-    """The text of a file, and what it says other than the model.
+    """Content of a file to be written, and its differences from the model.
 
     Attributes
     ----------
     content
-        The text.
+        Text of the file.
     remarks, errors
-        As of the plan.
+        As of :class:`RobotDescription`.
     left_out
-        Why something of the model is not said, by name.
-    beside
-        Files that belong to it.
+        Reasons why parts of the model are left out, by name.
+    companion_files
+        Content of further files, such as converted meshes, by path.
     """
 
     content: bytes
     remarks: tuple[str, ...]
     errors: Mapping[str, FrameDeviation]
     left_out: Mapping[str, str] = field(default_factory=dict)
-    beside: Mapping[Path, bytes] = field(default_factory=dict)
+    companion_files: Mapping[Path, bytes] = field(default_factory=dict)

@@ -31,6 +31,9 @@ def check_prefix(prefix: object) -> None:
         ) from None
 
 
+NameMap: TypeAlias = Callable[[str], str]
+"""Function that returns the name in the model for a name in a description."""
+
 NameFaultHandler: TypeAlias = Callable[[str, str, str], None]
 """Handler of an invalid name, called with place, problem and replacement; raises in a strict reader."""
 

@@ -13,7 +13,6 @@ from struct import Struct
 from kineverse.lie import snap
 from kineverse.model.body import Pose, Vector3
 
-
 _KEY = Struct("6d")
 
 

@@ -79,14 +79,14 @@ def save(
 
 
 def _put(target: Path, written: WrittenFile) -> None:
-    """Write a file and its mesh files: all of them, or none."""
-    new = [path for path in written.beside if not path.exists()]
+    """Write a file and those that belong to it: all of them, or none."""
+    new = [path for path in written.companion_files if not path.exists()]
     folders = [folder for folder in dict.fromkeys(path.parent for path in new) if not folder.exists()]
     try:
         for folder in folders:
             folder.mkdir()
         for path in new:
-            replace_file(path, written.beside[path])
+            replace_file(path, written.companion_files[path])
         replace_file(target, written.content)
     except (FormatError, OSError) as error:
         for path in new:

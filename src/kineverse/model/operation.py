@@ -180,7 +180,7 @@ class Operation(ABC):
     """True if the operation may overwrite frames, bodies, articulations and rates that it has not read."""
 
     document_kind: ClassVar[str]
-    """Name of the class in documents, in the kinds of articulations and in tags, whatever the class is called."""
+    """Frozen name of the class in documents, in kinds of articulations and in tags."""
 
     def __init_subclass__(cls, *, document_kind: str = "", **keywords: Any) -> None:
         """Name a class in documents: frozen for those that ship, else its own name."""

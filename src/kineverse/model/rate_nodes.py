@@ -137,7 +137,9 @@ class Composed(Node):
 
     def substitute(self, substitution: Substitution) -> Expression:
         """Return the node after a substitution."""
-        return Composed.from_arguments((_expression_of(self), *substitution.values()), (), tuple(substitution))
+        return Composed.from_arguments(
+            (_expression_of(self), *substitution.values()), (), tuple(substitution)
+        )
 
 
 def to_plain(expression: Expression) -> Expression:

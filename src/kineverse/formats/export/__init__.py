@@ -1,1 +1,1 @@
-"""What writers of formats share: motions recognised, limits sorted, what is refused collected."""
+"""Conversion of models to robot descriptions, shared by the writers of file formats."""

@@ -24,22 +24,22 @@ from .minimax_fit import MinimaxFit, chebyshev_points, enclose_curve, fit_polyno
 
 _ROUNDING = 1e-12
 _UP = 1 + 1e-12
-"""What sums of a few errors are rounded up by."""
+"""Factor by which sums of a few errors are rounded up."""
 
 
 class CurveApproximation:
-    """Replaces curves over one coordinate by polynomials.
+    """Polynomial approximation of motions by curves over one coordinate.
 
     Parameters
     ----------
     terms
-        Where the terms of motions are from.
+        Graph of the terms in the motions.
     limits
-        Of coordinates; those that are missing have none.
+        Ranges of coordinates and speeds; those that are missing are unlimited.
     degree
-        Of the polynomials.
+        Degree of the polynomials.
     tolerance
-        What is to be reached [m], [rad].
+        Largest error of a motion [m], [rad].
     """
 
     def __init__(
@@ -50,20 +50,23 @@ class CurveApproximation:
         self._fits: dict[tuple[int, tuple[float, ...]], MinimaxFit] = {}
         self._errors: dict[str, dict[int, float]] = {}
 
-    def placing(self, frame: str, found: MotionChain) -> MotionChain | str:
-        """Return the same with polynomials, or why there are none."""
-        moving = []
-        for k, motion in enumerate(found.moving):
-            if isinstance(motion, JointMotion) and (motion.curved or len(motion.amount) > self._degree + 1):
-                replaced = self._replaced(motion)
+    def approximate(self, frame: str, found: MotionChain) -> MotionChain | str:
+        """Return a chain with polynomials in place of its curves, or the reason why there are none."""
+        motions = []
+        for k, motion in enumerate(found.motions):
+            if isinstance(motion, JointMotion) and (
+                motion.is_curved or len(motion.coefficients) > self._degree + 1
+            ):
+                replaced = self._fit_motion(motion)
                 if isinstance(replaced, str):
                     return replaced
                 motion, error = replaced
                 self._errors.setdefault(frame, {})[k] = error
-            moving.append(motion)
-        return replace(found, moving=tuple(moving))
+            motions.append(motion)
+        return replace(found, motions=tuple(motions))
 
-    def _replaced(self, motion: JointMotion) -> tuple[JointMotion, float] | str:
+    def _fit_motion(self, motion: JointMotion) -> tuple[JointMotion, float] | str:
+        """Return a polynomial motion and the bound of its error, or the reason why there is none."""
         symbols = find_term_symbols(motion.variable)
         if len(symbols) != 1:
             names = ", ".join(map(str, symbols))
@@ -72,40 +75,45 @@ class CurveApproximation:
         lower, upper = self._limits.get(symbol, REALS)
         if not (math.isfinite(lower) and math.isfinite(upper) and lower < upper):
             return f"moves by a curve over '{symbol}', which has no limits between which it is approximated"
-        key = motion.variable.index, motion.amount
+        key = motion.variable.index, motion.coefficients
         if key not in self._fits:
-            values = self._values(motion, symbol, lower, upper)
+            values = self._sample(motion, symbol, lower, upper)
             if not np.isfinite(values).all():
                 return f"moves by a curve over '{symbol}' that is no number everywhere within its limits"
-            enough = self._tolerance if motion.turns else self._tolerance + _ROUNDING
+            enough = self._tolerance if motion.is_rotation else self._tolerance + _ROUNDING
             self._fits[key] = fit_polynomial(
                 lambda where: self._series(motion, symbol, where), values, lower, upper, self._degree, enough
             )
         found = self._fits[key]
         if found.error > self._tolerance:
-            unit = "rad" if motion.turns else "m"
+            unit = "rad" if motion.is_rotation else "m"
             least = found.error if math.isfinite(found.error) else found.sampled
             return (
                 f"moves by a curve over '{symbol}', and the best polynomial of degree {self._degree} is "
                 f"off by {least:.3g} {unit}"
             )
         variable = self._terms.term(symbol)
-        return replace(motion, variable=variable, amount=found.polynomial, curve=None), found.error
+        return replace(motion, variable=variable, coefficients=found.polynomial, curve=None), found.error
 
     def _series(self, motion: JointMotion, symbol: Symbol, where: RealInterval) -> TaylorSeries:
+        """Return the Taylor series of a motion's position over an interval of its coordinate."""
         (inner,) = self._enclosures.enclose([motion.variable], {symbol: taylor_variable(where)})
-        return taylor_polynomial(motion.amount, inner)
+        return taylor_polynomial(motion.coefficients, inner)
 
-    def _values(self, motion: JointMotion, symbol: Symbol, lower: float, upper: float) -> np.ndarray:
+    def _sample(self, motion: JointMotion, symbol: Symbol, lower: float, upper: float) -> np.ndarray:
+        """Return a motion's positions at the Chebyshev points of an interval."""
         x = chebyshev_points(lower, upper)
         if motion.curve is not None:
             function = ca.Function("curve", [symbol._sx], [expand_nodes(motion.curve)])
             inner = np.array([float(function(v)) for v in x])
-            return np.asarray(np.polynomial.polynomial.polyval(inner, motion.amount))
+            return np.asarray(np.polynomial.polynomial.polyval(inner, motion.coefficients))
         return np.array([sum(self._series(motion, symbol, (v, v))[0]) / 2 for v in x.tolist()])
 
-    def implied(self, expression: Expression, lower: float, upper: float) -> bool:
-        """Whether an expression stays within bounds as long as its one coordinate, and its speed, do."""
+    def is_implied(self, expression: Expression, lower: float, upper: float) -> bool:
+        """Return True if the limits of its one coordinate and that one's speed keep an expression in bounds.
+
+        The expression is a function of the coordinate, or the product of such a function and the speed.
+        """
         positions = {s.position for s in expression.symbols}
         if len(positions) != 1 or any(s.order > 1 for s in expression.symbols):
             return False
@@ -128,27 +136,27 @@ class CurveApproximation:
         low, high = interval_multiply(span, factor)
         return lower - _ROUNDING <= low and high <= upper + _ROUNDING
 
-    def errors(
+    def frame_deviations(
         self, placed: Mapping[str, MotionChain], parents: Mapping[str, str]
     ) -> dict[str, FrameDeviation]:
-        """Return how far off frames may be, those that are off at all.
+        """Return bounds of the pose errors of all frames that have one.
 
-        A rotation that is off by ε turns everything behind it by ε at most, and moves it by 2 sin(ε/2) times
-        its distance at most; a translation moves it by its own error. Errors of one motion after the other
-        add up. Distances from the line of a motion are taken as large as they may get, with all errors.
+        An error ε of a rotation turns every frame behind it by at most ε, and displaces it by at most
+        2 sin(ε/2) times its distance from the line. An error of a translation displaces it by that error. The
+        errors of successive motions add up. Distances are the largest within the limits, with all errors.
         """
         result: dict[str, FrameDeviation] = {}
-        # Before each frame: rotations that are off, with the distance from their lines, and translations.
+        # Errors of the rotations before each frame, with the distance to their lines, and of translations.
         before: dict[str, tuple[list[tuple[float, float]], float]] = {WORLD: ([], 0.0)}
         for name, found in placed.items():
             turns, shift = before[parents[name]]
             errors = self._errors.get(name, {})
-            reaches = [self._reach(m, errors.get(k, 0.0)) for k, m in enumerate(found.moving)]
+            reaches = [self._max_offset(m, errors.get(k, 0.0)) for k, m in enumerate(found.motions)]
             whole = float(np.linalg.norm(found.pose[:3, 3])) + sum(reaches)
             turns = [(angle, distance + whole) for angle, distance in turns]
             for k, error in errors.items():
-                motion = found.moving[k]
-                if _slides(motion):
+                motion = found.motions[k]
+                if _is_translation(motion):
                     shift += error
                 else:
                     turns.append((error, float(np.linalg.norm(motion.point)) + sum(reaches[k + 1 :])))
@@ -158,20 +166,20 @@ class CurveApproximation:
                 result[name] = FrameDeviation((shift + moved) * _UP, sum(a for a, _ in turns) * _UP)
         return result
 
-    def _reach(self, motion: JointMotion | QuaternionMotion, error: float) -> float:
-        """Return how far a motion takes the origin of its frame at most, also where it is off."""
-        if isinstance(motion, QuaternionMotion) or motion.turns:
+    def _max_offset(self, motion: JointMotion | QuaternionMotion, error: float) -> float:
+        """Return the largest distance by which a motion and its error displace the origin of its frame."""
+        if isinstance(motion, QuaternionMotion) or motion.is_rotation:
             return 2 * float(np.linalg.norm(motion.point))  # around a circle about the line
         lower, upper = self._limits.get(motion.variable.data, REALS)
         if not (math.isfinite(lower) and math.isfinite(upper)):
             return math.inf
-        amount = motion.amount
+        amount = motion.coefficients
         span = enclose_curve(lambda where: taylor_polynomial(amount, taylor_variable(where)), lower, upper)
         return max(abs(span[0]), abs(span[1])) + error
 
 
-def _slides(motion: JointMotion | QuaternionMotion) -> bool:
-    return isinstance(motion, JointMotion) and not motion.turns
+def _is_translation(motion: JointMotion | QuaternionMotion) -> bool:
+    return isinstance(motion, JointMotion) and not motion.is_rotation
 
 
 def find_term_symbols(term: Term) -> list[Symbol]:

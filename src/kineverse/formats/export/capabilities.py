@@ -9,45 +9,47 @@ from kineverse.errors import FormatError
 
 @dataclass(frozen=True)
 class FormatCapabilities:
-    """What a format can say.
+    """Features that a file format can represent.
 
     Attributes
     ----------
     name
-        Of the format.
-    sums
-        Whether it limits sums of several coordinates.
-    one_way
-        Whether a speed may have another limit forwards than backwards.
-    loops
-        Whether it ties frames, so that what closes a loop needs not be solved for.
-    degree
-        Of the polynomials by which a joint may follow another.
+        Name of the format.
+    sum_limits
+        True if the format limits linear combinations of coordinates.
+    one_way_speeds
+        True if the velocity limits of the two directions may differ.
+    loop_joints
+        True if the format closes loops by itself, so that dependent coordinates need no expression.
+    polynomial_degree
+        Highest degree of the polynomials by which a joint may follow another.
     """
 
     name: str
-    sums: bool = False
-    one_way: bool = False
-    loops: bool = False
-    degree: int = 1
+    sum_limits: bool = False
+    one_way_speeds: bool = False
+    loop_joints: bool = False
+    polynomial_degree: int = 1
 
 
 _SHOWN = 6
+"""Number of unsupported features that an error message lists."""
 
 
 class UnsupportedError(FormatError):
-    """What a model says and a format cannot, with what can be done about it.
+    """Features of a model that a file format cannot represent, with remedies.
 
     Parameters
     ----------
     problem
-        What that is.
+        Description of the features.
     curved
-        Whether some of it could be approximated.
+        True if an approximation of curves removes some of them.
     strict
-        Whether constraints are among it, which could be left out.
-    said
-        How whoever reads the message has curves approximated, leaves out one constraint, and all of them.
+        True if constraints are among them, which can be left out.
+    options
+        Options of the caller's interface that approximate curves, leave out one constraint, and leave out all
+        constraints.
     """
 
     def __init__(
@@ -55,39 +57,38 @@ class UnsupportedError(FormatError):
         problem: str,
         curved: bool = False,
         strict: bool = False,
-        said: tuple[str, str, str] = ("tolerance=0.001", "leave_out=(name, ...)", "without strict=True"),
+        options: tuple[str, str, str] = ("tolerance=0.001", "leave_out=(name, ...)", "without strict=True"),
     ) -> None:
-        tolerance, leave_out, all_of_them = said
+        tolerance, leave_out, leave_out_all = options
         remedies = ["Write a document (.kv.json), which says all of it"]
         if curved:
             remedies.append(f"have curves approximated with {tolerance}")
         if strict:
-            remedies.append(f"leave constraints out with {leave_out}, or all of them {all_of_them}")
+            remedies.append(f"leave constraints out with {leave_out}, or all of them {leave_out_all}")
         *first, last = remedies
         super().__init__(f"{problem} {', '.join(first)}, or {last}." if first else f"{problem} {last}.")
         self._problem, self._curved, self._strict = problem, curved, strict
 
-    def with_remedies(self, tolerance: str, leave_out: str, all_of_them: str) -> UnsupportedError:
-        """Return the same for somebody who says that in another way."""
-        return UnsupportedError(
-            self._problem, self._curved, self._strict, (tolerance, leave_out, all_of_them)
-        )
+    def with_remedies(self, tolerance: str, leave_out: str, leave_out_all: str) -> UnsupportedError:
+        """Return the same error with the options of another interface, such as the command line."""
+        options = (tolerance, leave_out, leave_out_all)
+        return UnsupportedError(self._problem, self._curved, self._strict, options)
 
 
 @dataclass
 class UnsupportedFeatures:
-    """A growing list of what is refused.
+    """Features of a model that a format does not support, collected during the conversion.
 
     Attributes
     ----------
     target
-        The name of the format.
+        Name of the format.
     strict
-        Whether constraints are refused, too, rather than left out.
+        True if constraints that the format cannot represent are errors. Otherwise they are left out.
     curved
-        Whether something among them could be approximated.
+        True if an approximation of curves removes some of the errors.
     left_out
-        Why constraints, and speeds of articulations, are left out, by name.
+        Reasons why constraints, and speeds of articulations, are left out, by name.
     """
 
     target: str
@@ -97,32 +98,32 @@ class UnsupportedFeatures:
     _reasons: dict[str, list[str]] = field(default_factory=dict)
     _speeds: set[str] = field(default_factory=set)
 
-    def add(self, name: str, reason: str) -> None:
-        """Note that something cannot be said; its reasons are sentences without their beginning."""
+    def refuse(self, name: str, reason: str) -> None:
+        """Add an unsupported feature; the reason is a sentence without its subject."""
         reasons = self._reasons.setdefault(name, [])
         if reason not in reasons:
             reasons.append(reason)
 
-    def leave(self, name: str, reason: str) -> None:
-        """Note that a constraint is left out; all frames are where they should be without it."""
+    def leave_out(self, name: str, reason: str) -> None:
+        """Leave out a constraint, which changes no pose; refuse it in strict mode."""
         if self.strict:
-            self.add(name, reason)
+            self.refuse(name, reason)
         elif name not in self.left_out:
             self.left_out[name] = reason
         elif reason not in self.left_out[name]:
             self.left_out[name] += f" and {reason}"
 
     def leave_out_speeds(self, name: str, reason: str) -> None:
-        """Note that the ties between the speeds of an articulation are left out, as those of wheels are."""
+        """Leave out the relation between the speeds of an articulation, such as that of wheels."""
         self._speeds.add(name)
-        self.leave(name, reason)
+        self.leave_out(name, reason)
 
     def __bool__(self) -> bool:
         return bool(self._reasons)
 
     @property
     def remarks(self) -> list[str]:
-        """What is left out, as sentences."""
+        """Sentences about the parts of the model that are left out."""
         return [
             f"that '{name}' {reason} is left out: {self.target} cannot say it, and its coordinates are free"
             if name in self._speeds
@@ -131,12 +132,12 @@ class UnsupportedFeatures:
         ]
 
     def check(self, file: str) -> None:
-        """Raise if there is something.
+        """Raise an error if a feature is not supported.
 
         Raises
         ------
         UnsupportedError
-            With the first of the names, each with its reasons, and how many more there are.
+            Naming the first features, each with its reasons, and the number of further ones.
         """
         if not self._reasons:
             return

@@ -1,8 +1,8 @@
 """Decomposition of transforms into a constant pose and motions about joint axes.
 
-Whatever a transform is written as, a product of factors or one matrix, it is looked at as mathematics: the
-variable whose spatial twist ∂T/∂x · T⁻¹ is constant moves the rest by exp(twist · x), which is a rotation
-about a line, a translation, or both. That is split off, and the rest is looked at again.
+A transform T is a product of factors or one matrix. If the spatial twist ∂T/∂x · T⁻¹ of a variable x is
+constant, then T = exp(twist · x) · R, and R does not depend on x. The exponential is a rotation about a line,
+a translation, or both (Chasles). It is split off, and R is decomposed in the same way.
 """
 
 from __future__ import annotations
@@ -30,41 +30,41 @@ ZERO_VECTOR: Vector3 = (0.0, 0.0, 0.0)
 
 @dataclass(frozen=True)
 class JointMotion:
-    """A rotation about a line or a translation, by a polynomial of a variable [rad] or [m].
+    """Rotation about a line or translation along one, by a polynomial of a variable [rad] or [m].
 
     Attributes
     ----------
-    turns
-        Whether it is a rotation.
+    is_rotation
+        True for a rotation, False for a translation.
     axis
-        A unit vector.
+        Direction of the line, a unit vector.
     point
-        On the line of a rotation [m].
+        Point on the line of a rotation [m].
     variable
-        What moves it: a coordinate, or a curve over coordinates.
-    amount
-        The coefficients of the polynomial, constant first.
+        Variable of the polynomial: a coordinate, or a curve over coordinates.
+    coefficients
+        Coefficients of the polynomial, constant first.
     curve
-        The variable as an expression, if it is a curve that was given as one.
+        The variable as an expression, if it is a curve that was given as an expression.
     """
 
-    turns: bool
+    is_rotation: bool
     axis: Vector3
     point: Vector3
     variable: Term
-    amount: Coefficients
+    coefficients: Coefficients
     curve: Expression | None = None
 
     @property
-    def curved(self) -> bool:
-        """Whether it moves by a curve over coordinates, and not by a polynomial of one."""
+    def is_curved(self) -> bool:
+        """True if the variable is a curve over coordinates rather than a coordinate."""
         return self.variable.op != ca.OP_PARAMETER
 
     def in_frame(self, pose: Matrix) -> JointMotion:
-        """Return the same motion in coordinates of a frame that is at ``pose`` where this one is in."""
+        """Return the motion in coordinates of a frame whose pose in this motion's frame is ``pose``."""
         r, p = pose[:3, :3], pose[:3, 3]
         axis = round_exact(r.T @ np.array(self.axis))
-        if not self.turns:
+        if not self.is_rotation:
             return self._with(axis, np.zeros(3))
         point = r.T @ (np.array(self.point) - p)
         return self._with(axis, point - axis * (axis @ point))
@@ -75,7 +75,7 @@ class JointMotion:
 
 @dataclass(frozen=True)
 class QuaternionMotion:
-    """A rotation by a quaternion of four coordinates (x, y, z, w) about a point [m]."""
+    """Rotation by a quaternion of four coordinates (x, y, z, w) about a point [m]."""
 
     factor: Expression
     point: Vector3 = ZERO_VECTOR
@@ -86,28 +86,32 @@ AnyJointMotion: TypeAlias = JointMotion | QuaternionMotion
 
 @dataclass(frozen=True)
 class MotionChain:
-    """parent_T_frame: a pose, then motions, all of them in the axes of the frame where all amounts are 0."""
+    """parent_T_frame as a constant pose and motions after it.
+
+    Axes and points of the motions are in coordinates of the frame while all positions are 0.
+    """
 
     pose: Matrix
-    moving: tuple[AnyJointMotion, ...]
+    motions: tuple[AnyJointMotion, ...]
 
 
 class UnrecognisedMotionError(Exception):
-    """A transform is no product of motions about fixed lines; the writer turns it into a refusal."""
+    """A transform that is no product of motions about fixed lines; reported as an unsupported feature."""
 
 
 def round_position(position: Matrix) -> Matrix:
-    """Return a position without the noise that products leave [m]."""
+    """Return a position [m] without the rounding errors of products."""
     return np.where(np.abs(position) < NOISE, 0.0, position)
 
 
 def as_vector3(numbers: Matrix) -> Vector3:
-    """Return three numbers as such, without negative zeros."""
+    """Return an array of three numbers as a tuple, without negative zeros."""
     x, y, z = (float(n) + 0.0 for n in numbers)
     return x, y, z
 
 
-_SAME = 1e-12
+_SKEW_TOLERANCE = 1e-12
+"""Tolerance for the skew symmetry of an angular velocity matrix Ṙ Rᵀ."""
 
 
 def decompose_transform(
@@ -117,23 +121,23 @@ def decompose_transform(
     *,
     offsets: bool = False,
 ) -> MotionChain:
-    """Return a product of transforms as a pose and motions.
+    """Decompose a product of transforms into a constant pose and motions.
 
     Parameters
     ----------
     factors
-        The transforms, in terms of coordinates that depend on nothing.
+        The transforms, as expressions of independent coordinates.
     terms
-        Where the steps of expressions are known.
+        Term graph of the expressions.
     quaternions
-        The rotations by quaternions that there are; they are recognised by being one of these.
+        All rotations by quaternions in the model; a factor is such a rotation if it equals one of them.
     offsets
-        Whether what is constant in the amount of a motion stays there, rather than in the pose.
+        If True, the constant part of a motion's position stays in its polynomial rather than in the pose.
 
     Raises
     ------
-    UnrecognisedError
-        If it is no such product.
+    UnrecognisedMotionError
+        If a factor is no product of motions about fixed lines.
     """
     parts: list[Matrix | AnyJointMotion] = []
     for factor in factors:
@@ -142,80 +146,86 @@ def decompose_transform(
         elif factor in quaternions:
             parts.append(QuaternionMotion(factor))
         else:
-            parts += _parts(factor, terms, offsets)
-    # Constants are gathered in front: behind a motion, they change the line that it is about.
-    behind, moving = np.eye(4), list[AnyJointMotion]()
+            parts += _decompose_factor(factor, terms, offsets)
+    # Constants are moved to the front: a constant behind a motion changes the coordinates of its line.
+    behind, motions = np.eye(4), list[AnyJointMotion]()
     for part in reversed(parts):
         if isinstance(part, JointMotion):
-            moving.append(part.in_frame(behind))
+            motions.append(part.in_frame(behind))
         elif isinstance(part, QuaternionMotion):
             if np.abs(behind[:3, :3] - np.eye(3)).max() > 0:
                 raise UnrecognisedMotionError(
                     "is turned by a constant behind its quaternion; add a frame for that"
                 )
-            moving.append(QuaternionMotion(part.factor, as_vector3(round_position(-behind[:3, 3]))))
+            motions.append(QuaternionMotion(part.factor, as_vector3(round_position(-behind[:3, 3]))))
         else:
             behind = _clean_pose(part @ behind)
-    return MotionChain(behind, tuple(reversed(moving)))
+    return MotionChain(behind, tuple(reversed(motions)))
 
 
-def _parts(factor: Expression, terms: TermGraph, offsets: bool) -> list[Matrix | AnyJointMotion]:
-    """Return one factor as constants and motions."""
-    harmonics = TrigPolynomialConverter()
+def _decompose_factor(factor: Expression, terms: TermGraph, offsets: bool) -> list[Matrix | AnyJointMotion]:
+    """Decompose one factor into constants and motions."""
+    converter = TrigPolynomialConverter()
     try:
         if isinstance(factor, OneAxisTransform):
-            amount = harmonics.of(terms.term(factor.amount))
-            found = _axis_motion(factor, amount, harmonics, terms, offsets)
+            amount = converter.convert(terms.term(factor.amount))
+            found = _axis_motion(factor, amount, converter, terms, offsets)
             if found is not None:
                 return found
         try:
-            return _split_off_motions(_entries(factor, terms, harmonics), harmonics)
+            return _split_off_motions(_matrix_entries(factor, terms, converter), converter)
         except UnrecognisedMotionError:
-            # A rotation by a curve, of which a document has the matrix only, is one by a variable.
-            angles = TrigPolynomialConverter(angles=True)
-            return list(
-                _substitute_polynomials(_split_off_motions(_entries(factor, terms, angles), angles), angles)
-            )
+            # Documents have only the matrix of a rotation by a curve: its angle becomes a variable.
+            converter = TrigPolynomialConverter(angles=True)
+            parts = _split_off_motions(_matrix_entries(factor, terms, converter), converter)
+            return list(_substitute_polynomials(parts, converter))
     except TooManyTermsError:
         raise UnrecognisedMotionError("is too long a product to be taken apart") from None
 
 
-def _entries(
-    factor: Expression, terms: TermGraph, harmonics: TrigPolynomialConverter
+def _matrix_entries(
+    factor: Expression, terms: TermGraph, converter: TrigPolynomialConverter
 ) -> list[list[TrigPolynomial]]:
-    entries = [harmonics.of(term) for term in terms.elements(factor)]
+    """Return the 4 x 4 entries of a transform as trigonometric polynomials."""
+    entries = [converter.convert(term) for term in terms.elements(factor)]
     return [[entries[row + 4 * column] for column in range(4)] for row in range(4)]
 
 
 def _substitute_polynomials(
-    parts: Iterable[Matrix | AnyJointMotion], harmonics: TrigPolynomialConverter
+    parts: Iterable[Matrix | AnyJointMotion], converter: TrigPolynomialConverter
 ) -> Iterator[Matrix | AnyJointMotion]:
-    """Yield the same with motions by polynomials in place of those by the variables that these are."""
+    """Yield the parts, with motions by variables that are polynomials replaced by polynomial motions."""
     for part in parts:
         sums = (
-            _as_polynomials(harmonics.of(part.variable), harmonics) if isinstance(part, JointMotion) else None
+            _as_polynomials(converter.convert(part.variable), converter)
+            if isinstance(part, JointMotion)
+            else None
         )
         if sums is None or not isinstance(part, JointMotion):
             yield part
             continue
         polynomials, offset = sums
         for index, coefficients in sorted(polynomials.items(), key=lambda item: -len(item[1])):
-            whole = tuple(part.amount[1] * c for c in (offset, *coefficients))
-            yield replace(part, variable=harmonics.variables[index], amount=whole)
+            whole = tuple(part.coefficients[1] * c for c in (offset, *coefficients))
+            yield replace(part, variable=converter.variables[index], coefficients=whole)
             offset = 0.0
 
 
 def _axis_motion(
     factor: OneAxisTransform,
     amount: TrigPolynomial,
-    harmonics: TrigPolynomialConverter,
+    converter: TrigPolynomialConverter,
     terms: TermGraph,
     offsets: bool,
 ) -> list[Matrix | AnyJointMotion] | None:
-    """Return one by its amount; None for a translation by waves, which is one along circles."""
-    sums = _as_polynomials(amount, harmonics)
+    """Decompose a one-axis transform by its amount; None for a translation by sines and cosines.
+
+    A translation by sines and cosines of coordinates is one along circles; see
+    :func:`_split_off_translation`.
+    """
+    sums = _as_polynomials(amount, converter)
     if sums is None:
-        if _of_coordinates(amount, harmonics) and not factor.is_rotation:
+        if _has_only_coordinates(amount, converter) and not factor.is_rotation:
             return None
         curve = factor.amount
         return [
@@ -236,37 +246,38 @@ def _axis_motion(
     for index, coefficients in sorted(polynomials.items()):
         whole = (offset, *coefficients)
         found.append(
-            JointMotion(factor.is_rotation, factor.direction, ZERO_VECTOR, harmonics.variables[index], whole)
+            JointMotion(factor.is_rotation, factor.direction, ZERO_VECTOR, converter.variables[index], whole)
         )
         offset = 0.0
     return found
 
 
-def _of_coordinates(amount: TrigPolynomial, harmonics: TrigPolynomialConverter) -> bool:
-    return all(harmonics.variables[v].op == ca.OP_PARAMETER for v in amount.variables)
+def _has_only_coordinates(amount: TrigPolynomial, converter: TrigPolynomialConverter) -> bool:
+    """Return True if all variables of an amount are coordinates, rather than curves over them."""
+    return all(converter.variables[v].op == ca.OP_PARAMETER for v in amount.variables)
 
 
 def _as_polynomials(
-    amount: TrigPolynomial, harmonics: TrigPolynomialConverter
+    amount: TrigPolynomial, converter: TrigPolynomialConverter
 ) -> tuple[dict[int, Coefficients], float] | None:
-    """Return an amount as polynomials of coordinates and a constant, if it is that."""
-    return amount.polynomials if _of_coordinates(amount, harmonics) else None
+    """Return an amount as polynomials of single coordinates and a constant; None if it is no such sum."""
+    return amount.polynomials if _has_only_coordinates(amount, converter) else None
 
 
 def _split_off_motions(
-    matrix: list[list[TrigPolynomial]], harmonics: TrigPolynomialConverter
+    matrix: list[list[TrigPolynomial]], converter: TrigPolynomialConverter
 ) -> list[Matrix | AnyJointMotion]:
-    """Split off one variable after the other, from the left."""
+    """Decompose a matrix by splitting off the motion of one variable after the other, from the left."""
     found: list[Matrix | AnyJointMotion] = []
     while variables := sorted({v for row in matrix for entry in row for v in entry.variables}):
         for index in variables:
             twist = _twist(matrix, index)
             if twist is not None:
-                found += _exponential(twist, harmonics.variables[index])
-                matrix = [[entry.at_zero(index) for entry in row] for row in matrix]
+                found += _twist_motions(twist, converter.variables[index])
+                matrix = [[entry.substitute_zero(index) for entry in row] for row in matrix]
                 break
         else:
-            found += _circles(matrix, harmonics)
+            found += _split_off_translation(matrix, converter)
             zero = TrigPolynomial.constant(0.0)
             matrix = [[*row[:3], zero] for row in matrix[:3]] + [matrix[3]]
             left = {v for row in matrix for entry in row for v in entry.variables}
@@ -279,39 +290,40 @@ def _split_off_motions(
 
 
 def _twist(matrix: list[list[TrigPolynomial]], index: int) -> Matrix | None:
-    """Return the twist (v, ω) by which a variable moves a transform, if it is constant."""
+    """Return the spatial twist (v, ω) of a transform by one variable; None if it is not constant."""
     if not any(index in entry.variables for row in matrix for entry in row):
         return None
     slope = [[entry.derivative(index) for entry in row] for row in matrix[:3]]
     spin = np.zeros((3, 3))
     for i in range(3):
         for j in range(3):
-            entry = _sum(slope[i][k] * matrix[j][k] for k in range(3)).number
+            entry = _add_up(slope[i][k] * matrix[j][k] for k in range(3)).number
             if entry is None:
                 return None
             spin[i, j] = entry
     velocity = np.zeros(3)
     for i in range(3):
         # v = ṗ - ω × p
-        carried = _sum(matrix[k][3].scaled(spin[i, k]) for k in range(3))
-        rest = (slope[i][3] - carried).number
-        if rest is None:
+        rotational = _add_up(matrix[k][3].scale(spin[i, k]) for k in range(3))
+        entry = (slope[i][3] - rotational).number
+        if entry is None:
             return None
-        velocity[i] = rest
-    if np.abs(spin + spin.T).max() > _SAME:
+        velocity[i] = entry
+    if np.abs(spin + spin.T).max() > _SKEW_TOLERANCE:
         raise UnrecognisedMotionError("is no rigid transform everywhere")
     return np.array([*velocity, spin[2, 1], spin[0, 2], spin[1, 0]])
 
 
-def _sum(parts: Iterable[TrigPolynomial]) -> TrigPolynomial:
+def _add_up(parts: Iterable[TrigPolynomial]) -> TrigPolynomial:
+    """Return the sum of trigonometric polynomials."""
     total = TrigPolynomial.constant(0.0)
     for part in parts:
         total = total + part
     return total
 
 
-def _exponential(twist: Matrix, variable: Term) -> list[Matrix | AnyJointMotion]:
-    """Return exp(twist · x) as a translation along a line and a rotation about it."""
+def _twist_motions(twist: Matrix, variable: Term) -> list[Matrix | AnyJointMotion]:
+    """Decompose exp(twist · x) into a translation along a line and a rotation about it."""
     v, w = twist[:3], twist[3:]
     speed = float(np.linalg.norm(w))
     if speed < NOISE:
@@ -325,13 +337,13 @@ def _exponential(twist: Matrix, variable: Term) -> list[Matrix | AnyJointMotion]
     return [JointMotion(False, as_vector3(axis), ZERO_VECTOR, variable, (0.0, pitch)), turn]
 
 
-def _circles(
-    matrix: list[list[TrigPolynomial]], harmonics: TrigPolynomialConverter
+def _split_off_translation(
+    matrix: list[list[TrigPolynomial]], converter: TrigPolynomialConverter
 ) -> list[Matrix | AnyJointMotion]:
-    """Return the translation of a transform as slides and, where it is a sum of waves, as circles.
+    """Decompose the translation of a transform into straight lines and ellipses.
 
-    Each wave of a point is an ellipse, and an ellipse is two circles that are run through in opposite
-    directions. A circle is a turn by w·x, an arm, and the turn back.
+    The terms of one frequency w move a point along an ellipse. An ellipse is the sum of two circles that are
+    traversed in opposite directions. A circle is a rotation by w·x, an arm, and the rotation back.
     """
     slides: dict[int, Matrix] = {}
     waves: dict[tuple[tuple[int, float], ...], npt.NDArray[np.complex128]] = {}
@@ -339,7 +351,7 @@ def _circles(
     for i in range(3):
         for (powers, frequencies), c in matrix[i][3].terms.items():
             if frequencies and not powers:
-                if frequencies[0][1] > 0:  # the other half is its conjugate
+                if frequencies[0][1] > 0:  # the term of the opposite frequency is its conjugate
                     waves.setdefault(frequencies, np.zeros(3, complex))[i] = 2 * c
             elif frequencies or sum(n for _, n in powers) > 1:
                 raise UnrecognisedMotionError("is moved by more than multiples and waves of its coordinates")
@@ -351,18 +363,18 @@ def _circles(
     for index, direction in slides.items():
         length = float(np.linalg.norm(direction))
         axis = as_vector3(round_exact(direction / length))
-        found.append(JointMotion(False, axis, ZERO_VECTOR, harmonics.variables[index], (0.0, length)))
+        found.append(JointMotion(False, axis, ZERO_VECTOR, converter.variables[index], (0.0, length)))
     for frequencies, amplitude in waves.items():
-        found += _ellipse(frequencies, amplitude, harmonics)
+        found += _ellipse_motions(frequencies, amplitude, converter)
     return found
 
 
-def _ellipse(
+def _ellipse_motions(
     frequencies: tuple[tuple[int, float], ...],
     c: npt.NDArray[np.complex128],
-    harmonics: TrigPolynomialConverter,
+    converter: TrigPolynomialConverter,
 ) -> list[Matrix | AnyJointMotion]:
-    """Return the translation by Re(c exp(iθ)), θ = w·x, as turns about the normal of its plane."""
+    """Decompose the translation Re(c exp(iθ)), θ = w·x, into rotations about the normal of its plane."""
     normal = np.cross(c.real, -c.imag)
     if np.linalg.norm(normal) < NOISE * np.abs(c).max():
         along = c.real if np.abs(c.real).max() > np.abs(c.imag).max() else c.imag
@@ -374,18 +386,18 @@ def _ellipse(
         arm = (c @ u + sign * 1j * (c @ v)) / 2
         if abs(arm) < NOISE:
             continue
-        # Re(arm · (u - sign·i·v) · exp(iθ)): an arm that is turned by θ about sign · normal.
+        # Re(arm · (u - sign·i·v) · exp(iθ)): an arm that is rotated by θ about sign · normal.
         reach = translation(arm.real * u + sign * arm.imag * v)
         axis = as_vector3(sign * normal)
         turns = [
-            JointMotion(True, axis, ZERO_VECTOR, harmonics.variables[index], (0.0, w))
+            JointMotion(True, axis, ZERO_VECTOR, converter.variables[index], (0.0, w))
             for index, w in frequencies
         ]
-        back = [JointMotion(True, axis, ZERO_VECTOR, m.variable, (0.0, -m.amount[1])) for m in turns]
+        back = [JointMotion(True, axis, ZERO_VECTOR, m.variable, (0.0, -m.coefficients[1])) for m in turns]
         found += [*turns, reach, *back]
     return found
 
 
 def _clean_pose(pose: Matrix) -> Matrix:
-    """Return a pose without the noise that products leave."""
+    """Return a pose without the rounding errors of products."""
     return transform(round_exact(pose[:3, :3]), round_position(pose[:3, 3]))

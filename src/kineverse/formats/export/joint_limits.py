@@ -13,12 +13,12 @@ from kineverse.formats.description import JointBounds, JointDescription, RobotDe
 from kineverse.model.constraint import Constraint
 from kineverse.symbols import Symbol
 
-from .capabilities import UnsupportedFeatures
+from .capabilities import FormatCapabilities, UnsupportedFeatures
 
 
 @dataclass(frozen=True)
 class CoordinateLimit:
-    """A constraint with numbers as bounds, on slope · symbol + offset."""
+    """Constraint lower <= slope · symbol + offset <= upper with constant bounds."""
 
     name: str
     symbol: Symbol
@@ -29,7 +29,7 @@ class CoordinateLimit:
 
     @property
     def symbol_range(self) -> tuple[float, float]:
-        """What it leaves of the symbol."""
+        """Range of the symbol."""
         if (self.slope, self.offset) == (1.0, 0.0):
             return self.lower, self.upper
         ends = ((self.lower - self.offset) / self.slope, (self.upper - self.offset) / self.slope)
@@ -38,7 +38,7 @@ class CoordinateLimit:
 
 @dataclass(frozen=True)
 class NonlinearLimit:
-    """A constraint with numbers as bounds on anything else, and why it is nothing simpler."""
+    """Constraint with constant bounds on any other expression, and the reason why it is no simpler limit."""
 
     name: str
     expression: Expression
@@ -50,41 +50,41 @@ class NonlinearLimit:
 def classify_constraints(
     constraints: Mapping[str, Constraint],
     resolve: Callable[[Expression], Expression],
-    refusals: UnsupportedFeatures,
+    unsupported: UnsupportedFeatures,
 ) -> Iterator[CoordinateLimit | SumLimit | NonlinearLimit]:
-    """Yield constraints as ranges of one symbol, of a sum of positions or of a curve; refuse the others.
+    """Yield constraints as limits of one symbol, of a linear combination of positions, or of a curve.
 
     Parameters
     ----------
     constraints
-        By name.
+        Constraints by name.
     resolve
-        Puts an expression in terms of what depends on nothing.
-    refusals
-        Those that are neither are left out there, with the reason.
+        Function that returns an expression in terms of independent symbols.
+    unsupported
+        Receives all other constraints, with the reason.
     """
     for name, given in constraints.items():
         middle, bounds = resolve(given.expression), [resolve(b) for b in (given.lower, given.upper)]
         about = [s for b in bounds for s in b.symbols]
         if about:
             names = ", ".join(dict.fromkeys(map(str, about)))
-            refusals.leave(name, f"has bounds that depend on {names}")
+            unsupported.leave_out(name, f"has bounds that depend on {names}")
             continue
         lower, upper = map(float, bounds)
         if (lower, upper) == (-math.inf, math.inf):
             continue
         if not middle.symbols:
-            refusals.leave(name, "is about nothing that moves")
+            unsupported.leave_out(name, "is about nothing that moves")
         elif has_given_gradient(middle):
-            refusals.leave(name, "has a gradient that was given and is not the derivative")
+            unsupported.leave_out(name, "has a gradient that was given and is not the derivative")
         elif any(s.order > 1 for s in middle.symbols):
-            refusals.leave(name, "limits accelerations")
+            unsupported.leave_out(name, "limits accelerations")
         else:
             yield _classify_constraint(name, middle, lower, upper)
 
 
 def intersect_limits(found: Iterable[CoordinateLimit]) -> dict[Symbol, tuple[float, float]]:
-    """Return between which values symbols are, by all that limits them."""
+    """Return the range of each symbol, the intersection of all its limits."""
     result: dict[Symbol, tuple[float, float]] = {}
     for item in found:
         low, high = item.symbol_range
@@ -96,7 +96,7 @@ def intersect_limits(found: Iterable[CoordinateLimit]) -> dict[Symbol, tuple[flo
 def _classify_constraint(
     name: str, expression: Expression, lower: float, upper: float
 ) -> CoordinateLimit | SumLimit | NonlinearLimit:
-    """Return a constraint on a sum of multiples, or a curve with the reason why it is none."""
+    """Return a constraint as the simplest limit that it is."""
     line = Constraint(as_expression(lower), expression, as_expression(upper)).line
     if line is not None:
         return CoordinateLimit(name, expression.symbols[0], *line, lower, upper)
@@ -114,70 +114,68 @@ def _classify_constraint(
 
 
 def assign_limits(
-    plan: RobotDescription,
+    description: RobotDescription,
     found: Collection[CoordinateLimit | SumLimit],
-    target: str,
-    sums: bool,
-    one_way: bool,
-    refusals: UnsupportedFeatures,
+    target: FormatCapabilities,
+    unsupported: UnsupportedFeatures,
 ) -> None:
-    """Put ranges where they belong: to the joint that they are named for, else to the coordinate's joint.
+    """Assign limits to joints: to the joint that a limit is named for, else to the joint of its coordinate.
 
     Parameters
     ----------
-    plan
-        Its joints receive bounds.
+    description
+        Robot description whose joints receive the limits.
     found
-        What was found among the constraints.
+        Limits of symbols and of sums.
     target
-        The name of the format.
-    sums, one_way
-        Whether it can limit sums of several coordinates, and speeds other than alike in both directions.
-    refusals
-        What has no place is left out there.
+        Capabilities of the format.
+    unsupported
+        Receives the limits that the format cannot represent.
     """
-    joints = {joint.name: joint for joint in plan.joints}
-    leaders = {joint.symbol: joint for joint in plan.joints if joint.leads}
+    joints = {joint.name: joint for joint in description.joints}
+    independent = {joint.symbol: joint for joint in description.joints if joint.is_independent}
     for item in found:
         if isinstance(item, SumLimit):
-            if not sums:
-                refusals.leave(item.name, f"limits a sum of {', '.join(map(str, item.factors))}")
-            elif any(s not in leaders for s in item.factors):
-                refusals.leave(item.name, "is about coordinates of which no joint consists")
+            if not target.sum_limits:
+                unsupported.leave_out(item.name, f"limits a sum of {', '.join(map(str, item.factors))}")
+            elif any(s not in independent for s in item.factors):
+                unsupported.leave_out(item.name, "is about coordinates of which no joint consists")
             else:
-                plan.sums.append(item)
+                description.sum_limits.append(item)
             continue
         coordinate = item.symbol.position if item.symbol.order else item.symbol
-        owner, _, what = item.name.rpartition("/")
+        owner, _, kind = item.name.rpartition("/")
         joint = joints.get(owner)
         if joint is not None and _is_about_joint(joint, coordinate, item):
             low, high = item.lower, item.upper
-        elif coordinate in leaders:
-            joint = leaders[coordinate]
+        elif coordinate in independent:
+            joint = independent[coordinate]
             low, high = item.symbol_range
         else:
-            refusals.leave(item.name, f"is about '{item.symbol}', which is the position or speed of no joint")
+            unsupported.leave_out(
+                item.name, f"is about '{item.symbol}', which is the position or speed of no joint"
+            )
             continue
         if not item.symbol.order:
-            if what == "soft_limits" and joint.name == owner and joint.bounds.soft is None:
+            if kind == "soft_limits" and joint.name == owner and joint.bounds.soft is None:
                 joint.bounds.soft = low, high
             else:
-                joint.bounds.keep(low, high)
-        elif one_way or low == -high:
-            joint.bounds.slow(low, high)
+                joint.bounds.intersect_positions(low, high)
+        elif target.one_way_speeds or low == -high:
+            joint.bounds.intersect_velocities(low, high)
         else:
-            refusals.leave(item.name, "limits a speed differently in its two directions")
-    for joint in plan.joints:
+            unsupported.leave_out(item.name, "limits a speed differently in its two directions")
+    for joint in description.joints:
         if joint.bounds.lower > joint.bounds.upper:
-            refusals.add(joint.name, f"cannot be anywhere: {_format_bounds(joint.bounds)}")
+            unsupported.refuse(joint.name, f"cannot be anywhere: {_format_bounds(joint.bounds)}")
 
 
 def _is_about_joint(joint: JointDescription, coordinate: Symbol, item: CoordinateLimit) -> bool:
-    """Whether a constraint is on just what the joint's position is, or on its speed."""
-    if joint.symbol != coordinate or len(joint.amount) != 2:
+    """Return True if a limit is on exactly the joint's position, or on its speed."""
+    if joint.symbol != coordinate or len(joint.coefficients) != 2:
         return False
-    offset = 0.0 if item.symbol.order else joint.amount[0]
-    return (offset, joint.amount[1]) == (item.offset, item.slope)
+    offset = 0.0 if item.symbol.order else joint.coefficients[0]
+    return (offset, joint.coefficients[1]) == (item.offset, item.slope)
 
 
 def _format_bounds(bounds: JointBounds) -> str:
@@ -185,6 +183,6 @@ def _format_bounds(bounds: JointBounds) -> str:
 
 
 def has_given_gradient(expression: Expression) -> bool:
-    """Whether a gradient inside of an expression was given rather than derived."""
+    """Return True if an expression contains a gradient that was given rather than derived."""
     nodes = topological_order(leaves(expression)[1], lambda n: n.arguments, lambda _: False)
     return any(isinstance(node, Augment) for node in nodes)

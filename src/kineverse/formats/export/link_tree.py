@@ -26,8 +26,7 @@ from kineverse.formats.description import (
 from kineverse.formats.names import TakenNames
 from kineverse.intervals.graph import TermGraph
 from kineverse.loops.equations import AXES
-from kineverse.loops.record import LOOP_KINDS as LOOPS
-from kineverse.loops.record import LoopRecord, find_loops
+from kineverse.loops.record import LOOP_KINDS, LoopRecord, find_loops
 from kineverse.model.articulation import Articulation
 from kineverse.model.body import Pose
 from kineverse.model.constraint import Constraint
@@ -55,10 +54,11 @@ from .joint_limits import (
     has_given_gradient,
     intersect_limits,
 )
+from .poses import ROTATION_TOLERANCE, rotation_deviation
 
 
 def sort_parents_first(model: ModelView) -> list[str]:
-    """Return the names of all frames, each after its parent, in their order where that allows it."""
+    """Return the names of all frames, each after its parent, otherwise in the order of the model."""
     frames = dict(model.frames)
     done = {WORLD: None}
     for name in frames:
@@ -71,26 +71,42 @@ def sort_parents_first(model: ModelView) -> list[str]:
 
 
 def check_left_out_names(leave_out: Iterable[str], model: ModelView) -> frozenset[str]:
-    """Return the names of what is to be left out, if all of them exist."""
-    wanted = [leave_out] if isinstance(leave_out, str) else list(leave_out)
+    """Check that constraints or articulations of the given names exist, and return the names.
+
+    Raises
+    ------
+    UnknownNameError
+        If a name is neither a constraint nor an articulation.
+    """
+    names = [leave_out] if isinstance(leave_out, str) else list(leave_out)
     known = {*model.constraints, *model.articulations, *map(str, model.rates)}
-    for name in wanted:
+    for name in names:
         if name not in known:
             raise UnknownNameError(
                 f"{name!r} cannot be left out: it is neither a constraint nor an articulation. "
                 f"{suggest(str(name), known, 'name')}"
             )
-    return frozenset(wanted)
+    return frozenset(names)
+
+
+def check_rotation(link: LinkDescription, unsupported: UnsupportedFeatures) -> None:
+    """Refuse a link whose constant pose has no rotation matrix, which no roll, pitch and yaw represent."""
+    deviation = rotation_deviation(link.pose)
+    if deviation > ROTATION_TOLERANCE:
+        unsupported.refuse(
+            link.name, f"is turned by a constant that is off by {deviation:.2g} from any rotation"
+        )
 
 
 _STILL_TOLERANCE = 1e-9
+"""Largest distance [m] of a point from a plane in which it stays."""
 
 
 def find_loop_joints(model: ModelView) -> Iterator[LoopJoint]:
-    """Yield what ties the ends of loops, and what they determine, where that is faithful.
+    """Yield the loops of a model that are equivalent to a ``connect`` or a ``weld``.
 
-    Points that coincide are tied by a ``connect``, and so are those in a plane that nothing leaves; frames
-    that coincide by a ``weld``. A loop that says anything else is none of these.
+    A ``connect`` makes two points coincide; it also represents points of a planar loop. A ``weld`` makes two
+    frames coincide. Loops of any other kind are not yielded.
     """
     for loop in find_loops(model):
         kind = _loop_joint_kind(model, loop)
@@ -99,11 +115,13 @@ def find_loop_joints(model: ModelView) -> Iterator[LoopJoint]:
 
 
 def _loop_joint_kind(model: ModelView, loop: LoopRecord) -> Literal["connect", "weld"] | None:
+    """Return the kind of equality that is equivalent to a loop; None if there is none."""
     if set(loop.mask) == set(AXES):
         return "weld"
     if not set(loop.mask) <= set(AXES[:3]):
         return None
-    # What the mask leaves open may not move, or the tie would hold it: a plane's normal does not.
+    # A connect would also hold the directions that the mask leaves open. They may not move at all, as the
+    # normal of a planar loop.
     for frame, to in loop.ends:
         pose = model.rates.resolve(model.fk(frame, to))
         for k, axis in enumerate(AXES[:3]):
@@ -116,7 +134,7 @@ _QX_SUFFIX = "/qx"
 
 
 def find_quaternions(model: ModelView) -> Iterator[tuple[str, Expression]]:
-    """Yield names and rotations of coordinates ``name/qx`` ... ``name/qw`` with q̇ = ½ q ⊗ (ω, 0)."""
+    """Yield the names and rotations of all quaternions, coordinates ``name/qx`` … with q̇ = ½ q ⊗ (ω, 0)."""
     rates = model.rates
     for coordinate in rates:
         if not coordinate.path.endswith(_QX_SUFFIX):
@@ -128,25 +146,32 @@ def find_quaternions(model: ModelView) -> Iterator[tuple[str, Expression]]:
 
 
 _POWERS = {1: "multiple", 4: "polynomial of degree 4"}
-_WHOLE = (IDENTITY_COEFFICIENTS, (0.0, -1.0))
-"""The amounts by which a joint may be a coordinate."""
+_UNIT_COEFFICIENTS = (IDENTITY_COEFFICIENTS, (0.0, -1.0))
+"""Polynomials by which a joint's position is its coordinate, about the axis or the opposite axis."""
 
 
 class LinkTreeBuilder:
-    """Turns one model into a plan.
+    """Builder of the robot description of one model.
 
     Parameters
     ----------
     model
         The model.
     target
-        What the format can say.
+        Capabilities of the format.
     leave_out
-        Names of constraints that are left out, and of articulations whose own speeds are.
+        Names of constraints to leave out, and of articulations whose relations between speeds to leave out.
     tolerance
-        How far frames may be off [m], [rad]; None for nowhere.
+        Largest pose error of a frame [m], [rad]; None for exact poses.
     strict
-        Whether constraints that the format cannot say are refused, rather than left out.
+        If True, constraints that the format cannot represent are refused rather than left out.
+
+    Attributes
+    ----------
+    unsupported
+        Features of the model that the format cannot represent.
+    remarks
+        Differences between the model and its description, as sentences.
     """
 
     def __init__(
@@ -157,89 +182,88 @@ class LinkTreeBuilder:
         tolerance: float | None = None,
         strict: bool = False,
     ) -> None:
-        self.model, self.target = model, target
-        self.refusals = UnsupportedFeatures(target.name, strict)
+        self.model, self.capabilities = model, target
+        self.unsupported = UnsupportedFeatures(target.name, strict)
         self.remarks: list[str] = []
-        # What refused frames move by: its own limits need no complaint of their own.
-        self._lost: set[Symbol] = set()
+        # Symbols of refused frames: their limits are not reported a second time.
+        self._refused_symbols: set[Symbol] = set()
         self._left_out = check_left_out_names(leave_out, model)
-        self._records = {record.child: name for name, record in _own_records(model)}
+        self._articulations = {record.child: name for name, record in _non_loop_articulations(model)}
         self._values: dict[Symbol, Expression] = {}
         self._terms = TermGraph({})
         self._quaternions = dict(find_quaternions(model))
         self._tolerance = tolerance
-        self._loops = list(find_loop_joints(model)) if target.loops else []
-        determined = {name for loop in self._loops for name in loop.dependent}
-        tied_by_loops = {s for s in model.rates.dependent if str(s) in determined}
-        given = model.plain_rates()
-        self._rates = Rates({x: e for x, e in given.items() if x not in tied_by_loops})
-        # What a tie determines is a coordinate like any other for who reads it.
-        self._coordinates = sorted({*model.degrees_of_freedom, *tied_by_loops}, key=lambda s: s.sort_key)
+        self._loops = list(find_loop_joints(model)) if target.loop_joints else []
+        dependent_names = {name for loop in self._loops for name in loop.dependent}
+        loop_dependent = {s for s in model.rates.dependent if str(s) in dependent_names}
+        rates = model.plain_rates()
+        self._rates = Rates({x: e for x, e in rates.items() if x not in loop_dependent})
+        # A format that closes loops itself has the dependent coordinates as joints like all others.
+        self._coordinates = sorted({*model.degrees_of_freedom, *loop_dependent}, key=lambda s: s.sort_key)
 
-    def plan(self) -> RobotDescription:
-        """Return the plan; what cannot be said is in :attr:`refusals`."""
-        tied = {name for loop in self._loops for name in loop.constraints}
-        # With rates, ``model.constraints`` has coordinates as nodes, which only look like curves.
-        kept = {
-            n: c
-            for n, c in self.model.plain_constraints().items()
-            if n not in self._left_out and n not in tied
-        }
-        found = list(classify_constraints(kept, self.resolve, self.refusals))
+    def build(self) -> RobotDescription:
+        """Build the robot description; :attr:`unsupported` receives what the format cannot represent."""
+        omitted = self._left_out | {name for loop in self._loops for name in loop.constraints}
+        # In a model with rates, ``model.constraints`` has nodes for coordinates, which look like curves.
+        constraints = {n: c for n, c in self.model.plain_constraints().items() if n not in omitted}
+        found = list(classify_constraints(constraints, self.resolve, self.unsupported))
         ranges = intersect_limits(item for item in found if isinstance(item, CoordinateLimit))
         approximation = None
         if self._tolerance is not None:
-            approximation = CurveApproximation(self._terms, ranges, self.target.degree, self._tolerance)
-        everywhere = {name: self._placed(name, approximation) for name in sort_parents_first(self.model)}
-        placed = {name: there for name, there in everywhere.items() if there is not None}
-        self._check_rates(placed)
+            degree = self.capabilities.polynomial_degree
+            approximation = CurveApproximation(self._terms, ranges, degree, self._tolerance)
+        names = sort_parents_first(self.model)
+        decomposed = {name: self._decompose_frame(name, approximation) for name in names}
+        chains = {name: chain for name, chain in decomposed.items() if chain is not None}
+        self._check_rates(chains)
         joints = TakenNames(s.path for s in self._coordinates)
-        leading = self._leading(placed)
-        links = [self._link(name, there, leading, joints) for name, there in placed.items()]
-        links += self._carriers(placed, set(leading), links)
-        plan = RobotDescription(links, self.model.bodies.get(WORLD, NO_BODY), loops=self._loops)
-        simple = list(self._simple(found, approximation))
-        assign_limits(plan, simple, self.target.name, self.target.sums, self.target.one_way, self.refusals)
-        if approximation is not None and len(placed) == len(everywhere):
-            plan.errors = approximation.errors(placed, {n: self.model.frames[n].parent for n in placed})
-            self._check_errors(plan.errors)
-        self._remark()
-        plan.remarks = self.remarks
-        return plan
+        independent = self._independent_motions(chains)
+        links = [self._link(name, chain, independent, joints) for name, chain in chains.items()]
+        links += self._carrier_links(chains, set(independent), links)
+        description = RobotDescription(links, self.model.bodies.get(WORLD, NO_BODY), loops=self._loops)
+        simple = list(self._expressible_constraints(found, approximation))
+        assign_limits(description, simple, self.capabilities, self.unsupported)
+        if approximation is not None and len(chains) == len(decomposed):
+            parents = {n: self.model.frames[n].parent for n in chains}
+            description.errors = approximation.frame_deviations(chains, parents)
+            self._check_errors(description.errors)
+        self._add_remarks()
+        description.remarks = self.remarks
+        return description
 
-    def _simple(
+    def _expressible_constraints(
         self,
         found: Iterable[CoordinateLimit | SumLimit | NonlinearLimit],
         approximation: CurveApproximation | None,
     ) -> Iterator[CoordinateLimit | SumLimit]:
-        """Yield the constraints that can be said, without those that hold because of others."""
+        """Yield the limits that the format can represent, without those that others imply."""
         for item in found:
             if isinstance(item, NonlinearLimit):
                 curve = item.expression, item.lower, item.upper
-                if approximation is None or not approximation.implied(*curve):
-                    self.refusals.leave(item.name, item.reason)
+                if approximation is None or not approximation.is_implied(*curve):
+                    self.unsupported.leave_out(item.name, item.reason)
                 else:
                     self.remarks.append(f"'{item.name}' is not written: it holds within the other limits")
-            elif isinstance(item, SumLimit) or item.symbol.position not in self._lost:
+            elif isinstance(item, SumLimit) or item.symbol.position not in self._refused_symbols:
                 yield item
 
     def _check_errors(self, errors: Mapping[str, FrameDeviation]) -> None:
-        """Refuse the frame that is off most, if that is too much."""
+        """Refuse the frame with the largest pose error, if that exceeds the tolerance."""
         assert self._tolerance is not None
         worst = max(errors, key=lambda name: max(errors[name].position, errors[name].angle), default=None)
         if worst is None:
             return
         error = errors[worst]
         if error.position == math.inf:
-            self.refusals.add(
+            self.unsupported.refuse(
                 worst,
                 "is carried by something approximated, and a coordinate without limits takes it anywhere",
             )
         elif max(error.position, error.angle) > self._tolerance:
-            self.refusals.add(worst, f"would be off by up to {error}, and no less was found")
+            self.unsupported.refuse(worst, f"would be off by up to {error}, and no less was found")
 
-    def home(self) -> dict[Symbol, float]:
-        """Return where every coordinate is unless more is known, those that loops determine among them."""
+    def home_positions(self) -> dict[Symbol, float]:
+        """Return the home position of every coordinate, including those that depend on loops."""
         state = self.model.default_state()
         values = {s: state[s] for s in self._coordinates if s in state}
         for s in self._coordinates:
@@ -248,7 +272,7 @@ class LinkTreeBuilder:
         return values
 
     def resolve(self, expression: Expression) -> Expression:
-        """Return an expression of coordinates that depend on nothing, parameters at their values."""
+        """Return an expression in terms of independent coordinates, with the values of parameters."""
         expression = self._rates.resolve(expression)
         parameters = [s for s in expression.symbols if not s.has_derivative]
         for s in parameters:
@@ -256,17 +280,18 @@ class LinkTreeBuilder:
                 self._values[s] = as_expression(s.value)
                 self.remarks.append(f"the parameter '{s}' is written with its value {s.value!r}")
             elif s.value is None:
-                self.refusals.add(str(s), "is a parameter without a value")
+                self.unsupported.refuse(str(s), "is a parameter without a value")
         known = {s: self._values[s] for s in parameters if s in self._values}
         return apply_substitution(expression, known) if known else expression
 
-    def _placed(self, name: str, approximation: CurveApproximation | None) -> MotionChain | None:
-        """Return where a frame is in its parent; None if that is refused."""
+    def _decompose_frame(self, name: str, approximation: CurveApproximation | None) -> MotionChain | None:
+        """Return the transform of a frame from its parent as a motion chain; None if it is refused."""
         factors = [self._factor(f) for f in self.model.frames[name].factors]
-        follows = name in self._records and self.model.articulations[self._records[name]].follows is not None
+        record = self._articulation_of(name)
+        follows = record is not None and record.follows is not None
         if any(has_given_gradient(f) for f in factors if isinstance(f, Expression)):
-            self.refusals.add(name, "moves with a gradient that was given and is not the derivative")
-            self._lost.update(s for f in factors if isinstance(f, Expression) for s in f.symbols)
+            self.unsupported.refuse(name, "moves with a gradient that was given and is not the derivative")
+            self._refused_symbols.update(s for f in factors if isinstance(f, Expression) for s in f.symbols)
             return None
         try:
             found = decompose_transform(
@@ -276,28 +301,31 @@ class LinkTreeBuilder:
             self._refuse(name, factors, str(problem))
             return None
         if approximation is not None:
-            near = approximation.placing(name, found)
-            if isinstance(near, str):
-                self._refuse(name, factors, near)
+            approximated = approximation.approximate(name, found)
+            if isinstance(approximated, str):
+                self._refuse(name, factors, approximated)
                 return None
-            return near
-        for motion in found.moving:
+            return approximated
+        degree = self.capabilities.polynomial_degree
+        for motion in found.motions:
             if isinstance(motion, JointMotion) and (
-                motion.curved or len(motion.amount) > self.target.degree + 1
+                motion.is_curved or len(motion.coefficients) > degree + 1
             ):
-                verb, powers = "turns" if motion.turns else "slides", _POWERS[self.target.degree]
-                self._refuse(name, factors, f"{verb} by no {powers} of a coordinate")
-                self.refusals.curved = True
+                verb = "turns" if motion.is_rotation else "slides"
+                self._refuse(name, factors, f"{verb} by no {_POWERS[degree]} of a coordinate")
+                self.unsupported.curved = True
                 return None
         return found
 
     def _refuse(self, name: str, factors: Iterable[Pose | Expression], problem: str) -> None:
-        about = dict.fromkeys(s for f in factors if isinstance(f, Expression) for s in f.symbols)
-        self._lost.update(about)
-        moves = f"it moves with {', '.join(map(str, about))}" if about else "loops hold it where it is"
-        self.refusals.add(name, f"{problem}; {moves}")
+        """Refuse a frame, naming the symbols that move it."""
+        symbols = dict.fromkeys(s for f in factors if isinstance(f, Expression) for s in f.symbols)
+        self._refused_symbols.update(symbols)
+        moves = f"it moves with {', '.join(map(str, symbols))}" if symbols else "loops hold it where it is"
+        self.unsupported.refuse(name, f"{problem}; {moves}")
 
     def _factor(self, factor: Pose | Expression) -> Pose | Expression:
+        """Return a factor of a transform in terms of independent coordinates."""
         if isinstance(factor, Pose):
             return factor
         if isinstance(factor, OneAxisTransform):
@@ -309,60 +337,62 @@ class LinkTreeBuilder:
             )
         return self.resolve(factor)
 
-    def _leading(self, placed: Mapping[str, MotionChain]) -> dict[Symbol, tuple[str, int]]:
-        """Return for each coordinate the frame, and which of its motions, that is just this coordinate.
+    def _independent_motions(self, chains: Mapping[str, MotionChain]) -> dict[Symbol, tuple[str, int]]:
+        """Return for each coordinate the frame and the number of the motion whose position it is.
 
-        Of several, the one that is on record for it; for some there is none.
+        Of several motions, the one in the articulation of the coordinate is taken. Coordinates without such a
+        motion are missing.
         """
-        leading: dict[Symbol, tuple[str, int]] = {}
-        on_record: set[Symbol] = set()
-        for name, found in placed.items():
-            own = self._record(name)
-            for k, motion in enumerate(found.moving):
-                if not isinstance(motion, JointMotion) or motion.amount not in _WHOLE:
+        independent: dict[Symbol, tuple[str, int]] = {}
+        in_articulation: set[Symbol] = set()
+        for name, found in chains.items():
+            own = self._articulation_of(name)
+            for k, motion in enumerate(found.motions):
+                if not isinstance(motion, JointMotion) or motion.coefficients not in _UNIT_COEFFICIENTS:
                     continue
                 symbol = motion.variable.data
-                if symbol not in leading:
-                    leading[symbol] = name, k
-                if own is not None and symbol in own.coordinates and symbol not in on_record:
-                    leading[symbol] = name, k
-                    on_record.add(symbol)
-        return leading
+                if symbol not in independent:
+                    independent[symbol] = name, k
+                if own is not None and symbol in own.coordinates and symbol not in in_articulation:
+                    independent[symbol] = name, k
+                    in_articulation.add(symbol)
+        return independent
 
-    def _record(self, frame: str) -> Articulation | None:
-        name = self._records.get(frame)
+    def _articulation_of(self, frame: str) -> Articulation | None:
+        name = self._articulations.get(frame)
         return None if name is None else self.model.articulations[name]
 
     def _link(
-        self, name: str, found: MotionChain, leading: Mapping[Symbol, tuple[str, int]], joints: TakenNames
+        self, name: str, found: MotionChain, independent: Mapping[Symbol, tuple[str, int]], joints: TakenNames
     ) -> LinkDescription:
-        record = self._record(name)
-        label = self._records.get(name, name)
+        """Return the link of a frame, with a joint for each of its motions."""
+        record = self._articulation_of(name)
+        label = self._articulations.get(name, name)
         dynamics = dict(record.dynamics) if record is not None else {}
         follows = None
         if record is not None and record.follows is not None:
             position = self.resolve(record.follows)
             follows = Constraint(position, position, position).line
         made: list[JointDescription | BallJointDescription] = []
-        for k, motion in enumerate(found.moving):
+        for k, motion in enumerate(found.motions):
             if isinstance(motion, QuaternionMotion):
                 ball = next(n for n, q in self._quaternions.items() if q == motion.factor)
                 made.append(BallJointDescription(ball, motion.point))
                 continue
             symbol: Symbol = motion.variable.data
-            if leading.get(symbol) == (name, k):
-                axis = motion.axis if motion.amount == IDENTITY_COEFFICIENTS else _negative(motion.axis)
-                made.append(JointDescription(symbol.path, motion.turns, axis, motion.point, symbol))
+            if independent.get(symbol) == (name, k):
+                axis = motion.axis if motion.coefficients == IDENTITY_COEFFICIENTS else _negative(motion.axis)
+                made.append(JointDescription(symbol.path, motion.is_rotation, axis, motion.point, symbol))
                 continue
-            what = "turn" if motion.turns else "slide"
-            wishes = [label, name] if len(found.moving) == 1 else []
-            own = joints.take(*wishes, f"{label}/{what}")
-            axis, amount = motion.axis, motion.amount
-            opposite = tuple(-c for c in amount)
+            kind = "turn" if motion.is_rotation else "slide"
+            preferred = [label, name] if len(found.motions) == 1 else []
+            own = joints.take(*preferred, f"{label}/{kind}")
+            axis, coefficients = motion.axis, motion.coefficients
+            opposite = tuple(-c for c in coefficients)
             if follows is not None and follows == opposite[::-1]:
-                # Its own limits are on what is on record, so that is its position, and not the opposite.
-                axis, amount = _negative(axis), opposite
-            made.append(JointDescription(own, motion.turns, axis, motion.point, symbol, amount))
+                # The limits of an articulation are on the position that it states, not on the opposite one.
+                axis, coefficients = _negative(axis), opposite
+            made.append(JointDescription(own, motion.is_rotation, axis, motion.point, symbol, coefficients))
         given = _split_dynamics(dynamics, made)
         made = [replace(joint, dynamics=own) for joint, own in zip(made, given, strict=True)]
         body = self.model.bodies.get(name, NO_BODY)
@@ -371,39 +401,39 @@ class LinkTreeBuilder:
             name, self.model.frames[name].parent, found.pose, made, body, fixed, record is not None
         )
 
-    def _carriers(
+    def _carrier_links(
         self,
-        placed: Mapping[str, MotionChain],
-        leading: set[Symbol],
+        chains: Mapping[str, MotionChain],
+        independent: set[Symbol],
         links: list[LinkDescription],
     ) -> Iterator[LinkDescription]:
-        """Yield links that carry nothing, for coordinates that only others follow, or that move nothing."""
+        """Yield links without body, for coordinates that are the position of no joint yet."""
         frames = TakenNames([*self.model.frames, WORLD])
-        used = {s for found in placed.values() for s in _quaternion_coordinates(found)}
+        used = {s for found in chains.values() for s in _quaternion_coordinates(found)}
         first: dict[Symbol, tuple[str, JointMotion]] = {}
-        for name, found in placed.items():
-            for motion in found.moving:
+        for name, found in chains.items():
+            for motion in found.motions:
                 if isinstance(motion, JointMotion):
                     first.setdefault(motion.variable.data, (self.model.frames[name].parent, motion))
         for symbol in self._coordinates:
-            if symbol in leading or symbol in used or symbol in self._lost:
+            if symbol in independent or symbol in used or symbol in self._refused_symbols:
                 continue
-            parent, turns, axis = links[0].name if links else WORLD, True, (0.0, 0.0, 1.0)
+            parent, is_rotation, axis = links[0].name if links else WORLD, True, (0.0, 0.0, 1.0)
             if symbol in first:
                 parent, follower = first[symbol]
-                turns, axis = follower.turns, follower.axis
-            joint = JointDescription(symbol.path, turns, axis, (0.0, 0.0, 0.0), symbol)
+                is_rotation, axis = follower.is_rotation, follower.axis
+            joint = JointDescription(symbol.path, is_rotation, axis, (0.0, 0.0, 0.0), symbol)
             self.remarks.append(f"'{symbol}' has a link of its own that carries nothing")
             yield LinkDescription(
                 frames.take(symbol.path, f"{symbol.path}/carrier"), parent, np.eye(4), [joint]
             )
 
-    def _check_rates(self, placed: Mapping[str, MotionChain]) -> None:
-        """Leave out that coordinates move by the speeds of others, except quaternions that turn."""
-        fine = {s for found in placed.values() for s in _quaternion_coordinates(found)}
+    def _check_rates(self, chains: Mapping[str, MotionChain]) -> None:
+        """Leave out the relations between the speeds of coordinates, except those of quaternions."""
+        quaternions = {s for found in chains.values() for s in _quaternion_coordinates(found)}
         driven: dict[str, set[str]] = {}
         for coordinate, row in self._rates.items():
-            if coordinate in fine:
+            if coordinate in quaternions:
                 continue
             owner = next(
                 (n for n, r in self.model.articulations.items() if coordinate in r.coordinates),
@@ -413,11 +443,12 @@ class LinkTreeBuilder:
                 continue
             driven.setdefault(owner, set()).update(map(str, row))
         for owner, speeds in driven.items():
-            self.refusals.leave_out_speeds(
+            self.unsupported.leave_out_speeds(
                 owner, f"moves by speeds that are not its own, {', '.join(sorted(speeds))}"
             )
 
-    def _remark(self) -> None:
+    def _add_remarks(self) -> None:
+        """Add remarks on data and on names that are left out on request."""
         if self.model.data:
             names = list(self.model.data)
             more = f" and {len(names) - 4} more" if len(names) > 4 else ""
@@ -426,14 +457,16 @@ class LinkTreeBuilder:
             self.remarks.append(f"'{name}' is left out, as asked for")
 
 
-def _own_records(model: ModelView) -> Iterator[tuple[str, Articulation]]:
+def _non_loop_articulations(model: ModelView) -> Iterator[tuple[str, Articulation]]:
+    """Yield the names and records of all articulations but loops."""
     for name, record in model.articulations.items():
-        if record.kind not in LOOPS:
+        if record.kind not in LOOP_KINDS:
             yield name, record
 
 
 def _quaternion_coordinates(found: MotionChain) -> Iterator[Symbol]:
-    for motion in found.moving:
+    """Yield the coordinates of all quaternions in a motion chain."""
+    for motion in found.motions:
         if isinstance(motion, QuaternionMotion):
             yield from motion.factor.symbols
 
@@ -441,7 +474,7 @@ def _quaternion_coordinates(found: MotionChain) -> Iterator[Symbol]:
 def _split_dynamics(
     dynamics: dict[str, object], joints: list[JointDescription | BallJointDescription]
 ) -> list[dict[str, object]]:
-    """Return what is known of each joint: all of it of a single one, else what bears its last name."""
+    """Return the dynamics of each joint: all of them for a single joint, else those under its last name."""
     if len(joints) == 1:
         return [dynamics]
     result = []

@@ -1,8 +1,8 @@
 """Minimax polynomial fits (Remez exchange) with certified error bounds.
 
-The polynomial is found by Remez' exchange on samples. Its error is then bounded without samples: over each
-interval the series of the difference is known, by interval arithmetic, and intervals are halved where the
-bound is not yet close to the largest error that occurs.
+Remez' exchange algorithm finds the polynomial on samples. Interval arithmetic then bounds its error
+everywhere: the Taylor series of the difference encloses it on each interval, and intervals are halved until
+the bound is close to the largest error at a point.
 """
 
 from __future__ import annotations
@@ -30,22 +30,24 @@ from kineverse.intervals.taylor import TaylorSeries, taylor_polynomial, taylor_s
 
 Matrix = npt.NDArray[np.float64]
 SeriesCurve = Callable[[RealInterval], TaylorSeries]
-"""The series of a function over an interval."""
+"""Function that returns the Taylor series of a curve over an interval."""
 
 SAMPLE_COUNT = 257
 _CLOSE = 1.05
+"""Ratio of the error bound to the largest sampled error at which the bound is close enough."""
 _NEGLIGIBLE = 1e-3
-"""What part of the tolerance need not be made sure of any further."""
-_MOST_INTERVALS = 1000
-_HALVINGS = 4
+"""Part of the tolerance within which the bound is close enough."""
+_MAX_INTERVALS = 1000
+_MAX_HALVINGS = 4
+_MAX_EXCHANGES = 40
 
 
 @dataclass(frozen=True)
 class MinimaxFit:
-    """A polynomial in place of a curve over an interval.
+    """Polynomial approximation of a curve over an interval.
 
-    ``error`` is certain to be no less than the largest difference, ``sampled`` the largest that was met, and
-    ``largest`` bounds the amount of the polynomial itself.
+    ``error`` is a certified upper bound of the largest difference, ``sampled`` the largest difference at a
+    sampled point. ``largest`` bounds the magnitude of the polynomial.
     """
 
     polynomial: Coefficients
@@ -55,37 +57,37 @@ class MinimaxFit:
 
 
 def chebyshev_points(lower: float, upper: float) -> Matrix:
-    """Return points that lie closer together towards the ends, where errors of polynomials are largest."""
+    """Return the Chebyshev points of an interval, which are closer together towards its ends."""
     angles = np.linspace(np.pi, 0, SAMPLE_COUNT)
     return (lower + upper) / 2 + (upper - lower) / 2 * np.cos(angles)
 
 
 def fit_polynomial(
-    curve: SeriesCurve, values: Matrix, lower: float, upper: float, degree: int, enough: float
+    curve: SeriesCurve, values: Matrix, lower: float, upper: float, degree: int, tolerance: float
 ) -> MinimaxFit:
-    """Return the best polynomial of a degree for a curve.
+    """Return the minimax polynomial of a curve.
 
     Parameters
     ----------
     curve
-        The curve, enclosed.
+        Taylor series of the curve over intervals.
     values
-        What it is worth at :func:`chebyshev_points`.
+        Values of the curve at :func:`chebyshev_points`.
     lower, upper
         The interval.
     degree
-        Of the polynomial.
-    enough
-        An error larger than this is not bounded from above any more: it is too large for certain.
+        Degree of the polynomial.
+    tolerance
+        Largest acceptable error. If a sample exceeds it, the error is not bounded and returned as infinite.
     """
     x = chebyshev_points(lower, upper)
     polynomial = _remez(x, values, lower, upper, degree)
     found = np.polynomial.polynomial.polyval(x, polynomial)
     sampled = float(np.abs(found - values).max())
     largest = float(np.abs(values).max()) + sampled
-    if sampled > enough:
+    if sampled > tolerance:
         return MinimaxFit(polynomial, math.inf, sampled, largest)
-    error = bound_error(curve, polynomial, lower, upper, sampled, _NEGLIGIBLE * enough)
+    error = bound_error(curve, polynomial, lower, upper, sampled, _NEGLIGIBLE * tolerance)
     extent = enclose_curve(lambda where: taylor_polynomial(polynomial, taylor_variable(where)), lower, upper)
     return MinimaxFit(polynomial, error, sampled, max(abs(extent[0]), abs(extent[1])))
 
@@ -98,7 +100,7 @@ def bound_error(
     sampled: float,
     negligible: float,
 ) -> float:
-    """Return a number that |curve - polynomial| exceeds nowhere in an interval, close to the least such."""
+    """Return an upper bound of |curve - polynomial| over an interval, close to the least one."""
 
     def difference(where: RealInterval) -> TaylorSeries:
         return taylor_subtract(curve(where), taylor_polynomial(polynomial, taylor_variable(where)))
@@ -110,28 +112,28 @@ def bound_error(
         sampled = max(sampled, -here[0][1], here[0][0])
         return -_size(_evaluate_series(here, around, low, high)), low, high
 
-    waiting = [entry(lower, upper)]
-    while len(waiting) < _MOST_INTERVALS:
-        worst, low, high = waiting[0]
+    heap = [entry(lower, upper)]
+    while len(heap) < _MAX_INTERVALS:
+        worst, low, high = heap[0]
         middle = (low + high) / 2
         if -worst <= max(_CLOSE * sampled, sampled + negligible) or not low < middle < high:
             break
-        heapq.heapreplace(waiting, entry(low, middle))
-        heapq.heappush(waiting, entry(middle, high))
-    return -waiting[0][0]
+        heapq.heapreplace(heap, entry(low, middle))
+        heapq.heappush(heap, entry(middle, high))
+    return -heap[0][0]
 
 
 def enclose_curve(curve: SeriesCurve, lower: float, upper: float, pieces: int = 32) -> RealInterval:
-    """Return between which numbers a curve lies over an interval, in pieces as short as they have to be."""
+    """Return a range that contains a curve over an interval, from pieces that are halved if need be."""
     ends = np.linspace(lower, upper, pieces + 1).tolist()
-    waiting = [(low, high, _HALVINGS) for low, high in itertools.pairwise(ends)]
+    stack = [(low, high, _MAX_HALVINGS) for low, high in itertools.pairwise(ends)]
     result: RealInterval | None = None
-    while waiting:
-        low, high, more = waiting.pop()
+    while stack:
+        low, high, halvings = stack.pop()
         middle = (low + high) / 2
         here = _evaluate_series(curve((middle, middle)), curve((low, high)), low, high)
-        if more and not math.isfinite(here[1] - here[0]):
-            waiting += [(low, middle, more - 1), (middle, high, more - 1)]
+        if halvings and not math.isfinite(here[1] - here[0]):
+            stack += [(low, middle, halvings - 1), (middle, high, halvings - 1)]
             continue
         result = here if result is None else interval_hull(result, here)
     assert result is not None
@@ -139,7 +141,11 @@ def enclose_curve(curve: SeriesCurve, lower: float, upper: float, pieces: int = 
 
 
 def _evaluate_series(here: TaylorSeries, around: TaylorSeries, low: float, high: float) -> RealInterval:
-    """Return the range over an interval, by the series in its middle and the last coefficient all over it."""
+    """Return a range of a function over an interval by Taylor's theorem.
+
+    ``here`` is the series at the midpoint, ``around`` that over the interval, whose last coefficient bounds
+    the remainder.
+    """
     value, count = around[0], min(len(here), len(around))
     if count == 1:
         return value
@@ -161,12 +167,12 @@ def _size(a: RealInterval) -> float:
 
 
 def _remez(x: Matrix, y: Matrix, lower: float, upper: float, degree: int) -> Coefficients:
-    """Return the polynomial with the least largest error at points, by exchanging where that is reached."""
+    """Return the minimax polynomial on points by Remez' exchange of the reference points."""
     t = (2 * x - lower - upper) / (upper - lower)
     basis = np.polynomial.chebyshev.chebvander(t, degree)
     chosen = np.linspace(0, len(x) - 1, degree + 2).round().astype(int)
     best, least = np.zeros(degree + 1), np.inf
-    for _ in range(40):
+    for _ in range(_MAX_EXCHANGES):
         signs = (-1.0) ** np.arange(degree + 2)
         solution = np.linalg.solve(np.column_stack([basis[chosen], signs]), y[chosen])
         coefficients, level = solution[:-1], abs(solution[-1])
@@ -175,10 +181,10 @@ def _remez(x: Matrix, y: Matrix, lower: float, upper: float, degree: int) -> Coe
             best, least = coefficients, float(np.abs(error).max())
         if np.abs(error).max() <= 1.0001 * level + 1e-15:
             break
-        # One point of each stretch on which the error keeps its sign: that at which it is largest.
-        turns = np.flatnonzero(np.diff(np.sign(error))) + 1
+        # The largest error of each stretch on which the error keeps its sign.
+        sign_changes = np.flatnonzero(np.diff(np.sign(error))) + 1
         peaks = np.array(
-            [s[np.argmax(np.abs(error[s]))] for s in np.split(np.arange(len(x)), turns) if len(s)]
+            [s[np.argmax(np.abs(error[s]))] for s in np.split(np.arange(len(x)), sign_changes) if len(s)]
         )
         if len(peaks) < degree + 2:
             break

@@ -1,8 +1,8 @@
 """Trigonometric polynomials: a normal form in which transforms are compared exactly.
 
-Rotations by multiples of coordinates, and all products of them with translations along multiples of
-coordinates, are made of terms c · x^n · exp(i w·x). Written so, two of them are equal if and only if their
-coefficients are, sin² + cos² is 1, and derivatives are as easy as sums.
+Products of rotations and translations by multiples of coordinates are sums of terms c · x^n · exp(i w·x). In
+this form, two of them are equal if and only if their coefficients are, sin² + cos² is 1, and derivatives are
+as easy as sums.
 """
 
 from __future__ import annotations
@@ -17,31 +17,31 @@ import casadi as ca
 from kineverse.intervals.graph import Term
 
 Exponents: TypeAlias = tuple[tuple[int, float], ...]
-"""Pairs of a variable and how often it occurs: its power, or the frequency of its wave; sorted."""
+"""Pairs of a variable and its exponent: a power n, or a frequency w; sorted."""
 
 NOISE = 1e-14
-"""What is left of a coefficient by rounding, of a motion in [m] and [rad], is this at most."""
-_MOST_TERMS = 300
+"""Largest rounding error of a coefficient, in motions in [m] and [rad]."""
+_MAX_TERMS = 300
 
 
 class TooManyTermsError(Exception):
-    """A product has more terms than are looked at; no user ever sees it."""
+    """A product with too many terms; never raised to users."""
 
 
 @dataclass(frozen=True)
 class TrigPolynomial:
-    """A sum of coefficients · powers · waves; variables are numbered by the terms that they are."""
+    """Sum of terms c · x^n · exp(i w·x); a variable is the index of its term in the graph."""
 
     terms: Mapping[tuple[Exponents, Exponents], complex]
 
     @staticmethod
     def constant(number: float) -> TrigPolynomial:
-        """Return a number."""
+        """Return a constant polynomial."""
         return TrigPolynomial({((), ()): complex(number)} if number else {})
 
     @staticmethod
     def variable(index: int) -> TrigPolynomial:
-        """Return a variable."""
+        """Return the polynomial of a variable."""
         return TrigPolynomial({(((index, 1.0),), ()): 1.0 + 0.0j})
 
     def __add__(self, other: TrigPolynomial) -> TrigPolynomial:
@@ -51,17 +51,17 @@ class TrigPolynomial:
         return _drop_noise(total)
 
     def __neg__(self) -> TrigPolynomial:
-        return self.scaled(-1.0)
+        return self.scale(-1.0)
 
     def __sub__(self, other: TrigPolynomial) -> TrigPolynomial:
         return self + (-other)
 
-    def scaled(self, factor: complex) -> TrigPolynomial:
-        """Return a multiple."""
+    def scale(self, factor: complex) -> TrigPolynomial:
+        """Return the product with a number."""
         return TrigPolynomial({key: factor * c for key, c in self.terms.items()})
 
     def __mul__(self, other: TrigPolynomial) -> TrigPolynomial:
-        if len(self.terms) * len(other.terms) > _MOST_TERMS**2:
+        if len(self.terms) * len(other.terms) > _MAX_TERMS**2:
             raise TooManyTermsError
         total: dict[tuple[Exponents, Exponents], complex] = {}
         for (p, w), c in self.terms.items():
@@ -72,14 +72,17 @@ class TrigPolynomial:
 
     @property
     def number(self) -> float | None:
-        """The constant that it is; None if it is none."""
+        """Value of a constant polynomial; None if it is not constant."""
         if all(key == ((), ()) for key in self.terms):
             return self.terms.get(((), ()), 0j).real
         return None
 
     @property
     def polynomials(self) -> tuple[dict[int, tuple[float, ...]], float] | None:
-        """Coefficients by variable, of its first power on, and the constant; None if it is no such sum."""
+        """Coefficients of a sum of polynomials of one variable each; None if it is no such sum.
+
+        By variable, from the first power on, and the constant.
+        """
         powers: dict[int, dict[int, float]] = {}
         offset = 0.0
         for (factors, waves), c in self.terms.items():
@@ -96,8 +99,8 @@ class TrigPolynomial:
         }, offset
 
     @property
-    def line(self) -> tuple[dict[int, float], float] | None:
-        """Slopes by variable, and the constant, of a sum of multiples; None for anything else."""
+    def affine(self) -> tuple[dict[int, float], float] | None:
+        """Slopes by variable, and the constant, of an affine function; None for any other."""
         found = self.polynomials
         if found is None or any(len(coefficients) > 1 for coefficients in found[0].values()):
             return None
@@ -105,20 +108,20 @@ class TrigPolynomial:
 
     @property
     def variables(self) -> set[int]:
-        """The variables that occur."""
+        """Variables of the polynomial."""
         return {index for key in self.terms for part in key for index, _ in part}
 
-    def wave(self) -> TrigPolynomial | None:
-        """Return exp(i·x) of a sum of multiples x; None for anything else."""
-        line = self.line
-        if line is None:
+    def exponential(self) -> TrigPolynomial | None:
+        """Return exp(i·x) of an affine function x; None for any other."""
+        affine = self.affine
+        if affine is None:
             return None
-        slopes, offset = line
+        slopes, offset = affine
         frequencies = tuple(sorted((index, w) for index, w in slopes.items() if w))
         return TrigPolynomial({((), frequencies): cmath.exp(1j * offset)})
 
     def derivative(self, index: int) -> TrigPolynomial:
-        """Return the partial derivative by a variable."""
+        """Return the partial derivative with respect to a variable."""
         total: dict[tuple[Exponents, Exponents], complex] = {}
         for (powers, waves), c in self.terms.items():
             w, n = dict(waves).get(index, 0.0), dict(powers).get(index, 0.0)
@@ -129,8 +132,8 @@ class TrigPolynomial:
                 total[key] = total.get(key, 0.0) + n * c
         return _drop_noise(total)
 
-    def at_zero(self, index: int) -> TrigPolynomial:
-        """Return what is left where a variable is 0."""
+    def substitute_zero(self, index: int) -> TrigPolynomial:
+        """Return the polynomial at the value 0 of a variable."""
         total: dict[tuple[Exponents, Exponents], complex] = {}
         for (powers, waves), c in self.terms.items():
             if index not in dict(powers):
@@ -140,37 +143,38 @@ class TrigPolynomial:
 
 
 class TrigPolynomialConverter:
-    """Turns steps of a graph into sums of powers and waves; what is neither becomes a variable.
+    """Converter of term graphs to trigonometric polynomials; any other term becomes a variable.
 
-    With ``angles``, so does what is inside of a sine or cosine and is no sum of multiples.
+    With ``angles``, so does the argument of a sine or cosine that is not affine.
     """
 
     def __init__(self, angles: bool = False) -> None:
         self._angles = angles
-        self._known: dict[int, TrigPolynomial] = {}
+        self._converted: dict[int, TrigPolynomial] = {}
         self.variables: dict[int, Term] = {}
 
-    def of(self, term: Term) -> TrigPolynomial:
-        """Return a step; its arguments are looked at first, however deep they are."""
-        waiting = [term]
-        while waiting:
-            last = waiting[-1]
-            missing = [a for a in last.args if a.index not in self._known]
+    def convert(self, term: Term) -> TrigPolynomial:
+        """Convert a term after its arguments, iteratively, whatever the depth."""
+        stack = [term]
+        while stack:
+            last = stack[-1]
+            missing = [a for a in last.args if a.index not in self._converted]
             if missing:
-                waiting += missing
+                stack += missing
                 continue
-            waiting.pop()
-            if last.index not in self._known:
-                found = self._step(last, [self._known[a.index] for a in last.args])
-                self._known[last.index] = self._variable(last) if found is None else found
-        return self._known[term.index]
+            stack.pop()
+            if last.index not in self._converted:
+                found = self._convert_term(last, [self._converted[a.index] for a in last.args])
+                self._converted[last.index] = self._variable(last) if found is None else found
+        return self._converted[term.index]
 
     def _variable(self, term: Term) -> TrigPolynomial:
+        """Return the polynomial of a term that becomes a variable."""
         self.variables[term.index] = term
         return TrigPolynomial.variable(term.index)
 
-    def _step(self, term: Term, args: list[TrigPolynomial]) -> TrigPolynomial | None:
-        """Return the sum that a step is, None if it is none."""
+    def _convert_term(self, term: Term, args: list[TrigPolynomial]) -> TrigPolynomial | None:
+        """Return the polynomial of a term from those of its arguments; None if it is none."""
         op = term.op
         if op == ca.OP_CONST:
             return TrigPolynomial.constant(term.data)
@@ -184,11 +188,11 @@ class TrigPolynomialConverter:
             return args[0] * args[1]
         if op == ca.OP_DIV:
             divisor = args[1].number
-            return args[0].scaled(1.0 / divisor) if divisor else None
+            return args[0].scale(1.0 / divisor) if divisor else None
         if op in (ca.OP_SIN, ca.OP_COS):
-            wave = args[0].wave()
+            wave = args[0].exponential()
             if wave is None and self._angles:
-                wave = self._variable(term.args[0]).wave()
+                wave = self._variable(term.args[0]).exponential()
             return None if wave is None else _real_part(wave, op == ca.OP_SIN)
         if op == ca.OP_POW:
             power = args[1].number
@@ -202,15 +206,16 @@ class TrigPolynomialConverter:
 
 
 def _real_part(wave: TrigPolynomial, sine: bool) -> TrigPolynomial:
-    """Return the real part of exp(i x), or its imaginary part."""
+    """Return cos(x), the real part of the wave exp(i x), or sin(x), its imaginary part."""
     ((powers, frequencies), c) = next(iter(wave.terms.items()))
-    back = tuple((index, -w) for index, w in frequencies)
+    opposite = tuple((index, -w) for index, w in frequencies)
     half = -0.5j if sine else 0.5
     first = TrigPolynomial({(powers, frequencies): half * c})
-    return first + TrigPolynomial({(powers, back): half.conjugate() * c.conjugate()})
+    return first + TrigPolynomial({(powers, opposite): half.conjugate() * c.conjugate()})
 
 
 def _multiply_exponents(a: Exponents, b: Exponents) -> Exponents:
+    """Return the exponents of a product: the sums of the exponents of its factors."""
     if not a or not b:
         return a or b
     total = dict(a)
@@ -220,6 +225,7 @@ def _multiply_exponents(a: Exponents, b: Exponents) -> Exponents:
 
 
 def _drop_noise(terms: Mapping[tuple[Exponents, Exponents], complex]) -> TrigPolynomial:
-    if len(terms) > _MOST_TERMS:
+    """Return a polynomial without the coefficients that are rounding errors."""
+    if len(terms) > _MAX_TERMS:
         raise TooManyTermsError
     return TrigPolynomial({key: c for key, c in terms.items() if abs(c) > NOISE})

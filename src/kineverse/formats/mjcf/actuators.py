@@ -9,9 +9,9 @@ from .mujoco_api import mujoco
 
 
 def joint_efforts(spec: Any) -> dict[str, float]:
-    """Return the largest force [N] or torque [N m] of actuators on each joint, by its name.
+    """Return the largest force [N] or torque [N m] of all actuators on each joint, by joint name.
 
-    A joint with an actuator of unknown strength is not in there: controllers decide that.
+    Joints with an actuator whose strength depends on its controller are missing.
     """
     engine = mujoco()
     direct = (engine.mjtTrn.mjTRN_JOINT, engine.mjtTrn.mjTRN_JOINTINPARENT)
@@ -24,6 +24,7 @@ def joint_efforts(spec: Any) -> dict[str, float]:
 
 
 def _strength(actuator: Any) -> float:
+    """Return the largest force of an actuator; infinite if its controller decides it."""
     engine = mujoco()
     if _limited(actuator.forcelimited, actuator.forcerange):
         return _largest(actuator.forcerange)
@@ -38,9 +39,11 @@ def _strength(actuator: Any) -> float:
 
 
 def _limited(flag: Any, limits: Any) -> bool:
+    """Return True if MuJoCo applies a range."""
     kinds = mujoco().mjtLimited
     return bool(flag == kinds.mjLIMITED_TRUE or (flag == kinds.mjLIMITED_AUTO and limits[0] < limits[1]))
 
 
 def _largest(limits: Any) -> float:
+    """Return the largest magnitude in a range."""
     return max(abs(float(limits[0])), abs(float(limits[1])))

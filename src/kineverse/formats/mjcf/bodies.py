@@ -13,7 +13,7 @@ from kineverse.formats.poses import IDENTITY, is_identity
 from kineverse.formats.xml_reader import quote
 from kineverse.model.body import Vector3
 
-from .compile import CompiledMjcf, ElementNote
+from .compile import CompiledMjcf
 from .description import (
     COORDINATE_SUFFIXES,
     WORLD,
@@ -23,23 +23,23 @@ from .description import (
     MjcfLink,
     MjcfSite,
 )
-from .elements import MjcfElement
+from .elements import ElementRemark, MjcfElement
 from .mujoco_api import mujoco
 from .shapes import MjcfShapes, mujoco_pose
 
 FREE_JOINT = "free"
-"""What the name of the free motion of a mocap body has behind that of the body."""
+"""Last part of the name of a mocap body's free joint, after the name of the body."""
 
 
 class MjcfBodies:
-    """The bodies of a model, with their names.
+    """Bodies, joints and sites of a compiled model, with unique names.
 
     Attributes
     ----------
     links, sites
-        What was read.
+        Links and sites of the description.
     body_names, joint_names, site_names
-        By the numbers that they have in the model.
+        Names by number in the ``MjModel``.
     """
 
     def __init__(
@@ -47,7 +47,7 @@ class MjcfBodies:
         compiled: CompiledMjcf,
         shapes: MjcfShapes,
         source: str,
-        note: ElementNote,
+        remark: ElementRemark,
         mend: NameFaultHandler,
     ) -> None:
         self._model, self._source, self._shapes = compiled.model, source, shapes
@@ -55,59 +55,64 @@ class MjcfBodies:
         self._custom, self._bound = compiled.prepared.custom, float(compiled.spec.compiler.boundmass)
         model, spec = compiled.model, compiled.spec
         if self._home is not None and len(self._home) != model.nq:
-            note(None, 'the key "home" does not fit the joints that are read, and is left out.')
+            remark(None, 'the key "home" does not fit the joints that are read, and is left out.')
             self._home = None
         self._body_nodes = compiled.nodes(spec.bodies)
-        # Of a <freejoint>, MuJoCo does not know the line.
+        # MuJoCo has no line number of a <freejoint>.
         self._joint_nodes = {
             number: node or self._body_nodes[int(model.jnt_bodyid[number])]
             for number, node in compiled.nodes(spec.joints).items()
         }
         self._site_nodes = compiled.nodes(spec.sites)
-        self._frames = UniqueNames(mend, WORLD)
-        self._movers = UniqueNames(mend)
-        self.body_names = self._named_bodies()
-        self.joint_names = self._named_joints()
+        self._unique_frames = UniqueNames(mend, WORLD)
+        self._unique_joints = UniqueNames(mend)
+        self.body_names = self._name_bodies()
+        self.joint_names = self._name_joints()
         joints: dict[int, list[MjcfJoint]] = {}
         for number in range(model.njnt):
             joints.setdefault(int(model.jnt_bodyid[number]), []).append(self._joint(number))
         for number in range(model.nbody):
             if model.body_mocapid[number] >= 0:
-                joints[number] = [self._handle(number)]
+                joints[number] = [self._mocap_joint(number)]
         self.links = tuple(self._link(number, tuple(joints.get(number, ()))) for number in range(model.nbody))
-        self.site_names = self._named_sites()
+        self.site_names = self._name_sites()
         self.sites = tuple(self._site(k) for k in range(model.nsite) if not self.is_closure_site(k))
 
     def is_closure_site(self, site: int) -> bool:
-        """Whether a site is only there to say where its body is tied, which is at its origin."""
+        """Return True if a site only marks the end of a loop closure at the origin of its body."""
         m = self._model
         pose = mujoco_pose(m.site_pos[site], m.site_quat[site])
         return drop_empty_parts(m.site(site).name) in self._custom.ends and is_identity(pose)
 
     def _where(self, node: MjcfElement | None) -> str:
+        """Return the place of an element for messages."""
         return self._source if node is None else node.where
 
-    def _named_bodies(self) -> list[str]:
+    def _name_bodies(self) -> list[str]:
+        """Return the names of all bodies; those without name are numbered below their parent."""
         m = self._model
         names = [WORLD, *[""] * (m.nbody - 1)]
         nameless: dict[int, int] = {}
         for number in range(1, m.nbody):
             if m.body(number).name:
-                names[number] = self._frames.take(m.body(number).name, self._where(self._body_nodes[number]))
+                names[number] = self._unique_frames.take(
+                    m.body(number).name, self._where(self._body_nodes[number])
+                )
         for number in range(1, m.nbody):
             if not names[number]:
                 parent = int(m.body_parentid[number])
                 count = nameless[parent] = nameless.get(parent, -1) + 1
                 name = f"body{count}" if parent == 0 else f"{names[parent]}/body{count}"
-                names[number] = self._frames.invent(name, self._where(self._body_nodes[number]))
+                names[number] = self._unique_frames.invent(name, self._where(self._body_nodes[number]))
         return names
 
-    def _named_joints(self) -> list[str]:
+    def _name_joints(self) -> list[str]:
+        """Return the names of all joints; those without name are named after their body."""
         m = self._model
         names = [""] * m.njnt
         for number in range(m.njnt):
             if m.joint(number).name:
-                names[number] = self._movers.take(
+                names[number] = self._unique_joints.take(
                     m.joint(number).name, self._where(self._joint_nodes[number])
                 )
         nameless: dict[int, list[int]] = {}
@@ -117,7 +122,7 @@ class MjcfBodies:
         for body, numbers in nameless.items():
             for count, number in enumerate(numbers):
                 name = self.body_names[body] + ("" if len(numbers) == 1 else f"/joint{count}")
-                names[number] = self._movers.invent(name, self._where(self._joint_nodes[number]))
+                names[number] = self._unique_joints.invent(name, self._where(self._joint_nodes[number]))
         kinds = {int(mujoco().mjtJoint.mjJNT_BALL): "ball", int(mujoco().mjtJoint.mjJNT_FREE): "free"}
         for number in range(m.njnt):
             kind: MjcfJointType = kinds.get(int(m.jnt_type[number]), "hinge")  # type: ignore[assignment]  # as above
@@ -125,14 +130,15 @@ class MjcfBodies:
             clash = [
                 f"{name}/{suffix}"
                 for suffix in COORDINATE_SUFFIXES[kind]
-                if f"{name}/{suffix}" in self._movers
+                if f"{name}/{suffix}" in self._unique_joints
             ]
             if clash:
                 problem = f"its coordinate would be called {quote(clash[0])} here, as a joint is. Rename one"
-                names[number] = self._movers.replace(f"{name}_joint", where, problem)
+                names[number] = self._unique_joints.replace(f"{name}_joint", where, problem)
         return names
 
-    def _named_sites(self) -> list[str]:
+    def _name_sites(self) -> list[str]:
+        """Return the names of all sites; those without name are numbered below their body."""
         m = self._model
         names = [""] * m.nsite
         nameless: dict[int, int] = {}
@@ -142,13 +148,14 @@ class MjcfBodies:
                 names[number] = self.body_names[body]
             elif m.site(number).name:
                 name = drop_empty_parts(m.site(number).name)
-                names[number] = self._frames.invent(name, where, f"{name}_site")
+                names[number] = self._unique_frames.invent(name, where, f"{name}_site")
             else:
                 count = nameless[body] = nameless.get(body, -1) + 1
-                names[number] = self._frames.invent(f"{self.body_names[body]}/site{count}", where)
+                names[number] = self._unique_frames.invent(f"{self.body_names[body]}/site{count}", where)
         return names
 
     def _link(self, number: int, joints: tuple[MjcfJoint, ...]) -> MjcfLink:
+        """Return the link of a body."""
         m, name = self._model, self.body_names[number]
         body = self._shapes.body(number)
         if name in self._custom.massless and m.body_mass[number] <= self._bound:
@@ -163,6 +170,7 @@ class MjcfBodies:
         )
 
     def _site(self, number: int) -> MjcfSite:
+        """Return the site of a number."""
         m = self._model
         return MjcfSite(
             self.site_names[number],
@@ -171,13 +179,14 @@ class MjcfBodies:
             self._where(self._site_nodes[number]),
         )
 
-    def _handle(self, number: int) -> MjcfJoint:
-        """Return the free motion of a mocap body, which users and programs move as they like."""
+    def _mocap_joint(self, number: int) -> MjcfJoint:
+        """Return the free joint of a mocap body, whose pose programs set."""
         where = self._where(self._body_nodes[number])
-        name = self._movers.invent(f"{self.body_names[number]}/{FREE_JOINT}", where)
+        name = self._unique_joints.invent(f"{self.body_names[number]}/{FREE_JOINT}", where)
         return MjcfJoint(name, "free", self.body_names[number], home=(0.0,) * 6 + (1.0,), where=where)
 
     def _joint(self, number: int) -> MjcfJoint:
+        """Return the joint of a number, with limits, home position and dynamics."""
         m, kinds = self._model, mujoco().mjtJoint
         kind: MjcfJointType = {
             int(kinds.mjJNT_HINGE): "hinge",
@@ -192,62 +201,64 @@ class MjcfBodies:
         return MjcfJoint(
             name,
             kind,
-            self._frames.invent(name, where, f"{name}_joint"),
+            self._unique_frames.invent(name, where, f"{name}_joint"),
             _vector(m.jnt_axis[number]),
             _vector(m.jnt_pos[number]) if kind in ("hinge", "ball") else (0.0, 0.0, 0.0),
             float(m.qpos0[address]) if kind in ("hinge", "slide") else 0.0,
             lower,
             upper,
             self._custom.speeds.get(name),
-            self._values(number, kind, address),
+            self._home_position(number, kind, address),
             self._dynamics(number, kind),
             where,
         )
 
-    def _values(self, number: int, kind: MjcfJointType, address: int) -> tuple[float, ...]:
-        """Return the coordinates of a joint at home."""
+    def _home_position(self, number: int, kind: MjcfJointType, address: int) -> tuple[float, ...]:
+        """Return the coordinates of a joint at its home position."""
         m, engine = self._model, mujoco()
-        given = m.qpos0 if self._home is None else self._home
+        qpos = m.qpos0 if self._home is None else self._home
         if kind in ("hinge", "slide"):
-            return (float(given[address]),)
+            return (float(qpos[address]),)
         if kind == "ball":
-            w, x, y, z = self._turn(given[address : address + 4]).tolist()
+            w, x, y, z = self._unit_quaternion(qpos[address : address + 4]).tolist()
             return x, y, z, w
-        # The joint's own coordinates begin where the body is in the file, MuJoCo's at the origin.
-        rest, pose = m.qpos0[address : address + 7], given[address : address + 7]
-        back, turn, offset = np.zeros(4), np.zeros(4), np.zeros(3)
-        engine.mju_negQuat(back, rest[3:])
-        engine.mju_mulQuat(turn, back, self._turn(pose[3:]))
-        engine.mju_rotVecQuat(offset, pose[:3] - rest[:3], back)
-        w, x, y, z = turn.tolist()
+        # The model's coordinates are relative to the pose of the body in the file, MuJoCo's to the world.
+        rest, pose = m.qpos0[address : address + 7], qpos[address : address + 7]
+        inverse, rotation, offset = np.zeros(4), np.zeros(4), np.zeros(3)
+        engine.mju_negQuat(inverse, rest[3:])
+        engine.mju_mulQuat(rotation, inverse, self._unit_quaternion(pose[3:]))
+        engine.mju_rotVecQuat(offset, pose[:3] - rest[:3], inverse)
+        w, x, y, z = rotation.tolist()
         return *offset.tolist(), x, y, z, w
 
-    def _turn(self, wxyz: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
-        """Return a quaternion of length one, as MuJoCo makes it: one without length turns nothing."""
+    def _unit_quaternion(self, wxyz: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+        """Return a normalized quaternion; one of length zero is the identity, as in MuJoCo."""
         unit = np.array(wxyz, dtype=float)
         mujoco().mju_normalize4(unit)
         return unit
 
     def _dynamics(self, number: int, kind: MjcfJointType) -> MjcfDynamics:
+        """Return the dynamics of a joint that are not zero."""
         m = self._model
         dof = int(m.jnt_dofadr[number])
         strength = self._efforts.get(m.joint(number).name) if kind in ("hinge", "slide") else None
         if m.jnt_actfrclimited[number]:
-            own = float(np.abs(m.jnt_actfrcrange[number]).max())
-            strength = own if strength is None else min(own, strength)
+            largest = float(np.abs(m.jnt_actfrcrange[number]).max())
+            strength = largest if strength is None else min(largest, strength)
         stiffness = float(m.jnt_stiffness[number])
-        springs = stiffness and kind in ("hinge", "slide")
+        has_spring = stiffness and kind in ("hinge", "slide")
         values = {
             "effort": strength,
             "damping": float(m.dof_damping[dof]) or None,
             "friction": float(m.dof_frictionloss[dof]) or None,
             "armature": float(m.dof_armature[dof]) or None,
             "spring_stiffness": stiffness or None,
-            "spring_reference": float(m.qpos_spring[int(m.jnt_qposadr[number])]) if springs else None,
+            "spring_reference": float(m.qpos_spring[int(m.jnt_qposadr[number])]) if has_spring else None,
         }
         return tuple((key, value) for key, value in values.items() if value is not None)
 
 
 def _vector(numbers: Any) -> Vector3:
+    """Return three numbers as a tuple."""
     x, y, z = map(float, numbers)
     return x, y, z

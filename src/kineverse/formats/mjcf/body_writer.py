@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from kineverse.errors import FormatError, MissingDependencyError
-from kineverse.formats.export.mesh_paths import RemarkCallback, find_file, path_to
+from kineverse.formats.export.mesh_paths import RemarkCallback, file_reference, find_file
 from kineverse.formats.export.poses import unit_quaternion
 from kineverse.formats.resource_paths import locate_mesh
 from kineverse.formats.xml_writer import Tag
@@ -33,88 +33,92 @@ from kineverse.model.registry import find_service
 
 _HEADER, _TRIANGLE = 84, 50
 MAX_STL_FACES = 200_000
-"""Faces of an STL that MuJoCo reads."""
+"""Largest number of faces of an STL file in MuJoCo."""
 
 
 class MeshFiles:
-    """Finds the meshes of one file, and converts those that MuJoCo cannot read.
+    """Mesh files of one description; meshes that MuJoCo cannot read are converted.
 
     Parameters
     ----------
     path
-        Where the file will lie; converted meshes lie beside it, in a folder ``NAME_meshes``.
-    note
-        Called with remarks.
-    without
-        Files, as the description names them, that are left out, since MuJoCo refuses them.
+        Path of the description. Converted meshes are in the folder ``NAME_meshes`` next to it.
+    remark
+        Called with remarks on meshes that are left out or converted.
+    excluded_files
+        References to files that are left out because MuJoCo refuses them.
 
     Attributes
     ----------
     converted
-        The content of files that are to be written beside the description.
+        Content of the converted meshes, by path.
     """
 
-    def __init__(self, path: Path, note: RemarkCallback, without: Collection[str] = ()) -> None:
+    def __init__(self, path: Path, remark: RemarkCallback, excluded_files: Collection[str] = ()) -> None:
         self._folder = path.absolute().parent
-        self._beside = self._folder / f"{path.name.removesuffix(path.suffix)}_meshes"
-        self._note, self._without = note, without
-        self._known: dict[tuple[str, str, str | None], str | None] = {}
+        self._mesh_folder = self._folder / f"{path.name.removesuffix(path.suffix)}_meshes"
+        self._remark, self._excluded_files = remark, excluded_files
+        self._references: dict[tuple[str, str, str | None], str | None] = {}
         self.converted: dict[Path, bytes] = {}
 
-    def file(self, mesh: Mesh) -> str | None:
-        """Return what the description calls the file of a mesh; None if it is left out, with a remark."""
+    def mesh_reference(self, mesh: Mesh) -> str | None:
+        """Return the reference to the file of a mesh; None, with a remark, if it is left out."""
         key = mesh.uri, mesh.folder, mesh.root
-        if key not in self._known:
-            self._known[key] = self._file(mesh)
-        named = self._known[key]
-        return None if named in self._without else named
+        if key not in self._references:
+            self._references[key] = self._find_or_convert(mesh)
+        reference = self._references[key]
+        return None if reference in self._excluded_files else reference
 
-    def texture(self, texture: Mesh) -> str | None:
-        """Return what the description calls the file of a texture; None if it is left out, with a remark.
+    def texture_reference(self, texture: Mesh) -> str | None:
+        """Return the reference to the file of a texture; None, with a remark, if it is left out.
 
         Parameters
         ----------
         texture
-            What it is called, its folder and its root, as those of a mesh.
+            Address, folder and root of the texture, as those of a mesh.
         """
         uri = texture.uri
         if not texture.folder and "://" not in uri and not os.path.isabs(uri):
-            self._note(f"the texture {uri} is left out: it is relative to a folder that is not known")
+            self._remark(f"the texture {uri} is left out: it is relative to a folder that is not known")
             return None
-        there = find_file(texture)
-        if there is None or there.suffix.lower() != ".png":
-            why = "it is not there" if there is None else "MuJoCo reads PNG"
-            self._note(f"the texture {uri} is left out: {why}")
+        file = find_file(texture)
+        if file is None or file.suffix.lower() != ".png":
+            reason = "it is not there" if file is None else "MuJoCo reads PNG"
+            self._remark(f"the texture {uri} is left out: {reason}")
             return None
-        return path_to(there, self._folder, self._note)
+        return file_reference(file, self._folder, self._remark)
 
-    def _file(self, mesh: Mesh) -> str | None:
+    def _find_or_convert(self, mesh: Mesh) -> str | None:
+        """Return the reference to a mesh file that MuJoCo reads; None, with a remark, if there is none."""
         try:
-            there = Path(os.path.abspath(locate_mesh(mesh)))
+            file = Path(os.path.abspath(locate_mesh(mesh)))
         except FormatError as error:
-            self._note(f"the mesh {mesh.uri} is left out. {error}")
+            self._remark(f"the mesh {mesh.uri} is left out. {error}")
             return None
-        if there.suffix.lower() in (".obj", ".msh") or _is_binary_stl(there):
-            return path_to(there, self._folder, self._note)
-        return self._convert(mesh, there)
+        if file.suffix.lower() in (".obj", ".msh") or _is_binary_stl(file):
+            return file_reference(file, self._folder, self._remark)
+        return self._convert(mesh, file)
 
-    def _convert(self, mesh: Mesh, there: Path) -> str | None:
+    def _convert(self, mesh: Mesh, file: Path) -> str | None:
+        """Convert a mesh to OBJ and return the reference to it."""
         try:
             triangles = find_service("read_mesh")(mesh)
         except (FormatError, MissingDependencyError, OSError) as error:
-            self._note(f"the mesh {mesh.uri} is left out: MuJoCo cannot read it, and {error}")
+            self._remark(f"the mesh {mesh.uri} is left out: MuJoCo cannot read it, and {error}")
             return None
         content = _to_obj(triangles.vertices, triangles.faces)
-        name, count = f"{there.stem}.obj", 1
-        while self._is_another(self._beside / name, content):
+        name, count = f"{file.stem}.obj", 1
+        while self._is_taken(self._mesh_folder / name, content):
             count += 1
-            name = f"{there.stem}_{count}.obj"
-        self.converted[self._beside / name] = content
-        self._note(f"the mesh {mesh.uri} is converted to {self._beside.name}/{name}, which MuJoCo can read")
-        return f"{self._beside.name}/{name}"
+            name = f"{file.stem}_{count}.obj"
+        self.converted[self._mesh_folder / name] = content
+        self._remark(
+            f"the mesh {mesh.uri} is converted to {self._mesh_folder.name}/{name}, which MuJoCo can read"
+        )
+        return f"{self._mesh_folder.name}/{name}"
 
-    def _is_another(self, path: Path, content: bytes) -> bool:
-        """Whether a path is that of another mesh, or of a file that is there and that nobody gave up."""
+    def _is_taken(self, path: Path, content: bytes) -> bool:
+        """Return True if a path is that of another mesh or of an existing file with different content."""
         if path in self.converted:
             return self.converted[path] != content
         try:
@@ -124,14 +128,14 @@ class MeshFiles:
 
 
 def _is_binary_stl(path: Path) -> bool:
-    """Whether a file is an STL as MuJoCo reads them: binary, with as many faces as there is room for."""
+    """Return True for an STL file that MuJoCo reads: binary, with at most :data:`MAX_STL_FACES` faces."""
     if path.suffix.lower() != ".stl":
         return False
     try:
         with path.open("rb") as file:
             start = file.read(_HEADER)
             size = os.fstat(file.fileno()).st_size
-    except OSError:  # whoever reads it says why
+    except OSError:  # the conversion reports the reason
         return False
     if len(start) < _HEADER:
         return False
@@ -140,44 +144,44 @@ def _is_binary_stl(path: Path) -> bool:
 
 
 def _to_obj(vertices: np.ndarray, faces: np.ndarray) -> bytes:
-    """Return triangles as an OBJ, coordinates to the last bit."""
+    """Return triangles as OBJ text with exact coordinates."""
     lines = [f"v {x!r} {y!r} {z!r}" for x, y, z in vertices.tolist()]
     lines += [f"f {a} {b} {c}" for a, b, c in (faces + 1).tolist()]
     return ("\n".join(lines) + "\n").encode()
 
 
 VISUAL_GROUP, COLLISION_GROUP = "1", "3"
-"""The groups of geoms that are seen, which viewers show, and touched, which they show when asked to."""
+"""Geom groups of visuals, which viewers show, and of collision shapes, which they show on request."""
 
 _SMALLEST_MASS, _SMALLEST_INERTIA = 1e-3, 1e-6
-_LIGHTEST = 1e-13
-"""What is less is none for MuJoCo, a mass [kg] or a moment of inertia [kg m²]: it wants 1e-15 and 1e-14."""
+_NEGLIGIBLE = 1e-13
+"""Mass [kg] and moment of inertia [kg m²] below which they are zero; MuJoCo needs 1e-15 and 1e-14."""
 _ROUNDING = 1e-12
 
 
 class MjcfBodyWriter:
-    """Writes the bodies of one file.
+    """Writer of the bodies of one file.
 
     Parameters
     ----------
     path
-        Where the file will lie.
+        Path of the file.
     remarks
-        What is left out is said here.
-    without
-        Files of meshes that are left out, by what they would be called.
+        Receives remarks on parts that are left out or changed.
+    excluded_files
+        References to mesh files that are left out.
 
     Attributes
     ----------
     assets
-        Meshes, textures and materials.
+        Element with all meshes, textures and materials.
     files
-        Where meshes are, and what becomes of those that MuJoCo cannot read.
+        Mesh files, with those that are converted.
     """
 
-    def __init__(self, path: Path, remarks: list[str], without: Collection[str] = ()) -> None:
+    def __init__(self, path: Path, remarks: list[str], excluded_files: Collection[str] = ()) -> None:
         self.assets = Tag("asset")
-        self.files = MeshFiles(path, self._remark, without)
+        self.files = MeshFiles(path, self._remark, excluded_files)
         self._unbalanced = self._weightless = False
         self._without_inertia: list[str] = []
         self._least_mass = self._least_inertia = math.inf
@@ -187,7 +191,7 @@ class MjcfBodyWriter:
         self._names: set[str] = set()
 
     def write(self, element: Tag, body: Body, name: str, *, moves: bool) -> None:
-        """Put a body into the element of its frame."""
+        """Add the elements of a body to the element of its frame."""
         least = None if body.inertia is None else self._inertia(element, body.inertia, name)
         if name != "world" and least is None:
             self._without_inertia.append(name)
@@ -196,49 +200,49 @@ class MjcfBodyWriter:
         self._least_inertia = min(self._least_inertia, inertia if inertia > 0 else math.inf)
         self._weightless |= moves and (mass <= 0 or inertia <= 0)
         for shape in body.visuals:
-            self._shape(element, shape, name, seen=True)
+            self._shape(element, shape, name, is_visual=True)
         for shape in body.collisions:
-            self._shape(element, shape, name, seen=False)
+            self._shape(element, shape, name, is_visual=False)
 
     def settings(self) -> dict[str, str | float]:
-        """Return what the compiler is to do about inertia: MuJoCo moves nothing that has none."""
+        """Return the compiler settings for inertia: MuJoCo moves no body without mass and inertia."""
         found: dict[str, str | float] = {"balanceinertia": "true"} if self._unbalanced else {}
         if self._weightless:
-            # What has less is given this much, so it is no more than what anything has.
+            # The compiler raises smaller values to these, so they must not exceed any given value.
             found["boundmass"] = min(_SMALLEST_MASS, self._least_mass)
             found["boundinertia"] = min(_SMALLEST_INERTIA, self._least_inertia)
         return found
 
     @property
     def massless(self) -> list[str]:
-        """The frames without inertia, if :meth:`settings` give them one."""
+        """Frames without inertia, if :meth:`settings` give them one."""
         return self._without_inertia if self._weightless else []
 
     def _inertia(self, element: Tag, inertia: Inertia, name: str) -> tuple[float, float] | None:
-        """Write an inertia; return mass and least moment as written, None if there is none like it."""
+        """Add an inertia; return its mass and smallest principal moment, None if it is left out."""
         xx, xy, xz, yy, yz, zz = inertia.tensor
         tensor = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
         moments, axes = np.linalg.eigh(tensor)
         least, middle, most = moments.tolist()
         mass = inertia.mass
-        # What is off by rounding is none that is negative: (0, 0, 1) in other axes has -1e-17 in it.
+        # Rounding errors are not negative moments: (0, 0, 1) in rotated axes has a moment of -1e-17.
         if mass < 0 or least < -_ROUNDING * max(most, 0.0):
             self._remark(f"the inertia of '{name}' is left out: no body has one that is negative")
             return None
-        if 0 < mass < _LIGHTEST:
+        if 0 < mass < _NEGLIGIBLE:
             self._remark(f"the mass of '{name}', {mass:g} kg, is as good as none for MuJoCo, so it has none")
             mass = 0.0
         pose, diagonal = inertia.origin.matrix, not (xy or xz or yz)
-        floor = max(_LIGHTEST, _ROUNDING * most)
-        if most < _LIGHTEST and tensor.any():
+        floor = max(_NEGLIGIBLE, _ROUNDING * most)
+        if most < _NEGLIGIBLE and tensor.any():
             self._remark(f"the inertia of '{name}' is as good as none for MuJoCo, so it has none")
             tensor, diagonal = np.zeros((3, 3)), True
             xx = yy = zz = least = middle = most = 0.0
         elif least < floor < most:
-            # As a full tensor it would be refused; so it is given along its axes, each with a moment.
-            is_one = least + middle >= most - floor
+            # MuJoCo refuses it as a full tensor, so the moments about its principal axes are written.
+            is_physical = least + middle >= most - floor
             least, middle = max(least, floor), max(middle, floor)
-            middle = max(middle, most - least) if is_one else middle
+            middle = max(middle, most - least) if is_physical else middle
             self._remark(
                 f"the inertia of '{name}' has a moment of as good as nothing, which MuJoCo refuses: it is "
                 f"written as {floor:g} kg m²"
@@ -251,29 +255,30 @@ class MjcfBodyWriter:
             self._remark(
                 f"the inertia of '{name}' is that of no body, so MuJoCo takes a sphere's in its place"
             )
-        made = element.add("inertial", pos=inertia.origin.matrix[:3, 3].tolist())
+        inertial = element.add("inertial", pos=inertia.origin.matrix[:3, 3].tolist())
         if not diagonal:
             turn = inertia.origin.matrix[:3, :3]
             xx, xy, xz, _, yy, yz, _, _, zz = (turn @ tensor @ turn.T).ravel().tolist()
-            made.give("mass", mass)
-            made.give("fullinertia", (xx, yy, zz, xy, xz, yz))
+            inertial.give("mass", mass)
+            inertial.give("fullinertia", (xx, yy, zz, xy, xz, yz))
             return mass, least
-        add_orientation(made, pose)
-        made.give("mass", mass)
-        made.give("diaginertia", (xx, yy, zz))
+        add_orientation(inertial, pose)
+        inertial.give("mass", mass)
+        inertial.give("diaginertia", (xx, yy, zz))
         return mass, min(xx, yy, zz)
 
-    def _shape(self, element: Tag, shape: Shape, name: str, *, seen: bool) -> None:
-        given = self._geometry(shape.geometry, name)
-        if given is None:
+    def _shape(self, element: Tag, shape: Shape, name: str, *, is_visual: bool) -> None:
+        """Add the geom of a shape, unless MJCF has no such shape."""
+        attributes = self._geometry(shape.geometry, name)
+        if attributes is None:
             return
-        geom = element.add("geom", name=self._name(shape, name), **given)
+        geom = element.add("geom", name=self._name(shape, name), **attributes)
         add_pose(geom, shape.origin.matrix)
-        geom.give("group", VISUAL_GROUP if seen else COLLISION_GROUP)
-        if seen:
+        geom.give("group", VISUAL_GROUP if is_visual else COLLISION_GROUP)
+        if is_visual:
             geom.give("contype", "0")
             geom.give("conaffinity", "0")
-        geom.give("mass", 0.0)  # that of the body is all there is
+        geom.give("mass", 0.0)  # the inertial element has the mass of the body
         material = self._material(shape) if shape.texture else None
         if material is not None:
             geom.give("material", material)
@@ -281,6 +286,7 @@ class MjcfBodyWriter:
             geom.give("rgba", shape.color)
 
     def _name(self, shape: Shape, owner: str) -> str | None:
+        """Return the name of a shape; None, with a remark, if it is taken."""
         if not shape.name or shape.name in self._names:
             if shape.name:
                 self._remark(f"a shape of '{owner}' has no name, since there is another '{shape.name}'")
@@ -289,6 +295,7 @@ class MjcfBodyWriter:
         return shape.name
 
     def _geometry(self, form: Geometry, name: str) -> dict[str, Any] | None:
+        """Return the geom attributes of a geometry; None, with a remark, if MJCF has no such geometry."""
         if isinstance(form, Mesh):
             mesh = self._mesh(form)
             return None if mesh is None else {"type": "mesh", "mesh": mesh}
@@ -312,22 +319,24 @@ class MjcfBodyWriter:
         return {"type": kind, "size": size}
 
     def _mesh(self, mesh: Mesh) -> str | None:
-        file = self.files.file(mesh)
+        """Return the name of the asset of a mesh, which is added if it is new; None if it is left out."""
+        file = self.files.mesh_reference(mesh)
         if file is None:
             return None
         key = file, mesh.scale
         if key not in self._meshes:
             self._meshes[key] = f"mesh_{len(self._meshes) + 1}"
             scale = None if mesh.scale == (1.0, 1.0, 1.0) else mesh.scale
-            # How much of it there is does not matter, since geoms have no mass; and some are flat.
+            # Geoms have no mass, so any inertia rule will do; "shell" accepts flat meshes, too.
             self.assets.add("mesh", name=self._meshes[key], file=file, scale=scale, inertia="shell")
         return self._meshes[key]
 
     def _material(self, shape: Shape) -> str | None:
-        beside = shape.geometry if isinstance(shape.geometry, Mesh) else Mesh("")
-        key = shape.color, shape.texture, beside.folder, beside.root
+        """Return the name of the material of a textured shape; None if its texture is left out."""
+        mesh = shape.geometry if isinstance(shape.geometry, Mesh) else Mesh("")
+        key = shape.color, shape.texture, mesh.folder, mesh.root
         if key not in self._materials:
-            file = self.files.texture(Mesh(shape.texture, folder=beside.folder, root=beside.root))
+            file = self.files.texture_reference(Mesh(shape.texture, folder=mesh.folder, root=mesh.root))
             self._materials[key] = None
             if file is not None:
                 name = self._materials[key] = f"material_{len(self._materials)}"
@@ -336,12 +345,13 @@ class MjcfBodyWriter:
         return self._materials[key]
 
     def _remark(self, text: str) -> None:
+        """Add a remark once."""
         if text not in self._remarks:
             self._remarks.append(text)
 
 
 def add_pose(element: Tag, pose: Any) -> None:
-    """Say where something is, unless it is where it is by default."""
+    """Add the position and orientation of an element, unless they are the identity."""
     if pose[:3, 3].any():
         element.give("pos", pose[:3, 3].tolist())
     add_orientation(element, pose)

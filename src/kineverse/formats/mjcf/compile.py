@@ -8,7 +8,6 @@ convention, and is what its kinematics run on. So the description is taken from 
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -20,36 +19,43 @@ from kineverse.formats.xml_values import LARGEST
 
 from . import mujoco_api
 from .actuators import joint_efforts
-from .elements import MjcfElement
+from .elements import ElementRemark, MjcfElement
 from .meshes import MeshAsset, MeshReplacement
 from .preprocess import PreprocessedMjcf
 
-ElementNote = Callable[[MjcfElement | None, str], None]
-
-_NUMBERS = ("body_pos", "body_quat", "jnt_pos", "jnt_axis", "qpos0", "site_pos", "site_quat", "eq_data")
+_CHECKED_ARRAYS = (
+    "body_pos",
+    "body_quat",
+    "jnt_pos",
+    "jnt_axis",
+    "qpos0",
+    "site_pos",
+    "site_quat",
+    "eq_data",
+)
 _SHAPELESS = {"mjGEOM_HFIELD": "a height field is no shape here", "mjGEOM_SDF": "its shape is a plugin's"}
 
 
 @dataclass(frozen=True, slots=True)
 class CompiledMjcf:
-    """What MuJoCo made of a document.
+    """Document compiled by MuJoCo.
 
     Attributes
     ----------
     spec, model
-        Its ``MjSpec`` and ``MjModel``; things in both have the same numbers.
+        ``MjSpec`` and ``MjModel`` of the document; elements have the same numbers in both.
     prepared
-        What it was given.
+        Preprocessed document.
     assets
-        The meshes of files, by name.
+        Meshes of files, by name.
     left_out
-        The numbers of geoms whose shape is not known, with the reason.
-    guessed
-        The numbers of bodies whose inertia is not known.
+        Reasons why geoms are left out, by the number of the geom.
+    unknown_inertia
+        Numbers of the bodies whose inertia depends on missing files.
     efforts
-        How strong joints are, by name [N] or [N m].
+        Largest force [N] or torque [N m] of joints, by name.
     home
-        Positions of all joints in the key ``home``.
+        Positions of all joints in the key ``home``; None without that key.
     """
 
     spec: Any
@@ -57,51 +63,51 @@ class CompiledMjcf:
     prepared: PreprocessedMjcf
     assets: dict[str, MeshAsset]
     left_out: dict[int, str]
-    guessed: frozenset[int]
+    unknown_inertia: frozenset[int]
     efforts: dict[str, float]
     home: npt.NDArray[np.float64] | None
 
-    def nodes(self, things: Any) -> dict[int, MjcfElement | None]:
-        """Return the elements of things of the specification, by their numbers."""
-        return {thing.id: self.prepared.node(thing.info) for thing in things}
+    def nodes(self, parts: Any) -> dict[int, MjcfElement | None]:
+        """Return the elements of parts of the specification, such as its joints, by number."""
+        return {part.id: self.prepared.node(part.info) for part in parts}
 
 
 class _MeshError(FormatError):
-    """What MuJoCo says where it may be the fault of a mesh file."""
+    """Error of MuJoCo that a mesh file may have caused."""
 
 
 def compile_document(
-    prepared: PreprocessedMjcf, source: str, folder: str, root: str, note: ElementNote
+    prepared: PreprocessedMjcf, source: str, folder: str, root: str, remark: ElementRemark
 ) -> CompiledMjcf:
-    """Have MuJoCo parse and compile a document.
+    """Parse and compile a document with MuJoCo.
 
     Parameters
     ----------
     prepared
-        The document.
+        Preprocessed document.
     source
-        Its name in messages.
+        Name of the document in messages.
     folder
-        From where mesh files are found, where they decide something.
+        Folder relative to which mesh files are found.
     root
-        The folder that they do not leave.
-    note
-        Called with what is left out.
+        Folder that contains all mesh files.
+    remark
+        Called with remarks on parts that are left out.
 
     Raises
     ------
     FormatError
-        With what MuJoCo says about which element; for numbers that are none.
+        With the message of MuJoCo and the element it is about; for numbers that are not finite or too large.
     """
-    with mujoco_api.capture_mujoco_warnings() as heard:
+    with mujoco_api.capture_mujoco_warnings() as captured:
         try:
-            compiled = _try_compile(prepared, source, folder, root, note)
+            compiled = _try_compile(prepared, source, folder, root, remark)
         except _MeshError as error:
-            note(None, f"inertia and sizes that follow from meshes are left out: {error}")
-            compiled = _try_compile(prepared, source, folder, root, note, with_files=False)
-    for remark in dict.fromkeys(heard):
-        note(None, f"MuJoCo says: {remark.strip()}")
-    for name in _NUMBERS:
+            remark(None, f"inertia and sizes that follow from meshes are left out: {error}")
+            compiled = _try_compile(prepared, source, folder, root, remark, with_files=False)
+    for text in dict.fromkeys(captured):
+        remark(None, f"MuJoCo says: {text.strip()}")
+    for name in _CHECKED_ARRAYS:
         if not (np.abs(getattr(compiled.model, name)) <= LARGEST).all():
             raise FormatError(f"{source}: a number of it is not finite, or too large ({name}).")
     return compiled
@@ -112,17 +118,18 @@ def _try_compile(
     source: str,
     folder: str,
     root: str,
-    note: ElementNote,
+    remark: ElementRemark,
     with_files: bool = True,
 ) -> CompiledMjcf:
+    """Compile a document with or without the mesh files that inertia and sizes depend on."""
     spec = mujoco_api.parse_spec(prepared, source)
     shapeless = _replace_shapeless(spec)
-    replacement = MeshReplacement(spec, prepared, folder, root, note)
+    replacement = MeshReplacement(spec, prepared, folder, root, remark)
     files = replacement.read_files(with_files)
     strength, home = joint_efforts(spec), _home(spec)
-    # What has been read goes: muscles make compiling long, and keys of what is left out make it fail.
-    for thing in (*spec.actuators, *spec.keys):
-        spec.delete(thing)
+    # Actuators and keys have been read: muscles slow down compilation, and keys fail if joints are left out.
+    for part in (*spec.actuators, *spec.keys):
+        spec.delete(part)
     try:
         model = mujoco_api.compile_spec(spec, prepared, source)
     except FormatError as error:
@@ -130,14 +137,14 @@ def _try_compile(
             raise _MeshError(str(error)) from None
         raise
     meshes = replacement.meshes
-    shapeless += [(geom, "its size is that of a mesh that is not there") for geom in meshes.fitted]
+    shapeless += [(geom, "its size is that of a mesh that is not there") for geom in meshes.unknown_size]
     left_out = {geom.id: f"is left out: {reason}." for geom, reason in shapeless}
-    guessed = frozenset(body.id for body in meshes.guessed)
-    return CompiledMjcf(spec, model, prepared, meshes.assets, left_out, guessed, strength, home)
+    unknown_inertia = frozenset(body.id for body in meshes.unknown_inertia)
+    return CompiledMjcf(spec, model, prepared, meshes.assets, left_out, unknown_inertia, strength, home)
 
 
 def _replace_shapeless(spec: Any) -> list[tuple[Any, str]]:
-    """Make spheres of geoms that need files or plugins; return them, each with the reason."""
+    """Replace geoms that need files or plugins by spheres; return these, each with the reason."""
     kinds = mujoco_api.mujoco().mjtGeom
     found: list[tuple[Any, str]] = []
     for geom in spec.geoms:
@@ -150,7 +157,7 @@ def _replace_shapeless(spec: Any) -> list[tuple[Any, str]]:
 
 
 def _home(spec: Any) -> npt.NDArray[np.float64] | None:
-    """Return the joint positions of the key ``home``."""
+    """Return the joint positions of the key ``home``; None if there is none."""
     for key in spec.keys:
         if key.name == "home" and len(key.qpos):
             return np.array(key.qpos, dtype=float)

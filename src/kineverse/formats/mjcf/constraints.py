@@ -12,27 +12,37 @@ from kineverse.formats.poses import IDENTITY, compose_poses, invert_pose
 from kineverse.model.body import Pose
 
 from .bodies import MjcfBodies
-from .compile import CompiledMjcf, ElementNote
+from .compile import CompiledMjcf
 from .custom_elements import merge_loop_closures
 from .description import MjcfClosure, MjcfCoupling, MjcfDynamics, MjcfTendon, Quartic
-from .elements import MjcfElement
+from .elements import ElementRemark, MjcfElement
 from .held_bodies import compute_rest_poses
 from .mujoco_api import mujoco
 from .shapes import mujoco_pose
 
-_CLOSED = 1e-6
-"""How far apart ends that are rigidly connected may be [m], [rad]: files have six digits."""
+_CLOSURE_TOLERANCE = 1e-6
+"""Largest distance between the ends of a closed loop [m], [rad]; files have six digits."""
 
-_UNTURNED = (1.0, 0.0, 0.0, 0.0)
+_IDENTITY_WXYZ = (1.0, 0.0, 0.0, 0.0)
 
 
 class MjcfConstraints:
-    """What couples joints, closes loops and ties lengths."""
+    """Constraints of a compiled model: couplings, loop closures and tendons.
+
+    Attributes
+    ----------
+    couplings, tendon_couplings
+        Equalities between joints and between tendons.
+    closures
+        Equalities that close loops.
+    tendons
+        Tendons with fixed and spatial lengths.
+    """
 
     def __init__(
-        self, compiled: CompiledMjcf, bodies: MjcfBodies, note: ElementNote, mend: NameFaultHandler
+        self, compiled: CompiledMjcf, bodies: MjcfBodies, remark: ElementRemark, mend: NameFaultHandler
     ) -> None:
-        self._model, self._bodies, self._note = compiled.model, bodies, note
+        self._model, self._bodies, self._remark = compiled.model, bodies, remark
         model = compiled.model
         self._nodes = compiled.nodes(compiled.spec.equalities)
         self._tendon_nodes = compiled.nodes(compiled.spec.tendons)
@@ -50,7 +60,7 @@ class MjcfConstraints:
         for number in range(model.neq):
             kind = model.eq_type[number]
             if not model.eq_active0[number]:
-                note(self._nodes.get(number), "is left out: it is not active.")
+                remark(self._nodes.get(number), "is left out: it is not active.")
             elif kind == kinds.mjEQ_JOINT:
                 couplings.append(self._joint_coupling(number))
             elif kind == kinds.mjEQ_TENDON:
@@ -60,16 +70,16 @@ class MjcfConstraints:
             elif kind == kinds.mjEQ_WELD:
                 closures += self._closure(number, "weld")
             else:
-                note(self._nodes.get(number), "is left out: no constraint here says it.")
+                remark(self._nodes.get(number), "is left out: no constraint here says it.")
         self.couplings = tuple(couplings)
-        said = compiled.prepared.custom.loops
-        self.closures = merge_loop_closures(tuple(closures), bodies.links, said, note)
+        loops = compiled.prepared.custom.loops
+        self.closures = merge_loop_closures(tuple(closures), bodies.links, loops, remark)
         self.tendon_couplings = tuple(tendon_couplings)
 
     def _named(
         self, names: UniqueNames, kind: str, count: int, nodes: dict[int, MjcfElement | None]
     ) -> list[str]:
-        """Return the names of equalities or tendons; those that have none are numbered by their element."""
+        """Return the names of equalities or tendons; those without name are numbered by tag."""
         result = [""] * count
         own = [getattr(self._model, kind if kind == "tendon" else "equality")(k).name for k in range(count)]
         for number in range(count):
@@ -85,11 +95,11 @@ class MjcfConstraints:
         return result
 
     def _where(self, node: MjcfElement | None) -> str:
+        """Return the place of an element for messages."""
         return "" if node is None else node.where
 
-    # -- couplings -------------------------------------------------------------------------------------------
-
     def _joint_coupling(self, number: int) -> MjcfCoupling:
+        """Return a joint equality."""
         m = self._model
         follower, leader = int(m.eq_obj1id[number]), int(m.eq_obj2id[number])
         rest = [float(m.qpos0[m.jnt_qposadr[joint]]) if joint >= 0 else 0.0 for joint in (follower, leader)]
@@ -105,12 +115,13 @@ class MjcfConstraints:
         )
 
     def _tendon_coupling(self, number: int) -> Iterator[MjcfCoupling]:
+        """Yield a tendon equality, unless one of its tendons is left out."""
         m = self._model
         follower, leader = int(m.eq_obj1id[number]), int(m.eq_obj2id[number])
         names = self._tendon_names
         ends = [names[tendon] for tendon in (follower, leader) if tendon >= 0]
         if any(name not in self._known for name in ends):
-            self._note(self._nodes.get(number), "is left out, as its tendon is.")
+            self._remark(self._nodes.get(number), "is left out, as its tendon is.")
             return
         rest = [float(m.tendon_length0[tendon]) if tendon >= 0 else 0.0 for tendon in (follower, leader)]
         yield MjcfCoupling(
@@ -124,12 +135,12 @@ class MjcfConstraints:
         )
 
     def _quartic(self, number: int) -> Quartic:
+        """Return the coefficients of the polynomial of an equality."""
         a, b, c, d, e = self._model.eq_data[number][:5].tolist()
         return a, b, c, d, e
 
-    # -- closures --------------------------------------------------------------------------------------------
-
     def _closure(self, number: int, kind: Literal["connect", "weld"]) -> Iterator[MjcfClosure]:
+        """Yield a connect or weld equality, unless it is redundant or holds a mocap body."""
         m = self._model
         node, data = self._nodes.get(number), m.eq_data[number]
         ends = [int(m.eq_obj1id[number]), int(m.eq_obj2id[number])]
@@ -137,16 +148,16 @@ class MjcfConstraints:
             bodies = [int(m.site_bodyid[site]) for site in ends]
             names = [self._bodies.site_names[site] for site in ends]
             poses = [mujoco_pose(m.site_pos[site], m.site_quat[site]) for site in ends]
-            inside = [IDENTITY, IDENTITY]  # the name is that of the site, or of the body where it is
+            inside = [IDENTITY, IDENTITY]  # the names are those of the sites
         else:
             bodies, names = ends, [self._bodies.body_names[body] for body in ends]
             if kind == "connect":
-                poses = [mujoco_pose(data[:3], _UNTURNED), mujoco_pose(data[3:6], _UNTURNED)]
+                poses = [mujoco_pose(data[:3], _IDENTITY_WXYZ), mujoco_pose(data[3:6], _IDENTITY_WXYZ)]
             else:
-                poses = [mujoco_pose(data[3:6], data[6:10]), mujoco_pose(data[:3], _UNTURNED)]
+                poses = [mujoco_pose(data[3:6], data[6:10]), mujoco_pose(data[:3], _IDENTITY_WXYZ)]
             inside = poses
         if any(m.body_mocapid[body] >= 0 for body in bodies):
-            self._note(node, "is left out: it ties to a mocap body, by which a user drags another.")
+            self._remark(node, "is left out: it ties to a mocap body, by which a user drags another.")
             return
         where = self._where(node)
         if m.body_weldid[bodies[0]] == m.body_weldid[bodies[1]]:
@@ -154,14 +165,13 @@ class MjcfConstraints:
                 compose_poses(self._rest[self._bodies.body_names[b]], pose)
                 for b, pose in zip(bodies, poses, strict=True)
             )
-            if _gap(first, second, kind) <= _CLOSED:
-                self._note(node, "is left out: it ties bodies that are rigidly connected anyway.")
+            if _gap(first, second, kind) <= _CLOSURE_TOLERANCE:
+                self._remark(node, "is left out: it ties bodies that are rigidly connected anyway.")
                 return
         yield MjcfClosure(self._names[number], kind, names[0], names[1], inside[0], inside[1], where)
 
-    # -- tendons ---------------------------------------------------------------------------------------------
-
     def _tendon(self, number: int) -> MjcfTendon | None:
+        """Return a tendon; None, with a remark, if it wraps around a geom."""
         m, kinds = self._model, mujoco().mjtWrap
         node = self._tendon_nodes.get(number)
         first = int(m.tendon_adr[number])
@@ -169,15 +179,15 @@ class MjcfConstraints:
         terms: list[tuple[str, float]] = []
         paths: list[tuple[float, list[str]]] = [(1.0, [])]
         for step in steps:
-            kind, thing, number_of = m.wrap_type[step], int(m.wrap_objid[step]), float(m.wrap_prm[step])
+            kind, wrapped, factor = m.wrap_type[step], int(m.wrap_objid[step]), float(m.wrap_prm[step])
             if kind == kinds.mjWRAP_JOINT:
-                terms.append((self._bodies.joint_names[thing], number_of))
+                terms.append((self._bodies.joint_names[wrapped], factor))
             elif kind == kinds.mjWRAP_SITE:
-                paths[-1][1].append(self._bodies.site_names[thing])
+                paths[-1][1].append(self._bodies.site_names[wrapped])
             elif kind == kinds.mjWRAP_PULLEY:
-                paths.append((number_of, []))
+                paths.append((factor, []))
             else:
-                self._note(node, "is left out: it wraps round a geom.")
+                self._remark(node, "is left out: it wraps round a geom.")
                 return None
         lower = upper = None
         if m.tendon_limited[number]:
@@ -193,6 +203,7 @@ class MjcfConstraints:
         )
 
     def _tendon_dynamics(self, number: int) -> MjcfDynamics:
+        """Return the dynamics of a tendon that are not zero."""
         m = self._model
         stiffness = float(m.tendon_stiffness[number])
         shortest, longest = m.tendon_lengthspring[number].tolist()
@@ -208,7 +219,7 @@ class MjcfConstraints:
 
 
 def _gap(first: Pose, second: Pose, kind: str) -> float:
-    """Return what is left between two ends [m], and for welds between their axes [rad]."""
+    """Return the distance between two ends [m]; for welds the larger of it and ‖R - I‖, R the rotation."""
     between = compose_poses(invert_pose(first), second).matrix
     gap = float(np.linalg.norm(between[:3, 3]))
     if kind == "weld":

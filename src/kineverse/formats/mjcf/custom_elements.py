@@ -1,21 +1,21 @@
 """Custom MJCF elements for data that MJCF has no place for, read and written.
 
 =======================================  ================================================================
-``<numeric>`` ``kineverse:speed:JOINT``  the range of the speed of a joint
-``<tuple>`` ``kineverse:massless``       bodies that have mass only because MuJoCo moves none without
-``<tuple>`` ``kineverse:ends``           sites that are there only to tie bodies
-``<tuple>`` ``kineverse:loop:NAME``      equalities and joints of a loop, those that follow with ``prm=1``
+``<numeric>`` ``kineverse:speed:JOINT``  velocity limits of a joint
+``<tuple>`` ``kineverse:massless``       bodies without mass, to which MuJoCo gives one
+``<tuple>`` ``kineverse:ends``           sites that mark the ends of loop closures
+``<tuple>`` ``kineverse:loop:NAME``      equalities and joints of a loop, dependent joints with ``prm=1``
 =======================================  ================================================================
 
-A ``<tuple>`` in which there are names with spaces is a ``<text>`` of that name, whose data are its elements
-in JSON: ``[[objtype, objname, prm], ...]``.
+A ``<tuple>`` with names that contain spaces is written as a ``<text>`` of the same name, whose data are its
+elements in JSON: ``[[objtype, objname, prm], ...]``.
 """
 
 from __future__ import annotations
 
 import json
 import math
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 
 from kineverse.formats.description import JointDescription, LoopJoint
@@ -25,19 +25,17 @@ from kineverse.formats.xml_writer import Tag
 from kineverse.symbols import parse_symbol_name
 
 from .description import MjcfClosure, MjcfLink
-from .elements import MjcfElement
-
-_ElementNote = Callable[[MjcfElement | None, str], None]
+from .elements import ElementRemark, MjcfElement
 
 SPEED_PREFIX, LOOP_PREFIX = "kineverse:speed:", "kineverse:loop:"
 MASSLESS, ENDS = "kineverse:massless", "kineverse:ends"
 TUPLE_ATTRIBUTES = ("objtype", "objname", "prm")
-"""The attributes of an element of a tuple."""
+"""Attributes of an element of a tuple."""
 
 
 @dataclass(frozen=True, slots=True)
 class CustomLoop:
-    """A loop: the names of its equalities and of its joints, and the element that says so."""
+    """Loop of custom elements: names of its equalities, of its independent and dependent joints."""
 
     equalities: tuple[str, ...]
     free: tuple[str, ...]
@@ -47,9 +45,10 @@ class CustomLoop:
 
 @dataclass(frozen=True, slots=True)
 class CustomElements:
-    """What custom elements say.
+    """Data of all custom elements, by name.
 
-    ``speeds`` are ranges of joints [rad/s] or [m/s], ``massless`` bodies and ``ends`` sites, all by name.
+    ``speeds`` are velocity limits of joints [rad/s] or [m/s], ``massless`` bodies without mass, and ``ends``
+    the sites that mark ends of loop closures.
     """
 
     speeds: Mapping[str, tuple[float, float]] = field(default_factory=dict)
@@ -58,15 +57,15 @@ class CustomElements:
     loops: Mapping[str, CustomLoop] = field(default_factory=dict)
 
 
-def read_custom_elements(root: MjcfElement, note: _ElementNote) -> CustomElements:
-    """Return what the custom elements of a document say, as far as they are those of the writer.
+def read_custom_elements(root: MjcfElement, remark: ElementRemark) -> CustomElements:
+    """Read the custom elements of a document that Kineverse has written; others are ignored.
 
     Parameters
     ----------
     root
-        Of the document.
-    note
-        Called with what is left out.
+        Root element of the document.
+    remark
+        Called with remarks on malformed elements.
     """
     speeds: dict[str, tuple[float, float]] = {}
     loops: dict[str, CustomLoop] = {}
@@ -78,7 +77,7 @@ def read_custom_elements(root: MjcfElement, note: _ElementNote) -> CustomElement
         if node.tag == "numeric" and name.startswith(SPEED_PREFIX):
             found = _parse_range(node.attributes.get("data", ""))
             if found is None:
-                note(node, "is left out: a range of speeds is two numbers, the first of them no larger.")
+                remark(node, "is left out: a range of speeds is two numbers, the first of them no larger.")
             else:
                 speeds[drop_empty_parts(name.removeprefix(SPEED_PREFIX))] = found
         elif node.tag == "tuple" and name in named:
@@ -86,18 +85,18 @@ def read_custom_elements(root: MjcfElement, note: _ElementNote) -> CustomElement
         elif node.tag == "tuple" and name.startswith(LOOP_PREFIX):
             loops[drop_empty_parts(name.removeprefix(LOOP_PREFIX))] = CustomLoop(
                 tuple(_object_names(node, "equality")),
-                tuple(_object_names(node, "joint", follows=False)),
-                tuple(_object_names(node, "joint", follows=True)),
+                tuple(_object_names(node, "joint", dependent=False)),
+                tuple(_object_names(node, "joint", dependent=True)),
                 node,
             )
     return CustomElements(speeds, frozenset(named[MASSLESS]), frozenset(named[ENDS]), loops)
 
 
 def _as_tuple(node: MjcfElement) -> MjcfElement:
-    """Return the tuple that a text stands for, or the text if it stands for none."""
+    """Return the tuple that a text represents, or the text if it represents none."""
     try:
-        given = json.loads(node.attributes.get("data", ""))
-        elements = [dict(zip(TUPLE_ATTRIBUTES, map(str, item), strict=True)) for item in given]
+        items = json.loads(node.attributes.get("data", ""))
+        elements = [dict(zip(TUPLE_ATTRIBUTES, map(str, item), strict=True)) for item in items]
     except (ValueError, TypeError, RecursionError):
         return node
     children = [MjcfElement("element", attributes, [], node.source, node.line) for attributes in elements]
@@ -108,31 +107,31 @@ def merge_loop_closures(
     closures: tuple[MjcfClosure, ...],
     links: tuple[MjcfLink, ...],
     loops: Mapping[str, CustomLoop],
-    note: _ElementNote,
+    remark: ElementRemark,
 ) -> tuple[MjcfClosure, ...]:
-    """Return closures with those that are one loop as one, which says who follows in it.
+    """Merge the closures of each custom loop into one, with its independent and dependent joints.
 
-    A loop that names what is not there, since somebody edited the file, is read as those of other files are.
+    A loop with names that do not exist in an edited file is ignored, with a remark.
     """
     by_name = {closure.name: closure for closure in closures}
     joints = {joint.name for link in links for joint in link.joints}
     for name, loop in loops.items():
         parts = [by_name.get(equality) for equality in loop.equalities]
         known = [part for part in parts if part is not None]
-        strange = [joint for joint in (*loop.free, *loop.dependent) if joint not in joints]
-        if not known or len(known) < len(parts) or strange or len({part.kind for part in known}) > 1:
-            note(loop.node, f"is left out: loop {quote(name)} is not in the file as it says.")
+        unknown = [joint for joint in (*loop.free, *loop.dependent) if joint not in joints]
+        if not known or len(known) < len(parts) or unknown or len({part.kind for part in known}) > 1:
+            remark(loop.node, f"is left out: loop {quote(name)} is not in the file as it says.")
             continue
         first, *others = known
-        said = replace(_swap_ends(first), name=name, more=tuple(map(_swap_ends, others)))
-        by_name[first.name] = replace(said, free=loop.free, dependent=loop.dependent)
+        merged = replace(_swap_ends(first), name=name, more=tuple(map(_swap_ends, others)))
+        by_name[first.name] = replace(merged, free=loop.free, dependent=loop.dependent)
         for part in others:
             del by_name[part.name]
     return tuple(by_name.values())
 
 
 def _swap_ends(closure: MjcfClosure) -> MjcfClosure:
-    """Return the same the other way round: the writer names the second end first."""
+    """Return a closure with its ends exchanged; the writer names the second end first."""
     return replace(
         closure,
         first=closure.second,
@@ -143,6 +142,7 @@ def _swap_ends(closure: MjcfClosure) -> MjcfClosure:
 
 
 def _parse_range(text: str) -> tuple[float, float] | None:
+    """Return the two numbers of a range; None if the text is none."""
     try:
         lower, upper = map(float, text.split())
     except ValueError:
@@ -150,58 +150,60 @@ def _parse_range(text: str) -> tuple[float, float] | None:
     return (lower, upper) if lower <= upper and lower < math.inf and upper > -math.inf else None
 
 
-def _object_names(node: MjcfElement, kind: str, follows: bool | None = None) -> Iterator[str]:
+def _object_names(node: MjcfElement, kind: str, dependent: bool | None = None) -> Iterator[str]:
+    """Yield the names of one type of objects in a tuple; only dependent or independent ones on request."""
     for element in node.children:
-        said = element.attributes
-        leads = said.get("prm", "0") in ("0", "")
-        if said.get("objtype") == kind and (follows is None or follows is not leads):
-            yield drop_empty_parts(said.get("objname", ""))
+        attributes = element.attributes
+        is_dependent = attributes.get("prm", "0") not in ("0", "")
+        if attributes.get("objtype") == kind and (dependent is None or dependent is is_dependent):
+            yield drop_empty_parts(attributes.get("objname", ""))
 
 
 def add_speeds(custom: Tag, joints: Iterable[JointDescription]) -> bool:
-    """Add the ranges of speeds of joints that have some; return whether there are any."""
+    """Add the velocity limits of joints; return True if there are any."""
     found = False
     for joint in joints:
-        slowest, fastest = joint.bounds.slowest, joint.bounds.fastest
-        if (slowest, fastest) != (-math.inf, math.inf):
+        min_velocity, max_velocity = joint.bounds.min_velocity, joint.bounds.max_velocity
+        if (min_velocity, max_velocity) != (-math.inf, math.inf):
             numeric = custom.add("numeric", name=f"{SPEED_PREFIX}{joint.name}")
-            numeric.attributes["data"] = format_range(slowest, fastest)
+            numeric.attributes["data"] = format_range(min_velocity, max_velocity)
             found = True
     return found
 
 
-def add_names(custom: Tag, what: str, kind: str, names: Iterable[str]) -> None:
-    """Add that things of some kind are something, unless there are none."""
-    listed = Tag("tuple", {"name": what})
+def add_names(custom: Tag, key: str, kind: str, names: Iterable[str]) -> None:
+    """Add a tuple of names of one type of objects, unless there are none."""
+    tuple_tag = Tag("tuple", {"name": key})
     for name in names:
-        listed.add("element", objtype=kind, objname=name)
-    if listed.inside:
-        custom.inside.append(_as_tuple_or_text(listed))
+        tuple_tag.add("element", objtype=kind, objname=name)
+    if tuple_tag.inside:
+        custom.inside.append(_as_tuple_or_text(tuple_tag))
 
 
 def add_loop(custom: Tag, loop: LoopJoint, equalities: Iterable[str], joints: Collection[str]) -> None:
-    """Add which coordinates of a loop follow; several of them may belong to one of the joints."""
-    listed = Tag("tuple", {"name": f"{LOOP_PREFIX}{loop.name}"})
+    """Add the equalities and joints of a loop; several of its coordinates may belong to one joint."""
+    tuple_tag = Tag("tuple", {"name": f"{LOOP_PREFIX}{loop.name}"})
     for name in equalities:
-        listed.add("element", objtype="equality", objname=name)
-    for names, follows in ((loop.free, 0), (loop.dependent, 1)):
+        tuple_tag.add("element", objtype="equality", objname=name)
+    for names, is_dependent in ((loop.free, 0), (loop.dependent, 1)):
         paths = [parse_symbol_name(name)[0] for name in names]
         owners = [path if path in joints else path.rpartition("/")[0] for path in paths]
         for joint in dict.fromkeys(owners):
-            listed.add("element", objtype="joint", objname=joint, prm=follows)
-    custom.inside.append(_as_tuple_or_text(listed))
+            tuple_tag.add("element", objtype="joint", objname=joint, prm=is_dependent)
+    custom.inside.append(_as_tuple_or_text(tuple_tag))
 
 
-def _as_tuple_or_text(listed: Tag) -> Tag:
-    """Return a tuple, as a text where there are names with spaces: MuJoCo takes each for several."""
-    if all(len(tag.attributes["objname"].split()) == 1 for tag in listed.inside):
-        return listed
-    elements = [[tag.attributes.get(key, "0") for key in TUPLE_ATTRIBUTES] for tag in listed.inside]
-    return Tag("text", {"name": listed.attributes["name"], "data": json.dumps(elements, ensure_ascii=False)})
+def _as_tuple_or_text(tuple_tag: Tag) -> Tag:
+    """Return a tuple, as a text if names contain spaces, which MuJoCo takes for several names."""
+    if all(len(tag.attributes["objname"].split()) == 1 for tag in tuple_tag.inside):
+        return tuple_tag
+    elements = [[tag.attributes.get(key, "0") for key in TUPLE_ATTRIBUTES] for tag in tuple_tag.inside]
+    data = json.dumps(elements, ensure_ascii=False)
+    return Tag("text", {"name": tuple_tag.attributes["name"], "data": data})
 
 
 def format_range(lower: float, upper: float) -> str:
-    """Return the ends of an interval as text, which may be infinite."""
+    """Return the ends of a range, which may be infinite, as text."""
     return " ".join(
         "inf" if end == math.inf else "-inf" if end == -math.inf else repr(end) for end in (lower, upper)
     )

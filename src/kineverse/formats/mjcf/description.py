@@ -1,7 +1,7 @@
 """Checked MJCF description: links, sites, couplings, closures and tendons.
 
-Units are [m], [rad], [kg], [s]. Everything has a name, and names of frames are unique. ``where`` is the place
-in the file, for messages. A description is plain immutable data.
+Units are [m], [rad], [kg], [s]. All elements have names, and names of frames are unique. ``where`` is the
+place of an element in the file, for messages. A description is plain immutable data.
 """
 
 from __future__ import annotations
@@ -16,10 +16,10 @@ MjcfJointType: TypeAlias = Literal["hinge", "slide", "ball", "free"]
 MjcfDynamics: TypeAlias = tuple[tuple[str, float], ...]
 Quartic: TypeAlias = tuple[float, float, float, float, float]
 
-_NOTHING = Body()
+_EMPTY_BODY = Body()
 
 WORLD = "world"
-"""What the body at the root is called."""
+"""Name of the root body."""
 
 COORDINATE_SUFFIXES: dict[MjcfJointType, tuple[str, ...]] = {
     "hinge": (),
@@ -27,20 +27,19 @@ COORDINATE_SUFFIXES: dict[MjcfJointType, tuple[str, ...]] = {
     "ball": ("qx", "qy", "qz", "qw"),
     "free": ("x", "y", "z", "qx", "qy", "qz", "qw"),
 }
-"""What the names of coordinates have behind the name of a joint, in the order of its home."""
+"""Last parts of the names of coordinates, after the name of a joint, in the order of its home position."""
 
 
 @dataclass(frozen=True, slots=True)
 class MjcfJoint:
-    """A joint of a body; several of them move a body one after the other.
+    """Joint of a body; several joints move a body one after the other.
 
-    ``anchor`` is the point about which it turns and ``axis`` a unit vector, both in the frame of the body.
-    While its coordinate is ``reference`` [rad] or [m], it has moved nothing. ``lower`` and ``upper`` bound
-    the coordinate, or ``upper`` the angle of a ball [rad]; None is no bound. ``speed`` is the range of its
-    speed, if that is known. ``frame`` is what the frame that
-    it moves is called if that is not the body's. ``home`` are the values of its coordinates at home.
-    ``dynamics`` are effort [N] or [N m], damping, friction, spring_stiffness, spring_reference and armature,
-    as far as they are not zero.
+    ``anchor`` is the centre of rotation [m] and ``axis`` a unit vector, both in the frame of the body. At the
+    coordinate ``reference`` [rad] or [m], the body is at its pose in the file. ``lower`` and ``upper`` bound
+    the coordinate, ``upper`` the angle of a ball [rad]; None for no limit. ``speed`` is the range of its
+    velocity, None if unknown. ``frame`` is the name of the frame that it moves, if that is not the body.
+    ``home`` is the home position of its coordinates. ``dynamics`` are those of effort [N] or [N m], damping,
+    friction, spring_stiffness, spring_reference and armature that are not zero.
     """
 
     name: str
@@ -59,19 +58,19 @@ class MjcfJoint:
 
 @dataclass(frozen=True, slots=True)
 class MjcfLink:
-    """A body: where it is in its parent while its joints are at rest, and what moves it."""
+    """Body: its pose in its parent while its joints are at their references, and the joints that move it."""
 
     name: str
     parent: str
     pose: Pose = IDENTITY
     joints: tuple[MjcfJoint, ...] = ()
-    body: Body = _NOTHING
+    body: Body = _EMPTY_BODY
     where: str = ""
 
 
 @dataclass(frozen=True, slots=True)
 class MjcfSite:
-    """A frame that moves with a body."""
+    """Frame fixed to a body."""
 
     name: str
     parent: str
@@ -81,7 +80,7 @@ class MjcfSite:
 
 @dataclass(frozen=True, slots=True)
 class MjcfCoupling:
-    """One joint or tendon as a polynomial of another: y - y0 = Σ aₖ (x - x0)ᵏ, with y = a0 where none leads.
+    """Equality between two joints or two tendons: y - y0 = Σ aₖ (x - x0)ᵏ, or y - y0 = a0 without leader.
 
     ``rest`` is y0 and ``leader_rest`` x0.
     """
@@ -97,10 +96,11 @@ class MjcfCoupling:
 
 @dataclass(frozen=True, slots=True)
 class MjcfClosure:
-    """Two points (``connect``) or two poses (``weld``) that coincide, each in the frame of a link or site.
+    """Loop closure: two points (``connect``) or two poses (``weld``) that coincide.
 
-    ``more`` are others of the same loop. ``free`` and ``dependent`` are the joints in it, those
-    that follow last, if the file says so.
+    ``in_first`` and ``in_second`` are their poses in the frames ``first`` and ``second``, links or sites.
+    ``more`` are further closures of the same loop. ``free`` and ``dependent`` are the independent and the
+    dependent joints of the loop, if the file states them.
     """
 
     name: str
@@ -117,9 +117,10 @@ class MjcfClosure:
 
 @dataclass(frozen=True, slots=True)
 class MjcfTendon:
-    """A length [m]: a sum of joint positions, each with its factor; or that of a line through sites.
+    """Tendon whose length [m] is a linear combination of joint positions, or that of a path through sites.
 
-    ``terms`` are joints and factors, ``paths`` divisors of pulleys and the sites of the branch behind.
+    ``terms`` are pairs of joint and factor, ``paths`` pairs of a pulley's divisor and the sites of its
+    branch.
     """
 
     name: str
@@ -133,11 +134,10 @@ class MjcfTendon:
 
 @dataclass(frozen=True, slots=True)
 class MjcfScene:
-    """All of a file.
+    """Description of a file.
 
-    ``links`` begin with the world, and each comes after its parent. ``remarks`` say what was left out or read
-    in a way its author may not have meant; each names its line. ``has_home`` says that a key of the file has
-    where joints are at home.
+    ``links`` begin with the world, each after its parent. ``remarks`` are warnings about ignored or ambiguous
+    elements, each with its line. ``has_home`` is True if the file has a home position.
     """
 
     links: tuple[MjcfLink, ...] = ()

@@ -1,7 +1,7 @@
 """MJCF element tree with its includes, and its text for MuJoCo.
 
-MuJoCo is given no path: it would open whatever a file names. Includes are expanded here, from within the
-root of the file and nowhere else, see :mod:`kineverse.formats.root_folder`.
+MuJoCo receives no path, because it would open every file that a document names. Includes are expanded here,
+from files within the root folder only, see :mod:`kineverse.formats.root_folder`.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import NoReturn
+from typing import NoReturn, TypeAlias
 from xml.sax.saxutils import quoteattr
 
 from kineverse.errors import FormatError
@@ -20,12 +20,12 @@ from kineverse.formats.root_folder import declared_roots, is_below, outside_root
 from kineverse.formats.xml_reader import Element, label, parse_xml, quote
 
 MAX_ELEMENT_DEPTH = 450
-"""The deepest nesting of elements: MuJoCo reads 500, and a body is inside of the body that carries it."""
+"""Deepest nesting of elements. MuJoCo reads 500, and bodies are nested in their parents."""
 
 
 @dataclass(slots=True, eq=False)
 class MjcfElement:
-    """An element, and where it was written."""
+    """Element with its place in a file."""
 
     tag: str
     attributes: dict[str, str]
@@ -35,7 +35,7 @@ class MjcfElement:
 
     @property
     def place(self) -> str:
-        """Line and opening tag, for remarks."""
+        """Line and opening tag, for warnings."""
         return f"line {self.line}, {label((self.tag, self.attributes, [], self.line))}"
 
     @property
@@ -44,7 +44,7 @@ class MjcfElement:
         return f"{self.source}, {self.place}"
 
     def refuse(self, reason: str) -> NoReturn:
-        """Raise the error that people see.
+        """Raise an error about the element.
 
         Raises
         ------
@@ -54,12 +54,16 @@ class MjcfElement:
         raise FormatError(f"{self.where}: {reason}")
 
     def walk(self) -> Iterator[MjcfElement]:
-        """Yield the node and all below it."""
-        ahead = [self]
-        while ahead:
-            node = ahead.pop()
+        """Yield the element and all of its descendants, depth first."""
+        stack = [self]
+        while stack:
+            node = stack.pop()
             yield node
-            ahead.extend(reversed(node.children))
+            stack.extend(reversed(node.children))
+
+
+ElementRemark: TypeAlias = Callable[[MjcfElement | None, str], None]
+"""Function that adds a warning about an element, or about the whole document."""
 
 
 def read_tree(
@@ -69,25 +73,25 @@ def read_tree(
     root: str,
     mend: Callable[[str, int, str], None] | None = None,
 ) -> MjcfElement:
-    """Return the root of a document, with the content of what it includes in place of the includes.
+    """Return the root element of a document, with includes replaced by the content of their files.
 
     Parameters
     ----------
     data
-        The document.
+        Text of the document.
     source
-        Its name in messages.
+        Name of the document in messages.
     folder
-        Where it lies, from where the files it includes are named. Empty for text that lies nowhere.
+        Folder relative to which included files are found; empty for text without file.
     root
-        The folder that they do not leave.
+        Folder that contains all included files.
     mend
-        Called with the file, the line and a text for what is read although XML forbids it; None to refuse it.
+        Called with file, line and text for mistakes in XML that can be read; None to refuse them.
 
     Raises
     ------
     FormatError
-        For what is no XML, or no MJCF; for includes that are not there, lead out of the root, or come
+        If the text is no XML or no MJCF; for includes that do not exist, are outside of the root, or occur
         twice.
     """
 
@@ -98,46 +102,46 @@ def read_tree(
 
     top = parsed(data, source)
     _check_root(top, source)
-    whole = MjcfElement("", {})
+    document = MjcfElement("", {})
     included: set[Path] = set()
-    ahead: list[tuple[Element, MjcfElement, str, str]] = [(top, whole, source, folder)]
-    while ahead:
-        element, parent, source, here = ahead.pop()
+    stack: list[tuple[Element, MjcfElement, str, str]] = [(top, document, source, folder)]
+    while stack:
+        element, parent, source, here = stack.pop()
         tag, attributes, children, line = element
         node = MjcfElement(tag, attributes, source=source, line=line)
         if tag == "include":
             path = find_below_root(node, attributes.get("file", ""), root, folder, here)
-            # A file in twice would have all its names twice, or include itself.
+            # A file that is included twice would repeat all of its names, or include itself.
             if path in included:
                 node.refuse("is there a second time; a file is included once.")
             included.add(path)
             below = str(path.parent)
             children = parsed(read_file(path), path.name)[2]
-            ahead.extend((child, parent, path.name, below) for child in reversed(children))
+            stack.extend((child, parent, path.name, below) for child in reversed(children))
             continue
         parent.children.append(node)
-        ahead.extend((child, node, source, here) for child in reversed(children))
-    return whole.children[0]
+        stack.extend((child, node, source, here) for child in reversed(children))
+    return document.children[0]
 
 
 def find_below_root(node: MjcfElement, name: str, root: str, *places: str) -> Path:
-    """Return the file that an element names, which is below the root, or below ``KINEVERSE_ROOT``.
+    """Find the file that an element names, below the root folder or ``KINEVERSE_ROOT``.
 
     Parameters
     ----------
     node
         The element.
     name
-        What it says: a path relative to one of the places.
+        Path in the document, relative to one of the places.
     root
-        The folder that it does not leave, a real path.
+        Folder that contains the file, a real path.
     places
-        Folders from which it is looked for, one after the other.
+        Folders in which the file is searched, in this order.
 
     Raises
     ------
     FormatError
-        If it is somewhere else, or is not there.
+        If the file does not exist, or is outside of these folders.
     """
     if not any(places):
         node.refuse(f"names the file {quote(name)}, and the text has no folder. Load it from its file.")
@@ -149,7 +153,7 @@ def find_below_root(node: MjcfElement, name: str, root: str, *places: str) -> Pa
         path = os.path.realpath(os.path.join(place, name))
         if not any(is_below(path, folder) for folder in allowed if folder):
             outside = True
-        elif os.path.isfile(path):  # which is no for a name that is too long, and no error
+        elif os.path.isfile(path):  # False rather than an error for a name that is too long
             return Path(path)
     if outside:
         node.refuse(f"names {outside_root_error(name, root)}")
@@ -157,6 +161,7 @@ def find_below_root(node: MjcfElement, name: str, root: str, *places: str) -> Pa
 
 
 def _check_root(root: Element, source: str) -> None:
+    """Check that the root element is that of an MJCF."""
     tag, _, _, line = root
     if tag == "mujoco":
         return
@@ -174,12 +179,12 @@ _ESCAPED = {"\n": "&#10;", "\r": "&#13;", "\t": "&#9;"}
 
 
 def serialize_elements(root: MjcfElement, first: int = 1) -> tuple[str, list[MjcfElement]]:
-    """Return a document, and its nodes by line from ``first`` on; the lines before are empty."""
+    """Return the text of a document, one element a line from line ``first`` on, and the elements in order."""
     lines: list[str] = []
     nodes: list[MjcfElement] = []
-    ahead: list[MjcfElement | str] = [root]
-    while ahead:
-        part = ahead.pop()
+    stack: list[MjcfElement | str] = [root]
+    while stack:
+        part = stack.pop()
         if isinstance(part, str):
             lines[-1] += part
             continue
@@ -187,6 +192,6 @@ def serialize_elements(root: MjcfElement, first: int = 1) -> tuple[str, list[Mjc
         nodes.append(part)
         lines.append(f"<{' '.join(words)}{'>' if part.children else '/>'}")
         if part.children:
-            ahead.append(f"</{part.tag}>")
-            ahead.extend(reversed(part.children))
+            stack.append(f"</{part.tag}>")
+            stack.extend(reversed(part.children))
     return "\n" * (first - 1) + "\n".join(lines), nodes

@@ -1,7 +1,7 @@
 """Free bodies attached to the links that hold them by a weld or connect equality.
 
-Closing a loop through a free joint would make a quaternion follow. But such a body has no place of its own:
-it hangs below what holds it, and nothing is to be solved.
+A loop through a free joint would have a dependent quaternion. But a held body has no position of its own: as
+a child of the link that holds it, it needs no loop equations.
 """
 
 from __future__ import annotations
@@ -17,20 +17,20 @@ from .description import WORLD, MjcfClosure, MjcfLink, MjcfScene
 
 
 def attach_held_bodies(scene: MjcfScene) -> MjcfScene:
-    """Return a description in which free bodies hang below what an equality ties them to.
+    """Return a description with held free bodies as children of the links that hold them.
 
-    Only where the end of the equality is rigidly connected to the free body, no other holds it already, and
-    the file does not say itself who follows. The links are in the order from the world outwards again.
+    A body is attached if the end of the equality is rigidly connected to it, if no other equality holds it,
+    and if the file does not state the dependent joints itself. The links are ordered from the world outwards.
     """
     if not scene.closures:
         return scene
-    holding = _HeldBodies(scene)
-    closures = tuple(c for c in scene.closures if c.dependent is not None or not holding.take(c))
-    return replace(scene, links=_outwards(holding.links.values()), closures=closures)
+    held_bodies = _HeldBodies(scene)
+    closures = tuple(c for c in scene.closures if c.dependent is not None or not held_bodies.attach(c))
+    return replace(scene, links=_outwards(held_bodies.links.values()), closures=closures)
 
 
 def compute_rest_poses(links: Iterable[MjcfLink]) -> dict[str, Pose]:
-    """Return where all bodies are in the world while no joint has moved."""
+    """Return the poses of all bodies in the world while all joints are at their references."""
     poses: dict[str, Pose] = {}
     for link in links:
         poses[link.name] = compose_poses(poses[link.parent], link.pose) if link.name != WORLD else IDENTITY
@@ -38,53 +38,61 @@ def compute_rest_poses(links: Iterable[MjcfLink]) -> dict[str, Pose]:
 
 
 class _HeldBodies:
+    """Links of a description, of which free ones are attached to others one by one."""
+
     def __init__(self, scene: MjcfScene) -> None:
         self.links = {link.name: link for link in scene.links}
         self._sites = {site.name: site for site in scene.sites}
         self._rest = compute_rest_poses(scene.links)
-        self._together = DisjointSets()
+        self._groups = DisjointSets()
         self._tops: dict[str, str] = {WORLD: WORLD}
         for link in scene.links:
             if link.name != WORLD:
                 free = link.parent == WORLD and _is_free(link)
                 self._tops[link.name] = link.name if free else self._tops[link.parent]
 
-    def take(self, closure: MjcfClosure) -> bool:
-        """Hang a free body below what an equality ties it to; return whether that is possible."""
+    def attach(self, closure: MjcfClosure) -> bool:
+        """Attach a free body at one end of an equality to the other end; return False if there is none."""
         first = self._on_link(closure.first, closure.in_first)
         second = self._on_link(closure.second, closure.in_second)
-        return self._hang(closure, first, second) or self._hang(closure, second, first)
+        return self._attach_to(closure, first, second) or self._attach_to(closure, second, first)
 
-    def _on_link(self, frame: str, inside: Pose) -> tuple[str, Pose]:
+    def _on_link(self, frame: str, pose: Pose) -> tuple[str, Pose]:
+        """Return the link of a link or site, and a pose of that frame in the link."""
         site = self._sites.get(frame)
-        return (frame, inside) if site is None else (site.parent, compose_poses(site.pose, inside))
+        return (frame, pose) if site is None else (site.parent, compose_poses(site.pose, pose))
 
-    def _hang(self, closure: MjcfClosure, holder: tuple[str, Pose], held: tuple[str, Pose]) -> bool:
+    def _attach_to(self, closure: MjcfClosure, holder: tuple[str, Pose], held: tuple[str, Pose]) -> bool:
+        """Attach the free body at one end to the link at the other end; return False if it is not free."""
         name, end = held
         while not self.links[name].joints and name != WORLD:
             end, name = compose_poses(self.links[name].pose, end), self.links[name].parent
-        link, (by, at) = self.links[name], holder
-        if not _is_free(link) or not self._together.union(self._tops[by], name):
+        link, (parent, parent_end) = self.links[name], holder
+        if not _is_free(link) or not self._groups.union(self._tops[parent], name):
             return False
         if closure.kind == "weld":
-            self.links[name] = replace(link, parent=by, pose=compose_poses(at, invert_pose(end)), joints=())
+            pose = compose_poses(parent_end, invert_pose(end))
+            self.links[name] = replace(link, parent=parent, pose=pose, joints=())
             return True
-        # At rest it is turned as in the file, and its end is where the other one is.
-        rows = compose_poses(invert_pose(self._rest[by]), self._rest[name]).rows
-        turn = Pose((*rows[:3], 0.0, *rows[4:7], 0.0, *rows[8:11], 0.0))
-        x, y, z = (p - q for p, q in zip(at.rows[3::4], compose_poses(turn, end).rows[3::4], strict=True))
+        # At rest, the body has its orientation in the file, and the two ends coincide.
+        rows = compose_poses(invert_pose(self._rest[parent]), self._rest[name]).rows
+        rotation = Pose((*rows[:3], 0.0, *rows[4:7], 0.0, *rows[8:11], 0.0))
+        rotated_end = compose_poses(rotation, end)
+        x, y, z = (p - q for p, q in zip(parent_end.rows[3::4], rotated_end.rows[3::4], strict=True))
         anchor = end.rows[3], end.rows[7], end.rows[11]
         ball = replace(link.joints[0], kind="ball", anchor=anchor, home=())
-        moved = compose_poses(Pose((1.0, 0.0, 0.0, x, 0.0, 1.0, 0.0, y, 0.0, 0.0, 1.0, z)), turn)
-        self.links[name] = replace(link, parent=by, pose=moved, joints=(ball,))
+        pose = compose_poses(Pose((1.0, 0.0, 0.0, x, 0.0, 1.0, 0.0, y, 0.0, 0.0, 1.0, z)), rotation)
+        self.links[name] = replace(link, parent=parent, pose=pose, joints=(ball,))
         return True
 
 
 def _is_free(link: MjcfLink) -> bool:
+    """Return True if a link has a free joint."""
     return any(joint.kind == "free" for joint in link.joints)
 
 
 def _outwards(links: Iterable[MjcfLink]) -> tuple[MjcfLink, ...]:
+    """Return links from the world outwards, depth first."""
     below: dict[str, list[MjcfLink]] = {}
     world = []
     for link in links:
@@ -93,9 +101,9 @@ def _outwards(links: Iterable[MjcfLink]) -> tuple[MjcfLink, ...]:
         else:
             below.setdefault(link.parent, []).append(link)
     ordered: list[MjcfLink] = []
-    ahead = world
-    while ahead:
-        link = ahead.pop()
+    stack = world
+    while stack:
+        link = stack.pop()
         ordered.append(link)
-        ahead.extend(reversed(below.get(link.name, ())))
+        stack.extend(reversed(below.get(link.name, ())))
     return tuple(ordered)

@@ -1,7 +1,7 @@
 """MJCF joint equalities as joints that follow others.
 
-An equality says y - y0 = Σ aₖ (x - x0)ᵏ. In the order of the file, y follows x, unless it follows already or
-x follows y: then the equality stays as what it is, a constraint.
+An equality is y - y0 = Σ aₖ (x - x0)ᵏ. In the order of the file, the joint y becomes a function of x, unless
+it follows another joint already or x follows y. Those equalities stay constraints.
 """
 
 from __future__ import annotations
@@ -18,33 +18,33 @@ from kineverse.symbols import position
 from .description import MjcfCoupling, MjcfJoint, Quartic
 
 _FIXED = "\0"
-"""Stands for what leads a joint that an equality holds where it is: no name has it."""
+"""Leader of joints that an equality fixes; not a valid name."""
 
-_SAME = 1e-6
+_HOME_TOLERANCE = 1e-6
 
 
 class FollowerJoints:
-    """The joints that follow others.
+    """Joints that follow others by equalities.
 
     Attributes
     ----------
     leaders
-        What each of them follows directly; None where it stands still.
-    left_over
-        The equalities that made none follow.
+        Joint that each of them follows directly; None for a joint that is fixed.
+    remaining
+        Equalities that remain constraints.
     """
 
-    def __init__(self, couplings: Iterable[MjcfCoupling], named: Callable[[str], str]) -> None:
-        self._named = named
+    def __init__(self, couplings: Iterable[MjcfCoupling], model_name: Callable[[str], str]) -> None:
+        self._model_name = model_name
         self._by_follower: dict[str, MjcfCoupling] = {}
-        self.left_over: list[MjcfCoupling] = []
+        self.remaining: list[MjcfCoupling] = []
         groups = DisjointSets()
         for coupling in couplings:
             follower = coupling.follower
             if follower not in self._by_follower and groups.union(coupling.leader or _FIXED, follower):
                 self._by_follower[follower] = coupling
             else:
-                self.left_over.append(coupling)
+                self.remaining.append(coupling)
         self._expressions: dict[str, Expression] = {}
         self.leaders = {name: coupling.leader for name, coupling in self._by_follower.items()}
 
@@ -52,30 +52,30 @@ class FollowerJoints:
         return joint in self._by_follower
 
     def position(self, joint: str) -> Expression:
-        """Return the position of a joint: its coordinate, or what it is in terms of those that lead."""
+        """Return the position of a joint: its coordinate, or an expression of independent coordinates."""
         chain: list[MjcfCoupling] = []
-        ahead: str | None = joint
-        while ahead is not None and ahead in self._by_follower and ahead not in self._expressions:
-            chain.append(self._by_follower[ahead])
-            ahead = chain[-1].leader
-        if ahead is None:
-            end = as_expression(0.0)  # of the polynomial only a0 is left
+        leader: str | None = joint
+        while leader is not None and leader in self._by_follower and leader not in self._expressions:
+            chain.append(self._by_follower[leader])
+            leader = chain[-1].leader
+        if leader is None:
+            q = as_expression(0.0)  # without leader, the polynomial is a0
         else:
-            end = self._expressions.get(ahead, position(self._named(ahead)))
+            q = self._expressions.get(leader, position(self._model_name(leader)))
         for coupling in reversed(chain):
-            end = self._expressions[coupling.follower] = coupling.rest + quartic_expression(
-                coupling.coefficients, end - coupling.leader_rest
+            q = self._expressions[coupling.follower] = coupling.rest + quartic_expression(
+                coupling.coefficients, q - coupling.leader_rest
             )
-        return end
+        return q
 
     def constraints(self) -> Iterator[Constrain]:
-        """Yield the equalities that are left over; tell of those that can never hold."""
-        for coupling in self.left_over:
+        """Yield the remaining equalities as constraints; warn of those that cannot hold."""
+        for coupling in self.remaining:
             leader = as_expression(0.0) if coupling.leader is None else self.position(coupling.leader)
-            along = quartic_expression(coupling.coefficients, leader - coupling.leader_rest)
-            residual = self.position(coupling.follower) - coupling.rest - along
+            target = quartic_expression(coupling.coefficients, leader - coupling.leader_rest)
+            residual = self.position(coupling.follower) - coupling.rest - target
             if residual.symbols:
-                name = self._named(coupling.name)
+                name = self._model_name(coupling.name)
                 yield Constrain(name, Constraint.of(0.0, residual, 0.0))
             elif abs(float(residual)) > 1e-9:
                 warn(
@@ -85,25 +85,25 @@ class FollowerJoints:
                     ]
                 )
 
-    def warn_homes(self, joints: Iterable[MjcfJoint], source: str) -> None:
-        """Tell of followers that a file says to be elsewhere at home than where they follow to."""
+    def warn_moved_homes(self, joints: Iterable[MjcfJoint], source: str) -> None:
+        """Warn of followers whose home position in the file is not that of the equality."""
         homes = {joint.name: joint.home[0] for joint in joints if len(joint.home) == 1}
-        known = {position(self._named(name)): home for name, home in homes.items()}
+        known = {position(self._model_name(name)): value for name, value in homes.items()}
         for name in self.leaders:
             follows = self.position(name)
             if name in homes and all(s in known for s in follows.symbols):
-                there = float(follows({s: known[s] for s in follows.symbols}))
-                if abs(there - homes[name]) > _SAME:
+                home = float(follows({s: known[s] for s in follows.symbols}))
+                if abs(home - homes[name]) > _HOME_TOLERANCE:
                     warn(
                         [
-                            f"{source}: its home is moved to where equalities hold: '{self._named(name)}' "
-                            f"from {homes[name]:.6g} to {there:.6g}."
+                            f"{source}: its home is moved to where equalities hold: "
+                            f"'{self._model_name(name)}' from {homes[name]:.6g} to {home:.6g}."
                         ]
                     )
 
 
 def quartic_expression(coefficients: Quartic, x: Expression) -> Expression:
-    """Return Σ aₖ xᵏ, by Horner's rule and without terms that are zero."""
+    """Return Σ aₖ xᵏ by Horner's rule, without the terms that are zero."""
     result: Expression | None = None
     for a in reversed(coefficients):
         if result is not None:

@@ -1,8 +1,8 @@
 """MJCF mesh assets, with boxes in their place while MuJoCo compiles.
 
-MuJoCo moves the origin of a mesh to its centre and turns it to its principal axes. What it did to the box,
-undone, is the frame of the file, for any content of the file. A file is read only where it decides something:
-the inertia of a body that states none, or the size of a shape fitted to it.
+MuJoCo moves the origin of a mesh to its centre and rotates it to its principal axes. The inverse of the
+transform that it applies to the box gives the frame of the file, whatever its content. A file is read only if
+something depends on it: the inertia of a body that states none, or the size of a shape fitted to it.
 """
 
 from __future__ import annotations
@@ -28,12 +28,13 @@ from .preprocess import PreprocessedMjcf
 
 _FORMATS = (".stl", ".obj", ".msh")
 _DIAGONAL = 1e-9
-_UNMOVED = [1.0] * 3, [0.0] * 3, [1.0, 0.0, 0.0, 0.0]
+_IDENTITY_PLACEMENT = [1.0] * 3, [0.0] * 3, [1.0, 0.0, 0.0, 0.0]
+"""Scale, position and quaternion (w, x, y, z) of a mesh that is not moved."""
 
 
 @dataclass(frozen=True, slots=True)
 class MeshAsset:
-    """A mesh as the description says it: v' = S Rᵀ (v - p) for the vertices v of the file."""
+    """Mesh asset of a description: v' = S Rᵀ (v - p) for the vertices v of the file."""
 
     uri: str
     scale: tuple[float, ...]
@@ -43,19 +44,19 @@ class MeshAsset:
 
 @dataclass(slots=True)
 class MjcfMeshes:
-    """The meshes of a specification, by name.
+    """Meshes of a specification, by name.
 
-    ``guessed`` are the bodies whose inertia nobody knows since a file is not there, ``fitted`` the shapes
-    whose size nobody knows.
+    ``unknown_inertia`` are the bodies whose inertia depends on a missing file, ``unknown_size`` the geoms
+    whose size does.
     """
 
     assets: dict[str, MeshAsset] = field(default_factory=dict)
-    guessed: list[Any] = field(default_factory=list)
-    fitted: list[Any] = field(default_factory=list)
+    unknown_inertia: list[Any] = field(default_factory=list)
+    unknown_size: list[Any] = field(default_factory=list)
 
 
 class MeshReplacement:
-    """Puts boxes for files into a specification, and files where they decide something."""
+    """Replacement of mesh files in a specification by boxes, or by their content where it matters."""
 
     def __init__(
         self,
@@ -63,9 +64,9 @@ class MeshReplacement:
         prepared: PreprocessedMjcf,
         folder: str,
         root: str,
-        note: Callable[[MjcfElement, str], None],
+        remark: Callable[[MjcfElement, str], None],
     ) -> None:
-        self._spec, self._prepared, self._note = spec, prepared, note
+        self._spec, self._prepared, self._remark = spec, prepared, remark
         self._folder, self._root = folder, root
         self.meshes = MjcfMeshes()
         self._nodes: dict[str, MjcfElement] = {}
@@ -75,19 +76,19 @@ class MeshReplacement:
             if node is None or node not in prepared.files:
                 continue
             self._nodes[mesh.name] = node
-            scale, position, turn = (tuple(map(float, v)) for v in (mesh.scale, mesh.refpos, mesh.refquat))
-            self.meshes.assets[mesh.name] = MeshAsset(prepared.files[node].uri, scale, position, turn)
-            mesh.scale, mesh.refpos, mesh.refquat = _UNMOVED
+            placement = (tuple(map(float, v)) for v in (mesh.scale, mesh.refpos, mesh.refquat))
+            self.meshes.assets[mesh.name] = MeshAsset(prepared.files[node].uri, *placement)
+            mesh.scale, mesh.refpos, mesh.refquat = _IDENTITY_PLACEMENT
             self._boxes[mesh.name] = mesh, list(mesh.uservert), list(mesh.userface)
 
     def read_files(self, wanted: bool = True) -> bool:
-        """Give MuJoCo the files that decide something; return whether there are any.
+        """Read the files on which inertia or sizes depend; return True if there are any.
 
-        Where they are not wanted, or cannot be had, their boxes are back and what they decide is not known.
+        If files are not wanted or cannot be read, their boxes remain, and inertia and sizes are unknown.
         """
-        self.meshes.guessed, self.meshes.fitted = [], []
+        self.meshes.unknown_inertia, self.meshes.unknown_size = [], []
         needed = [
-            (geom, body) for body in self._spec.bodies for geom in body.geoms if self._decides(geom, body)
+            (geom, body) for body in self._spec.bodies for geom in body.geoms if self._needs_file(geom, body)
         ]
         contents: dict[str, bytes] = {}
         missing: dict[str, bool] = {}
@@ -99,16 +100,16 @@ class MeshReplacement:
                 self._set_file(name, content, contents)
             if missing[name]:
                 if geom.type != mujoco().mjtGeom.mjGEOM_MESH:
-                    self.meshes.fitted.append(geom)
-                if not any(body is other for other in self.meshes.guessed) and body.name != "world":
-                    self.meshes.guessed.append(body)
+                    self.meshes.unknown_size.append(geom)
+                if not any(body is other for other in self.meshes.unknown_inertia) and body.name != "world":
+                    self.meshes.unknown_inertia.append(body)
         self._spec.assets = contents
-        for body in self.meshes.guessed:
+        for body in self.meshes.unknown_inertia:
             self._keep_frame(body)
         return bool(contents)
 
     def _keep_frame(self, body: Any) -> None:
-        """Leave the frame of a free body where it is: it would be aligned with an inertia nobody knows."""
+        """Keep the frame of a free body of unknown inertia, with which MuJoCo would align it."""
         engine, kinds = mujoco(), mujoco().mjtAlignFree
         for joint in body.joints:
             if joint.type != engine.mjtJoint.mjJNT_FREE or joint.align == kinds.mjALIGNFREE_FALSE:
@@ -116,10 +117,11 @@ class MeshReplacement:
             if joint.align == kinds.mjALIGNFREE_TRUE or self._spec.compiler.alignfree:
                 node = self._prepared.node(body.info)
                 if node is not None:
-                    self._note(node, "is not aligned with its inertia, which is not known.")
+                    self._remark(node, "is not aligned with its inertia, which is not known.")
             joint.align = kinds.mjALIGNFREE_FALSE
 
-    def _decides(self, geom: Any, body: Any) -> bool:
+    def _needs_file(self, geom: Any, body: Any) -> bool:
+        """Return True if the inertia of a body or the size of a geom depends on a mesh file."""
         if geom.meshname not in self._nodes:
             return False
         engine, compiler = mujoco(), self._spec.compiler
@@ -136,7 +138,7 @@ class MeshReplacement:
         return bool(rule == kinds.mjINERTIAFROMGEOM_TRUE)
 
     def _content(self, name: str) -> bytes | None:
-        """Return the content of a file, None if it is not below the root, or of no known format."""
+        """Return the content of a mesh file; None, with a remark, if it cannot be read."""
         node, uri = self._nodes[name], self.meshes.assets[name].uri
         if not uri:
             return None
@@ -146,15 +148,16 @@ class MeshReplacement:
             return read_file(find_below_root(node, uri, self._root, self._folder))
         except FormatError as error:
             reason = str(error).removeprefix(f"{node.where}: ")
-            self._note(node, f"is not read, where its triangles decide an inertia or a size: {reason}")
+            self._remark(node, f"is not read, where its triangles decide an inertia or a size: {reason}")
             return None
 
     def _set_file(self, name: str, content: bytes | None, contents: dict[str, bytes]) -> None:
+        """Set a mesh to the content of its file, or to its box if there is none."""
         asset = self.meshes.assets[name]
         mesh, *box = self._boxes[name]
         if content is None:
             mesh.file, (mesh.uservert, mesh.userface) = "", box
-            mesh.scale, mesh.refpos, mesh.refquat = _UNMOVED
+            mesh.scale, mesh.refpos, mesh.refquat = _IDENTITY_PLACEMENT
             return
         mesh.file = f"{len(contents)}{Path(asset.uri).suffix.lower()}"
         contents[mesh.file] = content
@@ -163,9 +166,9 @@ class MeshReplacement:
 
 
 def place_mesh(asset: MeshAsset, body_T_mesh: Pose, folder: str, root: str) -> tuple[Mesh, Pose] | None:
-    """Return a mesh and where its file's frame is; None where no scale of the file says it.
+    """Return a mesh and the pose of its file's frame in a body; None if no scale along its axes exists.
 
-    With v' = S Rᵀ (v - p), v' = Rᵀ (R S Rᵀ v) - S Rᵀ p, so R S Rᵀ has to be a scale, too.
+    v' = S Rᵀ (v - p) = Rᵀ (R S Rᵀ v) - S Rᵀ p, so R S Rᵀ has to be diagonal.
     """
     w, x, y, z = asset.quaternion
     turn = poses.pose_from_quaternion((0.0, 0.0, 0.0), (x, y, z, w)).matrix[:3, :3]

@@ -23,12 +23,12 @@ _NOISE = re.compile(r"^(XML Error: |Error: |could not parse model file with erro
 
 
 def mujoco() -> Any:
-    """Return the package, which is imported when it is first needed.
+    """Import MuJoCo when it is first needed.
 
     Raises
     ------
     MissingDependencyError
-        If it is not installed.
+        If MuJoCo is not installed.
     """
     try:
         import mujoco as package
@@ -41,27 +41,27 @@ def mujoco() -> Any:
 
 @contextmanager
 def capture_mujoco_warnings() -> Iterator[list[str]]:
-    """Yield a list that takes MuJoCo's warnings, which would go to the terminal and a file otherwise."""
+    """Capture MuJoCo's warnings in a list; otherwise they go to the terminal and a file."""
     engine = mujoco()
-    heard: list[str] = []
-    with _MUJOCO_LOCK, warnings.catch_warnings(record=True) as warned:  # both are one for all of the process
+    captured: list[str] = []
+    with _MUJOCO_LOCK, warnings.catch_warnings(record=True) as warned:  # both are global to the process
         warnings.simplefilter("always")
         before = engine.get_mju_user_warning()
-        engine.set_mju_user_warning(heard.append)
+        engine.set_mju_user_warning(captured.append)
         try:
-            yield heard
+            yield captured
         finally:
             engine.set_mju_user_warning(before)
-            heard += [str(warning.message) for warning in warned]
+            captured += [str(warning.message) for warning in warned]
 
 
 def parse_spec(prepared: PreprocessedMjcf, source: str) -> Any:
-    """Return the ``MjSpec`` of a document.
+    """Parse a document to an ``MjSpec``.
 
     Raises
     ------
     FormatError
-        With what MuJoCo says about which element.
+        With the message of MuJoCo and the element it is about.
     """
     engine = mujoco()
     try:
@@ -71,12 +71,12 @@ def parse_spec(prepared: PreprocessedMjcf, source: str) -> Any:
 
 
 def compile_spec(spec: Any, prepared: PreprocessedMjcf, source: str) -> Any:
-    """Return the ``MjModel`` of a specification.
+    """Compile a specification to an ``MjModel``.
 
     Raises
     ------
     FormatError
-        With what MuJoCo says about which element.
+        With the message of MuJoCo and the element it is about.
     """
     engine = mujoco()
     try:
@@ -86,47 +86,47 @@ def compile_spec(spec: Any, prepared: PreprocessedMjcf, source: str) -> Any:
 
 
 def mujoco_error(error: Exception, prepared: PreprocessedMjcf, source: str) -> FormatError:
-    """Return the error that people see for one of MuJoCo's."""
+    """Return an error of MuJoCo as one with the place in the file."""
     text = str(error)
     reason = extract_reason(text)
     lines = [int(number) for number in _LINE.findall(text)]
-    # The innermost comes first: an attached model is complained about at the element that attaches it, too.
+    # The innermost line comes first, before those of the elements that attach the model.
     node = prepared.node(f"line {lines[0]}") if lines else None
     where = source if node is None else node.where
     return FormatError(f"{where}: MuJoCo refuses it: {reason or 'it gives no reason'}.")
 
 
 def extract_reason(text: str, whole: bool = False) -> str:
-    """Return the first line of what MuJoCo says, or all of its lines in one, without its own preamble."""
+    """Return the first line of a message of MuJoCo, or all lines joined, without the preamble."""
     lines = _NOISE.sub("", text.strip()).splitlines() or [""]
     return ", ".join(line.strip() for line in (lines if whole else lines[:1])).rstrip(".")
 
 
-_NAMED = re.compile(r"\bmesh_\d+\b")
+_MESH_NAME = re.compile(r"\bmesh_\d+\b")
 
 
 def find_load_error(root: Tag, folder: Path, converted: Mapping[Path, bytes]) -> str | None:
-    """Return what MuJoCo says against a document; None if it opens it, or is not installed.
+    """Return the error with which MuJoCo loads a document; None if there is none or MuJoCo is not installed.
 
     Parameters
     ----------
     root
-        The document.
+        Root element of the document.
     folder
-        Where it will lie.
+        Folder of the document.
     converted
-        Files that are going to be written with it.
+        Content of files that will be written with it, by path.
     """
     try:
         engine = mujoco()
     except MissingDependencyError:
         return None
     with TemporaryDirectory(prefix="kineverse-") as temporary:
-        there = {}
+        copies = {}
         for k, (path, content) in enumerate(converted.items()):
-            there[path] = Path(temporary, f"{k}{path.suffix}")
-            there[path].write_bytes(content)
-        text = format_xml(_with_absolute_files(root, folder, there)).decode()
+            copies[path] = Path(temporary, f"{k}{path.suffix}")
+            copies[path].write_bytes(content)
+        text = format_xml(_with_absolute_files(root, folder, copies)).decode()
         with capture_mujoco_warnings():
             try:
                 engine.MjModel.from_xml_string(text)
@@ -135,33 +135,36 @@ def find_load_error(root: Tag, folder: Path, converted: Mapping[Path, bytes]) ->
     return None
 
 
-def find_blamed_mesh(complaint: str, root: Tag) -> str | None:
-    """Return the file of the mesh that a complaint is about; None if it is about something else."""
-    names = {name.lower() for name in _NAMED.findall(complaint)}
+def find_blamed_mesh(error: str, root: Tag) -> str | None:
+    """Return the file of the mesh that an error is about; None for other errors."""
+    names = {name.lower() for name in _MESH_NAME.findall(error)}
     for tag in _assets(root):
         file = tag.attributes.get("file", "")
-        if tag.name == "mesh" and (tag.attributes["name"] in names or Path(file).name in complaint):
+        if tag.name == "mesh" and (tag.attributes["name"] in names or Path(file).name in error):
             return file
     return None
 
 
 def _assets(root: Tag) -> list[Tag]:
+    """Return the asset elements of a document."""
     return [tag for part in root.inside if part.name == "asset" for tag in part.inside]
 
 
-def _with_absolute_files(root: Tag, folder: Path, there: Mapping[Path, Path]) -> Tag:
+def _with_absolute_files(root: Tag, folder: Path, copies: Mapping[Path, Path]) -> Tag:
+    """Return a document with absolute paths of its assets; those of temporary copies where there are some."""
     inside = []
     for part in root.inside:
         if part.name == "asset":
             part = Tag(
-                part.name, part.attributes, [_with_absolute_file(tag, folder, there) for tag in part.inside]
+                part.name, part.attributes, [_with_absolute_file(tag, folder, copies) for tag in part.inside]
             )
         inside.append(part)
     return Tag(root.name, root.attributes, inside)
 
 
-def _with_absolute_file(tag: Tag, folder: Path, there: Mapping[Path, Path]) -> Tag:
+def _with_absolute_file(tag: Tag, folder: Path, copies: Mapping[Path, Path]) -> Tag:
+    """Return an asset with the absolute path of its file, if it has one."""
     if "file" not in tag.attributes:
         return tag
     path = folder / tag.attributes["file"]
-    return Tag(tag.name, {**tag.attributes, "file": str(there.get(path, path))}, tag.inside)
+    return Tag(tag.name, {**tag.attributes, "file": str(copies.get(path, path))}, tag.inside)

@@ -1,19 +1,20 @@
 """MJCF descriptions as model operations: bodies, sites, loops, tendons and the home position.
 
 Bodies and sites become frames, joints degrees of freedom of the same name, below the prefix. A joint that is
-not the last of its body, or whose anchor is not at the origin of the body, has a frame of its own in between.
+not the last of its body, or whose anchor is not at the origin of the body, gets an intermediate frame.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from typing import Any
 
 from kineverse.articulations import Ball, Continuous, Floating, Prismatic, Revolute
 from kineverse.articulations import Joint as JointOperation
 from kineverse.expressions.expression import array
 from kineverse.expressions.gradient import total_derivative
+from kineverse.formats.names import NameMap
 from kineverse.formats.poses import IDENTITY, compose_poses
 from kineverse.formats.tree import path_between
 from kineverse.loops.close_loop import CloseLoop
@@ -34,10 +35,8 @@ from .joint_equalities import FollowerJoints
 from .reader import parse_mjcf
 from .tendons import Tendon, TendonCoupling
 
-_LoopNameMap = Callable[[str], str]
 
-
-def loop_operations(scene: MjcfScene, named: _LoopNameMap, followers: FollowerJoints) -> Iterator[Operation]:
+def loop_operations(scene: MjcfScene, model_name: NameMap, followers: FollowerJoints) -> Iterator[Operation]:
     """Yield the operations that close the loops of a scene, in the order of the file."""
     parents = {link.name: link.parent for link in scene.links if link.name != WORLD}
     parents |= {site.name: site.parent for site in scene.sites}
@@ -46,28 +45,31 @@ def loop_operations(scene: MjcfScene, named: _LoopNameMap, followers: FollowerJo
     tied: set[str] = set()
     for closure in scene.closures:
         if closure.dependent is not None:
-            inside_it = [by_name[name] for name in (*closure.free, *closure.dependent)]
-            yield from _close_loop(closure, named, [v for joint in inside_it for v in _at_home(joint, named)])
-            tied |= {joint.name for joint in inside_it}
+            stated = [by_name[name] for name in (*closure.free, *closure.dependent)]
+            home = [value for joint in stated for value in _home_position(joint, model_name)]
+            yield from _close_loop(closure, model_name, home)
+            tied |= {joint.name for joint in stated}
             continue
-        inside: dict[str, MjcfJoint] = {}
+        in_loop: dict[str, MjcfJoint] = {}
         for link in path_between(closure.first, closure.second, parents):
             for joint in joints.get(link, ()):
                 name: str | None = joint.name
                 while name is not None and name in followers:
                     name = followers.leaders[name]
                 if name is not None:
-                    inside[name] = by_name[name]
-        # What an earlier loop determines is none of this one's coordinates.
-        rest = [v for name, joint in inside.items() if name not in tied for v in _nonzero_rest(joint, named)]
-        tied |= inside.keys()
-        yield from _close_loop(closure, named, rest)
+                    in_loop[name] = by_name[name]
+        # Coordinates of an earlier loop are dependent, so this loop has none of them.
+        free = [joint for name, joint in in_loop.items() if name not in tied]
+        home = [value for joint in free for value in _nonzero_rest(joint, model_name)]
+        tied |= in_loop.keys()
+        yield from _close_loop(closure, model_name, home)
 
 
 def _close_loop(
-    closure: MjcfClosure, named: _LoopNameMap, home: Iterable[tuple[str, float]]
+    closure: MjcfClosure, model_name: NameMap, home: Iterable[tuple[str, float]]
 ) -> Iterator[Operation]:
-    name, follow = named(closure.name), closure.dependent
+    """Yield the operations that close a loop, with frames for ends that have none."""
+    name, dependent = model_name(closure.name), closure.dependent
     pairs: list[list[str]] = []
     for k, part in enumerate((closure, *closure.more)):
         pairs.append([])
@@ -75,40 +77,37 @@ def _close_loop(
             ("first", part.first, part.in_first),
             ("second", part.second, part.in_second),
         ):
-            end = named(frame)
+            end = model_name(frame)
             if pose is not IDENTITY:
                 end = f"{name}/{k}/{suffix}" if k else f"{name}/{suffix}"
-                yield AddFrame(end, Frame(named(frame), (pose,)))
+                yield AddFrame(end, Frame(model_name(frame), (pose,)))
             pairs[-1].append(end)
     (frame, to), *more = pairs
-    # If nothing is said, the coordinates on the way to the first end come first, and so stay free.
+    # Without stated joints, the coordinates on the path to the first end come first and stay independent.
     yield CloseLoop(
         name=name,
         frame=frame,
         to=to,
         more=tuple((one, other) for one, other in more),
         mask=AXES[:3] if closure.kind == "connect" else AXES,
-        dependent=None if follow is None else tuple(symbol_name(named(joint), 0) for joint in follow),
+        dependent=None if dependent is None else tuple(symbol_name(model_name(j), 0) for j in dependent),
         home=tuple(home),
     )
 
 
-def _at_home(joint: MjcfJoint, named: _LoopNameMap) -> Iterator[tuple[str, float]]:
-    """Yield the coordinates of a joint at home, where a loop that was written here is closed."""
+def _home_position(joint: MjcfJoint, model_name: NameMap) -> Iterator[tuple[str, float]]:
+    """Yield the coordinates of a joint at its home position, in which a loop of a written file is closed."""
     suffixes = COORDINATE_SUFFIXES[joint.kind] or ("",)
-    for suffix, value in zip(suffixes, joint.home, strict=False):  # what something holds has no home
-        yield symbol_name(f"{named(joint.name)}/{suffix}".rstrip("/"), 0), value
+    for suffix, value in zip(suffixes, joint.home, strict=False):  # held bodies have no home position
+        yield symbol_name(f"{model_name(joint.name)}/{suffix}".rstrip("/"), 0), value
 
 
-def _nonzero_rest(joint: MjcfJoint, named: _LoopNameMap) -> Iterator[tuple[str, float]]:
-    """Yield the coordinates of a joint that are not zero at rest, where its equalities hold."""
+def _nonzero_rest(joint: MjcfJoint, model_name: NameMap) -> Iterator[tuple[str, float]]:
+    """Yield the coordinates of a joint that are not zero in the reference configuration of its equalities."""
     if joint.kind in ("ball", "free"):
-        yield symbol_name(f"{named(joint.name)}/qw", 0), 1.0
+        yield symbol_name(f"{model_name(joint.name)}/qw", 0), 1.0
     elif joint.reference:
-        yield symbol_name(named(joint.name), 0), joint.reference
-
-
-MjcfNameMap = Callable[[str], str]
+        yield symbol_name(model_name(joint.name), 0), joint.reference
 
 
 def mjcf_file_operations(file: FileContent) -> Iterator[tuple[str, Operation]]:
@@ -119,87 +118,90 @@ def mjcf_file_operations(file: FileContent) -> Iterator[tuple[str, Operation]]:
 
 
 def mjcf_operations(scene: MjcfScene, prefix: str | None = None) -> Iterator[Operation]:
-    """Yield the operations that build what a file describes.
+    """Yield the operations that build the model of a file.
 
     Parameters
     ----------
     scene
         The description.
     prefix
-        Put in front of the names of frames and degrees of freedom, with a slash. The world of the file is
-        the frame ``prefix/world`` then.
+        Prefix of the names of frames and degrees of freedom, without its slash. The world of the file becomes
+        the frame ``prefix/world``.
     """
 
-    def named(name: str) -> str:
+    def model_name(name: str) -> str:
         return f"{prefix}/{name}" if prefix else name
 
     scene = attach_held_bodies(scene)
-    followers = FollowerJoints(scene.couplings, named)
+    followers = FollowerJoints(scene.couplings, model_name)
     if prefix:
-        yield AddFrame(named(WORLD), Frame(MODEL_WORLD, (IDENTITY,)))
+        yield AddFrame(model_name(WORLD), Frame(MODEL_WORLD, (IDENTITY,)))
     for link in scene.links:
         if link.name != WORLD:
-            yield from _link(link, named, followers)
+            yield from _link(link, model_name, followers)
         if not is_empty_body(link.body):
-            yield SetBody(named(link.name), link.body)
+            yield SetBody(model_name(link.name), link.body)
     for site in scene.sites:
-        yield AddFrame(named(site.name), Frame(named(site.parent), (site.pose,)))
+        yield AddFrame(model_name(site.name), Frame(model_name(site.parent), (site.pose,)))
     yield from followers.constraints()
     if scene.has_home:
-        followers.warn_homes((joint for link in scene.links for joint in link.joints), scene.source)
-    yield from loop_operations(scene, named, followers)
+        followers.warn_moved_homes((joint for link in scene.links for joint in link.joints), scene.source)
+    yield from loop_operations(scene, model_name, followers)
     for tendon in scene.tendons:
         yield Tendon(
-            name=named(tendon.name),
-            terms=tuple((named(joint), factor) for joint, factor in tendon.terms),
-            paths=tuple((divisor, tuple(map(named, sites))) for divisor, sites in tendon.paths),
+            name=model_name(tendon.name),
+            terms=tuple((model_name(joint), factor) for joint, factor in tendon.terms),
+            paths=tuple((divisor, tuple(map(model_name, sites))) for divisor, sites in tendon.paths),
             lower=tendon.lower,
             upper=tendon.upper,
             dynamics=tendon.dynamics,
         )
     for coupling in scene.tendon_couplings:
-        yield _tendon_coupling(coupling, named)
+        yield _tendon_coupling(coupling, model_name)
     for link in scene.links:
         for joint in link.joints:
-            if joint.name not in followers and (any(joint.home[:6]) or _is_outside(joint, scene.has_home)):
-                yield SetHome(named(joint.name), joint.home)
+            if joint.name not in followers and (
+                any(joint.home[:6]) or _is_home_outside(joint, scene.has_home)
+            ):
+                yield SetHome(model_name(joint.name), joint.home)
 
 
-def _link(link: MjcfLink, named: MjcfNameMap, followers: FollowerJoints) -> Iterator[Operation]:
-    """Yield the joints of a body one after the other, each from where the one before has moved it."""
-    child, parent, place = named(link.name), named(link.parent), link.pose
+def _link(link: MjcfLink, model_name: NameMap, followers: FollowerJoints) -> Iterator[Operation]:
+    """Yield the operations of the joints of a body in series."""
+    child, parent, parent_T_body = model_name(link.name), model_name(link.parent), link.pose
     for joint in link.joints:
         last = joint is link.joints[-1] and not any(joint.anchor)
-        origin = compose_poses(place, _offset(joint.anchor))
+        origin = compose_poses(parent_T_body, _translation(joint.anchor))
         if joint.reference:
-            origin = compose_poses(origin, _motion_back(joint))
-        moved = child if last else named(joint.frame)
-        yield _joint(joint, parent, moved, origin, named, followers)
+            origin = compose_poses(origin, _motion_from_reference(joint))
+        moved = child if last else model_name(joint.frame)
+        yield _joint(joint, parent, moved, origin, model_name, followers)
         if joint.kind == "ball" and joint.upper is not None:
-            yield _largest_angle(named(joint.name), joint.upper)
+            yield _angle_limit(model_name(joint.name), joint.upper)
         if joint.speed is not None and _velocity(joint) is None:
             q = followers.position(joint.name)
             limit = Constraint.of(joint.speed[0], total_derivative(q), joint.speed[1])
-            yield Constrain(f"{named(joint.name)}/velocity", limit)
+            yield Constrain(f"{model_name(joint.name)}/velocity", limit)
         x, y, z = joint.anchor
-        place, parent = _offset((-x, -y, -z)), moved
+        parent_T_body, parent = _translation((-x, -y, -z)), moved
     if parent != child:
-        yield AddFrame(child, Frame(parent, (place,)))
+        yield AddFrame(child, Frame(parent, (parent_T_body,)))
 
 
-def _is_outside(joint: MjcfJoint, said: bool) -> bool:
-    """Return whether a file says that a joint is at home where it cannot be."""
-    if not said or joint.kind not in ("hinge", "slide") or not joint.home:
+def _is_home_outside(joint: MjcfJoint, has_home: bool) -> bool:
+    """Return True if the home position of a joint in the file is outside of its limits."""
+    if not has_home or joint.kind not in ("hinge", "slide") or not joint.home:
         return False
     lower, upper = joint.lower, joint.upper
     return (lower is not None and joint.home[0] < lower) or (upper is not None and upper < joint.home[0])
 
 
 def _joint(
-    joint: MjcfJoint, parent: str, child: str, origin: Pose, named: MjcfNameMap, followers: FollowerJoints
+    joint: MjcfJoint, parent: str, child: str, origin: Pose, model_name: NameMap, followers: FollowerJoints
 ) -> JointOperation:
+    """Return the operation of a joint."""
     common: dict[str, Any] = {
-        "name": named(joint.name),
+        "name": model_name(joint.name),
         "parent": parent,
         "child": child,
         "origin": origin,
@@ -222,42 +224,44 @@ def _joint(
 
 
 def _velocity(joint: MjcfJoint) -> float | None:
-    """Return the limit of a speed that is the same in both directions."""
+    """Return the velocity limit of a joint; None unless it is the same in both directions."""
     if joint.speed is None or joint.speed[0] != -joint.speed[1]:
         return None
     return joint.speed[1]
 
 
-def _largest_angle(name: str, angle: float) -> Constrain:
-    """Return the limit of how far a ball turns, about any axis: 1 - cos(angle), which is smooth at rest."""
+def _angle_limit(name: str, angle: float) -> Constrain:
+    """Return the limit of a ball joint's angle, as one on 1 - cos(angle), which is smooth at zero."""
     x, y, z, w = (position(f"{name}/q{c}") for c in "xyzw")
     q, v = array([x, y, z, w]), array([x, y, z])
-    turned = 2 * (v @ v) / (q @ q)
+    one_minus_cos = 2 * (v @ v) / (q @ q)
     return Constrain(
-        f"{name}/angle", Constraint.of(-math.inf, turned, 2 * math.sin(min(angle, math.pi) / 2) ** 2)
+        f"{name}/angle", Constraint.of(-math.inf, one_minus_cos, 2 * math.sin(min(angle, math.pi) / 2) ** 2)
     )
 
 
-def _offset(point: Vector3) -> Pose:
+def _translation(point: Vector3) -> Pose:
+    """Return the pose of a translation."""
     if not any(point):
         return IDENTITY
     x, y, z = point
     return Pose((1.0, 0.0, 0.0, x, 0.0, 1.0, 0.0, y, 0.0, 0.0, 1.0, z))
 
 
-def _motion_back(joint: MjcfJoint) -> Pose:
-    """Return how a joint moves from its reference to 0."""
+def _motion_from_reference(joint: MjcfJoint) -> Pose:
+    """Return the motion of a joint from its reference to 0."""
     if joint.kind == "hinge":
         return Pose.of(axis_angle(joint.axis, -joint.reference))
     x, y, z = (-joint.reference * a for a in joint.axis)
-    return _offset((x, y, z))
+    return _translation((x, y, z))
 
 
-def _tendon_coupling(coupling: MjcfCoupling, named: MjcfNameMap) -> TendonCoupling:
-    leader = None if coupling.leader is None else named(coupling.leader)
+def _tendon_coupling(coupling: MjcfCoupling, model_name: NameMap) -> TendonCoupling:
+    """Return the operation of a tendon equality."""
+    leader = None if coupling.leader is None else model_name(coupling.leader)
     return TendonCoupling(
-        name=named(coupling.name),
-        tendon=named(coupling.follower),
+        name=model_name(coupling.name),
+        tendon=model_name(coupling.follower),
         leader=leader,
         coefficients=coupling.coefficients,
         rest=coupling.rest,

@@ -1,6 +1,6 @@
 """Preprocessing of MJCF: attached models gathered, files, plugins and unsupported elements removed.
 
-Where bodies are does not depend on any of it. Mesh files are replaced by boxes, see :mod:`.meshes`.
+None of these affects the poses of bodies. Mesh files are replaced by boxes, see :mod:`.meshes`.
 """
 
 from __future__ import annotations
@@ -21,20 +21,20 @@ from .custom_elements import CustomElements, read_custom_elements
 from .elements import MjcfElement, find_below_root, read_tree, serialize_elements
 
 MAX_ELEMENTS = 30_000
-"""The most elements that a file may be once <replicate> and <attach> have copied them."""
+"""Largest number of elements of a document after <replicate> and <attach>."""
 
 BOX_MESH = {
     "vertex": "-1 -2 -3  1 -2 -3  -1 2 -3  1 2 -3  -1 -2 3  1 -2 3  -1 2 3  1 2 3",
     "face": "0 2 1 1 2 3 4 5 6 5 7 6 0 1 4 1 5 4 2 6 3 3 6 7 0 4 2 2 4 6 1 3 5 3 7 5",
 }
-"""The triangles that stand for those of files."""
+"""Box in place of the triangles of mesh files."""
 
 _SECTIONS = frozenset(
     ("size", "visual", "statistic", "custom", "sensor", "extension", "contact", "deformable")
 )
 _ELEMENTS = frozenset(("plugin", "flexcomp", "skin", "texture", "hfield", "light", "camera", "layer"))
 _FLEXIBLE = frozenset(("flex", "flexvert", "flexstrain"))
-_TOLD = {
+_REMARKS = {
     "deformable": "is left out: what bends has no frames here.",
     "flexcomp": "is left out: what bends has no frames here.",
     "flex": "is left out: what bends has no frames here.",
@@ -75,31 +75,31 @@ _LARGE = re.compile(r"e\+?\d\d|\d{40}|0x|inf", re.IGNORECASE)
 
 @dataclass(frozen=True, slots=True)
 class MeshReference:
-    """The file of a mesh as the description names it; empty for shapes that MuJoCo generates."""
+    """Reference of a mesh to its file; empty for shapes that MuJoCo generates."""
 
     uri: str
 
 
 def remove_unsupported(
-    root: MjcfElement, note: Callable[[MjcfElement, str], None]
+    root: MjcfElement, remark: Callable[[MjcfElement, str], None]
 ) -> dict[MjcfElement, MeshReference]:
-    """Take out of a tree what MuJoCo is not given; return the files of meshes.
+    """Remove unsupported elements and attributes from a tree; return the files of its meshes.
 
     Raises
     ------
     FormatError
-        For numbers that are none, and models without file.
+        For numbers that are not finite or too large, and for models without file.
     """
-    meshdir, strips = _directory(root)
-    root.children = [child for child in root.children if not _is_left_out(child, _SECTIONS, note)]
+    meshdir, strip_paths = _mesh_directory(root)
+    root.children = [child for child in root.children if not _is_removed(child, _SECTIONS, remark)]
     files: dict[MjcfElement, MeshReference] = {}
     for node in root.walk():
         unwanted = _ELEMENTS | _FLEXIBLE if node.tag == "equality" else _ELEMENTS
-        node.children = [child for child in node.children if not _is_left_out(child, unwanted, note)]
+        node.children = [child for child in node.children if not _is_removed(child, unwanted, remark)]
         if node.tag == "model" and not node.attributes.get("file"):
             node.refuse("names no file.")
         if node.tag == "mesh" and ("file" in node.attributes or "builtin" in node.attributes):
-            files[node] = _without_file(node, meshdir, strips)
+            files[node] = _replace_file(node, meshdir, strip_paths)
         for key in _ATTRIBUTES.get(node.tag, ()):
             node.attributes.pop(key, None)
         for key, value in node.attributes.items():
@@ -109,56 +109,59 @@ def remove_unsupported(
 
 
 def _check_numbers(node: MjcfElement, key: str, value: str) -> None:
+    """Refuse an attribute with a NaN or with numbers that are too large."""
     if not _NOT_NUMBERS.isdisjoint(value.lower().split()):
         node.refuse(f"{key}={quote(value)} has a NaN, where a number is expected.")
     if key == "count" or not _LARGE.search(value):
         return
     words = value.split()
-    if key.endswith("range"):  # the largest numbers may say that there is no limit
+    if key.endswith("range"):  # very large numbers at one end mean no limit
         above = not words[0].startswith("-") and _is_large(words[0])
         if above or (words[-1].startswith("-") and _is_large(words[-1])):
             node.refuse(f"{key}={quote(value)} has all of its numbers beyond {LARGEST:g}.")
-    # Squares of larger ones overflow inside of MuJoCo.
+    # Squares of larger numbers overflow in MuJoCo.
     elif any(map(_is_large, words)):
         node.refuse(f"{key}={quote(value)} has a number beyond {LARGEST:g}.")
 
 
 def _is_large(word: str) -> bool:
+    """Return True for an infinite number, or one beyond :data:`LARGEST`."""
     try:
         number = float.fromhex(word) if "x" in word.lower() else float(word)
     except OverflowError:
         return True
-    except ValueError:  # MuJoCo says so
+    except ValueError:  # MuJoCo reports it
         return False
-    # What is only too long a number MuJoCo refuses itself.
+    # MuJoCo itself refuses numbers with too many digits.
     return abs(number) > LARGEST and (number < math.inf or "inf" in word.lower())
 
 
-def _is_left_out(
-    node: MjcfElement, unwanted: frozenset[str], note: Callable[[MjcfElement, str], None]
+def _is_removed(
+    node: MjcfElement, unwanted: frozenset[str], remark: Callable[[MjcfElement, str], None]
 ) -> bool:
+    """Return True for an element to remove, with a remark where that changes the model."""
     if node.tag not in unwanted:
         return False
-    if node.tag in _TOLD:
-        note(node, _TOLD[node.tag])
+    if node.tag in _REMARKS:
+        remark(node, _REMARKS[node.tag])
     return True
 
 
-def _directory(root: MjcfElement) -> tuple[str, bool]:
-    """Return the folder of meshes as the compiler settings say, and whether paths of files do not count."""
-    meshdir, strips = "", False
+def _mesh_directory(root: MjcfElement) -> tuple[str, bool]:
+    """Return ``meshdir`` and ``strippath`` of the compiler settings."""
+    meshdir, strip_paths = "", False
     for node in root.children:
         if node.tag == "compiler":
             meshdir = node.attributes.get("assetdir", meshdir)
             meshdir = node.attributes.get("meshdir", meshdir)
-            strips = node.attributes.get("strippath", str(strips)).lower() == "true"
-    return meshdir, strips
+            strip_paths = node.attributes.get("strippath", str(strip_paths)).lower() == "true"
+    return meshdir, strip_paths
 
 
-def _without_file(node: MjcfElement, meshdir: str, strips: bool) -> MeshReference:
-    """Put a box in place of what a mesh gets from elsewhere, under the name that the mesh would have."""
+def _replace_file(node: MjcfElement, meshdir: str, strip_paths: bool) -> MeshReference:
+    """Replace the file of a mesh by a box under the same name; return the file."""
     file = node.attributes.get("file", "")
-    if strips:
+    if strip_paths:
         file = posixpath.basename(file)
     if not node.attributes.get("name") and file:
         node.attributes["name"] = posixpath.splitext(posixpath.basename(file))[0]
@@ -169,34 +172,35 @@ def _without_file(node: MjcfElement, meshdir: str, strips: bool) -> MeshReferenc
 
 
 def check_element_count(root: MjcfElement, attached: Mapping[str, int]) -> int:
-    """Return how many elements a document has once all is copied that is to be copied.
+    """Return the number of elements of a document after all replications and attachments.
 
     Parameters
     ----------
     root
-        The document.
+        Root element of the document.
     attached
-        How many elements its models have, by name.
+        Number of elements of its attached models, by name.
 
     Raises
     ------
     FormatError
-        If they are more than ``MAX_ELEMENTS``.
+        If the number exceeds :data:`MAX_ELEMENTS`.
     """
     total = 0
-    ahead = [(root, 1)]
-    while ahead:
-        node, copies = ahead.pop()
+    stack = [(root, 1)]
+    while stack:
+        node, copies = stack.pop()
         if node.tag in ("replicate", "composite"):
             copies *= _count(node)
         total += copies * (1 + attached.get(node.attributes.get("model", ""), 0) * (node.tag == "attach"))
         if total > MAX_ELEMENTS:
             node.refuse(f"makes the model larger than {MAX_ELEMENTS} elements, the most that is read.")
-        ahead.extend((child, copies) for child in node.children)
+        stack.extend((child, copies) for child in node.children)
     return total
 
 
 def _count(node: MjcfElement) -> int:
+    """Return the number of copies that an element makes."""
     product = 1
     for word in node.attributes.get("count", "1").split():
         try:
@@ -207,16 +211,25 @@ def _count(node: MjcfElement) -> int:
 
 
 MAX_ATTACH_DEPTH = 20
-"""How many models may be inside of each other."""
+"""Deepest nesting of attached models."""
 
 
 @dataclass(slots=True)
 class PreprocessedMjcf:
-    """What MuJoCo is given.
+    """Input of MuJoCo's parser.
 
-    ``models`` are the texts of attached models, by the names that ``text`` and they know each other by. Line
-    n of all of them together is ``nodes[n - 1]``. ``files`` are the files of the meshes.
-    ``custom`` is what the file says beside that, if it was written here.
+    Attributes
+    ----------
+    text
+        Text of the document.
+    models
+        Texts of the attached models, by the names with which they are referenced.
+    nodes
+        Elements by line: ``nodes[n - 1]`` is on line n, over all of these texts.
+    files
+        Files of the meshes.
+    custom
+        Data of the custom elements.
     """
 
     text: str = ""
@@ -226,14 +239,14 @@ class PreprocessedMjcf:
     custom: CustomElements = field(default_factory=CustomElements)
 
     def node(self, info: str) -> MjcfElement | None:
-        """Return the element that MuJoCo says something about, as ``line 5``."""
+        """Return the element of a line in a message of MuJoCo, such as ``line 5``; None if there is none."""
         number = info.rpartition("line ")[2]
         return self.nodes[int(number) - 1] if number.isdecimal() and int(number) <= len(self.nodes) else None
 
 
 @dataclass(slots=True)
 class _AttachedModel:
-    """A file that is attached: its name for MuJoCo, its own name, and how many elements it makes."""
+    """Attached file: its name in the texts for MuJoCo, its model's name, and its number of elements."""
 
     name: str
     title: str
@@ -241,43 +254,44 @@ class _AttachedModel:
 
 
 class MjcfPreprocessor:
-    """Reads a file and those that it attaches, each of them once."""
+    """Preprocessor of a file and of those that it attaches, each read once."""
 
     def __init__(
         self,
         top: str,
         root: str,
-        note: Callable[[MjcfElement | None, str], None],
+        remark: Callable[[MjcfElement | None, str], None],
         mend: Callable[[str, int, str], None] | None,
     ) -> None:
         self._top, self._root = top, root
-        self._note, self._mend = note, mend
-        self._known: dict[Path, _AttachedModel] = {}
-        self._open: list[Path] = []
+        self._remark, self._mend = remark, mend
+        self._models: dict[Path, _AttachedModel] = {}
+        self._open_files: list[Path] = []
         self.prepared = PreprocessedMjcf()
 
     def run(self, data: str | bytes, source: str) -> PreprocessedMjcf:
-        """Return what MuJoCo is given for a document.
+        """Preprocess a document.
 
         Raises
         ------
         FormatError
-            For what is no MJCF, leaves its folder, holds itself, or is too large.
+            If a file is no MJCF, is outside of the root folder, attaches itself, or is too large.
         """
         root = self._read(data, source, self._top)
-        self.prepared.custom = read_custom_elements(root, self._note)
-        self.prepared.text = self._document(root, self._top)[0]
+        self.prepared.custom = read_custom_elements(root, self._remark)
+        self.prepared.text = self._preprocess(root, self._top)[0]
         return self.prepared
 
-    def _document(self, root: MjcfElement, folder: str) -> tuple[str, _AttachedModel]:
+    def _preprocess(self, root: MjcfElement, folder: str) -> tuple[str, _AttachedModel]:
+        """Return the text of a document for MuJoCo, and its size; attached models come first."""
         models: dict[str, int] = {}
         for node in root.walk():
             if node.tag == "model" and "file" in node.attributes:
-                model = self._attached(node, folder)
+                model = self._attached_model(node, folder)
                 node.attributes |= {"file": model.name}
                 node.attributes.pop("content_type", None)
                 models[node.attributes.get("name") or model.title] = model.size
-        files = remove_unsupported(root, self._note)
+        files = remove_unsupported(root, self._remark)
         for node, file in files.items():
             below = Path(os.path.relpath(folder, self._top)) if folder != self._top else Path()
             self.prepared.files[node] = MeshReference((below / file.uri).as_posix() if file.uri else "")
@@ -287,18 +301,20 @@ class MjcfPreprocessor:
         return text, _AttachedModel("", root.attributes.get("model", ""), size)
 
     def _read(self, data: str | bytes, source: str, folder: str) -> MjcfElement:
+        """Return the element tree of a document."""
         return read_tree(data, source, folder, self._root, self._mend)
 
-    def _attached(self, node: MjcfElement, folder: str) -> _AttachedModel:
+    def _attached_model(self, node: MjcfElement, folder: str) -> _AttachedModel:
+        """Return the model that an element attaches, preprocessed once."""
         path = find_below_root(node, node.attributes["file"], self._root, folder)
-        if path in self._open or len(self._open) >= MAX_ATTACH_DEPTH:
+        if path in self._open_files or len(self._open_files) >= MAX_ATTACH_DEPTH:
             node.refuse("attaches itself, directly or through others.")
-        if path not in self._known:
-            self._open.append(path)
+        if path not in self._models:
+            self._open_files.append(path)
             folder = str(path.parent)
-            text, model = self._document(self._read(read_file(path), path.name, folder), folder)
-            self._open.pop()
-            model.name = f"{len(self._known)}.xml"
-            self._known[path] = model
+            text, model = self._preprocess(self._read(read_file(path), path.name, folder), folder)
+            self._open_files.pop()
+            model.name = f"{len(self._models)}.xml"
+            self._models[path] = model
             self.prepared.models[model.name] = text.encode()
-        return self._known[path]
+        return self._models[path]

@@ -1,6 +1,6 @@
 """MJCF files and text as checked descriptions.
 
-``docs/mjcf.md`` lists what becomes what.
+``docs/mjcf.md`` lists the supported elements.
 """
 
 from __future__ import annotations
@@ -50,76 +50,76 @@ def parse_mjcf(
     Parameters
     ----------
     text
-        The document.
+        Text of the document.
     source
-        Its name in error messages.
+        Name of the document in error messages.
     folder
-        The folder from which the files it includes and the meshes it names are found.
+        Folder relative to which included files and meshes are found.
     root
-        The folder that they do not leave; None for that which :func:`kineverse.formats.root_folder.find_root` finds.
+        Folder that contains all of them; None for that of :func:`kineverse.formats.root_folder.find_root`.
     strict
-        Whether mistakes that others read past are refused, rather than remarked on.
+        If True, mistakes that other parsers accept are errors. Otherwise they are warnings.
 
     Raises
     ------
     FormatError
-        If it is not a valid MJCF; the message names source, line, element and reason.
+        If the text is no valid MJCF; the message names source, line, element and reason.
     MissingDependencyError
         If MuJoCo is not installed.
     """
-    notes = _Notes(source, strict)
-    below = find_text_root(folder, root)
-    prepared = MjcfPreprocessor(folder, below, notes.add, None if strict else notes.misspelt).run(
-        text, source
-    )
-    compiled = compile_document(prepared, source, folder, below, notes.add)
-    bodies = MjcfBodies(
-        compiled, MjcfShapes(compiled, folder, below, notes.add), source, notes.add, notes.mend
-    )
-    found = MjcfConstraints(compiled, bodies, notes.add, notes.mend)
+    mjcf_warnings = _MjcfWarnings(source, strict)
+    add, mend = mjcf_warnings.add, mjcf_warnings.mend
+    root_folder = find_text_root(folder, root)
+    preprocessor = MjcfPreprocessor(folder, root_folder, add, None if strict else mjcf_warnings.xml_fault)
+    compiled = compile_document(preprocessor.run(text, source), source, folder, root_folder, add)
+    shapes = MjcfShapes(compiled, folder, root_folder, add)
+    bodies = MjcfBodies(compiled, shapes, source, add, mend)
+    constraints = MjcfConstraints(compiled, bodies, add, mend)
     return MjcfScene(
         bodies.links,
         bodies.sites,
-        found.couplings,
-        found.closures,
-        found.tendons,
-        found.tendon_couplings,
+        constraints.couplings,
+        constraints.closures,
+        constraints.tendons,
+        constraints.tendon_couplings,
         source,
-        tuple(notes.texts),
+        tuple(mjcf_warnings.texts),
         compiled.home is not None,
     )
 
 
-class _Notes:
-    """What is remarked on a document, each remark once."""
+class _MjcfWarnings:
+    """Warnings about a document, each once."""
 
     def __init__(self, source: str, strict: bool) -> None:
         self._source, self._strict = source, strict
         self.texts: dict[str, None] = {}
 
     def add(self, node: MjcfElement | None, text: str) -> None:
+        """Add a warning about an element, or about the document."""
         if node is not None:
             text = f"{node.place if node.source == self._source else node.where} {text}"
         if text not in self.texts:
             self.texts[text] = None
             warn([f"{self._source}, {text}"])
 
-    def mend(self, where: str, problem: str, taken: str) -> None:
-        """Note a mistake at a place, and what is taken instead.
+    def mend(self, where: str, problem: str, replacement: str) -> None:
+        """Add a warning about a mistake, and its replacement.
 
         Raises
         ------
         FormatError
-            The mistake, where the file is read strictly.
+            If the file is read strictly.
         """
         if self._strict:
             raise FormatError(f"{where}: {problem}.")
-        self._fault(f"{where.removeprefix(f'{self._source}, ')}: {problem}; {taken}.")
+        self._fault(f"{where.removeprefix(f'{self._source}, ')}: {problem}; {replacement}.")
 
-    def misspelt(self, source: str, line: int, text: str) -> None:
-        """Note what is no XML, but can be read."""
+    def xml_fault(self, source: str, line: int, text: str) -> None:
+        """Add a warning about a mistake in the XML that can be read."""
         self._fault(f"{'' if source == self._source else f'{source}, '}line {line}, {text}")
 
     def _fault(self, text: str) -> None:
+        """Add a warning about a mistake."""
         self.texts[Fault(text)] = None
         warn([Fault(f"{self._source}, {text}")])

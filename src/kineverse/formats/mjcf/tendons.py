@@ -20,24 +20,24 @@ LENGTH_KEY = "length"
 
 @dataclass(frozen=True, kw_only=True)
 class Tendon(Operation, document_kind="Tendon"):
-    """A length that is a sum over joints, or that of a line through frames.
+    """Tendon with a length over joints or along a path through frames.
 
     L = Σ coef · q [m], where q are positions of articulations; or L = Σ |pₖ₊₁ - pₖ| / divisor [m] over the
-    origins p of frames, one pulley after the other. It is the datum ``name/length``, and its range the
-    constraint of the same name.
+    origins p of frames, summed over the branches of pulleys. The length is the datum ``name/length``, and its
+    range the constraint of the same name.
 
     Attributes
     ----------
     name
-        Of the tendon.
+        Name of the tendon.
     terms
         Pairs of articulation and factor.
     paths
-        Pairs of a pulley's divisor and the frames of the branch behind it.
+        Pairs of a pulley's divisor and the frames of its branch.
     lower, upper
-        Of the length [m]; None leaves that side open.
+        Limits of the length [m]; None for no limit.
     dynamics
-        What is known beside, as (name, value) pairs, the datum ``name/dynamics``.
+        Damping, friction and the like as (name, value) pairs, the datum ``name/dynamics``.
     """
 
     name: str
@@ -52,7 +52,7 @@ class Tendon(Operation, document_kind="Tendon"):
         length = as_expression(0.0)
         for joint, factor in self.terms:
             q = model.articulations[joint].position
-            assert q is not None  # MuJoCo has hinges and slides in tendons only
+            assert q is not None  # in MuJoCo, only hinges and slides are in tendons
             length = length + factor * q
         for divisor, frames in self.paths:
             for near, far in pairwise(frames):
@@ -70,16 +70,16 @@ class Tendon(Operation, document_kind="Tendon"):
 
 @dataclass(frozen=True, kw_only=True)
 class TendonCoupling(Operation, document_kind="TendonCoupling"):
-    """One tendon's length as a polynomial of another's: L - L0 = Σ aₖ (M - M0)ᵏ, a constraint.
+    """Equality between the lengths of two tendons: L - L0 = Σ aₖ (M - M0)ᵏ.
 
     Attributes
     ----------
     name
-        Of the constraint.
+        Name of the constraint.
     tendon, leader
-        The tendons; no leader means L - L0 = a0.
+        Tendons of the lengths L and M; L - L0 = a0 without leader.
     coefficients
-        a0 to a4.
+        Coefficients a0 to a4.
     rest, leader_rest
         L0 and M0 [m].
     """

@@ -1,7 +1,7 @@
 """Inertia, visuals and collision shapes of SDF links.
 
-Shapes and their colours decide nothing about where links are: a shape that cannot be said here, or is not
-said, is left out with a remark.
+Shapes and colours do not affect kinematics: a shape that is missing or not supported is left out with a
+remark.
 """
 
 from __future__ import annotations
@@ -11,8 +11,8 @@ from collections.abc import Callable
 from kineverse.formats.poses import IDENTITY, compose_poses
 from kineverse.formats.resource_paths import find_root_violation
 from kineverse.formats.xml_reader import Element, ElementError, find_child, label
-from kineverse.formats.xml_values import parse_numbers as spelt
 from kineverse.formats.xml_values import (
+    parse_numbers,
     read_child_number,
     read_child_numbers,
     read_child_text,
@@ -46,19 +46,19 @@ _UNSCALED = (1.0, 1.0, 1.0)
 
 
 def read_sdf_body(link: PoseNode) -> Body:
-    """Return what a link carries.
+    """Return the body of a link.
 
     Raises
     ------
     FormatError
-        If something is missing, malformed or without meaning.
+        If an element is missing or malformed, and the document is read strictly.
     """
     visuals: list[Shape] = []
     collisions: list[Shape] = []
     inertia = None
     document = link.document
     for part in link.element[2]:
-        with document.about(link.element):
+        with document.locate_errors(link.element):
             try:
                 if part[0] in ("visual", "collision"):
                     shape = _shape(part, link)
@@ -72,23 +72,25 @@ def read_sdf_body(link: PoseNode) -> Body:
 
 
 def _shape(element: Element, link: PoseNode) -> Shape | None:
+    """Return a visual or collision shape; None if it has no geometry."""
     geometry = find_child(element, "geometry")
     form = None if geometry is None else _geometry(geometry, element, link)
     if form is None:
         return None
-    place = IDENTITY
+    link_T_shape = IDENTITY
     pose = find_child(element, "pose")
     if pose is not None:
-        place = read_element_pose(pose, link.document.remarks)
-        old = "frame" if link.document.version < (1, 7) else "relative_to"
-        reference = pose[1].get(old, "")
+        link_T_shape = read_element_pose(pose, link.document.remarks)
+        reference = pose[1].get(link.document.reference_key, "")
         if reference:
-            place = compose_poses(pose_between(link, link.scope.find(reference, pose, element)), place)
+            link_T_reference = pose_between(link, link.scope.find(reference, pose, element))
+            link_T_shape = compose_poses(link_T_reference, link_T_shape)
     color = _color(element, link) if element[0] == "visual" else None
-    return Shape(form, place, element[1].get("name", ""), color)
+    return Shape(form, link_T_shape, element[1].get("name", ""), color)
 
 
 def _geometry(geometry: Element, shape: Element, link: PoseNode) -> Geometry | None:
+    """Return the geometry of a shape; None, with a remark, if it is empty or unknown."""
     form = geometry[2][0] if geometry[2] else None
     tag = "empty" if form is None else form[0]
     if form is None or tag == "empty":
@@ -113,9 +115,9 @@ def _geometry(geometry: Element, shape: Element, link: PoseNode) -> Geometry | N
     if find_child(form, "submesh") is not None:
         remarks.add(form, "names a submesh; all of the mesh is taken.", link.element)
     folder, root = link.document.folder, link.document.root
-    wrong = find_root_violation(uri, folder, root)
-    if wrong is not None:
-        remarks.add(form, f"names {wrong}", link.element)
+    violation = find_root_violation(uri, folder, root)
+    if violation is not None:
+        remarks.add(form, f"names {violation}", link.element)
     try:
         scale = read_child_vector(form, "scale", _UNSCALED)
     except ElementError as mistake:
@@ -125,6 +127,7 @@ def _geometry(geometry: Element, shape: Element, link: PoseNode) -> Geometry | N
 
 
 def _length(form: Element, tag: str) -> float:
+    """Return a length [m] that is not negative."""
     value = read_child_number(form, tag)
     if value < 0.0:
         raise ElementError(form, f"has a negative {tag}.")
@@ -132,6 +135,7 @@ def _length(form: Element, tag: str) -> float:
 
 
 def _lengths(form: Element, tag: str) -> tuple[float, float, float]:
+    """Return three lengths [m] that are not negative."""
     x, y, z = read_child_vector(form, tag)
     if min(x, y, z) < 0.0:
         raise ElementError(form, f"has a negative {tag}.")
@@ -139,6 +143,7 @@ def _lengths(form: Element, tag: str) -> tuple[float, float, float]:
 
 
 def _color(visual: Element, link: PoseNode) -> Rgba | None:
+    """Return the diffuse or else the ambient colour of a visual; None if it has none."""
     material = find_child(visual, "material")
     if material is None:
         return None
@@ -146,10 +151,9 @@ def _color(visual: Element, link: PoseNode) -> Rgba | None:
     if part is None or not read_text(part):
         return None
     words = read_text(part).split()
+    count = 3 if len(words) == 3 else 4
     try:
-        red, green, blue, alpha = (*spelt(read_text(part), min(len(words), 4) if len(words) > 2 else 4), 1.0)[
-            :4
-        ]
+        red, green, blue, alpha = (*parse_numbers(read_text(part), count), 1.0)[:4]
         opaque = 1.0 - read_child_number(visual, "transparency", 0.0)
     except (ValueError, ElementError) as error:
         mistake = error if isinstance(error, ElementError) else ElementError(part, f"{error}.")
@@ -159,6 +163,7 @@ def _color(visual: Element, link: PoseNode) -> Rgba | None:
 
 
 def _inertia(inertial: Element, link: PoseNode) -> Inertia | None:
+    """Return an inertia; None, with a remark, if it is to be computed from shapes."""
     if inertial[1].get("auto", "").lower() in ("true", "1"):
         link.document.remarks.add(inertial, "is to be computed from shapes; it is left out.", link.element)
         return None

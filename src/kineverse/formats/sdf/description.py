@@ -1,7 +1,7 @@
 """Checked SDF description: links, frames, roots, joints and loops.
 
 Units are [m], [rad], [kg], [s]. Names are paths: ``a::b`` of the file is ``a/b`` here. A description is plain
-immutable data: nothing in it refers to the file any more but line numbers, and no mesh has been opened.
+immutable data. It refers to the file by line numbers only, and meshes have not been opened.
 """
 
 from __future__ import annotations
@@ -35,24 +35,24 @@ AXIS_COUNT: dict[SdfJointType, int] = {
     "ball": 0,
     "gearbox": 2,
 }
-"""How many axes a joint of each kind moves along or about."""
+"""Number of axes of a joint of each type."""
 
 WORLD = "world"
-"""What stands for the world where the name of a link is expected: no link may be called so."""
+"""Name of the world in place of a link; reserved in SDF."""
 
 _IDENTITY = Pose()
-_NOTHING = Body()
+_EMPTY_BODY = Body()
 
 
 @dataclass(frozen=True, slots=True)
 class SdfAxis:
-    """One axis of a joint.
+    """Axis of a joint.
 
     ``xyz`` is a unit vector in the joint's frame. ``lower`` and ``upper`` bound the position [rad] or [m],
-    ``velocity`` the magnitude of the speed [rad/s] or [m/s]; None is no bound. ``dynamics`` are effort [N m]
-    or [N], damping, friction, spring_reference and spring_stiffness, as far as they are given. ``suffix`` is
-    what the name of its coordinate has behind that of the joint. ``following`` names the coordinate that it
-    follows, at the end of a chain.
+    ``velocity`` the magnitude of the velocity [rad/s] or [m/s]; None for no limit. ``dynamics`` are those of
+    effort [N m] or [N], damping, friction, spring_reference and spring_stiffness that are given. ``suffix``
+    is the part of the coordinate's name after that of the joint. ``mimic`` is the relation to the coordinate
+    that the axis follows, at the end of the chain.
     """
 
     xyz: Vector3 = (0.0, 0.0, 1.0)
@@ -61,39 +61,39 @@ class SdfAxis:
     velocity: float | None = None
     dynamics: tuple[tuple[str, float], ...] = ()
     suffix: str = ""
-    following: MimicRelation[str] | None = None
+    mimic: MimicRelation[str] | None = None
 
 
 @dataclass(frozen=True, slots=True)
 class SdfJoint:
-    """A joint between two links, or between a link and the world.
+    """Joint between two links, or between the world and a link.
 
-    ``in_parent`` and ``in_child`` are where its frame is in both while all positions are zero.
-    ``pitch`` [m per revolution] is that of a screw. ``turned`` says that child and parent were exchanged to
-    make a tree, with what follows from that: axes are negated and in reverse order. ``pose`` is where its
-    frame is in the world, ``gear`` what drives a gearbox and with which ratio.
+    ``pose_in_parent`` and ``pose_in_child`` are the poses of the joint's frame in both links while all
+    positions are zero. ``pitch`` [m per revolution] is that of a screw. ``gear`` is the relation of a gearbox
+    to the coordinate that drives it. ``is_reversed`` is True if parent and child were exchanged to form a
+    tree; the axes are then negated and in reverse order.
     """
 
     name: str
     kind: SdfJointType
     parent: str
     child: str
-    in_parent: Pose = _IDENTITY
-    in_child: Pose = _IDENTITY
+    pose_in_parent: Pose = _IDENTITY
+    pose_in_child: Pose = _IDENTITY
     axes: tuple[SdfAxis, ...] = ()
     pitch: float = 0.0
     gear: MimicRelation[str] | None = None
-    turned: bool = False
+    is_reversed: bool = False
     line: int = 0
     source: str = ""
 
 
 @dataclass(frozen=True, slots=True)
 class SdfLink:
-    """A link, and where it is in the world while all positions are zero."""
+    """Link, with its pose in the world while all positions are zero."""
 
     name: str
-    body: Body = _NOTHING
+    body: Body = _EMPTY_BODY
     pose: Pose = _IDENTITY
     static: bool = False
     line: int = 0
@@ -102,7 +102,7 @@ class SdfLink:
 
 @dataclass(frozen=True, slots=True)
 class SdfFrame:
-    """A frame that moves with a link or stands in the world: one of a ``<frame>`` or of a model."""
+    """Frame of a ``<frame>`` or of a model, fixed to a link or to the world."""
 
     name: str
     parent: str
@@ -113,7 +113,7 @@ class SdfFrame:
 
 @dataclass(frozen=True, slots=True)
 class SdfRoot:
-    """A link that no joint holds: it stands where it is, or moves freely."""
+    """Link without parent joint; it is fixed to the world, or moves freely if ``free``."""
 
     link: str
     free: bool = False
@@ -121,11 +121,11 @@ class SdfRoot:
 
 @dataclass(frozen=True, slots=True)
 class SdfScene:
-    """The models of a file.
+    """All models of a file.
 
-    ``joints`` lead from the ``roots`` outwards, so that a joint comes after what places its parent. ``loops``
-    are the joints between links that others place already. ``remarks`` say what was left out or read in a way
-    its author may not have meant; each names its line.
+    ``joints`` are ordered from the ``roots`` outwards, each after the joint of its parent link. ``loops`` are
+    the joints that close loops. ``remarks`` are warnings about ignored or ambiguous elements, each with its
+    line.
     """
 
     links: tuple[SdfLink, ...] = ()

@@ -1,8 +1,8 @@
 """SDF gearboxes as hinges of which one follows the other.
 
-With θ1 the angle from the reference body to the parent about ``<axis>`` and θ2 that from there to the child
-about ``<axis2>``, θ2 = -ratio θ1. The hinge of the parent is another joint of the file. That of the
-child may be one; where there is none, the gearbox is that hinge.
+θ2 = -ratio θ1, with the angle θ1 from the reference body to the parent about ``<axis>`` and the angle θ2 from
+the reference body to the child about ``<axis2>``. The hinge of the parent is another joint of the file. If
+there is no hinge of the child, the gearbox becomes that hinge.
 """
 
 from __future__ import annotations
@@ -22,38 +22,40 @@ from .joints import ResolvedJoint, find_reference_body
 from .pose_graph import PoseNode, pose_between
 
 _PARALLEL = 1e-4
-_TURNING = ("revolute", "continuous")
+_HINGE_TYPES = ("revolute", "continuous")
 
 
 def resolve_gearboxes(
-    hinges: Sequence[ResolvedJoint], carriers: dict[PoseNode, PoseNode]
+    hinges: Sequence[ResolvedJoint], attachments: dict[PoseNode, PoseNode]
 ) -> list[ResolvedJoint]:
-    """Return the joints without the gearboxes that only couple two others, which follow each other instead.
+    """Replace gearboxes by hinges that follow others.
+
+    A gearbox that couples two other hinges is removed, and the hinge of its child follows that of its parent.
 
     Raises
     ------
     FormatError
-        If a gearbox has nothing to couple.
+        If a gearbox has no hinge to couple, or axes that are not parallel to those of the hinges.
     """
     between: dict[frozenset[PoseNode], int] = {}
     result: list[ResolvedJoint | None] = list(hinges)
-    for at, hinge in enumerate(hinges):
-        if hinge.joint.kind in _TURNING:
-            between.setdefault(frozenset((hinge.parent, hinge.child)), at)
-    for at, hinge in enumerate(hinges):
+    for index, hinge in enumerate(hinges):
+        if hinge.joint.kind in _HINGE_TYPES:
+            between.setdefault(frozenset((hinge.parent, hinge.child)), index)
+    for index, hinge in enumerate(hinges):
         if hinge.joint.kind != "gearbox":
             continue
         node = hinge.node
         if not read_child_text(node.element, "gearbox_reference_body"):
-            with node.document.about(node.element):
+            with node.document.locate_errors(node.element):
                 mistake = ElementError(
                     node.element, "has no <gearbox_reference_body>: nothing says what it turns against."
                 )
                 node.document.remarks.mend(mistake, "it is left out")
-            result[at] = None
+            result[index] = None
             continue
-        body = find_reference_body(node, carriers)
-        with node.document.about(node.element):
+        body = find_reference_body(node, attachments)
+        with node.document.locate_errors(node.element):
             ratio = read_child_number(node.element, "gearbox_ratio", 1.0)
         if not ratio:
             node.refuse("has the ratio 0, so nothing would turn.")
@@ -71,28 +73,28 @@ def resolve_gearboxes(
             joint = replace(
                 hinge.joint,
                 parent=body.path or "world",
-                in_parent=pose_between(body, node),
+                pose_in_parent=pose_between(body, node),
                 axes=(replace(second, suffix=""),),
                 gear=MimicRelation(driver.joint.name, factor),
             )
-            result[at] = replace(hinge, joint=joint, parent=body)
+            result[index] = replace(hinge, joint=joint, parent=body)
             continue
         found = result[driven]
         assert found is not None
         axis = found.joint.axes[0]
-        if axis.following is not None:
+        if axis.mimic is not None:
             node.refuse(f"its child's hinge {quote(found.joint.name)} follows another joint already.")
         factor *= _sense(found, hinge, body, second)
-        following = replace(axis, following=MimicRelation(driver.joint.name, factor))
-        result[driven] = replace(found, joint=replace(found.joint, axes=(following,)))
-        result[at] = None
+        axis = replace(axis, mimic=MimicRelation(driver.joint.name, factor))
+        result[driven] = replace(found, joint=replace(found.joint, axes=(axis,)))
+        result[index] = None
     return [hinge for hinge in result if hinge is not None]
 
 
 def _sense(hinge: ResolvedJoint, gearbox: ResolvedJoint, body: PoseNode, axis: SdfAxis) -> float:
-    """Return 1 where a hinge turns from the body about an axis of the gearbox, -1 where against that."""
-    there = rotate_direction(pose_between(gearbox.node, hinge.node), hinge.joint.axes[0].xyz)
-    cosine = _dot(there, axis.xyz)
+    """Return the sign of a hinge's angle from the reference body about an axis of the gearbox, 1 or -1."""
+    hinge_axis = rotate_direction(pose_between(gearbox.node, hinge.node), hinge.joint.axes[0].xyz)
+    cosine = _dot(hinge_axis, axis.xyz)
     if abs(cosine) < 1.0 - _PARALLEL:
         angle = math.degrees(math.acos(min(abs(cosine), 1.0)))
         gearbox.node.refuse(

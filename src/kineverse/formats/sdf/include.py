@@ -22,28 +22,28 @@ _FILES = (".sdf", ".world", ".urdf")
 
 
 def find_included(uri: str, folder: str, root: str) -> Path:
-    """Return the file that an include means: a file, or that which the manifest of a folder names.
+    """Find the file of an include: the file itself, or the one that the manifest of a model folder names.
 
-    ``model://name/...`` and plain paths are looked for below the folder of the document, then below those of
+    ``model://name/...`` and paths are searched below the folder of the document, then below the folders of
     ``GZ_SIM_RESOURCE_PATH``, ``IGN_GAZEBO_RESOURCE_PATH``, ``GAZEBO_MODEL_PATH`` and ``SDF_PATH``, then below
-    the folders above the document. A path has to lie within the root, or below a folder that one of these
-    variables or ``KINEVERSE_ROOT`` names; a model may also be in a folder above the document that holds
-    models.
+    the parent folders of the document. The file has to be within the root, or below a folder that one of
+    these variables or ``KINEVERSE_ROOT`` names. A model may also be in a parent folder of the document that
+    holds models.
 
     Parameters
     ----------
     uri
-        What the document says.
+        Address in the document.
     folder
-        Where the document lies.
+        Folder of the document.
     root
-        The folder that paths do not leave, as :func:`kineverse.formats.root_folder.find_root` returns it.
+        Folder that contains all files, as :func:`kineverse.formats.root_folder.find_root` returns it.
 
     Raises
     ------
     FormatError
-        If there is none (the message says where it was looked for), if it is to be fetched from a network, or
-        if the path leaves the places where models are.
+        If there is no such file (the message names the searched folders), if the address is on a network, or
+        if the path leaves the allowed folders.
     """
     scheme, colon, rest = uri.partition("://")
     if not colon:
@@ -54,7 +54,7 @@ def find_included(uri: str, folder: str, root: str) -> Path:
             "by model:// or a path."
         )
     here = Path(folder).absolute()
-    given = [path for _, path in model_paths()]
+    declared = [path for _, path in model_paths()]
     rest = unquote(rest)
     if "\0" in rest or not rest.strip("/. \\"):
         raise FormatError(f"{quote(uri)} names no model.")
@@ -62,26 +62,26 @@ def find_included(uri: str, folder: str, root: str) -> Path:
     named = scheme in ("model", "package")
     if named and ".." in parts:
         raise FormatError(f"{quote(uri)} leads out of the folder of models with '..', which is refused.")
-    # A folder on the path may itself be the model.
-    itself = [(str(place), place.parent / rest) for place in given if place.name == parts[0]]
+    # A declared folder may itself be the model.
+    own = [(str(place), place.parent / rest) for place in declared if place.name == parts[0]]
     candidates = [(root, here / rest)]
     if ".." not in parts:
-        candidates += [*((str(place), place / rest) for place in given), *itself]
+        candidates += [*((str(place), place / rest) for place in declared), *own]
     if not os.path.isabs(rest) and scheme != "file":
         for above in here.parents:
             model = above / parts[0]
             bound = str(model) if named and counts_as_package(model, here, root) else root
             candidates.append((bound, above / rest))
-    left = False
+    outside = False
     for bound, candidate in candidates:
         real = os.path.realpath(candidate)
-        # A place may be a link to somewhere else; what is below it may not.
+        # An allowed folder may be a symbolic link; files below it may not lead out of it.
         if not any(is_below(real, os.path.realpath(place)) for place in (bound, *declared_roots()) if place):
-            left = left or bound == root
+            outside = outside or bound == root
             continue
         if _is_model(candidate):
             return _model_file(candidate) if candidate.is_dir() else candidate
-    if left and not named and (os.path.isabs(rest) or _is_model(here / rest)):
+    if outside and not named and (os.path.isabs(rest) or _is_model(here / rest)):
         raise outside_root_error(uri, root)
     variables = ", ".join(dict.fromkeys(variable for variable, _ in model_paths())) or "none is set"
     raise FormatError(
@@ -92,18 +92,19 @@ def find_included(uri: str, folder: str, root: str) -> Path:
 
 
 def _is_model(path: Path) -> bool:
-    if os.path.isdir(path):  # which is no for a name that is too long, and no error
+    """Return True for the folder of a model and for a description file."""
+    if os.path.isdir(path):  # False rather than an error for a name that is too long
         return (path / "model.config").is_file() or (path / "model.sdf").is_file()
     return path.suffix in _FILES and os.path.isfile(path)
 
 
 def _model_file(folder: Path) -> Path:
-    """Return the newest description that the manifest of a model names and that can be read."""
+    """Return the description of the newest supported version that the manifest of a model names."""
     manifest = folder / "model.config"
     if not manifest.is_file():
         return folder / "model.sdf"
     root = parse_xml(read_file(manifest), manifest.name, texts=True)
-    found = [(version, name) for version, name in _listed(root) if version <= _LATEST]
+    found = [(version, name) for version, name in _listed_files(root) if version <= _LATEST]
     if not found:
         raise FormatError(f"{quote(str(manifest))} names no <sdf> of a version up to 1.12.")
     _, name = max(found)
@@ -115,7 +116,8 @@ def _model_file(folder: Path) -> Path:
     return path
 
 
-def _listed(root: Element) -> Iterator[tuple[SdfVersion, str]]:
+def _listed_files(root: Element) -> Iterator[tuple[SdfVersion, str]]:
+    """Yield version and file name of all descriptions that a manifest lists."""
     for element in root[2]:
         if element[0] == "sdf" and read_text(element):
             match = re.fullmatch(r"1\.(\d{1,3})", element[1].get("version", "1.0").strip())

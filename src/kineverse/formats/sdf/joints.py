@@ -1,6 +1,6 @@
 """SDF joint elements as checked joints.
 
-A joint is read for what its kind can have: the axis of a fixed joint means nothing and is not looked at.
+Only the elements that apply to the type of a joint are read: the axis of a fixed joint is ignored.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ _DYNAMICS = ("damping", "friction", "spring_reference", "spring_stiffness")
 
 @dataclass(frozen=True, slots=True)
 class ResolvedJoint:
-    """A joint as it was read, and the nodes it connects."""
+    """Joint of the description, with the nodes of the pose graph that it connects."""
 
     joint: SdfJoint
     node: PoseNode
@@ -38,23 +38,23 @@ class ResolvedJoint:
     child: PoseNode
 
 
-def read_sdf_joint(node: PoseNode, carriers: dict[PoseNode, PoseNode]) -> ResolvedJoint:
-    """Return a joint; what its axes follow is the next coordinate, not yet that at the end of the chain.
+def read_sdf_joint(node: PoseNode, attachments: dict[PoseNode, PoseNode]) -> ResolvedJoint:
+    """Return the joint of a node; mimic chains are not resolved yet.
 
     Raises
     ------
     FormatError
-        If something is missing, malformed or without meaning.
+        If an element or attribute is missing or malformed.
     """
     element, document = node.element, node.document
-    parent, over = carriers[find_joint_end(node, "parent")], carriers[node]
-    if over.sort == "world":
+    parent, child = attachments[find_joint_end(node, "parent")], attachments[node]
+    if child.kind == "world":
         document.refuse(element, "its child moves with the world. Exchange parent and child.")
-    if parent is over:
+    if parent is child:
         document.refuse(
-            element, f"its parent and its child are both {quote(over.path)}: it connects a link to itself."
+            element, f"its parent and its child are both {quote(child.path)}: it connects a link to itself."
         )
-    with document.about(element):
+    with document.locate_errors(element):
         kind = _kind(element)
         axes = tuple(
             _axis(node, tag, suffix, kind)
@@ -67,32 +67,34 @@ def read_sdf_joint(node: PoseNode, carriers: dict[PoseNode, PoseNode]) -> Resolv
         node.path,
         kind,
         parent.path or "world",
-        over.path,
+        child.path,
         pose_between(parent, node),
-        pose_between(over, node),
+        pose_between(child, node),
         axes,
         pitch,
         line=element[3],
         source=document.source,
     )
-    return ResolvedJoint(joint, node, parent, over)
+    return ResolvedJoint(joint, node, parent, child)
 
 
 def _kind(element: Element) -> SdfJointType:
-    said = element[1].get("type")
-    if not said:
+    """Return the type of a joint, whatever its case."""
+    name = element[1].get("type")
+    if not name:
         raise ElementError(
             element, f"has no type; the specification requires one of {', '.join(AXIS_COUNT)}."
         )
     for kind in AXIS_COUNT:
-        if kind == said.lower():
+        if kind == name.lower():
             return kind
     raise ElementError(
-        element, f"type={quote(said)} is no joint type of SDF. {suggest(said, AXIS_COUNT, 'type')}"
+        element, f"type={quote(name)} is no joint type of SDF. {suggest(name, AXIS_COUNT, 'type')}"
     )
 
 
 def _axis(node: PoseNode, tag: str, suffix: str, kind: SdfJointType) -> SdfAxis:
+    """Return an axis of a joint; z, with a remark, if it is missing."""
     element, remarks = node.element, node.document.remarks
     axis = find_child(element, tag)
     if axis is None:
@@ -120,9 +122,9 @@ def _axis(node: PoseNode, tag: str, suffix: str, kind: SdfJointType) -> SdfAxis:
         lower = upper = None
     values = [] if effort is None or effort < 0.0 else [("effort", effort)]
     if dynamics is not None:
-        found = [(key, _known(dynamics, key, node)) for key in _DYNAMICS]
-        springs = any(value for key, value in found if key == "spring_stiffness")
-        values += [(k, v) for k, v in found if v or (springs and k == "spring_reference")]
+        found = [(key, _dynamics_value(dynamics, key, node)) for key in _DYNAMICS]
+        has_spring = any(value for key, value in found if key == "spring_stiffness")
+        values += [(k, v) for k, v in found if v or (has_spring and k == "spring_reference")]
     if find_child(axis, "initial_position") is not None and read_child_number(axis, "initial_position"):
         remarks.add(axis, "has an initial_position, which is ignored: a description has no state.", element)
     return SdfAxis(
@@ -132,12 +134,12 @@ def _axis(node: PoseNode, tag: str, suffix: str, kind: SdfJointType) -> SdfAxis:
         velocity if velocity is not None and velocity > 0.0 else None,
         tuple(values),
         suffix,
-        None if kind == "ball" else _following(node, axis),
+        None if kind == "ball" else _mimic(node, axis),
     )
 
 
 def _magnitude(limit: Element, key: str, node: PoseNode) -> float | None:
-    """Return a bound of a speed or an effort; what is none bounds nothing."""
+    """Return the limit of a velocity or an effort; None, with a remark, if it is malformed."""
     try:
         return read_child_limit(limit, key)
     except ElementError as mistake:
@@ -145,8 +147,8 @@ def _magnitude(limit: Element, key: str, node: PoseNode) -> float | None:
         return None
 
 
-def _known(dynamics: Element, key: str, node: PoseNode) -> float:
-    """Return a number of the dynamics, 0 where it is none."""
+def _dynamics_value(dynamics: Element, key: str, node: PoseNode) -> float:
+    """Return a number of the dynamics; 0, with a remark, if it is malformed."""
     try:
         return read_child_number(dynamics, key, 0.0)
     except ElementError as mistake:
@@ -155,14 +157,14 @@ def _known(dynamics: Element, key: str, node: PoseNode) -> float:
 
 
 def _direction(node: PoseNode, axis: Element) -> Vector3:
-    """Return the axis in the joint's frame."""
+    """Return the direction of an axis in the joint's frame."""
     xyz, version = read_axis_direction(axis), node.document.version
     part = find_child(axis, "xyz")
     frame = ""
     if version >= (1, 7):
         frame = "" if part is None else part[1].get("expressed_in", "")
     elif read_child_bool(axis, "use_parent_model_frame", default=version < (1, 5)):
-        frame = MODEL_FRAME if node.scope.model.sort != "world" else ""
+        frame = MODEL_FRAME if node.scope.model.kind != "world" else ""
     if not frame:
         return xyz
     assert part is not None or frame == MODEL_FRAME
@@ -170,7 +172,8 @@ def _direction(node: PoseNode, axis: Element) -> Vector3:
     return rotate_direction(pose_between(node, reference), xyz)
 
 
-def _following(node: PoseNode, axis: Element) -> MimicRelation[str] | None:
+def _mimic(node: PoseNode, axis: Element) -> MimicRelation[str] | None:
+    """Return the relation of an axis to the coordinate that it follows; None if it follows none."""
     mimic = find_child(axis, "mimic")
     if mimic is None:
         return None
@@ -180,20 +183,20 @@ def _following(node: PoseNode, axis: Element) -> MimicRelation[str] | None:
     if which not in ("axis", "axis2"):
         raise ElementError(mimic, f"says axis={quote(which)}; axis and axis2 are the ones there are.")
     leader = node.scope.find(name, mimic, node.element)
-    if leader.sort != "joint":
-        raise ElementError(mimic, f"names {quote(name)}, which is a {leader.sort} and no joint.")
+    if leader.kind != "joint":
+        raise ElementError(mimic, f"names {quote(name)}, which is a {leader.kind} and no joint.")
     kind = _kind(leader.element)
     count = AXIS_COUNT[kind]
     if count == 0 or kind == "gearbox" or (which == "axis2" and count < 2):
-        what = "no position" if count == 0 or kind == "gearbox" else "one axis only"
-        raise ElementError(mimic, f"names {quote(name)}, which is {kind} and has {what} to follow.")
+        available = "no position" if count == 0 or kind == "gearbox" else "one axis only"
+        raise ElementError(mimic, f"names {quote(name)}, which is {kind} and has {available} to follow.")
     multiplier, offset = read_child_number(mimic, "multiplier", 1.0), read_child_number(mimic, "offset", 0.0)
     shift = offset - multiplier * read_child_number(mimic, "reference", 0.0)
     return MimicRelation(leader.path + _SUFFIXES[count][which == "axis2"], multiplier, shift)
 
 
 def _pitch(element: Element) -> float:
-    """Return how far a screw goes in a revolution [m], positive for a right-handed thread."""
+    """Return the pitch of a screw [m per revolution], positive for a right-handed thread."""
     if find_child(element, "screw_thread_pitch") is not None or find_child(element, "thread_pitch") is None:
         pitch = read_child_number(element, "screw_thread_pitch", 1.0)
     else:
@@ -206,8 +209,8 @@ def _pitch(element: Element) -> float:
     return pitch
 
 
-def find_reference_body(node: PoseNode, carriers: dict[PoseNode, PoseNode]) -> PoseNode:
-    """Return the link against which a gearbox measures its angles."""
+def find_reference_body(node: PoseNode, attachments: dict[PoseNode, PoseNode]) -> PoseNode:
+    """Return the reference link of a gearbox's angles."""
     part = find_child(node.element, "gearbox_reference_body")
     assert part is not None
-    return carriers[node.scope.find(read_text(part), part, node.element)]
+    return attachments[node.scope.find(read_text(part), part, node.element)]

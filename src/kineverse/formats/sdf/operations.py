@@ -1,13 +1,13 @@
 """SDF descriptions as model operations.
 
 Links and frames become frames, joints degrees of freedom of the same name, below the prefix. A joint whose
-frame is not that of the link below it has a frame of its own in between, with its name.
+frame is not that of its child link gets an intermediate frame of its own name.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 from kineverse.articulations import (
@@ -26,6 +26,7 @@ from kineverse.articulations import (
 from kineverse.errors import FormatError
 from kineverse.expressions.expression import Expression
 from kineverse.formats.mimic import MimicRelation
+from kineverse.formats.names import NameMap
 from kineverse.formats.poses import IDENTITY, invert_pose, is_identity
 from kineverse.formats.tree import path_between
 from kineverse.formats.xml_reader import quote
@@ -33,7 +34,7 @@ from kineverse.loops.close_loop import CloseLoop
 from kineverse.loops.equations import AXES
 from kineverse.model.body import is_empty_body
 from kineverse.model.frame import WORLD as MODEL_WORLD
-from kineverse.model.frame import Frame as Placed
+from kineverse.model.frame import Frame
 from kineverse.model.operation import Operation
 from kineverse.model.operations import AddFrame, SetBody
 from kineverse.model.registry import FileContent
@@ -48,8 +49,6 @@ _AXIS_JOINTS: dict[str, type[OneDofJoint]] = {
     "prismatic": Prismatic,
 }
 _PERPENDICULAR = 1e-6
-
-SdfNameMap = Callable[[str], str]
 
 
 def sdf_file_operations(file: FileContent) -> Iterator[tuple[str, Operation]]:
@@ -67,15 +66,15 @@ def sdf_operations(scene: SdfScene, prefix: str | None = None) -> Iterator[Opera
     scene
         The description.
     prefix
-        Put in front of the names of frames and degrees of freedom, with a slash.
+        Prefix of the names of frames and degrees of freedom, without its slash.
 
     Raises
     ------
     FormatError
-        If two things would have the same name.
+        If two elements would have the same name.
     """
 
-    def named(name: str) -> str:
+    def model_name(name: str) -> str:
         if name == WORLD:
             return MODEL_WORLD
         return f"{prefix}/{name}" if prefix else name
@@ -84,62 +83,67 @@ def sdf_operations(scene: SdfScene, prefix: str | None = None) -> Iterator[Opera
     bodies = {link.name: link.body for link in scene.links if not is_empty_body(link.body)}
     poses = {link.name: link.pose for link in scene.links}
     for root in scene.roots:
-        name = named(root.link)
+        name = model_name(root.link)
         if root.free:
             free = f"{name}/free"
             yield Floating(name=free, parent=MODEL_WORLD, child=name, origin=poses[root.link])
         else:
-            yield AddFrame(name, Placed(MODEL_WORLD, (poses[root.link],)))
+            yield AddFrame(name, Frame(MODEL_WORLD, (poses[root.link],)))
         if root.link in bodies:
             yield SetBody(name, bodies[root.link])
     for joint in scene.joints:
-        yield from _tree_joint(joint, named)
+        yield from _tree_joint(joint, model_name)
         if joint.child in bodies:
-            yield SetBody(named(joint.child), bodies[joint.child])
+            yield SetBody(model_name(joint.child), bodies[joint.child])
     for frame in scene.frames:
-        yield AddFrame(named(frame.name), Placed(named(frame.parent), (frame.pose,)))
+        yield AddFrame(model_name(frame.name), Frame(model_name(frame.parent), (frame.pose,)))
     above = {joint.child: joint for joint in scene.joints}
     for joint in scene.loops:
-        yield from _loop(joint, named, _home(joint, above, named))
+        yield from _loop(joint, model_name, _home(joint, above, model_name))
 
 
-def _tree_joint(joint: SdfJoint, named: SdfNameMap) -> Iterator[Operation]:
-    if is_identity(joint.in_child):
-        yield from _motions(joint, named, named(joint.child))
+def _tree_joint(joint: SdfJoint, model_name: NameMap) -> Iterator[Operation]:
+    """Yield the operations of a joint, with an intermediate frame if its frame is not that of its child."""
+    if is_identity(joint.pose_in_child):
+        yield from _motions(joint, model_name, model_name(joint.child))
         return
-    between, link = named(joint.name), named(joint.child)
-    yield from _motions(joint, named, between)
-    yield AddFrame(link, Placed(between, (invert_pose(joint.in_child),)))
+    between, link = model_name(joint.name), model_name(joint.child)
+    yield from _motions(joint, model_name, between)
+    yield AddFrame(link, Frame(between, (invert_pose(joint.pose_in_child),)))
 
 
-def _home(loop: SdfJoint, above: Mapping[str, SdfJoint], named: SdfNameMap) -> tuple[tuple[str, float], ...]:
-    """Return where quaternions are that a loop goes by; all other coordinates are 0 there."""
+def _home(
+    loop: SdfJoint, above: Mapping[str, SdfJoint], model_name: NameMap
+) -> tuple[tuple[str, float], ...]:
+    """Return the home position of the quaternions in a loop; its other coordinates are 0."""
     parents = {link: joint.parent for link, joint in above.items()}
-    inside = [above[link] for link in path_between(loop.parent, loop.child, parents)]
-    return tuple((symbol_name(f"{named(joint.name)}/qw", 0), 1.0) for joint in inside if joint.kind == "ball")
+    joints = [above[link] for link in path_between(loop.parent, loop.child, parents)]
+    return tuple(
+        (symbol_name(f"{model_name(joint.name)}/qw", 0), 1.0) for joint in joints if joint.kind == "ball"
+    )
 
 
-def _loop(joint: SdfJoint, named: SdfNameMap, home: tuple[tuple[str, float], ...]) -> Iterator[Operation]:
-    """Yield a joint that ends in a frame of its own, and the loop that ties it to the link."""
-    name = named(joint.name)
+def _loop(joint: SdfJoint, model_name: NameMap, home: tuple[tuple[str, float], ...]) -> Iterator[Operation]:
+    """Yield the operations of a joint to a frame of its own, and of the loop that closes it at the link."""
+    name = model_name(joint.name)
     closed, loop = f"{name}/closed", f"{name}/loop"
     ball = joint.kind == "ball"
     if ball or joint.kind == "fixed":
-        yield AddFrame(name, Placed(named(joint.parent), (joint.in_parent,)))
+        yield AddFrame(name, Frame(model_name(joint.parent), (joint.pose_in_parent,)))
     else:
-        yield from _motions(joint, named, name)
-    yield AddFrame(closed, Placed(named(joint.child), (joint.in_child,)))
+        yield from _motions(joint, model_name, name)
+    yield AddFrame(closed, Frame(model_name(joint.child), (joint.pose_in_child,)))
     yield CloseLoop(name=loop, frame=closed, to=name, mask=AXES[:3] if ball else AXES, home=home)
 
 
-def _motions(joint: SdfJoint, named: SdfNameMap, child: str) -> Iterator[Operation]:
-    """Yield what a joint moves by, from its place in the parent to a frame."""
-    name = named(joint.name)
+def _motions(joint: SdfJoint, model_name: NameMap, child: str) -> Iterator[Operation]:
+    """Yield the operations of a joint from its parent to a frame."""
+    name = model_name(joint.name)
     common: dict[str, Any] = {
         "name": name,
-        "parent": named(joint.parent),
+        "parent": model_name(joint.parent),
         "child": child,
-        "origin": IDENTITY if is_identity(joint.in_parent) else joint.in_parent,
+        "origin": IDENTITY if is_identity(joint.pose_in_parent) else joint.pose_in_parent,
     }
     if joint.kind == "fixed":
         yield Fixed(**common)
@@ -148,7 +152,7 @@ def _motions(joint: SdfJoint, named: SdfNameMap, child: str) -> Iterator[Operati
     elif joint.kind == "gearbox":
         (axis,) = joint.axes
         assert joint.gear is not None
-        driver = position(named(joint.gear.leader))
+        driver = position(model_name(joint.gear.leader))
         yield Gearbox(
             **common,
             axis=axis.xyz,
@@ -161,22 +165,22 @@ def _motions(joint: SdfJoint, named: SdfNameMap, child: str) -> Iterator[Operati
             dynamics=axis.dynamics,
         )
     elif joint.kind in ("universal", "revolute2"):
-        yield from _two_axes(joint, common, named)
+        yield from _two_axes(joint, common, model_name)
     else:
         (axis,) = joint.axes
-        given = _axis(axis, named)
+        given = _axis(axis, model_name)
         if joint.kind == "screw":
             yield Screw(**common, **given, pitch=joint.pitch)
         else:
             yield _AXIS_JOINTS[joint.kind](**common, **given)
 
 
-def _two_axes(joint: SdfJoint, common: dict[str, Any], named: SdfNameMap) -> Iterator[Operation]:
-    """Yield a universal joint, or two hinges in a row where the axes are not such that it is one."""
+def _two_axes(joint: SdfJoint, common: dict[str, Any], model_name: NameMap) -> Iterator[Operation]:
+    """Yield a universal joint, or two hinges in series if it is reversed, coupled, or not perpendicular."""
     first, second = joint.axes
     cosine = math.fsum(a * b for a, b in zip(first.xyz, second.xyz, strict=True))
-    alone = first.following is None and second.following is None
-    if joint.kind == "universal" and alone and not joint.turned and abs(cosine) <= _PERPENDICULAR:
+    independent = first.mimic is None and second.mimic is None
+    if joint.kind == "universal" and independent and not joint.is_reversed and abs(cosine) <= _PERPENDICULAR:
         yield Universal(
             **common,
             first=first.xyz,
@@ -188,41 +192,44 @@ def _two_axes(joint: SdfJoint, common: dict[str, Any], named: SdfNameMap) -> Ite
         return
     name = common["name"]
     between = name + first.suffix
-    yield Revolute(**(common | {"name": name + first.suffix, "child": between}), **_axis(first, named))
+    yield Revolute(**(common | {"name": name + first.suffix, "child": between}), **_axis(first, model_name))
     own = {"name": name + second.suffix, "parent": between, "child": common["child"], "origin": IDENTITY}
-    yield Revolute(**own, **_axis(second, named))
+    yield Revolute(**own, **_axis(second, model_name))
 
 
-def _axis(axis: SdfAxis, named: SdfNameMap) -> dict[str, Any]:
+def _axis(axis: SdfAxis, model_name: NameMap) -> dict[str, Any]:
+    """Return the arguments of a joint of one DoF."""
     return {
         "axis": axis.xyz,
         "lower": axis.lower,
         "upper": axis.upper,
         "velocity": axis.velocity,
-        "position": None if axis.following is None else _mimic_position(axis.following, named),
+        "position": None if axis.mimic is None else _mimic_position(axis.mimic, model_name),
         "dynamics": axis.dynamics,
     }
 
 
-def _mimic_position(following: MimicRelation[str], named: SdfNameMap) -> Expression:
-    return following.multiplier * position(named(following.leader)) + following.offset
+def _mimic_position(mimic: MimicRelation[str], model_name: NameMap) -> Expression:
+    """Return the position of a coordinate that follows another."""
+    return mimic.multiplier * position(model_name(mimic.leader)) + mimic.offset
 
 
 def _dynamics(joint: SdfJoint, prefix: str, index: int = 0) -> tuple[tuple[str, float], ...]:
+    """Return the dynamics of one axis as pairs of name and value, with a prefix of the names."""
     axes = joint.axes[index : index + 1]
     return tuple((prefix + key, value) for axis in axes for key, value in axis.dynamics)
 
 
 def _check_names(scene: SdfScene) -> None:
-    """Raise where two things of the description would have the same name in the model."""
+    """Raise an error if two elements of the description would have the same name in the model."""
     frames: dict[str, str] = {MODEL_WORLD: "the world"}
     articulations: dict[str, str] = {}
 
-    def take(taken: dict[str, str], name: str, what: str, line: int, source: str) -> None:
-        other = taken.setdefault(name, f"{what} of line {line}")
-        if other != f"{what} of line {line}" or not name:
+    def take(taken: dict[str, str], name: str, element: str, line: int, source: str) -> None:
+        other = taken.setdefault(name, f"{element} of line {line}")
+        if other != f"{element} of line {line}" or not name:
             raise FormatError(
-                f"{source}, line {line}: {what} would be called {quote(name)} here, as {other} is. "
+                f"{source}, line {line}: {element} would be called {quote(name)} here, as {other} is. "
                 "Rename one of them."
             )
 
@@ -246,5 +253,5 @@ def _check_names(scene: SdfScene) -> None:
                 joint.line,
                 joint.source,
             )
-        if closes or not is_identity(joint.in_child):
+        if closes or not is_identity(joint.pose_in_child):
             take(frames, joint.name, "the frame of the joint", joint.line, joint.source)

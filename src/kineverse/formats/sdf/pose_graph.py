@@ -1,6 +1,6 @@
 """Pose graph of an SDF: elements with a pose, by name and scope, and the references between them.
 
-Everything here is iterative and linear in the number of nodes.
+All functions are iterative and linear in the number of nodes.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ SdfVersion: TypeAlias = tuple[int, int]
 
 @dataclass(slots=True, eq=False)
 class SdfDocument:
-    """A file that is being read: what the messages about its elements begin with."""
+    """File that is being read, with its version and its warnings."""
 
     source: str
     folder: str
@@ -43,85 +43,107 @@ class SdfDocument:
     remarks: ReaderWarnings
     root: str = NOWHERE
 
+    @property
+    def reference_key(self) -> str:
+        """Attribute of a ``<pose>`` that names the frame it is relative to."""
+        return "frame" if self.version < (1, 7) else "relative_to"
+
     @contextmanager
-    def about(self, owner: Element) -> Iterator[None]:
-        """Turn mistakes in an element into the errors that people see."""
+    def locate_errors(self, owner: Element) -> Iterator[None]:
+        """Raise mistakes inside of an element as errors with file, line and element."""
         try:
             yield
         except ElementError as mistake:
-            of = "" if mistake.element is owner else f"{label(mistake.element)} "
+            part = "" if mistake.element is owner else f"{label(mistake.element)} "
             where = f"{self.source}, line {mistake.element[3]}, {label(owner)}"
-            raise FormatError(f"{where}: {of}{mistake.message}") from None
+            raise FormatError(f"{where}: {part}{mistake.message}") from None
 
     def refuse(self, element: Element, message: str) -> NoReturn:
-        """Raise the error that an element is to blame for."""
+        """Raise an error about an element."""
         raise FormatError(f"{self.source}, line {element[3]}, {label(element)}: {message}")
 
 
 @dataclass(slots=True, eq=False)
 class PoseNode:
-    """Something with a pose: the world, a model, a link, a joint or a frame.
+    """Element with a pose: the world, a model, a link, a joint or a frame.
 
-    ``said`` is its ``<pose>``, whose references are names in ``said_in``. ``pose`` is where it is in
-    ``relative``; it moves with ``attached``. ``place`` is where it is in the world, ``depth`` how many steps
-    that is away, both known once :func:`.pose_graph.compute_world_poses` has been there.
+    Attributes
+    ----------
+    pose_element, pose_scope
+        ``<pose>`` of the element, and scope of the name that it refers to.
+    pose, relative_to
+        Pose in another node, and that node.
+    attached_to
+        Node to which it is fixed.
+    world_pose, depth
+        Pose in the world and number of references to it, once :func:`compute_world_poses` has run.
+    is_named_frame
+        True if the element becomes a frame of the model.
     """
 
-    sort: NodeKind
+    kind: NodeKind
     path: str
     scope: SdfScope
     element: Element
-    said: Element | None = None
-    said_in: SdfScope | None = None
+    pose_element: Element | None = None
+    pose_scope: SdfScope | None = None
     pose: Pose = IDENTITY
-    relative: PoseNode | None = None
-    attached: PoseNode | None = None
-    place: Pose | None = None
+    relative_to: PoseNode | None = None
+    attached_to: PoseNode | None = None
+    world_pose: Pose | None = None
     depth: int = 0
-    shown: bool = True
+    is_named_frame: bool = True
 
     @property
     def document(self) -> SdfDocument:
-        """The file that it is in."""
+        """File of the element."""
         return self.scope.document
 
     def refuse(self, message: str) -> NoReturn:
-        """Raise the error that this is to blame for."""
+        """Raise an error about the element."""
         self.document.refuse(self.element, message)
 
 
 @dataclass(slots=True, eq=False)
 class SdfScope:
-    """What names mean inside of a model, or of the world."""
+    """Scope of names: the inside of a model, or of the world."""
 
     path: str
     document: SdfDocument
     outer: SdfScope | None = None
     static: bool = False
-    model: PoseNode = None  # type: ignore[assignment]  # set as soon as there is one
+    model: PoseNode = None  # type: ignore[assignment]  # set when the node of the model is made
     names: dict[str, PoseNode] = field(default_factory=dict)
     inner: dict[str, SdfScope] = field(default_factory=dict)
     links: list[PoseNode] = field(default_factory=list)
     models: list[PoseNode] = field(default_factory=list)
 
-    def below(self, name: str) -> str:
-        """Return the path of a name in here."""
+    @property
+    def world(self) -> PoseNode:
+        """Node of the world."""
+        scope = self
+        while scope.outer is not None:
+            scope = scope.outer
+        return scope.model
+
+    def path_of(self, name: str) -> str:
+        """Return the path of a name of this scope."""
         parts = [part for piece in name.split("::") for part in piece.split("/") if part]
         return "/".join([self.path, *parts] if self.path else parts)
 
     def find(self, name: str, element: Element, owner: Element) -> PoseNode:
-        """Return what a reference means.
+        """Return the node that a name refers to.
 
         Raises
         ------
         FormatError
-            If there is nothing of that name here.
+            If the name does not exist in this scope.
         """
         found = self._find(name)
         if found is None:
             available = [*self.names, *(f"{m}::{n}" for m, inner in self.inner.items() for n in inner.names)]
             reserved = name != MODEL_FRAME and _is_reserved(name)
-            with self.document.about(owner):
+            with self.document.locate_errors(owner):
                 raise ElementError(
                     element,
                     f"refers to {quote(name)}, "
@@ -134,16 +156,17 @@ class SdfScope:
         return found
 
     def _find(self, name: str) -> PoseNode | None:
+        """Return the node of a name, or of a path ``a::b``; None if there is none."""
         if name == MODEL_FRAME:
-            return None if self.model.sort == "world" else self.model
-        if name == "world" and self.model.sort == "world":
+            return None if self.model.kind == "world" else self.model
+        if name == "world" and self.model.kind == "world":
             return self.model
         if name in self.names:
             return self.names[name]
         scope = self
         parts = name.split("::")
-        for at, part in enumerate(parts[:-1]):
-            rest = "::".join(parts[at:])
+        for k, part in enumerate(parts[:-1]):
+            rest = "::".join(parts[k:])
             if rest in scope.names:
                 return scope.names[rest]
             inner = scope.inner.get(part)
@@ -153,15 +176,32 @@ class SdfScope:
         return scope.model if parts[-1] == MODEL_FRAME else scope.names.get(parts[-1])
 
 
+@dataclass
+class PoseGraph:
+    """Nodes of all documents in reading order.
+
+    ``placements`` are models with a ``placement_frame``, ``canonical`` models with the name of their
+    canonical link, each with its scope and element.
+    """
+
+    nodes: list[PoseNode] = field(default_factory=list)
+    placements: list[tuple[PoseNode, SdfScope, str, Element]] = field(default_factory=list)
+    canonical: list[tuple[PoseNode, SdfScope, str, Element]] = field(default_factory=list)
+
+    def of_kind(self, kind: str) -> Iterator[PoseNode]:
+        """Yield the nodes of one kind."""
+        return (node for node in self.nodes if node.kind == kind)
+
+
 def check_sdf_name(name: str, element: Element, version: SdfVersion) -> None:
-    """Look whether something may be called so.
+    """Check that an element may have a name.
 
     Raises
     ------
     ElementError
-        If the name is reserved, or cannot be told from a scope.
+        If the name is reserved, contains the separator of scopes, or is empty.
     """
-    # Before frames had names of their own, joints could be called anything.
+    # Up to version 1.6, joints were in no scope with frames, and could have any name.
     free = version < (1, 7) and element[0] == "joint"
     if (name == "world" and not free) or _is_reserved(name):
         raise ElementError(element, "has a reserved name: 'world' and names like __this__ are. Rename it.")
@@ -172,207 +212,184 @@ def check_sdf_name(name: str, element: Element, version: SdfVersion) -> None:
 
 
 def _is_reserved(name: str) -> bool:
+    """Return True for names such as ``__this__``."""
     return len(name) >= 4 and name.startswith("__") and name.endswith("__")
 
 
-_NEAR = 64
-
-
-def check_cycles(nodes: Iterable[PoseNode]) -> None:
-    """Look whether all poses lead to the world, and all that moves with something else to a link.
+def resolve_pose_graph(graph: PoseGraph) -> None:
+    """Resolve the references of all nodes, and compute their poses in the world.
 
     Raises
     ------
     FormatError
-        If a chain of references leads in a circle.
+        For references to names that do not exist, for cycles, and for malformed poses.
+    """
+    for node in graph.nodes:
+        _attach(node)
+    for node, scope, canonical, element in reversed(graph.canonical):
+        _attach_model(node, scope, canonical, element)
+    for node in graph.nodes:
+        _relate(node)
+    check_cycles(graph.nodes)
+    # Nested models come later in the list than their outer ones, and have to be placed first.
+    for model, scope, frame, element in reversed(graph.placements):
+        model.pose = compose_poses(
+            model.pose, invert_pose(pose_in_model(model, scope.find(frame, element, element)))
+        )
+    compute_world_poses(graph.nodes)
+
+
+def find_joint_end(joint: PoseNode, role: str) -> PoseNode:
+    """Return the node that the ``<parent>`` or ``<child>`` of a joint names."""
+    element, document = joint.element, joint.document
+    part = find_child(element, role)
+    if part is None or not read_text(part):
+        document.refuse(element, f"has no <{role}>; the specification requires it.")
+    name = part[1].get(TEXT, "").strip()
+    if name == "world":
+        if role == "child":
+            document.refuse(element, "has the world as its child. Exchange parent and child.")
+        return joint.scope.world
+    found = joint.scope.find(name, part, element)
+    if found is joint:
+        document.refuse(element, f"is its own {role}.")
+    return found
+
+
+def _attach(node: PoseNode) -> None:
+    """Set the node to which a joint or a frame is attached."""
+    if node.kind == "joint":
+        node.attached_to = find_joint_end(node, "child")
+    elif node.kind == "frame" and node.is_named_frame:
+        name = node.element[1].get("attached_to", "")
+        target = node.scope.find(name, node.element, node.element) if name else node.scope.model
+        node.attached_to = target
+        node.relative_to = target
+
+
+def _attach_model(node: PoseNode, scope: SdfScope, canonical: str, element: Element) -> None:
+    """Set the node to which a model is attached: the world, its canonical link, or its first element."""
+    if scope.static:
+        node.attached_to = scope.world
+    elif canonical:
+        node.attached_to = scope.find(canonical, element, element)
+        if node.attached_to.kind != "link":
+            scope.document.refuse(element, f"its canonical_link {quote(canonical)} is no link.")
+    elif scope.links or scope.models:
+        node.attached_to = (scope.links or scope.models)[0]
+    else:
+        scope.document.refuse(element, "has no link; a model has at least one, unless it is static.")
+
+
+def _relate(node: PoseNode) -> None:
+    """Read the pose of a node and set the node that it is relative to."""
+    scope = node.pose_scope or node.scope
+    element = node.pose_element
+    default = node.relative_to
+    if default is None:
+        default = node.attached_to if node.kind == "joint" else scope.model
+    node.relative_to = default
+    if element is None:
+        return
+    with scope.document.locate_errors(node.element):
+        node.pose = read_element_pose(element, scope.document.remarks)
+    name = element[1].get(scope.document.reference_key, "")
+    if name:
+        node.relative_to = scope.find(name, element, node.element)
+
+
+def check_cycles(nodes: Iterable[PoseNode]) -> None:
+    """Check that no node refers to itself by ``attached_to`` or ``relative_to``.
+
+    Raises
+    ------
+    FormatError
+        If references form a cycle.
     """
     nodes = list(nodes)
-    for word, key in (("attached_to", "attached"), ("relative_to", "relative")):
+    for key in ("attached_to", "relative_to"):
         done: set[PoseNode] = set()
         for node in nodes:
             chain: dict[PoseNode, None] = {}
             at: PoseNode | None = node
             while at is not None and at not in done:
                 if at in chain:
-                    circle = " -> ".join(quote(n.path) for n in list(chain)[list(chain).index(at) :][:8])
-                    at.refuse(
-                        f"its pose depends on itself: {word} leads in a circle, {circle}."
-                        if word == "relative_to"
-                        else f"it moves with itself: attached_to leads in a circle, {circle}."
-                    )
+                    cycle = " -> ".join(quote(n.path) for n in list(chain)[list(chain).index(at) :][:8])
+                    problem = "its pose depends on" if key == "relative_to" else "it moves with"
+                    at.refuse(f"{problem} itself: {key} leads in a circle, {cycle}.")
                 chain[at] = None
                 at = getattr(at, key)
             done.update(chain)
 
 
 def compute_world_poses(nodes: Iterable[PoseNode]) -> None:
-    """Find where all nodes are in the world."""
+    """Compute the poses of all nodes in the world."""
     for node in nodes:
         chain = []
         at = node
-        while at.place is None and at.relative is not None:
+        while at.world_pose is None and at.relative_to is not None:
             chain.append(at)
-            at = at.relative
-        if at.place is None:
-            at.place = IDENTITY
+            at = at.relative_to
+        if at.world_pose is None:
+            at.world_pose = IDENTITY
         for inner in reversed(chain):
-            outer = inner.relative
+            outer = inner.relative_to
             assert outer is not None
-            assert outer.place is not None
-            inner.place = compose_poses(outer.place, inner.pose)
+            assert outer.world_pose is not None
+            inner.world_pose = compose_poses(outer.world_pose, inner.pose)
             inner.depth = outer.depth + 1
 
 
 def pose_in_model(model: PoseNode, frame: PoseNode) -> Pose:
-    """Return model_T_frame for a frame whose pose is known by way of the model."""
+    """Return model_T_frame for a frame whose pose is defined relative to the model."""
     chain: list[Pose] = []
     at = frame
     while at is not model:
-        if at.relative is None:
+        if at.relative_to is None:
             model.refuse(f"its placement_frame {quote(frame.path)} is no frame inside of it.")
         chain.append(at.pose)
-        at = at.relative
+        at = at.relative_to
     pose = IDENTITY
     for step in reversed(chain):
         pose = compose_poses(pose, step)
     return pose
 
 
+_MAX_PATH = 64
+"""Steps of the path between two nodes up to which their relative pose is composed along it."""
+
+
 def pose_between(a: PoseNode, b: PoseNode) -> Pose:
-    """Return a_T_b: by the shortest way if it is short, so that no rounding comes from elsewhere."""
-    assert a.place is not None
-    assert b.place is not None
+    """Return a_T_b, composed along the path between the nodes if that is short, which rounds the least."""
+    assert a.world_pose is not None
+    assert b.world_pose is not None
     a_up, b_up = IDENTITY, IDENTITY
     at_a, at_b = a, b
-    for _ in range(_NEAR):
+    for _ in range(_MAX_PATH):
         if at_a is at_b:
             return compose_poses(invert_pose(a_up), b_up)
         if at_a.depth > at_b.depth:
             a_up = compose_poses(at_a.pose, a_up)
-            assert at_a.relative is not None
-            at_a = at_a.relative
+            assert at_a.relative_to is not None
+            at_a = at_a.relative_to
         else:
             b_up = compose_poses(at_b.pose, b_up)
-            if at_b.relative is None:
+            if at_b.relative_to is None:
                 break
-            at_b = at_b.relative
-    return compose_poses(invert_pose(a.place), b.place)
+            at_b = at_b.relative_to
+    return compose_poses(invert_pose(a.world_pose), b.world_pose)
 
 
-def find_carriers(nodes: Sequence[PoseNode], world: PoseNode) -> dict[PoseNode, PoseNode]:
-    """Return for each node the link that it moves with, or the world."""
+def resolve_attachments(nodes: Sequence[PoseNode], world: PoseNode) -> dict[PoseNode, PoseNode]:
+    """Return for each node the link to which it is attached, or the world."""
     known = {world: world}
     for node in nodes:
         chain = []
         at = node
-        while at not in known and at.attached is not None:
+        while at not in known and at.attached_to is not None:
             chain.append(at)
-            at = at.attached
+            at = at.attached_to
         end = known.get(at, at)
         known.update(dict.fromkeys(chain, end))
         known[node] = end
     return known
-
-
-def resolve_pose_graph(parts: PoseGraph) -> None:
-    """Follow the references of all nodes, and find where they are in the world.
-
-    Raises
-    ------
-    FormatError
-        For references to what does not exist or in a circle, and poses that are none.
-    """
-    for node in parts.nodes:
-        _attach(node)
-    for node, scope, canonical, element in reversed(parts.canonical):
-        _attach_model(node, scope, canonical, element)
-    for node in parts.nodes:
-        _relate(node)
-    check_cycles(parts.nodes)
-    # Models inside of models come later in the list, and have to be placed first.
-    for model, scope, frame, element in reversed(parts.placements):
-        model.pose = compose_poses(
-            model.pose, invert_pose(pose_in_model(model, scope.find(frame, element, element)))
-        )
-    compute_world_poses(parts.nodes)
-
-
-def find_joint_end(joint: PoseNode, role: str) -> PoseNode:
-    """Return the parent or the child of a joint, whatever it is."""
-    element, document, scope = joint.element, joint.document, joint.scope
-    part = find_child(element, role)
-    if part is None or not read_text(part):
-        document.refuse(element, f"has no <{role}>; the specification requires it.")
-    name = _reference(part)
-    if name == "world":
-        if role == "child":
-            document.refuse(element, "has the world as its child. Exchange parent and child.")
-        while scope.outer is not None:
-            scope = scope.outer
-        return scope.model
-    found = scope.find(name, part, element)
-    if found is joint:
-        document.refuse(element, f"is its own {role}.")
-    return found
-
-
-def _reference(part: Element) -> str:
-    return part[1].get(TEXT, "").strip()
-
-
-def _attach(node: PoseNode) -> None:
-    """Find what a joint or a frame moves with."""
-    if node.sort == "joint":
-        node.attached = find_joint_end(node, "child")
-    elif node.sort == "frame" and node.shown:
-        name = node.element[1].get("attached_to", "")
-        target = node.scope.find(name, node.element, node.element) if name else node.scope.model
-        node.attached = target
-        node.relative = target
-
-
-def _attach_model(node: PoseNode, scope: SdfScope, canonical: str, element: Element) -> None:
-    """Find what a model moves with: the world, its canonical link, or the first model in it."""
-    if scope.static:
-        while scope.outer is not None:
-            scope = scope.outer
-        node.attached = scope.model
-    elif canonical:
-        node.attached = scope.find(canonical, element, element)
-        if node.attached.sort != "link":
-            scope.document.refuse(element, f"its canonical_link {quote(canonical)} is no link.")
-    elif scope.links or scope.models:
-        node.attached = (scope.links or scope.models)[0]
-    else:
-        scope.document.refuse(element, "has no link; a model has at least one, unless it is static.")
-
-
-def _relate(node: PoseNode) -> None:
-    """Read the pose of a node and find what it is relative to."""
-    scope = node.said_in or node.scope
-    said = node.said
-    default = node.relative
-    if default is None:
-        default = node.attached if node.sort == "joint" else scope.model
-    node.relative = default
-    if said is None:
-        return
-    with scope.document.about(node.element):
-        node.pose = read_element_pose(said, scope.document.remarks)
-    key = "frame" if scope.document.version < (1, 7) else "relative_to"
-    name = said[1].get(key, "")
-    if name:
-        node.relative = scope.find(name, said, node.element)
-
-
-@dataclass
-class PoseGraph:
-    """Everything that was found, in the order in which it was."""
-
-    nodes: list[PoseNode] = field(default_factory=list)
-    placements: list[tuple[PoseNode, SdfScope, str, Element]] = field(default_factory=list)
-    canonical: list[tuple[PoseNode, SdfScope, str, Element]] = field(default_factory=list)
-
-    def of(self, sort: str) -> Iterator[PoseNode]:
-        """Yield the nodes of one sort."""
-        return (node for node in self.nodes if node.sort == sort)

@@ -1,6 +1,6 @@
-"""Spanning tree of the joints of an SDF, and those that close loops.
+"""Spanning tree of the joints of an SDF, and joints that close loops.
 
-Everything here is iterative and linear but for the inverse of Ackermann's function.
+All functions are iterative and run in linear time, up to the inverse Ackermann function.
 """
 
 from __future__ import annotations
@@ -17,90 +17,93 @@ from .description import WORLD, SdfAxis, SdfJoint, SdfLink, SdfRoot
 def build_spanning_tree(
     links: Sequence[SdfLink],
     joints: Iterable[SdfJoint],
-    standing: Iterable[str],
-    note: Callable[[SdfJoint, str], None],
+    static: Iterable[str],
+    remark: Callable[[SdfJoint, str], None],
 ) -> tuple[tuple[SdfRoot, ...], tuple[SdfJoint, ...], tuple[SdfJoint, ...]]:
-    """Return the roots, the joints from there outwards, and those that close loops.
+    """Return the roots, the joints from the roots outwards, and the joints that close loops.
 
     Parameters
     ----------
     links, joints
-        In the order of the file.
-    standing
-        Links that stand where they are with all that is connected to them, unless the world holds that.
-    note
-        Called with joints that are left out, and why.
+        Links and joints in the order of the file.
+    static
+        Links that are fixed to the world with all links connected to them, unless a joint to the world is
+        among these.
+    remark
+        Called with joints that are left out or reversed, and the reason.
     """
-    whole, rigid = DisjointSets(), DisjointSets()
+    connected, rigid = DisjointSets(), DisjointSets()
     for link in links:
         if link.static:
-            whole.union(WORLD, link.name)
+            connected.union(WORLD, link.name)
             rigid.union(WORLD, link.name)
     joints = list(joints)
     for joint in joints:
         if joint.kind == "fixed":
             rigid.union(joint.parent, joint.child)
-    at: dict[str, list[SdfJoint]] = {}
-    held: set[str] = {link.name for link in links if link.static}
+    joints_at: dict[str, list[SdfJoint]] = {}
+    children: set[str] = {link.name for link in links if link.static}
     loops: list[SdfJoint] = []
     for joint in joints:
-        if whole.union(joint.parent, joint.child):
-            at.setdefault(joint.parent, []).append(joint)
-            at.setdefault(joint.child, []).append(joint)
-            held.add(joint.child)
+        if connected.union(joint.parent, joint.child):
+            joints_at.setdefault(joint.parent, []).append(joint)
+            joints_at.setdefault(joint.child, []).append(joint)
+            children.add(joint.child)
         elif rigid.find(joint.parent) != rigid.find(joint.child):
             loops.append(joint)
         else:
-            note(joint, "is left out: its links are rigidly connected anyway.")
+            remark(joint, "is left out: its links are rigidly connected anyway.")
     roots = [SdfRoot(link.name) for link in links if link.static]
     starts = [WORLD, *(root.link for root in roots)]
-    ordered = _outwards(starts, at, note)
-    reached = {whole.find(WORLD)}
-    fixed = {whole.find(name) for name in standing}
+    ordered = _outwards(starts, joints_at, remark)
+    reached = {connected.find(WORLD)}
+    fixed = {connected.find(name) for name in static}
     for link in links:
-        group = whole.find(link.name)
-        if group not in reached and link.name not in held:
+        group = connected.find(link.name)
+        if group not in reached and link.name not in children:
             reached.add(group)
             roots.append(SdfRoot(link.name, free=group not in fixed))
-            ordered += _outwards([link.name], at, note)
+            ordered += _outwards([link.name], joints_at, remark)
     return tuple(roots), tuple(ordered), tuple(loops)
 
 
 def _outwards(
-    starts: Sequence[str], at: dict[str, list[SdfJoint]], note: Callable[[SdfJoint, str], None]
+    starts: Sequence[str], joints_at: dict[str, list[SdfJoint]], remark: Callable[[SdfJoint, str], None]
 ) -> list[SdfJoint]:
+    """Return the joints from some links outwards, depth first, each reversed if it leads inwards."""
     ordered: list[SdfJoint] = []
-    seen: set[str] = set(starts)
-    ahead = [(start, joint) for start in reversed(starts) for joint in reversed(at.get(start, ()))]
-    while ahead:
-        near, joint = ahead.pop()
+    visited: set[str] = set(starts)
+    stack = [(start, joint) for start in reversed(starts) for joint in reversed(joints_at.get(start, ()))]
+    while stack:
+        near, joint = stack.pop()
         far = joint.child if joint.parent == near else joint.parent
-        if far in seen:
+        if far in visited:
             continue
-        seen.add(far)
+        visited.add(far)
         if joint.parent != near:
-            note(
+            remark(
                 joint, f"leads from {quote(near)} to {quote(far)} here, since that is the way from the root."
             )
             joint = reverse_joint(joint)
         ordered.append(joint)
-        ahead.extend((far, other) for other in reversed(at.get(far, ())))
+        stack.extend((far, other) for other in reversed(joints_at.get(far, ())))
     return ordered
 
 
 def reverse_joint(joint: SdfJoint) -> SdfJoint:
-    """Return a joint seen from the other end: the same coordinates about opposite axes."""
+    """Return a joint with parent and child exchanged: the same coordinates about opposite axes."""
     return replace(
         joint,
         parent=joint.child,
         child=joint.parent,
-        in_parent=joint.in_child,
-        in_child=joint.in_parent,
-        axes=tuple(_opposite(axis) for axis in reversed(joint.axes)),
-        turned=not joint.turned,
+        pose_in_parent=joint.pose_in_child,
+        pose_in_child=joint.pose_in_parent,
+        axes=tuple(_negate_axis(axis) for axis in reversed(joint.axes)),
+        is_reversed=not joint.is_reversed,
     )
 
 
-def _opposite(axis: SdfAxis) -> SdfAxis:
+def _negate_axis(axis: SdfAxis) -> SdfAxis:
+    """Return an axis of the opposite direction."""
     x, y, z = axis.xyz
     return replace(axis, xyz=(0.0 - x, 0.0 - y, 0.0 - z))

@@ -1,8 +1,7 @@
 """Inertia, visuals and collision shapes of URDF links.
 
-Specification: http://wiki.ros.org/urdf/XML/link, and urdf.xsd of ros/urdfdom for defaults. Shapes and their
-colours decide nothing about where links are: a shape that cannot be said here, or is not said, is left out
-with a remark.
+Specification: http://wiki.ros.org/urdf/XML/link, and urdf.xsd of ros/urdfdom for defaults. Shapes and colours
+do not affect kinematics: a shape that is missing or not supported is left out with a remark.
 """
 
 from __future__ import annotations
@@ -24,22 +23,22 @@ from kineverse.formats.xml_values import (
 from kineverse.model.body import Body, Box, Capsule, Cylinder, Geometry, Inertia, Mesh, Shape, Sphere, Vector3
 
 _UNSCALED = (1.0, 1.0, 1.0)
-_NOTHING = Body()
+_EMPTY_BODY = Body()
 
 
 class UrdfLinkReader:
-    """Reads the links of one document.
+    """Reader of the links of one document.
 
     Parameters
     ----------
     folder
-        Where the document lies; meshes remember it, to be found when somebody needs them.
+        Folder of the document, relative to which meshes are found.
     version
-        Of the specification that the document claims to follow.
+        Version of the specification that the document states.
     remarks
-        What is noticed goes here.
+        Receives warnings.
     root
-        The folder that meshes do not leave, see :mod:`kineverse.formats.root_folder`.
+        Folder that contains all meshes, see :mod:`kineverse.formats.root_folder`.
     """
 
     def __init__(
@@ -49,15 +48,15 @@ class UrdfLinkReader:
         self._folder, self._root = folder, root
         self._version = version
         self._remarks = remarks
-        self._uncoloured: list[tuple[str, int, Element, Element]] = []
+        self._undefined_materials: list[tuple[str, int, Element, Element]] = []
 
     def read(self, element: Element) -> UrdfLink:
-        """Return the link an element describes.
+        """Return the link of a ``<link>`` element.
 
         Raises
         ------
         ElementError
-            If something is missing, malformed or without meaning.
+            If an element or attribute is missing or malformed.
         """
         name = read_or_default(lambda: read_name(element), "", "it gets a name", self._remarks)
         visuals: list[Shape] = []
@@ -81,24 +80,25 @@ class UrdfLinkReader:
                 else:
                     self._remarks.add(part, "is ignored: another one came first.", element)
         if not visuals and not collisions and inertia is None:
-            return UrdfLink(name, _NOTHING, element[3])
+            return UrdfLink(name, _EMPTY_BODY, element[3])
         return UrdfLink(name, Body(tuple(visuals), tuple(collisions), inertia), element[3])
 
-    def colour(self, links: dict[str, UrdfLink]) -> None:
-        """Give shapes the materials that were only named before they were defined."""
-        for name, index, material, element in self._uncoloured:
-            color, texture = self.materials.appearance_at_last(material, element)
+    def assign_materials(self, links: dict[str, UrdfLink]) -> None:
+        """Assign the materials that were referenced before their definition."""
+        for name, index, material, element in self._undefined_materials:
+            color, texture = self.materials.final_appearance(material, element)
             link = links[name]
             visuals = list(link.body.visuals)
             visuals[index] = replace(visuals[index], color=color, texture=texture)
             links[name] = replace(link, body=replace(link.body, visuals=tuple(visuals)))
 
     def _shape(self, element: Element, link: Element, name: str = "", index: int = -1) -> Shape | None:
+        """Return the shape of a ``<visual>`` or ``<collision>``; None, with a remark, if it has none."""
         read = partial(self._read_shape, element, link, name, index)
         return read_or_default(read, None, f"the {label(element)} is left out", self._remarks, link)
 
     def _read_shape(self, element: Element, link: Element, name: str, index: int) -> Shape | None:
-        """Return a shape; the colour is looked at if an index among the visuals of the link is given."""
+        """Return a shape; with its appearance if ``index`` is that of a visual of the link."""
         origin = geometry = material = None
         for part in element[2]:
             tag = part[0]
@@ -111,16 +111,17 @@ class UrdfLinkReader:
         form = self._geometry(geometry, element, link)
         if form is None:
             return None
-        place, own_name = read_origin(origin, link, self._version, self._remarks), element[1].get("name", "")
+        pose, own_name = read_origin(origin, link, self._version, self._remarks), element[1].get("name", "")
         if material is None or index < 0:
-            return Shape(form, place, own_name)
+            return Shape(form, pose, own_name)
         appearance = self.materials.appearance(material, link)
         if appearance is None:
-            self._uncoloured.append((name, index, material, link))
-            return Shape(form, place, own_name)
-        return Shape(form, place, own_name, *appearance)
+            self._undefined_materials.append((name, index, material, link))
+            return Shape(form, pose, own_name)
+        return Shape(form, pose, own_name, *appearance)
 
     def _geometry(self, geometry: Element | None, shape: Element, link: Element) -> Geometry | None:
+        """Return the geometry of a shape; None, with a remark, if it is missing or unknown."""
         if geometry is None or not geometry[2]:
             self._remarks.add(geometry or shape, "says no shape and is left out.", link)
             return None
@@ -143,22 +144,23 @@ class UrdfLinkReader:
         return None
 
     def _mesh(self, mesh: Element, link: Element) -> Mesh:
+        """Return a mesh, with a remark if its file is outside of the root folder."""
         uri = mesh[1].get("filename")
         if not uri:
             raise ElementError(mesh, "has no filename; the specification requires it.")
-        wrong = find_root_violation(uri, self._folder, self._root)
-        if wrong is not None:
-            self._remarks.add(mesh, f"names {wrong}", link)
+        violation = find_root_violation(uri, self._folder, self._root)
+        if violation is not None:
+            self._remarks.add(mesh, f"names {violation}", link)
         return Mesh(uri, self._scale(mesh, link), self._folder, self._root)
 
     def _scale(self, mesh: Element, link: Element) -> Vector3:
-        """Return the three factors of a mesh; where there is one only, or one too many, what others take."""
+        """Return the scale of a mesh; one factor or four factors are read as other parsers read them."""
         words = mesh[1].get("scale", "").split()
         if len(words) in (1, 4):
             x, y, z = words * 3 if len(words) == 1 else words[:3]
-            taken = (mesh[0], {"scale": f"{x} {y} {z}"}, mesh[2], mesh[3])
+            corrected = (mesh[0], {"scale": f"{x} {y} {z}"}, mesh[2], mesh[3])
             default = read_or_default(
-                lambda: read_attribute_vector(taken, "scale"),
+                lambda: read_attribute_vector(corrected, "scale"),
                 _UNSCALED,
                 "it is not scaled",
                 self._remarks,
@@ -176,6 +178,7 @@ class UrdfLinkReader:
         )
 
     def _inertia(self, inertial: Element, link: Element) -> Inertia:
+        """Return the inertia of a link; a missing tensor is zero."""
         mass_element, tensor = find_child(inertial, "mass"), find_child(inertial, "inertia")
         mass = 0.0 if mass_element is None else read_attribute_number(mass_element, "value", 0.0)
         if mass < 0.0:
@@ -197,6 +200,7 @@ class UrdfLinkReader:
 
 
 def _length(form: Element, key: str) -> float:
+    """Return a length [m] that is not negative."""
     value = read_attribute_number(form, key)
     if value < 0.0:
         raise ElementError(form, f"has a negative {key}.")

@@ -1,7 +1,7 @@
 """Checked URDF description: links, joints, limits and mimic relations.
 
-Units are [m], [rad], [kg], [s]. A description is plain immutable data: nothing in it refers to the file any
-more but line numbers, and no mesh has been opened.
+Units are [m], [rad], [kg], [s]. A description is plain immutable data. It refers to the file by line numbers
+only, and meshes have not been opened.
 """
 
 from __future__ import annotations
@@ -24,25 +24,26 @@ DOF_BY_TYPE: dict[UrdfJointType, int] = {
     "floating": 6,
     "spherical": 3,
 }
-"""How many independent speeds a joint of each kind has, unless it mimics another.
+"""Degrees of freedom of a joint of each type that does not mimic another.
 
-``spherical`` is no word of URDF; MuJoCo reads it.
+``spherical`` is not part of URDF; MuJoCo reads it.
 """
 
-SPECIFIED = tuple(kind for kind in DOF_BY_TYPE if kind != "spherical")
-"""The kinds that the specification has."""
+SPECIFIED_TYPES = tuple(kind for kind in DOF_BY_TYPE if kind != "spherical")
+"""Joint types of the specification."""
 
 _IDENTITY = Pose()
-_NOTHING = Body()
+_EMPTY_BODY = Body()
 
 
 @dataclass(frozen=True, slots=True)
 class UrdfLimits:
-    """Bounds of one joint; None is no bound.
+    """Limits of one joint; None for no limit.
 
-    ``lower`` and ``upper`` bound the position [rad] or [m], ``velocity`` the magnitude of the speed [rad/s]
-    or [m/s], ``effort`` that of the torque [N m] or force [N]; from URDF 1.2 on, ``acceleration`` and
-    ``deceleration`` those of gaining and losing speed [rad/s²] or [m/s²], ``jerk`` that of their change.
+    ``lower`` and ``upper`` bound the position [rad] or [m], ``velocity`` the magnitude of the velocity
+    [rad/s] or [m/s], ``effort`` that of the torque [N m] or force [N]. From URDF 1.2 on, ``acceleration`` and
+    ``deceleration`` bound the rates at which the speed grows and falls [rad/s²] or [m/s²], and ``jerk`` the
+    magnitude of the jerk [rad/s³] or [m/s³].
     """
 
     lower: float | None = None
@@ -59,12 +60,12 @@ UNLIMITED = UrdfLimits()
 
 @dataclass(frozen=True, slots=True)
 class UrdfSafetyController:
-    """What the safety controller of a joint does (ROS wiki, pr2_controller_manager/safety_limits).
+    """Soft limits and gains of a joint's safety controller (ROS wiki, pr2_controller_manager/safety_limits).
 
-    It keeps the speed between ``-k_position (q - soft_lower)`` and ``-k_position (q - soft_upper)``, so that
-    the joint slows down towards the soft limits and is led back from beyond them; ``k_velocity`` bounds the
-    effort around the velocity limit in the same manner. Soft limits are in [rad] or [m], ``k_position`` is in
-    [1/s].
+    The controller keeps the velocity between ``-k_position (q - soft_lower)`` and ``-k_position (q -
+    soft_upper)``. The joint slows down towards the soft limits and returns from beyond them. ``k_velocity``
+    bounds the effort near the velocity limit in the same manner. Soft limits are in [rad] or [m],
+    ``k_position`` is in [1/s].
     """
 
     soft_lower: float = 0.0
@@ -73,16 +74,17 @@ class UrdfSafetyController:
     k_velocity: float = 0.0
 
     @property
-    def bounds(self) -> bool:
-        """Whether the soft limits leave a range; those left out are both 0 and bound nothing."""
+    def has_limits(self) -> bool:
+        """True if the soft limits are a range; missing ones are both 0 and do not limit the joint."""
         return self.soft_lower < self.soft_upper
 
 
 @dataclass(frozen=True, slots=True)
 class UrdfMimic:
-    """A position that follows another joint: ``multiplier * joint + offset``.
+    """Position of a joint that follows another: ``multiplier * joint + offset``.
 
-    A chain is resolved: ``joint`` is the one at its end that moves by itself, and the factors are composed.
+    Chains are resolved: ``joint`` is the independent joint at the end of the chain, and the factors are
+    composed.
     """
 
     joint: str
@@ -103,12 +105,12 @@ FRICTIONLESS = UrdfDynamics()
 
 @dataclass(frozen=True, slots=True)
 class UrdfJoint:
-    """A joint between two links.
+    """Joint between two links.
 
     ``origin`` is parent_T_joint, the pose of the child link in the parent link at position zero. ``axis`` is
-    a unit vector in the joint's frame: of rotation, of translation, or the normal of the plane; None for
-    joints that have none. ``limits``, ``safety``, ``mimic`` and ``dynamics`` only have meaning for joints of
-    one DoF.
+    a unit vector in the joint's frame: the axis of rotation, the direction of translation, or the normal of
+    the plane; None for joints without axis. ``limits``, ``safety``, ``mimic`` and ``dynamics`` are defined
+    for joints of one DoF only.
     """
 
     name: str
@@ -126,21 +128,21 @@ class UrdfJoint:
 
 @dataclass(frozen=True, slots=True)
 class UrdfLink:
-    """A link: a frame, and what is attached to it."""
+    """Link: a frame and the body attached to it."""
 
     name: str
-    body: Body = _NOTHING
+    body: Body = _EMPTY_BODY
     line: int = 0
 
 
 @dataclass(frozen=True, slots=True)
 class UrdfRobot:
-    """A tree of links and joints.
+    """Tree of links and joints.
 
-    ``links`` are in the order of the file; ``joints`` lead from the ``root`` outwards, so that a joint comes
-    after the one that moves its parent. ``more_roots`` are further links that are nobody's child, of files
-    that are no tree: they stand where the root does. ``remarks`` say what was ignored, or read in a way its
-    author may not have meant; each names its line.
+    ``links`` are in the order of the file. ``joints`` are ordered from the ``root`` outwards, each after the
+    joint of its parent link. ``more_roots`` are further links without parent, in files that are no tree;
+    their pose is that of the root. ``remarks`` are warnings about ignored or ambiguous elements, each with
+    its line.
     """
 
     name: str
@@ -153,5 +155,5 @@ class UrdfRobot:
 
     @property
     def dof(self) -> int:
-        """The number of independent speeds; joints that mimic another have none of their own."""
+        """Number of degrees of freedom; joints that mimic another have none."""
         return sum(DOF_BY_TYPE[joint.kind] for joint in self.joints if joint.mimic is None)

@@ -1,8 +1,8 @@
 """URDF joint elements as checked joints.
 
-Specification: http://wiki.ros.org/urdf/XML/joint, and urdf.xsd of ros/urdfdom for defaults. A joint is read
-for what its kind can have: the limits of a fixed joint mean nothing and are not looked at. What other parsers
-read although it is wrong is read as they do, with a remark, unless the document is read strictly.
+Specification: http://wiki.ros.org/urdf/XML/joint, and urdf.xsd of ros/urdfdom for defaults. Only the elements
+that apply to the type of a joint are read: the limits of a fixed joint are ignored. Mistakes that other
+parsers accept are read as they do, with a remark, unless the document is read strictly.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from kineverse.formats.reader_warnings import ReaderWarnings
 from kineverse.formats.urdf.description import (
     DOF_BY_TYPE,
     FRICTIONLESS,
-    SPECIFIED,
+    SPECIFIED_TYPES,
     UNLIMITED,
     UrdfDynamics,
     UrdfJoint,
@@ -38,19 +38,19 @@ from kineverse.model.body import Vector3
 
 _X = (1.0, 0.0, 0.0)
 _Z = (0.0, 0.0, 1.0)
-_SHORTEST_AXIS = 1e-9
+_MIN_AXIS_LENGTH = 1e-9
 _PARTS = frozenset(
     ("origin", "parent", "child", "axis", "limit", "safety_controller", "mimic", "dynamics", "calibration")
 )
 
 
 def read_urdf_joint(element: Element, version: tuple[int, int], remarks: ReaderWarnings) -> UrdfJoint:
-    """Return the joint an element describes; what it mimics is not resolved yet.
+    """Return the joint of a ``<joint>`` element; mimic chains are not resolved yet.
 
     Raises
     ------
     ElementError
-        If something is missing, malformed or without meaning.
+        If an element or attribute is missing or malformed.
     """
     name = read_or_default(lambda: read_name(element), "", "it is called by its links", remarks)
     kind = _kind(element, remarks)
@@ -90,6 +90,7 @@ def read_urdf_joint(element: Element, version: tuple[int, int], remarks: ReaderW
 
 
 def _dynamics(dynamics: Element | None) -> UrdfDynamics:
+    """Return damping and friction; zero if they are missing."""
     if dynamics is None:
         return FRICTIONLESS
     return UrdfDynamics(
@@ -98,12 +99,16 @@ def _dynamics(dynamics: Element | None) -> UrdfDynamics:
 
 
 def _kind(element: Element, remarks: ReaderWarnings) -> UrdfJointType:
+    """Return the type of a joint, which may also be ``spherical``, with a remark."""
     kind = element[1].get("type")
     if kind is None:
-        raise ElementError(element, f"has no type; the specification requires one of {', '.join(SPECIFIED)}.")
-    if kind not in SPECIFIED:
+        raise ElementError(
+            element, f"has no type; the specification requires one of {', '.join(SPECIFIED_TYPES)}."
+        )
+    if kind not in SPECIFIED_TYPES:
         mistake = ElementError(
-            element, f'type="{abbreviate(kind)}" is no joint type of URDF. {suggest(kind, SPECIFIED, "type")}'
+            element,
+            f'type="{abbreviate(kind)}" is no joint type of URDF. {suggest(kind, SPECIFIED_TYPES, "type")}',
         )
         if kind not in DOF_BY_TYPE:
             raise mistake
@@ -112,7 +117,7 @@ def _kind(element: Element, remarks: ReaderWarnings) -> UrdfJointType:
 
 
 def _parts(element: Element, remarks: ReaderWarnings) -> dict[str, Element]:
-    """Return the children by tag, of several with one tag the first, as all parsers do."""
+    """Return the children by tag; of several with one tag, the first, as all parsers do."""
     children = element[2]
     parts = {part[0]: part for part in reversed(children)}
     if len(parts) != len(children):
@@ -123,6 +128,7 @@ def _parts(element: Element, remarks: ReaderWarnings) -> dict[str, Element]:
 
 
 def _link(element: Element, parts: dict[str, Element], role: str) -> str:
+    """Return the name of the parent or the child link."""
     part = parts.get(role)
     if part is None:
         raise ElementError(element, f'has no <{role} link="..."/>; the specification requires it.')
@@ -133,14 +139,14 @@ def _link(element: Element, parts: dict[str, Element], role: str) -> str:
 
 
 def _axis(axis: Element | None, joint: Element, remarks: ReaderWarnings, taken: str) -> Vector3 | None:
-    """Return the unit vector of an axis, None if it has no length; the specification's default is x."""
+    """Return the unit vector of an axis, x by default; None, with a remark, for a vector of length zero."""
     if axis is None:
         return _X
     if "xyz" not in axis[1]:
         remarks.add(axis, "has no xyz; it is 1 0 0, the default, where others move about nothing.", joint)
     x, y, z = scale_to_bounds(read_attribute_vector(axis, "xyz", _X, turns=True))
     length = math.hypot(x, y, z)
-    if length < _SHORTEST_AXIS:
+    if length < _MIN_AXIS_LENGTH:
         mistake = ElementError(
             axis, f'xyz="{abbreviate(axis[1]["xyz"])}" has length zero: nothing to move along or about.'
         )
@@ -158,6 +164,7 @@ def _limits(
     version: tuple[int, int],
     remarks: ReaderWarnings,
 ) -> UrdfLimits:
+    """Return the limits of a joint; none, with a remark, if a required ``<limit>`` is missing."""
     if limit is None:
         if kind != "continuous":
             mistake = ElementError(
@@ -184,7 +191,7 @@ def _limits(
 def _magnitude(
     limit: Element, key: str, joint: Element, newer: bool, remarks: ReaderWarnings
 ) -> float | None:
-    """Return a bound of a magnitude; from URDF 1.2 on it may be left out, and must not be negative."""
+    """Return a limit of a magnitude; from URDF 1.2 on it is optional and must not be negative."""
     if newer and key not in limit[1]:
         return None
     value = read_or_default(
@@ -203,43 +210,48 @@ def _magnitude(
 
 
 def _bound(value: float | None) -> float | None:
-    """Return a bound; the largest number there is bounds nothing, and is written where URDF wants one."""
+    """Return a limit; the largest float, written where URDF requires a number, is no limit."""
     return None if value is None or abs(value) == sys.float_info.max else value
 
 
 def _range(
     limit: Element, joint: Element, newer: bool, remarks: ReaderWarnings
 ) -> tuple[float | None, float | None]:
-    """Return the ends of a range, None for one that is open: as Bullet and MuJoCo do, where there is none."""
-    said = limit[1]
+    """Return the ends of a range, None for an infinite one; a joint without valid range is not limited.
+
+    Bullet and MuJoCo read invalid ranges in the same way.
+    """
+    attributes = limit[1]
     if newer:
         for key in ("lower", "upper"):
-            if key not in said:
+            if key not in attributes:
                 mistake = ElementError(limit, f"has no {key}; the specification requires it.")
                 remarks.mend(mistake, "the joint is not limited", joint)
                 return None, None
-    elif "lower" not in said and "upper" not in said:
+    elif "lower" not in attributes and "upper" not in attributes:
         remarks.add(
             limit, "has neither lower nor upper; both are 0 by the specification: it cannot move.", joint
         )
     lower, upper = _end(limit, "lower", joint, remarks), _end(limit, "upper", joint, remarks)
     if math.isnan(lower) or math.isnan(upper):
         return None, None
-    wrong: ElementError | None = None
+    invalid: ElementError | None = None
     if lower > upper:
-        wrong = ElementError(limit, f"has lower={lower!r} above upper={upper!r}: no position would be valid.")
+        invalid = ElementError(
+            limit, f"has lower={lower!r} above upper={upper!r}: no position would be valid."
+        )
     elif lower > LARGEST or upper < -LARGEST:
-        wrong = ElementError(
+        invalid = ElementError(
             limit, f"has lower={lower!r} and upper={upper!r}: all positions would be beyond {LARGEST:g}."
         )
-    if wrong is not None:
-        remarks.mend(wrong, "the joint is not limited", joint)
+    if invalid is not None:
+        remarks.mend(invalid, "the joint is not limited", joint)
         return None, None
     return (lower if lower > -math.inf else None), (upper if upper < math.inf else None)
 
 
 def _end(limit: Element, key: str, joint: Element, remarks: ReaderWarnings) -> float:
-    """Return an end of a range: infinite where there is none, NaN where nobody knows."""
+    """Return an end of a range: infinite for no limit, NaN if the attribute is no number."""
     text = limit[1].get(key, "0").strip()
     if not text:
         return read_or_default(lambda: read_attribute_number(limit, key), 0.0, "it is 0", remarks, joint)
@@ -255,6 +267,7 @@ def _end(limit: Element, key: str, joint: Element, remarks: ReaderWarnings) -> f
 
 
 def _safety(safety: Element | None, limits: UrdfLimits) -> UrdfSafetyController | None:
+    """Return the safety controller of a joint; its soft limits have to overlap the limits."""
     if safety is None:
         return None
     lower, upper = (
@@ -269,7 +282,7 @@ def _safety(safety: Element | None, limits: UrdfLimits) -> UrdfSafetyController 
         read_attribute_number(safety, "k_position", 0.0),
         read_attribute_number(safety, "k_velocity"),
     )
-    if limits.lower is None or limits.upper is None or not result.bounds:
+    if limits.lower is None or limits.upper is None or not result.has_limits:
         return result
     if upper < limits.lower or lower > limits.upper:
         raise ElementError(
@@ -281,6 +294,7 @@ def _safety(safety: Element | None, limits: UrdfLimits) -> UrdfSafetyController 
 
 
 def _mimic(mimic: Element) -> UrdfMimic:
+    """Return the joint that is followed, by its name in the file, and the factors."""
     joint = mimic[1].get("joint")
     if not joint:
         raise ElementError(mimic, "does not say which joint.")

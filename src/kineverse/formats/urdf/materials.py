@@ -1,7 +1,7 @@
 """URDF materials: colours and textures, and the names that share them.
 
-A visual's own colour counts for that visual. A material that is only named is looked up among those of the
-robot, then among those that some visual defines.
+A colour inside of a visual applies to that visual. A material that is only named is looked up among those of
+the robot, then among those that other visuals define.
 """
 
 from __future__ import annotations
@@ -14,57 +14,59 @@ from kineverse.formats.xml_values import parse_numbers
 from kineverse.model.body import Rgba
 
 Appearance: TypeAlias = tuple[Rgba | None, str]
-"""Colour, if there is one, and the file of the texture, or an empty string."""
+"""Colour or None, and the file of the texture or an empty string."""
 
-_NONE: Appearance = (None, "")
+_NO_APPEARANCE: Appearance = (None, "")
 
 
 class UrdfMaterials:
-    """The materials of one document, as far as it has been read."""
+    """Materials of one document, as far as it has been read."""
 
     def __init__(self, remarks: ReaderWarnings):
         self._remarks = remarks
         self._shared: dict[str, Appearance] = {}
         self._local: dict[str, Appearance] = {}
 
-    def share(self, material: Element) -> None:
-        """Take up a material of the robot itself.
+    def define(self, material: Element) -> None:
+        """Define a material of the robot.
 
         Raises
         ------
         ElementError
-            If there is another one of that name which differs. Saying the same twice is harmless.
+            If a different material of that name exists, and the document is read strictly.
         """
         appearance = self._read(material, material)
-        if appearance == _NONE:
+        if appearance == _NO_APPEARANCE:
             return
         earlier = self._shared.setdefault(material[1].get("name", ""), appearance)
         if earlier != appearance:
             mistake = ElementError(
                 material,
-                f"is {_show(appearance)} here and {_show(earlier)} before; give the two different names.",
+                f"is {_format_appearance(appearance)} here and {_format_appearance(earlier)} before; "
+                "give the two different names.",
             )
             self._remarks.mend(mistake, "the first is taken")
 
     def appearance(self, material: Element, link: Element) -> Appearance | None:
-        """Return what the ``<material>`` of a visual looks like, None if that may be said further on."""
+        """Return the appearance of a visual's ``<material>``; None if it is not defined yet."""
         name = material[1].get("name", "")
         if material[2]:
             own = self._read(material, link)
-            if own != _NONE:
+            if own != _NO_APPEARANCE:
                 self._local.setdefault(name, own)
                 return own
-        return self._shared.get(name) if name else _NONE
+        return self._shared.get(name) if name else _NO_APPEARANCE
 
-    def appearance_at_last(self, material: Element, link: Element) -> Appearance:
-        """Return what a material that is only named looks like, now that all of the document is read."""
+    def final_appearance(self, material: Element, link: Element) -> Appearance:
+        """Return the appearance of a material that is only named, after the end of the document."""
         name = material[1].get("name", "")
         found = self._shared.get(name) or self._local.get(name)
         if found is None:
             self._remarks.add(material, "is defined nowhere; the shape has no colour.", link)
-        return found or _NONE
+        return found or _NO_APPEARANCE
 
     def _read(self, material: Element, owner: Element) -> Appearance:
+        """Return the colour and texture of a material; three numbers are read as an opaque colour."""
         color, texture = find_child(material, "color"), find_child(material, "texture")
         file = "" if texture is None else texture[1].get("filename", "")
         text = None if color is None else color[1].get("rgba")
@@ -89,7 +91,8 @@ class UrdfMaterials:
         return ((red, green, blue, alpha), file)
 
 
-def _show(appearance: Appearance) -> str:
+def _format_appearance(appearance: Appearance) -> str:
+    """Return an appearance as text for messages."""
     color, texture = appearance
     words = [] if color is None else ["rgba " + " ".join(f"{part:g}" for part in color)]
     return " with ".join([*words, f"texture {quote(texture)}"] if texture else words)

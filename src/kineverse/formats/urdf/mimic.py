@@ -13,10 +13,10 @@ from kineverse.formats.xml_reader import quote
 
 
 def resolve_mimic_joints(joints: Iterable[UrdfJoint], remarks: ReaderWarnings) -> list[UrdfJoint]:
-    """Return the joints, each ``mimic`` naming the joint at the end of its chain and the composed factors.
+    """Resolve mimic chains: each ``mimic`` names the joint at the end of its chain and the composed factors.
 
-    A joint that mimics one that does not exist, itself, in a circle, or one that has no single position,
-    moves by itself, as it does for others.
+    A joint is independent, with a remark, if the joint that it mimics does not exist, has no single position,
+    or mimics it in a cycle. Other parsers do the same.
 
     Raises
     ------

@@ -1,7 +1,8 @@
 """URDF descriptions as model operations.
 
-Links become frames and joints degrees of freedom of the same name, below the prefix. The tags are those of
-the things: ``joint pr2/l_elbow_flex_joint``, ``body pr2/l_elbow_flex_link``, ``soft limits ...``.
+Links become frames and joints degrees of freedom of the same name, below the prefix. The tags of the
+operations name the elements: ``joint pr2/l_elbow_flex_joint``, ``body pr2/l_elbow_flex_link``, ``soft limits
+...``.
 """
 
 from __future__ import annotations
@@ -70,29 +71,28 @@ def urdf_operations(
     robot
         The description.
     prefix
-        Put in front of the names of frames and degrees of freedom, with a slash.
+        Prefix of the names of frames and degrees of freedom, without its slash.
     parent
-        The frame to which the root link is attached. A root link ``world`` without prefix is the world.
-
+        Frame to which the root link is attached. A root link ``world`` without prefix is the world.
     strict
-        Whether names that cannot be names here are refused, rather than replaced with a remark.
+        If True, invalid names are errors. Otherwise they are replaced, with a remark.
 
     Empty parts of names are left out: ``/base_link`` becomes ``base_link``.
 
     Raises
     ------
     FormatError
-        If the root is the world and is to be attached elsewhere; for names, where they are read strictly.
+        If the root is the world and is to be attached to another frame; for invalid names in strict mode.
     """
     links, joints = _assign_names(robot, prefix, strict)
 
-    def named(name: str) -> str:
+    def frame_name(name: str) -> str:
         return f"{prefix}/{links[name]}" if prefix else links[name]
 
-    def moved(name: str) -> str:
+    def joint_name(name: str) -> str:
         return f"{prefix}/{joints[name]}" if prefix else joints[name]
 
-    root = named(robot.root)
+    root = frame_name(robot.root)
     bodies = {link.name: link.body for link in robot.links if not is_empty_body(link.body)}
     if root != WORLD:
         yield AddFrame(root, Frame(parent, (_ROOT,)))
@@ -104,23 +104,24 @@ def urdf_operations(
     if robot.root in bodies:
         yield SetBody(root, bodies[robot.root])
     for other in robot.more_roots:
-        yield AddFrame(named(other), Frame(parent, (_ROOT,)))
+        yield AddFrame(frame_name(other), Frame(parent, (_ROOT,)))
         if other in bodies:
-            yield SetBody(named(other), bodies[other])
+            yield SetBody(frame_name(other), bodies[other])
     for joint in robot.joints:
-        yield from _joint_operations(joint, named, moved)
+        yield from _joint_operations(joint, frame_name, joint_name)
         if joint.child in bodies:
-            yield SetBody(named(joint.child), bodies[joint.child])
+            yield SetBody(frame_name(joint.child), bodies[joint.child])
 
 
 def _joint_operations(
-    joint: UrdfJoint, named: Callable[[str], str], moved: Callable[[str], str]
+    joint: UrdfJoint, frame_name: Callable[[str], str], joint_name: Callable[[str], str]
 ) -> Iterator[Operation]:
-    name = moved(joint.name)
+    """Yield the operations of a joint and of its soft limits."""
+    name = joint_name(joint.name)
     common: dict[str, Any] = {
         "name": name,
-        "parent": named(joint.parent),
-        "child": named(joint.child),
+        "parent": frame_name(joint.parent),
+        "child": frame_name(joint.child),
         "origin": joint.origin,
     }
     if joint.kind == "fixed":
@@ -133,15 +134,18 @@ def _joint_operations(
         assert joint.axis is not None
         yield Planar(**common, axis=joint.axis)
     else:
-        followed = _mimic_position(joint, moved)
-        yield _axis_joint(joint, common, followed)
+        mimic_position = _mimic_position(joint, joint_name)
+        yield _axis_joint(joint, common, mimic_position)
         safety = joint.safety
-        if safety is not None and safety.bounds and joint.kind != "continuous":
-            q = position(name) if followed is None else followed
+        if safety is not None and safety.has_limits and joint.kind != "continuous":
+            q = position(name) if mimic_position is None else mimic_position
             yield SoftLimits(name, q, safety.soft_lower, safety.soft_upper)
 
 
-def _axis_joint(joint: UrdfJoint, common: dict[str, Any], followed: Expression | None) -> JointOperation:
+def _axis_joint(
+    joint: UrdfJoint, common: dict[str, Any], mimic_position: Expression | None
+) -> JointOperation:
+    """Return the operation of a joint of one DoF, or of one that follows another."""
     assert joint.axis is not None
     return _AXIS_JOINTS[joint.kind](
         **common,
@@ -149,19 +153,20 @@ def _axis_joint(joint: UrdfJoint, common: dict[str, Any], followed: Expression |
         lower=joint.limits.lower,
         upper=joint.limits.upper,
         velocity=joint.limits.velocity,
-        position=followed,
+        position=mimic_position,
         dynamics=_dynamics(joint),
     )
 
 
-def _mimic_position(joint: UrdfJoint, moved: Callable[[str], str]) -> Expression | None:
-    """Return the expression that stands for the position of a joint that mimics another one."""
+def _mimic_position(joint: UrdfJoint, joint_name: Callable[[str], str]) -> Expression | None:
+    """Return the position of a joint that mimics another one; None for an independent joint."""
     if joint.mimic is None:
         return None
-    return joint.mimic.multiplier * position(moved(joint.mimic.joint)) + joint.mimic.offset
+    return joint.mimic.multiplier * position(joint_name(joint.mimic.joint)) + joint.mimic.offset
 
 
 def _dynamics(joint: UrdfJoint) -> tuple[tuple[str, float], ...]:
+    """Return the dynamics of a joint as pairs of name and value, without those that are missing."""
     values = {
         "effort": joint.limits.effort,
         "acceleration": joint.limits.acceleration,
@@ -178,12 +183,12 @@ def _dynamics(joint: UrdfJoint) -> tuple[tuple[str, float], ...]:
 def _assign_names(
     robot: UrdfRobot, prefix: str | None, strict: bool
 ) -> tuple[dict[str, str], dict[str, str]]:
-    """Return what links and joints are called here, those that cannot have their names with another one.
+    """Return the names of links and joints in the model; invalid and repeated names are replaced.
 
     Raises
     ------
     FormatError
-        If there are such names, and the description is read strictly.
+        If there is such a name, and the description is read strictly.
     """
     numbers = NumberedNames()
 
@@ -237,7 +242,7 @@ def _assign_names(
 
 
 class _TakenPrefixes:
-    """Whether a name is taken, or those of coordinates below it are."""
+    """Container of all taken names and their prefixes, the names above them."""
 
     def __init__(self, taken: set[str]) -> None:
         self._taken = {

@@ -1,7 +1,7 @@
 """URDF files and text as checked descriptions.
 
-Specification: http://wiki.ros.org/urdf/XML and urdf.xsd of ros/urdfdom; ``docs/urdf.md`` lists where parsers
-disagree and how it is decided here.
+Specification: http://wiki.ros.org/urdf/XML and urdf.xsd of ros/urdfdom. ``docs/urdf.md`` lists the
+differences between parsers and the choices made here.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from kineverse.formats.xml_reader import Element, ElementError, Visit, label, pa
 
 _VERSIONS = {"1.0": (1, 0), "1.1": (1, 1), "1.2": (1, 2)}
 _EXTENSIONS = frozenset(("gazebo", "transmission"))
-EXPAND = "Run xacro first: xacro robot.urdf.xacro > robot.urdf"
+XACRO_HINT = "Run xacro first: xacro robot.urdf.xacro > robot.urdf"
 
 _OTHER_FORMATS = {
     "sdf": "an SDF",
@@ -64,20 +64,20 @@ def parse_urdf(
     Parameters
     ----------
     text
-        The document.
+        Text of the document.
     source
-        Its name in error messages.
+        Name of the document in error messages.
     folder
-        The folder from which the meshes it names are found, when somebody asks for them.
+        Folder relative to which meshes are found.
     root
-        The folder that they do not leave; None for that which :func:`kineverse.formats.root_folder.find_root` finds.
+        Folder that contains all meshes; None for that of :func:`kineverse.formats.root_folder.find_root`.
     strict
-        Whether mistakes that others read past are refused, rather than remarked on.
+        If True, mistakes that other parsers accept are errors. Otherwise they are warnings.
 
     Raises
     ------
     FormatError
-        If it is not a valid URDF; the message names source, line, element and reason.
+        If the text is no valid URDF; the message names source, line, element and reason.
     """
     remarks = ReaderWarnings(source, strict=strict)
     document = _Document(folder, find_text_root(folder, root), remarks)
@@ -99,40 +99,41 @@ def parse_urdf(
 
 
 class _Document:
-    """The links and joints of a document, which are taken up as they come."""
+    """Links and joints of a document, collected while it is parsed."""
 
     def __init__(self, folder: str, root: str, remarks: ReaderWarnings):
         self.links: dict[str, UrdfLink] = {}
         self.joints: dict[str, UrdfJoint] = {}
         self.remarks = remarks
         self._folder, self._root = folder, root
-        self._strangers: list[Element] = []
+        self._unknown_elements: list[Element] = []
         self._numbers = NumberedNames()
 
     def begin(self, root: Element) -> Visit:
-        """Look at the root element, which has no children yet."""
+        """Read the root element, which has no children yet; return the visitor of its children."""
         try:
             self._version = _version(root, self.remarks)
         except ElementError as mistake:
             raise self._error(mistake, root) from None
         self._xacro = _xacro_prefix(root)
         self._reader = UrdfLinkReader(self._folder, self._version, self.remarks, self._root)
-        return self._take
+        return self._read_element
 
     def finish(self, root: Element) -> str:
-        """Do what needs all of the document; return a hint for the case that it is no tree."""
-        self._reader.colour(self.links)
+        """Complete the links after the end of the document; return a hint for joints that form no tree."""
+        self._reader.assign_materials(self.links)
         try:
-            hint = _note_strangers(root, self._strangers, bool(self.joints), self.remarks)
+            hint = _warn_unknown_elements(root, self._unknown_elements, bool(self.joints), self.remarks)
         except ElementError as mistake:
             raise self._error(mistake, mistake.element) from None
         if not self.links:
             declared = any(key.startswith("xmlns:") and "xacro" in value for key, value in root[1].items())
-            hint += f" {EXPAND}" if declared else ""
+            hint += f" {XACRO_HINT}" if declared else ""
             raise self._error(ElementError(root, f"has no <link>; a robot has at least one.{hint}"), root)
         return hint
 
-    def _take(self, element: Element) -> None:
+    def _read_element(self, element: Element) -> None:
+        """Read a child of the root element."""
         tag = element[0]
         try:
             if tag in ("link", "joint"):
@@ -143,14 +144,14 @@ class _Document:
             elif tag == "joint":
                 self._add_joint(read_urdf_joint(element, self._version, self.remarks), element)
             elif tag == "material":
-                self._reader.materials.share(element)
+                self._reader.materials.define(element)
             elif tag != "sensor":
-                self._strangers.append(element)
+                self._unknown_elements.append(element)
         except ElementError as mistake:
             raise self._error(mistake, element) from None
 
     def _add_joint(self, joint: UrdfJoint, element: Element) -> None:
-        """Take up a joint; a name that a fixed one has, too, goes to the other, which has a coordinate."""
+        """Add a joint; of a fixed joint and another of the same name, the fixed one is renamed."""
         other = self.joints.get(joint.name)
         if other is None or "fixed" not in (joint.kind, other.kind):
             _add(self.joints, joint.name, joint, element)
@@ -165,14 +166,15 @@ class _Document:
         self.joints[fixed] = replace(joint, name=fixed)
 
     def _error(self, mistake: ElementError, owner: Element) -> FormatError:
-        """Return the error that people see; a mistake is often deep inside the element they know by name."""
-        of = "" if mistake.element is owner else f"{label(mistake.element)} "
+        """Return a mistake as an error that names the enclosing link or joint."""
+        part = "" if mistake.element is owner else f"{label(mistake.element)} "
         where = f"{self.remarks.source}, line {mistake.element[3]}, {label(owner)}"
-        return FormatError(f"{where}: {of}{mistake.message}")
+        return FormatError(f"{where}: {part}{mistake.message}")
 
 
-def _add(named: dict[str, T], name: str, part: T, element: Element) -> None:
-    other = named.setdefault(name, part)
+def _add(by_name: dict[str, T], name: str, part: T, element: Element) -> None:
+    """Add a link or joint under its name, which has to be unique."""
+    other = by_name.setdefault(name, part)
     if other is not part:
         raise ElementError(
             element, f"has the name of the {element[0]} on line {other.line} again; names are unique."
@@ -180,7 +182,7 @@ def _add(named: dict[str, T], name: str, part: T, element: Element) -> None:
 
 
 def _version(root: Element, remarks: ReaderWarnings) -> tuple[int, int]:
-    """Return the version of the specification that the root element claims, 1.0 if it claims none."""
+    """Return the version of the specification that the root element states, 1.0 by default."""
     if root[0] != "robot":
         guess = f" This is {_OTHER_FORMATS[root[0]]} file." if root[0] in _OTHER_FORMATS else ""
         mistake = ElementError(root, f"is not <robot>, the root element of a URDF.{guess}")
@@ -200,34 +202,32 @@ def _version(root: Element, remarks: ReaderWarnings) -> tuple[int, int]:
         latest = math.inf > float(text) > 1.2
     except ValueError:
         latest = False
-    taken = "1.2" if latest else "1.0"
-    remarks.mend(mistake, f"{taken} is taken")
-    return _VERSIONS[taken]
+    assumed = "1.2" if latest else "1.0"
+    remarks.mend(mistake, f"{assumed} is taken")
+    return _VERSIONS[assumed]
 
 
-def _note_strangers(
-    root: Element, strangers: list[Element], has_joints: bool, remarks: ReaderWarnings
+def _warn_unknown_elements(
+    root: Element, unknown: list[Element], has_joints: bool, remarks: ReaderWarnings
 ) -> str:
-    """Remark on elements that may have been meant to be part of the robot, and return them as a hint.
+    """Warn of unknown elements that may be meant as parts of the robot, and return them as a hint.
 
-    Elements that URDF does not know are allowed, and are ignored; but joints of other dialects are how links
-    come to be without a parent.
+    URDF allows unknown elements, and they are ignored. Joints of other dialects among them leave links
+    without parent.
 
     Raises
     ------
     ElementError
-        For macros that were never expanded, where they are all that there is.
+        For macros that were not expanded, if the document has no joints.
     """
     xacro = _xacro_prefix(root)
-    for element in strangers:
+    for element in unknown:
         if element[0].startswith(xacro):
-            mistake = ElementError(element, f"is xacro that was not expanded. {EXPAND}")
+            mistake = ElementError(element, f"is xacro that was not expanded. {XACRO_HINT}")
             if not has_joints:
                 raise mistake
             remarks.mend(mistake, "it is passed over, and what it would add is missing")
-    suspects = [
-        e for e in strangers if e[0].lower().endswith(("link", "joint")) and not e[0].startswith(xacro)
-    ]
+    suspects = [e for e in unknown if e[0].lower().endswith(("link", "joint")) and not e[0].startswith(xacro)]
     for element in suspects:
         remarks.add(element, "is ignored: URDF does not know it.")
     if not suspects:
@@ -237,17 +237,18 @@ def _note_strangers(
 
 
 def _check_expanded(element: Element, xacro: str, remarks: ReaderWarnings) -> None:
+    """Warn of xacro inside of an element."""
     if "${" in element[1].get("name", ""):
-        mistake = ElementError(element, f"has a name that xacro was to expand. {EXPAND}")
+        mistake = ElementError(element, f"has a name that xacro was to expand. {XACRO_HINT}")
         remarks.mend(mistake, "it is taken as it is")
     for part in element[2]:
         if part[0].startswith(xacro):
-            mistake = ElementError(part, f"is xacro that was not expanded. {EXPAND}")
+            mistake = ElementError(part, f"is xacro that was not expanded. {XACRO_HINT}")
             remarks.mend(mistake, "it is passed over, and what it would add is missing", element)
 
 
 def _xacro_prefix(root: Element) -> str:
-    """Return the prefix that marks elements of xacro, with its colon."""
+    """Return the namespace prefix of xacro elements, with its colon."""
     for key, value in root[1].items():
         if key.startswith("xmlns:") and value.rstrip("/#").endswith("xacro"):
             return key[len("xmlns:") :] + ":"

@@ -1,6 +1,6 @@
 """Kinematic tree of a URDF: one parent each, joints from the root outwards.
 
-Everything here is iterative and linear, whatever the depth: a chain of 10^5 links is a robot like any other.
+All functions are iterative and run in linear time, also for a chain of 10^5 links.
 """
 
 from __future__ import annotations
@@ -16,16 +16,16 @@ _SHOWN = 8
 
 
 def keep_one_parent(joints: Sequence[UrdfJoint], remarks: ReaderWarnings) -> list[UrdfJoint]:
-    """Return the joints, of several that lead to one link that with the last name, as urdfdom takes it.
+    """Return the joints with one parent joint for each link: the last by name, as in urdfdom.
 
     Raises
     ------
     FormatError
-        If there are such joints, and the description is read strictly.
+        If a link has several parent joints, and the description is read strictly.
     """
-    above: dict[str, UrdfJoint] = {}
+    joint_above: dict[str, UrdfJoint] = {}
     for joint in joints:
-        other = above.setdefault(joint.child, joint)
+        other = joint_above.setdefault(joint.child, joint)
         if other is joint:
             continue
         text = (
@@ -33,35 +33,37 @@ def keep_one_parent(joints: Sequence[UrdfJoint], remarks: ReaderWarnings) -> lis
             f"line {other.line}. URDF describes trees only: a link has one parent."
         )
         if remarks.strict:
-            raise FormatError(f"{_place(remarks.source, joint)}: {text}")
+            raise FormatError(f"{_location(remarks.source, joint)}: {text}")
         kept, dropped = (joint, other) if joint.name.encode() > other.name.encode() else (other, joint)
-        above[joint.child] = kept
+        joint_above[joint.child] = kept
         remarks.fault(
             joint.line,
             f"<joint name={quote(joint.name)}>: {text.rstrip('.')}; {quote(dropped.name)} is left out.",
         )
-    return [joint for joint in joints if above[joint.child] is joint]
+    return [joint for joint in joints if joint_above[joint.child] is joint]
 
 
 def order_from_root(
     links: Sequence[UrdfLink], joints: Sequence[UrdfJoint], remarks: ReaderWarnings, hint: str = ""
 ) -> tuple[tuple[str, ...], tuple[UrdfJoint, ...], list[UrdfLink]]:
-    """Return the roots, the joints from there outwards, siblings as in the file, and all links reached.
+    """Return the roots, the joints from the roots outwards, and the links that they reach.
+
+    Siblings are in the order of the file.
 
     Parameters
     ----------
     links, joints
-        In the order of the file, with unique names; each link has one parent, or none.
+        Links and joints in the order of the file, with unique names; each link has at most one parent.
     remarks
-        If there is more than one root, as MuJoCo reads, that is said here.
+        Receives warnings: of several roots, which MuJoCo reads as well, and of cycles.
     hint
-        What else the reader noticed that may explain why there is no tree.
+        Text for error messages that may explain why there is no tree.
 
     Raises
     ------
     FormatError
-        If a joint names a link that does not exist, or joints lead in a circle; if there is more than one
-        root, and the description is read strictly.
+        If a joint names a link that does not exist, or there is no root; in strict mode also for several
+        roots and for cycles.
     """
     source = remarks.source
     lines = {link.name: link.line for link in links}
@@ -71,7 +73,7 @@ def order_from_root(
         for role, name in (("parent", joint.parent), ("child", joint.child)):
             if name not in lines:
                 raise FormatError(
-                    f"{_place(source, joint)}: its {role} link {quote(name)} does not exist; every link "
+                    f"{_location(source, joint)}: its {role} link {quote(name)} does not exist; every link "
                     f"needs a <link> element of its own. {suggest(name, lines, 'link')}"
                 )
         joint_above[joint.child] = joint
@@ -94,18 +96,18 @@ def order_from_root(
         loop = _loop(next(joint for joint in joints if joint.child not in reached), joint_above)
         shown = " -> ".join(f"{quote(joint.name)}" for joint in loop[:_SHOWN])
         more = f" and {len(loop) - _SHOWN} more" if len(loop) > _SHOWN else ""
-        circle = (
+        cycle = (
             f"the joints {shown}{more} lead in a circle"
             if len(loop) > 1
             else "its child link is its own parent"
         )
-        text = f"{circle}. URDF describes trees only: remove a joint.{hint}"
+        text = f"{cycle}. URDF describes trees only: remove a joint.{hint}"
         if remarks.strict or not roots:
-            raise FormatError(f"{_place(source, loop[0])}: {text}")
-        place = _place(source, loop[0]).removeprefix(f"{source}, line {loop[0].line}, ")
+            raise FormatError(f"{_location(source, loop[0])}: {text}")
+        where = _location(source, loop[0]).removeprefix(f"{source}, line {loop[0].line}, ")
         left = len(links) - len(reached)
         remarks.fault(
-            loop[0].line, f"{place}: {text.rstrip('.')}; {left} links that no root holds are left out."
+            loop[0].line, f"{where}: {text.rstrip('.')}; {left} links that no root holds are left out."
         )
     return tuple(root.name for root in roots), tuple(ordered), [k for k in links if k.name in reached]
 
@@ -113,22 +115,22 @@ def order_from_root(
 def _outwards(root: str, joints_below: dict[str, list[UrdfJoint]]) -> list[UrdfJoint]:
     """Return the joints below a link, depth first."""
     ordered: list[UrdfJoint] = []
-    ahead = joints_below.get(root, [])[::-1]
-    while ahead:
-        joint = ahead.pop()
+    stack = joints_below.get(root, [])[::-1]
+    while stack:
+        joint = stack.pop()
         ordered.append(joint)
-        ahead.extend(reversed(joints_below.get(joint.child, ())))
+        stack.extend(reversed(joints_below.get(joint.child, ())))
     return ordered
 
 
 def _loop(start: UrdfJoint, joint_above: dict[str, UrdfJoint]) -> list[UrdfJoint]:
-    """Return the joints of the circle that ``start`` is in or below, from the first of the file onwards."""
-    joint, passed = start, {start.name}
+    """Return the joints of the cycle that ``start`` is in or below, beginning with the first in the file."""
+    joint, visited = start, {start.name}
     while True:
         joint = joint_above[joint.parent]
-        if joint.name in passed:
+        if joint.name in visited:
             break
-        passed.add(joint.name)
+        visited.add(joint.name)
     loop = [joint]
     while (above := joint_above[loop[-1].parent]) is not joint:
         loop.append(above)
@@ -137,5 +139,6 @@ def _loop(start: UrdfJoint, joint_above: dict[str, UrdfJoint]) -> list[UrdfJoint
     return loop[first:] + loop[:first]
 
 
-def _place(source: str, joint: UrdfJoint) -> str:
+def _location(source: str, joint: UrdfJoint) -> str:
+    """Return file, line and name of a joint for error messages."""
     return f"{source}, line {joint.line}, <joint name={quote(joint.name)}>"

@@ -1,8 +1,8 @@
 """Models as URDF text.
 
-Every frame is a link and every coordinate a joint of its name. What moves by several coordinates, or about a
-line that does not pass through its origin, hangs on links in between that carry nothing; what moves by a
-multiple of a coordinate mimics it.
+Every frame becomes a link and every coordinate a joint of its name. A link that moves by several coordinates,
+or about a line that does not pass through its origin, has intermediate links without body. A joint that moves
+by a multiple of a coordinate mimics the joint of that coordinate.
 """
 
 from __future__ import annotations
@@ -30,9 +30,9 @@ from kineverse.formats.description import (
     WrittenFile,
 )
 from kineverse.formats.export.capabilities import FormatCapabilities, UnsupportedFeatures
-from kineverse.formats.export.link_tree import LinkTreeBuilder
+from kineverse.formats.export.link_tree import LinkTreeBuilder, check_rotation
 from kineverse.formats.export.mesh_paths import mesh_reference
-from kineverse.formats.export.poses import ROTATION_TOLERANCE, rotation_deviation, rpy_angles
+from kineverse.formats.export.poses import ROTATION_TOLERANCE, rpy_angles
 from kineverse.formats.names import TakenNames
 from kineverse.formats.reader_warnings import collect_warnings
 from kineverse.formats.urdf.operations import urdf_operations
@@ -62,14 +62,14 @@ _TENSOR = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
 
 
 class UrdfBodyWriter:
-    """Writes the bodies of one file.
+    """Writer of the bodies of one file.
 
     Parameters
     ----------
     folder
-        Where the file will lie.
+        Folder of the file.
     remarks
-        What is left out is said here.
+        Receives remarks on parts that are left out.
     """
 
     def __init__(self, folder: Path, remarks: list[str]) -> None:
@@ -78,7 +78,7 @@ class UrdfBodyWriter:
         self._materials: dict[object, str] = {}
 
     def write(self, link: Tag, body: Body) -> None:
-        """Put a body into the element of its link."""
+        """Add the elements of a body to its link."""
         name = link.attributes["name"]
         if body.inertia is not None:
             _add_inertia(link, body.inertia)
@@ -92,6 +92,7 @@ class UrdfBodyWriter:
                 self._remark(f"the colours of what is to be touched of '{name}' are left out")
 
     def _shape(self, link: Tag, tag: str, shape: Shape, name: str) -> Tag | None:
+        """Add a visual or collision shape; None, with a remark, if URDF has no such shape."""
         if isinstance(shape.geometry, (Ellipsoid, Cone)):
             self._remark(f"URDF has no {shape.geometry.kind}: one of '{name}' is left out ({tag})")
             return None
@@ -101,6 +102,7 @@ class UrdfBodyWriter:
         return element
 
     def _geometry(self, element: Tag, form: Geometry) -> None:
+        """Add the element of a geometry."""
         if isinstance(form, Box):
             element.add("box", size=form.size)
         elif isinstance(form, Cylinder):
@@ -114,11 +116,12 @@ class UrdfBodyWriter:
             element.add("mesh", filename=mesh_reference(form, self._folder, self._remark), scale=scale)
 
     def _material(self, visual: Tag, shape: Shape) -> None:
+        """Add the material of a visual, if it has a colour or a texture."""
         if shape.color is None and not shape.texture:
             return
         folder = shape.geometry.folder if shape.texture and isinstance(shape.geometry, Mesh) else ""
         key = shape.color, shape.texture, folder
-        # Equal ones share a name, because a name that means two things is an error for some readers.
+        # Equal materials share a name; different materials of one name are an error for some readers.
         name = self._materials.setdefault(key, f"material_{len(self._materials) + 1}")
         material = visual.add("material", name=name)
         if shape.color is not None:
@@ -127,7 +130,7 @@ class UrdfBodyWriter:
             material.add("texture", filename=self._texture(shape))
 
     def _texture(self, shape: Shape) -> str:
-        """Return what the file calls a texture; where a relative one is, only a mesh beside it knows."""
+        """Return the reference to a texture, relative to the folder of the shape's mesh."""
         if isinstance(shape.geometry, Mesh) and shape.geometry.folder:
             texture = replace(shape.geometry, uri=shape.texture)
             return mesh_reference(texture, self._folder, self._remark)
@@ -136,20 +139,22 @@ class UrdfBodyWriter:
         return shape.texture
 
     def _remark(self, text: str) -> None:
+        """Add a remark once."""
         if text not in self._remarks:
             self._remarks.append(text)
 
 
 def add_origin(element: Tag, pose: Pose) -> None:
-    """Say where something is, unless it is where it is by default."""
+    """Add the ``<origin>`` of an element, unless it is the identity."""
     if pose == _IDENTITY:
         return
     matrix = pose.matrix
-    turned = rpy_angles(matrix)
-    element.add("origin", xyz=matrix[:3, 3].tolist(), rpy=None if turned == (0.0, 0.0, 0.0) else turned)
+    rpy = rpy_angles(matrix)
+    element.add("origin", xyz=matrix[:3, 3].tolist(), rpy=None if rpy == (0.0, 0.0, 0.0) else rpy)
 
 
 def _add_inertia(link: Tag, inertia: Inertia) -> None:
+    """Add the ``<inertial>`` of a link."""
     element = link.add("inertial")
     add_origin(element, inertia.origin)
     element.add("mass", value=inertia.mass)
@@ -160,7 +165,7 @@ Matrix = npt.NDArray[np.float64]
 
 URDF_CAPABILITIES = FormatCapabilities("URDF")
 LARGEST_FLOAT = sys.float_info.max
-"""Stands for no limit at all, where URDF wants a number."""
+"""Number written in place of no limit, where URDF requires a number."""
 
 _NEWER = ("acceleration", "deceleration", "jerk")
 _KNOWN = frozenset(("effort", "damping", "friction", "k_position", "k_velocity", *_NEWER))
@@ -174,40 +179,42 @@ def to_urdf(
     tolerance: float | None = None,
     strict: bool = False,
 ) -> WrittenFile:
-    """Return the text of a file, and what it says other than the model, or not at all.
+    """Convert a model to URDF.
 
     Parameters
     ----------
     model
         The model.
     path
-        Where the file will lie; its name becomes that of the robot, and meshes are named from there.
+        Path of the file. Its name becomes the name of the robot, and meshes are referenced relative to it.
     leave_out
-        Names of constraints that are not to be said, and of articulations whose speeds are not.
+        Names of constraints to leave out, and of articulations whose relations between speeds to leave out.
     tolerance
-        How far frames may be off where motions are approximated [m], [rad]; None for no approximation.
+        Largest pose error of a frame by approximation [m], [rad]; None for no approximation.
     strict
-        Whether constraints that it cannot say are refused, rather than left out with a remark.
+        If True, constraints that URDF cannot represent are errors. Otherwise they are left out, with a
+        remark.
 
     Raises
     ------
     FormatError
-        Naming what URDF cannot say, and why; or if the result could not be read again.
+        Naming all features that URDF cannot represent, with the reasons; or if the result cannot be read
+        back.
     """
-    recognition = LinkTreeBuilder(model, URDF_CAPABILITIES, leave_out, tolerance, strict)
-    plan = recognition.plan()
-    content = UrdfWriter(plan, path, recognition.refusals).document()
+    builder = LinkTreeBuilder(model, URDF_CAPABILITIES, leave_out, tolerance, strict)
+    description = builder.build()
+    content = UrdfWriter(description, path, builder.unsupported).document()
     _check_read_back(content, path)
-    return WrittenFile(content, tuple(plan.remarks), plan.errors, recognition.refusals.left_out)
+    return WrittenFile(content, tuple(description.remarks), description.errors, builder.unsupported.left_out)
 
 
 def _check_read_back(content: bytes, path: Path) -> None:
-    """Read again what was written.
+    """Read the text of a file as a model.
 
     Raises
     ------
     FormatError
-        If there is something wrong with it.
+        If it cannot be read.
     """
     model = Model()
     try:
@@ -220,52 +227,52 @@ def _check_read_back(content: bytes, path: Path) -> None:
 
 
 class UrdfWriter:
-    """Writes one plan."""
+    """Writer of one robot description as URDF."""
 
-    def __init__(self, plan: RobotDescription, path: Path, refusals: UnsupportedFeatures) -> None:
-        self._plan, self._path, self._refusals = plan, path, refusals
-        self._links = TakenNames([WORLD, *(link.name for link in plan.links)])
+    def __init__(self, description: RobotDescription, path: Path, unsupported: UnsupportedFeatures) -> None:
+        self._description, self._path, self._unsupported = description, path, unsupported
+        self._links = TakenNames([WORLD, *(link.name for link in description.links)])
         self._joints = TakenNames(
-            [*(link.label for link in plan.links), *(joint.name for joint in plan.joints)]
+            [
+                *(link.fixed_joint_name for link in description.links),
+                *(joint.name for joint in description.joints),
+            ]
         )
-        self._bodies = UrdfBodyWriter(path.absolute().parent, plan.remarks)
+        self._bodies = UrdfBodyWriter(path.absolute().parent, description.remarks)
         self._root = Tag("robot", {"name": path.name.removesuffix(path.suffix) or "model"})
 
     def document(self) -> bytes:
-        """Return the text.
+        """Return the text of the file.
 
         Raises
         ------
         FormatError
-            Naming what URDF cannot say.
+            Naming all features that URDF cannot represent.
         """
-        links = self._plan.links
-        if any(key in joint.dynamics for joint in self._plan.joints for key in _NEWER):
+        links = self._description.links
+        if any(key in joint.dynamics for joint in self._description.joints for key in _NEWER):
             self._root.give("version", "1.2")
         root = self._root_link()
         if root is None:
-            self._bodies.write(self._root.add("link", name=WORLD), self._plan.world)
+            self._bodies.write(self._root.add("link", name=WORLD), self._description.world_body)
         for link in links:
             self._link(link, link is root)
-        self._refusals.check(self._path.name)
-        self._plan.remarks += self._refusals.remarks
-        return format_xml(self._root, [*self._plan.remarks, *self._plan.error_lines])
+        self._unsupported.check(self._path.name)
+        self._description.remarks += self._unsupported.remarks
+        return format_xml(self._root, [*self._description.remarks, *self._description.error_lines])
 
     def _root_link(self) -> LinkDescription | None:
-        """Return the link that is where the world is and carries all others, if there is one."""
-        below = [link for link in self._plan.links if link.parent == WORLD]
-        if len(below) != 1 or self._plan.world != NO_BODY:
+        """Return the link that is fixed at the world's origin and carries all others; None without one."""
+        roots = [link for link in self._description.links if link.parent == WORLD]
+        if len(roots) != 1 or self._description.world_body != NO_BODY:
             return None
-        if below[0].joints or below[0].recorded or not np.array_equal(below[0].pose, np.eye(4)):
+        if roots[0].joints or roots[0].is_articulation or not np.array_equal(roots[0].pose, np.eye(4)):
             return None
-        return below[0]
+        return roots[0]
 
     def _link(self, link: LinkDescription, is_root: bool) -> None:
-        if rotation_deviation(link.pose) > ROTATION_TOLERANCE:
-            self._refusals.add(
-                link.name,
-                f"is turned by a constant that is off by {rotation_deviation(link.pose):.2g} from any rotation",
-            )
+        """Add a link with its joints and the intermediate links between them."""
+        check_rotation(link, self._unsupported)
         if is_root:
             self._bodies.write(self._root.add("link", name=link.name), link.body)
             return
@@ -276,30 +283,32 @@ class UrdfWriter:
             self._bodies.write(self._root.add("link", name=link.name), link.body)
             self._joint(name, kind, parent, link.name, pose, axis)
             return
-        at = np.zeros(3)
+        offset = np.zeros(3)
         for k, joint in enumerate(link.joints):
             if isinstance(joint, BallJointDescription):
-                self._refusals.add(joint.name, "turns by a quaternion, which URDF has for free motion only")
+                self._unsupported.refuse(
+                    joint.name, "turns by a quaternion, which URDF has for free motion only"
+                )
                 return
-            point = np.array(joint.point) if joint.turns else at
+            point = np.array(joint.point) if joint.is_rotation else offset
             last = k == len(link.joints) - 1 and not point.any()
             child = link.name if last else self._links.take(f"{link.name}/{joint.name.rpartition('/')[2]}")
             element = self._root.add("link", name=child)
             if last:
                 self._bodies.write(element, link.body)
-            self._axis_joint(joint, parent, child, pose @ translation(point - at))
-            parent, pose, at = child, np.eye(4), point
-        if at.any() or not link.joints:
-            name = link.label or self._joints.take(f"{link.name}/fixed")
+            self._axis_joint(joint, parent, child, pose @ translation(point - offset))
+            parent, pose, offset = child, np.eye(4), point
+        if offset.any() or not link.joints:
+            name = link.fixed_joint_name or self._joints.take(f"{link.name}/fixed")
             self._bodies.write(self._root.add("link", name=link.name), link.body)
-            self._joint(name, "fixed", parent, link.name, pose @ translation(-at))
+            self._joint(name, "fixed", parent, link.name, pose @ translation(-offset))
 
     def _compound(self, link: LinkDescription) -> tuple[str, str, tuple[float, ...] | None] | None:
-        """Return name, kind and axis of a joint with several coordinates, if the link moves by one."""
+        """Return name, type and axis of the floating or planar joint that moves a link; None for others."""
         if len(link.joints) not in (3, 4):
             return None
         axes = [j for j in link.joints if isinstance(j, JointDescription)]
-        if any(not j.leads or not _is_plain(j) for j in axes):
+        if any(not j.is_independent or not _is_plain(j) for j in axes):
             return None
         names = [j.name for j in axes]
         ball = link.joints[-1]
@@ -309,8 +318,8 @@ class UrdfWriter:
         if len(axes) != 3 or len(link.joints) != 3:
             return None
         name, n = names[2].removesuffix("/angle"), axes[2].axis
-        turn = rotation_from_z(n)
-        first, second = (tuple((turn[:3, k] + 0.0).tolist()) for k in (0, 1))
+        rotation = rotation_from_z(n)
+        first, second = (tuple((rotation[:3, k] + 0.0).tolist()) for k in (0, 1))
         flat = [(f"{name}/x", False, first), (f"{name}/y", False, second), (f"{name}/angle", True, n)]
         same = all(
             a[:2] == b[:2] and np.abs(np.subtract(a[2], b[2])).max() < ROTATION_TOLERANCE
@@ -319,11 +328,18 @@ class UrdfWriter:
         return (name, "planar", n) if same and not any(axes[2].point) else None
 
     def _axis_joint(self, joint: JointDescription, parent: str, child: str, pose: Matrix) -> None:
-        kind = "prismatic" if not joint.turns else "continuous" if joint.bounds.open else "revolute"
+        """Add a revolute, continuous or prismatic joint."""
+        kind = (
+            "prismatic"
+            if not joint.is_rotation
+            else "continuous"
+            if joint.bounds.is_unbounded
+            else "revolute"
+        )
         element = self._joint(joint.name, kind, parent, child, pose, joint.axis)
         self._limit(element, joint, kind)
-        if joint.amount != IDENTITY_COEFFICIENTS or not joint.leads:
-            offset, factor = (*joint.amount, 0.0)[:2]
+        if joint.coefficients != IDENTITY_COEFFICIENTS or not joint.is_independent:
+            offset, factor = (*joint.coefficients, 0.0)[:2]
             element.add(
                 "mimic", joint=joint.symbol.path, multiplier=factor, offset=offset if offset else None
             )
@@ -332,7 +348,9 @@ class UrdfWriter:
             element.add("dynamics", damping=_number(known, "damping"), friction=_number(known, "friction"))
         soft = joint.bounds.soft
         if soft is not None and kind == "continuous":
-            self._refusals.leave(f"{joint.name}/soft_limits", "are soft limits of a joint that has no others")
+            self._unsupported.leave_out(
+                f"{joint.name}/soft_limits", "are soft limits of a joint that has no others"
+            )
             soft = None
         if soft is not None or "k_velocity" in known:
             lower, upper = soft or (None, None)
@@ -345,22 +363,23 @@ class UrdfWriter:
             )
         for key in known:
             if key not in _KNOWN:
-                self._plan.remarks.append(f"URDF has no {key}: that of '{joint.name}' is left out")
+                self._description.remarks.append(f"URDF has no {key}: that of '{joint.name}' is left out")
 
     def _limit(self, element: Tag, joint: JointDescription, kind: str) -> None:
+        """Add the ``<limit>`` of a joint, unless a continuous joint has none."""
         bounds, known = joint.bounds, joint.dynamics
-        effort, fastest = _number(known, "effort"), bounds.fastest
+        effort, max_velocity = _number(known, "effort"), bounds.max_velocity
         newer = {key: _number(known, key) for key in _NEWER}
-        if kind == "continuous" and effort is None and fastest == math.inf and not any(newer.values()):
+        if kind == "continuous" and effort is None and max_velocity == math.inf and not any(newer.values()):
             return
-        if not fastest > 0:
-            self._refusals.add(joint.name, "may not move at all, by a limit of its speed that is 0")
+        if not max_velocity > 0:
+            self._unsupported.refuse(joint.name, "may not move at all, by a limit of its speed that is 0")
         limit = element.add("limit")
         if kind != "continuous":
             limit.give("lower", max(bounds.lower, -LARGEST_FLOAT))
             limit.give("upper", min(bounds.upper, LARGEST_FLOAT))
         limit.give("effort", LARGEST_FLOAT if effort is None else min(effort, LARGEST_FLOAT))
-        limit.give("velocity", min(fastest, LARGEST_FLOAT))
+        limit.give("velocity", min(max_velocity, LARGEST_FLOAT))
         for key, value in newer.items():
             limit.give(key, value)
 
@@ -373,6 +392,7 @@ class UrdfWriter:
         pose: Matrix,
         axis: Iterable[float] | None = None,
     ) -> Tag:
+        """Add a joint and return its element."""
         element = self._root.add("joint", name=name, type=kind)
         xyz, rpy = pose[:3, 3].tolist(), rpy_angles(pose)
         if any(xyz) or any(rpy):
@@ -385,15 +405,19 @@ class UrdfWriter:
 
 
 def _axis_key(joint: JointDescription) -> tuple[str, bool, tuple[float, ...]]:
-    return joint.name, joint.turns, joint.axis
+    """Return name, kind and axis of a joint for comparison."""
+    return joint.name, joint.is_rotation, joint.axis
 
 
 def _is_plain(joint: JointDescription) -> bool:
-    """Whether nothing limits a joint: URDF has no limits of joints with several coordinates."""
+    """Return True if a joint has neither limits nor dynamics, which URDF has for joints of one DoF only."""
     bounds = joint.bounds
-    return bounds.open and bounds.soft is None and bounds.fastest == math.inf and not joint.dynamics
+    return (
+        bounds.is_unbounded and bounds.soft is None and bounds.max_velocity == math.inf and not joint.dynamics
+    )
 
 
-def _number(known: object, key: str) -> float | None:
-    value = known.get(key) if isinstance(known, dict) else None
+def _number(dynamics: object, key: str) -> float | None:
+    """Return a number of the dynamics of a joint; None if it is missing or no number."""
+    value = dynamics.get(key) if isinstance(dynamics, dict) else None
     return float(value) if isinstance(value, (int, float)) and not math.isnan(value) else None

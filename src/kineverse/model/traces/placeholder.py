@@ -48,7 +48,9 @@ class ReadNode(Node):
     kind = "read"
 
     @classmethod
-    def from_expression(cls, expression: Expression, listener: Tracer, question: int, part: int) -> Expression:
+    def from_expression(
+        cls, expression: Expression, listener: Tracer, question: int, part: int
+    ) -> Expression:
         """Return a placeholder that stands for an expression."""
         return cls.from_arguments((expression,), expression.shape, (listener, question, part, ()))
 
@@ -115,7 +117,7 @@ class ReadNode(Node):
 
     def gradient(self, heuristic: bool) -> Mapping[Symbol, Expression]:
         """Return the gradient, with placeholders as entries."""
-        watcher, question, part, path = self.options
+        listener, question, part, path = self.options
         return {
             key: ReadNode.from_arguments(
                 (entry,), self.shape, (listener, question, part, (*path, (key, heuristic)))

@@ -1,4 +1,4 @@
-"""A mesh in the formats in which meshes come."""
+"""A tetrahedron in the file formats of meshes."""
 
 from __future__ import annotations
 
