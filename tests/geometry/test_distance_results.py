@@ -1,4 +1,4 @@
-"""Lists of pairs whose entries are made when they are looked at."""
+"""Sequences of distance results, whose entries are made on access."""
 
 from __future__ import annotations
 
@@ -17,19 +17,19 @@ def scene():
     return scene
 
 
-def test_it_is_a_sequence_of_pairs(scene):
-    found = scene.within(0.5)
+def test_distance_results_are_a_sequence(scene):
+    found = scene.pairs_within(0.5)
     assert isinstance(found, DistanceResults)
     assert len(found) == len(list(found)) > 5
     assert all(isinstance(pair, DistanceResult) for pair in found[1:4])
     assert found[-1].distance == found.distances[-1]
     with pytest.raises(IndexError):
         found[len(found)]
-    assert not scene.within(0.0)[:0]
+    assert not scene.pairs_within(0.0)[:0]
 
 
-def test_its_arrays_and_its_entries_say_the_same(scene):
-    found = scene.within(0.5)
+def test_arrays_of_distance_results_match_the_entries(scene):
+    found = scene.pairs_within(0.5)
     order = {name: k for k, name in enumerate(scene.bodies)}
     for k, pair in enumerate(found):
         assert order[pair.a] < order[pair.b]
@@ -41,18 +41,18 @@ def test_its_arrays_and_its_entries_say_the_same(scene):
         np.testing.assert_array_equal(alone.point_a, pair.point_a)
 
 
-def test_it_stays_when_the_scene_moves_on(scene):
-    found = scene.within(0.5)
+def test_distance_results_stay_valid_after_an_update(scene):
+    found = scene.pairs_within(0.5)
     before = found.distances.copy(), found.normals.copy(), [str(pair) for pair in found]
     scene.update(random_state(scene.model, np.random.default_rng(1)))
-    scene.within(0.5)
+    scene.pairs_within(0.5)
     np.testing.assert_array_equal(found.distances, before[0])
     np.testing.assert_array_equal(found.normals, before[1])
     assert [str(pair) for pair in found] == before[2]
 
 
-def test_its_text_lists_the_nearest(scene):
-    found = scene.within(0.5)
+def test_repr_of_distance_results_lists_the_nearest(scene):
+    found = scene.pairs_within(0.5)
     text = repr(found).splitlines()
     assert text[0] == f"<{len(found)} pairs"
     assert text[1].strip() == str(found[0])

@@ -1,4 +1,4 @@
-"""What scenes do not look at, and why; and solids as triangles."""
+"""Excluded shapes and pairs with their reasons; surfaces of solids."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def with_bad_bodies(folder):
     return model
 
 
-def test_shapes_that_cannot_be_used_are_named_and_the_rest_can_be_asked(tmp_path):
+def test_find_unusable_shapes_names_them_and_leave_out_excludes_them(tmp_path):
     model = with_bad_bodies(tmp_path)
     problems = find_unusable_shapes(model)
     assert set(problems) == {
@@ -63,26 +63,26 @@ def test_shapes_that_cannot_be_used_are_named_and_the_rest_can_be_asked(tmp_path
     ]
     scene = Scene(model, leave_out=problems)
     scene.update(model.default_state())
-    assert scene.within(0.1)
+    assert scene.pairs_within(0.1)
     assert "bad/all" not in scene.bodies
     # The ball, at (0, 0, 1) of the base, is there, in each of them.
     for name in ("lost", "empty", "flat"):
         found = scene.distance(f"bad/{name}", "box0")
         only = Scene(model, leave_out=[f"bad/{name}", *problems])
         assert f"bad/{name}" not in only.bodies
-        assert found.piece_a == 0
+        assert found.shape_a == 0
     assert find_unusable_shapes(arm_among_boxes()) == {}
 
 
 @pytest.mark.parametrize("option", ["leave_out", "triangles", "decomposed"])
-def test_names_that_mean_no_body_are_refused(option):
+def test_scene_refuses_unknown_names_in_options(option):
     model = arm_among_boxes(boxes=1)
     with pytest.raises(kv.errors.UnknownNameError, match=f"{option}= names 'hnad'.*hand"):
         Scene(model, **{option: ["hnad"]})
     assert Scene(model, **{option: ["nothing*"]}).bodies == Scene(model).bodies
 
 
-def test_every_pair_is_looked_at_or_there_is_a_reason():
+def test_excluded_pairs_have_a_reason_and_checked_pairs_none():
     model = arm_among_boxes()
     with model.edit() as edit:
         edit.add_frame("hand/camera", "hand", kv.translation(0, 0, 0.1), body(Sphere(0.02)))
@@ -96,19 +96,19 @@ def test_every_pair_is_looked_at_or_there_is_a_reason():
     ignored = ExcludedPairs(model, scene.bodies)
     pairs = list(itertools.combinations(scene.bodies, 2))
     for a, b in pairs:
-        assert (ignored.why(a, b) == "") == scene.checks_pair(a, b)
-        assert ignored.why(a, b) == ignored.why(b, a)
+        assert (ignored.reason(a, b) == "") == scene.checks_pair(a, b)
+        assert ignored.reason(a, b) == ignored.reason(b, a)
     looked_at = sum(scene.checks_pair(a, b) for a, b in pairs)
     assert ignored.counts == (looked_at, len(pairs) - looked_at)
-    assert ignored.why("hand", "hand/camera") == RIGID
-    assert ignored.why("link3", "hand/camera") == JOINED
-    assert ignored.why("hand", "box3") == "excepted: it reaches between them"
-    assert ignored.why("link2", "box1") == "excepted by a rule"
-    assert ignored.why("link0", "link1") == ""
+    assert ignored.reason("hand", "hand/camera") == RIGID
+    assert ignored.reason("link3", "hand/camera") == JOINED
+    assert ignored.reason("hand", "box3") == "excepted: it reaches between them"
+    assert ignored.reason("link2", "box1") == "excepted by a rule"
+    assert ignored.reason("link0", "link1") == ""
 
 
 @given(st.integers(0, 2**32 - 1), st.integers(4, 60))
-def test_hulls_are_closed_surfaces_seen_from_outside(seed, count):
+def test_solid_surface_of_a_hull_is_closed_and_faces_outwards(seed, count):
     points = np.random.default_rng(seed).normal(size=(count, 3))
     solid = solid_from_geometry(Box((1, 1, 1)))
     assert solid_surface(solid) == Box((1, 1, 1))
@@ -120,7 +120,7 @@ def test_hulls_are_closed_surfaces_seen_from_outside(seed, count):
     np.testing.assert_allclose(np.cross(b - a, c - a).sum(axis=0), 0.0, atol=1e-9)
 
 
-def test_of_many_missing_meshes_a_few_are_listed_each_in_one_short_line(tmp_path):
+def test_error_for_many_missing_meshes_lists_a_few_in_short_lines(tmp_path):
     model = kv.Model()
     with model.edit() as edit:
         for k in range(20):
@@ -130,7 +130,7 @@ def test_of_many_missing_meshes_a_few_are_listed_each_in_one_short_line(tmp_path
     scene = Scene(model)
     scene.update(model.default_state())
     with pytest.raises(kv.KineverseError) as caught:
-        scene.within(0.1)
+        scene.pairs_within(0.1)
     first, *lines = str(caught.value).splitlines()
     assert first.startswith("20 shapes cannot be used. Mend the model, or leave such bodies out")
     assert len(lines) == 13

@@ -1,13 +1,13 @@
 """Convex decomposition of meshes: made offline by CoACD, cached, measured.
 
-Distances to convex solids are fast and have a depth; a mug is not convex. :func:`decompose` takes seconds
-to minutes, so nothing calls it by itself: ``kineverse decompose`` does, and :func:`find_hulls` returns what is
-there.
+Distances to convex solids are fast and have a depth, but many meshes, such as a mug, are not convex.
+:func:`decompose` takes seconds to minutes, so scenes never call it. The command ``kineverse decompose`` fills
+the cache, and :func:`find_hulls` reads it.
 """
 
 from .accuracy import Accuracy
 from .convex_decomposition import DecompositionOutcome, decompose, decompose_all, find_hulls
-from .hull_cache import CacheEntry, clear, folder, listing
+from .hull_cache import CacheEntry, clear, folder, list_entries
 from .result import Decomposition, DecompositionSettings
 from .worker import DecompositionError, ResourceLimits
 
@@ -24,5 +24,5 @@ __all__ = [
     "decompose_all",
     "find_hulls",
     "folder",
-    "listing",
+    "list_entries",
 ]
