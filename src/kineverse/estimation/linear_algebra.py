@@ -22,9 +22,15 @@ def multiply_vectors(matrices: Array, vectors: Array) -> Array:
     return result
 
 
+def log_determinants(matrices: Array) -> Array:
+    """Return the log determinants of positive definite matrices."""
+    result: Array = np.linalg.slogdet(matrices)[1]
+    return result
+
+
 def sum_log_determinants(matrices: Array) -> float:
     """Sum the log determinants of positive definite matrices."""
-    return float(np.sum(np.linalg.slogdet(matrices)[1]))
+    return float(np.sum(log_determinants(matrices)))
 
 
 def symmetric(matrix: Array) -> Array:

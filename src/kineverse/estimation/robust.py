@@ -13,6 +13,9 @@ from kineverse.errors import InvalidValueError
 if TYPE_CHECKING:
     from .tracking.measurements import MeasurementModel
 
+CHI_SQUARED_6 = 22.5
+"""Quantile of χ² with six degrees of freedom that is exceeded once in a thousand."""
+
 # Volume of SO(3) in rotation vectors [rad³].
 _ROTATION_VOLUME = 8 * math.pi**2
 
