@@ -78,7 +78,8 @@ def read_table(path: Path) -> TextTable:
     for line, cells in split:
         if len(cells) != len(first):
             raise FormatError(
-                f"{source}, line {line}: {_count_text(len(cells))}, where line {found[0][0]} has {len(first)}."
+                f"{source}, line {line}: {_count_text(len(cells))}, where line {found[0][0]} has "
+                f"{len(first)}."
             )
     body = split[1:] if has_head else split
     if not body:
