@@ -65,7 +65,7 @@ _STATIC_WIDTH = np.array([1e-9])
 _erf = np.vectorize(math.erf, otypes=[np.float64])
 
 
-def log_evidence(served: KnownJoint, seen: KnownResiduals, is_static: bool = False) -> float:
+def log_evidence(served: KnownJoint, residuals: KnownResiduals, is_static: bool = False) -> float:
     """Return the log density of the observed relative poses, with joint values integrated out.
 
     Limits truncate the prior only for a single joint value. For several joint values, and for limits on
@@ -73,35 +73,37 @@ def log_evidence(served: KnownJoint, seen: KnownResiduals, is_static: bool = Fal
 
     Parameters
     ----------
-    served, seen
+    served, residuals
         The served joint and its residuals.
     is_static
         True to assume one constant joint value within the limits.
     """
-    log = -float(np.sum(0.5 * np.sum(seen.orthogonal**2, axis=1) + seen.log_scale))
-    log -= 0.5 * float(np.nansum(np.maximum(seen.limit_excess, 0.0) ** 2))
+    log = -float(np.sum(0.5 * np.sum(residuals.orthogonal**2, axis=1) + residuals.log_scale))
+    log -= 0.5 * float(np.nansum(np.maximum(residuals.limit_excess, 0.0) ** 2))
     # The expected squared disagreement under a correct model is 1.
-    known = np.isfinite(seen.disagreement)
-    log -= 0.5 * float(np.maximum(np.nansum(seen.disagreement**2, axis=0) - known.sum(axis=0), 0.0).sum())
+    known = np.isfinite(residuals.disagreement)
+    log -= 0.5 * float(
+        np.maximum(np.nansum(residuals.disagreement**2, axis=0) - known.sum(axis=0), 0.0).sum()
+    )
     widths = _STATIC_WIDTH if is_static else _WIDTHS
     if served.joints == 1:
         lower, upper = float(served.lower[0]), float(served.upper[0])
         density = float(_log_density(served)[0])
-        values, variances = seen.values[:, 0], seen.covariances[:, 0, 0]
+        values, variances = residuals.values[:, 0], residuals.covariances[:, 0, 0]
         return log + _log_mean(_log_evidence_by_width(values, variances, lower, upper, widths, density))
     # The prior of several joint values is not truncated; the distance to the limits counts instead.
-    log -= 0.5 * float(np.sum(np.maximum(seen.bound_excess, 0.0) ** 2))
-    return log + (_log_evidence_of_several(served, seen, widths) if served.joints else 0.0)
+    log -= 0.5 * float(np.sum(np.maximum(residuals.bound_excess, 0.0) ** 2))
+    return log + (_log_evidence_of_several(served, residuals, widths) if served.joints else 0.0)
 
 
-def log_displacement_gain(seen: KnownResiduals) -> float:
+def log_displacement_gain(residuals: KnownResiduals) -> float:
     """Return the log density ratio of a displaced joint, or child on it, to the served one.
 
     ρ = G δ + noise with δ ~ N(0, s² I), with δ integrated out and averaged over several s.
     """
-    transposed = np.swapaxes(seen.displacement_jacobian, 1, 2)
-    information = np.sum(transposed @ seen.displacement_jacobian, axis=0)
-    pull = np.sum(transposed @ seen.orthogonal[:, :, None], axis=0)[:, 0]
+    transposed = np.swapaxes(residuals.displacement_jacobian, 1, 2)
+    information = np.sum(transposed @ residuals.displacement_jacobian, axis=0)
+    pull = np.sum(transposed @ residuals.orthogonal[:, :, None], axis=0)[:, 0]
     logs = []
     for size in SIZES:
         total = information + np.eye(len(pull)) / size**2
@@ -110,19 +112,19 @@ def log_displacement_gain(seen: KnownResiduals) -> float:
     return _log_mean(np.array(logs))
 
 
-def _log_evidence_of_several(served: KnownJoint, seen: KnownResiduals, widths: Array) -> float:
+def _log_evidence_of_several(served: KnownJoint, residuals: KnownResiduals, widths: Array) -> float:
     """Return log ∫ Π_k ∫ N(â_k; a, C_k) p(a; μ, s) da dμ at the best widths s, on average."""
     best, log = np.zeros(served.joints), 0.0
     for j in range(served.joints):
-        variances = seen.covariances[:, j, j]
-        logs = _log_evidence_by_width(seen.values[:, j], variances, -math.inf, math.inf, widths, 0.0)
+        variances = residuals.covariances[:, j, j]
+        logs = _log_evidence_by_width(residuals.values[:, j], variances, -math.inf, math.inf, widths, 0.0)
         best[j] = widths[int(np.argmax(logs))]
         log += _log_mean(logs - float(np.max(logs)))
-    total = seen.covariances + np.diag(best**2)
+    total = residuals.covariances + np.diag(best**2)
     weights = invert_matrices(total)
     information = weights.sum(axis=0)
-    mean = np.linalg.solve(information, multiply_vectors(weights, seen.values).sum(axis=0))
-    off = seen.values - mean
+    mean = np.linalg.solve(information, multiply_vectors(weights, residuals.values).sum(axis=0))
+    off = residuals.values - mean
     log -= 0.5 * (
         float(np.sum(off * multiply_vectors(weights, off))) + sum_log_determinants(math.tau * total)
     )
@@ -208,17 +210,17 @@ class JointObservations:
 
 def judge_joint(
     model: Model,
-    seen: JointObservations,
+    data: JointObservations,
     implausible_since: int | None,
     families: FamilyChoice,
     outliers: Outliers | None,
 ) -> JointVerdict:
     """Compare a joint with its alternatives, given the change point of the sequential test."""
     if implausible_since is None:
-        recent = seen
-        right = reject_outliers(seen.residuals, outliers)
+        recent = data
+        right = reject_outliers(data.residuals, outliers)
     else:
-        recent = seen.select(slice(int(np.searchsorted(seen.times, implausible_since)), None))
+        recent = data.select(slice(int(np.searchsorted(data.times, implausible_since)), None))
         right = np.arange(len(recent.times))
         if outliers is not None and len(right) >= 2:
             right = identify_observations(recent.observations, families, outliers).best.right
@@ -227,17 +229,17 @@ def judge_joint(
     probabilities = _probabilities(inliers, alternative)
     operation, reason = None, ""
     if implausible_since is not None:
-        operation, reason = _propose_replacement(model, seen, inliers, alternative)
+        operation, reason = _propose_replacement(model, data, inliers, alternative)
     else:
         reason = _ambiguity_reason(probabilities, len(right))
     squares = np.mean(inliers.residuals.pose_residuals**2, axis=0)
     rms = math.sqrt(float(squares[:3].sum())), math.sqrt(float(squares[3:].sum()))
     outlier_times = tuple(np.setdiff1d(recent.times, inliers.times).tolist())
     return JointVerdict(
-        seen.joint,
+        data.joint,
         probabilities,
         rms,
-        len(seen.times),
+        len(data.times),
         implausible_since,
         alternative,
         operation,
@@ -246,8 +248,8 @@ def judge_joint(
     )
 
 
-def _probabilities(seen: JointObservations, alternative: IdentificationResult | None) -> dict[str, float]:
-    served, residuals = seen.served, seen.residuals
+def _probabilities(data: JointObservations, alternative: IdentificationResult | None) -> dict[str, float]:
+    served, residuals = data.served, data.residuals
     as_served = log_evidence(served, residuals)
     logs = {
         "served": math.log(PRIOR["served"]) + as_served,
@@ -279,39 +281,39 @@ def _ambiguity_reason(probabilities: Mapping[str, float], count: int) -> str:
 
 
 def _propose_replacement(
-    model: Model, seen: JointObservations, recent: JointObservations, alternative: IdentificationResult | None
+    model: Model, data: JointObservations, recent: JointObservations, alternative: IdentificationResult | None
 ) -> tuple[Operation | None, str]:
     if alternative is None or len(recent.times) < _LEAST_COUNT:
         return None, "it was seen too seldom since to say what it is instead"
     if not alternative.best.told:
         return None, f"what it is instead is not known yet, {alternative}"
-    if not follows_another(model, seen.joint) and _explains_alone(model, recent, alternative):
+    if not follows_another(model, data.joint) and _explains_alone(model, recent, alternative):
         # Another joint would not resolve the contradiction.
         return None, "by itself it explains what is seen, but not together with what limits or moves it"
     try:
-        used = np.searchsorted(seen.times, recent.times)
-        rows, fit = extend_fit(alternative.best, seen.observations, used)
-        coordinates = seen.served.solve_unbounded(seen.observations, seen.residuals.coordinates)[rows]
+        used = np.searchsorted(data.times, recent.times)
+        rows, fit = extend_fit(alternative.best, data.observations, used)
+        coordinates = data.served.solve_unbounded(data.observations, data.residuals.coordinates)[rows]
         operation = build_replacement(
-            model, seen.joint, seen.served, coordinates, seen.residuals.other_values[rows], fit
+            model, data.joint, data.served, coordinates, data.residuals.other_values[rows], fit
         )
     except KineverseError as error:
         return None, f"what it is instead is no operation. {error}"
     try:
         with model.copy().edit() as edit:
-            edit.replace(seen.joint.tag, operation)
+            edit.replace(data.joint.tag, operation)
     except KineverseError as error:
         return None, f"what it is instead cannot take its place. {error}"
     return operation, ""
 
 
-def _explains_alone(model: Model, seen: JointObservations, alternative: IdentificationResult) -> bool:
+def _explains_alone(model: Model, data: JointObservations, alternative: IdentificationResult) -> bool:
     """Return True if a joint fits without consistency tests and with loops opened."""
-    if not (seen.residuals.limit_excess.size or seen.residuals.disagreement.size):
+    if not (data.residuals.limit_excess.size or data.residuals.disagreement.size):
         return False
-    served = KnownJoint(model, seen.joint.child, seen.joint.parent, open_loops=True)
-    residuals = compute_residuals(served, seen.observations)
+    served = KnownJoint(model, data.joint.child, data.joint.parent, open_loops=True)
+    residuals = compute_residuals(served, data.observations)
     alone = _probabilities(
-        JointObservations(seen.joint, served, seen.observations, residuals, seen.times), alternative
+        JointObservations(data.joint, served, data.observations, residuals, data.times), alternative
     )
     return alone["served"] >= SURE

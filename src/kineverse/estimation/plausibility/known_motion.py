@@ -133,18 +133,18 @@ class KnownJoint:
                 twists[:, 3 + row, j] = 0.5 * (turned[:, a, b] - turned[:, b, a])
         return poses, twists
 
-    def solve(self, seen: Observations) -> tuple[Array, Solution[KnownMotion]]:
+    def solve(self, observations: Observations) -> tuple[Array, Solution[KnownMotion]]:
         """Find the most likely coordinates (N, n) inside the limits, and the solution around them."""
-        coordinates = self._initial_coordinates(seen)
+        coordinates = self._initial_coordinates(observations)
         for _ in range(1 if self.is_plain else _ROUNDS):
-            values = np.zeros((len(seen), self.joints))
+            values = np.zeros((len(observations), self.joints))
             if self.is_plain:
                 coordinates, values = values, coordinates
-            solution = levenberg_marquardt(seen, KnownMotion(self, coordinates), values)
+            solution = levenberg_marquardt(observations, KnownMotion(self, coordinates), values)
             coordinates = self.retract(coordinates, solution.values)
         return coordinates, solution
 
-    def solve_unbounded(self, seen: Observations, inside: Array) -> Array:
+    def solve_unbounded(self, observations: Observations, inside: Array) -> Array:
         """Find the most likely coordinates (N, n) without limits.
 
         Where the pose is undefined beyond the limits, those inside stay.
@@ -152,17 +152,17 @@ class KnownJoint:
         free = copy(self)
         free.lower, free.upper = np.full(self.joints, -np.inf), np.full(self.joints, np.inf)
         try:
-            coordinates, _ = free.solve(seen)
+            coordinates, _ = free.solve(observations)
         except (KineverseError, np.linalg.LinAlgError):
             return inside
         return coordinates if np.isfinite(coordinates).all() else inside
 
-    def _initial_coordinates(self, seen: Observations) -> Array:
+    def _initial_coordinates(self, observations: Observations) -> Array:
         """Return the best coordinates of a grid for each observation."""
         grid = self._grid()
         poses = self.linearise(grid).pose
-        observed = seen.relative
-        covariance = np.einsum("nii->i", seen.child_covariance) / len(seen)
+        observed = observations.relative
+        covariance = np.einsum("nii->i", observations.child_covariance) / len(observations)
         place, turn = covariance[:3].sum() / 3.0, covariance[3:].sum() / 3.0
         # ‖R - S‖² = 6 - 2 tr(RᵀS) is twice the square of a small angle.
         flat, tried = observed[:, :3, :3].reshape(-1, 9), poses[:, :3, :3].reshape(-1, 9)

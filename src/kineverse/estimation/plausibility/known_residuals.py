@@ -91,9 +91,9 @@ class KnownResiduals:
         return type(self)(*(getattr(self, name)[rows] for name in self.__dataclass_fields__))
 
 
-def compute_residuals(served: KnownJoint, seen: Observations) -> KnownResiduals:
+def compute_residuals(served: KnownJoint, observations: Observations) -> KnownResiduals:
     """Compute the residuals of observations under a served joint."""
-    coordinates, solution = served.solve(seen)
+    coordinates, solution = served.solve(observations)
     whitening = np.linalg.inv(np.linalg.cholesky(solution.covariance))
     error = (whitening @ solution.residuals[:, :, None])[:, :, 0]
     directions = whitening @ solution.linear.by_joints
@@ -119,7 +119,7 @@ def compute_residuals(served: KnownJoint, seen: Observations) -> KnownResiduals:
         excess / np.tile(deviations, (1, 2)),
         solution.residuals,
         0.5 * (log_determinants(math.tau * solution.covariance) - log_determinants(math.tau * covariances)),
-        *(np.zeros((len(seen), 0)) for _ in range(3)),
+        *(np.zeros((len(observations), 0)) for _ in range(3)),
     )
 
 

@@ -102,11 +102,11 @@ class PlausibilityMonitor:
     @property
     def implausible_since(self) -> dict[str, int]:
         """First observation that each rejected joint does not explain, by tag."""
-        found: dict[str, int] = {}
+        result: dict[str, int] = {}
         for monitored in self._monitored:
             if (number := monitored.implausible_since) is not None:
-                found[monitored.joint.tag] = min(number, found.get(monitored.joint.tag, number))
-        return found
+                result[monitored.joint.tag] = min(number, result.get(monitored.joint.tag, number))
+        return result
 
     def update(self, observations: Mapping[str, PosesLike]) -> tuple[str, ...]:
         """Add one observation; return the tags of newly rejected joints.
@@ -127,14 +127,14 @@ class PlausibilityMonitor:
                 raise UnknownNameError(
                     f"The frame {name!r} is not watched. {suggest(str(name), self.frames, 'frame')}"
                 )
-        seen = check_tracks({name: _one(given, name) for name, given in observations.items()}, self._noise)
+        tracks = check_tracks({name: _one(given, name) for name, given in observations.items()}, self._noise)
         if self.model.version != self._version:
             self._find_joints()
         if self._relative_to is not None:
-            seen[self._relative_to] = exact_track(1)
+            tracks[self._relative_to] = exact_track(1)
         before = set(self.implausible_since)
-        self._add(seen)
-        self._recent.append(seen)
+        self._add(tracks)
+        self._recent.append(tracks)
         self.count += 1
         return tuple(tag for tag in self.implausible_since if tag not in before)
 
@@ -185,13 +185,13 @@ class PlausibilityMonitor:
     def _new_test(self) -> SequentialTest:
         return SequentialTest(self.false_alarms, self._outliers.fraction if self._outliers else 0.0)
 
-    def _add(self, seen: Mapping[str, PoseTrack]) -> None:
+    def _add(self, tracks: Mapping[str, PoseTrack]) -> None:
         residuals: dict[TestableJoint, TimedResiduals] = {}
         for monitored in self._monitored:
             joint = monitored.joint
-            if monitored.served is None or not {joint.parent, joint.child} <= seen.keys():
+            if monitored.served is None or not {joint.parent, joint.child} <= tracks.keys():
                 continue
-            parent, child = seen[joint.parent], seen[joint.child]
+            parent, child = tracks[joint.parent], tracks[joint.child]
             if parent.seen[0] and child.seen[0]:
                 now = np.array([0])
                 residuals[joint] = TimedResiduals(
@@ -235,10 +235,10 @@ class PlausibilityMonitor:
             never = f"'{joint.parent}' and '{joint.child}' were not seen together"
             return undetermined(joint, 0, monitored.reason or never)
         times = self._times(monitored, first)
-        seen = JointObservations(
+        data = JointObservations(
             joint, monitored.served, self._poses(joint, times, first), residuals, np.array(times)
         )
-        return judge_joint(self.model, seen, monitored.implausible_since, self._families, self._outliers)
+        return judge_joint(self.model, data, monitored.implausible_since, self._families, self._outliers)
 
 
 def _one(given: PosesLike, name: str) -> PosesLike:

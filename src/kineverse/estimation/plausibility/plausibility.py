@@ -79,15 +79,15 @@ def check_plausibility(
     outlier_model = as_outliers(outliers)
     if isinstance(model, Snapshot):
         model = model.model()
-    seen = check_tracks(observations, noise)
-    found = find_testable_joints(model, observations, relative_to)
+    tracks = check_tracks(observations, noise)
+    testable = find_testable_joints(model, observations, relative_to)
     if relative_to is not None:
-        seen[relative_to] = exact_track(max((len(track.poses) for track in seen.values()), default=0))
+        tracks[relative_to] = exact_track(max((len(track.poses) for track in tracks.values()), default=0))
     residuals: dict[TestableJoint, TimedResiduals] = {}
     reasons: dict[TestableJoint, JointVerdict] = {}
     served_joints: dict[TestableJoint, KnownJoint] = {}
-    for joint in found.joints:
-        parent, child = seen[joint.parent], seen[joint.child]
+    for joint in testable.joints:
+        parent, child = tracks[joint.parent], tracks[joint.child]
         times = np.flatnonzero(parent.seen & child.seen)
         if not len(times):
             reasons[joint] = undetermined(
@@ -104,12 +104,12 @@ def check_plausibility(
             reasons[joint] = undetermined(joint, len(times), f"its pose cannot be computed. {error}")
     tested = ConsistencyTests(model, served_joints, relative_to).apply(residuals)
     verdicts = []
-    for joint in found.joints:
+    for joint in testable.joints:
         if joint in reasons:
             verdicts.append(reasons[joint])
             continue
         times = residuals[joint].times
-        poses = pair_tracks(seen[joint.parent], seen[joint.child], times)
+        poses = pair_tracks(tracks[joint.parent], tracks[joint.child], times)
         verdicts.append(
             _test_joint(
                 model,
@@ -119,7 +119,7 @@ def check_plausibility(
                 outlier_model,
             )
         )
-    result = Plausibility(tuple(verdicts), found.untested, false_alarms)
+    result = Plausibility(tuple(verdicts), testable.untested, false_alarms)
     if strict:
         result.raise_if_implausible()
     return result
@@ -146,14 +146,14 @@ def undetermined(joint: TestableJoint, count: int, reason: str) -> JointVerdict:
 
 def _test_joint(
     model: Model,
-    seen: JointObservations,
+    data: JointObservations,
     families: FamilyChoice,
     false_alarms: float,
     outliers: Outliers | None,
 ) -> JointVerdict:
     test = SequentialTest(false_alarms, outliers.fraction if outliers else 0.0)
-    residuals = seen.residuals
+    residuals = data.residuals
     for row in zip(residuals.orthogonal, residuals.displacement_jacobian, residuals.one_sided, strict=True):
         test.add(*row)
-    implausible_since = None if test.implausible_since is None else int(seen.times[test.implausible_since])
-    return judge_joint(model, seen, implausible_since, families, outliers)
+    implausible_since = None if test.implausible_since is None else int(data.times[test.implausible_since])
+    return judge_joint(model, data, implausible_since, families, outliers)

@@ -102,14 +102,14 @@ def follows_another(model: Model, joint: TestableJoint) -> bool:
     )
 
 
-def extend_fit(fit: Fit, seen: Observations, used: RowIndices) -> tuple[RowIndices, Fit]:
+def extend_fit(fit: Fit, observations: Observations, used: RowIndices) -> tuple[RowIndices, Fit]:
     """Extend a fit of some observations to all observations that it explains.
 
     Parameters
     ----------
     fit
         Fit of the observations ``used``.
-    seen
+    observations
         All observations.
     used
         Numbers of the fitted observations.
@@ -120,10 +120,10 @@ def extend_fit(fit: Fit, seen: Observations, used: RowIndices) -> tuple[RowIndic
         Numbers of further explained observations followed by the fitted ones, and the fit with all joint
         values.
     """
-    others = np.setdiff1d(np.arange(len(seen)), used)
+    others = np.setdiff1d(np.arange(len(observations)), used)
     if not len(others) or not fit.motion.joints:
         return used, fit
-    solution = project_observations(fit.motion, fit.joint_values, seen.at(others))
+    solution = project_observations(fit.motion, fit.joint_values, observations.at(others))
     fits = squared_errors(solution) < CHI_SQUARED_6
     values = np.concatenate([solution.values[fits], fit.joint_values])
     return np.concatenate([others[fits], used]), replace(fit, joint_values=values)

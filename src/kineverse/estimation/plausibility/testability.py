@@ -58,14 +58,14 @@ class TestableJoints:
     untested: Mapping[str, str]
 
 
-def find_testable_joints(model: Model, seen: Iterable[str], relative_to: str | None) -> TestableJoints:
+def find_testable_joints(model: Model, observed: Iterable[str], relative_to: str | None) -> TestableJoints:
     """Find the joints that observed frames can test.
 
     Parameters
     ----------
     model
         The served model.
-    seen
+    observed
         Names of the observed frames.
     relative_to
         Frame in which they are observed, with exactly known pose; None for an observer that is no part of the
@@ -76,7 +76,7 @@ def find_testable_joints(model: Model, seen: Iterable[str], relative_to: str | N
     UnknownNameError
         For a frame that does not exist.
     """
-    frames = list(dict.fromkeys(seen))
+    frames = list(dict.fromkeys(observed))
     for name in frames if relative_to is None else [*frames, relative_to]:
         if name != WORLD and name not in model.frames:
             raise UnknownNameError(
@@ -100,11 +100,11 @@ class _Finder:
         joints: list[TestableJoint] = []
         untested: dict[str, str] = {}
         for name in self.frames:
-            found = self._find_rigid_pair(name) or self._find_moving_pair(name)
-            if isinstance(found, TestableJoint):
-                joints.append(found)
-            elif found:
-                untested[name] = found
+            result = self._find_rigid_pair(name) or self._find_moving_pair(name)
+            if isinstance(result, TestableJoint):
+                joints.append(result)
+            elif result:
+                untested[name] = result
         return TestableJoints(tuple(joints), untested)
 
     def _find_rigid_pair(self, name: str) -> TestableJoint | None:

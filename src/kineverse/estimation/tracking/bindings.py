@@ -96,7 +96,7 @@ class NativeMapSolver:
         self._input = np.zeros(len(layout.arguments))
         self._size = size
         widths = [len(group.tangent) for group in layout.groups]
-        kept = {
+        indices = {
             "is_pose": [one.is_pose for one in layout.observations],
             "size": [one.size for one in layout.observations],
             "value": [where.start for where in layout.value_slices],
@@ -115,7 +115,7 @@ class NativeMapSolver:
             "first_bend": np.cumsum([0, *map(len, is_varying)]),
         }
         self._indices: dict[str, TangentIndices] = {
-            name: np.array(v, dtype=np.int64) for name, v in kept.items()
+            name: np.array(v, dtype=np.int64) for name, v in indices.items()
         }
         self._squares = np.zeros(len(layout.observations))
         self._numbers = {
@@ -259,22 +259,22 @@ class NativeInlierSolver:
         self, mixture: GaussianSum, reading: Measurements, inputs: Array, groups: Sequence[int]
     ) -> tuple[list[Candidate], int]:
         """Return candidates for the groups that have no alternative, and the number of evaluations."""
-        single = [number for number in groups if mixture.alive[:, number].sum() == 1]
+        unambiguous = [number for number in groups if mixture.alive[:, number].sum() == 1]
         result = self._native.update(mixture.best, reading, inputs)
         if result is None:
             return [], 0
-        right = self._inlier_probabilities(result, reading) > 0.5
-        all_right = [n for n in single if right[self._measured(n, reading)].all()]
-        candidates = [self._candidate(mixture, result, reading, right, all_right)]
-        split = [n for n in single if n not in all_right]
+        inliers = self._inlier_probabilities(result, reading) > 0.5
+        all_right = [n for n in unambiguous if inliers[self._measured(n, reading)].all()]
+        candidates = [self._candidate(mixture, result, reading, inliers, all_right)]
+        split = [n for n in unambiguous if n not in all_right]
         if not split:
             return candidates, result.rounds
-        again = self._native.update(mixture.best, reading._replace(mask=reading.mask & right), inputs)
-        if again is None:
+        refined = self._native.update(mixture.best, reading._replace(mask=reading.mask & inliers), inputs)
+        if refined is None:
             return candidates, result.rounds
-        rivals = self._rival_evidence(mixture, reading, inputs, right, split)
-        candidates.append(self._candidate(mixture, again, reading, right, split, rivals))
-        return candidates, max(result.rounds, again.rounds)
+        rivals = self._rival_evidence(mixture, reading, inputs, inliers, split)
+        candidates.append(self._candidate(mixture, refined, reading, inliers, split, rivals))
+        return candidates, max(result.rounds, refined.rounds)
 
     def _measured(self, number: int, reading: Measurements) -> list[int]:
         return [i for i in self._layout.groups[number].observation_indices if reading.mask[i]]
@@ -293,12 +293,12 @@ class NativeInlierSolver:
         mixture: GaussianSum,
         reading: Measurements,
         inputs: Array,
-        right: npt.NDArray[np.bool_],
+        inliers: npt.NDArray[np.bool_],
         groups: Sequence[int],
     ) -> dict[int, float]:
         """Return an upper bound on the evidence of each group if a rejected measurement is an inlier."""
         best = dict.fromkeys(groups, -np.inf)
-        rejected = {n: [i for i in self._measured(n, reading) if not right[i]] for n in groups}
+        rejected = {n: [i for i in self._measured(n, reading) if not inliers[i]] for n in groups}
         peaks = np.maximum(self._log_inlier - reading.log_scale, self._log_outlier)
         for index in range(max(map(len, rejected.values()))):
             alone = {n: those[index] for n, those in rejected.items() if index < len(those)}
@@ -316,25 +316,27 @@ class NativeInlierSolver:
         mixture: GaussianSum,
         result: MapResult,
         reading: Measurements,
-        right: npt.NDArray[np.bool_],
+        inliers: npt.NDArray[np.bool_],
         groups: Sequence[int],
         rivals: dict[int, float] | None = None,
     ) -> Candidate:
         """Return the result as a candidate for those groups of which it is the only one."""
         weights = self._inlier_probabilities(result, reading)
-        sure = []
+        certain = []
         for number in groups:
-            seen = self._measured(number, reading)
-            kept = [i for i in seen if right[i]]
-            nothing = float(self._log_outlier[seen].sum())
-            by_outliers = len(kept) * self._log_inlier + nothing - float(self._log_outlier[kept].sum())
+            measured = self._measured(number, reading)
+            accepted = [i for i in measured if inliers[i]]
+            all_outliers = float(self._log_outlier[measured].sum())
+            by_outliers = (
+                len(accepted) * self._log_inlier + all_outliers - float(self._log_outlier[accepted].sum())
+            )
             gained = _evidence_gain(result, mixture, number) + by_outliers
             result.belief.evidence[number] += by_outliers
             others = [rivals[number]] if rivals else []
-            rival = max([nothing, *others] if kept else others)
-            if gained - rival > PRUNING_LOG_RATIO and all(weights[i] > _CERTAIN for i in kept):
-                sure.append(number)
-        return Candidate(result.belief, np.empty(0), right.astype(float), result.nis, result.dof, sure)
+            rival = max([all_outliers, *others] if accepted else others)
+            if gained - rival > PRUNING_LOG_RATIO and all(weights[i] > _CERTAIN for i in accepted):
+                certain.append(number)
+        return Candidate(result.belief, np.empty(0), inliers.astype(float), result.nis, result.dof, certain)
 
 
 def _evidence_gain(result: MapResult, mixture: GaussianSum, number: int) -> float:

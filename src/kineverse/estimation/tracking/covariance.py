@@ -75,69 +75,71 @@ class RidgeCovariance:
         """
         t = self._layout.groups[number].t
         information = belief.information[np.ix_(t, t)]
-        straight = inverse_spd(information)
+        gaussian = inverse_spd(information)
         record = belief.records[number]
         if record is None:
-            return straight
+            return gaussian
         directions, across = self._unobservable.directions(number, information)
         reading = record.as_measurements(self._layout, self._reader)
         posterior = _LocalPosterior(number, belief, record, across, reading)
         if not len(directions) or self._evaluate(posterior, np.zeros(len(t))) is None:
-            return straight
-        result, is_straight = straight, True
+            return gaussian
+        result, is_straight = gaussian, True
         for k in range(len(directions)):
             others = np.concatenate([np.delete(directions, k, axis=0), across])
             more, is_so = self._integrate_direction(replace(posterior, across=others), directions[k])
             result, is_straight = result + more, is_straight and is_so
-        back = np.linalg.inv(np.concatenate([directions, across]))
+        inverse = np.linalg.inv(np.concatenate([directions, across]))
         for one, other in itertools.combinations(directions, 2):
-            bend = self._mixed_curvature(posterior, one, other)
-            is_straight &= float(np.linalg.norm(bend @ back)) < _RIDGE_CURVATURE
-            result = result + np.outer(bend, bend)
-        return straight if is_straight else _floor_covariance(result, np.concatenate([directions, across]))
+            curvature = self._mixed_curvature(posterior, one, other)
+            is_straight &= float(np.linalg.norm(curvature @ inverse)) < _RIDGE_CURVATURE
+            result = result + np.outer(curvature, curvature)
+        return gaussian if is_straight else _floor_covariance(result, np.concatenate([directions, across]))
 
     def _integrate_direction(self, posterior: _LocalPosterior, direction: Array) -> tuple[Array, bool]:
         """Return the covariance gained along one direction, and whether the ridge is straight there."""
         top = self._evaluate(posterior, np.zeros(len(direction)))
         assert top is not None
-        back = np.linalg.inv(np.concatenate([direction[None], posterior.across]))
-        total, result, is_straight = 1.0, np.zeros_like(back), True
+        inverse = np.linalg.inv(np.concatenate([direction[None], posterior.across]))
+        total, result, is_straight = 1.0, np.zeros_like(inverse), True
         for ray in (direction, -direction):
             for point, density in self._walk_ridge(posterior, top, ray):
                 total += density
                 result += density * (posterior.spread(point) - posterior.spread(top))
-                along, *aside = point.step @ back
+                along, *deviation = point.step @ inverse
                 log = math.log(density) + along**2 / 2
-                is_straight &= float(np.linalg.norm(aside)) < _RIDGE_CURVATURE and abs(log) < _RIDGE_CURVATURE
+                is_straight &= (
+                    float(np.linalg.norm(deviation)) < _RIDGE_CURVATURE and abs(log) < _RIDGE_CURVATURE
+                )
         result /= total
         return result - np.outer(direction, direction), is_straight
 
     def _mixed_curvature(self, posterior: _LocalPosterior, one: Array, other: Array) -> Array:
         """Return the curvature of the ridge for two directions together, beyond that of each alone."""
-        bend = np.zeros_like(one)
+        curvature = np.zeros_like(one)
         for sign in (1, -1):
             for direction in (one + sign * other, -one - sign * other):
                 point = self._ridge_point(posterior, direction)
                 if point is None:
                     return np.zeros_like(one)
-                bend += sign * (point.step - direction) / 4
-        return bend
+                curvature += sign * (point.step - direction) / 4
+        return curvature
 
     def _walk_ridge(
         self, posterior: _LocalPosterior, top: _ManifoldPoint, ray: Array
     ) -> Iterator[tuple[_ManifoldPoint, float]]:
         """Yield points along the ridge, with their relative density after marginalising across it."""
         stride, point, density = _STRIDE * ray, top, 1.0
-        aside = before = np.zeros_like(ray)
+        deviation = before = np.zeros_like(ray)
         for count in range(1, math.ceil(_FARTHEST / _STRIDE)):
-            there = self._ridge_point(posterior, count * stride + 2 * aside - before)
+            there = self._ridge_point(posterior, count * stride + 2 * deviation - before)
             if there is None:
                 # Beyond the limits, which the Gaussian ignores: continue straight, with its density.
                 density *= math.exp(-(count - 0.5) * _STRIDE**2)
                 point = replace(point, step=point.step + stride)
             else:
                 point, density = there, there.density(top)
-                before, aside = aside, there.step - count * stride
+                before, deviation = deviation, there.step - count * stride
             if density < _LEAST_DENSITY:
                 return
             yield point, density
@@ -148,14 +150,14 @@ class RidgeCovariance:
         for _ in range(_MOST_CORRECTIONS):
             if best is None:
                 return None
-            aside = np.linalg.solve(best.across, -best.gradient)
-            if float(np.linalg.norm(aside)) < _SETTLED:
+            deviation = np.linalg.solve(best.across, -best.gradient)
+            if float(np.linalg.norm(deviation)) < _SETTLED:
                 break
-            tried = self._evaluate(posterior, best.step + share * aside @ posterior.across)
-            if tried is None or tried.cost > best.cost:
+            trial = self._evaluate(posterior, best.step + share * deviation @ posterior.across)
+            if trial is None or trial.cost > best.cost:
                 share /= 4
             else:
-                best, share = tried, 1.0
+                best, share = trial, 1.0
         return best
 
     def _evaluate(self, posterior: _LocalPosterior, step: Array) -> _ManifoldPoint | None:
@@ -189,8 +191,8 @@ class RidgeCovariance:
 
 def _floor_covariance(covariance: Array, steps: Array) -> Array:
     """Return the covariance with a standard deviation of at least half of each step."""
-    back = np.linalg.inv(steps)
-    values, vectors = np.linalg.eigh(symmetric(back.T @ covariance @ back))
+    inverse = np.linalg.inv(steps)
+    values, vectors = np.linalg.eigh(symmetric(inverse.T @ covariance @ inverse))
     wide = steps.T @ vectors * np.sqrt(np.maximum(values, 0.25))
     return symmetric(wide @ wide.T)
 
@@ -223,13 +225,13 @@ class _ManifoldPoint:
     across: Array
 
     @cached_property
-    def narrowness(self) -> float:
+    def log_curvature(self) -> float:
         """Log determinant of the curvature across the ridge."""
         return float(np.linalg.slogdet(self.across)[1])
 
     def density(self, top: _ManifoldPoint) -> float:
         """Return the density marginalised across the ridge, relative to the top."""
-        log = top.cost - self.cost + (top.narrowness - self.narrowness) / 2
+        log = top.cost - self.cost + (top.log_curvature - self.log_curvature) / 2
         return math.exp(min(log, math.log(_MOST_DENSITY)))
 
 
@@ -299,12 +301,12 @@ class CovarianceInflation:
         Both are in deviations of the measurement noise.
         """
         group, inputs = self._layout.groups[number], record.inputs
-        seen = list(record.means)
+        measured = list(record.means)
         here = self._residuals.evaluate(belief.x, inputs)
         as_predicted = noise._replace(values=self._reader.as_values(here))
-        as_predicted.mask[seen] = True
-        slopes = {i: s for i, (_, s) in self._residuals.errors(here, as_predicted, seen).items()}
-        most = dict.fromkeys(seen, 0.0)
+        as_predicted.mask[measured] = True
+        slopes = {i: s for i, (_, s) in self._residuals.errors(here, as_predicted, measured).items()}
+        most = dict.fromkeys(measured, 0.0)
         for step in (*directions, *-directions):
             try:
                 x, _ = self._process_model.retract(number, belief.x[group.x], step, inputs)
@@ -314,10 +316,10 @@ class CovarianceInflation:
             except KineverseError:  # infeasible
                 continue
             remaining = self._group_bounds[number].remaining(belief.x[group.x], there[group.x], step)
-            for i, (error, _) in self._residuals.errors(predicted, as_predicted, seen).items():
-                bend = error + slopes[i] @ remaining
-                if np.isfinite(bend).all():
-                    most[i] = max(most[i], float(bend @ bend) / len(bend))
+            for i, (error, _) in self._residuals.errors(predicted, as_predicted, measured).items():
+                curvature = error + slopes[i] @ remaining
+                if np.isfinite(curvature).all():
+                    most[i] = max(most[i], float(curvature @ curvature) / len(curvature))
         return most, slopes
 
     def _missing_covariance(
@@ -329,7 +331,7 @@ class CovarianceInflation:
             variance = float(np.einsum("ij,jk,ik->", slope, covariance, slope)) / len(slope)
             lacking.append(np.full(len(slope), max(most[i] - variance, 0.0)))
         scale = self._unobservable.deviations[self._layout.groups[number].t]
-        back = np.linalg.pinv(np.concatenate(list(slopes.values())) * scale, rcond=_RANK)
-        back *= scale[:, None]
-        missing: Array = (back * np.concatenate(lacking)) @ back.T
+        inverse = np.linalg.pinv(np.concatenate(list(slopes.values())) * scale, rcond=_RANK)
+        inverse *= scale[:, None]
+        missing: Array = (inverse * np.concatenate(lacking)) @ inverse.T
         return missing

@@ -42,10 +42,10 @@ class QuadraticCost:
         """Make the cost with matrix Λ and vector η whose minimum is 0."""
         return QuadraticCost(matrix, vector, float(vector @ inverse_spd(matrix) @ vector) / 2)
 
-    def with_measurements(self, seen: Iterable[tuple[Array, Array, float]]) -> QuadraticCost:
+    def with_measurements(self, measurements: Iterable[tuple[Array, Array, float]]) -> QuadraticCost:
         """Add the weighted squares of errors e - S ξ, given as (e, S, weight)."""
         matrix, vector, cost = self.matrix.copy(), self.vector.copy(), self.cost
-        for error, slope, weight in seen:
+        for error, slope, weight in measurements:
             matrix += weight * (slope.T @ slope)
             vector += weight * (slope.T @ error)
             cost += weight * float(error @ error) / 2

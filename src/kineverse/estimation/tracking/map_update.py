@@ -209,11 +209,11 @@ class MapSolver:
         """Accept the trial as the best iterate if it is better; otherwise increase the damping."""
         group = self._layout.groups[number]
         with np.errstate(invalid="ignore"):  # a trial with an infinite Jacobian is rejected
-            seen = self._residuals.errors(out, reading, group.observation_indices)
-        squares = {i: float(e @ e) for i, (e, _) in seen.items()}
+            measured = self._residuals.errors(out, reading, group.observation_indices)
+        squares = {i: float(e @ e) for i, (e, _) in measured.items()}
         weighed = {i: self._robust_cost(i, square, reading, loss) for i, square in squares.items()}
         cost = iterate.trial_prior.cost + sum(each for _, each in weighed.values())
-        is_finite = np.isfinite(cost) and all(np.isfinite(s).all() for _, s in seen.values())
+        is_finite = np.isfinite(cost) and all(np.isfinite(s).all() for _, s in measured.values())
         if not is_finite and iterate.rows is None:
             self._residuals.check(out, group.observation_indices)
         rows = self.group_bounds[number].rows(iterate.trial, out)
@@ -225,7 +225,7 @@ class MapSolver:
         iterate.x, iterate.prior, iterate.cost, iterate.rows = iterate.trial, iterate.trial_prior, cost, rows
         weights[list(weighed)] = [weight for weight, _ in weighed.values()]
         iterate.posterior = iterate.prior.with_measurements(
-            (e, s, weighed[i][0]) for i, (e, s) in seen.items()
+            (e, s, weighed[i][0]) for i, (e, s) in measured.items()
         )
         iterate.excess = cost - iterate.posterior.cost
         iterate.damping = iterate.damping / 10 if iterate.damping > 1e-6 else 0.0
@@ -275,18 +275,18 @@ class MapSolver:
         nis, dof = np.zeros(count), np.zeros(count)
         for number, iterate in iterates.items():
             group = self._layout.groups[number]
-            seen = [i for i in group.observation_indices if reading.mask[i]]
+            measured = [i for i in group.observation_indices if reading.mask[i]]
             after.x[group.x] = iterate.x
             posterior = iterate.settled or iterate.posterior
             after.set_group_cost(group.t, posterior)
             # Least cost without limits. In the linear case this is the innovation squared in S⁻¹.
             nis[number] = max(2 * posterior.minimum, 0.0)
-            dof[number] = sum(self._layout.observations[i].size for i in seen if weights[i] >= 0.5)
+            dof[number] = sum(self._layout.observations[i].size for i in measured if weights[i] >= 0.5)
             after.evidence[number] += (
                 (iterate.prior.log_determinant - posterior.log_determinant) / 2
                 - (posterior.cost - iterate.constrained_minimum)
                 - iterate.excess
-                - float(reading.log_scale[seen].sum())
+                - float(reading.log_scale[measured].sum())
             )
         priors = {number: iterate.prior for number, iterate in iterates.items()}
         return MapResult(after, nis, dof, rounds, None if loss == "gaussian" else weights, priors=priors)

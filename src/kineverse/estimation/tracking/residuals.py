@@ -124,11 +124,11 @@ class MeasurementReader:
         count = len(self._all)
         if given.shape != (count, 4, 4):
             raise ShapeError(f"The poses are an array of shape {(count, 4, 4)}, not {given.shape}.")
-        seen = self._all if mask is None else np.ascontiguousarray(mask)
-        if seen.dtype != bool or seen.shape != (count,):
+        observed = self._all if mask is None else np.ascontiguousarray(mask)
+        if observed.dtype != bool or observed.shape != (count,):
             raise ShapeError(f"seen= is a mask of {count} booleans, not {mask!r:.80}.")
         values = np.ascontiguousarray(given).reshape(-1)
-        return Measurements(values, seen, self._whitening, self._log_scale)
+        return Measurements(values, observed, self._whitening, self._log_scale)
 
     def check_poses(self, reading: Measurements) -> None:
         """Check that all measured poses are rigid.
@@ -248,30 +248,32 @@ class Residuals:
             Numbers of the requested observations.
         """
         layout = self._layout
-        seen = [i for i in indices if reading.mask[i]]
-        values = {i: reading.values[layout.measurement_slices[i]] for i in seen}
+        measured = [i for i in indices if reading.mask[i]]
+        values = {i: reading.values[layout.measurement_slices[i]] for i in measured}
         errors: dict[int, Array] = {}
         slopes: dict[int, Array] = {}
-        for i in seen:
+        for i in measured:
             size = layout.observations[i].size
             slopes[i] = out[layout.jacobian_slices[i]].reshape(size, self._widths[i])
-        poses = [i for i in seen if layout.observations[i].is_pose]
+        poses = [i for i in measured if layout.observations[i].is_pose]
         if poses:
             predicted = np.stack([out[layout.value_slices[i]] for i in poses])
-            measured = np.stack([values[i] for i in poses]).reshape(-1, 4, 4)
-            differences = pose_difference(measured, transform(predicted[:, :9].reshape(-1, 3, 3), predicted[:, 9:]))
+            observed = np.stack([values[i] for i in poses]).reshape(-1, 4, 4)
+            differences = pose_difference(
+                observed, transform(predicted[:, :9].reshape(-1, 3, 3), predicted[:, 9:])
+            )
             back = inverse_right_jacobian(differences[:, 3:])
             errors.update(zip(poses, differences, strict=True))
             for i, turn in zip(poses, back, strict=True):
                 slope = slopes[i]
                 slopes[i] = np.concatenate([slope[:3], turn @ slope[3:]])
-        for i in seen:
+        for i in measured:
             if i not in errors:
                 errors[i] = wrap_difference(
                     values[i] - out[layout.value_slices[i]], layout.observations[i].period
                 )
         pairs = {}
-        for i in seen:
+        for i in measured:
             size = layout.observations[i].size
             white = reading.whitening[layout.whitening_slices[i]].reshape(size, size)
             pairs[i] = white @ errors[i], white @ slopes[i]

@@ -309,23 +309,23 @@ class UpdateStep:
 
     def _update_mixture(self, mixture: GaussianSum, reading: Measurements, inputs: Array) -> StepResult:
         """Update all components and keep the best candidates."""
-        seen = self._measured_groups(reading)
-        candidates, rounds = self._solve_inliers(mixture, reading, inputs, seen)
-        sure = {number for candidate in candidates for number in candidate.groups}
-        left = [number for number in seen if number not in sure]
+        measured = self._measured_groups(reading)
+        candidates, rounds = self._solve_inliers(mixture, reading, inputs, measured)
+        solved = {number for candidate in candidates for number in candidate.groups}
+        remaining = [number for number in measured if number not in solved]
         for component, belief in enumerate(mixture.beliefs):
-            groups = mixture.groups(component, left)
+            groups = mixture.groups(component, remaining)
             if not groups:
                 continue
             try:
-                new, took = self._explain(belief, reading, inputs, groups, component == 0)
+                new, count = self._explain(belief, reading, inputs, groups, component == 0)
             except KineverseError:
                 # The best component must succeed; others that fail are dropped.
                 if component == 0:
                     raise
                 continue
             candidates += new
-            rounds = max(rounds, took)
+            rounds = max(rounds, count)
         after, best = mixture.select(
             candidates, partial(self.merge_criterion.should_merge, inputs, self.periodic)
         )
@@ -361,9 +361,9 @@ class UpdateStep:
             if is_best and (unexplained := self._unexplained(belief, result, reading, groups)):
                 candidates += self._restart(belief, result, reading, inputs, unexplained)
             return candidates, result.rounds
-        nearby = self.solver.find_robust_start(belief, reading, inputs, groups)
+        robust_start = self.solver.find_robust_start(belief, reading, inputs, groups)
         candidates, rounds = [], 0
-        for start in (belief, nearby):
+        for start in (belief, robust_start):
             result = self.solver.update(start, reading, inputs, groups, self.outliers)
             candidates.append(self._relinearised(start, result, reading, inputs, groups))
             rounds = max(rounds, result.rounds)
@@ -372,9 +372,9 @@ class UpdateStep:
         all_outliers = belief.copy()
         none = np.zeros(len(self.layout.groups))
         for number in groups:
-            seen = [i for i in self.layout.groups[number].observation_indices if reading.mask[i]]
-            wrong = sum(self.outliers.log_density(self.layout.observations[i]) for i in seen)
-            all_outliers.evidence[number] += wrong
+            measured = [i for i in self.layout.groups[number].observation_indices if reading.mask[i]]
+            log_outliers = sum(self.outliers.log_density(self.layout.observations[i]) for i in measured)
+            all_outliers.evidence[number] += log_outliers
         weights = np.zeros(len(self.layout.observations))
         candidates.append(self._candidate(all_outliers, weights, none, none, groups, inputs))
         return candidates, rounds

@@ -132,7 +132,7 @@ def _are_redundant(
     zero = as_expression(0.0)
     speeds = sorted({v for x in block for v in rates[x]}, key=lambda s: s.sort_key)
     matrix = array([[rates[x].get(v, zero) for v in speeds] for x in block])
-    seen = [value for value in values if not set(block).isdisjoint(value.symbols)]
+    dependent = [value for value in values if not set(block).isdisjoint(value.symbols)]
     random = np.random.default_rng(0)
     for _ in range(_SAMPLES):
         point = {x: default.get(x, 0.0) + random.uniform(-0.3, 0.3) for x in block}
@@ -146,7 +146,7 @@ def _are_redundant(
                 {x: point[x] + h * d for x, d in zip(block, direction.tolist(), strict=True)}
                 for h in (_STEP, -_STEP)
             )
-            for value in seen:
+            for value in dependent:
                 change = np.abs(
                     _evaluate_at(value, ahead, default) - _evaluate_at(value, behind, default)
                 ).max()

@@ -40,13 +40,13 @@ if TYPE_CHECKING:
 
 
 def arrange_state(
-    model: ModelView, seen: tuple[MeasurementModel, ...], given: frozenset[Symbol]
+    model: ModelView, observations: tuple[MeasurementModel, ...], given: frozenset[Symbol]
 ) -> tuple[Layout, StateBounds]:
     """Choose the estimated coordinates, and collect their limits.
 
     Parameters
     ----------
-    model, seen
+    model, observations
         The model, and its measurement models.
     given
         Coordinates that are measured elsewhere.
@@ -57,7 +57,7 @@ def arrange_state(
         If an observation depends on no estimated coordinate.
     """
     rates = model.rates
-    values = [rates.resolve(to_plain(one.value)) for one in seen]
+    values = [rates.resolve(to_plain(one.value)) for one in observations]
     tangent_space = build_tangent_space(rates, values, given, model.default_state())
     limits = collect_bounds(model, tangent_space, given)
     dependencies = {s for value in values for s in value.symbols}
@@ -66,7 +66,7 @@ def arrange_state(
         s for x in tangent_space.coordinates if x in rates for e in rates[x].values() for s in e.symbols
     }
     inputs = sorted(dependencies - set(tangent_space.coordinates), key=lambda s: s.sort_key)
-    return build_layout(tangent_space, seen, limits.curved, inputs), limits
+    return build_layout(tangent_space, observations, limits.curved, inputs), limits
 
 
 class Tracker:
