@@ -1,4 +1,4 @@
-"""Whether a model explains what is seen: kitchens that are as served, and kitchens that are not."""
+"""Plausibility check of kitchens that are as served, and of kitchens that are not."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def make_slider(joint: kv.Revolute) -> kv.Operation:
 
 
 def repair_model(model: kv.Model, report: Plausibility) -> kv.Model:
-    """Return the model with what is proposed."""
+    """Return the model with its replacements."""
     result = model.copy()
     with result.edit() as edit:
         for tag, operation in report.replacements.items():
@@ -142,7 +142,7 @@ def test_door_beyond_its_limits_is_rejected(kitchen: kv.Model) -> None:
 
 
 def corrupt(observations: dict[str, np.ndarray], rows: list[int], seed: int) -> None:
-    """Make some poses of the handle plain wrong."""
+    """Corrupt some poses of the handle."""
     random = np.random.default_rng(seed)
     observations[HANDLE][rows, :3, 3] += random.normal(0.0, 0.5, (len(rows), 3))
     observations[HANDLE][rows, :3, :3] = Rotation.random(len(rows), random_state=seed).as_matrix()
@@ -157,7 +157,7 @@ def test_single_wrong_pose_is_an_outlier(kitchen: kv.Model, row: int) -> None:
     assert verdict.outliers == (row,)
     assert verdict.replacement is None
     assert "1 of 30 observations left out" in str(verdict)
-    # Who says that there are none has one explained.
+    # Without an outlier model the pose is evidence against the joint.
     verdict = check_plausibility(kitchen, observations, noise=NOISE, families=SOME, outliers=False)[TAG]
     assert verdict.implausible_since == row
 
@@ -269,7 +269,7 @@ def test_custom_family_is_proposed() -> None:
     assert check_plausibility(model, observations, noise=NOISE, families=["revolute", "free"])[
         "door"
     ].explains
-    # What was seen before it was noticed says how far it goes, too.
+    # The range includes observations before the rejection.
     low, high = model.limits("garage/door")
     assert (low, high) == pytest.approx((0.0, 1.5), abs=0.05)
 

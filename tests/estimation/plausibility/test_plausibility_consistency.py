@@ -1,4 +1,4 @@
-"""Limits that depend on several coordinates, coordinates that move several parts, and what is proposed then."""
+"""Limits on several coordinates, coordinates that move several parts, and their replacements."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ SOME = ("rigid", "prismatic", "revolute", "free")
 
 
 def make_cupboard() -> kv.Model:
-    """Return a door, and a drawer that it lets out as far as it is open."""
+    """Return a door, and a drawer that opens only as far as the door."""
     model = kv.Model()
     door, drawer = kv.position("door"), kv.position("drawer")
     with model.edit() as edit:
@@ -36,7 +36,7 @@ def make_cupboard() -> kv.Model:
 
 
 def repair_model(model: kv.Model, report: Plausibility) -> kv.Model:
-    """Return the model with what is proposed, from a document."""
+    """Return the model with its replacements, read back from a document."""
     copy = model.copy()
     with copy.edit() as edit:
         for tag, operation in report.replacements.items():
@@ -45,7 +45,7 @@ def repair_model(model: kv.Model, report: Plausibility) -> kv.Model:
 
 
 def add_consistency(model: kv.Model, observations: dict[str, Array]) -> dict[str, KnownResiduals]:
-    """Return by tag what is told of articulations, with ties."""
+    """Return the residuals with consistency tests by tag."""
     found = find_testable_joints(model, observations, "world")
     known = {
         "world": exact_track(len(next(iter(observations.values())))),
@@ -62,7 +62,7 @@ def add_consistency(model: kv.Model, observations: dict[str, Array]) -> dict[str
 
 
 def is_standard_normal(z: Array) -> bool:
-    """Whether numbers may well be; of those that are, one set in ten thousand is not taken for it."""
+    """Return True if numbers are standard normal; a correct set fails once in ten thousand."""
     count = len(z)
     mean, squares = abs(float(z.mean())), float(np.sum(z**2))
     return mean < 4.0 / np.sqrt(count) and abs(squares - count) < 4.0 * np.sqrt(2.0 * count)
@@ -83,13 +83,13 @@ def test_limit_set_by_another_coordinate_is_tested() -> None:
             assert report["drawer"].implausible_since is not None
             assert report["drawer"].replacement is None
             assert "together with what limits" in report["drawer"].reason
-        # Nobody knows what the door lets out where nobody sees it.
+        # Without observations of the door the limit is unknown.
         alone = check_plausibility(model, {"drawer": observations["drawer"]}, noise=NOISE, families=SOME)
         assert alone["drawer"].explains
 
 
 def test_limit_excess_is_standard_normal_at_the_limit() -> None:
-    """With the derivatives of the limit by both coordinates: without the door's share it would be 1.4."""
+    """Both coordinates contribute; without the door's share the deviation would be 1.4."""
     model = make_cupboard()
     doors = np.random.default_rng(2).uniform(0.3, 1.2, 400)
     observations = observe_frames(
@@ -220,7 +220,7 @@ def test_replacement_of_a_mimic_joint_follows_an_unobserved_leader() -> None:
 
 
 def make_linkage(pivot: float = 1.0, coupler: float = 1.1) -> kv.Model:
-    """Return a crank that goes round, and a rocker."""
+    """Return a crank that revolves, and a rocker."""
     model = kv.Model()
     with model.edit() as edit:
         bars = [
@@ -261,7 +261,7 @@ def test_bars_of_a_linkage_are_tested_together_and_replaced(served_linkage: kv.M
     assert "rocker" in copy.articulations
     assert check_plausibility(copy, observations, noise=NOISE, families=SOME).implausible == ()
 
-    # The hinge is where it was: it is a bar of another length that moves it otherwise.
+    # The hinge is unchanged; a bar of another length moves it.
     observations = observe_frames(make_linkage(coupler=1.2), frames, cranks, 12)
     report = check_plausibility(served, observations, noise=NOISE, families=SOME)
     assert [verdict.tag for verdict in report.implausible] == ["rocker"]
@@ -280,9 +280,9 @@ def test_monitor_applies_consistency_tests() -> None:
         assert tuple(monitor.implausible_since) == noticed
     assert monitor.implausible_since["right"] == pytest.approx(40, abs=3)
     assert monitor.report()["right"].implausible_since == monitor.implausible_since["right"]
-    # What is not seen now says nothing now.
+    # Missing frames are ignored.
     monitor.update({"right": wrong["right"][0]})
-    # A limit that comes later is one of the articulation that it limits.
+    # A later limit belongs to the joint that it limits.
     with served.edit() as edit:
         edit.constrain("narrow", -np.inf, kv.position("left") ** 2, 0.01)
     for k in range(10):
@@ -291,7 +291,7 @@ def test_monitor_applies_consistency_tests() -> None:
 
 
 def test_singular_linkages_raise_no_alarm(served_linkage: kv.Model) -> None:
-    """Near the dead centre the rocker hardly determines the crank. One alarm in a thousand is allowed; 18 are tested."""
+    """Near the dead centre the rocker hardly determines the crank; 18 tests run."""
     model, alarms = served_linkage, 0
     for seed in range(3, 9):
         cranks = {"crank": np.random.default_rng(seed).uniform(-3.0, 3.0, 40)}

@@ -1,4 +1,4 @@
-"""What plausibility promises: few false alarms, densities that are right, and a monitor that agrees."""
+"""False alarm rate, densities, and agreement of the monitor with the batch check."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def kitchen() -> kv.Model:
 
 @pytest.fixture(scope="module")
 def resting(kitchen: kv.Model) -> KnownResiduals:
-    # A door that moves at random, often rests at its limits, and is seen by noisy eyes, for a long time.
+    # A door that moves at random and often rests at its limits, in a long series of noisy observations.
     angles = np.clip(np.cumsum(np.random.default_rng(0).normal(0.0, 0.3, RUNS * LONG)) % 4.0 - 1.0, 0.0, 1.57)
     poses = observe_frames(kitchen, [HANDLE, FRIDGE], {DOOR: angles}, 1)
     return compute_residuals(
@@ -42,7 +42,7 @@ def test_false_alarm_rate_is_bounded(resting: KnownResiduals, wrong: float) -> N
     assert left.orthogonal.shape == (RUNS * LONG, 5)
     assert stats.kstest(squares, stats.chi2(5).cdf).pvalue > 0.01
 
-    # What is wrong is wrong in the way that looks most like something else: always the same.
+    # Outliers are constant, which looks most like a change of the joint.
     corrupt = np.random.default_rng(9).uniform(size=RUNS * LONG) < wrong
     normal = np.where(corrupt[:, None], 40.0, left.orthogonal)
     beyond = np.where(corrupt[:, None], 40.0, left.bound_excess)
@@ -57,7 +57,7 @@ def test_false_alarm_rate_is_bounded(resting: KnownResiduals, wrong: float) -> N
 
 
 def test_evidence_ratio_has_mean_one() -> None:
-    # E[M] = 1 after one observation, whatever its derivatives are: Ville's inequality needs no more.
+    # E[M] = 1 after one observation for any Jacobian, which is the condition of Ville's inequality.
     displacement_jacobian = np.random.default_rng(2).normal(size=(1, 12))
     grid = np.sinh(np.linspace(-7.5, 7.5, 2001))
     nothing, unlimited = np.zeros((0, 12)), np.full(2, -np.inf)
@@ -67,7 +67,7 @@ def test_evidence_ratio_has_mean_one() -> None:
     ):
         logs = np.array([SequentialTest(1e-300).add(*row) for row in rows]) + stats.norm.logpdf(grid)
         assert integrate.trapezoid(np.exp(logs), grid) == pytest.approx(1.0, abs=1e-3)
-        # With wrong observations it is fair at best, wherever they are.
+        # With outliers of any distribution the mean is at most 1.
         won = np.array([SequentialTest(1e-300, outlier_fraction=0.05).add(*row) for row in rows])
         mean = integrate.trapezoid(np.exp(won + stats.norm.logpdf(grid)), grid)
         assert 0.8 < 0.95 * mean + 0.05 * np.exp(won.max()) < 1.0 + 1e-3
@@ -110,14 +110,14 @@ def test_log_evidence_equals_the_integral_over_joint_values() -> None:
     widths = np.geomspace(1e-5, 10.0, 43)
     for width in widths:
         if width < 0.01:
-            # Narrower than the grid, and than the noise: both values are the mean.
+            # Narrower than grid and noise: both values equal the mean.
             total += integrate.trapezoid(likelihood.prod(axis=1), values) / 2.0 / len(widths)
             continue
         prior = stats.norm(values[:, None], width).pdf(values)
         prior /= integrate.trapezoid(prior, values, axis=1)[:, None]
         each = integrate.trapezoid(prior[:, :, None] * likelihood, values, axis=1)
         total += integrate.trapezoid(each.prod(axis=1), values) / 2.0 / len(widths)
-    # What is not on the grid is known to some percent: the mean is integrated out by Laplace's method.
+    # Laplace's method integrates the mean to some percent.
     assert found == pytest.approx(across + np.log(total), abs=0.1)
 
 
@@ -135,7 +135,7 @@ def test_log_displacement_gain_equals_a_normal_density(resting: KnownResiduals) 
 
 
 def test_densities_compare_with_those_of_identification() -> None:
-    # With many poses a rigid connection's evidence is its likelihood times the volume that they leave.
+    # With many poses the evidence of a rigid connection is its likelihood times the posterior volume.
     random = np.random.default_rng(4)
     poses = np.tile(np.eye(4), (200, 1, 1))
     poses[:, :3, 3] = random.normal(0.0, 0.01, (200, 3))

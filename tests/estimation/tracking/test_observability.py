@@ -38,7 +38,7 @@ def make_tip_tracker(model: kv.Model, observer: NoisyObserver, deviation: float,
 
 
 def test_covariance_of_a_redundant_arm_is_consistent():
-    """The mean of squares varies by 6 % between runs like this one; that of many is .95."""
+    """The sample mean of NEES varies by 6 % between such runs; over many runs it is 0.95."""
     model, rng = make_arm(), np.random.default_rng(1)
     observer = NoisyObserver(model, ["tip"], seed=1)
     first = make_tip_tracker(model, observer, 0.2)
@@ -55,7 +55,7 @@ def test_covariance_of_a_redundant_arm_is_consistent():
 
 @pytest.mark.parametrize(("noise", "runs", "looks"), [(1e-4, 40, 10), (1e-2, 40, 10)])
 def test_covariance_of_a_redundant_arm_with_process_noise_is_consistent(noise, runs, looks):
-    """The mean of squares varies by 9 %, and that of many is .95 to 1.05."""
+    """The sample mean of NEES varies by 9 %; over many runs it is 0.95 to 1.05."""
     model, rng = make_arm(), np.random.default_rng(2)
     observer = NoisyObserver(model, ["tip"], seed=2)
     first = make_tip_tracker(model, observer, 0.2, process_noise={f"{name}:velocity": noise for name in BENT})
@@ -73,7 +73,7 @@ def test_covariance_of_a_redundant_arm_with_process_noise_is_consistent(noise, r
 
 
 def test_linear_unobservable_model_equals_a_kalman_filter_over_time():
-    """Two slides of which the sum is seen."""
+    """Observe the sum of two slides."""
     model = kv.Model()
     with model.edit() as edit:
         edit.apply(kv.Planar(name="p", parent="world", child="p"))
@@ -140,7 +140,7 @@ def test_static_updates_equal_one_batch_estimate():
     for seen in readings:
         estimate = tracker.update({"tip": seen})
     best = least_squares(residuals, list(estimate.state.values()), xtol=1e-12, ftol=1e-12, gtol=1e-12)
-    # But for the mean of rotations, which is one of rotation vectors only nearly.
+    # Equal up to the mean of rotations, which averages rotation vectors to first order.
     assert np.allclose(list(estimate.state.values()), best.x, rtol=0, atol=2e-4)
     assert np.linalg.eigvalsh(tracker._mixture.best.information)[0] == pytest.approx(0.3**-2, rel=1e-6)
 
@@ -217,7 +217,7 @@ def test_later_observation_selects_the_mirror_image():
 
 
 def test_static_record_is_dropped_when_inputs_change():
-    """A slide on another one that somebody moves: where the first ends is open only once it is known."""
+    """Projections of a point at three known angles determine both of its coordinates."""
     model = kv.Model()
     with model.edit() as edit:
         edit.apply(kv.Planar(name="p", parent="world", child="p"))
@@ -242,7 +242,7 @@ def make_hinge(**options) -> kv.Model:
 @pytest.mark.parametrize("truth", [0.3, 0.5, 0.9, 1.2])
 @pytest.mark.parametrize("kind", ["distance", "wave", "saw"])
 def test_equally_likely_components_are_kept(kind, truth):
-    """Numbers that come twice leave two states, of which a pose chooses one."""
+    """Two states predict the same number; a pose selects one of them."""
     model = make_hinge(lower=0.0, upper=1.5)
     q = model.symbol("q")
     value = {"distance": np.abs(q - 0.7), "wave": np.cos(4 * q), "saw": kv.where(q < 0.75, q, q - 0.75)}[kind]
@@ -256,7 +256,7 @@ def test_equally_likely_components_are_kept(kind, truth):
 
 
 def test_estimate_at_a_limit_has_the_bias_of_the_truncated_gaussian():
-    """The most probable state inside is max(0, z) for z about 0: .4 deviations open, a NEES of one half."""
+    """The estimate is max(0, z) with z about 0: biased by 0.4 deviations, with a NEES of one half."""
     model, rng = make_hinge(lower=0.0, upper=1.5), np.random.default_rng(0)
     q = model.symbol("q")
     first = Tracker(model, [ObservedExpression("dial", q, 0.02**2)])

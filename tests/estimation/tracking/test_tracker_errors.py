@@ -79,7 +79,7 @@ def test_invalid_measurement_is_refused_by_name(model, seen, message, outliers):
 
 def test_update_poses_checks_shapes_and_matches_update(model, tracker):
     poses = np.stack([pose(model), np.full((4, 4), np.nan)])
-    tracker.update_poses(poses, np.array([True, False]))  # what is not seen is not looked at
+    tracker.update_poses(poses, np.array([True, False]))  # missing poses are not checked
     with pytest.raises(kv.KineverseError, match="fridge_door_handle' is not finite"):
         tracker.update_poses(poses)
     with pytest.raises(kv.errors.ShapeError, match=r"\(2, 4, 4\)"):

@@ -99,7 +99,7 @@ def test_order_of_observations_hardly_matters():
         for seen in order:
             estimate = tracker.update(seen)
         results.append(np.array([estimate.state["one"], estimate.state["two"]]))
-    # What is left comes from where things were linear: second order in the noise.
+    # The remaining difference is second order in the noise, from linearisation.
     assert np.abs(results[0] - results[1]).max() < 0.02 * min(estimate.deviation.values())
 
 
@@ -155,7 +155,7 @@ def test_estimate_minimises_the_cost_inside_the_limits(truth):
 
 
 def test_jacobians_equal_finite_differences_of_residuals():
-    """The geometric Jacobian and Jr⁻¹ are what finite differences of the residual say, far from zero as well."""
+    """Geometric Jacobian and Jr⁻¹ equal finite differences of the residual, also for large residuals."""
     model = make_arm()
     tracker = Tracker(model, ["tip"])
     rng = np.random.default_rng(0)
@@ -196,7 +196,7 @@ def test_periodic_angles_wrap_and_multi_start_finds_them():
 
 
 def test_model_is_never_evaluated_outside_its_limits():
-    """The published garage door is arccos(a/l): beyond its limit it says nothing at all."""
+    """The published garage door has arccos(a/l), which is undefined beyond its limit."""
     model = kv.Model()
     with model.edit() as edit:
         edit.apply(kv.articulations.GarageDoor(name="g", parent="world", form="published"))
@@ -221,12 +221,12 @@ def test_limits_on_several_coordinates_hold():
     x = np.array([estimate.state["a"], estimate.state["b"]])
     assert np.linalg.norm(x) == pytest.approx(1.0, abs=1e-6)
     assert x == pytest.approx(np.array([0.8, 0.6]), abs=1e-2)
-    # The belief itself knows nothing of the circle, so news can lead away from it again.
+    # The Gaussian ignores the circle, so new measurements can lead away from it.
     assert x + estimate.mean == pytest.approx(np.array([1.2, 0.9]), abs=2e-2)
 
 
 def test_limits_that_depend_on_coordinates_hold():
-    """A drawer may come out as far as the door beside it is open, and a bolt holds the door near zero."""
+    """A door limits the drawer beside it, and a bolt holds the door near zero."""
     model = make_slides()
     a, b = kv.position("a"), kv.position("b")
     with model.edit() as edit:
@@ -237,7 +237,7 @@ def test_limits_that_depend_on_coordinates_hold():
     tracker = Tracker(model, [seen], uncertainty={"a": 10.0, "b": 10.0})
     for _ in range(3):
         estimate = tracker.update({"z": [0.9, 0.3]})
-    # The nearest point of a = 0.2 + 0.8 b.
+    # The nearest point on the line a = 0.2 + 0.8 b.
     along = np.array([0.8, 1.0]) / np.hypot(0.8, 1.0)
     wanted = np.array([0.2, 0.0]) + along * (along @ (np.array([0.9, 0.3]) - [0.2, 0.0]))
     assert [estimate.state["a"], estimate.state["b"]] == pytest.approx(wanted.tolist(), abs=1e-4)
@@ -342,7 +342,7 @@ def test_compiled_and_numpy_updates_agree_on_inliers():
 @pytest.mark.compiler
 @pytest.mark.parametrize("gross", [0.1, 1.0])
 def test_compiled_and_numpy_updates_agree_on_outliers(gross, monkeypatch):
-    """Small outliers are ambiguous, which is left to numpy; large ones never are, once something is known."""
+    """Small outliers are ambiguous and left to numpy; large ones are not after some updates."""
     model = kv.load("kitchen")
     observer = NoisyObserver(model, [f for f in model.frames if model.speeds_of(f)], 0.02, np.radians(2))
     observed = [ObservedPose(f, covariance=observer.covariance) for f in observer.frames]
@@ -435,7 +435,7 @@ def test_solve_bounded_qp_equals_nonnegative_least_squares():
         x = solve_bounded_qp(np.linalg.inv(A), g, rows, low, high)
         assert (rows @ x >= low - 1e-8).all()
         assert (rows @ x <= high + 1e-8).all()
-        # Karush, Kuhn and Tucker: the gradient is made of active rows, with the right signs.
+        # Karush-Kuhn-Tucker: the gradient is a combination of active rows with the correct signs.
         gradient = A @ x + g
         at_low, at_high = np.abs(rows @ x - low) < 1e-8, np.abs(rows @ x - high) < 1e-8
         normals = np.concatenate([rows[at_low], -rows[at_high]])

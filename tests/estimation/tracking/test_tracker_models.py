@@ -148,7 +148,7 @@ def test_positions_and_expressions_from_a_moving_camera_are_tracked():
     ],
 )
 def test_redundant_coordinates_and_multi_turn_joints_are_tracked(name, truth):
-    """Wheels that are seen to turn, threads of many turns, quaternions within a cone, closed loops."""
+    """Observed wheels, screws of many turns, quaternions within a cone, closed loops."""
     model = kv.load(f"articulations/{name}")
     observer = NoisyObserver(model, moving(model))
     tracker = Tracker(model, observer.frames)
@@ -191,7 +191,7 @@ def test_unknown_camera_pose_is_estimated_from_static_frames():
 
 @pytest.mark.parametrize("name", ["bare", "drawn"])
 def test_periodic_dial_is_tracked_beyond_a_turn(name):
-    """A turntable goes round twice, and its dial says so within a turn; C and numpy alike."""
+    """A turntable turns twice, and its dial wraps after a turn; in C and numpy."""
     model = kv.Model()
     with model.edit() as edit:
         edit.apply(kv.Continuous(name="q", parent="world", child="plate"))

@@ -37,7 +37,7 @@ def fisher_information(observer, state, symbols, deviations):
 @pytest.mark.compiler
 @pytest.mark.parametrize(("position", "degrees"), [(0.01, 1), (0.05, 5), (0.1, 10)])
 def test_kitchen_is_consistent_and_efficient(position, degrees):
-    """Consistent, and as good as can be: on 920 coordinates the mean of squares varies by 5 %."""
+    """NEES near 1 and errors near the bound; on 920 coordinates the sample mean varies by 5 %."""
     model = kv.load("kitchen")
     frames = [f for f in model.frames if model.speeds_of(f)]
     observer = NoisyObserver(model, frames, position, np.radians(degrees), seed=degrees)
@@ -95,7 +95,7 @@ def test_covariance_of_a_free_body_equals_the_sample_covariance():
 
 
 def test_process_noise_on_wheels_is_consistent():
-    """Process noise enters by the rates: a robot that drives knows how far off it may be, sideways too."""
+    """Process noise enters through the rates, so the lateral error of a driving base is consistent."""
     model = kv.Model()
     with model.edit() as edit:
         edit.apply(
@@ -156,7 +156,7 @@ def test_outliers_and_occlusion_are_tracked_consistently():
 
 
 def test_first_measurement_as_outlier_is_corrected():
-    """A free body fits any pose. The second observation contradicts the first, and the third decides."""
+    """A free body fits any pose: the second observation contradicts the first, the third decides."""
     model = kv.Model()
     with model.edit() as edit:
         edit.apply(kv.Floating(name="box", parent="world", child="box"))
@@ -199,7 +199,7 @@ def test_hypothesis_bank_tells_hinge_from_drawer():
 @pytest.mark.compiler
 @pytest.mark.parametrize("is_compiled", [True, False])
 def test_evidence_counts_limits(is_compiled):
-    """The evidence is that inside the limits: compared with an integral over them, it is off by one at most."""
+    """The evidence inside the limits differs from its integral by one at most."""
     seen = [0.09, 0.11, 0.1]
     found, exact = {}, {}
     for lower in (0.0, 0.08, 0.25):
@@ -284,7 +284,7 @@ def make_vehicle(points):
 
 @pytest.mark.parametrize("seed", range(4))
 def test_one_point_of_a_body_leaves_its_angle_unknown(seed):
-    """States are possible on a ring; its tangents at two places must not pass for two observations."""
+    """The states form a ring; its tangents at two points must not count as two observations."""
     model, tracker = make_vehicle({"p": (0.1, 0.2, 0.3)})
     rng = np.random.default_rng(seed)
     truth = {"b/x": rng.normal(), "b/y": rng.normal(), "b/angle": rng.uniform(-3, 3)}

@@ -247,5 +247,5 @@ class KnownMotion:
         return result
 
     def prior(self) -> ParameterPrior:
-        """Return that nothing is believed beforehand."""
+        """Return the empty prior of no parameters."""
         return ParameterPrior(np.zeros(0), np.zeros((0, 0)))

@@ -86,6 +86,8 @@ def find_testable_joints(model: Model, observed: Iterable[str], relative_to: str
 
 
 class _Finder:
+    """Search for testable pairs of observed frames."""
+
     def __init__(self, model: Model, frames: list[str], exact: str | None) -> None:
         self.model = model
         self.exact = exact
