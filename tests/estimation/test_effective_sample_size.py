@@ -1,4 +1,4 @@
-"""Of rows whose errors are alike, so many are kept as tell something of their own."""
+"""Effective sample size of autocorrelated residuals."""
 
 from __future__ import annotations
 
@@ -8,31 +8,31 @@ import pytest
 from kineverse.estimation.recordings import effective_sample_size
 
 
-def errors(count: int, alike: float, seed: int) -> np.ndarray:
-    """Return errors (count, 6) with the autocorrelation alike^k."""
+def errors(count: int, correlation: float, seed: int) -> np.ndarray:
+    """Return errors (count, 6) with the autocorrelation ``correlation``^k."""
     random = np.random.default_rng(seed)
     result = random.normal(size=(count, 6))
     for k in range(1, count):
-        result[k] = alike * result[k - 1] + np.sqrt(1.0 - alike**2) * result[k]
+        result[k] = correlation * result[k - 1] + np.sqrt(1.0 - correlation**2) * result[k]
     return result
 
 
-def test_independent_errors_are_all_kept() -> None:
+def test_independent_errors_count_fully() -> None:
     kept = [effective_sample_size(errors(300, 0.0, seed)) for seed in range(20)]
     assert np.median(kept) == 300
 
 
-@pytest.mark.parametrize("alike", [0.5, 0.8])
-def test_a_known_correlation_is_measured(alike: float) -> None:
-    kept = [effective_sample_size(errors(4000, alike, seed)) for seed in range(5)]
-    # The slowest of six components counts, so it is rather fewer.
-    assert np.mean(kept) == pytest.approx(4000 * (1 - alike) / (1 + alike), rel=0.2)
+@pytest.mark.parametrize("correlation", [0.5, 0.8])
+def test_known_correlation_is_estimated(correlation: float) -> None:
+    kept = [effective_sample_size(errors(4000, correlation, seed)) for seed in range(5)]
+    # The component with the largest correlation time counts, so the size is smaller.
+    assert np.mean(kept) == pytest.approx(4000 * (1 - correlation) / (1 + correlation), rel=0.2)
 
 
-def test_one_component_is_enough_and_one_wrong_pose_is_not() -> None:
+def test_one_correlated_component_counts_and_one_outlier_does_not() -> None:
     slow = errors(400, 0.0, 1)
     slow[:, 2] = np.sin(np.linspace(0, 6, 400))
-    # Two bumps say little, however many rows they have.
+    # Two bumps hold little information in any number of rows.
     assert effective_sample_size(slow) == 8
     jump = errors(400, 0.0, 2)
     jump[17] = 1e6

@@ -1,4 +1,4 @@
-"""Tables of poses: what was written is read, whatever the form, and what cannot be is named with its line."""
+"""Reading of pose tables in every form, and refusals that name the line."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ ORIENTATIONS = {
 }
 
 
-def written(tmp_path, text, name="poses.csv"):
+def write_table(tmp_path, text, name="poses.csv"):
     path = tmp_path / name
     path.write_bytes(text if isinstance(text, bytes) else text.encode())
     return path
 
 
-def poses_of(seed, count=6):
+def random_poses(seed, count=6):
     rng = np.random.default_rng(seed)
     poses = np.tile(np.eye(4), (count, 1, 1))
     poses[:, :3, :3] = Rotation.random(count, rng=rng).as_matrix()
@@ -35,7 +35,7 @@ def poses_of(seed, count=6):
     return poses
 
 
-def numbers_of(poses, form):
+def pose_columns(poses, form):
     return np.column_stack([poses[:, :3, 3], ORIENTATIONS[form](Rotation.from_matrix(poses[:, :3, :3]))])
 
 
@@ -48,10 +48,10 @@ def numbers_of(poses, form):
     wide=st.booleans(),
     timed=st.booleans(),
 )
-def test_poses_come_back_from_every_form(tmp_path_factory, seed, form, separator, ending, wide, timed):
-    truth = {"a/frame": poses_of(seed), "door": poses_of(seed + 1)}
+def test_poses_are_read_in_every_form(tmp_path_factory, seed, form, separator, ending, wide, timed):
+    truth = {"a/frame": random_poses(seed), "door": random_poses(seed + 1)}
     names = ["x", "y", "z", *form.split(",")]
-    numbers = {part: numbers_of(poses, form).tolist() for part, poses in truth.items()}
+    numbers = {part: pose_columns(poses, form).tolist() for part, poses in truth.items()}
     rows = []
     for k in range(6):
         time = [0.1 * k] if timed else []
@@ -62,76 +62,76 @@ def test_poses_come_back_from_every_form(tmp_path_factory, seed, form, separator
     named = [f"{p}.{n}" for p in truth for n in names] if wide else ["part", *names]
     head = ["time", *named] if timed else named
     text = ending.join(separator.join(map(str, row)) for row in [head, *rows])
-    recording = read_recording(written(tmp_path_factory.mktemp("table"), text))
+    recording = read_recording(write_table(tmp_path_factory.mktemp("table"), text))
     for part, poses in truth.items():
         np.testing.assert_allclose(recording.tracks[part].poses, poses, atol=1e-12)
     pair = recording.pair("a/frame", "door")
     np.testing.assert_allclose(pair.parent_poses, truth["a/frame"], atol=1e-12)
     np.testing.assert_allclose(pair.child_poses, truth["door"], atol=1e-12)
-    assert pair.alone == 0
+    assert pair.unpaired == 0
 
 
-def test_without_names_three_columns_are_positions_and_seven_are_poses(tmp_path):
-    pair = read_recording(written(tmp_path, "1 2 3\n4 5 6\n\n")).pair()
+def test_table_without_head_has_positions_or_poses(tmp_path):
+    pair = read_recording(write_table(tmp_path, "1 2 3\n4 5 6\n\n")).pair()
     assert (pair.parent, pair.child, pair.parent_poses) == ("world", "part", None)
     np.testing.assert_array_equal(pair.child_poses, [[1, 2, 3], [4, 5, 6]])
-    turned = read_recording(written(tmp_path, "# a half turn\n1,2,3,0,0,1,0\n")).tracks[""]
+    turned = read_recording(write_table(tmp_path, "# a half turn\n1,2,3,0,0,1,0\n")).tracks[""]
     np.testing.assert_allclose(turned.poses[0, :3, :3], np.diag([-1, -1, 1]), atol=1e-15)
     np.testing.assert_array_equal(turned.lines, [2])
 
 
-def test_columns_can_be_said(tmp_path):
-    table = written(tmp_path, "0.1\t 1 2 3  77\n0.2\t 4 5 6  78\n")
+def test_columns_argument_replaces_the_head(tmp_path):
+    table = write_table(tmp_path, "0.1\t 1 2 3  77\n0.2\t 4 5 6  78\n")
     track = read_recording(table, "time [ms],x [mm],y [cm],z,-").tracks[""]
     np.testing.assert_allclose(track.poses, [[0.001, 0.02, 3], [0.004, 0.05, 6]])
     np.testing.assert_allclose(track.times, [1e-4, 2e-4])
-    headed = read_recording(written(tmp_path, "a;b;c\n1;2;3\n"), ["z", "y", "x"])
+    headed = read_recording(write_table(tmp_path, "a;b;c\n1;2;3\n"), ["z", "y", "x"])
     np.testing.assert_array_equal(headed.tracks[""].poses, [[3, 2, 1]])
 
 
-def test_what_was_not_seen_is_left_out_and_counted(tmp_path):
-    table = written(tmp_path, "time,A.x,A.y,A.z,A.rx,A.ry,A.rz,B.x,B.y,B.z\n" + "0,1,2,3,0,0,0,,,\n"
+def test_missing_parts_are_left_out_and_counted(tmp_path):
+    table = write_table(tmp_path, "time,A.x,A.y,A.z,A.rx,A.ry,A.rz,B.x,B.y,B.z\n" + "0,1,2,3,0,0,0,,,\n"
                     "1,1,2,3,0,0,0,4,5,6\n2,,,,,,,4,5,6\n")  # fmt: skip
     recording = read_recording(table)
     assert [len(recording.tracks[part]) for part in "AB"] == [2, 2]
     pair = recording.pair("A", "B")
-    assert (len(pair.child_poses), pair.alone, pair.lines.tolist()) == (1, 2, [3])
+    assert (len(pair.child_poses), pair.unpaired, pair.lines.tolist()) == (1, 2, [3])
     assert len(recording.pair(child="B").child_poses) == 2
 
 
-def test_parts_in_rows_without_times_belong_together_in_their_order(tmp_path):
+def test_rows_without_times_pair_in_order(tmp_path):
     rows = "\n".join(f"{part},{k},0,0,0,0,0,1" for k in range(3) for part in ("A", "B"))
-    pair = read_recording(written(tmp_path, "part,x,y,z,qx,qy,qz,qw\n" + rows)).pair("A", "B")
+    pair = read_recording(write_table(tmp_path, "part,x,y,z,qx,qy,qz,qw\n" + rows)).pair("A", "B")
     np.testing.assert_array_equal(pair.parent_poses, pair.child_poses)
     assert len(pair.parent_poses) == 3
 
 
-def test_a_single_part_may_have_any_name(tmp_path):
-    recording = read_recording(written(tmp_path, "1 2 3\n4 5 7\n"))
+def test_single_part_takes_any_name(tmp_path):
+    recording = read_recording(write_table(tmp_path, "1 2 3\n4 5 7\n"))
     assert recording.pair(child="door").child == "door"
 
 
 @pytest.mark.parametrize("column", ["part", "name", "link", "body", "object", "frame", "child_frame_id"])
-def test_the_column_of_parts_has_several_names(column, tmp_path):
-    recording = read_recording(written(tmp_path, f"t,{column},x,y,z\n0,wall,1,0,0\n0,door,2,0,0\n"))
+def test_part_column_has_synonyms(column, tmp_path):
+    recording = read_recording(write_table(tmp_path, f"t,{column},x,y,z\n0,wall,1,0,0\n0,door,2,0,0\n"))
     assert recording.ignored == ()
     assert set(recording.tracks) == {"wall", "door"}
 
 
-def test_a_part_called_world_is_a_part(tmp_path):
+def test_part_named_world_is_a_part(tmp_path):
     recording = read_recording(
-        written(tmp_path, "part,x,y,z,rx,ry,rz\nworld,1,0,0,0,0,0\ndoor,2,0,0,0,0,0\n")
+        write_table(tmp_path, "part,x,y,z,rx,ry,rz\nworld,1,0,0,0,0,0\ndoor,2,0,0,0,0,0\n")
     )
     pair = recording.pair(child="door")
     assert pair.parent_poses[0, 0, 3] == 1
 
 
-def test_columns_that_mean_nothing_are_named(tmp_path):
-    assert read_recording(written(tmp_path, "x,y,z,confidence\n1,2,3,0.5\n")).ignored == ("confidence",)
+def test_unknown_columns_are_listed(tmp_path):
+    assert read_recording(write_table(tmp_path, "x,y,z,confidence\n1,2,3,0.5\n")).ignored == ("confidence",)
 
 
-def test_quaternions_of_two_digits_are_good_enough(tmp_path):
-    track = read_recording(written(tmp_path, "0 0 0 0 0 0.71 0.71\n")).tracks[""]
+def test_quaternions_of_two_digits_are_accepted(tmp_path):
+    track = read_recording(write_table(tmp_path, "0 0 0 0 0 0.71 0.71\n")).tracks[""]
     np.testing.assert_allclose(track.poses[0, :3, :3], [[0, -1, 0], [1, 0, 0], [0, 0, 1]], atol=1e-12)
 
 
@@ -174,9 +174,9 @@ BAD = {
 
 
 @pytest.mark.parametrize("case", BAD)
-def test_what_cannot_be_read_is_said_with_its_line(case, tmp_path):
+def test_malformed_table_is_refused_with_its_line(case, tmp_path):
     text, says = BAD[case]
-    path = tmp_path / "poses.csv" if text is None else written(tmp_path, text)
+    path = tmp_path / "poses.csv" if text is None else write_table(tmp_path, text)
     with pytest.raises(FormatError, match=says) as caught:
         read_recording(path)
     assert "poses.csv" in str(caught.value)
@@ -186,14 +186,14 @@ def test_what_cannot_be_read_is_said_with_its_line(case, tmp_path):
     ("columns", "says"),
     [("x,y", "2 names were given"), ("x,y,y", "'y' is there twice"), ("x,y,time", "has no column z")],
 )
-def test_names_that_do_not_fit_are_refused(columns, says, tmp_path):
+def test_invalid_column_names_are_refused(columns, says, tmp_path):
     with pytest.raises(FormatError, match=says):
-        read_recording(written(tmp_path, "1 2 3\n"), columns)
+        read_recording(write_table(tmp_path, "1 2 3\n"), columns)
 
 
-def test_wrong_parts_are_refused(tmp_path):
+def test_unknown_parts_are_refused(tmp_path):
     rows = "0,table,1,2,3\n1,door,1,2,3\n2,lid,1,2,3\n"
-    recording = read_recording(written(tmp_path, LONG + rows))
+    recording = read_recording(write_table(tmp_path, LONG + rows))
     with pytest.raises(UnknownNameError, match="Did you mean 'door'"):
         recording.pair(child="dor")
     with pytest.raises(UnknownNameError, match=r"has no part 'tabel'\. Did you mean 'table'"):
@@ -206,43 +206,43 @@ def test_wrong_parts_are_refused(tmp_path):
         recording.pair("table", "door")
 
 
-def test_parts_that_were_never_seen_together_are_refused(tmp_path):
+def test_parts_never_observed_together_are_refused(tmp_path):
     rows = "0,table,1,2,3,0,0,0\n1,door,1,2,3,0,0,0\n"
-    recording = read_recording(written(tmp_path, "time,part,x,y,z,rx,ry,rz\n" + rows))
+    recording = read_recording(write_table(tmp_path, "time,part,x,y,z,rx,ry,rz\n" + rows))
     with pytest.raises(FormatError, match="never seen at the same time"):
         recording.pair("table", "door")
 
 
-def test_a_table_without_names_is_one_part_in_the_world(tmp_path):
+def test_table_without_names_is_one_part_in_the_world(tmp_path):
     with pytest.raises(UnknownNameError, match=r"names no parts.*no 'table'"):
-        read_recording(written(tmp_path, "1 2 3\n4 5 7\n")).pair("table", "door")
+        read_recording(write_table(tmp_path, "1 2 3\n4 5 7\n")).pair("table", "door")
 
 
-def test_relative_poses_are_those_in_the_parent(tmp_path):
-    a, b = poses_of(1), poses_of(2)
-    rows = [[*x, *y] for x, y in zip(numbers_of(a, "rx,ry,rz"), numbers_of(b, "rx,ry,rz"), strict=True)]
+def test_relative_poses_are_in_the_parent_frame(tmp_path):
+    a, b = random_poses(1), random_poses(2)
+    rows = [[*x, *y] for x, y in zip(pose_columns(a, "rx,ry,rz"), pose_columns(b, "rx,ry,rz"), strict=True)]
     head = ",".join(f"{part}.{name}" for part in "AB" for name in ("x", "y", "z", "rx", "ry", "rz"))
     text = "\n".join([head, *(",".join(map(str, row)) for row in rows)])
-    recording = read_recording(written(tmp_path, text))
+    recording = read_recording(write_table(tmp_path, text))
     np.testing.assert_allclose(recording.pair("A", "B").relative, np.linalg.inv(a) @ b, atol=1e-12)
-    positions = read_recording(written(tmp_path, text), ",".join([*head.split(",")[:9], "-", "-", "-"])).pair(
-        "A", "B"
-    )
+    positions = read_recording(
+        write_table(tmp_path, text), ",".join([*head.split(",")[:9], "-", "-", "-"])
+    ).pair("A", "B")
     np.testing.assert_allclose(positions.relative, (np.linalg.inv(a) @ b)[:, :3, 3], atol=1e-12)
 
 
-def test_thinned_recordings_keep_both_ends_and_their_pairs(tmp_path):
-    pair = read_recording(written(tmp_path, "\n".join(f"{k} 0 0" for k in range(100)))).pair()
-    few = pair.thinned(5)
+def test_thin_keeps_both_ends_and_pairs(tmp_path):
+    pair = read_recording(write_table(tmp_path, "\n".join(f"{k} 0 0" for k in range(100)))).pair()
+    few = pair.thin(5)
     np.testing.assert_array_equal(few.child_poses[:, 0], [0, 25, 50, 74, 99])
     np.testing.assert_array_equal(few.lines, [1, 26, 51, 75, 100])
-    assert len(pair.thinned(1000).child_poses) == 100
+    assert len(pair.thin(1000).child_poses) == 100
     with pytest.raises(InvalidValueError, match="at least two"):
-        pair.thinned(1)
+        pair.thin(1)
 
 
-def test_a_rotation_vector_of_any_length_is_read(tmp_path):
+def test_rotation_vector_of_any_length_is_read(tmp_path):
     for angle in (0.0, 1e-12, math.pi, 7.0):
-        table = written(tmp_path, f"x,y,z,rx,ry,rz\n0,0,0,0,{angle},0\n")
+        table = write_table(tmp_path, f"x,y,z,rx,ry,rz\n0,0,0,0,{angle},0\n")
         expected = Rotation.from_rotvec([0, angle, 0]).as_matrix()
         np.testing.assert_allclose(read_recording(table).tracks[""].poses[0, :3, :3], expected, atol=1e-12)

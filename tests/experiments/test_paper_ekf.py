@@ -1,4 +1,4 @@
-"""The papers' own filter: its equations, written out here a second time, and what it refuses."""
+"""The papers' filter: its equations, implemented a second time, and its refusals."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ HINGE = ("door", "handle")
 
 @pytest.fixture(scope="module")
 def furniture():
-    """A door with a handle, a drawer within a drawer, a knob that turns for ever, and a wall."""
+    """Return a door with a handle, a drawer within a drawer, a knob without limits, and a wall."""
     model = kv.Model()
     with model.edit() as edit:
         edit.apply(kv.Revolute(name="door", parent="world", child="door", axis=(0, 0, 1), lower=0, upper=1.5))
@@ -65,12 +65,12 @@ def entries_of(two):
 
 
 def door_slopes(q):
-    """Return their derivatives, exactly: the noise is so ill-conditioned that a difference quotient would show."""
+    """Return their exact derivatives: the noise is too ill-conditioned for difference quotients."""
     c, s = math.cos(q), math.sin(q)
     return np.array([-s, -c, c, -s, -s, -c, -0.1 * s - 0.6 * c, c, -s, 0.1 * c - 0.6 * s])
 
 
-def test_a_hinge_is_filtered_as_published(furniture):
+def test_hinge_follows_the_published_equations(furniture):
     rng = np.random.default_rng(1)
     published = PaperEkf(furniture, HINGE)
     training = seen(poses(furniture, HINGE, door=0.3), rng, 400)
@@ -102,7 +102,7 @@ def test_a_hinge_is_filtered_as_published(furniture):
     assert q == pytest.approx(1.2, abs=0.05)
 
 
-def test_drawers_on_drawers_are_one_linear_group(furniture):
+def test_nested_drawers_equal_weighted_least_squares(furniture):
     rng = np.random.default_rng(2)
     frames = ("inner", "drawer")
     published = PaperEkf(furniture, frames, steps=0)
@@ -124,8 +124,8 @@ def test_drawers_on_drawers_are_one_linear_group(furniture):
     assert published.covariance == pytest.approx(np.linalg.inv(information))
 
 
-def test_only_entries_that_move_are_observed(furniture):
-    """What is wrong in the others makes no difference."""
+def test_constant_entries_are_ignored(furniture):
+    """Errors in constant entries make no difference."""
     rng = np.random.default_rng(3)
     frames = ("drawer", "door")
     one, other = (PaperEkf(furniture, frames) for _ in range(2))
@@ -147,7 +147,7 @@ def test_frames_that_share_coordinates_form_a_group_in_any_order(furniture, orde
     assert groups == {("door",), ("drawer", "inner")} | ({("knob",)} if "knob" in order else set())
 
 
-def test_groups_do_not_see_each_other(furniture):
+def test_groups_are_independent(furniture):
     rng = np.random.default_rng(4)
     frames = ("door", "drawer", "handle", "knob")
     both, alone = PaperEkf(furniture, frames), PaperEkf(furniture, HINGE)
@@ -162,7 +162,7 @@ def test_groups_do_not_see_each_other(furniture):
     assert np.count_nonzero(both.covariance) == 3
 
 
-def test_copies_are_so_many_filters(furniture):
+def test_copies_equal_separate_filters(furniture):
     rng = np.random.default_rng(5)
     frames = ("door", "inner", "drawer")
     side_by_side = PaperEkf(furniture, frames, copies=3)
@@ -178,14 +178,14 @@ def test_copies_are_so_many_filters(furniture):
     np.testing.assert_allclose(side_by_side.covariance, [f.covariance for f in alone], rtol=1e-9)
 
 
-def test_it_starts_in_the_middle_of_the_limits(furniture):
+def test_start_is_the_middle_of_the_limits(furniture):
     published = PaperEkf(furniture, ("door", "knob"))
     np.testing.assert_allclose(published.limits, [[0, 1.5], [-math.pi, math.pi]])
     np.testing.assert_allclose(published.q, [0.75, 0])
     np.testing.assert_allclose(published.covariance, np.diag([0.75**2, math.pi**2]))
 
 
-def test_reset_forgets_all_but_the_noise(furniture):
+def test_reset_keeps_only_the_noise(furniture):
     rng = np.random.default_rng(6)
     published = PaperEkf(furniture, HINGE)
     true = poses(furniture, HINGE, door=1.0)
@@ -242,7 +242,7 @@ def test_invalid_observations_are_refused_without_effect(furniture):
     np.testing.assert_array_equal(published.covariance, covariance)
 
 
-def test_noise_with_directions_of_none_makes_the_innovation_singular(furniture):
+def test_singular_innovation_covariance_is_refused(furniture):
     published = PaperEkf(furniture, HINGE)
     true = poses(furniture, HINGE, door=1.0)
     published.learn_noise([true, true])
@@ -253,7 +253,7 @@ def test_noise_with_directions_of_none_makes_the_innovation_singular(furniture):
         published.learn_noise([true])
 
 
-def test_a_step_to_where_the_model_means_nothing_is_refused():
+def test_step_beyond_the_model_is_refused():
     """The published garage door has no angle beyond a = 2."""
     model = kv.Model()
     with model.edit() as edit:
@@ -266,7 +266,7 @@ def test_a_step_to_where_the_model_means_nothing_is_refused():
     assert published.q == pytest.approx([1.0])
 
 
-def test_frames_must_say_something(furniture):
+def test_frames_without_coordinates_are_refused(furniture):
     with pytest.raises(ModelError, match="'wall' depends on no coordinate"):
         PaperEkf(furniture, ["door", "wall"])
     with pytest.raises(UnknownNameError, match="handle"):

@@ -63,7 +63,7 @@ def test_speeds_and_estimates() -> None:
         model.integrate(state, {"elsewhere:velocity": 1.0}, 2.0)
     with pytest.raises(kv.errors.DuplicateNameError, match="There are two values for 'kitchen/a:velocity'"):
         model.integrate(state, {"kitchen/a:velocity": 1.0, a.derivative(): 2.0}, 2.0)
-    tracker = Tracker(model, "kitchen/drawer", known="kitchen/a", start={"kitchen/b": 0.2})
+    tracker = Tracker(model, "kitchen/drawer", inputs="kitchen/a", start={"kitchen/b": 0.2})
     assert list(map(str, tracker.symbols)) == ["kitchen/b"]
     with pytest.raises(kv.errors.UnknownNameError, match="'drawer' is not estimated"):
         Tracker(model, "kitchen/drawer", start={"drawer": 0.2})

@@ -115,10 +115,10 @@ def run(arguments: argparse.Namespace) -> int:
         names = ", ".join(recording.ignored)
         print(f"kineverse: note: columns that mean nothing here: {names}", file=sys.stderr)
     pair = recording.pair(arguments.parent, arguments.child)
-    if pair.alone:
-        print(f"kineverse: note: {pair.alone} poses of one part without the other", file=sys.stderr)
+    if pair.unpaired:
+        print(f"kineverse: note: {pair.unpaired} poses of one part without the other", file=sys.stderr)
     if arguments.thin is not None:
-        pair = pair.thinned(arguments.thin)
+        pair = pair.thin(arguments.thin)
     with show_activity(f"learning from {len(pair.lines)} poses"):
         learned = fit_joint(pair, stated, arguments.families, arguments.thin is None)
     written = write_results(arguments, pair, learned)
@@ -197,10 +197,12 @@ def fit_joint(
     if count == len(pair.lines):
         return LearnedJoint(found, noise, count, found.best)
     judged = spaced_indices(len(pair.lines), count)
-    found, noise = identify_joint(pair.at(judged), stated, families)
+    found, noise = identify_joint(pair.select(judged), stated, families)
     covariance = make_covariance(noise.position, noise.orientation)
     seen = check_observations(pair.parent_poses, pair.child_poses, covariance, covariance)
-    fit = complete_fit(found.best, seen, judged, outliers=Outliers(), stated=noise.given, ordered=pair.timed)
+    fit = complete_fit(
+        found.best, seen, judged, outliers=Outliers(), stated=noise.given, ordered=pair.is_timed
+    )
     return LearnedJoint(found, noise, count, fit)
 
 
@@ -219,7 +221,7 @@ def identify_joint(
     from kineverse.estimation import identify
     from kineverse.estimation.identification.identify import UNKNOWN_NOISE
 
-    if stated is not None and stated[1] is None and pair.is_whole:
+    if stated is not None and stated[1] is None and pair.has_orientation:
         raise InvalidValueError("--noise: poses have two, of positions and orientations: 3mm,1deg")
     chosen = None if families is None else [name.strip() for name in families.split(",")]
     covariance = None if stated is None else make_covariance(*stated)
@@ -229,10 +231,12 @@ def identify_joint(
         noise=covariance,
         families=chosen,
         outliers=True,
-        ordered=pair.timed,
+        ordered=pair.is_timed,
     )
     position, orientation = stated or (found.noise_scale * one for one in UNKNOWN_NOISE)
-    return found, ObservationNoise(position, orientation if pair.is_whole else None, stated is not None)
+    return found, ObservationNoise(
+        position, orientation if pair.has_orientation else None, stated is not None
+    )
 
 
 def make_covariance(position: float, orientation: float | None) -> Array:
@@ -255,7 +259,9 @@ def count_independent(found: IdentificationResult, pair: RecordedPair) -> int:
     right = len(fit.right)
     judged = min(count, round(effective_sample_size(fit.residuals[fit.right]) * count / right))
     # And enough to count turns.
-    while pair.timed and judged < count and fit.at(spaced_indices(count, judged)).turned > MAX_ROTATION_STEP:
+    while (
+        pair.is_timed and judged < count and fit.at(spaced_indices(count, judged)).turned > MAX_ROTATION_STEP
+    ):
         judged += 1
     return judged
 
@@ -273,5 +279,5 @@ def write_results(arguments: argparse.Namespace, pair: RecordedPair, learned: Le
     if arguments.document:
         from kineverse.cli.fit_output import make_joint_model
 
-        make_joint_model(pair.at(fit.right), fit).save(arguments.document)
+        make_joint_model(pair.select(fit.right), fit).save(arguments.document)
     return {"picture": arguments.picture, "document": arguments.document}

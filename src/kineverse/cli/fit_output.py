@@ -128,7 +128,7 @@ def _revolution_warning(fit: Fit, pair: RecordedPair) -> list[str]:
     """Return that turns may have been counted wrongly."""
     from kineverse.cli.fit import MAX_ROTATION_STEP
 
-    if not pair.timed or fit.turned < MAX_ROTATION_STEP:
+    if not pair.is_timed or fit.turned < MAX_ROTATION_STEP:
         return []
     most = format_number(math.degrees(fit.turned), 3)
     return [f"  from one to the next it turns by up to {most} deg: it may be more turns, or fewer"]

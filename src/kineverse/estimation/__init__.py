@@ -1,8 +1,8 @@
-"""Layer 5: where things are, from noisy observations, and how they move.
+"""Estimation: state tracking, model identification and plausibility of models.
 
-:mod:`kineverse.estimation.tracking` estimates the state of a model that is known,
-:mod:`kineverse.estimation.identification` the model of parts whose poses are known, and
-:mod:`kineverse.estimation.plausibility` says whether a model explains what is seen.
+:mod:`kineverse.estimation.tracking` estimates the state of a known model,
+:mod:`kineverse.estimation.identification` identifies joints between observed frames, and
+:mod:`kineverse.estimation.plausibility` tests a model against observations. Layer 5.
 """
 
 from kineverse._synonyms import MODULE_SYNONYMS, unknown_attribute_error

@@ -1,26 +1,56 @@
-"""Inverses, products and determinants of stacks of small matrices."""
+"""Inverses, products and determinants of small matrices and of stacks of them."""
 
 from __future__ import annotations
 
 import numpy as np
 
-from kineverse.lie import Stack
+from kineverse.errors import InvalidValueError
+from kineverse.lie import Array
 
 
-def invert_matrices(matrices: Stack) -> Stack:
-    """Return the inverses of positive definite matrices."""
+def invert_matrices(matrices: Array) -> Array:
+    """Invert a stack of positive definite matrices."""
     size = matrices.shape[-1]
     if size == 1:
         return 1.0 / matrices
     return np.asarray(np.linalg.inv(matrices), dtype=np.float64)
 
 
-def multiply_vectors(matrices: Stack, vectors: Stack) -> Stack:
-    """Return the products of matrices (..., m, n) and vectors (..., n)."""
-    result: Stack = (matrices @ vectors[..., None])[..., 0]
+def multiply_vectors(matrices: Array, vectors: Array) -> Array:
+    """Multiply matrices (..., m, n) by vectors (..., n)."""
+    result: Array = (matrices @ vectors[..., None])[..., 0]
     return result
 
 
-def sum_log_determinants(matrices: Stack) -> float:
-    """Return the sum of the logarithms of the determinants of positive definite matrices."""
-    return float(np.sum(np.linalg.slogdet(matrices)[1]))
+def log_determinants(matrices: Array) -> Array:
+    """Return the log determinants of positive definite matrices."""
+    result: Array = np.linalg.slogdet(matrices)[1]
+    return result
+
+
+def sum_log_determinants(matrices: Array) -> float:
+    """Sum the log determinants of positive definite matrices."""
+    return float(np.sum(log_determinants(matrices)))
+
+
+def symmetric(matrix: Array) -> Array:
+    """Return the symmetric part ½ (A + Aᵀ), which removes rounding errors."""
+    return (matrix + matrix.T) / 2
+
+
+def inverse_spd(matrix: Array) -> Array:
+    """Return the symmetric inverse of a positive definite matrix.
+
+    Raises
+    ------
+    InvalidValueError
+        If it is numerically singular.
+    """
+    try:
+        np.linalg.cholesky(matrix)
+        return symmetric(np.asarray(np.linalg.inv(matrix), dtype=np.float64))
+    except np.linalg.LinAlgError:
+        raise InvalidValueError(
+            "Some directions are known so much better than others that floating point cannot hold both: a "
+            "covariance that was handed in is far too small, or an uncertainty far too large."
+        ) from None

@@ -1,9 +1,8 @@
 """Convention for pose errors and their covariance.
 
-A measured pose is ``(p + δp, Exp(δθ) R)`` for a true position p and orientation R: both errors are written in
-the axes of the frame in which the pose was measured, linear part first, as the rows of
-``model.jacobian(frame, relative_to, form="world_aligned")`` are. This is also what ROS means by a
-``PoseWithCovariance``.
+A measured pose is ``(p + δp, Exp(δθ) R)`` for the true position p and orientation R. Both errors are written
+in the axes of the observing frame, linear part first, like the rows of ``model.jacobian(frame, relative_to,
+form="world_aligned")``. ROS uses the same convention in ``PoseWithCovariance``.
 """
 
 from __future__ import annotations
@@ -20,14 +19,14 @@ if TYPE_CHECKING:
 
 
 def pose_covariance(position: float, orientation: float) -> Array:
-    """Return the covariance of a pose whose errors have no preferred direction: diag(σp² I, σr² I), 6×6.
+    """Return the covariance of a pose with isotropic errors: diag(σp² I, σr² I), 6×6.
 
     Parameters
     ----------
     position
-        The standard deviation of each of the three coordinates [m].
+        Standard deviation of each of the three coordinates [m].
     orientation
-        The standard deviation of each of the three components of the rotation vector [rad].
+        Standard deviation of each of the three components of the rotation vector [rad].
 
     Raises
     ------

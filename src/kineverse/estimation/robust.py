@@ -13,28 +13,31 @@ from kineverse.errors import InvalidValueError
 if TYPE_CHECKING:
     from .tracking.measurements import MeasurementModel
 
-# So much rotation there is: the volume of SO(3) in rotation vectors [rad³].
-_ROTATIONS = 8 * math.pi**2
+CHI_SQUARED_6 = 22.5
+"""Quantile of χ² with six degrees of freedom that is exceeded once in a thousand."""
+
+# Volume of SO(3) in rotation vectors [rad³].
+_ROTATION_VOLUME = 8 * math.pi**2
 
 
 @dataclass(frozen=True)
 class Outliers:
-    """How often observations are wrong, and where they are then: anywhere.
+    """Outlier model: a mixture of the noise density and a uniform density.
 
-    An observation with the density N of the noise is right with the probability
+    A measurement with the noise density N is an inlier with the probability
 
         w = (1 - ε) N / ((1 - ε) N + ε u)
 
-    where u is the density of any pose within a cube, turned in any way. It counts by w; what is believed
-    less than one half is listed as an outlier. So a good observation counts in full and a gross error not at
-    all, other than with weights that fall with a power (Huber, Student).
+    where u is the density of a pose that is uniform in a cube and over all rotations. The measurement has the
+    weight w. Below one half it is listed as an outlier. So inliers have full weight and gross errors none, in
+    contrast to weights that fall with a power (Huber, Student).
 
     Attributes
     ----------
     fraction
-        ε, of all observations.
+        ε, the expected fraction of outliers.
     reach
-        The edge of the cube [m], and for expressions the range of each of their numbers.
+        Edge of the cube [m], and for expressions the range of each of their numbers.
 
     Raises
     ------
@@ -52,46 +55,46 @@ class Outliers:
             raise InvalidValueError(f"The reach of outliers is positive and finite, not {self.reach!r}.")
 
     @property
-    def log_anywhere(self) -> float:
-        """The logarithm of u, of a pose."""
-        return -3 * math.log(self.reach) - math.log(_ROTATIONS)
+    def log_uniform_density(self) -> float:
+        """Logarithm of u for a pose."""
+        return -3 * math.log(self.reach) - math.log(_ROTATION_VOLUME)
 
-    def log_density(self, one: MeasurementModel) -> float:
+    def log_density(self, observation: MeasurementModel) -> float:
         """Return log(ε u) of an observation."""
-        if one.is_pose:
-            return math.log(self.fraction) + self.log_anywhere
-        return math.log(self.fraction) - one.size * math.log(self.reach)
+        if observation.is_pose:
+            return math.log(self.fraction) + self.log_uniform_density
+        return math.log(self.fraction) - observation.size * math.log(self.reach)
 
-    def judge(self, square: float, log_scale: float, log_density: float) -> tuple[float, float]:
-        """Return how probable it is that an observation is right, and what it costs as it is.
+    def weigh(self, square: float, log_scale: float, log_density: float) -> tuple[float, float]:
+        """Return the inlier probability of a measurement, and its robust cost.
 
         Parameters
         ----------
         square
-            Of its whitened error.
+            Squared norm of its whitened residual.
         log_scale
             ½ log |2πR|.
         log_density
-            What :meth:`log_density` gave.
+            Result of :meth:`log_density`.
 
         Returns
         -------
         weight, cost
-            The cost is -log of its density, less ``log_scale``; ½ ``square`` where there are no outliers.
+            The cost is the negative log density less ``log_scale``; without outliers it is ½ ``square``.
         """
-        right = math.log(1 - self.fraction) - square / 2
-        wrong = log_density + log_scale
-        together = float(np.logaddexp(right, wrong))
-        return math.exp(right - together), -together
+        inlier = math.log(1 - self.fraction) - square / 2
+        outlier = log_density + log_scale
+        total = float(np.logaddexp(inlier, outlier))
+        return math.exp(inlier - total), -total
 
 
 def cauchy_weight(square: float, size: int) -> float:
-    """Return the weight of a Cauchy distribution, which draws to where most agree from far away."""
+    """Return the weight of a Cauchy distribution, which is robust to starts far away."""
     return (1 + size) / (1 + square)
 
 
 def as_outliers(given: Outliers | bool | None) -> Outliers | None:
-    """Return what was said about outliers: True means the usual ones."""
+    """Convert an argument to an outlier model: True stands for the default, False and None for none."""
     if isinstance(given, Outliers):
         return given
     if given is None or isinstance(given, bool):

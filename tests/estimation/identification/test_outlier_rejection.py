@@ -98,7 +98,7 @@ def test_families_are_weighed_by_the_same_observations(hinge) -> None:
     fit = found.best
     without = identify(seen.parent[fit.right], child[fit.right], noise=seen.covariance)
     usual = Outliers()
-    belief = 16 * math.log(1 - usual.fraction) + 4 * (math.log(usual.fraction) + usual.log_anywhere)
+    belief = 16 * math.log(1 - usual.fraction) + 4 * (math.log(usual.fraction) + usual.log_uniform_density)
     assert fit.log_evidence == pytest.approx(without["revolute"].log_evidence + belief, abs=0.01)
     # What moves freely explains everything, and what does not move cannot call almost everything wrong.
     assert found["free"].outliers == found["rigid"].outliers == ()

@@ -1,4 +1,4 @@
-"""Frames of a model as somebody with noisy eyes sees them."""
+"""Noisy synthetic poses of frames of a model."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ POSITION, ORIENTATION = 0.01, 0.02
 NOISE = pose_covariance(POSITION, ORIENTATION)
 
 
-def seen(
+def observe_frames(
     model: kv.Model, frames: Iterable[str], values: Mapping[str, npt.ArrayLike], seed: int
 ) -> dict[str, Array]:
-    """Return poses (N, 4, 4) of frames at N values of some coordinates, with noise."""
+    """Return noisy poses (N, 4, 4) of frames at N values of some coordinates."""
     random = np.random.default_rng(seed)
     symbols = [model.symbol(name) for name in values]
     points = np.column_stack([np.asarray(v, dtype=np.float64) for v in values.values()])
@@ -34,8 +34,8 @@ def seen(
     return result
 
 
-def moved(joint: kv.Joint, x: float = 0.0, y: float = 0.0) -> kv.model.Pose:
-    """Return the origin of a joint, shifted."""
+def shift_origin(joint: kv.Joint, x: float = 0.0, y: float = 0.0) -> kv.model.Pose:
+    """Return the shifted origin of a joint."""
     matrix = np.array(joint.origin.matrix)
     matrix[:2, 3] += (x, y)
     return kv.model.Pose.of(matrix)

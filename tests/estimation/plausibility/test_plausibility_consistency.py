@@ -1,4 +1,4 @@
-"""Limits that depend on several coordinates, coordinates that move several parts, and what is proposed then."""
+"""Limits on several coordinates, coordinates that move several parts, and their replacements."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import numpy.typing as npt
 import pytest
-from observed_frames import NOISE, seen
+from observed_frames import NOISE, observe_frames
 
 import kineverse as kv
 from kineverse.estimation import Plausibility, PlausibilityMonitor, check_plausibility
@@ -22,8 +22,8 @@ Array = npt.NDArray[np.float64]
 SOME = ("rigid", "prismatic", "revolute", "free")
 
 
-def cupboard() -> kv.Model:
-    """Return a door, and a drawer that it lets out as far as it is open."""
+def make_cupboard() -> kv.Model:
+    """Return a door, and a drawer that opens only as far as the door."""
     model = kv.Model()
     door, drawer = kv.position("door"), kv.position("drawer")
     with model.edit() as edit:
@@ -35,8 +35,8 @@ def cupboard() -> kv.Model:
     return model
 
 
-def mended(model: kv.Model, report: Plausibility) -> kv.Model:
-    """Return the model with what is proposed, from a document."""
+def repair_model(model: kv.Model, report: Plausibility) -> kv.Model:
+    """Return the model with its replacements, read back from a document."""
     copy = model.copy()
     with copy.edit() as edit:
         for tag, operation in report.replacements.items():
@@ -44,63 +44,65 @@ def mended(model: kv.Model, report: Plausibility) -> kv.Model:
     return kv.formats.from_bytes(kv.formats.to_bytes(copy))
 
 
-def told(model: kv.Model, observations: dict[str, Array]) -> dict[str, KnownResiduals]:
-    """Return by tag what is told of articulations, with ties."""
+def add_consistency(model: kv.Model, observations: dict[str, Array]) -> dict[str, KnownResiduals]:
+    """Return the residuals with consistency tests by tag."""
     found = find_testable_joints(model, observations, "world")
     known = {
         "world": exact_track(len(next(iter(observations.values())))),
         **check_tracks(observations, NOISE),
     }
-    judged = {link: KnownJoint(model, link.child, link.parent) for link in found.links}
+    judged = {joint: KnownJoint(model, joint.child, joint.parent) for joint in found.joints}
     each = {}
-    for link, served in judged.items():
-        times = np.flatnonzero(known[link.parent].seen & known[link.child].seen)
-        each[link] = TimedResiduals(
-            times, compute_residuals(served, pair_tracks(known[link.parent], known[link.child], times))
+    for joint, served in judged.items():
+        times = np.flatnonzero(known[joint.parent].seen & known[joint.child].seen)
+        each[joint] = TimedResiduals(
+            times, compute_residuals(served, pair_tracks(known[joint.parent], known[joint.child], times))
         )
-    return {link.tag: left for link, left in ConsistencyTests(model, judged, "world").tied(each).items()}
+    return {joint.tag: left for joint, left in ConsistencyTests(model, judged, "world").apply(each).items()}
 
 
 def is_standard_normal(z: Array) -> bool:
-    """Whether numbers may well be; of those that are, one set in ten thousand is not taken for it."""
+    """Return True if numbers are standard normal; a correct set fails once in ten thousand."""
     count = len(z)
     mean, squares = abs(float(z.mean())), float(np.sum(z**2))
     return mean < 4.0 / np.sqrt(count) and abs(squares - count) < 4.0 * np.sqrt(2.0 * count)
 
 
-def test_a_limit_that_another_coordinate_sets_counts() -> None:
-    model = cupboard()
+def test_limit_set_by_another_coordinate_is_tested() -> None:
+    model = make_cupboard()
     random = np.random.default_rng(0)
     doors = random.uniform(0.1, 1.4, 40)
     inside = random.uniform(0.0, 1.0, 40) * (0.1 + 0.3 * np.sin(doors))
     for drawers, explained in ((inside, True), (np.minimum(inside + 0.25, 0.55), False)):
         values = {"door": doors, "drawer": drawers}
-        observations = seen(model, ["handle", "drawer"], values, 1)
+        observations = observe_frames(model, ["handle", "drawer"], values, 1)
         report = check_plausibility(model, observations, noise=NOISE, families=SOME)
         assert report["door"].explains
         assert report["drawer"].explains is explained
         if not explained:
-            assert report["drawer"].stopped is not None
-            assert report["drawer"].proposal is None
+            assert report["drawer"].implausible_since is not None
+            assert report["drawer"].replacement is None
             assert "together with what limits" in report["drawer"].reason
-        # Nobody knows what the door lets out where nobody sees it.
+        # Without observations of the door the limit is unknown.
         alone = check_plausibility(model, {"drawer": observations["drawer"]}, noise=NOISE, families=SOME)
         assert alone["drawer"].explains
 
 
-def test_how_far_a_limit_is_passed_is_standard_normal_where_it_is_reached() -> None:
-    """With the derivatives of the limit by both coordinates: without the door's share it would be 1.4."""
-    model = cupboard()
+def test_limit_excess_is_standard_normal_at_the_limit() -> None:
+    """Both coordinates contribute; without the door's share the deviation would be 1.4."""
+    model = make_cupboard()
     doors = np.random.default_rng(2).uniform(0.3, 1.2, 400)
-    observations = seen(model, ["handle", "drawer"], {"door": doors, "drawer": 0.1 + 0.3 * np.sin(doors)}, 3)
+    observations = observe_frames(
+        model, ["handle", "drawer"], {"door": doors, "drawer": 0.1 + 0.3 * np.sin(doors)}, 3
+    )
     observations["handle"][:7] = np.nan
-    tied = told(model, observations)["drawer"].tied
+    tied = add_consistency(model, observations)["drawer"].limit_excess
     above = tied[:, -1]  # below, the limit is 0
     assert np.isnan(above[:7]).all()
     assert is_standard_normal(above[7:])
 
 
-def test_a_limit_that_jumps_says_nothing_where_it_may() -> None:
+def test_limit_excess_is_nan_at_a_jump() -> None:
     model = kv.Model()
     door, drawer = kv.position("door"), kv.position("drawer")
     with model.edit() as edit:
@@ -108,14 +110,16 @@ def test_a_limit_that_jumps_says_nothing_where_it_may() -> None:
         edit.apply(kv.Prismatic(name="drawer", parent="world", child="drawer"), tag="drawer")
         edit.constrain("latch", -np.inf, drawer, kv.where(door > 0.5, 0.4, 0.1))
     doors = np.array([0.2, 0.49, 0.51, 0.9])
-    tied = told(model, seen(model, ["door", "drawer"], {"door": doors, "drawer": np.full(4, 0.2)}, 0))
-    z = tied["drawer"].tied[:, 0]
+    tied = add_consistency(
+        model, observe_frames(model, ["door", "drawer"], {"door": doors, "drawer": np.full(4, 0.2)}, 0)
+    )
+    z = tied["drawer"].limit_excess[:, 0]
     assert z[0] > 5.0
     assert np.isnan(z[1:3]).all()
     assert z[3] < -10.0
 
 
-def test_a_limit_of_several_coordinates_of_ones_own_counts() -> None:
+def test_limit_on_several_own_coordinates_is_tested() -> None:
     x, y = kv.position("puck/x"), kv.position("puck/y")
     model = kv.Model()
     with model.edit() as edit:
@@ -125,14 +129,14 @@ def test_a_limit_of_several_coordinates_of_ones_own_counts() -> None:
     for radius, explained in ((0.49, True), (0.6, False)):
         x, y = radius * inwards * np.cos(around), radius * inwards * np.sin(around)
         values = {"puck/x": x, "puck/y": y, "puck/angle": angle}
-        rating = check_plausibility(model, seen(model, ["puck"], values, 4), noise=NOISE, families=SOME)[
-            "puck"
-        ]
-        assert rating.explains is explained
-        assert (rating.stopped is None) is explained
+        verdict = check_plausibility(
+            model, observe_frames(model, ["puck"], values, 4), noise=NOISE, families=SOME
+        )["puck"]
+        assert verdict.explains is explained
+        assert (verdict.implausible_since is None) is explained
 
 
-def test_the_cone_of_a_ball_counts() -> None:
+def test_cone_of_a_ball_joint_is_tested() -> None:
     model = kv.Model()
     with model.edit() as edit:
         edit.apply(
@@ -145,13 +149,13 @@ def test_the_cone_of_a_ball_counts() -> None:
         half = np.sin(lean / 2)
         quaternion = half * np.cos(around), half * np.sin(around), 0 * around, np.cos(lean / 2) + 0 * around
         values = dict(zip((f"arm/q{c}" for c in "xyzw"), quaternion, strict=True))
-        rating = check_plausibility(model, seen(model, ["hand"], values, 5), noise=NOISE, families=SOME)[
-            "arm"
-        ]
-        assert (rating.stopped is None) is explained
+        verdict = check_plausibility(
+            model, observe_frames(model, ["hand"], values, 5), noise=NOISE, families=SOME
+        )["arm"]
+        assert (verdict.implausible_since is None) is explained
 
 
-def gripper(factor: float = -1.0, shift: float = 0.0) -> kv.Model:
+def make_gripper(factor: float = -1.0, shift: float = 0.0) -> kv.Model:
     """Return two fingers, the second of which mimics the first."""
     model = kv.Model()
     with model.edit() as edit:
@@ -173,50 +177,50 @@ def gripper(factor: float = -1.0, shift: float = 0.0) -> kv.Model:
 FINGERS = {"left": np.random.default_rng(0).uniform(0.0, 0.4, 40)}
 
 
-def test_fingers_that_move_as_one_explain_themselves() -> None:
-    observations = seen(gripper(), ["right", "left"], FINGERS, 6)
-    report = check_plausibility(gripper(), observations, noise=NOISE, families=SOME)
+def test_correct_mimic_fingers_explain() -> None:
+    observations = observe_frames(make_gripper(), ["right", "left"], FINGERS, 6)
+    report = check_plausibility(make_gripper(), observations, noise=NOISE, families=SOME)
     assert report["left"].explains
     assert report["right"].explains
     many = {"left": np.random.default_rng(1).uniform(0.0, 0.4, 400)}
-    left = told(gripper(), seen(gripper(), ["right", "left"], many, 7))
-    assert left["left"].apart.shape == (400, 0)
-    assert is_standard_normal(left["right"].apart[:, 0])
+    left = add_consistency(make_gripper(), observe_frames(make_gripper(), ["right", "left"], many, 7))
+    assert left["left"].disagreement.shape == (400, 0)
+    assert is_standard_normal(left["right"].disagreement[:, 0])
 
 
 @pytest.mark.parametrize(("factor", "shift"), [(-0.5, 0.0), (-1.0, 0.06)])
-def test_a_mimic_joint_that_is_geared_or_placed_otherwise_is_noticed_and_mended(
-    factor: float, shift: float
-) -> None:
-    served = gripper()
-    observations = seen(gripper(factor, shift), ["right", "left"], FINGERS, 8)
+def test_wrong_mimic_joint_is_replaced(factor: float, shift: float) -> None:
+    served = make_gripper()
+    observations = observe_frames(make_gripper(factor, shift), ["right", "left"], FINGERS, 8)
     report = check_plausibility(served, observations, noise=NOISE, families=SOME)
     assert report["left"].explains
-    assert report["right"].stopped is not None
-    model = mended(served, report)
+    assert report["right"].implausible_since is not None
+    model = repair_model(served, report)
     assert model.degrees_of_freedom == served.degrees_of_freedom
     assert check_plausibility(model, observations, noise=NOISE, families=SOME)["right"].explains
     slope = model.fk("right")[1, 3].gradient()[kv.position("left").derivative()]
     assert float(slope({})) == pytest.approx(factor, abs=0.05)
 
 
-def test_a_mimic_joint_whose_leader_nobody_sees_goes_on_to_follow() -> None:
-    served = gripper()
-    truth = gripper()
+def test_replacement_of_a_mimic_joint_follows_an_unobserved_leader() -> None:
+    served = make_gripper()
+    truth = make_gripper()
     with truth.edit() as edit:
         turned = kv.model.Pose.of((kv.translation(0.1, 0, 0) @ kv.rotation_z(0.4))())
         edit.replace("right", replace(truth.history.operation("right"), origin=turned))
-    observations = seen(truth, ["right"], FINGERS, 9)
+    observations = observe_frames(truth, ["right"], FINGERS, 9)
     report = check_plausibility(served, observations, noise=NOISE, families=SOME)
-    assert report["right"].stopped is not None
-    model = mended(served, report)
+    assert report["right"].implausible_since is not None
+    model = repair_model(served, report)
     assert model.degrees_of_freedom == served.degrees_of_freedom
     assert model.fk("left") == served.fk("left")
-    assert check_plausibility(model, observations, noise=NOISE, families=SOME)["right"].stopped is None
+    assert (
+        check_plausibility(model, observations, noise=NOISE, families=SOME)["right"].implausible_since is None
+    )
 
 
-def linkage(pivot: float = 1.0, coupler: float = 1.1) -> kv.Model:
-    """Return a crank that goes round, and a rocker."""
+def make_linkage(pivot: float = 1.0, coupler: float = 1.1) -> kv.Model:
+    """Return a crank that revolves, and a rocker."""
     model = kv.Model()
     with model.edit() as edit:
         bars = [
@@ -235,19 +239,21 @@ def linkage(pivot: float = 1.0, coupler: float = 1.1) -> kv.Model:
 
 @pytest.fixture(scope="module")
 def served_linkage() -> kv.Model:
-    return linkage()
+    return make_linkage()
 
 
-def test_bars_of_a_linkage_are_judged_together_and_mended(served_linkage: kv.Model) -> None:
+def test_bars_of_a_linkage_are_tested_together_and_replaced(served_linkage: kv.Model) -> None:
     served, frames = served_linkage, ["rocker", "crank", "coupler"]
     cranks = {"crank": np.random.default_rng(0).uniform(-3.0, 3.0, 40)}
-    report = check_plausibility(served, seen(served, frames, cranks, 10), noise=NOISE, families=SOME)
+    report = check_plausibility(
+        served, observe_frames(served, frames, cranks, 10), noise=NOISE, families=SOME
+    )
     assert len(report) == 3
-    assert all(rating.explains and not rating.outliers for rating in report)
+    assert all(verdict.explains and not verdict.outliers for verdict in report)
 
-    observations = seen(linkage(pivot=1.08), frames, cranks, 11)
+    observations = observe_frames(make_linkage(pivot=1.08), frames, cranks, 11)
     report = check_plausibility(served, observations, noise=NOISE, families=SOME)
-    assert [rating.tag for rating in report.implausible] == ["rocker"]
+    assert [verdict.tag for verdict in report.implausible] == ["rocker"]
     copy = served.copy()
     with copy.edit() as edit:
         edit.replace("rocker", report.replacements["rocker"])
@@ -255,43 +261,45 @@ def test_bars_of_a_linkage_are_judged_together_and_mended(served_linkage: kv.Mod
     assert "rocker" in copy.articulations
     assert check_plausibility(copy, observations, noise=NOISE, families=SOME).implausible == ()
 
-    # The hinge is where it was: it is a bar of another length that moves it otherwise.
-    observations = seen(linkage(coupler=1.2), frames, cranks, 12)
+    # The hinge is unchanged; a bar of another length moves it.
+    observations = observe_frames(make_linkage(coupler=1.2), frames, cranks, 12)
     report = check_plausibility(served, observations, noise=NOISE, families=SOME)
-    assert [rating.tag for rating in report.implausible] == ["rocker"]
-    assert report["rocker"].proposal is None
+    assert [verdict.tag for verdict in report.implausible] == ["rocker"]
+    assert report["rocker"].replacement is None
     assert "by itself it explains what is seen" in report["rocker"].reason
 
 
-def test_the_monitor_sees_ties_as_well() -> None:
-    served = gripper()
+def test_monitor_applies_consistency_tests() -> None:
+    served = make_gripper()
     monitor = PlausibilityMonitor(served, ["right", "left"], noise=NOISE, families=SOME)
-    right = seen(gripper(), ["right", "left"], FINGERS, 13)
-    wrong = seen(gripper(-0.5), ["right", "left"], {"left": np.full(20, 0.3)}, 14)
+    right = observe_frames(make_gripper(), ["right", "left"], FINGERS, 13)
+    wrong = observe_frames(make_gripper(-0.5), ["right", "left"], {"left": np.full(20, 0.3)}, 14)
     for observations, noticed in ((right, ()), (wrong, ("right",))):
         for k in range(len(observations["left"])):
             monitor.update({name: poses[k] for name, poses in observations.items()})
-        assert tuple(monitor.stopped) == noticed
-    assert monitor.stopped["right"] == pytest.approx(40, abs=3)
-    assert monitor.report()["right"].stopped == monitor.stopped["right"]
-    # What is not seen now says nothing now.
+        assert tuple(monitor.implausible_since) == noticed
+    assert monitor.implausible_since["right"] == pytest.approx(40, abs=3)
+    assert monitor.report()["right"].implausible_since == monitor.implausible_since["right"]
+    # Missing frames are ignored.
     monitor.update({"right": wrong["right"][0]})
-    # A limit that comes later is one of the articulation that it limits.
+    # A later limit belongs to the joint that it limits.
     with served.edit() as edit:
         edit.constrain("narrow", -np.inf, kv.position("left") ** 2, 0.01)
     for k in range(10):
         monitor.update({name: poses[k] for name, poses in wrong.items()})
-    assert "left" in monitor.stopped
+    assert "left" in monitor.implausible_since
 
 
-def test_stretched_linkages_alarm_nobody(served_linkage: kv.Model) -> None:
-    """Where the rocker turns back it hardly tells the crank: an alarm in a thousand is allowed, and 18 are looked at."""
+def test_singular_linkages_raise_no_alarm(served_linkage: kv.Model) -> None:
+    """Near the dead centre the rocker hardly determines the crank; 18 tests run."""
     model, alarms = served_linkage, 0
     for seed in range(3, 9):
         cranks = {"crank": np.random.default_rng(seed).uniform(-3.0, 3.0, 40)}
-        for left in told(model, seen(model, ["rocker", "crank", "coupler"], cranks, seed)).values():
-            watch = SequentialTest(1e-3)
-            for row in zip(left.normal, left.by_place, left.against, strict=True):
-                watch.add(*row)
-            alarms += watch.stopped is not None
+        for left in add_consistency(
+            model, observe_frames(model, ["rocker", "crank", "coupler"], cranks, seed)
+        ).values():
+            test = SequentialTest(1e-3)
+            for row in zip(left.orthogonal, left.displacement_jacobian, left.one_sided, strict=True):
+                test.add(*row)
+            alarms += test.implausible_since is not None
     assert alarms == 0

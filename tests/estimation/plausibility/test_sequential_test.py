@@ -1,10 +1,10 @@
-"""What plausibility promises: few false alarms, densities that are right, and a monitor that agrees."""
+"""False alarm rate, densities, and agreement of the monitor with the batch check."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
-from observed_frames import NOISE, seen
+from observed_frames import NOISE, observe_frames
 from scipy import integrate, stats
 
 import kineverse as kv
@@ -27,77 +27,77 @@ def kitchen() -> kv.Model:
 
 @pytest.fixture(scope="module")
 def resting(kitchen: kv.Model) -> KnownResiduals:
-    # A door that moves at random, often rests at its limits, and is seen by noisy eyes, for a long time.
+    # A door that moves at random and often rests at its limits, in a long series of noisy observations.
     angles = np.clip(np.cumsum(np.random.default_rng(0).normal(0.0, 0.3, RUNS * LONG)) % 4.0 - 1.0, 0.0, 1.57)
-    poses = seen(kitchen, [HANDLE, FRIDGE], {DOOR: angles}, 1)
+    poses = observe_frames(kitchen, [HANDLE, FRIDGE], {DOOR: angles}, 1)
     return compute_residuals(
         KnownJoint(kitchen, HANDLE, FRIDGE), check_observations(poses[FRIDGE], poses[HANDLE], NOISE, NOISE)
     )
 
 
 @pytest.mark.parametrize("wrong", [0.0, 0.05])
-def test_false_alarms_are_as_rare_as_stated(resting: KnownResiduals, wrong: float) -> None:
+def test_false_alarm_rate_is_bounded(resting: KnownResiduals, wrong: float) -> None:
     left = resting
-    squares = np.sum(left.normal**2, axis=1)
-    assert left.normal.shape == (RUNS * LONG, 5)
+    squares = np.sum(left.orthogonal**2, axis=1)
+    assert left.orthogonal.shape == (RUNS * LONG, 5)
     assert stats.kstest(squares, stats.chi2(5).cdf).pvalue > 0.01
 
-    # What is wrong is wrong in the way that looks most like something else: always the same.
-    astray = np.random.default_rng(9).uniform(size=RUNS * LONG) < wrong
-    normal = np.where(astray[:, None], 40.0, left.normal)
-    beyond = np.where(astray[:, None], 40.0, left.beyond)
+    # Outliers are constant, which looks most like a change of the joint.
+    corrupt = np.random.default_rng(9).uniform(size=RUNS * LONG) < wrong
+    normal = np.where(corrupt[:, None], 40.0, left.orthogonal)
+    beyond = np.where(corrupt[:, None], 40.0, left.bound_excess)
     stated = 0.2
     alarms = 0
     for run in range(RUNS):
-        watch = SequentialTest(stated, wrong)
+        test = SequentialTest(stated, wrong)
         for k in range(run * LONG, (run + 1) * LONG):
-            watch.add(normal[k], left.by_place[k], beyond[k])
-        alarms += watch.stopped is not None
+            test.add(normal[k], left.displacement_jacobian[k], beyond[k])
+        alarms += test.implausible_since is not None
     assert alarms <= stats.binom(RUNS, stated).ppf(0.99)
 
 
-def test_the_ratio_is_a_fair_game() -> None:
-    # E[M] = 1 after one observation, whatever its derivatives are: Ville's inequality needs no more.
-    by_place = np.random.default_rng(2).normal(size=(1, 12))
+def test_evidence_ratio_has_mean_one() -> None:
+    # E[M] = 1 after one observation for any Jacobian, which is the condition of Ville's inequality.
+    displacement_jacobian = np.random.default_rng(2).normal(size=(1, 12))
     grid = np.sinh(np.linspace(-7.5, 7.5, 2001))
     nothing, unlimited = np.zeros((0, 12)), np.full(2, -np.inf)
     for rows in (
-        [(np.array([x]), by_place, unlimited) for x in grid],
+        [(np.array([x]), displacement_jacobian, unlimited) for x in grid],
         [(np.zeros(0), nothing, np.array([-np.inf, x])) for x in grid],
     ):
         logs = np.array([SequentialTest(1e-300).add(*row) for row in rows]) + stats.norm.logpdf(grid)
         assert integrate.trapezoid(np.exp(logs), grid) == pytest.approx(1.0, abs=1e-3)
-        # With wrong observations it is fair at best, wherever they are.
-        won = np.array([SequentialTest(1e-300, wrong=0.05).add(*row) for row in rows])
+        # With outliers of any distribution the mean is at most 1.
+        won = np.array([SequentialTest(1e-300, outlier_fraction=0.05).add(*row) for row in rows])
         mean = integrate.trapezoid(np.exp(won + stats.norm.logpdf(grid)), grid)
         assert 0.8 < 0.95 * mean + 0.05 * np.exp(won.max()) < 1.0 + 1e-3
 
 
-def test_a_small_displacement_is_noticed_in_time_and_its_beginning_found() -> None:
+def test_small_displacement_is_detected_with_its_change_point() -> None:
     random = np.random.default_rng(3)
-    by_place = np.concatenate([np.eye(5), np.zeros((5, 7))], axis=1) / 0.02
+    displacement_jacobian = np.concatenate([np.eye(5), np.zeros((5, 7))], axis=1) / 0.02
     noticed, beginnings = [], []
     for _ in range(20):
-        watch = SequentialTest(1e-3)
+        test = SequentialTest(1e-3)
         for k in range(160):
-            shift = by_place[:, 0] * 0.02 * (k >= 60)
-            watch.add(random.normal(size=5) + shift, by_place, np.full(2, -np.inf))
-        assert watch.stopped is not None
-        noticed.append(watch.noticed)
-        beginnings.append(watch.stopped)
+            shift = displacement_jacobian[:, 0] * 0.02 * (k >= 60)
+            test.add(random.normal(size=5) + shift, displacement_jacobian, np.full(2, -np.inf))
+        assert test.implausible_since is not None
+        noticed.append(test.detected_at)
+        beginnings.append(test.implausible_since)
     assert np.median(beginnings) == pytest.approx(60, abs=4)
     assert np.median(noticed) < 100
 
 
-def slider(upper: float) -> tuple[kv.Model, KnownJoint]:
+def make_bounded_slider(upper: float) -> tuple[kv.Model, KnownJoint]:
     model = kv.Model()
     with model.edit() as edit:
         edit.apply(kv.Prismatic(name="s", parent="world", child="s", axis=(1, 0, 0), lower=0, upper=upper))
     return model, KnownJoint(model, "s", "world")
 
 
-def test_the_evidence_is_the_integral_over_joint_values_and_their_spread() -> None:
-    _, served = slider(2.0)
+def test_log_evidence_equals_the_integral_over_joint_values() -> None:
+    _, served = make_bounded_slider(2.0)
     noise = pose_covariance(0.05, 0.1)
     poses = np.tile(np.eye(4), (2, 1, 1))
     poses[:, :3, 3] = [[0.7, 0.03, 0.0], [1.1, -0.02, 0.05]]
@@ -110,30 +110,32 @@ def test_the_evidence_is_the_integral_over_joint_values_and_their_spread() -> No
     widths = np.geomspace(1e-5, 10.0, 43)
     for width in widths:
         if width < 0.01:
-            # Narrower than the grid, and than the noise: both values are the mean.
+            # Narrower than grid and noise: both values equal the mean.
             total += integrate.trapezoid(likelihood.prod(axis=1), values) / 2.0 / len(widths)
             continue
         prior = stats.norm(values[:, None], width).pdf(values)
         prior /= integrate.trapezoid(prior, values, axis=1)[:, None]
         each = integrate.trapezoid(prior[:, :, None] * likelihood, values, axis=1)
         total += integrate.trapezoid(each.prod(axis=1), values) / 2.0 / len(widths)
-    # What is not on the grid is known to some percent: the mean is integrated out by Laplace's method.
+    # Laplace's method integrates the mean to some percent.
     assert found == pytest.approx(across + np.log(total), abs=0.1)
 
 
-def test_the_evidence_of_sitting_elsewhere_is_a_normal_density(resting: KnownResiduals) -> None:
-    few = resting.at(slice(7))
-    by_place, rho = few.by_place.reshape(-1, 12), few.normal.ravel()
+def test_log_displacement_gain_equals_a_normal_density(resting: KnownResiduals) -> None:
+    few = resting.select(slice(7))
+    displacement_jacobian, rho = few.displacement_jacobian.reshape(-1, 12), few.orthogonal.ravel()
     apart = [
-        stats.multivariate_normal(cov=np.eye(len(rho)) + s**2 * by_place @ by_place.T).logpdf(rho)
+        stats.multivariate_normal(
+            cov=np.eye(len(rho)) + s**2 * displacement_jacobian @ displacement_jacobian.T
+        ).logpdf(rho)
         for s in SIZES
     ]
     expected = np.logaddexp.reduce(apart) - np.log(len(SIZES)) - stats.norm.logpdf(rho).sum()
     assert log_displacement_gain(few) == pytest.approx(expected, abs=1e-6)
 
 
-def test_densities_have_the_unit_of_those_of_identification() -> None:
-    # With many poses a rigid connection's evidence is its likelihood times the volume that they leave.
+def test_densities_compare_with_those_of_identification() -> None:
+    # With many poses the evidence of a rigid connection is its likelihood times the posterior volume.
     random = np.random.default_rng(4)
     poses = np.tile(np.eye(4), (200, 1, 1))
     poses[:, :3, 3] = random.normal(0.0, 0.01, (200, 3))
@@ -148,7 +150,7 @@ def test_densities_have_the_unit_of_those_of_identification() -> None:
     assert fit.log_evidence == pytest.approx(there + volume, abs=0.01)
 
 
-def test_the_monitor_agrees_with_a_look_at_everything(kitchen: kv.Model) -> None:
+def test_monitor_agrees_with_check_plausibility(kitchen: kv.Model) -> None:
     truth = kitchen.copy()
     joint = truth.history.operation(TAG)
     assert isinstance(joint, kv.Revolute)
@@ -158,16 +160,16 @@ def test_the_monitor_agrees_with_a_look_at_everything(kitchen: kv.Model) -> None
     frames = [HANDLE, FRIDGE]
     angles = np.random.default_rng(0).uniform(0.0, 0.4, 40)
     before, after = (
-        seen(model, frames, {DOOR: values}, 5 + k)
+        observe_frames(model, frames, {DOOR: values}, 5 + k)
         for k, (model, values) in enumerate(((kitchen, angles[:20]), (truth, angles[20:])))
     )
     poses = {frame: np.concatenate([before[frame], after[frame]]) for frame in frames}
     served = kitchen.copy()
     monitor = PlausibilityMonitor(served, frames, noise=NOISE, families=["prismatic", "revolute", "free"])
-    told = [monitor.update({frame: poses[frame][k] for frame in frames}) for k in range(40)]
-    assert [tags for tags in told if tags] == [(TAG,)]
+    add_consistency = [monitor.update({frame: poses[frame][k] for frame in frames}) for k in range(40)]
+    assert [tags for tags in add_consistency if tags] == [(TAG,)]
     whole = check_plausibility(served, poses, noise=NOISE, families=["prismatic", "revolute", "free"])
-    assert monitor.stopped == {TAG: whole[TAG].stopped}
+    assert monitor.implausible_since == {TAG: whole[TAG].implausible_since}
     report = monitor.report()
     assert report[TAG].probabilities == pytest.approx(whole[TAG].probabilities, abs=1e-6)
 
@@ -175,15 +177,15 @@ def test_the_monitor_agrees_with_a_look_at_everything(kitchen: kv.Model) -> None
         edit.replace(TAG, report.replacements[TAG])
     for k in range(20, 40):
         assert monitor.update({frame: poses[frame][k] for frame in frames}) == ()
-    assert monitor.stopped == {}
+    assert monitor.implausible_since == {}
     assert monitor.report()["joint kitchen/fridge_joint"].count == 60
 
 
-def test_a_monitor_forgets_and_says_what_it_cannot_use(kitchen: kv.Model) -> None:
+def test_monitor_window_and_refusals(kitchen: kv.Model) -> None:
     frames = [HANDLE, FRIDGE]
     monitor = PlausibilityMonitor(kitchen, frames, noise=NOISE, keep=5, families=["revolute", "free"])
     assert monitor.report()[TAG].verdict == "cannot tell"
-    poses = seen(kitchen, frames, {DOOR: np.linspace(0.0, 1.5, 12)}, 7)
+    poses = observe_frames(kitchen, frames, {DOOR: np.linspace(0.0, 1.5, 12)}, 7)
     for k in range(10):
         monitor.update({HANDLE: poses[HANDLE][k], FRIDGE: (poses[FRIDGE][k], NOISE)})
     monitor.update({HANDLE: poses[HANDLE][10]})

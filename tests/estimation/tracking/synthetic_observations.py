@@ -1,4 +1,4 @@
-"""Noisy eyes for the tests: what is seen of a model at a state."""
+"""Synthetic noisy observations of a model."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from scipy.spatial.transform import Rotation
 import kineverse as kv
 
 
-def noisy(poses: Any, position: float, orientation: float, rng: np.random.Generator) -> Any:
-    """Return poses (..., 4, 4) with errors on each axis of the observer."""
+def add_pose_noise(poses: Any, position: float, orientation: float, rng: np.random.Generator) -> Any:
+    """Add noise to poses (..., 4, 4), on each axis of the observing frame."""
     seen = np.array(poses)
     flat = seen.reshape(-1, 4, 4)
     flat[:, :3, 3] += position * rng.standard_normal((len(flat), 3))
@@ -21,8 +21,8 @@ def noisy(poses: Any, position: float, orientation: float, rng: np.random.Genera
     return seen
 
 
-class Eyes:
-    """Sees frames of a model, as a tracker wants to hear it."""
+class NoisyObserver:
+    """Noisy measurements of frames of a model, in the form that a tracker takes."""
 
     def __init__(
         self,
@@ -39,18 +39,18 @@ class Eyes:
         self._poses = kv.compile([model.fk(f, relative_to) for f in frames])
 
     def truth(self, state: Mapping[Any, float]) -> Any:
-        """Return the poses as they are."""
+        """Return the true poses."""
         return np.array(self._poses(kv.State(state)))
 
     def array(self, state: Mapping[Any, float]) -> Any:
-        """Return the poses as they are seen, (m, 4, 4)."""
-        return noisy(self.truth(state), self.position, self.orientation, self.rng)
+        """Return the measured poses, (m, 4, 4)."""
+        return add_pose_noise(self.truth(state), self.position, self.orientation, self.rng)
 
     def __call__(self, state: Mapping[Any, float]) -> dict[str, Any]:
-        """Return the same by frame."""
+        """Return the measured poses by frame."""
         return dict(zip(self.frames, self.array(state), strict=True))
 
     @property
     def covariance(self) -> Any:
-        """What a tracker has to know."""
+        """Covariance of the noise."""
         return kv.estimation.pose_covariance(self.position, self.orientation)

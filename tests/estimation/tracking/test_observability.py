@@ -1,4 +1,4 @@
-"""Where what is seen leaves directions open: redundant arms, mirror images, places without a slope."""
+"""Unobservable directions: redundant arms, mirror images, vanishing Jacobians."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
-from synthetic_observations import Eyes
+from synthetic_observations import NoisyObserver
 
 import kineverse as kv
 from kineverse.estimation import ObservedExpression, ObservedPose, ObservedPosition, Tracker
@@ -18,8 +18,8 @@ OFFSETS = [(0, 0, 0.3), (0, 0, 0), (0, 0, 0.3), (0.1, 0, 0), (-0.1, 0, 0.4), (0,
 BENT = dict(zip("abcdefg", (0.3, 0.5, 0.2, 1.5, 0.4, 1.4, 0.3), strict=True))
 
 
-def arm() -> kv.Model:
-    """An arm of seven joints, one more than its tip has ways to go."""
+def make_arm() -> kv.Model:
+    """Return an arm of seven joints, one more than the degrees of freedom of its tip."""
     model = kv.Model()
     with model.edit() as edit:
         before = "world"
@@ -31,34 +31,34 @@ def arm() -> kv.Model:
     return model
 
 
-def tracked(model: kv.Model, eyes: Eyes, deviation: float, **options) -> Tracker:
-    """A tracker of the arm's tip."""
-    observed = [ObservedPose("tip", covariance=eyes.covariance)]
+def make_tip_tracker(model: kv.Model, observer: NoisyObserver, deviation: float, **options) -> Tracker:
+    """Return a tracker of the arm's tip."""
+    observed = [ObservedPose("tip", covariance=observer.covariance)]
     return Tracker(model, observed, start=BENT, uncertainty=dict.fromkeys(BENT, deviation), **options)
 
 
-def test_an_arm_seen_by_its_tip_knows_how_little_it_knows():
-    """The mean of squares varies by 6 % between runs like this one; that of many is .95."""
-    model, rng = arm(), np.random.default_rng(1)
-    eyes = Eyes(model, ["tip"], seed=1)
-    first = tracked(model, eyes, 0.2)
+def test_covariance_of_a_redundant_arm_is_consistent():
+    """The sample mean of NEES varies by 6 % between such runs; over many runs it is 0.95."""
+    model, rng = make_arm(), np.random.default_rng(1)
+    observer = NoisyObserver(model, ["tip"], seed=1)
+    first = make_tip_tracker(model, observer, 0.2)
     found = []
     for _ in range(70):
         truth = {name: value + 0.2 * rng.standard_normal() for name, value in BENT.items()}
         tracker = first.copy()
         for _ in range(6):
-            estimate = tracker.update(eyes(truth))
+            estimate = tracker.update(observer(truth))
         error = np.array([estimate.state[s] - truth[str(s)] for s in tracker.symbols])
         found.append(error @ estimate.information @ error / len(error))
     assert 0.9 < np.mean(found) < 1.1
 
 
 @pytest.mark.parametrize(("noise", "runs", "looks"), [(1e-4, 40, 10), (1e-2, 40, 10)])
-def test_an_arm_that_is_shaken_knows_how_little_it_knows(noise, runs, looks):
-    """The mean of squares varies by 9 %, and that of many is .95 to 1.05."""
-    model, rng = arm(), np.random.default_rng(2)
-    eyes = Eyes(model, ["tip"], seed=2)
-    first = tracked(model, eyes, 0.2, process_noise={f"{name}:velocity": noise for name in BENT})
+def test_covariance_of_a_redundant_arm_with_process_noise_is_consistent(noise, runs, looks):
+    """The sample mean of NEES varies by 9 %; over many runs it is 0.95 to 1.05."""
+    model, rng = make_arm(), np.random.default_rng(2)
+    observer = NoisyObserver(model, ["tip"], seed=2)
+    first = make_tip_tracker(model, observer, 0.2, process_noise={f"{name}:velocity": noise for name in BENT})
     found = []
     for _ in range(runs):
         truth = {name: value + 0.2 * rng.standard_normal() for name, value in BENT.items()}
@@ -66,14 +66,14 @@ def test_an_arm_that_is_shaken_knows_how_little_it_knows(noise, runs, looks):
         for step in range(looks):
             if step:
                 truth = {q: x + np.sqrt(noise * 0.1) * rng.standard_normal() for q, x in truth.items()}
-            estimate = tracker.update(eyes(truth), at=0.1 * step)
+            estimate = tracker.update(observer(truth), at=0.1 * step)
         error = np.array([estimate.state[s] - truth[str(s)] for s in tracker.symbols])
         found.append(error @ estimate.information @ error / len(error))
     assert 0.8 < np.mean(found) < 1.2
 
 
-def test_what_is_linear_and_open_is_a_kalman_filter_in_time():
-    """Two slides of which the sum is seen."""
+def test_linear_unobservable_model_equals_a_kalman_filter_over_time():
+    """Observe the sum of two slides."""
     model = kv.Model()
     with model.edit() as edit:
         edit.apply(kv.Planar(name="p", parent="world", child="p"))
@@ -97,40 +97,40 @@ def test_what_is_linear_and_open_is_a_kalman_filter_in_time():
         assert tracker.log_evidence == pytest.approx(evidence)
 
 
-def test_a_tracker_with_open_directions_goes_to_another_process():
-    model = arm()
-    eyes = Eyes(model, ["tip"])
-    tracker = tracked(model, eyes, 0.2)
+def test_tracker_with_unobservable_directions_is_picklable():
+    model = make_arm()
+    observer = NoisyObserver(model, ["tip"])
+    tracker = make_tip_tracker(model, observer, 0.2)
     truth = {name: value + 0.1 for name, value in BENT.items()}
-    tracker.update(eyes(truth))
-    there, seen = pickle.loads(pickle.dumps(tracker)), eyes(truth)
+    tracker.update(observer(truth))
+    there, seen = pickle.loads(pickle.dumps(tracker)), observer(truth)
     here, again = tracker.update(seen), there.update(seen)
     np.testing.assert_allclose(again.covariance, here.covariance, rtol=1e-6)
 
 
-def test_an_arm_is_told_as_well_where_observations_may_be_wrong():
-    model = arm()
-    eyes = Eyes(model, ["tip"])
-    one, other = (tracked(model, eyes, 0.2, outliers=wrong) for wrong in (False, True))
+def test_covariance_of_a_redundant_arm_with_outliers_is_consistent():
+    model = make_arm()
+    observer = NoisyObserver(model, ["tip"])
+    one, other = (make_tip_tracker(model, observer, 0.2, outliers=wrong) for wrong in (False, True))
     truth = {name: value + 0.1 for name, value in BENT.items()}
     for _ in range(5):
-        seen = eyes(truth)
+        seen = observer(truth)
         a, b = one.update(seen), other.update(seen)
     assert np.allclose(a.covariance, b.covariance, rtol=0, atol=1e-3 * np.abs(a.covariance).max())
     seen["tip"][:3, 3] += 0.5
     assert other.update(seen).outliers == ("tip",)
 
 
-def test_what_stands_still_is_as_if_all_had_been_seen_at_once():
-    model = arm()
-    eyes = Eyes(model, ["tip"], 0.02, np.radians(2))
-    tracker = tracked(model, eyes, 0.3)
+def test_static_updates_equal_one_batch_estimate():
+    model = make_arm()
+    observer = NoisyObserver(model, ["tip"], 0.02, np.radians(2))
+    tracker = make_tip_tracker(model, observer, 0.3)
     truth = {name: value + 0.3 for name, value in BENT.items()}
     names = [str(s) for s in tracker.symbols]
-    readings = [eyes(truth)["tip"] for _ in range(8)]
+    readings = [observer(truth)["tip"] for _ in range(8)]
 
     def residuals(x):
-        pose = eyes.truth(dict(zip(names, x, strict=True)))[0]
+        pose = observer.truth(dict(zip(names, x, strict=True)))[0]
         errors = [(x - [BENT[name] for name in names]) / 0.3]
         for seen in readings:
             turned = Rotation.from_matrix(seen[:3, :3] @ pose[:3, :3].T).as_rotvec()
@@ -140,12 +140,12 @@ def test_what_stands_still_is_as_if_all_had_been_seen_at_once():
     for seen in readings:
         estimate = tracker.update({"tip": seen})
     best = least_squares(residuals, list(estimate.state.values()), xtol=1e-12, ftol=1e-12, gtol=1e-12)
-    # But for the mean of rotations, which is one of rotation vectors only nearly.
+    # Equal up to the mean of rotations, which averages rotation vectors to first order.
     assert np.allclose(list(estimate.state.values()), best.x, rtol=0, atol=2e-4)
-    assert np.linalg.eigvalsh(tracker._modes.best.information)[0] == pytest.approx(0.3**-2, rel=1e-6)
+    assert np.linalg.eigvalsh(tracker._mixture.best.information)[0] == pytest.approx(0.3**-2, rel=1e-6)
 
 
-def test_what_is_linear_is_told_as_it_is_although_open():
+def test_linear_model_keeps_its_covariance_in_unobservable_directions():
     model = kv.Model()
     with model.edit() as edit:
         edit.apply(kv.Planar(name="p", parent="world", child="p"))
@@ -163,7 +163,7 @@ def test_what_is_linear_is_told_as_it_is_although_open():
 
 @pytest.mark.parametrize("outliers", [False, True])
 @pytest.mark.parametrize("limit", [1.5, 3.0, None])
-def test_an_angle_begins_where_its_cosine_has_no_slope(outliers, limit):
+def test_update_leaves_a_vanishing_jacobian_of_a_cosine(outliers, limit):
     model = kv.Model()
     limits = {} if limit is None else {"lower": -limit, "upper": limit}
     with model.edit() as edit:
@@ -179,7 +179,7 @@ def test_an_angle_begins_where_its_cosine_has_no_slope(outliers, limit):
     assert estimate.deviation["q"] < 0.01
 
 
-def test_an_arm_that_is_stretched_out_bends():
+def test_update_leaves_the_singularity_of_a_stretched_arm():
     model = kv.Model()
     with model.edit() as edit:
         edit.apply(kv.Revolute(name="a", parent="world", child="upper", axis=(0, 0, 1), lower=-1, upper=1))
@@ -197,7 +197,7 @@ def test_an_arm_that_is_stretched_out_bends():
     assert estimate.state["a"] == pytest.approx(-estimate.state["b"] / 2, abs=1e-3)
 
 
-def test_who_was_taken_for_its_mirror_image_is_found_when_more_is_seen():
+def test_later_observation_selects_the_mirror_image():
     model = kv.Model()
     with model.edit() as edit:
         edit.apply(kv.Planar(name="p", parent="world", child="p"))
@@ -216,23 +216,23 @@ def test_who_was_taken_for_its_mirror_image_is_found_when_more_is_seen():
     assert estimate.nis < 9
 
 
-def test_what_was_seen_at_other_values_of_what_is_known_is_not_linearised_anew():
-    """A slide on another one that somebody moves: where the first ends is open only once it is known."""
+def test_static_record_is_dropped_when_inputs_change():
+    """Projections of a point at three known angles determine both of its coordinates."""
     model = kv.Model()
     with model.edit() as edit:
         edit.apply(kv.Planar(name="p", parent="world", child="p"))
     x, y, pan = model.symbol("p/x"), model.symbol("p/y"), kv.position("pan")
     seen = ObservedExpression("bearing", np.cos(pan) * x + np.sin(pan) * y, 0.01**2)
-    tracker = Tracker(model, [seen], known=[pan], uncertainty={x: 3, y: 3})
+    tracker = Tracker(model, [seen], inputs=[pan], uncertainty={x: 3, y: 3})
     for angle in (0.0, 0.5, 1.5):
         value = np.cos(angle) * 1.0 + np.sin(angle) * 2.0
-        estimate = tracker.update({"bearing": value}, given={pan: angle})
+        estimate = tracker.update({"bearing": value}, inputs={pan: angle})
     assert estimate.state[x] == pytest.approx(1, abs=1e-3)
     assert estimate.state[y] == pytest.approx(2, abs=1e-3)
     assert max(estimate.deviation[s] for s in (x, y)) < 0.02
 
 
-def hinged(**options) -> kv.Model:
+def make_hinge(**options) -> kv.Model:
     model = kv.Model()
     with model.edit() as edit:
         edit.apply(kv.Revolute(name="q", parent="world", child="door", axis=(0, 0, 1), **options))
@@ -241,9 +241,9 @@ def hinged(**options) -> kv.Model:
 
 @pytest.mark.parametrize("truth", [0.3, 0.5, 0.9, 1.2])
 @pytest.mark.parametrize("kind", ["distance", "wave", "saw"])
-def test_what_explains_as_much_is_not_forgotten(kind, truth):
-    """Numbers that come twice leave two states, of which a pose chooses one."""
-    model = hinged(lower=0.0, upper=1.5)
+def test_equally_likely_components_are_kept(kind, truth):
+    """Two states predict the same number; a pose selects one of them."""
+    model = make_hinge(lower=0.0, upper=1.5)
     q = model.symbol("q")
     value = {"distance": np.abs(q - 0.7), "wave": np.cos(4 * q), "saw": kv.where(q < 0.75, q, q - 0.75)}[kind]
     tracker = Tracker(model, ["door", ObservedExpression(kind, value, 0.01**2)])
@@ -255,9 +255,9 @@ def test_what_explains_as_much_is_not_forgotten(kind, truth):
     assert estimate.confidence[(q,)] > 0.999
 
 
-def test_a_shut_door_is_told_open_by_what_noise_allows():
-    """The most probable state inside is max(0, z) for z about 0: .4 deviations open, a NEES of one half."""
-    model, rng = hinged(lower=0.0, upper=1.5), np.random.default_rng(0)
+def test_estimate_at_a_limit_has_the_bias_of_the_truncated_gaussian():
+    """The estimate is max(0, z) with z about 0: biased by 0.4 deviations, with a NEES of one half."""
+    model, rng = make_hinge(lower=0.0, upper=1.5), np.random.default_rng(0)
     q = model.symbol("q")
     first = Tracker(model, [ObservedExpression("dial", q, 0.02**2)])
     errors, means = [], []

@@ -1,4 +1,4 @@
-"""What cannot be is refused by name, and leaves the belief as it was."""
+"""Refusals of a tracker: each names the input and leaves the belief unchanged."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ def broken(model, **entries):
     ],
 )
 @pytest.mark.parametrize("outliers", [None, True])
-def test_what_was_seen_wrong(model, seen, message, outliers):
+def test_invalid_measurement_is_refused_by_name(model, seen, message, outliers):
     tracker = Tracker(model, [DOOR, HANDLE], outliers=outliers)
     tracker.update({DOOR: pose(model)}, at=1.0)
     before = tracker.estimate
@@ -77,9 +77,9 @@ def test_what_was_seen_wrong(model, seen, message, outliers):
     assert np.array_equal(after.information, before.information)
 
 
-def test_arrays_of_poses(model, tracker):
+def test_update_poses_checks_shapes_and_matches_update(model, tracker):
     poses = np.stack([pose(model), np.full((4, 4), np.nan)])
-    tracker.update_poses(poses, np.array([True, False]))  # what is not seen is not looked at
+    tracker.update_poses(poses, np.array([True, False]))  # missing poses are not checked
     with pytest.raises(kv.KineverseError, match="fridge_door_handle' is not finite"):
         tracker.update_poses(poses)
     with pytest.raises(kv.errors.ShapeError, match=r"\(2, 4, 4\)"):
@@ -90,7 +90,7 @@ def test_arrays_of_poses(model, tracker):
         Tracker(model, [DOOR, ObservedExpression("z", kv.position(DOOR), 1.0)]).update_poses(poses)
 
 
-def test_time(model, tracker):
+def test_time_steps_are_checked_and_accumulate(model, tracker):
     tracker.update({DOOR: pose(model)}, at=5.0)
     with pytest.raises(
         kv.KineverseError, match="Time goes backwards: an observation at 4 s after one at 5 s"
@@ -129,18 +129,18 @@ def test_time(model, tracker):
         ([DOOR], {"process_noise": {f"{DOOR}:velocity": np.nan}}, "positive and finite"),
         ([DOOR], {"process_noise": {"wheel:velocity": 1.0}}, "Nothing that is estimated moves with"),
         ([DOOR], {"outliers": 3}, "Outliers are"),
-        ([DOOR], {"known": ["kitchen/fridge_dor"]}, "Did you mean"),
-        ([DOOR], {"known": [DOOR]}, "does not move with any coordinate"),
+        ([DOOR], {"inputs": ["kitchen/fridge_dor"]}, "Did you mean"),
+        ([DOOR], {"inputs": [DOOR]}, "does not move with any coordinate"),
     ],
 )
-def test_trackers_that_cannot_be(model, observed, options, message):
+def test_invalid_tracker_options_are_refused(model, observed, options, message):
     frames = [name for name in model.frames if not model.speeds_of(name)]
     observed = [frames[0] if o == "kitchen/room" else o for o in observed]
     with pytest.raises(kv.KineverseError, match=message):
         Tracker(model, observed, **options)
 
 
-def test_commands_and_known(model, tracker):
+def test_commands_and_inputs_are_checked(model, tracker):
     with pytest.raises(kv.KineverseError, match="Nothing that is estimated moves with 'fridge:velocity'"):
         tracker.predict(0.1, {"fridge:velocity": 1.0})
     with pytest.raises(kv.KineverseError, match="must be finite"):
@@ -149,18 +149,18 @@ def test_commands_and_known(model, tracker):
         tracker.predict(0.1, {f"{DOOR}:velocity": "fast"})
     with model.edit() as edit:
         edit.add_frame("eye", parent="world", transform=kv.rotation_z(kv.position("pan")))
-    with_camera = Tracker(model, [ObservedPose(DOOR, relative_to="eye")], known=["pan"])
+    with_camera = Tracker(model, [ObservedPose(DOOR, relative_to="eye")], inputs=["pan"])
     with pytest.raises(kv.KineverseError, match="no finite value of 'pan'"):
         with_camera.update({DOOR: pose(model)})
-    with pytest.raises(kv.KineverseError, match="'pam' is not known"):
-        with_camera.update({DOOR: pose(model)}, given={"pam": 0.0})
-    with_camera.update({DOOR: pose(model)}, given={"pan": 0.0})
+    with pytest.raises(kv.KineverseError, match="'pam' is not in inputs="):
+        with_camera.update({DOOR: pose(model)}, inputs={"pam": 0.0})
+    with_camera.update({DOOR: pose(model)}, inputs={"pan": 0.0})
     at_rest = kv.State({DOOR: 0.5}, stamp=0.0)
-    begun = Tracker(model, [ObservedPose(DOOR, relative_to="eye")], known=["pan"], start=at_rest)
-    assert begun.update({DOOR: pose(model)}, at=1.0, given={"pan": 0.0}).stamp == 1.0
+    begun = Tracker(model, [ObservedPose(DOOR, relative_to="eye")], inputs=["pan"], start=at_rest)
+    assert begun.update({DOOR: pose(model)}, at=1.0, inputs={"pan": 0.0}).stamp == 1.0
 
 
-def test_two_numbers_are_a_vector_and_no_pair():
+def test_tuple_of_two_numbers_is_a_vector():
     model = kv.Model()
     with model.edit() as edit:
         edit.apply(kv.Planar(name="p", parent="world", child="p"))
@@ -170,13 +170,13 @@ def test_two_numbers_are_a_vector_and_no_pair():
     assert tracker.update({"p": ((1.0, 2.0), np.eye(2))}).state["p/x"] == pytest.approx(1.0, abs=1e-3)
 
 
-def test_outliers_that_cannot_be():
+def test_invalid_outlier_models_are_refused():
     for options in ({"fraction": 0.0}, {"fraction": 1.0}, {"reach": 0.0}, {"reach": np.inf}):
         with pytest.raises(kv.KineverseError):
             Outliers(**options)
 
 
-def test_hypotheses_that_cannot_be(model, tracker):
+def test_invalid_hypothesis_banks_are_refused(model, tracker):
     with pytest.raises(kv.KineverseError, match="no hypothesis"):
         HypothesisBank({})
     with pytest.raises(kv.KineverseError, match="observe different things"):
@@ -189,7 +189,7 @@ def test_hypotheses_that_cannot_be(model, tracker):
         HypothesisBank({"a": tracker}, forgetting=-1.0)
 
 
-def test_who_contradicts_the_limits_is_told():
+def test_contradicting_limits_are_reported():
     model = kv.Model()
     a, b = kv.position("a"), kv.position("b")
     with model.edit() as edit:
@@ -218,7 +218,7 @@ steps = st.lists(st.dictionaries(st.sampled_from(["box", "lid"]), poses, min_siz
 
 @given(steps, st.booleans())
 @settings(max_examples=12)
-def test_whatever_is_seen_no_answer_is_nan(steps, wrong):
+def test_estimate_is_finite_for_any_measurement(steps, wrong):
     tracker = FIRST[wrong].copy()
     for k, step in enumerate(steps):
         seen = {}

@@ -1,4 +1,4 @@
-"""Laws of a tracker: what it must agree with, and what must not matter."""
+"""Laws of a tracker: equalities with reference solutions, and invariances."""
 
 from __future__ import annotations
 
@@ -9,15 +9,15 @@ import numpy as np
 import pytest
 from scipy.optimize import least_squares, nnls
 from scipy.spatial.transform import Rotation
-from synthetic_observations import Eyes, noisy
+from synthetic_observations import NoisyObserver, add_pose_noise
 
 import kineverse as kv
 from kineverse.estimation import ObservedExpression, ObservedPose, Outliers, Tracker, pose_covariance
 from kineverse.estimation.tracking.quadratic_program import solve_bounded_qp
 
 
-def slides() -> kv.Model:
-    """Two coordinates of which linear expressions are seen."""
+def make_slides() -> kv.Model:
+    """Return two coordinates with linear observations."""
     model = kv.Model()
     a, b = kv.position("a"), kv.position("b")
     with model.edit() as edit:
@@ -25,8 +25,8 @@ def slides() -> kv.Model:
     return model
 
 
-def arm(tilt: object = None) -> kv.Model:
-    """Two hinges one after the other, possibly in a world that lies elsewhere."""
+def make_arm(tilt: object = None) -> kv.Model:
+    """Return two hinges in a chain, possibly in a tilted world."""
     model = kv.Model()
     with model.edit() as edit:
         edit.add_frame("foot", parent="world", transform=kv.translation(0, 0, 0) if tilt is None else tilt)
@@ -41,12 +41,12 @@ def arm(tilt: object = None) -> kv.Model:
     return model
 
 
-def test_what_is_linear_is_a_kalman_filter():
+def test_linear_model_equals_a_kalman_filter():
     a, b = kv.position("a"), kv.position("b")
     R = np.array([[0.04, 0.01], [0.01, 0.09]])
     seen = ObservedExpression("z", kv.array([a + 2 * b, a - b]), R)
     tracker = Tracker(
-        slides(),
+        make_slides(),
         [seen],
         start={"a": 0.3, "b": -0.2},
         uncertainty={"a": 0.5, "b": 2.0},
@@ -71,13 +71,13 @@ def test_what_is_linear_is_a_kalman_filter():
         assert tracker.log_evidence == pytest.approx(log_density)
 
 
-def test_two_observations_are_one_with_the_sum_of_their_information():
+def test_two_observations_equal_one_with_the_summed_information():
     a, b = kv.position("a"), kv.position("b")
     first, second = np.diag([0.04, 0.01]), np.array([[0.02, 0.01], [0.01, 0.05]])
     together = np.linalg.inv(np.linalg.inv(first) + np.linalg.inv(second))
     z1, z2 = np.array([0.1, 0.2]), np.array([0.3, -0.1])
     both = together @ (np.linalg.solve(first, z1) + np.linalg.solve(second, z2))
-    once = Tracker(slides(), [ObservedExpression("z", kv.array([a, b]), together)])
+    once = Tracker(make_slides(), [ObservedExpression("z", kv.array([a, b]), together)])
     twice = once.copy()
     merged = once.update({"z": both})
     twice.update({"z": (z2, second)})
@@ -86,11 +86,11 @@ def test_two_observations_are_one_with_the_sum_of_their_information():
     assert np.allclose(list(merged.state.values()), list(apart.state.values()), atol=1e-9)
 
 
-def test_the_order_of_observations_does_not_matter_much():
-    model = arm()
-    eyes = Eyes(model, ["lower", "tip"], 0.002, np.radians(0.2))
-    readings = [eyes({"one": 0.4, "two": -0.7}) for _ in range(6)]
-    observed = [ObservedPose(f, covariance=eyes.covariance) for f in eyes.frames]
+def test_order_of_observations_hardly_matters():
+    model = make_arm()
+    observer = NoisyObserver(model, ["lower", "tip"], 0.002, np.radians(0.2))
+    readings = [observer({"one": 0.4, "two": -0.7}) for _ in range(6)]
+    observed = [ObservedPose(f, covariance=observer.covariance) for f in observer.frames]
     results = []
     for order in (readings, readings[::-1]):
         tracker = Tracker(
@@ -99,20 +99,20 @@ def test_the_order_of_observations_does_not_matter_much():
         for seen in order:
             estimate = tracker.update(seen)
         results.append(np.array([estimate.state["one"], estimate.state["two"]]))
-    # What is left comes from where things were linear: second order in the noise.
+    # The remaining difference is second order in the noise, from linearisation.
     assert np.abs(results[0] - results[1]).max() < 0.02 * min(estimate.deviation.values())
 
 
-def test_the_world_may_lie_anywhere():
+def test_estimate_is_invariant_to_the_world_frame():
     place = np.array(kv.translation(3, -2, 1)() @ kv.rpy(0.3, -1.1, 2.0)())
-    plain, moved = arm(), arm(kv.translation(3, -2, 1) @ kv.rpy(0.3, -1.1, 2.0))
-    eyes = Eyes(plain, ["lower", "tip"], 0.05, np.radians(5))
+    plain, moved = make_arm(), make_arm(kv.translation(3, -2, 1) @ kv.rpy(0.3, -1.1, 2.0))
+    observer = NoisyObserver(plain, ["lower", "tip"], 0.05, np.radians(5))
     covariance = np.diag([0.01, 0.02, 0.03, 0.004, 0.005, 0.006])
     turn = np.kron(np.eye(2), place[:3, :3])
-    here = Tracker(plain, [ObservedPose(f, covariance=covariance) for f in eyes.frames])
-    there = Tracker(moved, [ObservedPose(f, covariance=turn @ covariance @ turn.T) for f in eyes.frames])
+    here = Tracker(plain, [ObservedPose(f, covariance=covariance) for f in observer.frames])
+    there = Tracker(moved, [ObservedPose(f, covariance=turn @ covariance @ turn.T) for f in observer.frames])
     for _ in range(4):
-        seen = eyes({"one": 0.4, "two": -0.7})
+        seen = observer({"one": 0.4, "two": -0.7})
         a, b = here.update(seen), there.update({f: place @ T for f, T in seen.items()})
         assert np.allclose(list(a.state.values()), list(b.state.values()), atol=1e-7)
         assert np.allclose(a.covariance, b.covariance, rtol=1e-5)
@@ -120,7 +120,7 @@ def test_the_world_may_lie_anywhere():
 
 
 def residuals(x, model, seen, covariance, prior):
-    """The whitened errors of a state, written anew with scipy."""
+    """Compute whitened residuals of a state with scipy."""
     parts = [(x - prior[0]) / prior[1]]
     whiten = np.linalg.inv(np.linalg.cholesky(covariance))
     for frame, T in seen.items():
@@ -133,14 +133,14 @@ def residuals(x, model, seen, covariance, prior):
 
 
 @pytest.mark.parametrize("truth", [(0.4, -0.7), (1.5, 1.5), (1.45, -1.5)])
-def test_the_estimate_is_the_most_probable_state_inside_the_limits(truth):
-    model = arm()
+def test_estimate_minimises_the_cost_inside_the_limits(truth):
+    model = make_arm()
     covariance = pose_covariance(0.1, np.radians(10))
-    eyes = Eyes(model, ["lower", "tip"], 0.1, np.radians(10), seed=3)
+    observer = NoisyObserver(model, ["lower", "tip"], 0.1, np.radians(10), seed=3)
     prior = np.zeros(2), np.full(2, 1.5)
     for _ in range(3):
-        seen = eyes(dict(zip(("one", "two"), truth, strict=True)))
-        tracker = Tracker(model, [ObservedPose(f, covariance=covariance) for f in eyes.frames])
+        seen = observer(dict(zip(("one", "two"), truth, strict=True)))
+        tracker = Tracker(model, [ObservedPose(f, covariance=covariance) for f in observer.frames])
         estimate = tracker.update(seen)
         found = least_squares(
             residuals,
@@ -154,19 +154,21 @@ def test_the_estimate_is_the_most_probable_state_inside_the_limits(truth):
         assert [estimate.state["one"], estimate.state["two"]] == pytest.approx(found.x.tolist(), abs=2e-6)
 
 
-def test_derivatives_are_those_of_the_residual():
-    """The geometric Jacobian and Jr⁻¹ are what finite differences of the residual say, far from zero as well."""
-    model = arm()
+def test_jacobians_equal_finite_differences_of_residuals():
+    """Geometric Jacobian and Jr⁻¹ equal finite differences of the residual, also for large residuals."""
+    model = make_arm()
     tracker = Tracker(model, ["tip"])
     rng = np.random.default_rng(0)
-    filter_ = tracker._filter
+    update_step = tracker._update_step
     for _ in range(20):
         x = rng.uniform(-1.4, 1.4, 2)
-        seen = noisy(model.fk("tip")(dict(zip(("one", "two"), x, strict=True))), 0.3, 0.8, rng)
-        reading = filter_.reader.read({"tip": seen})
+        seen = add_pose_noise(model.fk("tip")(dict(zip(("one", "two"), x, strict=True))), 0.3, 0.8, rng)
+        reading = update_step.reader.read({"tip": seen})
 
         def error(at, reading=reading):
-            return filter_.residuals.errors(filter_.residuals.evaluate(at, np.empty(0)), reading, [0])[0]
+            return update_step.residuals.errors(
+                update_step.residuals.evaluate(at, np.empty(0)), reading, [0]
+            )[0]
 
         _, slope = error(x)
         h = 1e-6
@@ -174,7 +176,7 @@ def test_derivatives_are_those_of_the_residual():
         assert np.allclose(slope, -numeric, atol=1e-4 * np.abs(slope).max())
 
 
-def test_turns_wrap_and_several_starts_find_them():
+def test_periodic_angles_wrap_and_multi_start_finds_them():
     model = kv.Model()
     with model.edit() as edit:
         edit.apply(kv.Continuous(name="wheel", parent="world", child="wheel", axis=(0, 0, 1)))
@@ -193,21 +195,21 @@ def test_turns_wrap_and_several_starts_find_them():
             tracker.predict(1.0, {"wheel:velocity": 0.1})
 
 
-def test_nothing_is_asked_outside_of_limits():
-    """The published garage door is arccos(a/l): beyond its limit it says nothing at all."""
+def test_model_is_never_evaluated_outside_its_limits():
+    """The published garage door has arccos(a/l), which is undefined beyond its limit."""
     model = kv.Model()
     with model.edit() as edit:
         edit.apply(kv.articulations.GarageDoor(name="g", parent="world", form="published"))
-    eyes = Eyes(model, ["g/door", "g/upper_edge"], 0.1, np.radians(10), seed=1)
-    tracker = Tracker(model, [ObservedPose(f, covariance=eyes.covariance) for f in eyes.frames])
+    observer = NoisyObserver(model, ["g/door", "g/upper_edge"], 0.1, np.radians(10), seed=1)
+    tracker = Tracker(model, [ObservedPose(f, covariance=observer.covariance) for f in observer.frames])
     for _ in range(20):
-        estimate = tracker.update(eyes({"g/door": 1.999, "g/bolt": 0.1}))
+        estimate = tracker.update(observer({"g/door": 1.999, "g/bolt": 0.1}))
         assert 0 <= estimate.state["g/door"] <= 2
         assert np.isfinite(estimate.covariance).all()
 
 
-def test_limits_may_be_about_several_coordinates():
-    model = slides()
+def test_limits_on_several_coordinates_hold():
+    model = make_slides()
     a, b = kv.position("a"), kv.position("b")
     with model.edit() as edit:
         edit.constrain("circle", 0, a * a + b * b, 1)
@@ -219,13 +221,13 @@ def test_limits_may_be_about_several_coordinates():
     x = np.array([estimate.state["a"], estimate.state["b"]])
     assert np.linalg.norm(x) == pytest.approx(1.0, abs=1e-6)
     assert x == pytest.approx(np.array([0.8, 0.6]), abs=1e-2)
-    # The belief itself knows nothing of the circle, so news can lead away from it again.
+    # The Gaussian ignores the circle, so new measurements can lead away from it.
     assert x + estimate.mean == pytest.approx(np.array([1.2, 0.9]), abs=2e-2)
 
 
-def test_limits_may_move_with_others():
-    """A drawer may come out as far as the door beside it is open, and a bolt holds the door near zero."""
-    model = slides()
+def test_limits_that_depend_on_coordinates_hold():
+    """A door limits the drawer beside it, and a bolt holds the door near zero."""
+    model = make_slides()
     a, b = kv.position("a"), kv.position("b")
     with model.edit() as edit:
         edit.constrain("a/position", 0, a, kv.articulations.tabulated_limit(b, {0.0: 0.2, 1.0: 1.0}))
@@ -235,16 +237,16 @@ def test_limits_may_move_with_others():
     tracker = Tracker(model, [seen], uncertainty={"a": 10.0, "b": 10.0})
     for _ in range(3):
         estimate = tracker.update({"z": [0.9, 0.3]})
-    # The nearest point of a = 0.2 + 0.8 b.
+    # The nearest point on the line a = 0.2 + 0.8 b.
     along = np.array([0.8, 1.0]) / np.hypot(0.8, 1.0)
     wanted = np.array([0.2, 0.0]) + along * (along @ (np.array([0.9, 0.3]) - [0.2, 0.0]))
     assert [estimate.state["a"], estimate.state["b"]] == pytest.approx(wanted.tolist(), abs=1e-4)
     assert not model.violations(estimate.state, tolerance=1e-7)
 
 
-def test_information_comes_back_from_a_limit():
+def test_estimate_leaves_a_limit_when_measurements_do():
     a = kv.position("a")
-    model = slides()
+    model = make_slides()
     with model.edit() as edit:
         edit.constrain("a/position", 0, a, 1)
     tracker = Tracker(model, [ObservedExpression("z", a, 1.0)], uncertainty={"a": 100.0})
@@ -257,20 +259,20 @@ def test_information_comes_back_from_a_limit():
 
 
 @pytest.mark.compiler
-def test_compiled_and_numpy_do_the_same():
+def test_compiled_and_numpy_updates_agree():
     model = kv.load("kitchen")
-    eyes = Eyes(model, [f for f in model.frames if model.speeds_of(f)], 0.1, np.radians(10))
-    observed = [ObservedPose(f, covariance=eyes.covariance) for f in eyes.frames]
+    observer = NoisyObserver(model, [f for f in model.frames if model.speeds_of(f)], 0.1, np.radians(10))
+    observed = [ObservedPose(f, covariance=observer.covariance) for f in observer.frames]
     noise = dict.fromkeys(model.speeds, 1e-3)
     fast, slow = (Tracker(model, observed, process_noise=noise) for _ in range(2))
-    slow._filter.native = None
+    slow._update_step.native = None
     assert fast.wait()
     rng = np.random.default_rng(2)
     for _ in range(3):
         truth = {str(s): rng.choice([*fast.limits[s], rng.uniform(*fast.limits[s])]) for s in fast.symbols}
         one, other = fast.copy(), slow.copy()
         for _ in range(4):
-            seen, mask = eyes.array(truth), rng.random(len(eyes.frames)) < 0.7
+            seen, mask = observer.array(truth), rng.random(len(observer.frames)) < 0.7
             a, b = one.update_poses(seen, mask), other.update_poses(seen, mask)
             assert np.allclose(list(a.state.values()), list(b.state.values()), rtol=0, atol=1e-12)
             assert np.allclose(a.information, b.information, rtol=1e-12)
@@ -285,25 +287,27 @@ def test_compiled_and_numpy_do_the_same():
 
 @pytest.mark.compiler
 @pytest.mark.parametrize("place", [0.3, 1.5])
-def test_compiled_and_numpy_do_the_same_to_what_moves_by_others_speeds(place):
+def test_compiled_and_numpy_updates_agree_on_floating_bodies(place):
     model = kv.Model()
     with model.edit() as edit:
         edit.apply(kv.Floating(name="box", parent="world", child="box"))
         edit.apply(kv.Revolute(name="lid", parent="box", child="lid", axis=(0, 1, 0), lower=-1.5, upper=1.5))
         edit.apply(kv.articulations.Ball(name="ball", parent="lid", child="hook"))
-    eyes = Eyes(model, ["box", "lid", "hook"], 0.05, 0.05)
-    observed = [ObservedPose(f, covariance=eyes.covariance) for f in eyes.frames]
+    observer = NoisyObserver(model, ["box", "lid", "hook"], 0.05, 0.05)
+    observed = [ObservedPose(f, covariance=observer.covariance) for f in observer.frames]
     noise = dict.fromkeys(model.speeds, 0.001)
     fast, slow = (Tracker(model, observed, process_noise=noise) for _ in range(2))
-    slow._filter.native = None
+    slow._update_step.native = None
     assert fast.wait()
     turns = Rotation.random(2, random_state=0).as_quat()
     truth = {"box/x": 0.5, "box/y": 1.0, "box/z": -2.0, "lid": place}
     for name, turn in zip(("box", "ball"), turns, strict=True):
         truth |= dict(zip((f"{name}/q{c}" for c in "xyzw"), turn, strict=True))
     for step in range(5):
-        seen = eyes(truth)
-        native = fast._filter.native.update(fast._modes.best, fast._filter.reader.read(seen), np.empty(0))
+        seen = observer(truth)
+        native = fast._update_step.native.update(
+            fast._mixture.best, fast._update_step.reader.read(seen), np.empty(0)
+        )
         assert native is not None
         for a, b in [
             (fast.update(seen), slow.update(seen)),
@@ -318,18 +322,18 @@ def test_compiled_and_numpy_do_the_same_to_what_moves_by_others_speeds(place):
 
 
 @pytest.mark.compiler
-def test_what_is_not_doubted_is_found_in_c_as_well():
+def test_compiled_and_numpy_updates_agree_on_inliers():
     model = kv.load("kitchen")
-    eyes = Eyes(model, [f for f in model.frames if model.speeds_of(f)][:12])
-    fast, slow = (Tracker(model, eyes.frames, outliers=True) for _ in range(2))
-    slow._filter.native = None
+    observer = NoisyObserver(model, [f for f in model.frames if model.speeds_of(f)][:12])
+    fast, slow = (Tracker(model, observer.frames, outliers=True) for _ in range(2))
+    slow._update_step.native = None
     assert fast.wait()
     truth = {str(s): np.mean(fast.limits[s]) for s in fast.symbols}
     for step in range(4):
-        seen = eyes(truth)
-        seen[eyes.frames[2 * step]][:3, 3] += 1.0
+        seen = observer(truth)
+        seen[observer.frames[2 * step]][:3, 3] += 1.0
         a, b = fast.update(seen), slow.update(seen)
-        assert a.outliers == b.outliers == (eyes.frames[2 * step],)
+        assert a.outliers == b.outliers == (observer.frames[2 * step],)
         assert np.allclose(list(a.state.values()), list(b.state.values()), rtol=0, atol=1e-9)
         assert np.allclose(a.information, b.information, rtol=1e-6)
         assert a.log_evidence == pytest.approx(b.log_evidence, rel=1e-6)
@@ -337,23 +341,23 @@ def test_what_is_not_doubted_is_found_in_c_as_well():
 
 @pytest.mark.compiler
 @pytest.mark.parametrize("gross", [0.1, 1.0])
-def test_who_is_wrong_is_found_in_c_as_well(gross, monkeypatch):
-    """Small outliers are ambiguous, which is left to numpy; large ones never are, once something is known."""
+def test_compiled_and_numpy_updates_agree_on_outliers(gross, monkeypatch):
+    """Small outliers are ambiguous and left to numpy; large ones are not after some updates."""
     model = kv.load("kitchen")
-    eyes = Eyes(model, [f for f in model.frames if model.speeds_of(f)], 0.02, np.radians(2))
-    observed = [ObservedPose(f, covariance=eyes.covariance) for f in eyes.frames]
+    observer = NoisyObserver(model, [f for f in model.frames if model.speeds_of(f)], 0.02, np.radians(2))
+    observed = [ObservedPose(f, covariance=observer.covariance) for f in observer.frames]
     fast, slow = (Tracker(model, observed, outliers=Outliers(0.3)) for _ in range(2))
-    slow._filter.native = None
+    slow._update_step.native = None
     assert fast.wait()
     left = []
-    explain = fast._filter._explanations
-    monkeypatch.setattr(fast._filter, "_explanations", lambda *a: left.extend(a[3]) or explain(*a))
+    explain = fast._update_step._explain
+    monkeypatch.setattr(fast._update_step, "_explain", lambda *a: left.extend(a[3]) or explain(*a))
     rng = np.random.default_rng(3)
     truth = {str(s): rng.uniform(*fast.limits[s]) for s in fast.symbols}
     for step in range(10):
         left.clear()
-        seen, mask = eyes.array(truth), rng.random(len(eyes.frames)) < 0.7
-        wrong = rng.random(len(eyes.frames)) < 0.3
+        seen, mask = observer.array(truth), rng.random(len(observer.frames)) < 0.7
+        wrong = rng.random(len(observer.frames)) < 0.3
         turns = Rotation.from_rotvec(gross * rng.standard_normal((len(seen), 3))).as_matrix()
         seen[wrong, :3, 3] += gross * rng.choice([-1, 1], (wrong.sum(), 3))
         seen[wrong, :3, :3] = turns[wrong] @ seen[wrong, :3, :3]
@@ -389,21 +393,23 @@ def test_compiled_and_numpy_agree_about_groups_with_several_active_bounds(seed):
     ]
     noise = dict.fromkeys(model.speeds, 0.01)
     fast, slow = (Tracker(model, observed, process_noise=noise) for _ in range(2))
-    slow._filter.native = None
+    slow._update_step.native = None
     assert fast.wait()
     assert len(fast.groups) == 1
     truth = {str(s): rng.choice([-0.5, 0.5, 0.1]) for s in fast.symbols}
     at_bounds = 0
     for _ in range(4):
         seen = {
-            "e end": noisy(model.fk("e end")(truth), 0.1, 0.1, rng),
+            "e end": add_pose_noise(model.fk("e end")(truth), 0.1, 0.1, rng),
             "c end": rng.standard_normal(3) * 0.01
             + (model.fk("c end") @ [0.1, 0.2, 0.3, 1])({s: truth[s] for s in "abc"})[:3],
             "sum": [truth["a"] + truth["b"], truth["a"] * truth["b"]] + 0.1 * rng.standard_normal(2),
         }
         one, other = fast.update(seen), slow.update(seen)
         assert (
-            fast._filter.native.update(fast._modes.best, fast._filter.reader.read(seen), np.empty(0))
+            fast._update_step.native.update(
+                fast._mixture.best, fast._update_step.reader.read(seen), np.empty(0)
+            )
             is not None
         )
         for _ in range(2):
@@ -416,7 +422,7 @@ def test_compiled_and_numpy_agree_about_groups_with_several_active_bounds(seed):
     assert at_bounds > 0
 
 
-def test_the_least_of_a_quadratic_between_bounds():
+def test_solve_bounded_qp_equals_nonnegative_least_squares():
     rng = np.random.default_rng(0)
     for _ in range(60):
         n, m = rng.integers(1, 7), rng.integers(0, 7)
@@ -429,7 +435,7 @@ def test_the_least_of_a_quadratic_between_bounds():
         x = solve_bounded_qp(np.linalg.inv(A), g, rows, low, high)
         assert (rows @ x >= low - 1e-8).all()
         assert (rows @ x <= high + 1e-8).all()
-        # Karush, Kuhn and Tucker: the gradient is made of active rows, with the right signs.
+        # Karush-Kuhn-Tucker: the gradient is a combination of active rows with the correct signs.
         gradient = A @ x + g
         at_low, at_high = np.abs(rows @ x - low) < 1e-8, np.abs(rows @ x - high) < 1e-8
         normals = np.concatenate([rows[at_low], -rows[at_high]])
@@ -444,14 +450,14 @@ def test_the_least_of_a_quadratic_between_bounds():
 
 
 @pytest.mark.compiler
-def test_copies_may_be_used_in_several_threads():
+def test_copies_are_usable_in_several_threads():
     model = kv.load("kitchen")
-    eyes = Eyes(model, [f for f in model.frames if model.speeds_of(f)])
-    first = Tracker(model, eyes.frames, process_noise=dict.fromkeys(model.speeds, 1e-3))
+    observer = NoisyObserver(model, [f for f in model.frames if model.speeds_of(f)])
+    first = Tracker(model, observer.frames, process_noise=dict.fromkeys(model.speeds, 1e-3))
     first.wait()
     rng = np.random.default_rng(0)
     truths = [{str(s): rng.uniform(*first.limits[s]) for s in first.symbols} for _ in range(4)]
-    readings = [[eyes.array(truth) for _ in range(30)] for truth in truths]
+    readings = [[observer.array(truth) for _ in range(30)] for truth in truths]
 
     def follow(some):
         tracker = first.copy()
@@ -465,14 +471,14 @@ def test_copies_may_be_used_in_several_threads():
 
 
 @pytest.mark.compiler
-def test_a_tracker_goes_to_another_process_as_it_is():
+def test_tracker_is_picklable():
     model = kv.load("kitchen")
     frames = [f for f in model.frames if model.speeds_of(f)]
-    eyes, tracker = Eyes(model, frames), Tracker(model, frames, outliers=True)
+    observer, tracker = NoisyObserver(model, frames), Tracker(model, frames, outliers=True)
     truth = {str(s): 0.2 for s in tracker.symbols}
     tracker.wait()
-    tracker.update(eyes(truth))
-    there, seen = pickle.loads(pickle.dumps(tracker)), eyes(truth)
+    tracker.update(observer(truth))
+    there, seen = pickle.loads(pickle.dumps(tracker)), observer(truth)
     here, again = tracker.update(seen), there.update(seen)
     assert again.state == pytest.approx(dict(here.state), abs=1e-9)
     np.testing.assert_allclose(again.covariance, here.covariance, rtol=1e-9)

@@ -1,10 +1,10 @@
-"""Whatever a model can be made of is tracked: doors, mechanisms, bases, free bodies, cameras."""
+"""Tracking of all kinds of models: doors, mechanisms, bases, free bodies, cameras."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
-from synthetic_observations import Eyes
+from synthetic_observations import NoisyObserver
 
 import kineverse as kv
 from kineverse.estimation import ObservedExpression, ObservedPose, ObservedPosition, Tracker
@@ -14,8 +14,8 @@ def moving(model: kv.Model) -> list[str]:
     return [name for name in model.frames if model.speeds_of(name)]
 
 
-def within(estimate, truth, deviations=4.0):
-    """Whether all coordinates are right, as far as the estimate says it knows."""
+def is_consistent(estimate, truth, deviations=4.0):
+    """Return True if all coordinates are within some deviations of the truth."""
     return {
         str(s): (estimate.state[s], truth[str(s)], estimate.deviation[s])
         for s in estimate.state
@@ -39,40 +39,40 @@ def within(estimate, truth, deviations=4.0):
         ),
     ],
 )
-def test_mechanisms(mechanism, truth):
+def test_mechanism_is_tracked(mechanism, truth):
     model = kv.Model()
     with model.edit() as edit:
         edit.apply(mechanism)
-    eyes = Eyes(model, moving(model), 0.02, np.radians(2))
-    tracker = Tracker(model, [ObservedPose(f, covariance=eyes.covariance) for f in eyes.frames])
+    observer = NoisyObserver(model, moving(model), 0.02, np.radians(2))
+    tracker = Tracker(model, [ObservedPose(f, covariance=observer.covariance) for f in observer.frames])
     for _ in range(25):
-        estimate = tracker.update(eyes(truth))
-    assert not within(estimate, truth)
+        estimate = tracker.update(observer(truth))
+    assert not is_consistent(estimate, truth)
     assert max(estimate.deviation.values()) < 0.02
 
 
-def test_a_kitchen_by_name_in_groups():
+def test_kitchen_splits_into_groups():
     model = kv.load("kitchen")
-    eyes = Eyes(model, moving(model))
-    tracker = Tracker(model, eyes.frames)
+    observer = NoisyObserver(model, moving(model))
+    tracker = Tracker(model, observer.frames)
     assert tracker.symbols == model.degrees_of_freedom
     assert len(tracker.groups) == 23
     assert tracker.limits[model.symbol("kitchen/fridge_door")] == (0.0, pytest.approx(np.pi / 2))
     rng = np.random.default_rng(1)
     truth = {str(s): rng.uniform(*model.limits(s)) for s in tracker.symbols}
     for _ in range(5):
-        estimate = tracker.update(eyes(truth))
-    assert not within(estimate, truth)
-    assert estimate.dof == 6 * len(eyes.frames)
+        estimate = tracker.update(observer(truth))
+    assert not is_consistent(estimate, truth)
+    assert estimate.dof == 6 * len(observer.frames)
 
 
-def test_a_free_body_with_a_joint_on_it():
+def test_free_body_with_a_joint_is_tracked():
     model = kv.Model()
     with model.edit() as edit:
         edit.apply(kv.Floating(name="box", parent="world", child="box"))
         edit.apply(kv.Revolute(name="lid", parent="box", child="lid", axis=(0, 0, 1), lower=-1, upper=1))
-    eyes = Eyes(model, ["box", "lid"])
-    tracker = Tracker(model, eyes.frames, uncertainty={"box/x": 3, "box/y": 3, "box/z": 3})
+    observer = NoisyObserver(model, ["box", "lid"])
+    tracker = Tracker(model, observer.frames, uncertainty={"box/x": 3, "box/y": 3, "box/z": 3})
     truth = dict(
         zip(
             ("box/x", "box/y", "box/z", "box/qx", "box/qy", "box/qz", "box/qw", "lid"),
@@ -81,12 +81,12 @@ def test_a_free_body_with_a_joint_on_it():
         )
     )
     for _ in range(20):
-        estimate = tracker.update(eyes(truth))
-    assert not within(estimate, truth)
+        estimate = tracker.update(observer(truth))
+    assert not is_consistent(estimate, truth)
     assert len(estimate.tangent) == 7  # six of the body, not seven
 
 
-def test_wheels_get_anywhere_and_move_by_their_own_rates():
+def test_wheeled_base_is_tracked_along_its_rates():
     model = kv.Model()
     with model.edit() as edit:
         edit.apply(
@@ -95,18 +95,18 @@ def test_wheels_get_anywhere_and_move_by_their_own_rates():
             )
         )
     left, right = model.speeds
-    eyes = Eyes(model, ["base"])
+    observer = NoisyObserver(model, ["base"])
     tracker = Tracker(model, ["base"], process_noise={left: 0.01, right: 0.01})
     state = kv.State({"base/x": 1.0, "base/y": -1.0, "base/angle": 2.0})
     for _ in range(30):
         state = model.integrate(state, {left: 5.0, right: 3.0}, 0.1)
         tracker.predict(0.1, {left: 5.0, right: 3.0})
-        estimate = tracker.update(eyes(state))
-    assert not within(estimate, {str(s): v for s, v in state.items()})
+        estimate = tracker.update(observer(state))
+    assert not is_consistent(estimate, {str(s): v for s, v in state.items()})
     assert [str(v) for v in estimate.tangent] == ["base/angle:velocity", "base/x:velocity", "base/y:velocity"]
 
 
-def test_positions_and_expressions_and_a_camera_that_moves():
+def test_positions_and_expressions_from_a_moving_camera_are_tracked():
     model = kv.load("kitchen")
     with model.edit() as edit:
         pan = kv.position("pan")
@@ -118,13 +118,13 @@ def test_positions_and_expressions_and_a_camera_that_moves():
             ObservedPosition(handle, (0.1, 0.0, 0.0), relative_to="camera", covariance=1e-4 * np.eye(3)),
             ObservedExpression("potentiometer", 2 * kv.position(door), covariance=0.01),
         ],
-        known=["pan"],
+        inputs=["pan"],
     )
     point = model.fk(handle, "camera") @ [0.1, 0, 0, 1]
     for pan_now in np.linspace(0, 1, 10):
         truth = {door: 0.9, "pan": pan_now}
         seen = {handle: point(truth)[:3], "potentiometer": 1.8}
-        estimate = tracker.update(seen, given={"pan": pan_now})
+        estimate = tracker.update(seen, inputs={"pan": pan_now})
     assert estimate.state[door] == pytest.approx(0.9, abs=1e-3)
     assert estimate.dof == 4
 
@@ -147,27 +147,27 @@ def test_positions_and_expressions_and_a_camera_that_moves():
         ("jansen_leg", None),
     ],
 )
-def test_what_has_more_coordinates_than_ways_to_move_or_many_turns(name, truth):
-    """Wheels that are seen to turn, threads of many turns, quaternions within a cone, closed loops."""
+def test_redundant_coordinates_and_multi_turn_joints_are_tracked(name, truth):
+    """Observed wheels, screws of many turns, quaternions within a cone, closed loops."""
     model = kv.load(f"articulations/{name}")
-    eyes = Eyes(model, moving(model))
-    tracker = Tracker(model, eyes.frames)
+    observer = NoisyObserver(model, moving(model))
+    tracker = Tracker(model, observer.frames)
     if truth is None:
         state = model.default_state()
     else:
         state = kv.State({f"{name}/{s}": value for s, value in truth.items()})
     for _ in range(4):
-        estimate = tracker.update(eyes(state))
+        estimate = tracker.update(observer(state))
     coordinates = [s for s in estimate.state if str(s)[-3:-1] != "/q"]
     for s in coordinates:
         off = estimate.state[s] - state[s]
-        if s in tracker.turning:
+        if s in tracker.periodic:
             off = np.angle(np.exp(1j * off))
         assert abs(off) < 5 * estimate.deviation[s]
-    assert np.abs(eyes.truth(estimate.state) - eyes.truth(state)).max() < 0.05
+    assert np.abs(observer.truth(estimate.state) - observer.truth(state)).max() < 0.05
 
 
-def test_a_camera_that_nobody_knows_is_found_by_what_stands_still():
+def test_unknown_camera_pose_is_estimated_from_static_frames():
     model = kv.Model()
     hinge = kv.model.Pose.of(kv.translation(1, 0, 0))
     with model.edit() as edit:
@@ -178,20 +178,20 @@ def test_a_camera_that_nobody_knows_is_found_by_what_stands_still():
             )
         )
         edit.add_frame("marker", "world", kv.translation(1, 1, 0.3))
-    eyes = Eyes(model, ["marker", "door"], relative_to="camera")
-    tracker = Tracker(model, [ObservedPose(f, relative_to="camera") for f in eyes.frames])
+    observer = NoisyObserver(model, ["marker", "door"], relative_to="camera")
+    tracker = Tracker(model, [ObservedPose(f, relative_to="camera") for f in observer.frames])
     turn = {"camera/qx": 0.5, "camera/qy": -0.5, "camera/qz": 0.5, "camera/qw": 0.5}
     truth = model.default_state().updated({"camera/x": 0.3, "door": 0.8, **turn})
     for _ in range(10):
-        estimate = tracker.update(eyes(truth))
+        estimate = tracker.update(observer(truth))
     assert estimate.state["door"] == pytest.approx(0.8, abs=4 * estimate.deviation["door"])
     assert estimate.state["camera/x"] == pytest.approx(0.3, abs=4 * estimate.deviation["camera/x"])
     assert len(estimate.tangent) == 7
 
 
 @pytest.mark.parametrize("name", ["bare", "drawn"])
-def test_a_dial_that_begins_again(name):
-    """A turntable goes round twice, and its dial says so within a turn; C and numpy alike."""
+def test_periodic_dial_is_tracked_beyond_a_turn(name):
+    """A turntable turns twice, and its dial wraps after a turn; in C and numpy."""
     model = kv.Model()
     with model.edit() as edit:
         edit.apply(kv.Continuous(name="q", parent="world", child="plate"))
@@ -204,7 +204,7 @@ def test_a_dial_that_begins_again(name):
         uncertainty={"q": 0.1},
         process_noise={"q:velocity": 0.1},
     )
-    assert tracker.turning == {q}
+    assert tracker.periodic == {q}
     for step in range(100):
         tracker.wait() if step == 50 else None
         truth = 3.0 + 0.13 * step

@@ -1,4 +1,4 @@
-"""A tracker knows how much it knows: errors, innovations and covariances against the noise that made them."""
+"""Statistical consistency of a tracker: errors, innovations and covariances against the true noise."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
-from synthetic_observations import Eyes
+from synthetic_observations import NoisyObserver
 
 import kineverse as kv
 from kineverse.estimation import (
@@ -22,26 +22,26 @@ STEPS = 25
 CONFIGURATIONS = 40
 
 
-def information_of(eyes, state, symbols, deviations):
-    """What 25 observations and the start say about each coordinate, by differences of poses: Cramér and Rao."""
-    at, h = eyes.truth(state), 1e-6
+def fisher_information(observer, state, symbols, deviations):
+    """Return the information of 25 observations and the start by differences of poses (Cramér-Rao)."""
+    at, h = observer.truth(state), 1e-6
     found = deviations**-2.0
     for i, symbol in enumerate(symbols):
-        there = eyes.truth({**state, symbol: state[symbol] + h})
-        shift = (there[:, :3, 3] - at[:, :3, 3]) / h / eyes.position
+        there = observer.truth({**state, symbol: state[symbol] + h})
+        shift = (there[:, :3, 3] - at[:, :3, 3]) / h / observer.position
         turn = Rotation.from_matrix(there[:, :3, :3] @ at[:, :3, :3].transpose(0, 2, 1)).as_rotvec() / h
-        found[i] += STEPS * ((shift**2).sum() + (turn**2).sum() / eyes.orientation**2)
+        found[i] += STEPS * ((shift**2).sum() + (turn**2).sum() / observer.orientation**2)
     return found
 
 
 @pytest.mark.compiler
 @pytest.mark.parametrize(("position", "degrees"), [(0.01, 1), (0.05, 5), (0.1, 10)])
-def test_a_kitchen(position, degrees):
-    """Consistent, and as good as can be: on 920 coordinates the mean of squares varies by 5 %."""
+def test_kitchen_is_consistent_and_efficient(position, degrees):
+    """NEES near 1 and errors near the bound; on 920 coordinates the sample mean varies by 5 %."""
     model = kv.load("kitchen")
     frames = [f for f in model.frames if model.speeds_of(f)]
-    eyes = Eyes(model, frames, position, np.radians(degrees), seed=degrees)
-    first = Tracker(model, [ObservedPose(f, covariance=eyes.covariance) for f in frames])
+    observer = NoisyObserver(model, frames, position, np.radians(degrees), seed=degrees)
+    first = Tracker(model, [ObservedPose(f, covariance=observer.covariance) for f in frames])
     first.wait()
     limits = np.array([first.limits[s] for s in first.symbols])
     names = [str(s) for s in first.symbols]
@@ -52,11 +52,11 @@ def test_a_kitchen(position, degrees):
         state = dict(zip(names, truth.tolist(), strict=True))
         tracker = first.copy()
         for step in range(STEPS):
-            estimate = tracker.update_poses(eyes.array(state))
+            estimate = tracker.update_poses(observer.array(state))
             if step:  # the start is uniform and no Gaussian
                 innovations.append(estimate.nis)
         error = np.array([estimate.state[s] for s in first.symbols]) - truth
-        information = information_of(eyes, state, names, np.ptp(limits, axis=1) / 2)
+        information = fisher_information(observer, state, names, np.ptp(limits, axis=1) / 2)
         inside = np.minimum(truth - limits[:, 0], limits[:, 1] - truth) > 3 / np.sqrt(information)
         errors.append(error)
         bounds.append(1 / information)
@@ -68,13 +68,13 @@ def test_a_kitchen(position, degrees):
     assert low < np.mean(innovations) / estimate.dof < high
 
 
-def test_the_covariance_of_a_free_body_is_that_of_many_runs():
+def test_covariance_of_a_free_body_equals_the_sample_covariance():
     model = kv.Model()
     with model.edit() as edit:
         edit.apply(kv.Floating(name="box", parent="world", child="box"))
         edit.apply(kv.Revolute(name="lid", parent="box", child="lid", axis=(0, 1, 0), lower=-1.5, upper=1.5))
-    eyes = Eyes(model, ["box", "lid"], 0.02, np.radians(3))
-    first = Tracker(model, [ObservedPose(f, covariance=eyes.covariance) for f in eyes.frames])
+    observer = NoisyObserver(model, ["box", "lid"], 0.02, np.radians(3))
+    first = Tracker(model, [ObservedPose(f, covariance=observer.covariance) for f in observer.frames])
     turn = Rotation.from_rotvec([2.0, -1.0, 1.0])
     state = dict(zip(("box/x", "box/y", "box/z"), (1.0, -2.0, 0.5), strict=True)) | {"lid": 0.4}
     state |= dict(zip(("box/qx", "box/qy", "box/qz", "box/qw"), turn.as_quat(), strict=True))
@@ -82,7 +82,7 @@ def test_the_covariance_of_a_free_body_is_that_of_many_runs():
     for _ in range(40):
         tracker = first.copy()
         for _ in range(5):
-            estimate = tracker.update(eyes(state))
+            estimate = tracker.update(observer(state))
         found = estimate.state
         said = Rotation.from_quat([found[f"box/q{c}"] for c in "xyzw"])
         # From the estimate to the truth: angular velocities are in the axes of the body.
@@ -94,8 +94,8 @@ def test_the_covariance_of_a_free_body_is_that_of_many_runs():
     assert low < sum(nees) < high
 
 
-def test_wheels_with_noise_on_them():
-    """Process noise enters by the rates: a robot that drives knows how far off it may be, sideways too."""
+def test_process_noise_on_wheels_is_consistent():
+    """Process noise enters through the rates, so the lateral error of a driving base is consistent."""
     model = kv.Model()
     with model.edit() as edit:
         edit.apply(
@@ -133,17 +133,17 @@ def anywhere(rng):
     return pose
 
 
-def test_one_in_five_is_wrong_and_half_is_hidden():
+def test_outliers_and_occlusion_are_tracked_consistently():
     model = kv.load("kitchen")
     frames = [f for f in model.frames if model.speeds_of(f)][:16]
-    eyes = Eyes(model, frames, 0.02, np.radians(2), seed=4)
-    observed = [ObservedPose(f, covariance=eyes.covariance) for f in frames]
+    observer = NoisyObserver(model, frames, 0.02, np.radians(2), seed=4)
+    observed = [ObservedPose(f, covariance=observer.covariance) for f in frames]
     tracker = Tracker(model, observed, outliers=Outliers(fraction=0.2))
     rng = np.random.default_rng(5)
     truth = {str(s): rng.uniform(*tracker.limits[s]) for s in tracker.symbols}
     listed, wrong = [], []
     for _ in range(15):
-        seen = {f: T for f, T in eyes(truth).items() if rng.random() < 0.5}
+        seen = {f: T for f, T in observer(truth).items() if rng.random() < 0.5}
         bad = [f for f in seen if rng.random() < 0.2]
         estimate = tracker.update(seen | {f: anywhere(rng) for f in bad})
         listed.append(set(estimate.outliers))
@@ -155,19 +155,19 @@ def test_one_in_five_is_wrong_and_half_is_hidden():
     assert min(estimate.confidence.values()) > 0.99
 
 
-def test_who_began_with_a_wrong_one_changes_its_mind():
-    """A free body fits any pose. The second observation contradicts the first, and the third decides."""
+def test_first_measurement_as_outlier_is_corrected():
+    """A free body fits any pose: the second observation contradicts the first, the third decides."""
     model = kv.Model()
     with model.edit() as edit:
         edit.apply(kv.Floating(name="box", parent="world", child="box"))
-    eyes = Eyes(model, ["box"])
+    observer = NoisyObserver(model, ["box"])
     tracker = Tracker(model, ["box"], outliers=True)
     truth = model.default_state()
     tracker.update({"box": anywhere(np.random.default_rng(1))})
-    estimate = tracker.update(eyes(truth))
+    estimate = tracker.update(observer(truth))
     assert max(estimate.confidence.values()) < 0.9
     for _ in range(3):
-        estimate = tracker.update(eyes(truth))
+        estimate = tracker.update(observer(truth))
     assert min(estimate.confidence.values()) > 0.999
     assert abs(estimate.state["box/x"]) < 0.02
 
@@ -179,7 +179,7 @@ def part(joint) -> kv.Model:
     return model
 
 
-def test_hinge_or_drawer():
+def test_hypothesis_bank_tells_hinge_from_drawer():
     hinge = part(kv.Revolute(name="q", parent="world", child="part", axis=(0, 0, 1), lower=0, upper=1.5))
     drawer = part(kv.Prismatic(name="q", parent="world", child="part", axis=(0, 1, 0), lower=0, upper=0.5))
     for right, model, reach in (("hinge", hinge, 1.0), ("drawer", drawer, 0.4)):
@@ -188,9 +188,9 @@ def test_hinge_or_drawer():
             for name, m in (("hinge", hinge), ("drawer", drawer))
         }
         hypotheses = HypothesisBank(trackers)
-        eyes = Eyes(model, ["part"])
+        observer = NoisyObserver(model, ["part"])
         for k in range(10):
-            probabilities = hypotheses.update(eyes({"q": reach * k / 10}), at=0.1 * k)
+            probabilities = hypotheses.update(observer({"q": reach * k / 10}), at=0.1 * k)
         assert sum(probabilities.values()) == pytest.approx(1.0)
         assert hypotheses.best == right
         assert probabilities[right] > 0.999
@@ -198,8 +198,8 @@ def test_hinge_or_drawer():
 
 @pytest.mark.compiler
 @pytest.mark.parametrize("is_compiled", [True, False])
-def test_who_has_to_leave_its_limits_to_explain_is_not_believed(is_compiled):
-    """The evidence is that inside the limits: compared with an integral over them, it is off by one at most."""
+def test_evidence_counts_limits(is_compiled):
+    """The evidence inside the limits differs from its integral by one at most."""
     seen = [0.09, 0.11, 0.1]
     found, exact = {}, {}
     for lower in (0.0, 0.08, 0.25):
@@ -209,7 +209,7 @@ def test_who_has_to_leave_its_limits_to_explain_is_not_believed(is_compiled):
         tracker = Tracker(model, [ObservedPosition("part", covariance=np.eye(3) * 0.01**2)])
         tracker.wait()
         if not is_compiled:
-            tracker._filter.native = None
+            tracker._update_step.native = None
         q = np.linspace(lower, 0.5, 100_001)
         prior = np.exp(-(((q - tracker.estimate.state["q"]) / (0.5 - lower) * 2) ** 2) / 2)
         right = np.prod([np.exp(-(((q - z) / 0.01) ** 2) / 2) for z in seen], axis=0)
@@ -221,7 +221,7 @@ def test_who_has_to_leave_its_limits_to_explain_is_not_believed(is_compiled):
         assert found[lower] - found[0.0] == pytest.approx(exact[lower] - exact[0.0], rel=0.02, abs=1)
 
 
-def test_locked_or_free_and_a_lock_that_opens():
+def test_hypothesis_bank_follows_a_lock_that_opens():
     model = part(kv.Revolute(name="q", parent="world", child="part", axis=(0, 0, 1), lower=0, upper=1.5))
     start = {"start": {"q": 0.0}, "uncertainty": {"q": 0.01}}
     hypotheses = HypothesisBank(
@@ -231,15 +231,15 @@ def test_locked_or_free_and_a_lock_that_opens():
         },
         forgetting=1.0,
     )
-    eyes, found = Eyes(model, ["part"]), []
+    observer, found = NoisyObserver(model, ["part"]), []
     for k in range(60):
         angle = max(0.0, 0.1 * (k - 40) / 2)
-        found.append(hypotheses.update(eyes({"q": angle}), at=0.1 * k)["locked"])
+        found.append(hypotheses.update(observer({"q": angle}), at=0.1 * k)["locked"])
     assert np.mean(found[20:40]) > 0.8
     assert max(found[50:]) < 1e-3
 
 
-def test_a_lock_of_the_model_holds_against_noise_and_commands():
+def test_locks_hold_against_noise_and_commands():
     model = kv.Model()
     with model.edit() as edit:
         edit.apply(kv.articulations.GarageDoor(name="g", parent="world"))
@@ -257,7 +257,7 @@ def test_a_lock_of_the_model_holds_against_noise_and_commands():
         assert estimate.deviation["g/bolt"] > 0.05
 
 
-def test_points_of_a_body_from_any_side():
+def test_points_determine_a_body_from_any_start():
     model = kv.Model()
     with model.edit() as edit:
         edit.apply(kv.Floating(name="b", parent="world", child="b"))
@@ -274,7 +274,7 @@ def test_points_of_a_body_from_any_side():
         assert (said * turn.inv()).magnitude() < 0.05
 
 
-def on_wheels(points):
+def make_vehicle(points):
     model = kv.Model()
     with model.edit() as edit:
         edit.apply(kv.articulations.OmniBase(name="b", parent="world", child="b"))
@@ -283,9 +283,9 @@ def on_wheels(points):
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_who_sees_one_point_of_a_body_learns_nothing_of_its_angle(seed):
-    """States are possible on a ring; its tangents at two places must not pass for two observations."""
-    model, tracker = on_wheels({"p": (0.1, 0.2, 0.3)})
+def test_one_point_of_a_body_leaves_its_angle_unknown(seed):
+    """The states form a ring; its tangents at two points must not count as two observations."""
+    model, tracker = make_vehicle({"p": (0.1, 0.2, 0.3)})
     rng = np.random.default_rng(seed)
     truth = {"b/x": rng.normal(), "b/y": rng.normal(), "b/angle": rng.uniform(-3, 3)}
     there = (model.fk("b")(truth) @ [0.1, 0.2, 0.3, 1])[:3]
@@ -296,9 +296,9 @@ def test_who_sees_one_point_of_a_body_learns_nothing_of_its_angle(seed):
         assert abs(estimate.state[name] - truth[name]) < 3 * estimate.deviation[name]
 
 
-def test_two_points_of_a_body_seen_in_turn():
+def test_two_alternating_points_determine_a_body():
     points = {"p": (0.1, 0.2, 0.3), "q": (-0.4, 0.1, 0.0)}
-    model, first = on_wheels(points)
+    model, first = make_vehicle(points)
     found = []
     for seed in range(40):
         tracker, rng = first.copy(), np.random.default_rng(seed)
@@ -314,7 +314,7 @@ def test_two_points_of_a_body_seen_in_turn():
 
 
 @pytest.mark.parametrize("start", [(-5, 0.5), (1, 1), (5, 5), (0, -3)])
-def test_a_place_from_distances_one_at_a_time(start):
+def test_position_from_sequential_distances_is_consistent(start):
     model = kv.Model()
     with model.edit() as edit:
         edit.apply(kv.Planar(name="p", parent="world", child="p"))

@@ -167,7 +167,7 @@ def is_inlier(squares: Stack, log_scale: Stack, outliers: Outliers, rows: int = 
 
 
 def _log_wrong(outliers: Outliers, rows: int) -> float:
-    anywhere = outliers.log_anywhere if rows == 6 else -3.0 * math.log(outliers.reach)
+    anywhere = outliers.log_uniform_density if rows == 6 else -3.0 * math.log(outliers.reach)
     return math.log(outliers.fraction) + anywhere
 
 

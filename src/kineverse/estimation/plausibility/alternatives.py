@@ -1,9 +1,10 @@
 """Comparison of the served joint with its alternatives.
 
-As in :mod:`kineverse.estimation.identification.evidence`, joint values are drawn from a Gaussian of unknown
-mean and width, here cut off at the limits: so a door that only moved a little is not compared with one that
-moved all the way. What is identified instead has a mean pose of which nothing is known beforehand; here it is
-somewhere within a cube of 2 m and turned in any way, so that both densities have the same unit.
+As in :mod:`kineverse.estimation.identification.evidence`, the prior of joint values is a Gaussian of unknown
+mean and width, here truncated at the limits. So the amplitude of a motion is no evidence: a door that moved a
+little is not compared with one that moved all the way. Identified joints have an improper prior of their mean
+pose. Here the pose is uniform in a cube of 2 m and over all rotations, so that both densities have the same
+unit.
 """
 
 from __future__ import annotations
@@ -25,9 +26,14 @@ from kineverse.estimation.identification.kinematic_graph.pairwise import (
 from kineverse.estimation.identification.observations import Observations
 from kineverse.estimation.identification.outlier_rejection import RowIndices, is_inlier
 from kineverse.estimation.identification.result import SURE, IdentificationResult
-from kineverse.estimation.linear_algebra import invert_matrices, multiply_vectors, sum_log_determinants
+from kineverse.estimation.linear_algebra import (
+    invert_matrices,
+    log_determinants,
+    multiply_vectors,
+    sum_log_determinants,
+)
 from kineverse.estimation.robust import Outliers
-from kineverse.lie import Stack
+from kineverse.lie import Array
 from kineverse.model.model import Model
 from kineverse.model.operation import Operation
 
@@ -38,65 +44,66 @@ from .report import JointVerdict
 from .testability import TestableJoint
 
 
-def reject_outliers(left: KnownResiduals, outliers: Outliers | None) -> RowIndices:
-    """Return the numbers of the observations that are right if the articulation is as served."""
-    everything = np.arange(len(left))
-    if outliers is None or not len(left):
-        return everything
-    squares = np.sum(left.normal**2, axis=1)
-    if left.against.size:
-        squares = squares + np.fmax(left.against, 0.0).max(axis=1) ** 2
-    log_scale = left.log_scale + 0.5 * np.linalg.slogdet(2.0 * np.pi * left.covariances)[1]
-    right = everything[is_inlier(squares, log_scale, outliers)]
-    # More than chance makes of their fraction are no outliers, but something that is not understood.
-    expected = outliers.fraction * len(left)
-    usual = len(left) - len(right) <= expected + 2.0 * math.sqrt(expected)
-    return right if usual else everything
+def reject_outliers(residuals: KnownResiduals, outliers: Outliers | None) -> RowIndices:
+    """Return the numbers of the inliers under the served joint."""
+    all_rows = np.arange(len(residuals))
+    if outliers is None or not len(residuals):
+        return all_rows
+    squares = np.sum(residuals.orthogonal**2, axis=1)
+    if residuals.one_sided.size:
+        squares = squares + np.fmax(residuals.one_sided, 0.0).max(axis=1) ** 2
+    log_scale = residuals.log_scale + 0.5 * log_determinants(math.tau * residuals.covariances)
+    right = all_rows[is_inlier(squares, log_scale, outliers)]
+    # More outliers than chance explains indicate a wrong model instead.
+    expected = outliers.fraction * len(residuals)
+    usual = len(residuals) - len(right) <= expected + 2.0 * math.sqrt(expected)
+    return right if usual else all_rows
 
 
 _WIDTHS = np.geomspace(1e-5, 10.0, 43)
-_STILL = np.array([1e-9])
+_STATIC_WIDTH = np.array([1e-9])
 _erf = np.vectorize(math.erf, otypes=[np.float64])
 
 
-def log_evidence(served: KnownJoint, seen: KnownResiduals, still: bool = False) -> float:
-    """Return the logarithm of the density of the observed relative poses, with joint values integrated out.
+def log_evidence(served: KnownJoint, residuals: KnownResiduals, is_static: bool = False) -> float:
+    """Return the log density of the observed relative poses, with joint values integrated out.
 
-    Limits cut off what is drawn only where there is one joint value. What is beyond those of several, or
-    beyond ties, is less probable by its distance.
+    Limits truncate the prior only for a single joint value. For several joint values, and for limits on
+    several coordinates, violations reduce the density by their distance.
 
     Parameters
     ----------
-    served, seen
-        The articulation and what it leaves unexplained.
-    still
-        Whether it is taken as not moving, somewhere within its limits.
+    served, residuals
+        The served joint and its residuals.
+    is_static
+        True to assume one constant joint value within the limits.
     """
-    log = -float(np.sum(0.5 * np.sum(seen.normal**2, axis=1) + seen.log_scale))
-    log -= 0.5 * float(np.nansum(np.maximum(seen.tied, 0.0) ** 2))
-    # What others say of a coordinate differs by 1 on average if the model is right.
-    told = np.isfinite(seen.apart)
-    log -= 0.5 * float(np.maximum(np.nansum(seen.apart**2, axis=0) - told.sum(axis=0), 0.0).sum())
-    widths = _STILL if still else _WIDTHS
+    log = -float(np.sum(0.5 * np.sum(residuals.orthogonal**2, axis=1) + residuals.log_scale))
+    log -= 0.5 * float(np.nansum(np.maximum(residuals.limit_excess, 0.0) ** 2))
+    # The expected squared disagreement under a correct model is 1.
+    known = np.isfinite(residuals.disagreement)
+    log -= 0.5 * float(
+        np.maximum(np.nansum(residuals.disagreement**2, axis=0) - known.sum(axis=0), 0.0).sum()
+    )
+    widths = _STATIC_WIDTH if is_static else _WIDTHS
     if served.joints == 1:
         lower, upper = float(served.lower[0]), float(served.upper[0])
         density = float(_log_density(served)[0])
-        values, variances = seen.values[:, 0], seen.covariances[:, 0, 0]
+        values, variances = residuals.values[:, 0], residuals.covariances[:, 0, 0]
         return log + _log_mean(_log_evidence_by_width(values, variances, lower, upper, widths, density))
-    # Of several joint values the prior is not cut off, but the nearest that is inside the limits counts.
-    log -= 0.5 * float(np.sum(np.maximum(seen.beyond, 0.0) ** 2))
-    return log + (_several(served, seen, widths) if served.joints else 0.0)
+    # The prior of several joint values is not truncated; the distance to the limits counts instead.
+    log -= 0.5 * float(np.sum(np.maximum(residuals.bound_excess, 0.0) ** 2))
+    return log + (_log_evidence_of_several(served, residuals, widths) if served.joints else 0.0)
 
 
-def log_displacement_gain(seen: KnownResiduals) -> float:
-    """Return by how much the density is larger if the articulation, or the child on it, sits elsewhere.
+def log_displacement_gain(residuals: KnownResiduals) -> float:
+    """Return the log density ratio of a displaced joint, or child on it, to the served one.
 
-    With ρ = G δ + noise and δ ~ N(0, s² I), where it sits integrated out, on average over some sizes s. As a
-    logarithm.
+    ρ = G δ + noise with δ ~ N(0, s² I), with δ integrated out and averaged over several s.
     """
-    transposed = np.swapaxes(seen.by_place, 1, 2)
-    information = np.sum(transposed @ seen.by_place, axis=0)
-    pull = np.sum(transposed @ seen.normal[:, :, None], axis=0)[:, 0]
+    transposed = np.swapaxes(residuals.displacement_jacobian, 1, 2)
+    information = np.sum(transposed @ residuals.displacement_jacobian, axis=0)
+    pull = np.sum(transposed @ residuals.orthogonal[:, :, None], axis=0)[:, 0]
     logs = []
     for size in SIZES:
         total = information + np.eye(len(pull)) / size**2
@@ -105,19 +112,19 @@ def log_displacement_gain(seen: KnownResiduals) -> float:
     return _log_mean(np.array(logs))
 
 
-def _several(served: KnownJoint, seen: KnownResiduals, widths: Stack) -> float:
+def _log_evidence_of_several(served: KnownJoint, residuals: KnownResiduals, widths: Array) -> float:
     """Return log ∫ Π_k ∫ N(â_k; a, C_k) p(a; μ, s) da dμ at the best widths s, on average."""
     best, log = np.zeros(served.joints), 0.0
     for j in range(served.joints):
-        variances = seen.covariances[:, j, j]
-        logs = _log_evidence_by_width(seen.values[:, j], variances, -math.inf, math.inf, widths, 0.0)
+        variances = residuals.covariances[:, j, j]
+        logs = _log_evidence_by_width(residuals.values[:, j], variances, -math.inf, math.inf, widths, 0.0)
         best[j] = widths[int(np.argmax(logs))]
         log += _log_mean(logs - float(np.max(logs)))
-    total = seen.covariances + np.diag(best**2)
+    total = residuals.covariances + np.diag(best**2)
     weights = invert_matrices(total)
     information = weights.sum(axis=0)
-    mean = np.linalg.solve(information, multiply_vectors(weights, seen.values).sum(axis=0))
-    off = seen.values - mean
+    mean = np.linalg.solve(information, multiply_vectors(weights, residuals.values).sum(axis=0))
+    off = residuals.values - mean
     log -= 0.5 * (
         float(np.sum(off * multiply_vectors(weights, off))) + sum_log_determinants(math.tau * total)
     )
@@ -125,21 +132,21 @@ def _several(served: KnownJoint, seen: KnownResiduals, widths: Stack) -> float:
     return log + min(volume + float(_log_density(served).sum()), 0.0)
 
 
-def _log_density(served: KnownJoint) -> Stack:
-    """Return the logarithm of the density of the mean of each joint value: anywhere within its limits."""
+def _log_density(served: KnownJoint) -> Array:
+    """Return the log density of the mean of each joint value, uniform within its limits."""
     width = served.upper - served.lower
-    free = np.where(served.turning, 2.0 * math.pi, 20.0)
-    density: Stack = -np.log(np.where(np.isfinite(width), np.maximum(width, 1e-6), free))
+    free = np.where(served.is_angle, 2.0 * math.pi, 20.0)
+    density: Array = -np.log(np.where(np.isfinite(width), np.maximum(width, 1e-6), free))
     return density
 
 
-def _log_mean(logs: Stack) -> float:
+def _log_mean(logs: Array) -> float:
     return float(np.logaddexp.reduce(logs)) - math.log(len(logs))
 
 
 def _log_evidence_by_width(
-    values: Stack, variances: Stack, lower: float, upper: float, widths: Stack, density: float
-) -> Stack:
+    values: Array, variances: Array, lower: float, upper: float, widths: Array, density: float
+) -> Array:
     """Return log ∫ dμ p(μ) Π_k ∫ N(â_k; a, C_k) p(a; μ, s) da for each width s."""
     s2 = widths[:, None] ** 2
     total = variances + s2
@@ -147,7 +154,7 @@ def _log_evidence_by_width(
     sums = weights.sum(axis=1)
     mean = np.clip((weights @ values) / sums, lower, upper)
     off = values - mean[:, None]
-    logs: Stack = -0.5 * np.sum(np.log(2.0 * math.pi * total) + off**2 * weights, axis=1)
+    logs: Array = -0.5 * np.sum(np.log(2.0 * math.pi * total) + off**2 * weights, axis=1)
     logs += np.minimum(0.5 * np.log(2.0 * math.pi / sums) + density, 0.0)
     if math.isfinite(lower) or math.isfinite(upper):
         spread = np.sqrt(variances * s2 * weights)
@@ -157,108 +164,115 @@ def _log_evidence_by_width(
     return logs
 
 
-def _log_mass(mean: Stack, deviation: Stack, lower: float, upper: float) -> Stack:
-    """Return the logarithm of the part of a Gaussian that is inside limits."""
+def _log_mass(mean: Array, deviation: Array, lower: float, upper: float) -> Array:
+    """Return the log probability of a Gaussian inside limits."""
     scale = math.sqrt(2.0) * deviation
     mass = 0.5 * (_erf((upper - mean) / scale) - _erf((lower - mean) / scale))
-    result: Stack = np.log(np.maximum(mass, 1e-300))
+    result: Array = np.log(np.maximum(mass, 1e-300))
     return result
 
 
-BELIEFS: Mapping[str, float] = MappingProxyType(
-    {"served": 0.8, "elsewhere": 0.05, "rigid": 0.1, "other": 0.05}
-)
-"""How probable it is beforehand that an articulation is as served, that it or what is on it sits a bit
-elsewhere, that it does not move, or that it is something else."""
+PRIOR: Mapping[str, float] = MappingProxyType({"served": 0.8, "elsewhere": 0.05, "rigid": 0.1, "other": 0.05})
+"""Prior probabilities: joint as served, joint or child displaced, rigid, another joint."""
 
-# Fewer observations do not show how something moves.
-_ENOUGH = 5
+# Least number of observations for a statement about the motion.
+_LEAST_COUNT = 5
 
 
 @dataclass(frozen=True)
 class JointObservations:
-    """A link and how it was seen.
+    """Observations of a tested joint.
 
     Attributes
     ----------
+    joint, served
+        The tested joint, and its motion in the served model.
     observations
-        Of both frames.
-    misfit
-        What of them the articulation does not explain.
+        Observations of both frames.
+    residuals
+        Residuals under the served joint.
     times
-        The numbers of the observations, (N,).
+        Numbers of the observations, (N,).
     """
 
-    link: TestableJoint
+    joint: TestableJoint
     served: KnownJoint
     observations: Observations
-    misfit: KnownResiduals
+    residuals: KnownResiduals
     times: npt.NDArray[np.int_]
 
-    def at(self, rows: slice | npt.NDArray[np.int_]) -> JointObservations:
-        """Return some of the times at which it was seen."""
+    def select(self, rows: slice | npt.NDArray[np.int_]) -> JointObservations:
+        """Return some of the observations."""
         return JointObservations(
-            self.link, self.served, self.observations.at(rows), self.misfit.at(rows), self.times[rows]
+            self.joint, self.served, self.observations.at(rows), self.residuals.select(rows), self.times[rows]
         )
 
 
 def judge_joint(
     model: Model,
-    seen: JointObservations,
-    stopped: int | None,
+    data: JointObservations,
+    implausible_since: int | None,
     families: FamilyChoice,
     outliers: Outliers | None,
 ) -> JointVerdict:
-    """Return the rating of an articulation, given since when it does not explain what is seen."""
-    if stopped is None:
-        since = seen
-        right = reject_outliers(seen.misfit, outliers)
+    """Compare a joint with its alternatives, given the change point of the sequential test."""
+    if implausible_since is None:
+        recent = data
+        right = reject_outliers(data.residuals, outliers)
     else:
-        since = seen.at(slice(int(np.searchsorted(seen.times, stopped)), None))
-        right = np.arange(len(since.times))
+        recent = data.select(slice(int(np.searchsorted(data.times, implausible_since)), None))
+        right = np.arange(len(recent.times))
         if outliers is not None and len(right) >= 2:
-            right = identify_observations(since.observations, families, outliers).best.right
-    good = since.at(right)
-    instead = identify_observations(good.observations, families) if len(right) >= 2 else None
-    probabilities = _probabilities(good, instead)
+            right = identify_observations(recent.observations, families, outliers).best.right
+    inliers = recent.select(right)
+    alternative = identify_observations(inliers.observations, families) if len(right) >= 2 else None
+    probabilities = _probabilities(inliers, alternative)
     operation, reason = None, ""
-    if stopped is not None:
-        operation, reason = _propose_replacement(model, seen, good, instead)
+    if implausible_since is not None:
+        operation, reason = _propose_replacement(model, data, inliers, alternative)
     else:
-        reason = _doubt(probabilities, len(right))
-    squares = np.mean(good.misfit.residuals**2, axis=0)
+        reason = _ambiguity_reason(probabilities, len(right))
+    squares = np.mean(inliers.residuals.pose_residuals**2, axis=0)
     rms = math.sqrt(float(squares[:3].sum())), math.sqrt(float(squares[3:].sum()))
-    wrong = tuple(np.setdiff1d(since.times, good.times).tolist())
+    outlier_times = tuple(np.setdiff1d(recent.times, inliers.times).tolist())
     return JointVerdict(
-        seen.link, probabilities, rms, len(seen.times), stopped, instead, operation, reason, wrong
+        data.joint,
+        probabilities,
+        rms,
+        len(data.times),
+        implausible_since,
+        alternative,
+        operation,
+        reason,
+        outlier_times,
     )
 
 
-def _probabilities(seen: JointObservations, instead: IdentificationResult | None) -> dict[str, float]:
-    served, left = seen.served, seen.misfit
-    as_served = log_evidence(served, left)
+def _probabilities(data: JointObservations, alternative: IdentificationResult | None) -> dict[str, float]:
+    served, residuals = data.served, data.residuals
+    as_served = log_evidence(served, residuals)
     logs = {
-        "served": math.log(BELIEFS["served"]) + as_served,
-        "elsewhere": math.log(BELIEFS["elsewhere"]) + as_served + log_displacement_gain(left),
+        "served": math.log(PRIOR["served"]) + as_served,
+        "elsewhere": math.log(PRIOR["elsewhere"]) + as_served + log_displacement_gain(residuals),
         "rigid": -math.inf,
     }
     if served.joints:
-        logs["rigid"] = math.log(BELIEFS["rigid"]) + log_evidence(served, left, still=True)
-    # A family's probability is its evidence times its belief beforehand, up to what is common to all.
-    for fit in instead or ():
-        if fit.probability > 0.0 and instead is not None:
-            odds = math.log(BELIEFS["other"]) + math.log(fit.probability / instead.best.probability)
-            log = odds + instead.best.log_evidence + LOG_ANYWHERE
+        logs["rigid"] = math.log(PRIOR["rigid"]) + log_evidence(served, residuals, is_static=True)
+    # A family's probability is its evidence times its prior, up to a common factor.
+    for fit in alternative or ():
+        if fit.probability > 0.0 and alternative is not None:
+            odds = math.log(PRIOR["other"]) + math.log(fit.probability / alternative.best.probability)
+            log = odds + alternative.best.log_evidence + LOG_ANYWHERE
             logs[fit.family] = float(np.logaddexp(logs.get(fit.family, -math.inf), log))
     total = float(np.logaddexp.reduce(list(logs.values())))
     return {"free": 0.0, **{name: math.exp(log - total) for name, log in logs.items()}}
 
 
-def _doubt(probabilities: Mapping[str, float], count: int) -> str:
-    """Return what speaks against an articulation that explains what is seen."""
+def _ambiguity_reason(probabilities: Mapping[str, float], count: int) -> str:
+    """Return the reason why a joint that fits is not certain."""
     if probabilities["served"] >= SURE:
         return ""
-    if count < _ENOUGH:
+    if count < _LEAST_COUNT:
         return f"both were seen {count} time{'s' if count > 1 else ''} only"
     other = max((name for name in probabilities if name != "served"), key=lambda name: probabilities[name])
     if other == "elsewhere":
@@ -267,37 +281,39 @@ def _doubt(probabilities: Mapping[str, float], count: int) -> str:
 
 
 def _propose_replacement(
-    model: Model, seen: JointObservations, since: JointObservations, instead: IdentificationResult | None
+    model: Model, data: JointObservations, recent: JointObservations, alternative: IdentificationResult | None
 ) -> tuple[Operation | None, str]:
-    if instead is None or len(since.times) < _ENOUGH:
+    if alternative is None or len(recent.times) < _LEAST_COUNT:
         return None, "it was seen too seldom since to say what it is instead"
-    if not instead.best.told:
-        return None, f"what it is instead is not known yet, {instead}"
-    if not follows_another(model, seen.link) and _stands_alone(model, since, instead):
-        # Another joint in its place would not help.
+    if not alternative.best.told:
+        return None, f"what it is instead is not known yet, {alternative}"
+    if not follows_another(model, data.joint) and _explains_alone(model, recent, alternative):
+        # Another joint would not resolve the contradiction.
         return None, "by itself it explains what is seen, but not together with what limits or moves it"
     try:
-        used = np.searchsorted(seen.times, since.times)
-        rows, fit = extend_fit(instead.best, seen.observations, used)
-        coordinates = seen.served.beyond_limits(seen.observations, seen.misfit.coordinates)[rows]
+        used = np.searchsorted(data.times, recent.times)
+        rows, fit = extend_fit(alternative.best, data.observations, used)
+        coordinates = data.served.solve_unbounded(data.observations, data.residuals.coordinates)[rows]
         operation = build_replacement(
-            model, seen.link, seen.served, coordinates, seen.misfit.others[rows], fit
+            model, data.joint, data.served, coordinates, data.residuals.other_values[rows], fit
         )
     except KineverseError as error:
         return None, f"what it is instead is no operation. {error}"
     try:
         with model.copy().edit() as edit:
-            edit.replace(seen.link.tag, operation)
+            edit.replace(data.joint.tag, operation)
     except KineverseError as error:
         return None, f"what it is instead cannot take its place. {error}"
     return operation, ""
 
 
-def _stands_alone(model: Model, seen: JointObservations, instead: IdentificationResult) -> bool:
-    """Whether an articulation explains what is seen without its ties to others, and with loops opened."""
-    if not (seen.misfit.tied.size or seen.misfit.apart.size):
+def _explains_alone(model: Model, data: JointObservations, alternative: IdentificationResult) -> bool:
+    """Return True if a joint fits without consistency tests and with loops opened."""
+    if not (data.residuals.limit_excess.size or data.residuals.disagreement.size):
         return False
-    served = KnownJoint(model, seen.link.child, seen.link.parent, opened=True)
-    left = compute_residuals(served, seen.observations)
-    alone = _probabilities(JointObservations(seen.link, served, seen.observations, left, seen.times), instead)
+    served = KnownJoint(model, data.joint.child, data.joint.parent, open_loops=True)
+    residuals = compute_residuals(served, data.observations)
+    alone = _probabilities(
+        JointObservations(data.joint, served, data.observations, residuals, data.times), alternative
+    )
     return alone["served"] >= SURE

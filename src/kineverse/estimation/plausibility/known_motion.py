@@ -15,44 +15,44 @@ from kineverse.estimation.identification.motion_model import LinearisedPoses, Pa
 from kineverse.estimation.identification.observations import Observations
 from kineverse.estimation.identification.optimise import Solution, levenberg_marquardt
 from kineverse.expressions.expression import array, as_expression
-from kineverse.lie import Stack
+from kineverse.lie import Array
 from kineverse.model.constraint import Constraint
 from kineverse.model.model import Model
 from kineverse.model.rate_nodes import to_plain
 from kineverse.symbols import Symbol
 
-# How many starts there are along a single coordinate, and scattered over several.
-_ALONG, _SCATTERED = 33, 256
-# Limits are approached up to this part of their width: right there a slope may be infinite.
-_INSIDE = 1e-6
-# Poses are linearised anew so often, where coordinates are not their own tangent.
+# Number of initial values of a single coordinate, and of several coordinates.
+_GRID_SIZE, _SAMPLE_SIZE = 33, 256
+# Relative margin to limits, where slopes may be infinite.
+_MARGIN = 1e-6
+# Number of relinearisations where coordinates are not their own tangent.
 _ROUNDS = 4
 
 
 class KnownJoint:
-    """The pose of a child in its parent as a function of k joint values.
+    """Pose of a child in its parent as a function of k joint values.
 
-    Joint values are the coordinates between both, or where a quaternion is among them, turns away from a
-    reference. If ``opened``, coordinates that loops determine are as if they were free.
+    Joint values are the coordinates between both. With a quaternion among them, they are displacements from a
+    reference instead. With ``open_loops``, coordinates determined by loops count as free.
 
     Attributes
     ----------
     coordinates
         The n coordinates.
     joints
-        The number of joint values, k.
+        Number of joint values, k.
     lower, upper
         Limits of the joint values, (k,); ±inf where there are none.
-    turning
-        Which joint values turn the child, (k,).
+    is_angle
+        True for joint values that rotate the child, (k,).
     home, middle
-        The coordinates in the model's default state, (n,), and where the child is then, (3,).
+        Coordinates in the model's default state, (n,), and the child's position there, (3,).
     """
 
-    def __init__(self, model: Model, child: str, parent: str, opened: bool = False) -> None:
+    def __init__(self, model: Model, child: str, parent: str, open_loops: bool = False) -> None:
         rates = model.rates
         pose = to_plain(model.fk(child, parent))
-        self.pose = pose = pose if opened else rates.resolve(pose)
+        self.pose = pose = pose if open_loops else rates.resolve(pose)
         self.coordinates = coordinates = tuple(s for s in pose.symbols if s.has_derivative)
         slopes, still = pose.gradient(heuristic=False), as_expression(np.zeros((4, 4)))
         by_coordinate = [slopes.get(x.derivative(), still) for x in coordinates]
@@ -64,11 +64,11 @@ class KnownJoint:
         inputs = (*coordinates, *others)
         self._linear = compile([pose, *by_coordinate], inputs)
         self.home = np.array([default.get(x, 0.0) for x in coordinates])
-        # Coordinates with more numbers than ways to move, such as a quaternion, move by their speeds. Others
-        # are where they are, however they came there, be it on wheels.
+        # Redundant coordinates, such as quaternions, move by their speeds. For others, also those moved by
+        # wheels, only their values matter.
         self._rates: CompiledFunction | None = None
         count = len(coordinates)
-        if any(x in rates for x in coordinates) and self._ways() < count:
+        if any(x in rates for x in coordinates) and self._mobility() < count:
             speeds = sorted({v for row in rows for v in row}, key=lambda s: s.sort_key)
             none = as_expression(0.0)
             self._rates = compile(array([[row.get(v, none) for v in speeds] for row in rows]), inputs)
@@ -76,17 +76,17 @@ class KnownJoint:
         self.joints = count
         limits = [_limits(model, x) for x in coordinates] if self.is_plain else [UNBOUNDED] * count
         self.lower, self.upper = (np.array([pair[side] for pair in limits]) for side in (0, 1))
-        there = self.at(self.home[None, :])
+        there = self.linearise(self.home[None, :])
         self.middle = there.pose[0, :3, 3]
-        self.turning = np.abs(there.by_joints[0, 3:]).max(axis=0, initial=0.0) > 1e-9
+        self.is_angle = np.abs(there.by_joints[0, 3:]).max(axis=0, initial=0.0) > 1e-9
 
     @property
     def is_plain(self) -> bool:
-        """Whether joint values are the coordinates."""
+        """True if the joint values are the coordinates."""
         return self._rates is None
 
-    def same(self, other: KnownJoint) -> bool:
-        """Whether another articulation moves alike within the same limits."""
+    def is_equal(self, other: KnownJoint) -> bool:
+        """Return True if another joint has the same motion and limits."""
         return (
             self.pose == other.pose
             and np.array_equal(self.lower, other.lower)
@@ -94,35 +94,35 @@ class KnownJoint:
             and np.array_equal(self._others, other._others)
         )
 
-    def at(self, coordinates: Stack) -> LinearisedPoses:
-        """Return poses at coordinates (N, n), and twists per unit of each joint value."""
+    def linearise(self, coordinates: Array) -> LinearisedPoses:
+        """Evaluate poses at coordinates (N, n), and twists per unit of each joint value."""
         poses, twists = self._twists(coordinates)
         if self._rates is not None:
             twists = twists @ self._rates.batch(self._points(coordinates))
         return LinearisedPoses(poses, np.zeros((len(poses), 6, 0)), twists)
 
-    def moved(self, coordinates: Stack, change: Stack) -> Stack:
+    def retract(self, coordinates: Array, change: Array) -> Array:
         """Return coordinates (N, n) after changes of the joint values (N, k), without limits."""
         if self._rates is not None:
             rates = self._rates.batch(self._points(coordinates))
             change = (rates @ change[:, :, None])[:, :, 0]
-        result: Stack = coordinates + change
+        result: Array = coordinates + change
         return result
 
-    def per_joint(self, coordinates: Stack, slopes: Stack) -> Stack:
-        """Return slopes (N, c, k) by joint values, of those by coordinates, (N, c, n)."""
+    def per_joint(self, coordinates: Array, slopes: Array) -> Array:
+        """Convert slopes by coordinates (N, c, n) to slopes by joint values (N, c, k)."""
         return slopes if self._rates is None else slopes @ self._rates.batch(self._points(coordinates))
 
-    def _ways(self) -> int:
-        """Return in how many ways the child can move at home."""
+    def _mobility(self) -> int:
+        """Return the number of degrees of freedom of the child at home."""
         _, twists = self._twists(self.home[None, :])
         return int(np.linalg.matrix_rank(twists[0]))
 
-    def _points(self, coordinates: Stack) -> Stack:
+    def _points(self, coordinates: Array) -> Array:
         others = np.broadcast_to(self._others, (len(coordinates), len(self._others)))
         return np.concatenate([coordinates, others], axis=1)
 
-    def _twists(self, coordinates: Stack) -> tuple[Stack, Stack]:
+    def _twists(self, coordinates: Array) -> tuple[Array, Array]:
         """Return poses, and twists per unit of each coordinate (N, 6, n)."""
         poses, *slopes = self._linear.batch(self._points(coordinates))
         twists = np.zeros((len(poses), 6, len(slopes)))
@@ -133,65 +133,66 @@ class KnownJoint:
                 twists[:, 3 + row, j] = 0.5 * (turned[:, a, b] - turned[:, b, a])
         return poses, twists
 
-    def solve(self, seen: Observations) -> tuple[Stack, Solution[KnownMotion]]:
-        """Return the most likely coordinates (N, n) inside the limits, and the quadratic around them."""
-        coordinates = self._starts(seen)
+    def solve(self, observations: Observations) -> tuple[Array, Solution[KnownMotion]]:
+        """Find the most likely coordinates (N, n) inside the limits, and the solution around them."""
+        coordinates = self._initial_coordinates(observations)
         for _ in range(1 if self.is_plain else _ROUNDS):
-            values = np.zeros((len(seen), self.joints))
+            values = np.zeros((len(observations), self.joints))
             if self.is_plain:
                 coordinates, values = values, coordinates
-            solution = levenberg_marquardt(seen, KnownMotion(self, coordinates), values)
-            coordinates = self.moved(coordinates, solution.values)
+            solution = levenberg_marquardt(observations, KnownMotion(self, coordinates), values)
+            coordinates = self.retract(coordinates, solution.values)
         return coordinates, solution
 
-    def beyond_limits(self, seen: Observations, inside: Stack) -> Stack:
-        """Return the most likely coordinates (N, n) as if there were no limits.
+    def solve_unbounded(self, observations: Observations, inside: Array) -> Array:
+        """Find the most likely coordinates (N, n) without limits.
 
-        Where the pose means nothing beyond them, those inside stay.
+        Where the pose is undefined beyond the limits, those inside stay.
         """
         free = copy(self)
         free.lower, free.upper = np.full(self.joints, -np.inf), np.full(self.joints, np.inf)
         try:
-            coordinates, _ = free.solve(seen)
+            coordinates, _ = free.solve(observations)
         except (KineverseError, np.linalg.LinAlgError):
             return inside
         return coordinates if np.isfinite(coordinates).all() else inside
 
-    def _starts(self, seen: Observations) -> Stack:
-        """Return coordinates near each observation: the best of some that are tried."""
+    def _initial_coordinates(self, observations: Observations) -> Array:
+        """Return the best coordinates of a grid for each observation."""
         grid = self._grid()
-        poses = self.at(grid).pose
-        observed = seen.relative
-        covariance = np.einsum("nii->i", seen.child_covariance) / len(seen)
+        poses = self.linearise(grid).pose
+        observed = observations.relative
+        covariance = np.einsum("nii->i", observations.child_covariance) / len(observations)
         place, turn = covariance[:3].sum() / 3.0, covariance[3:].sum() / 3.0
         # ‖R - S‖² = 6 - 2 tr(RᵀS) is twice the square of a small angle.
         flat, tried = observed[:, :3, :3].reshape(-1, 9), poses[:, :3, :3].reshape(-1, 9)
         off = (3.0 - flat @ tried.T) / turn
         p, q = observed[:, :3, 3], poses[:, :3, 3]
         off += (np.sum(p**2, axis=1)[:, None] - 2.0 * p @ q.T + np.sum(q**2, axis=1)) / place
-        nearest: Stack = grid[np.argmin(off, axis=1)]
+        nearest: Array = grid[np.argmin(off, axis=1)]
         return nearest
 
-    def _grid(self) -> Stack:
+    def _grid(self) -> Array:
         if not self.joints:
             return self.home[None, :]
-        low, high = self._inside()
-        reach = np.where(self.turning, math.pi, 1.0)
+        low, high = self.inner_limits()
+        reach = np.where(self.is_angle, math.pi, 1.0)
         middle = self.home if self.is_plain else np.zeros(self.joints)
         from_low = np.where(np.isfinite(low), low, middle) + reach
         from_high = np.where(np.isfinite(high), high, middle) - reach
         low, high = np.where(np.isfinite(low), low, from_high), np.where(np.isfinite(high), high, from_low)
         if self.joints == 1:
-            values = np.linspace(low, high, _ALONG)
+            values = np.linspace(low, high, _GRID_SIZE)
         else:
             random = np.random.default_rng(0)
-            values = random.uniform(low, high, (_SCATTERED, self.joints))
+            values = random.uniform(low, high, (_SAMPLE_SIZE, self.joints))
         start = np.zeros_like(self.home) if self.is_plain else self.home
-        return self.moved(np.tile(start, (len(values), 1)), values)
+        return self.retract(np.tile(start, (len(values), 1)), values)
 
-    def _inside(self) -> tuple[Stack, Stack]:
+    def inner_limits(self) -> tuple[Array, Array]:
+        """Return the limits of joint values with a margin."""
         width = self.upper - self.lower
-        margin = np.where(np.isfinite(width), _INSIDE * width, 0.0)
+        margin = np.where(np.isfinite(width), _MARGIN * width, 0.0)
         return self.lower + margin, self.upper - margin
 
 
@@ -199,7 +200,7 @@ UNBOUNDED = (-math.inf, math.inf)
 
 
 def _limits(model: Model, coordinate: Symbol) -> tuple[float, float]:
-    """Return the limits of a coordinate by itself; those that depend on others may be narrower."""
+    """Return the constant limits of a coordinate; limits that depend on others may be narrower."""
     lower, upper = UNBOUNDED
     for constraint in model.constraints_for([coordinate]).values():
         if is_own_limit(constraint, coordinate):
@@ -210,41 +211,41 @@ def _limits(model: Model, coordinate: Symbol) -> tuple[float, float]:
 
 
 def is_own_limit(constraint: Constraint, coordinate: Symbol) -> bool:
-    """Whether a constraint holds a coordinate between two numbers."""
+    """Return True if a constraint bounds a coordinate by two numbers."""
     bounds = (*constraint.lower.symbols, *constraint.upper.symbols)
     return constraint.line is not None and constraint.expression.symbols == (coordinate,) and not bounds
 
 
 @dataclass(frozen=True)
 class KnownMotion:
-    """What :func:`.solving.solve` takes: joint values as changes of coordinates (N, n)."""
+    """Motion model of a served joint: joint values are changes of coordinates (N, n), without parameters."""
 
     served: KnownJoint
-    reference: Stack
+    reference: Array
 
     size = 0
 
     @property
     def joints(self) -> int:
-        """The number of joint values."""
+        """Number of joint values."""
         return self.served.joints
 
-    def at(self, values: Stack) -> LinearisedPoses:
+    def at(self, values: Array) -> LinearisedPoses:
         """Return the poses at joint values (N, k)."""
-        return self.served.at(self.served.moved(self.reference, values))
+        return self.served.linearise(self.served.retract(self.reference, values))
 
-    def moved(self, step: Stack) -> Self:
+    def moved(self, step: Array) -> Self:
         """Return itself: there are no parameters."""
         return self
 
-    def bounded(self, values: Stack, step: Stack) -> Stack:
+    def bounded(self, values: Array, step: Array) -> Array:
         """Return joint values after a step: at most half a radian at once, and inside the limits."""
-        turning = self.served.turning
-        step = np.where(turning, np.clip(step, -0.5, 0.5), step)
-        low, high = self.served._inside()
-        result: Stack = np.clip(values + step, low, high)
+        is_angle = self.served.is_angle
+        step = np.where(is_angle, np.clip(step, -0.5, 0.5), step)
+        low, high = self.served.inner_limits()
+        result: Array = np.clip(values + step, low, high)
         return result
 
     def prior(self) -> ParameterPrior:
-        """Return that nothing is believed beforehand."""
+        """Return the empty prior of no parameters."""
         return ParameterPrior(np.zeros(0), np.zeros((0, 0)))

@@ -1,12 +1,14 @@
 """Residuals of observations under the served model.
 
-The whitened residual of a relative pose has six components of deviation 1. Those along the joint directions
-are taken up by the joint values; the other 6 - k, ρ, do not depend on them, and if the articulation is as
-served they are independent standard normal numbers. Joint values that lie beyond their limits say the rest.
+The whitened residual of a relative pose has six components with unit deviation. The joint values absorb the
+components along the joint directions. The other 6 - k, ρ, do not depend on them: if the joint is as served,
+they are independent standard normal numbers. Joint values beyond their limits are further evidence against
+it.
 """
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Self
 
@@ -15,125 +17,122 @@ import numpy.typing as npt
 
 from kineverse.estimation.identification.motion_model import LinearisedPoses
 from kineverse.estimation.identification.observations import Observations
-from kineverse.estimation.linear_algebra import invert_matrices
-from kineverse.lie import Stack, pose_difference, skew
+from kineverse.estimation.linear_algebra import invert_matrices, log_determinants
+from kineverse.lie import Array, pose_difference, skew
 
 from .known_motion import KnownJoint
 
 SIZES = (0.01, 0.05, 0.3)
-"""How far elsewhere something may sit, as standard deviations of each part of a twist [m], [rad]."""
+"""Standard deviations of a displacement, for each component of a twist [m], [rad]."""
 
-# Joint values that nothing tells are believed within 100 [m] or [rad].
+# Prior information of joint values: a deviation of 100 [m] or [rad].
 _PRECISION = 1e-4
 
 
 @dataclass(frozen=True)
 class KnownResiduals:
-    """N observations beside a served articulation.
+    """Residuals of N observations under a served joint.
 
     Attributes
     ----------
     coordinates
-        The most likely coordinates inside the limits, (N, n).
+        Most likely coordinates inside the limits, (N, n).
     values
-        The most likely joint values without limits, by linearisation, (N, k). Where they are no coordinates,
-        turns and slides from the first observation.
+        Most likely joint values without limits, by linearisation, (N, k). Where they are not the coordinates,
+        they are displacements from the first observation.
     covariances
-        Of them, (N, k, k).
-    normal
-        ρ, (N, 6 - k).
-    by_place
-        How ρ changes if the articulation sits elsewhere in the parent and the child elsewhere on it: per unit
+        Covariances of ``values``, (N, k, k).
+    orthogonal
+        ρ, the whitened residual orthogonal to the joint directions, (N, 6 - k).
+    displacement_jacobian
+        Derivative of ρ by a displacement of the joint in the parent and of the child on the joint: per unit
         of a twist of either, in their axes and about the child in the default state, (N, 6 - k, 12).
-    beyond
-        How far values are below the lower and above the upper limits, in standard deviations; -∞ without
+    bound_excess
+        Distance of values below the lower and above the upper limits, in standard deviations; -∞ without
         limits, (N, 2 k).
-    residuals
-        Of the relative pose in the parent's axes, with the best joint values inside the limits, (N, 6).
+    pose_residuals
+        Residual of the relative pose in the parent's axes, with the best joint values inside the limits, (N,
+        6).
     log_scale
-        ½ log |2πS| of each observation less ½ log |2πC| of its joint values: with ½ |ρ|², what is left when
-        joint values are integrated out, (N,).
-    tied
-        How far values are beyond limits that depend on several coordinates, in standard deviations; NaN where
-        that is not known, (N, c).
-    apart
-        How far values differ from what others say of the same coordinates, likewise, (N, e).
-    others
-        What these say, (N, e). See :mod:`.ties`, which fills the last three in.
+        ½ log |2πS| of each observation minus ½ log |2πC| of its joint values. Together with ½ |ρ|² it is the
+        negative log density with joint values integrated out, (N,).
+    limit_excess
+        Violation of limits on several coordinates, in standard deviations; NaN where unknown, (N, c).
+    disagreement
+        Difference from the estimates of the same coordinates by others, likewise, (N, e).
+    other_values
+        These estimates, (N, e). :mod:`.consistency` sets the last three.
     """
 
-    coordinates: Stack
-    values: Stack
-    covariances: Stack
-    normal: Stack
-    by_place: Stack
-    beyond: Stack
-    residuals: Stack
-    log_scale: Stack
-    tied: Stack
-    apart: Stack
-    others: Stack
+    coordinates: Array
+    values: Array
+    covariances: Array
+    orthogonal: Array
+    displacement_jacobian: Array
+    bound_excess: Array
+    pose_residuals: Array
+    log_scale: Array
+    limit_excess: Array
+    disagreement: Array
+    other_values: Array
 
     def __len__(self) -> int:
-        return len(self.normal)
+        return len(self.orthogonal)
 
     @property
-    def against(self) -> Stack:
-        """Everything that is beyond something, in standard deviations, (N, 2 k + c + 2 e)."""
-        return np.concatenate([self.beyond, self.tied, self.apart, -self.apart], axis=1)
+    def one_sided(self) -> Array:
+        """All one-sided test quantities, in standard deviations, (N, 2 k + c + 2 e)."""
+        return np.concatenate(
+            [self.bound_excess, self.limit_excess, self.disagreement, -self.disagreement], axis=1
+        )
 
-    def at(self, rows: slice | npt.NDArray[np.int_]) -> Self:
-        """Return the misfit of some of the observations."""
+    def select(self, rows: slice | npt.NDArray[np.int_]) -> Self:
+        """Return the residuals of some of the observations."""
         return type(self)(*(getattr(self, name)[rows] for name in self.__dataclass_fields__))
 
 
-def compute_residuals(served: KnownJoint, seen: Observations) -> KnownResiduals:
-    """Return what of the observations is left unexplained."""
-    coordinates, solution = served.solve(seen)
+def compute_residuals(served: KnownJoint, observations: Observations) -> KnownResiduals:
+    """Compute the residuals of observations under a served joint."""
+    coordinates, solution = served.solve(observations)
     whitening = np.linalg.inv(np.linalg.cholesky(solution.covariance))
     error = (whitening @ solution.residuals[:, :, None])[:, :, 0]
     directions = whitening @ solution.linear.by_joints
     transposed = np.swapaxes(directions, 1, 2)
     joints = served.joints
     covariances = invert_matrices(transposed @ directions + _PRECISION * np.eye(joints))
-    # At a limit the best value without limits is a step away.
+    # At a limit, one Gauss-Newton step leads to the optimum without limits.
     step = (covariances @ transposed @ error[:, :, None])[:, :, 0]
     values = solution.values + step
     if not served.is_plain:
-        values = _turns(solution.linear)
+        values = _displacements(solution.linear)
     basis = np.linalg.qr(directions, mode="complete")[0]
     across = np.swapaxes(basis[:, :, joints:], 1, 2)
     deviations = np.sqrt(np.einsum("nii->ni", covariances))
-    beyond = np.concatenate([served.lower - values, values - served.upper], axis=1)
+    excess = np.concatenate([served.lower - values, values - served.upper], axis=1)
     pose = solution.linear.pose
     return KnownResiduals(
         coordinates,
         values,
         covariances,
         (across @ error[:, :, None])[:, :, 0],
-        across @ whitening @ _moved(pose, served.middle),
-        beyond / np.tile(deviations, (1, 2)),
+        across @ whitening @ _displacement_jacobian(pose, served.middle),
+        excess / np.tile(deviations, (1, 2)),
         solution.residuals,
-        0.5 * (_log_determinants(solution.covariance) - _log_determinants(covariances)),
-        *(np.zeros((len(seen), 0)) for _ in range(3)),
+        0.5 * (log_determinants(math.tau * solution.covariance) - log_determinants(math.tau * covariances)),
+        *(np.zeros((len(observations), 0)) for _ in range(3)),
     )
 
 
-def _turns(linear: LinearisedPoses) -> Stack:
-    """Return the joint values that lead from the first pose to each, to first order."""
-    values: Stack = pose_difference(linear.pose, linear.pose[0]) @ np.linalg.pinv(linear.by_joints[0]).T
+def _displacements(linear: LinearisedPoses) -> Array:
+    """Return the joint values from the first pose to each, to first order."""
+    values: Array = pose_difference(linear.pose, linear.pose[0]) @ np.linalg.pinv(linear.by_joints[0]).T
     return values
 
 
-def _moved(pose: Stack, middle: Stack) -> Stack:
-    """Return twists of the child per unit twist of the articulation in the parent, and of the child on it."""
+def _displacement_jacobian(pose: Array, middle: Array) -> Array:
+    """Return the child's twist per unit twist of the joint in the parent, and of the child on the joint."""
     result = np.zeros((len(pose), 6, 12))
     result[:, :3, :3] = result[:, 3:, 3:6] = np.eye(3)
     result[:, :3, 3:6] = -skew(pose[:, :3, 3] - middle)
     result[:, :3, 6:9] = result[:, 3:, 9:] = pose[:, :3, :3]
     return result
-
-
-def _log_determinants(matrices: Stack) -> Stack:
-    logs: Stack = np.linalg.slogdet(2.0 * np.pi * matrices)[1]
-    return logs

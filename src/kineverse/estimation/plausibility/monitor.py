@@ -21,7 +21,7 @@ from kineverse.estimation.identification.observations import (
     pair_tracks,
 )
 from kineverse.estimation.robust import Outliers, as_outliers
-from kineverse.lie import Stack
+from kineverse.lie import Array
 from kineverse.model.frame import WORLD
 from kineverse.model.model import Model
 
@@ -37,36 +37,36 @@ from .testability import TestableJoint, TestableJoints, find_testable_joints
 
 @dataclass
 class _MonitoredJoint:
-    """A link with all that belongs to it."""
+    """Tested joint with its sequential test."""
 
-    link: TestableJoint
+    joint: TestableJoint
     served: KnownJoint | None
     reason: str
-    watch: SequentialTest
-    # The number of each observation that the watch has taken.
+    test: SequentialTest
+    # Numbers of the observations in the test.
     numbers: list[int] = field(default_factory=list)
 
     @property
-    def stopped(self) -> int | None:
-        return None if self.watch.stopped is None else self.numbers[self.watch.stopped]
+    def implausible_since(self) -> int | None:
+        return None if self.test.implausible_since is None else self.numbers[self.test.implausible_since]
 
 
 class PlausibilityMonitor:
-    """Says when an articulation of a model stops explaining what is seen, while one watches.
+    """Online plausibility test of a model.
 
-    The probability that it is ever said of an articulation which is as served is at most ``false_alarms``,
-    however long one watches. If the model is edited, what the edit changed is judged anew.
+    The probability of ever rejecting a joint that is as served is at most ``false_alarms``, for any duration.
+    After an edit of the model, joints that it changed are tested anew.
 
     Parameters
     ----------
     model
-        The model.
+        The served model.
     frames
-        Names of the frames that may be seen.
+        Names of the frames that may be observed.
     noise, relative_to, families, false_alarms, outliers
         As in :func:`~kineverse.estimation.check_plausibility`.
     keep
-        How many of the last observations are kept, to say what an articulation is instead.
+        Number of recent observations that reports use.
 
     Raises
     ------
@@ -93,144 +93,158 @@ class PlausibilityMonitor:
         self.count = 0
         self._outliers = as_outliers(outliers)
         self._noise, self._relative_to, self._families = noise, relative_to, families
-        self._kept: deque[dict[str, PoseTrack]] = deque(maxlen=keep)
-        self._watched: list[_MonitoredJoint] = []
-        self._links = TestableJoints((), {})
-        self._ties = ConsistencyTests(model, {}, relative_to)
-        self._look()
+        self._recent: deque[dict[str, PoseTrack]] = deque(maxlen=keep)
+        self._monitored: list[_MonitoredJoint] = []
+        self._testable = TestableJoints((), {})
+        self._consistency = ConsistencyTests(model, {}, relative_to)
+        self._find_joints()
 
     @property
-    def stopped(self) -> dict[str, int]:
-        """By tag, the observation from which on an articulation does not explain what is seen."""
-        found: dict[str, int] = {}
-        for watched in self._watched:
-            if (number := watched.stopped) is not None:
-                found[watched.link.tag] = min(number, found.get(watched.link.tag, number))
-        return found
+    def implausible_since(self) -> dict[str, int]:
+        """First observation that each rejected joint does not explain, by tag."""
+        result: dict[str, int] = {}
+        for monitored in self._monitored:
+            if (number := monitored.implausible_since) is not None:
+                result[monitored.joint.tag] = min(number, result.get(monitored.joint.tag, number))
+        return result
 
     def update(self, observations: Mapping[str, PosesLike]) -> tuple[str, ...]:
-        """Take one observation; return the tags of the articulations that it makes implausible.
+        """Add one observation; return the tags of newly rejected joints.
 
         Parameters
         ----------
         observations
-            From names of frames to a pose, (4, 4), or a pair of a pose and its covariance, (6, 6). What was
-            not seen is left out.
+            Pose by name of the frame, (4, 4), or pair of a pose and its covariance, (6, 6). Absent names are
+            missing.
 
         Raises
         ------
         UnknownNameError, ShapeError, InvalidValueError
-            For frames, poses and covariances that are none; nothing has happened then.
+            For invalid frames, poses and covariances; the monitor does not change then.
         """
         for name in observations:
             if name not in self.frames:
                 raise UnknownNameError(
                     f"The frame {name!r} is not watched. {suggest(str(name), self.frames, 'frame')}"
                 )
-        seen = check_tracks({name: _one(given, name) for name, given in observations.items()}, self._noise)
+        tracks = check_tracks({name: _one(given, name) for name, given in observations.items()}, self._noise)
         if self.model.version != self._version:
-            self._look()
+            self._find_joints()
         if self._relative_to is not None:
-            seen[self._relative_to] = exact_track(1)
-        before = set(self.stopped)
-        self._add(seen)
-        self._kept.append(seen)
+            tracks[self._relative_to] = exact_track(1)
+        before = set(self.implausible_since)
+        self._add(tracks)
+        self._recent.append(tracks)
         self.count += 1
-        return tuple(tag for tag in self.stopped if tag not in before)
+        return tuple(tag for tag in self.implausible_since if tag not in before)
 
     def report(self) -> Plausibility:
-        """Return the ratings of all articulations, by the observations that are kept."""
+        """Return the verdicts on all joints from the recent observations."""
         if self.model.version != self._version:
-            self._look()
-        first = self.count - len(self._kept)
-        told = {watched.link: self._told(watched, first) for watched in self._watched}
-        tied = self._ties.tied({link: known for link, known in told.items() if known is not None})
-        ratings = [self._rating(watched, tied.get(watched.link), first) for watched in self._watched]
-        return Plausibility(tuple(ratings), self._links.left_out, self.false_alarms)
+            self._find_joints()
+        first = self.count - len(self._recent)
+        residuals = {
+            monitored.joint: self._compute_residuals(monitored, first) for monitored in self._monitored
+        }
+        tested = self._consistency.apply(
+            {joint: known for joint, known in residuals.items() if known is not None}
+        )
+        verdicts = [
+            self._verdict(monitored, tested.get(monitored.joint), first) for monitored in self._monitored
+        ]
+        return Plausibility(tuple(verdicts), self._testable.untested, self.false_alarms)
 
-    def _look(self) -> None:
-        """Find out what can be judged, and go on with what has not changed."""
-        known = {watched.link: watched for watched in self._watched}
-        before = self._ties
+    def _find_joints(self) -> None:
+        """Find the testable joints, and keep the tests of unchanged ones."""
+        known = {monitored.joint: monitored for monitored in self._monitored}
+        before = self._consistency
         self._version = self.model.version
-        self._links = find_testable_joints(self.model, self.frames, self._relative_to)
-        judged_by: dict[TestableJoint, KnownJoint] = {}
-        reasons = dict.fromkeys(self._links.links, "")
-        for link in self._links.links:
+        self._testable = find_testable_joints(self.model, self.frames, self._relative_to)
+        served_joints: dict[TestableJoint, KnownJoint] = {}
+        reasons = dict.fromkeys(self._testable.joints, "")
+        for joint in self._testable.joints:
             try:
-                judged_by[link] = KnownJoint(self.model, link.child, link.parent)
+                served_joints[joint] = KnownJoint(self.model, joint.child, joint.parent)
             except KineverseError as error:
-                reasons[link] = f"its pose cannot be computed. {error}"
-        self._ties = ConsistencyTests(self.model, judged_by, self._relative_to)
-        self._watched = []
-        for link, reason in reasons.items():
-            old, served = known.get(link), judged_by.get(link)
+                reasons[joint] = f"its pose cannot be computed. {error}"
+        self._consistency = ConsistencyTests(self.model, served_joints, self._relative_to)
+        self._monitored = []
+        for joint, reason in reasons.items():
+            old, served = known.get(joint), served_joints.get(joint)
             if (
                 old is not None
                 and old.served is not None
                 and served is not None
-                and served.same(old.served)
-                and self._ties.same(link, before)
+                and served.is_equal(old.served)
+                and self._consistency.is_equal(joint, before)
             ):
-                self._watched.append(old)
+                self._monitored.append(old)
             else:
-                self._watched.append(_MonitoredJoint(link, served, reason, self._watch()))
+                self._monitored.append(_MonitoredJoint(joint, served, reason, self._new_test()))
 
-    def _watch(self) -> SequentialTest:
+    def _new_test(self) -> SequentialTest:
         return SequentialTest(self.false_alarms, self._outliers.fraction if self._outliers else 0.0)
 
-    def _add(self, seen: Mapping[str, PoseTrack]) -> None:
-        told: dict[TestableJoint, TimedResiduals] = {}
-        for watched in self._watched:
-            link = watched.link
-            if watched.served is None or not {link.parent, link.child} <= seen.keys():
+    def _add(self, tracks: Mapping[str, PoseTrack]) -> None:
+        residuals: dict[TestableJoint, TimedResiduals] = {}
+        for monitored in self._monitored:
+            joint = monitored.joint
+            if monitored.served is None or not {joint.parent, joint.child} <= tracks.keys():
                 continue
-            parent, child = seen[link.parent], seen[link.child]
+            parent, child = tracks[joint.parent], tracks[joint.child]
             if parent.seen[0] and child.seen[0]:
                 now = np.array([0])
-                told[link] = TimedResiduals(
-                    now, compute_residuals(watched.served, pair_tracks(parent, child, now))
+                residuals[joint] = TimedResiduals(
+                    now, compute_residuals(monitored.served, pair_tracks(parent, child, now))
                 )
-        tied = self._ties.tied(told)
-        for watched in self._watched:
-            if watched.link in tied:
-                left = tied[watched.link]
-                watched.numbers.append(self.count)
-                watched.watch.add(left.normal[0], left.by_place[0], left.against[0])
+        tested = self._consistency.apply(residuals)
+        for monitored in self._monitored:
+            if monitored.joint in tested:
+                joint_residuals = tested[monitored.joint]
+                monitored.numbers.append(self.count)
+                monitored.test.add(
+                    joint_residuals.orthogonal[0],
+                    joint_residuals.displacement_jacobian[0],
+                    joint_residuals.one_sided[0],
+                )
 
-    def _told(self, watched: _MonitoredJoint, first: int) -> TimedResiduals | None:
-        """Return what the observations that are kept tell of an articulation; None if they tell nothing."""
-        times = self._times(watched, first)
-        if watched.served is None or not times:
+    def _compute_residuals(self, monitored: _MonitoredJoint, first: int) -> TimedResiduals | None:
+        """Return the residuals of a joint in the recent observations; None if there are none."""
+        times = self._times(monitored, first)
+        if monitored.served is None or not times:
             return None
         return TimedResiduals(
-            np.array(times), compute_residuals(watched.served, self._poses(watched.link, times, first))
+            np.array(times), compute_residuals(monitored.served, self._poses(monitored.joint, times, first))
         )
 
-    def _times(self, watched: _MonitoredJoint, first: int) -> list[int]:
-        return [number for number in watched.numbers if number >= first]
+    def _times(self, monitored: _MonitoredJoint, first: int) -> list[int]:
+        return [number for number in monitored.numbers if number >= first]
 
-    def _poses(self, link: TestableJoint, times: Iterable[int], first: int) -> Observations:
-        kept = [self._kept[number - first] for number in times]
+    def _poses(self, joint: TestableJoint, times: Iterable[int], first: int) -> Observations:
+        kept = [self._recent[number - first] for number in times]
         parent, child = (
-            concatenate_tracks([one[name] for one in kept]) for name in (link.parent, link.child)
+            concatenate_tracks([one[name] for one in kept]) for name in (joint.parent, joint.child)
         )
         return pair_tracks(parent, child, np.arange(len(kept)))
 
-    def _rating(self, watched: _MonitoredJoint, left: KnownResiduals | None, first: int) -> JointVerdict:
-        link = watched.link
-        if watched.served is None or left is None:
-            never = f"'{link.parent}' and '{link.child}' were not seen together"
-            return undetermined(link, 0, watched.reason or never)
-        times = self._times(watched, first)
-        seen = JointObservations(link, watched.served, self._poses(link, times, first), left, np.array(times))
-        return judge_joint(self.model, seen, watched.stopped, self._families, self._outliers)
+    def _verdict(
+        self, monitored: _MonitoredJoint, residuals: KnownResiduals | None, first: int
+    ) -> JointVerdict:
+        joint = monitored.joint
+        if monitored.served is None or residuals is None:
+            never = f"'{joint.parent}' and '{joint.child}' were not seen together"
+            return undetermined(joint, 0, monitored.reason or never)
+        times = self._times(monitored, first)
+        data = JointObservations(
+            joint, monitored.served, self._poses(joint, times, first), residuals, np.array(times)
+        )
+        return judge_joint(self.model, data, monitored.implausible_since, self._families, self._outliers)
 
 
 def _one(given: PosesLike, name: str) -> PosesLike:
     pose, *covariance = given if isinstance(given, tuple) and len(given) == 2 else (given,)
     try:
-        matrix: Stack = np.asarray(pose, dtype=np.float64)
+        matrix: Array = np.asarray(pose, dtype=np.float64)
     except (TypeError, ValueError):
         raise ShapeError(f"The pose of '{name}' is no array of numbers.") from None
     if matrix.shape != (4, 4):

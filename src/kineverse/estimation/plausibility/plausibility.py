@@ -24,7 +24,7 @@ from .sequential_test import SequentialTest
 from .testability import TestableJoint, find_testable_joints
 
 FALSE_ALARMS = 1e-3
-"""The default probability of calling an articulation implausible that is as served."""
+"""Default probability of rejecting a joint that is as served."""
 
 
 def check_plausibility(
@@ -38,93 +38,95 @@ def check_plausibility(
     outliers: Outliers | bool | None = True,
     strict: bool = False,
 ) -> Plausibility:
-    """Return whether the articulations of a model still explain what is seen, and what would if they do not.
+    """Test whether the joints of a model explain observations, and propose replacements if not.
 
-    Each articulation between frames that were seen is judged as it is served, with its own parameters and
-    limits and unknown joint values, beside a rigid connection, none at all, and what
-    :func:`~kineverse.estimation.identify` finds.
+    Each joint between observed frames is tested as served, with its own parameters and limits and unknown
+    joint values. It is compared with a rigid connection, with a free child, and with the result of
+    :func:`~kineverse.estimation.identify`.
 
     Parameters
     ----------
     model
-        The model.
+        The served model.
     observations
-        From names of frames to their poses over time, (N, 4, 4), or pairs of poses and covariance, (6, 6) or
-        (N, 6, 6); a pose that was not seen is NaN throughout.
+        Poses over time by name of the frame, (N, 4, 4), or pairs of poses and covariance, (6, 6) or (N, 6,
+        6); missing poses are NaN throughout.
     noise
-        The covariance, (6, 6), of what comes with none, see :mod:`kineverse.estimation.noise`.
+        Default covariance of a pose, (6, 6), see :mod:`kineverse.estimation.noise`.
     relative_to
-        The frame in which poses are given. It is taken as exactly known and is compared with what is seen
-        where nothing else on its part is; None for an observer that is no part of the model.
+        Frame in which poses are given. Its pose is taken as exactly known. It is compared with other frames
+        where nothing else on its part is observed. None for an observer that is no part of the model.
     families
-        What is tried instead, see :func:`~kineverse.estimation.identify`.
+        Joint families of the alternatives, see :func:`~kineverse.estimation.identify`.
     false_alarms
-        The probability with which an articulation may be called implausible though it is as served.
+        Probability of rejecting a joint that is as served.
     outliers
-        How often observations are wrong altogether, see :class:`~kineverse.estimation.Outliers`; False or
-        None if they never are. Then less is noticed sooner.
+        Outlier model, see :class:`~kineverse.estimation.Outliers`; False or None without outliers, which
+        detects deviations sooner.
     strict
-        Whether to raise if one is.
+        True to raise if a joint is rejected.
 
     Raises
     ------
     UnknownNameError
         For a frame or a family that does not exist.
     ShapeError, InvalidValueError
-        For poses or covariances that are none, and if it is not known how well a frame is seen.
+        For invalid poses or covariances, and if a covariance is missing.
     ImplausibleError
-        If ``strict``, and an articulation stopped explaining what is seen.
+        If ``strict``, and a joint does not explain the observations.
     """
     check_false_alarms(false_alarms)
-    wrong = as_outliers(outliers)
+    outlier_model = as_outliers(outliers)
     if isinstance(model, Snapshot):
         model = model.model()
-    seen = check_tracks(observations, noise)
-    found = find_testable_joints(model, observations, relative_to)
+    tracks = check_tracks(observations, noise)
+    testable = find_testable_joints(model, observations, relative_to)
     if relative_to is not None:
-        seen[relative_to] = exact_track(max((len(track.poses) for track in seen.values()), default=0))
-    told: dict[TestableJoint, TimedResiduals] = {}
+        tracks[relative_to] = exact_track(max((len(track.poses) for track in tracks.values()), default=0))
+    residuals: dict[TestableJoint, TimedResiduals] = {}
     reasons: dict[TestableJoint, JointVerdict] = {}
-    judged_by: dict[TestableJoint, KnownJoint] = {}
-    for link in found.links:
-        parent, child = seen[link.parent], seen[link.child]
+    served_joints: dict[TestableJoint, KnownJoint] = {}
+    for joint in testable.joints:
+        parent, child = tracks[joint.parent], tracks[joint.child]
         times = np.flatnonzero(parent.seen & child.seen)
         if not len(times):
-            reasons[link] = undetermined(
-                link, 0, f"'{link.parent}' and '{link.child}' were never seen together"
+            reasons[joint] = undetermined(
+                joint, 0, f"'{joint.parent}' and '{joint.child}' were never seen together"
             )
             continue
         try:
-            served = KnownJoint(model, link.child, link.parent)
-            told[link] = TimedResiduals(times, compute_residuals(served, pair_tracks(parent, child, times)))
-            judged_by[link] = served
+            served = KnownJoint(model, joint.child, joint.parent)
+            residuals[joint] = TimedResiduals(
+                times, compute_residuals(served, pair_tracks(parent, child, times))
+            )
+            served_joints[joint] = served
         except KineverseError as error:
-            reasons[link] = undetermined(link, len(times), f"its pose cannot be computed. {error}")
-    tied = ConsistencyTests(model, judged_by, relative_to).tied(told)
-    ratings = []
-    for link in found.links:
-        if link in reasons:
-            ratings.append(reasons[link])
+            reasons[joint] = undetermined(joint, len(times), f"its pose cannot be computed. {error}")
+    tested = ConsistencyTests(model, served_joints, relative_to).apply(residuals)
+    verdicts = []
+    for joint in testable.joints:
+        if joint in reasons:
+            verdicts.append(reasons[joint])
             continue
-        times = told[link].times
-        poses = pair_tracks(seen[link.parent], seen[link.child], times)
-        ratings.append(
+        times = residuals[joint].times
+        poses = pair_tracks(tracks[joint.parent], tracks[joint.child], times)
+        verdicts.append(
             _test_joint(
                 model,
-                JointObservations(link, judged_by[link], poses, tied[link], times),
+                JointObservations(joint, served_joints[joint], poses, tested[joint], times),
                 families,
                 false_alarms,
-                wrong,
+                outlier_model,
             )
         )
-    result = Plausibility(tuple(ratings), found.left_out, false_alarms)
+    result = Plausibility(tuple(verdicts), testable.untested, false_alarms)
     if strict:
         result.raise_if_implausible()
     return result
 
 
 def check_false_alarms(probability: float) -> None:
-    """Look whether a probability of false alarms is one.
+    """Check a probability of false alarms.
 
     Raises
     ------
@@ -137,21 +139,21 @@ def check_false_alarms(probability: float) -> None:
         )
 
 
-def undetermined(link: TestableJoint, count: int, reason: str) -> JointVerdict:
-    """Return the rating of an articulation about which nothing can be said."""
-    return JointVerdict(link, {}, (math.nan, math.nan), count, reason=reason)
+def undetermined(joint: TestableJoint, count: int, reason: str) -> JointVerdict:
+    """Return the verdict on a joint that cannot be tested."""
+    return JointVerdict(joint, {}, (math.nan, math.nan), count, reason=reason)
 
 
 def _test_joint(
     model: Model,
-    seen: JointObservations,
+    data: JointObservations,
     families: FamilyChoice,
     false_alarms: float,
     outliers: Outliers | None,
 ) -> JointVerdict:
-    watch = SequentialTest(false_alarms, outliers.fraction if outliers else 0.0)
-    left = seen.misfit
-    for row in zip(left.normal, left.by_place, left.against, strict=True):
-        watch.add(*row)
-    stopped = None if watch.stopped is None else int(seen.times[watch.stopped])
-    return judge_joint(model, seen, stopped, families, outliers)
+    test = SequentialTest(false_alarms, outliers.fraction if outliers else 0.0)
+    residuals = data.residuals
+    for row in zip(residuals.orthogonal, residuals.displacement_jacobian, residuals.one_sided, strict=True):
+        test.add(*row)
+    implausible_since = None if test.implausible_since is None else int(data.times[test.implausible_since])
+    return judge_joint(model, data, implausible_since, families, outliers)

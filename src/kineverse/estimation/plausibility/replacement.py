@@ -1,10 +1,9 @@
 """Replacement of a joint by an identified one.
 
-Whoever hangs below or looks at a coordinate goes on working: frames keep their names, and so does the
-coordinate where there is one before and one after. It keeps its direction and its zero as well, as far as it
-has them: joint values are aligned with those of the served articulation. What followed another coordinate, as
-a mimic joint, goes on to follow it, geared otherwise if that is what was seen. What the old operation wrote
-beside the joint stays.
+Frames keep their names, and so does the coordinate if the joint has one before and after. The coordinate
+keeps its direction and its zero as far as possible: joint values are aligned with those of the served joint.
+A joint that follows another coordinate, as a mimic joint, follows it afterwards too, with the observed ratio.
+Other writes of the old operation stay. So children of the joint and users of its coordinate remain valid.
 """
 
 from __future__ import annotations
@@ -25,8 +24,9 @@ from kineverse.estimation.identification.observations import Observations
 from kineverse.estimation.identification.outlier_rejection import RowIndices
 from kineverse.estimation.identification.projection import project_observations, squared_errors
 from kineverse.estimation.identification.result import Fit
+from kineverse.estimation.robust import CHI_SQUARED_6
 from kineverse.expressions.expression import Expression
-from kineverse.lie import Stack, exp_so3, inverse, transform
+from kineverse.lie import Array, exp_so3, inverse, transform
 from kineverse.model.articulation import Articulation
 from kineverse.model.body import Pose
 from kineverse.model.frame import Frame
@@ -42,41 +42,41 @@ from .testability import TestableJoint
 
 @dataclass(frozen=True)
 class JointValue:
-    """How far a joint had moved.
+    """Value of a joint as an expression of its coordinate.
 
     Attributes
     ----------
     coordinate
-        That of the served articulation.
+        Coordinate of the served joint.
     value
-        How far the joint has moved, as an expression of it.
+        Joint value, as an expression of the coordinate.
     follows
-        What it follows, if it has no coordinate of its own.
-    led
-        Whether its value is more than the coordinate: one that follows, in whichever way.
+        Expression that the joint follows, if it has no coordinate of its own.
+    is_derived
+        True if the value is not the coordinate itself.
     lower, upper
-        Its limits.
+        Limits of the value.
     """
 
     coordinate: Symbol
     value: Expression
     follows: Expression | None
-    led: bool
+    is_derived: bool
     lower: float
     upper: float
 
-    def at(self, coordinates: Stack) -> Stack:
-        """Return how far it had moved at values of the coordinate, (N,)."""
-        if not self.led:
+    def evaluate(self, coordinates: Array) -> Array:
+        """Return the joint values at values of the coordinate, (N,)."""
+        if not self.is_derived:
             return coordinates
-        moved: Stack = np.asarray(compile(self.value, [self.coordinate]).batch(coordinates[:, None]))
+        moved: Array = np.asarray(compile(self.value, [self.coordinate]).batch(coordinates[:, None]))
         return moved
 
 
 def find_joint_value(
-    model: Model, link: TestableJoint, served: KnownJoint, records: Mapping[str, Articulation]
+    model: Model, joint: TestableJoint, served: KnownJoint, records: Mapping[str, Articulation]
 ) -> JointValue | None:
-    """Return how far a joint had moved; None if that is not one number."""
+    """Return the value of a joint; None if it has several degrees of freedom."""
     if served.joints != 1 or len(served.coordinates) != 1:
         return None
     (coordinate,) = served.coordinates
@@ -85,7 +85,7 @@ def find_joint_value(
         return JointValue(coordinate, coordinate, None, False, float(served.lower[0]), float(served.upper[0]))
     value = model.rates.resolve(to_plain(position))
     lower, upper = -math.inf, math.inf
-    for (kind, _), limit in model.history.entry(link.tag).writes.items():
+    for (kind, _), limit in model.history.entry(joint.tag).writes.items():
         if kind == CONSTRAINTS and limit.expression == position:
             if not (limit.lower.symbols or limit.upper.symbols):
                 lower, upper = max(lower, float(limit.lower)), min(upper, float(limit.upper))
@@ -93,67 +93,64 @@ def find_joint_value(
     return JointValue(coordinate, value, follows, True, lower, upper)
 
 
-def follows_another(model: Model, link: TestableJoint) -> bool:
-    """Whether an operation says itself what its joint follows, as a mimic joint."""
-    writes = model.history.entry(link.tag).writes
+def follows_another(model: Model, joint: TestableJoint) -> bool:
+    """Return True if an operation records an expression that its joint follows, as a mimic joint does."""
+    writes = model.history.entry(joint.tag).writes
     return any(
-        kind == ARTICULATIONS and value.child == link.frame and value.follows is not None
+        kind == ARTICULATIONS and value.child == joint.frame and value.follows is not None
         for (kind, _), value in writes.items()
     )
 
 
-# χ² of six numbers that is exceeded once in a thousand.
-_LIKELY = 22.5
-
-
-def extend_fit(fit: Fit, seen: Observations, used: RowIndices) -> tuple[RowIndices, Fit]:
-    """Return which observations a fit to some of them explains, and the fit with their joint values.
+def extend_fit(fit: Fit, observations: Observations, used: RowIndices) -> tuple[RowIndices, Fit]:
+    """Extend a fit of some observations to all observations that it explains.
 
     Parameters
     ----------
     fit
-        Of the observations ``used``.
-    seen
+        Fit of the observations ``used``.
+    observations
         All observations.
     used
-        The numbers of those of the fit.
+        Numbers of the fitted observations.
 
     Returns
     -------
     rows, fit
-        The numbers of other observations that are explained, followed by those of the fit.
+        Numbers of further explained observations followed by the fitted ones, and the fit with all joint
+        values.
     """
-    others = np.setdiff1d(np.arange(len(seen)), used)
+    others = np.setdiff1d(np.arange(len(observations)), used)
     if not len(others) or not fit.motion.joints:
         return used, fit
-    solution = project_observations(fit.motion, fit.joint_values, seen.at(others))
-    fits = squared_errors(solution) < _LIKELY
+    solution = project_observations(fit.motion, fit.joint_values, observations.at(others))
+    fits = squared_errors(solution) < CHI_SQUARED_6
     values = np.concatenate([solution.values[fits], fit.joint_values])
     return np.concatenate([others[fits], used]), replace(fit, joint_values=values)
 
 
 WrittenValues: TypeAlias = Mapping[tuple[str, str], Any]
 
-# What follows another may be off by so many deviations, and is geared if its slope is off by so many.
+# A joint follows another up to this residual, and with another ratio above this slope error, in deviations.
 _FOLLOWS, _GEARED = 3.0, 4.0
 
 
 @dataclass(frozen=True)
 class ReplacedJoint(Operation, document_kind="Relearned"):
-    """A joint that was learned, and what the operation that it stands in for wrote beside its joint.
+    """Identified joint, with the other writes of the operation that it replaces.
 
     Attributes
     ----------
     joint
-        The joint.
+        Operation of the joint.
     record
-        The name under which the articulation is on record; that of the joint if None.
+        Name of the articulation's record; that of the joint if None.
     kept
-        The rest, as pairs of a cell (kind, name) and a value.
+        Other writes, as pairs of a cell (kind, name) and a value.
     frame
-        The frame that the joint places.
+        Frame that the joint places.
     before, after
-        Where the joint stands in its parent, and the frame on what the joint moves.
+        Pose of the joint in its parent, and of the frame in the joint's child.
     """
 
     joint: Operation
@@ -164,7 +161,7 @@ class ReplacedJoint(Operation, document_kind="Relearned"):
     after: Pose = Pose()
 
     def apply(self, model: ReadRecorder) -> Writes:
-        """Write the joint and the rest."""
+        """Write the joint and the other cells."""
         writes = self.joint.apply(model).writes()
         if (FRAMES, self.frame) in writes:
             placed = writes[FRAMES, self.frame]
@@ -178,46 +175,50 @@ class ReplacedJoint(Operation, document_kind="Relearned"):
         return Writes.of({**dict(self.kept), **writes})
 
     def default_tag(self) -> str:
-        """Return that of the joint."""
+        """Return the tag of the joint."""
         return self.joint.default_tag()
 
 
 def build_replacement(
-    model: Model, link: TestableJoint, served: KnownJoint, coordinates: Stack, others: Stack, fit: Fit
+    model: Model, joint: TestableJoint, served: KnownJoint, coordinates: Array, others: Array, fit: Fit
 ) -> Operation:
-    """Return the operation to replace the link's one by.
+    """Build the operation that replaces a joint.
 
     Parameters
     ----------
-    model, link, served
-        The model as it is served, and the articulation in question.
+    model, joint, served
+        The served model, the tested joint, and its motion.
     coordinates
-        The served articulation's coordinates at the fit's observations, (N, n).
+        Coordinates of the served joint at the fit's observations, (N, n).
     others
-        What others say of coordinates that are theirs, (N, e); NaN where they say nothing.
+        Values of shared coordinates from other joints, (N, e); NaN where unknown.
     fit
-        What was identified between the frames that were seen.
+        Identified joint between the observed frames.
     """
-    base_T_parent = _constant(model, link.parent, link.base)
-    frame_T_child = _constant(model, link.child, link.frame)
-    writes = model.history.entry(link.tag).writes
-    records = _records(writes, link)
+    base_T_parent = _constant(model, joint.parent, joint.base)
+    frame_T_child = _constant(model, joint.child, joint.frame)
+    writes = model.history.entry(joint.tag).writes
+    records = _records(writes, joint)
     record = next(iter(records), None)
     if not isinstance(fit.motion, GroupMotion):
-        joint = fit.operation(_name(records, link, served, fit.joint_values.shape[1]), link.base, link.frame)
-        kept = _kept(writes, link, served, False, records)
+        operation = fit.operation(
+            _name(records, joint, served, fit.joint_values.shape[1]), joint.base, joint.frame
+        )
+        kept = _remaining_writes(writes, joint, served, False, records)
         places = rigid_pose(base_T_parent), rigid_pose(inverse(frame_T_child))
-        return ReplacedJoint(joint, record, kept, link.frame, *places)
+        return ReplacedJoint(operation, record, kept, joint.frame, *places)
     motion, values = fit.motion, fit.joint_values
-    before = find_joint_value(model, link, served, records)
-    alike, position = False, None
+    before = find_joint_value(model, joint, served, records)
+    same_kind, position = False, None
     if motion.joints == 1 and before is not None:
         turns = motion.freedom.joints[0] >= WX
-        alike = bool(served.turning[0]) == turns
-        told = others[:, 0] if others.shape[1] else coordinates[:, 0]
-        old = before.at(np.where(np.isfinite(told), told, coordinates[:, 0]))
-        motion, values, slope = _aligned(motion, values, old, alike, before.led and bool(others.shape[1]))
-        alike = alike and slope == 1.0
+        same_kind = bool(served.is_angle[0]) == turns
+        known = others[:, 0] if others.shape[1] else coordinates[:, 0]
+        old = before.evaluate(np.where(np.isfinite(known), known, coordinates[:, 0]))
+        motion, values, slope = _align_values(
+            motion, values, old, same_kind, before.is_derived and bool(others.shape[1])
+        )
+        same_kind = same_kind and slope == 1.0
         if before.follows is not None:
             off = values[:, 0] - slope * old
             if float(np.std(off)) < _FOLLOWS * float(np.sqrt(np.mean(fit.deviations**2))):
@@ -225,35 +226,35 @@ def build_replacement(
     limits = [
         (float(low), float(high)) for low, high in zip(values.min(axis=0), values.max(axis=0), strict=True)
     ]
-    if alike and before is not None:
-        # Nothing was seen that contradicts the old limits; those that were left are wider now.
+    if same_kind and before is not None:
+        # The old limits stay, widened to the observed range.
         (low, high), *_ = limits
         limits = [(min(low, before.lower), max(high, before.upper))]
     motion = replace(motion, left=base_T_parent @ motion.left, right=motion.right @ inverse(frame_T_child))
-    name = _name(records, link, served, motion.joints)
-    joint = joint_operation(motion, limits, name, link.base, link.frame)
-    if record is not None and isinstance(joint, Joint):
-        joint = replace(joint, dynamics=records[record].dynamics)
-    if position is not None and isinstance(joint, OneDofJoint):
-        joint = replace(joint, position=position)
-    kept = _kept(writes, link, served, alike, records)
+    name = _name(records, joint, served, motion.joints)
+    operation = joint_operation(motion, limits, name, joint.base, joint.frame)
+    if record is not None and isinstance(operation, Joint):
+        operation = replace(operation, dynamics=records[record].dynamics)
+    if position is not None and isinstance(operation, OneDofJoint):
+        operation = replace(operation, position=position)
+    kept = _remaining_writes(writes, joint, served, same_kind, records)
     if record in (None, name) and not kept:
-        return joint
-    return ReplacedJoint(joint, None if record == name else record, kept)
+        return operation
+    return ReplacedJoint(operation, None if record == name else record, kept)
 
 
-def _records(writes: WrittenValues, link: TestableJoint) -> dict[str, Articulation]:
-    """Return what is on record about the joint."""
+def _records(writes: WrittenValues, joint: TestableJoint) -> dict[str, Articulation]:
+    """Return the articulation records of the joint."""
     return {
         name: value
         for (kind, name), value in writes.items()
-        if kind == ARTICULATIONS and value.child == link.frame
+        if kind == ARTICULATIONS and value.child == joint.frame
     }
 
 
-def _name(records: Mapping[str, Articulation], link: TestableJoint, served: KnownJoint, joints: int) -> str:
-    """Return what the joint is called: like the old coordinate, where there was one of its own and is one."""
-    named = next(iter(records), link.frame)
+def _name(records: Mapping[str, Articulation], joint: TestableJoint, served: KnownJoint, joints: int) -> str:
+    """Return the name of the new joint: that of the old coordinate if each has exactly one of its own."""
+    named = next(iter(records), joint.frame)
     if joints != 1 or len(served.coordinates) != 1:
         return named
     own = [x for value in records.values() for x in value.coordinates]
@@ -262,36 +263,37 @@ def _name(records: Mapping[str, Articulation], link: TestableJoint, served: Know
     return named if records else served.coordinates[0].path
 
 
-def _kept(
+def _remaining_writes(
     writes: WrittenValues,
-    link: TestableJoint,
+    joint: TestableJoint,
     served: KnownJoint,
-    alike: bool,
+    same_kind: bool,
     records: Mapping[str, Articulation],
 ) -> tuple[tuple[tuple[str, str], Any], ...]:
-    """Return what has nothing to do with the pose between both frames."""
+    """Return the writes that do not concern the pose between both frames."""
     own = {*served.coordinates, *(x for value in records.values() for x in value.coordinates)}
     kept = []
     for (kind, name), value in writes.items():
-        if (kind == FRAMES and name == link.frame) or (kind == ARTICULATIONS and name in records):
+        if (kind == FRAMES and name == joint.frame) or (kind == ARTICULATIONS and name in records):
             continue
         if kind == RATES and value[0] in own:
             continue
         if kind == CONSTRAINTS:
             about = {s.position for s in value.expression.symbols}
-            # Limits are new; a speed limit or a lock means something as long as its unit is the same.
-            if about <= own and not (alike and any(s.order for s in value.symbols)):
+            # Position limits are new; speed limits and locks stay if the unit is the same.
+            if about <= own and not (same_kind and any(s.order for s in value.symbols)):
                 continue
         kept.append(((kind, name), value))
     return tuple(kept)
 
 
-def _aligned(
-    motion: GroupMotion, values: Stack, old: Stack, alike: bool, geared: bool
-) -> tuple[GroupMotion, Stack, float]:
-    """Return the same motion with joint values that grow with the old ones, and are 0 where those are.
+def _align_values(
+    motion: GroupMotion, values: Array, old: Array, same_kind: bool, geared: bool
+) -> tuple[GroupMotion, Array, float]:
+    """Align joint values with the old ones: same direction and zero; also return the ratio of both.
 
-    And how fast: as fast, if they are alike, unless ``geared`` says that the old ones were seen elsewhere.
+    The ratio is 1 for joints of the same kind, unless ``geared`` says that other joints observed the old
+    values.
     """
     new = values[:, 0]
     slope = float(np.mean((old - old.mean()) * (new - new.mean())))
@@ -303,7 +305,7 @@ def _aligned(
     slope = slope / variance if variance > 0.0 else 0.0
     off = new - new.mean() - slope * (old - old.mean())
     known = math.sqrt(float(np.var(off)) / (variance * len(old))) if variance > 0.0 else math.inf
-    if alike and not (geared and abs(slope - 1.0) > _GEARED * known):
+    if same_kind and not (geared and abs(slope - 1.0) > _GEARED * known):
         slope = 1.0
     shift = float(new.mean()) - slope * float(old.mean())
     twist = np.zeros(6)
@@ -313,7 +315,7 @@ def _aligned(
     return motion, (new - shift)[:, None], slope
 
 
-def _constant(model: Model, frame: str, relative_to: str) -> Stack:
+def _constant(model: Model, frame: str, relative_to: str) -> Array:
     transform = model.fk(frame, relative_to)
-    values: Stack = transform({s: s.value or 0.0 for s in transform.symbols})
+    values: Array = transform({s: s.value or 0.0 for s in transform.symbols})
     return values

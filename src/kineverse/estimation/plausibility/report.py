@@ -14,62 +14,63 @@ from .testability import TestableJoint
 
 
 class ImplausibleError(ModelError):
-    """Articulations of a model do not explain what is seen."""
+    """Joints of a model do not explain the observations."""
 
 
 @dataclass(frozen=True)
 class JointVerdict:
-    """One articulation.
+    """Verdict on one joint.
 
     Attributes
     ----------
-    link
-        The operation that was judged, and between which frames.
+    joint
+        The tested joint: its operation and frames.
     probabilities
-        Of the articulation as ``served``, of the same ``elsewhere``, of a ``rigid`` connection, of the child
-        being ``free``, and of other families: on the observations from ``stopped`` on, or on all.
+        Probabilities of the joint as ``served``, of the same displaced (``elsewhere``), of a ``rigid``
+        connection, of a ``free`` child, and of other families. They use the observations from
+        ``implausible_since`` on, or all.
     rms
-        What is left of positions [m] and orientations [rad] with the best joint values, root mean square over
-        the same observations.
+        Root mean square of the residuals of positions [m] and orientations [rad] with the best joint values,
+        over the same observations.
     count
-        In how many observations both frames were seen.
-    stopped
-        The observation from which on it does not explain what is seen; None if it does.
-    found
-        What was identified instead; None where that was not possible.
-    proposal
-        The operation to replace the served one by, if it stopped explaining and something else does.
+        Number of observations of both frames.
+    implausible_since
+        First observation that the joint does not explain; None if it explains all.
+    result
+        Identification result of the alternatives; None if there are too few observations.
+    replacement
+        Operation to replace the served one, if the joint is rejected and an alternative fits.
     reason
-        Why nothing can be told, or proposed; empty if it can.
+        Reason for a missing verdict or replacement; empty otherwise.
     outliers
-        The observations that are taken for wrong altogether, and left out of all of this.
+        Numbers of the outliers, which are left out of all of this.
     """
 
-    link: TestableJoint
+    joint: TestableJoint
     probabilities: Mapping[str, float]
     rms: tuple[float, float]
     count: int
-    stopped: int | None = None
-    found: IdentificationResult | None = None
-    proposal: Operation | None = None
+    implausible_since: int | None = None
+    result: IdentificationResult | None = None
+    replacement: Operation | None = None
     reason: str = ""
     outliers: tuple[int, ...] = ()
 
     @property
     def tag(self) -> str:
-        """Of the operation."""
-        return self.link.tag
+        """Tag of the operation."""
+        return self.joint.tag
 
     @property
     def verdict(self) -> str:
-        """``explains``, ``stopped explaining at observation k``, or ``cannot tell``."""
-        if self.stopped is not None:
-            return f"stopped explaining at observation {self.stopped}"
+        """Result in words: ``explains``, ``stopped explaining at observation k``, or ``cannot tell``."""
+        if self.implausible_since is not None:
+            return f"stopped explaining at observation {self.implausible_since}"
         return "explains" if self.probabilities.get("served", 0.0) >= SURE else "cannot tell"
 
     @property
     def explains(self) -> bool:
-        """Whether it is sure that it explains what was seen."""
+        """True if the joint as served is certain."""
         return self.verdict == "explains"
 
     def __str__(self) -> str:
@@ -88,68 +89,68 @@ class JointVerdict:
 
 @dataclass(frozen=True)
 class Plausibility:
-    """All articulations that could be judged.
+    """Verdicts on all testable joints.
 
     Attributes
     ----------
-    ratings
+    verdicts
         One for each pair of frames; a second frame on the same part is a pair of its own.
-    left_out
-        Frames that were seen but tell nothing about a single operation, with the reason in words.
+    untested
+        Observed frames that test no single operation, with the reason in words.
     false_alarms
-        The probability with which an articulation that is as served is called implausible all the same.
+        Probability of rejecting a joint that is as served.
     """
 
-    ratings: tuple[JointVerdict, ...]
-    left_out: Mapping[str, str]
+    verdicts: tuple[JointVerdict, ...]
+    untested: Mapping[str, str]
     false_alarms: float
 
     @property
     def implausible(self) -> tuple[JointVerdict, ...]:
-        """Those that stopped explaining what is seen."""
-        return tuple(r for r in self.ratings if r.stopped is not None)
+        """Verdicts of rejected joints."""
+        return tuple(r for r in self.verdicts if r.implausible_since is not None)
 
     @property
     def replacements(self) -> dict[str, Operation]:
-        """What to replace, by tag: ``edit.replace(tag, operation)`` for each."""
-        return {r.tag: r.proposal for r in reversed(self.ratings) if r.proposal is not None}
+        """Operations for ``edit.replace(tag, operation)``, by tag."""
+        return {r.tag: r.replacement for r in reversed(self.verdicts) if r.replacement is not None}
 
     def raise_if_implausible(self) -> None:
-        """Raise if an articulation stopped explaining what is seen.
+        """Raise if a joint was rejected.
 
         Raises
         ------
         ImplausibleError
-            Naming all of them, and what is there instead.
+            Naming all rejected joints, and their alternatives.
         """
         if not self.implausible:
             return
         lines = []
-        for rating in self.implausible:
-            instead = rating.reason or "nothing else is proposed"
-            if rating.proposal is not None and rating.found is not None:
-                instead = f"what is seen is {rating.found}"
-            lines.append(f"\n  '{rating.tag}' {rating.verdict}: {instead}")
+        for verdict in self.implausible:
+            alternative = verdict.reason or "nothing else is proposed"
+            if verdict.replacement is not None and verdict.result is not None:
+                alternative = f"what is seen is {verdict.result}"
+            lines.append(f"\n  '{verdict.tag}' {verdict.verdict}: {alternative}")
         raise ImplausibleError(
             "The model does not explain what is seen. Replace these operations by their proposals, or look "
             "whether the noise is as stated:" + "".join(lines)
         )
 
     def __getitem__(self, tag: str) -> JointVerdict:
-        """Return the rating of an operation; of several, the worst one."""
-        found = [r for r in self.ratings if r.tag == tag]
-        if not found:
-            tags = [r.tag for r in self.ratings]
+        """Return the verdict on an operation; of several, the worst one."""
+        result = [r for r in self.verdicts if r.tag == tag]
+        if not result:
+            tags = [r.tag for r in self.verdicts]
             raise UnknownNameError(f"The operation {tag!r} was not judged. {suggest(tag, tags, 'tag')}")
-        return min(found, key=lambda r: (r.stopped is None, r.probabilities.get("served", 1.0)))
+        return min(result, key=lambda r: (r.implausible_since is None, r.probabilities.get("served", 1.0)))
 
     def __iter__(self) -> Iterator[JointVerdict]:
-        return iter(self.ratings)
+        return iter(self.verdicts)
 
     def __len__(self) -> int:
-        return len(self.ratings)
+        return len(self.verdicts)
 
     def __str__(self) -> str:
-        lines = [str(rating) for rating in self.ratings]
-        lines += [f"'{frame}' tells nothing: {reason}" for frame, reason in self.left_out.items()]
+        lines = [str(verdict) for verdict in self.verdicts]
+        lines += [f"'{frame}' tells nothing: {reason}" for frame, reason in self.untested.items()]
         return "\n".join(lines) or "nothing was seen"

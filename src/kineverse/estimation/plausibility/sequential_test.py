@@ -1,26 +1,26 @@
 """Sequential test by an e-process with Ville's bound.
 
-Under the articulation as served, ρ of each observation is standard normal. Against it stand alternatives:
+If the joint is as served, ρ of each observation is standard normal. The alternatives are:
 
-- it, or the child on it, sits elsewhere: ρ = G δ + noise with an unknown δ, believed within some size;
-- nothing holds the child: ρ is normal with a larger deviation;
-- joint values beyond their limits, or apart from what others say of them, by z standard deviations:
-  exp(λ z - λ²/2) is 1 on average at a limit, and less inside.
+- the joint, or the child on it, is displaced: ρ = G δ + noise with an unknown δ, Gaussian with some size;
+- nothing constrains the child: ρ is normal with a larger deviation;
+- joint values exceed their limits, or contradict other estimates, by z standard deviations: the gain
+  exp(λ z - λ²/2) has the mean 1 at a limit, and less inside.
 
-Each may begin to hold at any observation j, the j-th with the weight 1/(j (j+1)). The ratio M of the
-densities of all that was seen, under the mixture of alternatives and under the articulation as served, is a
-supermartingale that begins at 1 if the latter is right, whatever joint values do. So by Ville's inequality
-the probability that M ever reaches 1/α is at most α, however long one watches. To first order, that is: poses
-are linearised around the best joint values.
+Each alternative may begin at any observation j, with the prior weight 1/(j (j+1)). M is the ratio of the
+density of all observations under the mixture of alternatives to that under the served joint. If the joint is
+as served, M is a supermartingale that begins at 1, for any joint values. By Ville's inequality, the
+probability that M ever reaches 1/α is then at most α, for any number of observations. This holds to first
+order, as poses are linearised around the best joint values.
 
-Some observations may be wrong altogether, each with the probability ε, and then nothing is said about where
-they are. So what an alternative wins by one observation, L, is cut off at some c: whatever happens to the
-fraction ε,
+Observations may be outliers of unknown distribution, each with the probability ε. So the gain L of an
+alternative by one observation is cut off at some c. For any distribution of the outliers
 
     E[min(L, c)] <= (1 - ε) + ε c
 
-and min(L, c) divided by this is a fair bet again (Huber's censored ratio). A small c costs little each time,
-and finds what is a bit off, slowly; a large one finds what is far off at once. Capital is split among them.
+and min(L, c) divided by this bound is a fair bet again (Huber's censored ratio). A small c costs little per
+observation and detects small deviations slowly; a large c detects gross ones at once. The capital is split
+among several c.
 """
 
 from __future__ import annotations
@@ -29,123 +29,126 @@ import math
 
 import numpy as np
 
-from kineverse.lie import Stack
+from kineverse.estimation.robust import CHI_SQUARED_6
+from kineverse.lie import Array
 
 from .known_residuals import SIZES
 
 _DEVIATIONS = np.array([1.0, 3.0, 10.0, 30.0, 100.0])
 _SLOPES = np.array([2.0, 5.0])
-# The part of its capital that is bet on the next observation, by who thinks that all of them are off, and by
-# who thinks that now and then one is.
+# Fraction of the capital bet on each observation: against a permanent and an occasional deviation.
 _STAKES = np.array([1.0 - 1e-9, 0.1])
-# Where one observation's gain is cut off if some are wrong.
+# Upper bounds on the gain by one observation, if there are outliers.
 _CUTS = np.array([1.5, 4.0, 20.0])
-# χ² of six numbers that is exceeded once in a thousand: a displacement is not learned from what is beyond.
-_LIKELY = 22.5
-# As many beginnings of a displacement are followed; dropping some only makes M smaller.
-_FOLLOWED = 12
+# Number of change points of a displacement; dropping some only reduces M.
+_MOST_CHANGE_POINTS = 12
 
 
 class SequentialTest:
-    """Follows one articulation.
+    """Sequential test of one joint.
 
     Parameters
     ----------
     false_alarms
-        The probability α that an articulation which is as served is ever said not to be.
-    wrong
-        The probability ε that an observation is wrong altogether.
+        Probability α of ever rejecting a joint that is as served.
+    outlier_fraction
+        Probability ε of an outlier.
 
     Attributes
     ----------
     count
-        Observations so far.
-    stopped
-        The observation, from 0, from which on it probably does not explain what is seen; None as long as it
-        does. Never taken back.
-    noticed
-        The observation at which that was noticed.
+        Number of observations so far.
+    implausible_since
+        Most likely change point: the first observation, from 0, that the joint does not explain; None before
+        rejection. A rejection is final.
+    detected_at
+        Observation at which the joint was rejected.
     """
 
-    def __init__(self, false_alarms: float, wrong: float = 0.0) -> None:
+    def __init__(self, false_alarms: float, outlier_fraction: float = 0.0) -> None:
         self._threshold = -math.log(false_alarms)
-        self._bet = _Bet(wrong)
+        self._bet = _CensoredBet(outlier_fraction)
         self.count = 0
-        self.stopped: int | None = None
-        self.noticed: int | None = None
-        self._elsewhere = _Elsewhere(self._bet)
-        self._loose = _Beginnings(len(_DEVIATIONS), self._bet)
-        self._beyond = _Beginnings(0, self._bet)
+        self.implausible_since: int | None = None
+        self.detected_at: int | None = None
+        self._displacement = _DisplacementTest(self._bet)
+        self._unconstrained = _ChangePoints(len(_DEVIATIONS), self._bet)
+        self._beyond = _ChangePoints(0, self._bet)
 
-    def add(self, normal: Stack, by_place: Stack, beyond: Stack) -> float:
-        """Take one observation; return log M.
+    def add(self, orthogonal: Array, displacement_jacobian: Array, one_sided: Array) -> float:
+        """Add one observation; return log M.
 
-        They are rows of a :class:`kineverse.estimation.plausibility.known_residuals.KnownResiduals`, ``beyond`` of what is ``against`` it; NaN says nothing.
+        Parameters
+        ----------
+        orthogonal, displacement_jacobian, one_sided
+            Row of a :class:`.known_residuals.KnownResiduals`; NaN is ignored.
         """
         self.count += 1
         weight = -math.log(self.count * (self.count + 1.0))
         if self.count == 1:
-            self._limited = np.logical_not(np.isneginf(beyond))
-            self._beyond = _Beginnings(int(self._limited.sum()) * len(_SLOPES), self._bet)
+            self._limited = np.logical_not(np.isneginf(one_sided))
+            self._beyond = _ChangePoints(int(self._limited.sum()) * len(_SLOPES), self._bet)
         parts: list[tuple[float, float, int]] = []
-        if len(normal):
-            parts.append((0.5, *self._elsewhere.add(weight, self.count - 1, normal, by_place)))
-            squares = float(normal @ normal)
+        if len(orthogonal):
+            parts.append(
+                (0.5, *self._displacement.add(weight, self.count - 1, orthogonal, displacement_jacobian))
+            )
+            squares = float(orthogonal @ orthogonal)
             grown = 1.0 + _DEVIATIONS**2
-            log = -0.5 * len(normal) * np.log(grown) + 0.5 * squares * (1.0 - 1.0 / grown)
-            parts.append((0.3, *self._loose.add(weight, self.count - 1, log)))
+            log = -0.5 * len(orthogonal) * np.log(grown) + 0.5 * squares * (1.0 - 1.0 / grown)
+            parts.append((0.3, *self._unconstrained.add(weight, self.count - 1, log)))
         if self._limited.any():
-            z = np.maximum(beyond[self._limited], -1e3)
+            z = np.maximum(one_sided[self._limited], -1e3)
             log = np.nan_to_num(_SLOPES[:, None] * z - 0.5 * _SLOPES[:, None] ** 2, nan=0.0).ravel()
             parts.append((0.2, *self._beyond.add(weight, self.count - 1, log)))
         if not parts:
             return 0.0
         total = sum(p for p, _, _ in parts)
         logs = [math.log(p / total) + log for p, log, _ in parts]
-        # Of all beginnings 1/(n + 1) are still to come.
+        # The prior weight 1/(n + 1) belongs to change points still to come.
         ratio = float(np.logaddexp.reduce([*logs, -math.log(self.count + 1.0)]))
-        if self.stopped is None and ratio >= self._threshold:
-            self.noticed = self.count - 1
-            self.stopped = parts[int(np.argmax(logs))][2]
+        if self.implausible_since is None and ratio >= self._threshold:
+            self.detected_at = self.count - 1
+            self.implausible_since = parts[int(np.argmax(logs))][2]
         return ratio
 
 
-class _Bet:
-    """What one observation wins, if a fraction of them is wrong."""
+class _CensoredBet:
+    """Gain by one observation, censored for outliers."""
 
-    def __init__(self, wrong: float) -> None:
-        self.robust = wrong > 0.0
+    def __init__(self, outlier_fraction: float) -> None:
+        self.robust = outlier_fraction > 0.0
         self._cuts = np.log(_CUTS) if self.robust else np.array([np.inf])
-        self._price = np.log1p(wrong * (_CUTS - 1.0)) if self.robust else np.zeros(1)
+        self._price = np.log1p(outlier_fraction * (_CUTS - 1.0)) if self.robust else np.zeros(1)
         self._stakes = _STAKES if self.robust else np.ones(1)
-        self.ways = len(self._cuts)
-        self.shape = len(self._stakes), self.ways
+        self.cuts = len(self._cuts)
+        self.shape = len(self._stakes), self.cuts
 
-    def gains(self, log: Stack) -> Stack:
-        """Return log gains for each cut, (..., ways), of the logarithms of ratios of densities."""
-        gains: Stack = np.minimum(log[..., None], self._cuts) - self._price
+    def gains(self, log: Array) -> Array:
+        """Return the log gain for each cut, (..., cuts), of log density ratios."""
+        gains: Array = np.minimum(log[..., None], self._cuts) - self._price
         return gains
 
-    def staked(self, log: Stack) -> Stack:
-        """Return the same for each stake too, (..., stakes, ways)."""
+    def stake(self, log: Array) -> Array:
+        """Return the log gain for each stake and cut, (..., stakes, cuts)."""
         with np.errstate(divide="ignore"):
             kept = np.log1p(-self._stakes)
         return self.gains(np.logaddexp(kept, np.log(self._stakes) + log[..., None]))
 
 
-class _Beginnings:
-    """Alternatives whose observations are independent: all beginnings are summed up exactly."""
+class _ChangePoints:
+    """Alternatives with independent observations; all change points are summed exactly."""
 
-    def __init__(self, count: int, bet: _Bet) -> None:
+    def __init__(self, count: int, bet: _CensoredBet) -> None:
         self._bet = bet
         shape = (count, *bet.shape)
         self._logs = np.full(shape, -np.inf)
         self._best = np.full(shape, -np.inf)
         self._start = np.zeros(shape, dtype=int)
 
-    def add(self, weight: float, index: int, log: Stack) -> tuple[float, int]:
-        """Return the logarithm of the mixture over all, and the likeliest beginning."""
-        gains = self._bet.staked(log)
+    def add(self, weight: float, index: int, log: Array) -> tuple[float, int]:
+        """Return the log of the mixture over all, and the most likely change point."""
+        gains = self._bet.stake(log)
         self._logs = np.logaddexp(self._logs, weight) + gains
         newer = self._best < weight
         self._start[newer] = index
@@ -154,42 +157,44 @@ class _Beginnings:
         return mean, int(self._start.flat[np.argmax(self._best)])
 
 
-class _Elsewhere:
-    """Displacements δ ~ N(0, s² I) for some sizes s, followed from some beginnings each."""
+class _DisplacementTest:
+    """Displacements δ ~ N(0, s² I) for several sizes s, each with several change points."""
 
-    def __init__(self, bet: _Bet) -> None:
+    def __init__(self, bet: _CensoredBet) -> None:
         self._bet = bet
         self._starts = np.zeros(0, dtype=int)
-        self._logs = np.zeros((0, len(SIZES), bet.ways))
+        self._logs = np.zeros((0, len(SIZES), bet.cuts))
         self._means = np.zeros((0, len(SIZES), 12))
         self._covariances = np.zeros((0, len(SIZES), 12, 12))
 
-    def add(self, weight: float, index: int, normal: Stack, by_place: Stack) -> tuple[float, int]:
-        """Return the logarithm of the mixture over sizes and beginnings, and the likeliest beginning."""
+    def add(
+        self, weight: float, index: int, orthogonal: Array, displacement_jacobian: Array
+    ) -> tuple[float, int]:
+        """Return the log of the mixture over sizes and change points, and the most likely change point."""
         sizes = len(SIZES)
         self._starts = np.append(self._starts, index)
-        self._logs = np.concatenate([self._logs, np.full((1, sizes, self._bet.ways), weight)])
+        self._logs = np.concatenate([self._logs, np.full((1, sizes, self._bet.cuts), weight)])
         self._means = np.concatenate([self._means, np.zeros((1, sizes, 12))])
         prior = np.square(SIZES)[:, None, None] * np.eye(12)
         self._covariances = np.concatenate([self._covariances, prior[None]])
-        error = normal - self._means @ by_place.T
-        carried = self._covariances @ by_place.T
-        spread = by_place @ carried + np.eye(len(normal))
-        gain = np.swapaxes(np.linalg.solve(spread, np.swapaxes(carried, 2, 3)), 2, 3)
+        error = orthogonal - self._means @ displacement_jacobian.T
+        cross_covariance = self._covariances @ displacement_jacobian.T
+        spread = displacement_jacobian @ cross_covariance + np.eye(len(orthogonal))
+        gain = np.swapaxes(np.linalg.solve(spread, np.swapaxes(cross_covariance, 2, 3)), 2, 3)
         solved = np.linalg.solve(spread, error[..., None])[..., 0]
         squares = np.sum(error * solved, axis=2)
-        ratio = 0.5 * (normal @ normal - squares) - 0.5 * np.linalg.slogdet(spread)[1]
+        ratio = 0.5 * (orthogonal @ orthogonal - squares) - 0.5 * np.linalg.slogdet(spread)[1]
         self._logs += self._bet.gains(ratio)
         if self._bet.robust:
-            gain[squares > _LIKELY] = 0.0
+            gain[squares > CHI_SQUARED_6] = 0.0
         self._means += (gain @ error[..., None])[..., 0]
-        self._covariances -= gain @ np.swapaxes(carried, 2, 3)
-        result = float(np.logaddexp.reduce(self._logs, axis=None)) - math.log(sizes * self._bet.ways)
+        self._covariances -= gain @ np.swapaxes(cross_covariance, 2, 3)
+        result = float(np.logaddexp.reduce(self._logs, axis=None)) - math.log(sizes * self._bet.cuts)
         leading = self._logs.max(axis=(1, 2))
         best = int(self._starts[np.argmax(leading)])
-        if len(self._starts) > _FOLLOWED:
-            # The newest have had no time yet to show anything.
-            older = np.argsort(-leading[:-3])[: _FOLLOWED - 3]
+        if len(self._starts) > _MOST_CHANGE_POINTS:
+            # Keep the newest ones, which have little evidence yet.
+            older = np.argsort(-leading[:-3])[: _MOST_CHANGE_POINTS - 3]
             kept = np.sort(np.append(older, np.arange(len(self._starts) - 3, len(self._starts))))
             self._starts, self._logs = self._starts[kept], self._logs[kept]
             self._means, self._covariances = self._means[kept], self._covariances[kept]

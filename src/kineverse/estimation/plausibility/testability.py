@@ -1,9 +1,8 @@
 """Joints that the observed frames can test.
 
-Frames that are rigidly connected are one part. A part that is seen is compared with the nearest part above
-it that is seen too; if everything that moves between them was written by one operation, that is the one
-which is judged. Of several frames of one part, the others are compared with the first: whether they are as
-rigid as the model says.
+Rigidly connected frames form a part. An observed part is compared with the nearest observed part above it. If
+one operation wrote everything that moves between both, this operation is tested. Further frames of a part are
+compared with the first one, which tests whether they are rigid.
 """
 
 from __future__ import annotations
@@ -20,19 +19,19 @@ from kineverse.model.model import Model
 
 @dataclass(frozen=True)
 class TestableJoint:
-    """Two frames that are seen, and the operation between them.
+    """Pair of observed frames with one operation between them.
 
     Attributes
     ----------
     tag
-        Of the operation that is judged.
+        Tag of the tested operation.
     parent, child
-        The frames that are seen.
+        The observed frames.
     base, frame
-        The frame that the operation hangs on, and the one it places there; between them are at most other
+        Frame to which the operation attaches, and the frame that it places there. Between them are only
         frames of the same operation.
     moves
-        Whether the model says that the child moves against the parent.
+        True if the child moves relative to the parent.
     """
 
     tag: str
@@ -45,39 +44,39 @@ class TestableJoint:
 
 @dataclass(frozen=True)
 class TestableJoints:
-    """What can be judged, and why the rest cannot.
+    """Testable joints of a model, with the reasons for other frames.
 
     Attributes
     ----------
-    links
+    joints
         Parents first.
-    left_out
-        Frames that are seen but tell nothing about a single operation, with the reason in words.
+    untested
+        Observed frames that test no single operation, with the reason in words.
     """
 
-    links: tuple[TestableJoint, ...]
-    left_out: Mapping[str, str]
+    joints: tuple[TestableJoint, ...]
+    untested: Mapping[str, str]
 
 
-def find_testable_joints(model: Model, seen: Iterable[str], relative_to: str | None) -> TestableJoints:
-    """Return what can be judged.
+def find_testable_joints(model: Model, observed: Iterable[str], relative_to: str | None) -> TestableJoints:
+    """Find the joints that observed frames can test.
 
     Parameters
     ----------
     model
-        The model that is served.
-    seen
-        Names of the frames whose poses are observed.
+        The served model.
+    observed
+        Names of the observed frames.
     relative_to
-        The frame in which they are observed, whose place is exactly known; None for an observer that is no
-        part of the model.
+        Frame in which they are observed, with exactly known pose; None for an observer that is no part of the
+        model.
 
     Raises
     ------
     UnknownNameError
         For a frame that does not exist.
     """
-    frames = list(dict.fromkeys(seen))
+    frames = list(dict.fromkeys(observed))
     for name in frames if relative_to is None else [*frames, relative_to]:
         if name != WORLD and name not in model.frames:
             raise UnknownNameError(
@@ -87,29 +86,31 @@ def find_testable_joints(model: Model, seen: Iterable[str], relative_to: str | N
 
 
 class _Finder:
+    """Search for testable pairs of observed frames."""
+
     def __init__(self, model: Model, frames: list[str], exact: str | None) -> None:
         self.model = model
         self.exact = exact
         self.chains = {f: self._chain(f) for f in (*frames, *([] if exact is None else [exact]))}
         self.frames = sorted(frames, key=lambda f: len(self.chains[f]))
-        # What is seen of each part. The observer is one of it, but what is seen is preferred.
+        # Observed frames of each part. The observer's frame comes last, because others are preferred.
         self.parts: dict[str, list[str]] = {}
         for name in (*self.frames, *([] if exact is None else [exact])):
             self.parts.setdefault(self._root(name), []).append(name)
 
     def find(self) -> TestableJoints:
-        links: list[TestableJoint] = []
-        left_out: dict[str, str] = {}
+        joints: list[TestableJoint] = []
+        untested: dict[str, str] = {}
         for name in self.frames:
-            found = self._rigid(name) or self._moving(name)
-            if isinstance(found, TestableJoint):
-                links.append(found)
-            elif found:
-                left_out[name] = found
-        return TestableJoints(tuple(links), left_out)
+            result = self._find_rigid_pair(name) or self._find_moving_pair(name)
+            if isinstance(result, TestableJoint):
+                joints.append(result)
+            elif result:
+                untested[name] = result
+        return TestableJoints(tuple(joints), untested)
 
-    def _rigid(self, name: str) -> TestableJoint | None:
-        """Return the link to another frame of the same part, if this is not the first that is seen of it."""
+    def _find_rigid_pair(self, name: str) -> TestableJoint | None:
+        """Return the pair with the first observed frame of the same part; None for that frame itself."""
         part = self.parts[self._root(name)]
         first = self.exact if self.exact in part else part[0]
         if first is None or first == name or name == WORLD:
@@ -117,7 +118,7 @@ class _Finder:
         nearest = self._nearest(self.chains[name][1:], part, first)
         return TestableJoint(self._writer(name), nearest, name, self.model.frames[name].parent, name, False)
 
-    def _moving(self, name: str) -> TestableJoint | str:
+    def _find_moving_pair(self, name: str) -> TestableJoint | str:
         frame = top = self._root(name)
         tags: list[str] = []
         while top != WORLD:
@@ -143,7 +144,7 @@ class _Finder:
         return self.model.history.writers(f"frames/{frame}")[-1]
 
     def _root(self, name: str) -> str:
-        """Return the frame at the root of a part."""
+        """Return the root frame of a part."""
         while name != WORLD and not self._moves(name):
             name = self.model.frames[name].parent
         return name
@@ -155,5 +156,5 @@ class _Finder:
         )
 
     def _chain(self, name: str) -> list[str]:
-        """Return the frame and all above it, the world last."""
+        """Return the frame and all its ancestors, the world last."""
         return [*ancestors(name, self.model.frames.__getitem__), WORLD]

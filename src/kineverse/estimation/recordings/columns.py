@@ -18,7 +18,7 @@ ORIENTATIONS: Mapping[str, tuple[str, ...]] = MappingProxyType(
         "rotation vector": ("rx", "ry", "rz"),
     }
 )
-"""Ways to write an orientation, by name, with the columns of each."""
+"""Representations of an orientation, with their columns."""
 
 TIME, PART, SKIP = "time", "part", "-"
 SYNONYMS: Mapping[str, str] = MappingProxyType(
@@ -34,13 +34,13 @@ UNITS: Mapping[str, Mapping[str, float]] = MappingProxyType(
     | dict.fromkeys(POSITION, _LENGTHS)
     | dict.fromkeys(ORIENTATIONS["rpy"] + ORIENTATIONS["rotation vector"], _ANGLES)
 )
-"""The units of quantities that have one; the first is meant where none is written."""
+"""Units of each quantity; the first is the default."""
 
 QUANTITIES = (TIME, PART, *POSITION, *(name for names in ORIENTATIONS.values() for name in names))
-WITHOUT_NAMES: Mapping[int, str] = MappingProxyType({3: "x,y,z", 7: "x,y,z,qx,qy,qz,qw"})
-"""What the columns of a table without names are taken for, by their number."""
+UNNAMED_COLUMNS: Mapping[int, str] = MappingProxyType({3: "x,y,z", 7: "x,y,z,qx,qy,qz,qw"})
+"""Column names of a table without a head, by number of columns."""
 
-SAYS = (
+COLUMN_HELP = (
     "Known are time, part, x, y, z, and qx, qy, qz, qw or roll, pitch, yaw or rx, ry, rz (a rotation "
     "vector), with a unit as in 'x [mm]', and for several parts in a row a name before them, as in 'door.x'."
 )
@@ -50,14 +50,14 @@ _WITH_UNIT = re.compile(r"(?P<name>.*?)\s*(?:[\[(]\s*(?P<unit>[^\[\]()]*?)\s*[\]
 
 @dataclass(frozen=True)
 class PartColumns:
-    """Where the numbers of one part are.
+    """Columns of one part.
 
     Attributes
     ----------
     position
-        The columns of x, y and z.
+        Columns of x, y and z.
     orientation
-        Those of the orientation, empty if there is none.
+        Columns of the orientation; empty if there is none.
     form
         One of :data:`ORIENTATIONS`, or "".
     """
@@ -69,20 +69,20 @@ class PartColumns:
 
 @dataclass(frozen=True)
 class Columns:
-    """What is where in a row.
+    """Columns of a table by meaning.
 
     Attributes
     ----------
     names
-        The names as they were given.
+        Names as given.
     parts
-        By the name of a part; one of the name "" if columns name no part.
+        Columns of each part by name; the name is "" if columns name no part.
     time, part
-        The columns of the time and of the part's name, None if there are none.
+        Columns of the time and of the part's name; None if there are none.
     factors
-        What the numbers of a column are multiplied by to be in metres, radians and seconds.
+        Factors that convert columns to metres, radians and seconds.
     ignored
-        Names that mean nothing here.
+        Names without meaning.
     """
 
     names: tuple[str, ...]
@@ -94,25 +94,26 @@ class Columns:
 
 
 def parse_columns(names: Sequence[str], where: str) -> Columns:
-    """Return what columns of these names are.
+    """Parse column names.
 
     Parameters
     ----------
     names
-        A quantity each, with a unit in brackets behind it or not; before it a part and ``.``, ``/`` or ``:``.
+        Quantities, optionally followed by a unit in brackets, and preceded by a part and ``.``, ``/`` or
+        ``:``.
     where
-        Begins a message: the file and the line.
+        File and line, at the beginning of messages.
 
     Raises
     ------
     FormatError
-        If a quantity is there twice, a position or an orientation lacks a column, or there is no position.
+        If a quantity occurs twice, a position or an orientation lacks a column, or there is no position.
     """
     places: dict[tuple[str, str], int] = {}
     factors: dict[int, float] = {}
     ignored: list[str] = []
     for index, name in enumerate(names):
-        part, quantity, factor = _read(name, where)
+        part, quantity, factor = _parse_column(name, where)
         if not quantity:
             ignored += [name] if name not in ("", SKIP) else []
             continue
@@ -124,7 +125,9 @@ def parse_columns(names: Sequence[str], where: str) -> Columns:
     time, row_part = places.get(("", TIME)), places.get(("", PART))
     owners = dict.fromkeys(part for part, quantity in places if quantity not in (TIME, PART))
     if not owners:
-        raise FormatError(f"{where}: no column is a position; the columns are {_listed(names)}. {SAYS}")
+        raise FormatError(
+            f"{where}: no column is a position; the columns are {_format_list(names)}. {COLUMN_HELP}"
+        )
     if row_part is not None and set(owners) != {""}:
         raise FormatError(
             f"{where}: a part is named in each row, and in the names of columns too "
@@ -133,14 +136,14 @@ def parse_columns(names: Sequence[str], where: str) -> Columns:
     if "" in owners and len(owners) > 1:
         named = next(filter(None, owners))
         raise FormatError(f"{where}: some columns belong to a part ('{named}'), others such as 'x' to none.")
-    parts = {part: _part(part, places, where, ignored) for part in owners}
+    parts = {part: _parse_part(part, places, where, ignored) for part in owners}
     return Columns(tuple(names), parts, time, row_part, factors, tuple(ignored))
 
 
-def _read(name: str, where: str) -> tuple[str, str, float]:
-    """Return part, quantity and factor of a column; no quantity if the name means nothing."""
+def _parse_column(name: str, where: str) -> tuple[str, str, float]:
+    """Return part, quantity and factor of a column; the quantity is empty if the name has no meaning."""
     match = _WITH_UNIT.fullmatch(name.strip())
-    assert match is not None  # everything in it is optional
+    assert match is not None  # all parts of the pattern are optional
     part, quantity = "", match["name"]
     found = re.fullmatch(r"(.*)[./:]([^./:]*)", match["name"])
     if found:
@@ -161,47 +164,51 @@ def _read(name: str, where: str) -> tuple[str, str, float]:
     return part, quantity, units[unit]
 
 
-def _part(
+def _parse_part(
     part: str, places: Mapping[tuple[str, str], int], where: str, ignored: Iterable[str]
 ) -> PartColumns:
-    position = _complete(part, POSITION, places, where, ignored)
+    position = _find_columns(part, POSITION, places, where, ignored)
     if not position:
-        raise FormatError(f"{where}: {_owner(part)} an orientation, but no position x, y, z.")
+        raise FormatError(f"{where}: {_describe_owner(part)} an orientation, but no position x, y, z.")
     forms = {
         form: found
         for form, names in ORIENTATIONS.items()
-        if (found := _complete(part, names, places, where, ignored))
+        if (found := _find_columns(part, names, places, where, ignored))
     }
     if len(forms) > 1:
-        raise FormatError(f"{where}: {_owner(part)} its orientation twice, as {' and '.join(forms)}.")
+        raise FormatError(
+            f"{where}: {_describe_owner(part)} its orientation twice, as {' and '.join(forms)}."
+        )
     for form, found in forms.items():
         return PartColumns(position, found, form)
     return PartColumns(position)
 
 
-def _complete(
+def _find_columns(
     part: str,
     quantities: tuple[str, ...],
     places: Mapping[tuple[str, str], int],
     where: str,
     ignored: Iterable[str],
 ) -> tuple[int, ...]:
-    """Return the columns of quantities that belong together, none if all are missing."""
+    """Return the columns of quantities that belong together; none if all are missing."""
     found = [places.get((part, quantity)) for quantity in quantities]
     missing = [quantity for quantity, place in zip(quantities, found, strict=True) if place is None]
     if len(missing) == len(quantities):
         return ()
     if missing:
         others = list(ignored)
-        hint = f" Not understood: {_listed(others)}." if others else ""
-        raise FormatError(f"{where}: {_owner(part)} no column {', '.join(missing)}.{hint} {SAYS}")
+        hint = f" Not understood: {_format_list(others)}." if others else ""
+        raise FormatError(
+            f"{where}: {_describe_owner(part)} no column {', '.join(missing)}.{hint} {COLUMN_HELP}"
+        )
     return tuple(place for place in found if place is not None)
 
 
-def _owner(part: str) -> str:
+def _describe_owner(part: str) -> str:
     return f"the part '{part}' has" if part else "the table has"
 
 
-def _listed(names: Sequence[str]) -> str:
+def _format_list(names: Sequence[str]) -> str:
     shown = ", ".join(f"'{name}'" for name in names[:12])
     return shown if len(names) <= 12 else f"{shown} and {len(names) - 12} more"

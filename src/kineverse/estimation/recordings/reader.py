@@ -12,7 +12,13 @@ import numpy as np
 import numpy.typing as npt
 
 from kineverse.errors import FormatError
-from kineverse.estimation.recordings.columns import SAYS, WITHOUT_NAMES, Columns, PartColumns, parse_columns
+from kineverse.estimation.recordings.columns import (
+    COLUMN_HELP,
+    UNNAMED_COLUMNS,
+    Columns,
+    PartColumns,
+    parse_columns,
+)
 from kineverse.estimation.recordings.recording import Indices, RecordedTrack, Recording
 from kineverse.formats.files import read_file
 from kineverse.formats.xml_values import LARGEST
@@ -23,18 +29,18 @@ COMMENT = "#"
 
 @dataclass(frozen=True)
 class TextTable:
-    """The cells of a file.
+    """Text cells of a table file.
 
     Attributes
     ----------
     source
-        What the file is called in messages.
+        Name of the file in messages.
     head
-        The names of the columns, None if the file begins with numbers.
+        Column names; None if the file begins with numbers.
     lines
-        The number of each row's line, counted from 1.
+        Line number of each row, counted from 1.
     cells
-        The texts of each row, as many in each.
+        Texts of each row, equally many in each.
     """
 
     source: str
@@ -43,36 +49,37 @@ class TextTable:
     cells: tuple[tuple[str, ...], ...]
 
 
-def read_rows(path: Path) -> TextTable:
-    """Read a table whose cells are separated by commas, semicolons, tabs or spaces.
+def read_table(path: Path) -> TextTable:
+    """Read a table with cells separated by commas, semicolons, tabs or spaces.
 
-    Empty lines are skipped, and those that begin with ``#``. The first other line is the head if a cell of it
-    is no number. It also tells the separator: a semicolon if it has one, else a comma, else a tab in a head,
-    else spaces.
+    Empty lines and lines that begin with ``#`` are skipped. The first other line is the head if one of its
+    cells is not a number. It also determines the separator: a semicolon if it has one, else a comma, else a
+    tab in a head, else spaces.
 
     Raises
     ------
     FormatError
-        If there is no such file, it is no text, it is empty, or a row has more or fewer cells than others.
+        If there is no such file, it is not text, it is empty, or rows differ in length.
     """
     source = str(path)
     found = [
         (line, text)
-        for line, text in enumerate(_text(path, source).splitlines(), start=1)
+        for line, text in enumerate(_read_text(path, source).splitlines(), start=1)
         if text.strip() and not text.lstrip().startswith(COMMENT)
     ]
     if not found:
         raise FormatError(f"{source}: the file is empty; a row for each pose is expected.")
     separator = next((mark for mark in ";,\t" if mark in found[0][1]), None)
-    if separator == "\t" and all(map(spells_number, found[0][1].split())):
-        separator = None  # columns of numbers, aligned by tabs and spaces
-    first = _cells(found[0][1], separator)
-    has_head = not all(map(spells_number, filter(None, first)))
-    split = [(line, _cells(text, separator)) for line, text in found]
+    if separator == "\t" and all(map(is_number, found[0][1].split())):
+        separator = None  # numeric columns, aligned by tabs and spaces
+    first = _split_cells(found[0][1], separator)
+    has_head = not all(map(is_number, filter(None, first)))
+    split = [(line, _split_cells(text, separator)) for line, text in found]
     for line, cells in split:
         if len(cells) != len(first):
             raise FormatError(
-                f"{source}, line {line}: {_counted(len(cells))}, where line {found[0][0]} has {len(first)}."
+                f"{source}, line {line}: {_count_text(len(cells))}, where line {found[0][0]} has "
+                f"{len(first)}."
             )
     body = split[1:] if has_head else split
     if not body:
@@ -81,8 +88,8 @@ def read_rows(path: Path) -> TextTable:
     return TextTable(source, head, tuple(line for line, _ in body), tuple(tuple(cells) for _, cells in body))
 
 
-def spells_number(text: str) -> bool:
-    """Return whether a text is a number, NaN and infinities included."""
+def is_number(text: str) -> bool:
+    """Return True if a text is a number, including NaN and infinities."""
     # Python also reads digits grouped by underscores.
     if "_" in text:
         return False
@@ -93,7 +100,7 @@ def spells_number(text: str) -> bool:
     return True
 
 
-def _text(path: Path, source: str) -> str:
+def _read_text(path: Path, source: str) -> str:
     data = read_file(path)
     if b"\0" in data:
         raise FormatError(f"{source}: this is no text, or not in UTF-8; poses are read from a table in text.")
@@ -106,50 +113,49 @@ def _text(path: Path, source: str) -> str:
         ) from None
 
 
-def _cells(text: str, separator: str | None) -> list[str]:
+def _split_cells(text: str, separator: str | None) -> list[str]:
     if separator is None:
         return text.split()
     return [cell.strip() for cell in next(csv.reader([text], delimiter=separator, skipinitialspace=True))]
 
 
-def _counted(count: int) -> str:
+def _count_text(count: int) -> str:
     return f"{count} cell{'' if count == 1 else 's'}"
 
 
 Array = npt.NDArray[np.float64]
 
-OFF_UNIT = 0.01
-"""How far the length of a quaternion may be from one, so that two digits are enough."""
+QUATERNION_TOLERANCE = 0.01
+"""Largest accepted deviation of a quaternion's length from one; two digits suffice."""
 
 
 def read_recording(path: str | os.PathLike[str], columns: str | Sequence[str] | None = None) -> Recording:
     """Read a table of poses.
 
-    A head names the columns: ``time``, ``part``, ``x``, ``y``, ``z``, and an orientation, a quaternion
-    ``qx``, ``qy``, ``qz``, ``qw``, or ``roll``, ``pitch``, ``yaw`` about fixed axes, or a rotation vector
-    ``rx``, ``ry``, ``rz``; in [m], [rad] and [s] unless a unit follows as in ``x [mm]``. There is a part in
-    each row, or all of them, and then columns are called ``door.x``. Empty cells mean that a part was not
-    seen. Without a head, three columns are positions and seven are positions and quaternions.
+    A head names the columns: ``time``, ``part``, ``x``, ``y``, ``z``, and an orientation. The orientation is
+    a quaternion ``qx``, ``qy``, ``qz``, ``qw``, or ``roll``, ``pitch``, ``yaw`` about fixed axes, or a
+    rotation vector ``rx``, ``ry``, ``rz``. Units are [m], [rad] and [s] unless a name says otherwise, as in
+    ``x [mm]``. A row has one part, or all parts with columns such as ``door.x``. Empty cells mark a part that
+    was not observed. Without a head, three columns are positions and seven are positions and quaternions.
 
     Parameters
     ----------
     path
-        Text with cells separated by commas, semicolons, tabs or spaces; ``#`` begins a comment.
+        Text file with cells separated by commas, semicolons, tabs or spaces; ``#`` begins a comment.
     columns
-        What the columns are, in place of the head or where there is none; ``-`` leaves one out. Names, or a
-        text of names with commas between them.
+        Column names that replace the head; ``-`` skips a column. A sequence, or one text separated by commas.
 
     Raises
     ------
     FormatError
-        If it cannot be read so, or has a number that cannot be: NaN, a quaternion that is not of unit length,
-        a time that is not later than the one before it. The message names the line.
+        If the table is malformed or has an invalid number: NaN, a quaternion that is not of unit length, or a
+        time that does not increase. The message names the line.
     """
-    table = read_rows(Path(path))
+    table = read_table(Path(path))
     named = columns.split(",") if isinstance(columns, str) else columns
-    given = _columns(table, None if named is None else [name.strip() for name in named])
+    given = _choose_columns(table, None if named is None else [name.strip() for name in named])
     tracks = {
-        part or name: _track(table, given, where, rows)
+        part or name: _build_track(table, given, where, rows)
         for part, where in given.parts.items()
         for name, rows in _rows_by_part(table, given, where).items()
     }
@@ -159,7 +165,7 @@ def read_recording(path: str | os.PathLike[str], columns: str | Sequence[str] | 
     return Recording(table.source, {k: t for k, t in tracks.items() if len(t)}, given.ignored)
 
 
-def _columns(table: TextTable, named: Sequence[str] | None) -> Columns:
+def _choose_columns(table: TextTable, named: Sequence[str] | None) -> Columns:
     count = len(table.cells[0])
     if named is not None:
         if len(named) != count:
@@ -170,16 +176,16 @@ def _columns(table: TextTable, named: Sequence[str] | None) -> Columns:
         return parse_columns(named, "The names of the columns")
     if table.head is not None:
         return parse_columns(table.head, f"{table.source}, line 1" if table.lines[0] == 2 else table.source)
-    if count not in WITHOUT_NAMES:
+    if count not in UNNAMED_COLUMNS:
         raise FormatError(
-            f"{table.source}: {count} columns without names. 3 are taken for {WITHOUT_NAMES[3]} and 7 for "
-            f"{WITHOUT_NAMES[7]}; otherwise say what they are (--columns). {SAYS}"
+            f"{table.source}: {count} columns without names. 3 are taken for {UNNAMED_COLUMNS[3]} and 7 for "
+            f"{UNNAMED_COLUMNS[7]}; otherwise say what they are (--columns). {COLUMN_HELP}"
         )
-    return parse_columns(WITHOUT_NAMES[count].split(","), table.source)
+    return parse_columns(UNNAMED_COLUMNS[count].split(","), table.source)
 
 
 def _rows_by_part(table: TextTable, columns: Columns, where: PartColumns) -> dict[str, Indices]:
-    """Return the rows in which something was seen, by the name of the part in the row."""
+    """Return the rows in which each part was observed, by its name."""
     seen: dict[str, list[int]] = {}
     for row, cells in enumerate(table.cells):
         name = cells[columns.part] if columns.part is not None else ""
@@ -198,19 +204,19 @@ def _rows_by_part(table: TextTable, columns: Columns, where: PartColumns) -> dic
     return {name: np.array(rows, dtype=np.intp) for name, rows in seen.items()}
 
 
-def _track(table: TextTable, columns: Columns, where: PartColumns, rows: Indices) -> RecordedTrack:
+def _build_track(table: TextTable, columns: Columns, where: PartColumns, rows: Indices) -> RecordedTrack:
     lines = np.array(table.lines, dtype=np.intp)[rows]
-    poses = _numbers(table, columns, where.position, rows)
+    poses = _parse_numbers(table, columns, where.position, rows)
     if where.form:
         poses = transform(_rotations(table, columns, where, rows), poses)
     times = None
     if columns.time is not None:
-        times = _numbers(table, columns, (columns.time,), rows)[:, 0]
+        times = _parse_numbers(table, columns, (columns.time,), rows)[:, 0]
         _check_order(table, times, lines)
     return RecordedTrack(poses, rows, lines, times)
 
 
-def _numbers(table: TextTable, columns: Columns, places: Sequence[int], rows: Indices) -> Array:
+def _parse_numbers(table: TextTable, columns: Columns, places: Sequence[int], rows: Indices) -> Array:
     """Return the cells of some columns as numbers, (N, len(places))."""
     texts = [[table.cells[row][k] for k in places] for row in rows]
     try:
@@ -218,7 +224,7 @@ def _numbers(table: TextTable, columns: Columns, places: Sequence[int], rows: In
         good = np.abs(numbers) <= LARGEST  # NaN is not
         good &= np.array(["_" not in text for row in texts for text in row], dtype=bool).reshape(good.shape)
     except ValueError:
-        good = np.array([[spells_number(text) for text in row] for row in texts])
+        good = np.array([[is_number(text) for text in row] for row in texts])
     if not good.all():
         row, k = np.argwhere(~good)[0]
         text, name = texts[row][k], columns.names[places[k]]
@@ -234,23 +240,23 @@ def _numbers(table: TextTable, columns: Columns, places: Sequence[int], rows: In
 
 def _rotations(table: TextTable, columns: Columns, where: PartColumns, rows: Indices) -> Array:
     """Return (N, 3, 3)."""
-    numbers = _numbers(table, columns, where.orientation, rows)
+    numbers = _parse_numbers(table, columns, where.orientation, rows)
     if where.form == "quaternion":
         lengths = np.linalg.norm(numbers, axis=1)
         off = np.abs(lengths - 1.0)
-        if off.size and off.max() > OFF_UNIT:
-            worst = int(np.argmax(off > OFF_UNIT))
+        if off.size and off.max() > QUATERNION_TOLERANCE:
+            worst = int(np.argmax(off > QUATERNION_TOLERANCE))
             raise FormatError(
                 f"{table.source}, line {table.lines[rows[worst]]}: the quaternion has the length "
-                f"{lengths[worst]:.4g}, which is off by {off[worst]:.2g}; {int((off > OFF_UNIT).sum())} of "
-                f"{len(off)} are not of unit length."
+                f"{lengths[worst]:.4g}, which is off by {off[worst]:.2g}; "
+                f"{int((off > QUATERNION_TOLERANCE).sum())} of {len(off)} are not of unit length."
             )
         return quaternion(numbers)
     return rpy(numbers) if where.form == "rpy" else exp_so3(numbers)
 
 
 def _check_order(table: TextTable, times: Array, lines: Indices) -> None:
-    """Look whether each time is later than the one before it."""
+    """Check that times increase."""
     wrong = np.flatnonzero(np.diff(times) <= 0.0)
     if not wrong.size:
         return

@@ -10,26 +10,26 @@ import numpy as np
 import numpy.typing as npt
 
 from kineverse.errors import FormatError, InvalidValueError, UnknownNameError, suggest
+from kineverse.lie import Array
 from kineverse.model.frame import WORLD
 
-Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.intp]
 
 
 @dataclass(frozen=True, eq=False)
 class RecordedTrack:
-    """What was seen of one part.
+    """Recorded poses of one part.
 
     Attributes
     ----------
     poses
-        (N, 4, 4) in the observer's frame [m]; (N, 3) where only positions were seen.
+        (N, 4, 4) in the observer's frame [m]; (N, 3) for positions only.
     rows
-        (N,) which rows of the table these were: parts of one row were seen at one time.
+        Rows of the table, (N,); parts in one row were observed at one time.
     lines
-        (N,) the lines of the file.
+        Lines of the file, (N,).
     times
-        (N,) [s], None if the table has none.
+        (N,) [s]; None if the table has no times.
     """
 
     poses: Array
@@ -39,7 +39,7 @@ class RecordedTrack:
 
     @property
     def has_orientation(self) -> bool:
-        """Whether whole poses were seen, rather than positions."""
+        """True for whole poses, False for positions only."""
         return self.poses.ndim == 3
 
     def __len__(self) -> int:
@@ -47,28 +47,28 @@ class RecordedTrack:
 
 
 def spaced_indices(count: int, most: int) -> Indices:
-    """Return at most so many of the numbers below a count, the first and the last among them."""
+    """Return at most ``most`` evenly spaced numbers below ``count``, including the first and the last."""
     return np.unique(np.linspace(0, count - 1, most).round().astype(np.intp))
 
 
 @dataclass(frozen=True, eq=False)
 class RecordedPair:
-    """Two parts at the times when both were seen.
+    """Synchronised poses of two parts.
 
     Attributes
     ----------
     parent, child
-        Their names.
+        Names of the parts.
     parent_poses
         (N, 4, 4); None for the world, which is known exactly.
     child_poses
         (N, 4, 4) or (N, 3).
     lines
-        (N,) where the child's are in the file.
-    alone
-        How often one of them was seen without the other.
-    timed
-        Whether they are in the order of their times.
+        Lines of the child's poses in the file, (N,).
+    unpaired
+        Number of poses of one part without the other.
+    is_timed
+        True if the poses are in order of time.
     """
 
     parent: str
@@ -76,12 +76,12 @@ class RecordedPair:
     parent_poses: Array | None
     child_poses: Array
     lines: Indices
-    alone: int = 0
-    timed: bool = False
+    unpaired: int = 0
+    is_timed: bool = False
 
     @property
-    def is_whole(self) -> bool:
-        """Whether orientations were seen, of the child or of a parent."""
+    def has_orientation(self) -> bool:
+        """True if the child's or a parent's orientations were observed."""
         return self.child_poses.ndim == 3 or self.parent_poses is not None
 
     @property
@@ -94,19 +94,19 @@ class RecordedPair:
         offsets = self.child_poses - self.parent_poses[:, :3, 3]
         return np.asarray(np.einsum("nji,nj->ni", self.parent_poses[:, :3, :3], offsets))
 
-    def thinned(self, count: int) -> RecordedPair:
-        """Return at most so many of the observations, evenly over all.
+    def thin(self, count: int) -> RecordedPair:
+        """Return at most ``count`` evenly spaced observations.
 
         Raises
         ------
         InvalidValueError
-            If that is less than two.
+            If ``count`` is less than two.
         """
         if count < 2:
             raise InvalidValueError(f"{count} of the poses: how something moves takes at least two to see.")
-        return self.at(spaced_indices(len(self.lines), count))
+        return self.select(spaced_indices(len(self.lines), count))
 
-    def at(self, rows: Indices) -> RecordedPair:
+    def select(self, rows: Indices) -> RecordedPair:
         """Return some of the observations."""
         parents = None if self.parent_poses is None else self.parent_poses[rows]
         return replace(self, parent_poses=parents, child_poses=self.child_poses[rows], lines=self.lines[rows])
@@ -114,16 +114,16 @@ class RecordedPair:
 
 @dataclass(frozen=True, eq=False)
 class Recording:
-    """The tracks of a table.
+    """Recorded tracks of a table.
 
     Attributes
     ----------
     source
-        What the file is called in messages.
+        Name of the file in messages.
     tracks
-        By the name of the part; a table that names none has one, called "".
+        Tracks by name of the part; a table without names has one, called "".
     ignored
-        Columns that mean nothing here.
+        Columns without meaning.
     """
 
     source: str
@@ -131,28 +131,28 @@ class Recording:
     ignored: tuple[str, ...] = ()
 
     def pair(self, parent: str = WORLD, child: str | None = None) -> RecordedPair:
-        """Return two parts at the times when both were seen.
+        """Synchronise the poses of two parts.
 
         Parameters
         ----------
         parent
-            Its name; ``world``, unless a part is called so, for the frame in which everything was seen.
+            Name of the parent. ``world`` stands for the observer's frame, unless a part has this name.
         child
-            Its name; None for the only other part. A table that names no part has one, of any name.
+            Name of the child; None for the only other part. A table without names has one part, of any name.
 
         Raises
         ------
         UnknownNameError
-            If there is no such part, or several could be meant.
+            If there is no such part, or the child is ambiguous.
         FormatError
-            If the parent's orientation was not seen, or the two were never seen together.
+            If the parent's orientation is missing, or the two were never observed together.
         """
         others = [name for name in self.tracks if name != parent]
         if child is None:
             if len(others) != 1:
                 raise UnknownNameError(
-                    f"{self.source}: which part moves? There are {_listed(others)}; name one as the child "
-                    "(--child on the command line)."
+                    f"{self.source}: which part moves? There are {_format_list(others)}; name one as the "
+                    "child (--child on the command line)."
                 )
             child = others[0]
         track = self._track(child)
@@ -164,8 +164,10 @@ class Recording:
             )
         name = child or "part"
         if parent == WORLD and WORLD not in self.tracks:
-            return RecordedPair(parent, name, None, track.poses, track.lines, timed=track.times is not None)
-        return self._together(parent, name, self._track(parent), track)
+            return RecordedPair(
+                parent, name, None, track.poses, track.lines, is_timed=track.times is not None
+            )
+        return self._synchronise(parent, name, self._track(parent), track)
 
     def _track(self, name: str) -> RecordedTrack:
         if list(self.tracks) == [""] and name != WORLD:
@@ -176,56 +178,54 @@ class Recording:
             )
         return self.tracks[name]
 
-    def _together(self, parent: str, child: str, a: RecordedTrack, b: RecordedTrack) -> RecordedPair:
+    def _synchronise(self, parent: str, child: str, a: RecordedTrack, b: RecordedTrack) -> RecordedPair:
         if not a.has_orientation:
             raise FormatError(
                 f"{self.source}: only positions of the parent '{parent}' were seen. How something moves in a "
                 "part's frame can only be told if its orientation is known."
             )
-        # Times where there are some; else the rows, which in a table of a part per row pair nothing.
-        timed = a.times is not None and b.times is not None
-        keys = [np.asarray(track.times if timed else track.rows) for track in (a, b)]
+        # Pair by time, else by row. In a table with one part per row, rows pair nothing.
+        is_timed = a.times is not None and b.times is not None
+        keys = [np.asarray(track.times if is_timed else track.rows) for track in (a, b)]
         _, of_a, of_b = np.intersect1d(keys[0], keys[1], assume_unique=True, return_indices=True)
-        if not len(of_a) and not timed and len(a) == len(b):
+        if not len(of_a) and not is_timed and len(a) == len(b):
             of_a = of_b = np.arange(len(a))
         if not len(of_a):
             raise FormatError(
                 f"{self.source}: '{parent}' and '{child}' were never seen at the same time; "
                 "a pose of both with the same time is expected."
             )
-        alone = len(a) + len(b) - 2 * len(of_a)
-        return RecordedPair(parent, child, a.poses[of_a], b.poses[of_b], b.lines[of_b], alone, timed)
+        unpaired = len(a) + len(b) - 2 * len(of_a)
+        return RecordedPair(parent, child, a.poses[of_a], b.poses[of_b], b.lines[of_b], unpaired, is_timed)
 
 
-def _listed(names: list[str]) -> str:
+def _format_list(names: list[str]) -> str:
     return ", ".join(f"'{name}'" for name in names[:12]) or "none"
 
 
-ResidualArray = npt.NDArray[np.float64]
-
-# Of fewer rows correlations are not known, and fewer than these are never asked for.
-_LOOKED_AT, _FEWEST = 20, 8
+# Least number of rows to estimate a correlation from, and least effective sample size.
+_LEAST_COUNT, _LEAST_EFFECTIVE = 20, 8
 
 
-def effective_sample_size(residuals: ResidualArray) -> int:
-    """Return how many of the observations behind residuals (N, m), in order, are worth as much as all.
+def effective_sample_size(residuals: Array) -> int:
+    """Return the effective sample size of residuals (N, m) in order.
 
-    What is left of a pose is often left of the next one too: a camera is filtered, a marker is bent. The
-    integrated autocorrelation time τ = 1 + 2 Σ ρ_k says of how many rows each tells nothing new, and N / τ
-    are left. The sum ends where ρ_k is no larger than by chance, and the slowest component counts.
+    Successive errors of poses are often correlated: cameras are filtered, markers are bent. With the
+    integrated autocorrelation time τ = 1 + 2 Σ ρ_k, N observations are worth N / τ independent ones. The sum
+    ends where ρ_k falls to the level of chance. The component with the largest τ counts.
     """
     count = len(residuals)
-    if count <= _LOOKED_AT:
+    if count <= _LEAST_COUNT:
         return count
     slowest = max(_correlation_time(column) for column in residuals.T)
-    return min(count, max(_FEWEST, round(count / slowest)))
+    return min(count, max(_LEAST_EFFECTIVE, round(count / slowest)))
 
 
-def _correlation_time(errors: ResidualArray) -> float:
+def _correlation_time(errors: Array) -> float:
     middle = float(np.median(np.abs(errors)))
     if middle == 0.0:
         return 1.0
-    # Three standard deviations: what is wrong altogether says nothing about the others.
+    # Clip at three standard deviations, so that outliers do not count.
     kept = np.clip(errors, -4.5 * middle, 4.5 * middle)
     kept = kept - kept.mean()
     variance = float(kept @ kept)
@@ -233,8 +233,8 @@ def _correlation_time(errors: ResidualArray) -> float:
         return 1.0
     time, chance = 1.0, 3.0 / math.sqrt(len(kept))
     for k in range(1, len(kept) // 3):
-        alike = float(kept[:-k] @ kept[k:]) / variance
-        if alike < chance:
+        correlation = float(kept[:-k] @ kept[k:]) / variance
+        if correlation < chance:
             break
-        time += 2.0 * alike
+        time += 2.0 * correlation
     return time

@@ -1,10 +1,10 @@
 """Bindings of the C update, with the fast path for unambiguous inliers.
 
-Until then, without a compiler, and where limits are curved, numpy does the same.
+Before compilation ends, without a compiler, and for curved limits, numpy does the same.
 
-A group is left to others if something in it is neither right nor wrong beyond doubt. What is taken to be
-wrong might be right, and others wrong instead: the evidence of that is bounded from above by what it says
-alone, and by the largest density that each of the others can have.
+The fast path leaves a group to numpy if the inlier probability of a measurement in it is ambiguous. A
+rejected measurement might be an inlier and others outliers instead. The evidence of this alternative is
+bounded from above by the evidence of that measurement alone times the peak density of each other measurement.
 """
 
 from __future__ import annotations
@@ -33,8 +33,8 @@ from .map_update import MapResult
 from .process_model import ProcessModel
 from .residuals import RIGID, Measurements
 
-# What the C has room for.
-_MOST_UNKNOWNS, _MOST_NUMBERS = 64, 64
+# Sizes of the arrays on the stack of the C code.
+_MAX_UNKNOWNS, _MAX_MEASUREMENT_SIZE = 64, 64
 
 _COUNTS = ("observations", "groups", "coordinates", "directions", "known")
 _INDICES = (
@@ -61,54 +61,65 @@ def _declare(code: Any) -> None:
 
 
 native_library = SourceLibrary(QUADRATIC_PROGRAM + PROCESS_MODEL + RESIDUAL + MAP_UPDATE, _declare)
-"""The compiled update, once there is one; for all trackers of the process."""
+"""Compiled update, shared by all trackers of the process."""
 
 
 class NativeMapSolver:
-    """What :class:`.map_update.MapSolver` does for one tracker, in C.
+    """Compiled counterpart of :class:`.map_update.MapSolver` for one tracker.
 
-    It has memory of its own, which threads use in turns.
+    It owns its memory; a lock serialises threads.
 
     Parameters
     ----------
-    layout, limits, function, charted
-        The parts of a tracker.
+    layout, limits, function, process_model
+        Components of the tracker.
     """
 
     def __init__(
-        self, layout: Layout, limits: StateBounds, function: CompiledFunction, charted: ProcessModel
+        self, layout: Layout, limits: StateBounds, function: CompiledFunction, process_model: ProcessModel
     ) -> None:
-        self._layout, self._limits, self._function, self._charted = layout, limits, function, charted
-        count, size, directions = len(layout.groups), len(layout.chart.coordinates), len(layout.chart.tangent)
-        self._motions = [charted.motion(number) for number in range(count)]
-        bends = [np.empty(0) if motion is None else motion.bends.reshape(-1) for motion in self._motions]
-        self._input = np.zeros(len(layout.inputs))
+        self._layout, self._limits, self._function, self._process_model = (
+            layout,
+            limits,
+            function,
+            process_model,
+        )
+        count, size, directions = (
+            len(layout.groups),
+            len(layout.tangent_space.coordinates),
+            len(layout.tangent_space.tangent),
+        )
+        self._motions = [process_model.flow(number) for number in range(count)]
+        is_varying = [
+            np.empty(0) if motion is None else motion.is_varying.reshape(-1) for motion in self._motions
+        ]
+        self._input = np.zeros(len(layout.arguments))
         self._size = size
         widths = [len(group.tangent) for group in layout.groups]
-        kept = {
+        indices = {
             "is_pose": [one.is_pose for one in layout.observations],
             "size": [one.size for one in layout.observations],
             "value": [where.start for where in layout.value_slices],
-            "slope": [where.start for where in layout.slope_slices],
-            "seen": [where.start for where in layout.seen_slices],
-            "white": [where.start for where in layout.white_slices],
+            "slope": [where.start for where in layout.jacobian_slices],
+            "seen": [where.start for where in layout.measurement_slices],
+            "white": [where.start for where in layout.whitening_slices],
             "first": np.cumsum([0, *widths]),
             "place": np.concatenate([group.t for group in layout.groups]),
-            "own": np.concatenate([group.own for group in layout.groups]),
+            "own": np.concatenate([group.coordinate_indices for group in layout.groups]),
             "first_x": np.cumsum([0, *(len(group.x) for group in layout.groups)]),
             "place_x": np.concatenate([group.x for group in layout.groups]),
-            "first_watch": np.cumsum([0, *(len(group.seen) for group in layout.groups)]),
-            "watch": [i for group in layout.groups for i in group.seen],
+            "first_watch": np.cumsum([0, *(len(group.observation_indices) for group in layout.groups)]),
+            "watch": [i for group in layout.groups for i in group.observation_indices],
             "rates": np.zeros(count),
             "step": np.zeros(count),
-            "first_bend": np.cumsum([0, *map(len, bends)]),
+            "first_bend": np.cumsum([0, *map(len, is_varying)]),
         }
         self._indices: dict[str, TangentIndices] = {
-            name: np.array(v, dtype=np.int64) for name, v in kept.items()
+            name: np.array(v, dtype=np.int64) for name, v in indices.items()
         }
         self._squares = np.zeros(len(layout.observations))
         self._numbers = {
-            "bend": np.concatenate(bends).astype(np.float64),
+            "bend": np.concatenate(is_varying).astype(np.float64),
             "period": np.array([one.period for one in layout.observations]),
             "lower": limits.lower,
             "upper": limits.upper,
@@ -122,43 +133,47 @@ class NativeMapSolver:
             groups=count,
             coordinates=size,
             directions=directions,
-            known=len(layout.known),
+            known=len(layout.inputs),
         )
         for name, array in (*self._indices.items(), *self._numbers.items()):
             setattr(self._problem, name, array.ctypes.data)
         self._results = np.zeros((2, count))
         self._motion = np.zeros((2, size))
-        # Buffers that stay where they are: asking an array for its address takes longer than copying it.
+        # Buffers with fixed addresses: asking an array for its address takes longer than copying it.
         self._belief = np.zeros(InformationState((size, directions, count)).numbers.shape)
         self._reading = Measurements(
-            np.zeros(layout.seen_slices[-1].stop),
+            np.zeros(layout.measurement_slices[-1].stop),
             np.zeros(len(layout.observations), dtype=bool),
-            np.zeros(layout.white_slices[-1].stop),
+            np.zeros(layout.whitening_slices[-1].stop),
             np.zeros(len(layout.observations)),
         )
         self._loaded: Measurements | None = None
         self._lock = threading.Lock()
-        self._where = ctypes.addressof(self._problem)
-        self._moved = [row.ctypes.data for row in self._motion]
-        self._seen = [array.ctypes.data for array in self._reading]
-        self._written = [self._belief.ctypes.data, *self._seen, *(row.ctypes.data for row in self._results)]
+        self._problem_address = ctypes.addressof(self._problem)
+        self._motion_addresses = [row.ctypes.data for row in self._motion]
+        self._reading_addresses = [array.ctypes.data for array in self._reading]
+        self._addresses = [
+            self._belief.ctypes.data,
+            *self._reading_addresses,
+            *(row.ctypes.data for row in self._results),
+        ]
 
     def __reduce__(self) -> Any:
-        # Addresses mean something in this process only.
-        return NativeMapSolver, (self._layout, self._limits, self._function, self._charted)
+        # Addresses are valid in this process only.
+        return NativeMapSolver, (self._layout, self._limits, self._function, self._process_model)
 
     @staticmethod
     def suits(layout: Layout) -> bool:
-        """Whether C can do it: limits of single coordinates only, and not too many of anything."""
+        """Return True if C supports the layout: bounds on single coordinates only, and small groups."""
         return (
             not layout.limits
-            and all(max(len(group.x), len(group.t)) <= _MOST_UNKNOWNS for group in layout.groups)
-            and all(one.size <= _MOST_NUMBERS for one in layout.observations)
+            and all(max(len(group.x), len(group.t)) <= _MAX_UNKNOWNS for group in layout.groups)
+            and all(one.size <= _MAX_MEASUREMENT_SIZE for one in layout.observations)
         )
 
     @property
     def is_ready(self) -> bool:
-        """Whether the update, the model and how it moves are compiled."""
+        """True once the update, the measurement function and the process model are compiled."""
         if native_library.code is None or self._function.address is None:
             return False
         self._problem.compute = self._function.address
@@ -170,42 +185,49 @@ class NativeMapSolver:
                 self._indices["rates"][number], self._indices["step"][number] = addresses
         return True
 
-    def update(self, belief: InformationState, reading: Measurements, known: Array) -> MapResult | None:
-        """Do what :meth:`.solving.Solver.update` does for all groups that are seen; None if that is not easy.
+    def update(self, belief: InformationState, reading: Measurements, inputs: Array) -> MapResult | None:
+        """Update measured groups as :meth:`.map_update.MapSolver.update` does; return None on any difficulty.
 
-        Then numpy finds out why.
+        The numpy solver then reports the reason.
         """
         with self._lock:
             self._load(reading)
             self._belief[:] = belief.numbers
-            self._input[self._size :] = known
-            rounds = native_library.code.update(self._where, *self._written)
+            self._input[self._size :] = inputs
+            rounds = native_library.code.update(self._problem_address, *self._addresses)
             if rounds < 0:
                 return None
             nis, dof = self._results.copy()
-            after = InformationState(belief.sizes, self._belief.copy(), belief.standing)
+            after = InformationState(belief.sizes, self._belief.copy(), belief.records)
             return MapResult(after, nis, dof, rounds, squares=self._squares.copy())
 
-    def predict(self, belief: InformationState, moved: Array, grown: Array) -> InformationState | None:
-        """Return the belief inside the limits after steps and with variances added, both by coordinate.
+    def predict(
+        self, belief: InformationState, displacement: Array, added_variance: Array
+    ) -> InformationState | None:
+        """Predict a belief by displacements and added variances per coordinate, inside the limits.
 
-        None if that is not easy.
+        None on any difficulty.
         """
         with self._lock:
             self._belief[:] = belief.numbers
-            self._motion[0], self._motion[1] = moved, grown
-            if native_library.code.predict(self._where, self._written[0], *self._moved) < 0:
+            self._motion[0], self._motion[1] = displacement, added_variance
+            if (
+                native_library.code.predict(
+                    self._problem_address, self._addresses[0], *self._motion_addresses
+                )
+                < 0
+            ):
                 return None
-            return InformationState(belief.sizes, self._belief.copy(), belief.standing)
+            return InformationState(belief.sizes, self._belief.copy(), belief.records)
 
     def are_rigid(self, reading: Measurements) -> bool:
-        """Whether all poses that were seen are rigid; False if that is not known."""
+        """Return True if all measured poses are rigid; False if that is unknown."""
         code = native_library.code
         if code is None:
             return False
         with self._lock:
             self._load(reading)
-            return bool(code.first_broken(self._where, *self._seen[:2], RIGID) < 0)
+            return bool(code.first_broken(self._problem_address, *self._reading_addresses[:2], RIGID) < 0)
 
     def _load(self, reading: Measurements) -> None:
         if self._loaded is reading:
@@ -215,105 +237,108 @@ class NativeMapSolver:
         self._loaded = reading
 
 
-# Who is right with this probability is not doubted: what is left changes nothing that counts.
-_SURE = 1 - 1e-6
+# Above this inlier probability a measurement is taken as an inlier.
+_CERTAIN = 1 - 1e-6
 
 
 class NativeInlierSolver:
-    """Explains groups in C.
+    """Compiled update of groups whose measurements are unambiguous inliers or outliers.
 
     Parameters
     ----------
     layout, native, outliers
-        The parts of a tracker.
+        Components of the tracker.
     """
 
     def __init__(self, layout: Layout, native: NativeMapSolver, outliers: Outliers) -> None:
         self._layout, self._native, self._outliers = layout, native, outliers
-        self._wrong = np.array([outliers.log_density(one) for one in layout.observations])
-        self._fair = math.log(1 - outliers.fraction)
+        self._log_outlier = np.array([outliers.log_density(one) for one in layout.observations])
+        self._log_inlier = math.log(1 - outliers.fraction)
 
-    def explained(
-        self, modes: GaussianSum, reading: Measurements, known: Array, groups: Sequence[int]
+    def solve(
+        self, mixture: GaussianSum, reading: Measurements, inputs: Array, groups: Sequence[int]
     ) -> tuple[list[Candidate], int]:
-        """Return explanations of those groups of which there is no other, and the number of evaluations."""
-        single = [number for number in groups if modes.alive[:, number].sum() == 1]
-        found = self._native.update(modes.best, reading, known)
-        if found is None:
+        """Return candidates for the groups that have no alternative, and the number of evaluations."""
+        unambiguous = [number for number in groups if mixture.alive[:, number].sum() == 1]
+        result = self._native.update(mixture.best, reading, inputs)
+        if result is None:
             return [], 0
-        right = self._believed(found, reading) > 0.5
-        all_right = [n for n in single if right[self._seen(n, reading)].all()]
-        candidates = [self._candidate(modes, found, reading, right, all_right)]
-        split = [n for n in single if n not in all_right]
+        inliers = self._inlier_probabilities(result, reading) > 0.5
+        all_right = [n for n in unambiguous if inliers[self._measured(n, reading)].all()]
+        candidates = [self._candidate(mixture, result, reading, inliers, all_right)]
+        split = [n for n in unambiguous if n not in all_right]
         if not split:
-            return candidates, found.rounds
-        again = self._native.update(modes.best, reading._replace(seen=reading.seen & right), known)
-        if again is None:
-            return candidates, found.rounds
-        rivals = self._rivals(modes, reading, known, right, split)
-        candidates.append(self._candidate(modes, again, reading, right, split, rivals))
-        return candidates, max(found.rounds, again.rounds)
+            return candidates, result.rounds
+        refined = self._native.update(mixture.best, reading._replace(mask=reading.mask & inliers), inputs)
+        if refined is None:
+            return candidates, result.rounds
+        rivals = self._rival_evidence(mixture, reading, inputs, inliers, split)
+        candidates.append(self._candidate(mixture, refined, reading, inliers, split, rivals))
+        return candidates, max(result.rounds, refined.rounds)
 
-    def _seen(self, number: int, reading: Measurements) -> list[int]:
-        return [i for i in self._layout.groups[number].seen if reading.seen[i]]
+    def _measured(self, number: int, reading: Measurements) -> list[int]:
+        return [i for i in self._layout.groups[number].observation_indices if reading.mask[i]]
 
-    def _believed(self, found: MapResult, reading: Measurements) -> Array:
-        """Return how probable it is that each observation is right."""
-        weights = np.zeros(len(reading.seen))
-        assert found.squares is not None
-        for i in np.flatnonzero(reading.seen).tolist():
-            square, scale = float(found.squares[i]), float(reading.log_scale[i])
-            weights[i], _ = self._outliers.judge(square, scale, float(self._wrong[i]))
+    def _inlier_probabilities(self, result: MapResult, reading: Measurements) -> Array:
+        """Return the inlier probability of each observation."""
+        weights = np.zeros(len(reading.mask))
+        assert result.squares is not None
+        for i in np.flatnonzero(reading.mask).tolist():
+            square, scale = float(result.squares[i]), float(reading.log_scale[i])
+            weights[i], _ = self._outliers.weigh(square, scale, float(self._log_outlier[i]))
         return weights
 
-    def _rivals(
+    def _rival_evidence(
         self,
-        modes: GaussianSum,
+        mixture: GaussianSum,
         reading: Measurements,
-        known: Array,
-        right: npt.NDArray[np.bool_],
+        inputs: Array,
+        inliers: npt.NDArray[np.bool_],
         groups: Sequence[int],
     ) -> dict[int, float]:
-        """Return how much evidence there is at most for each group if a doubted one is right after all."""
+        """Return an upper bound on the evidence of each group if a rejected measurement is an inlier."""
         best = dict.fromkeys(groups, -np.inf)
-        doubted = {n: [i for i in self._seen(n, reading) if not right[i]] for n in groups}
-        peaks = np.maximum(self._fair - reading.log_scale, self._wrong)
-        for turn in range(max(map(len, doubted.values()))):
-            alone = {n: those[turn] for n, those in doubted.items() if turn < len(those)}
-            mask = np.zeros_like(reading.seen)
+        rejected = {n: [i for i in self._measured(n, reading) if not inliers[i]] for n in groups}
+        peaks = np.maximum(self._log_inlier - reading.log_scale, self._log_outlier)
+        for index in range(max(map(len, rejected.values()))):
+            alone = {n: those[index] for n, those in rejected.items() if index < len(those)}
+            mask = np.zeros_like(reading.mask)
             mask[list(alone.values())] = True
-            found = self._native.update(modes.best, reading._replace(seen=mask), known)
+            result = self._native.update(mixture.best, reading._replace(mask=mask), inputs)
             for n, i in alone.items():
-                others = sum(float(peaks[k]) for k in self._seen(n, reading) if k != i)
-                gained = np.inf if found is None else _gained(found, modes, n)
-                best[n] = max(best[n], gained + self._fair + others)
+                others = sum(float(peaks[k]) for k in self._measured(n, reading) if k != i)
+                gained = np.inf if result is None else _evidence_gain(result, mixture, n)
+                best[n] = max(best[n], gained + self._log_inlier + others)
         return best
 
     def _candidate(
         self,
-        modes: GaussianSum,
-        found: MapResult,
+        mixture: GaussianSum,
+        result: MapResult,
         reading: Measurements,
-        right: npt.NDArray[np.bool_],
+        inliers: npt.NDArray[np.bool_],
         groups: Sequence[int],
         rivals: dict[int, float] | None = None,
     ) -> Candidate:
-        """Return what was found as an explanation of those groups of which it is the only one."""
-        believed = self._believed(found, reading)
-        sure = []
+        """Return the result as a candidate for those groups of which it is the only one."""
+        weights = self._inlier_probabilities(result, reading)
+        certain = []
         for number in groups:
-            seen = self._seen(number, reading)
-            kept = [i for i in seen if right[i]]
-            nothing = float(self._wrong[seen].sum())
-            by_outliers = len(kept) * self._fair + nothing - float(self._wrong[kept].sum())
-            gained = _gained(found, modes, number) + by_outliers
-            found.belief.evidence[number] += by_outliers
+            measured = self._measured(number, reading)
+            accepted = [i for i in measured if inliers[i]]
+            all_outliers = float(self._log_outlier[measured].sum())
+            by_outliers = (
+                len(accepted) * self._log_inlier + all_outliers - float(self._log_outlier[accepted].sum())
+            )
+            gained = _evidence_gain(result, mixture, number) + by_outliers
+            result.belief.evidence[number] += by_outliers
             others = [rivals[number]] if rivals else []
-            rival = max([nothing, *others] if kept else others)
-            if gained - rival > PRUNING_LOG_RATIO and all(believed[i] > _SURE for i in kept):
-                sure.append(number)
-        return Candidate(found.belief, np.empty(0), right.astype(float), found.nis, found.dof, sure)
+            rival = max([all_outliers, *others] if accepted else others)
+            if gained - rival > PRUNING_LOG_RATIO and all(weights[i] > _CERTAIN for i in accepted):
+                certain.append(number)
+        return Candidate(result.belief, np.empty(0), inliers.astype(float), result.nis, result.dof, certain)
 
 
-def _gained(found: MapResult, modes: GaussianSum, number: int) -> float:
-    return float(found.belief.evidence[number] - modes.best.evidence[number])
+def _evidence_gain(result: MapResult, mixture: GaussianSum, number: int) -> float:
+    """Return the log evidence that a group gained."""
+    return float(result.belief.evidence[number] - mixture.best.evidence[number])

@@ -25,16 +25,16 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False)
 class StateBounds:
-    """What is known of a state beforehand.
+    """Constraints on the estimated coordinates.
 
     Attributes
     ----------
     names
-        Of all constraints that count.
+        Names of all constraints in use.
     lower, upper
-        Bounds of single free coordinates, in the order of the chart; ±inf where there are none.
+        Bounds of single free coordinates, in the order of the coordinates; ±inf where there are none.
     curved
-        All others, in plain coordinates: of several coordinates, not straight, or with bounds that move.
+        All other constraints, resolved: of several coordinates, nonlinear, or with moving bounds.
     """
 
     names: tuple[str, ...]
@@ -42,28 +42,30 @@ class StateBounds:
     upper: Array
     curved: tuple[Constraint, ...]
 
-    def by_symbol(self, chart: TangentSpace) -> dict[Symbol, tuple[float, float]]:
-        """Return the bounds of single coordinates."""
+    def by_symbol(self, tangent_space: TangentSpace) -> dict[Symbol, tuple[float, float]]:
+        """Return the bounds of single coordinates by symbol."""
         bounds = zip(self.lower.tolist(), self.upper.tolist(), strict=True)
-        return dict(zip(chart.coordinates, bounds, strict=True))
+        return dict(zip(tangent_space.coordinates, bounds, strict=True))
 
 
-def collect_bounds(model: ModelView, chart: TangentSpace, known: frozenset[Symbol]) -> StateBounds:
-    """Return the limits on coordinates: constraints without speeds about nothing else than what is known.
+def collect_bounds(model: ModelView, tangent_space: TangentSpace, inputs: frozenset[Symbol]) -> StateBounds:
+    """Collect the position limits: constraints without speeds on estimated coordinates and inputs alone.
 
-    Locks, which limit speeds, and constraints that also look at coordinates nobody watches are none.
+    Locks, which bound speeds, and constraints on unobserved coordinates are left out.
     """
-    index = {x: i for i, x in enumerate(chart.coordinates)}
+    index = {x: i for i, x in enumerate(tangent_space.coordinates)}
     lower, upper = np.full(len(index), -np.inf), np.full(len(index), np.inf)
     names, curved = [], []
-    for name, carried in model.constraints_for(chart.coordinates).items():
-        constraint = Constraint(*(chart.plain(e) for e in (carried.lower, carried.expression, carried.upper)))
-        moving = [s for s in constraint.symbols if s.has_derivative and s not in known]
+    for name, carried in model.constraints_for(tangent_space.coordinates).items():
+        constraint = Constraint(
+            *(tangent_space.resolve(e) for e in (carried.lower, carried.expression, carried.upper))
+        )
+        moving = [s for s in constraint.symbols if s.has_derivative and s not in inputs]
         if any(s not in index for s in moving) or not any(s in index for s in constraint.expression.symbols):
             continue
         names.append(name)
-        if not _is_box(constraint, chart):
-            curved += _one_sided(constraint, index)
+        if not _is_coordinate_bound(constraint, tangent_space):
+            curved += _split_moving_bounds(constraint, index)
             continue
         slope, offset = constraint.line or (1.0, 0.0)
         low, high = sorted((float(b) - offset) / slope for b in (constraint.lower, constraint.upper))
@@ -72,8 +74,8 @@ def collect_bounds(model: ModelView, chart: TangentSpace, known: frozenset[Symbo
     return StateBounds(tuple(names), lower, upper, tuple(curved))
 
 
-def _one_sided(constraint: Constraint, moving: Mapping[Symbol, int]) -> list[Constraint]:
-    """Return a constraint as such, or if its bounds move, as two whose bounds are 0."""
+def _split_moving_bounds(constraint: Constraint, moving: Mapping[Symbol, int]) -> list[Constraint]:
+    """Split a constraint whose bounds depend on estimated coordinates into two with constant bound 0."""
     low, middle, high = constraint.lower, constraint.expression, constraint.upper
     if not any(s in moving for s in (*low.symbols, *high.symbols)):
         return [constraint]
@@ -85,55 +87,57 @@ def _one_sided(constraint: Constraint, moving: Mapping[Symbol, int]) -> list[Con
     return sides
 
 
-def _is_box(constraint: Constraint, chart: TangentSpace) -> bool:
+def _is_coordinate_bound(constraint: Constraint, tangent_space: TangentSpace) -> bool:
     if constraint.line is None or constraint.lower.symbols or constraint.upper.symbols:
         return False
-    return constraint.expression.symbols[0] not in chart.by_speeds
+    return constraint.expression.symbols[0] not in tangent_space.by_speeds
 
 
 def initial_point(
-    model: ModelView, chart: TangentSpace, limits: StateBounds, given: Mapping[Symbol, float]
+    model: ModelView, tangent_space: TangentSpace, limits: StateBounds, given: Mapping[Symbol, float]
 ) -> Array:
-    """Return where a tracker begins: where it is told, else in the middle of limits, else at the default."""
+    """Return the initial state: given values, else the middle of the limits, else the default state."""
     default = model.default_state()
     values = []
-    for x, low, high in zip(chart.coordinates, limits.lower, limits.upper, strict=True):
+    for x, low, high in zip(tangent_space.coordinates, limits.lower, limits.upper, strict=True):
         middle = (low + high) / 2 if np.isfinite(high - low) else default.get(x, 0.0)
         values.append(given.get(x, float(middle)))
     return np.clip(values, limits.lower, limits.upper)
 
 
-def initial_deviations(chart: TangentSpace, limits: StateBounds, turning: frozenset[Symbol]) -> Array:
-    """Return how uncertain the tangent is then.
+def initial_deviations(
+    tangent_space: TangentSpace, limits: StateBounds, periodic: frozenset[Symbol]
+) -> Array:
+    """Return the initial standard deviation of each tangent direction (t,).
 
-    Half the width of the limits; without limits π for what comes back after a turn and for the turning of
-    quaternions, else 10 m.
+    Half the width of the limits. Without limits, π for periodic coordinates and rotations of quaternions,
+    else 10 m.
     """
-    found = np.full(len(chart.tangent), np.pi)
-    for x, low, high in zip(chart.coordinates, limits.lower, limits.upper, strict=True):
-        if x in chart.by_speeds:
+    result = np.full(len(tangent_space.tangent), np.pi)
+    for x, low, high in zip(tangent_space.coordinates, limits.lower, limits.upper, strict=True):
+        if x in tangent_space.by_speeds:
             continue
         width = high - low
-        usual = np.pi if x in turning else UNBOUNDED_DEVIATION
-        # Limits that leave nothing leave it known; the information stays finite.
-        found[chart.tangent.index(x.derivative())] = (
+        usual = np.pi if x in periodic else UNBOUNDED_DEVIATION
+        # Coinciding limits fix the coordinate; the information stays finite.
+        result[tangent_space.tangent.index(x.derivative())] = (
             max(width / 2, LEAST_DEVIATION) if np.isfinite(width) else usual
         )
-    return found
+    return result
 
 
 UNBOUNDED_DEVIATION = 10.0
-"""The deviation at the start of a length without limits [m]."""
+"""Initial standard deviation of a length without limits [m]."""
 
 LEAST_DEVIATION = 1e-9
-"""That of a coordinate whose limits leave nothing."""
+"""Initial standard deviation of a coordinate whose limits coincide."""
 
 
 _FAR = 1e300
 
 
 class BoundRows(NamedTuple):
-    """What a step may change at a place: ``lower <= rows ξ <= upper``."""
+    """Bounds on a step at a point: ``lower <= rows ξ <= upper``."""
 
     rows: Array
     lower: Array
@@ -141,24 +145,24 @@ class BoundRows(NamedTuple):
 
     @property
     def violation(self) -> float:
-        """By how much the place itself is outside."""
+        """Total violation at the point itself."""
         return float(np.maximum(np.maximum(self.lower, -self.upper), 0.0).sum())
 
 
 class GroupBounds:
-    """The limits of one group.
+    """Limits of one group.
 
     Parameters
     ----------
     number
-        Of the group.
+        Number of the group.
     layout, limits
-        The parts of a tracker.
+        Components of the tracker.
     """
 
     def __init__(self, number: int, layout: Layout, limits: StateBounds) -> None:
         group = layout.groups[number]
-        by_speeds = layout.chart.by_speeds
+        by_speeds = layout.tangent_space.by_speeds
         self._own = [k for k, x in enumerate(group.coordinates) if x not in by_speeds]
         places = group.x[self._own]
         self._lower, self._upper = limits.lower[places], limits.upper[places]
@@ -167,64 +171,68 @@ class GroupBounds:
         for row, k in enumerate(self._own):
             self._rows[row, group.tangent.index(group.coordinates[k].derivative())] = 1.0
 
-    def room(self, x: Array, out: Array) -> BoundRows:
-        """Return what steps may change at a place, where the model was evaluated."""
+    def rows(self, x: Array, out: Array) -> BoundRows:
+        """Return the bounds on steps at a point x with evaluated limits ``out``."""
         own = x[self._own]
         rows, lower, upper = self._rows, self._lower - own, self._upper - own
         if self._curved:
             curved = np.stack([out[where] for where in self._curved])
             rows = np.concatenate([rows, curved[:, 3:]])
-            # Bounds that hold only now and then are infinite else, and so may be what they are compared with.
+            # Conditional bounds are infinite while inactive, and so may be the value that they bound.
             value = np.nan_to_num(curved[:, 0], nan=np.nan, posinf=_FAR, neginf=-_FAR)
             lower = np.concatenate([lower, curved[:, 1] - value])
             upper = np.concatenate([upper, curved[:, 2] - value])
         return BoundRows(rows, lower, upper)
 
-    def clipped(self, x: Array) -> Array:
-        """Return a place that rounding has not led out of the bounds of single coordinates."""
+    def clip(self, x: Array) -> Array:
+        """Clip a point to the bounds of single coordinates, against rounding errors; in place."""
         x[self._own] = np.clip(x[self._own], self._lower, self._upper)
         return x
 
-    def taken(self, x: Array, after: Array, step: Array) -> Array:
-        """Return what is left of a step in the tangent if it was clipped on the way from x."""
+    def remaining(self, x: Array, after: Array, step: Array) -> Array:
+        """Return the tangent step that leads from x to the clipped point ``after``."""
         left = step.copy()
         for row, k in zip(self._rows, self._own, strict=True):
             left[row == 1.0] = after[k] - x[k]
         return left
 
 
-# Slower than this in both directions is locked [m/s], [rad/s]. At equality a truth is 0.5, and free.
+# Speed bounds below this lock a coordinate [m/s], [rad/s]. At equality a condition is 0.5, which is free.
 _STILL = 1e-6
 
 
 class SpeedLocks:
-    """The constraints that bound single speeds by expressions of what is estimated or known.
+    """Constraints that bound single speeds by expressions of estimated coordinates and inputs.
 
     Parameters
     ----------
-    model, layout, charted
-        What is tracked.
+    model, layout, process_model
+        Components of the tracker.
     """
 
-    def __init__(self, model: ModelView, layout: Layout, charted: ProcessModel) -> None:
-        chart = layout.chart
-        values = (*chart.coordinates, *layout.known)
+    def __init__(self, model: ModelView, layout: Layout, process_model: ProcessModel) -> None:
+        tangent_space = layout.tangent_space
+        values = (*tangent_space.coordinates, *layout.inputs)
         self._speeds: list[Symbol] = []
         bounds = []
-        for constraint in model.constraints_for(chart.coordinates).values():
+        for constraint in model.constraints_for(tangent_space.coordinates).values():
             speed = constraint.expression
-            low, high = chart.plain(constraint.lower), chart.plain(constraint.upper)
-            looked_at = {*low.symbols, *high.symbols}
-            if isinstance(speed, Symbol) and str(speed) in charted.speeds and looked_at <= set(values):
+            low, high = tangent_space.resolve(constraint.lower), tangent_space.resolve(constraint.upper)
+            dependencies = {*low.symbols, *high.symbols}
+            if (
+                isinstance(speed, Symbol)
+                and str(speed) in process_model.speeds
+                and dependencies <= set(values)
+            ):
                 self._speeds.append(speed)
                 bounds += [low, high]
         self._bounds = compile(array(bounds), values) if bounds else None
-        self._all = frozenset(charted.speeds.values())
+        self._all = frozenset(process_model.speeds.values())
 
-    def free(self, belief: InformationState, known: Array) -> frozenset[Symbol]:
-        """Return the speeds that are not locked at what is believed."""
+    def free(self, belief: InformationState, inputs: Array) -> frozenset[Symbol]:
+        """Return the speeds that no lock holds at the estimate."""
         if self._bounds is None:
             return self._all
-        bounds = self._bounds(np.concatenate([belief.x, known])).reshape(-1, 2)
+        bounds = self._bounds(np.concatenate([belief.x, inputs])).reshape(-1, 2)
         still = np.abs(bounds).max(axis=1) < _STILL
         return self._all - {v for v, is_locked in zip(self._speeds, still.tolist(), strict=True) if is_locked}

@@ -1,14 +1,14 @@
 """Posterior covariance along unobservable manifolds, and its inflation for curvature.
 
-A point that is seen of a body on a plane says where this point is and nothing of the angle: states are
-possible on a ring. A Gaussian is about the ring's tangent, and would have the truth within its noise of that.
-So the covariance that is told is another one: the mean of the squares of what the state may be off by, summed
-up along its ridge, which is walked in open directions, with Laplace's approximation across.
+One measured point of a body in the plane determines the position of this point but not the angle: the
+possible states form a ring. A Gaussian covers the tangent of the ring only and would place the truth within
+the noise of that. :class:`RidgeCovariance` therefore computes the second moment of the posterior along its
+ridge: it steps along the unobservable directions and applies Laplace's approximation across them.
 
-A Gaussian is about the tangent of a ridge. At the next estimate the tangent is a bit different, and two of
-them cross: as if something were known along them. So before it is carried on it is made so wide that the
-curve fits in, as far as it reaches. Second-order filters add the same to each observation (Athans, Wishner
-and Bertolini, Suboptimal state estimation for continuous-time nonlinear systems, 1968).
+At the next estimate the tangent of the ridge differs, and the intersection of two tangents would pass for
+information along the ridge. :class:`CovarianceInflation` therefore widens the Gaussian before prediction, so
+that it contains the curved ridge. Second-order filters add the same to each measurement (Athans, Wishner and
+Bertolini, Suboptimal state estimation for continuous-time nonlinear systems, 1968).
 """
 
 from __future__ import annotations
@@ -22,194 +22,202 @@ from functools import cached_property
 import numpy as np
 
 from kineverse.errors import KineverseError
+from kineverse.estimation.linear_algebra import inverse_spd, symmetric
 from kineverse.lie import Array
 
 from .bounds import GroupBounds
-from .gaussian import InformationState, inverse_spd, symmetric
+from .gaussian import InformationState
 from .layout import Layout
 from .observability import UnobservableDirections
 from .process_model import ProcessModel
 from .residuals import MeasurementReader, Measurements, Residuals
 from .static_batch import StaticRecord
 
-# In deviations.
+# Step length and largest distance along the ridge, in deviations.
 _STRIDE, _FARTHEST = 0.5, 5.0
 _MOST_CORRECTIONS = 6
-# A correction of so many deviations across the ridge is the last.
+# Corrections across the ridge stop below this length, in deviations.
 _SETTLED = 0.03
-# Who is so much less probable than the top is not there, and nobody counts so much more.
-_LEAST, _MOST = 1e-4, 10.0
-# A ridge that is nowhere farther off from straight, and the density from a Gaussian's by no more, is that.
+# Relative densities below the first end the walk; those above the second are cut off.
+_LEAST_DENSITY, _MOST_DENSITY = 1e-4, 10.0
+# A ridge whose deviation from a line and log density ratio to a Gaussian stay below this is straight.
 _RIDGE_CURVATURE = 0.05
 
 
 class RidgeCovariance:
-    """Finds the covariance of groups.
+    """Posterior covariance of groups with unobservable directions.
 
     Parameters
     ----------
-    layout, residuals, charted, reader, boxes, openness
-        The parts of a tracker.
+    layout, residuals, process_model, reader, group_bounds, unobservable
+        Components of the tracker.
     """
 
     def __init__(
         self,
         layout: Layout,
         residuals: Residuals,
-        charted: ProcessModel,
+        process_model: ProcessModel,
         reader: MeasurementReader,
-        boxes: Sequence[GroupBounds],
-        openness: UnobservableDirections,
+        group_bounds: Sequence[GroupBounds],
+        unobservable: UnobservableDirections,
     ) -> None:
-        self._layout, self._residuals, self._charted = layout, residuals, charted
-        self._reader, self._boxes, self._openness = reader, boxes, openness
+        self._layout, self._residuals, self._process_model = layout, residuals, process_model
+        self._reader, self._group_bounds, self._unobservable = reader, group_bounds, unobservable
 
-    def covariance(self, number: int, belief: InformationState) -> Array:
-        """Return how far the state of a group may be off: the mean of the squares (t, t).
+    def compute(self, number: int, belief: InformationState) -> Array:
+        """Return the second moment of the posterior of a group about its estimate (t, t).
 
         Raises
         ------
         InvalidValueError
-            If rounding has left nothing of the information in some direction.
+            If the information is numerically singular.
         """
         t = self._layout.groups[number].t
         information = belief.information[np.ix_(t, t)]
-        straight = inverse_spd(information)
-        standing = belief.standing[number]
-        if standing is None:
-            return straight
-        ways, across = self._openness.directions(number, information)
-        reading = standing.reading(self._layout, self._reader)
-        hill = _LocalPosterior(number, belief, standing, across, reading)
-        if not len(ways) or self._place(hill, np.zeros(len(t))) is None:
-            return straight
-        found, is_straight = straight, True
-        for k in range(len(ways)):
-            others = np.concatenate([np.delete(ways, k, axis=0), across])
-            more, is_so = self._beyond(replace(hill, across=others), ways[k])
-            found, is_straight = found + more, is_straight and is_so
-        back = np.linalg.inv(np.concatenate([ways, across]))
-        for one, other in itertools.combinations(ways, 2):
-            bend = self._bend(hill, one, other)
-            is_straight &= float(np.linalg.norm(bend @ back)) < _RIDGE_CURVATURE
-            found = found + np.outer(bend, bend)
-        return straight if is_straight else _no_narrower(found, np.concatenate([ways, across]))
+        gaussian = inverse_spd(information)
+        record = belief.records[number]
+        if record is None:
+            return gaussian
+        directions, across = self._unobservable.directions(number, information)
+        reading = record.as_measurements(self._layout, self._reader)
+        posterior = _LocalPosterior(number, belief, record, across, reading)
+        if not len(directions) or self._evaluate(posterior, np.zeros(len(t))) is None:
+            return gaussian
+        result, is_straight = gaussian, True
+        for k in range(len(directions)):
+            others = np.concatenate([np.delete(directions, k, axis=0), across])
+            more, is_so = self._integrate_direction(replace(posterior, across=others), directions[k])
+            result, is_straight = result + more, is_straight and is_so
+        inverse = np.linalg.inv(np.concatenate([directions, across]))
+        for one, other in itertools.combinations(directions, 2):
+            curvature = self._mixed_curvature(posterior, one, other)
+            is_straight &= float(np.linalg.norm(curvature @ inverse)) < _RIDGE_CURVATURE
+            result = result + np.outer(curvature, curvature)
+        return gaussian if is_straight else _floor_covariance(result, np.concatenate([directions, across]))
 
-    def _beyond(self, hill: _LocalPosterior, way: Array) -> tuple[Array, bool]:
-        """Return what a walk along a way adds to the covariance, and whether that is straight."""
-        top = self._place(hill, np.zeros(len(way)))
+    def _integrate_direction(self, posterior: _LocalPosterior, direction: Array) -> tuple[Array, bool]:
+        """Return the covariance gained along one direction, and whether the ridge is straight there."""
+        top = self._evaluate(posterior, np.zeros(len(direction)))
         assert top is not None
-        back = np.linalg.inv(np.concatenate([way[None], hill.across]))
-        total, found, is_straight = 1.0, np.zeros_like(back), True
-        for ray in (way, -way):
-            for place, density in self._along(hill, top, ray):
+        inverse = np.linalg.inv(np.concatenate([direction[None], posterior.across]))
+        total, result, is_straight = 1.0, np.zeros_like(inverse), True
+        for ray in (direction, -direction):
+            for point, density in self._walk_ridge(posterior, top, ray):
                 total += density
-                found += density * (hill.spread(place) - hill.spread(top))
-                along, *aside = place.step @ back
+                result += density * (posterior.spread(point) - posterior.spread(top))
+                along, *deviation = point.step @ inverse
                 log = math.log(density) + along**2 / 2
-                is_straight &= float(np.linalg.norm(aside)) < _RIDGE_CURVATURE and abs(log) < _RIDGE_CURVATURE
-        found /= total
-        return found - np.outer(way, way), is_straight
+                is_straight &= (
+                    float(np.linalg.norm(deviation)) < _RIDGE_CURVATURE and abs(log) < _RIDGE_CURVATURE
+                )
+        result /= total
+        return result - np.outer(direction, direction), is_straight
 
-    def _bend(self, hill: _LocalPosterior, one: Array, other: Array) -> Array:
-        """Return by how much the ridge is bent where both ways are gone, beyond what each alone says."""
-        bend = np.zeros_like(one)
+    def _mixed_curvature(self, posterior: _LocalPosterior, one: Array, other: Array) -> Array:
+        """Return the curvature of the ridge for two directions together, beyond that of each alone."""
+        curvature = np.zeros_like(one)
         for sign in (1, -1):
-            for way in (one + sign * other, -one - sign * other):
-                place = self._above(hill, way)
-                if place is None:
+            for direction in (one + sign * other, -one - sign * other):
+                point = self._ridge_point(posterior, direction)
+                if point is None:
                     return np.zeros_like(one)
-                bend += sign * (place.step - way) / 4
-        return bend
+                curvature += sign * (point.step - direction) / 4
+        return curvature
 
-    def _along(
-        self, hill: _LocalPosterior, top: _ManifoldPoint, ray: Array
+    def _walk_ridge(
+        self, posterior: _LocalPosterior, top: _ManifoldPoint, ray: Array
     ) -> Iterator[tuple[_ManifoldPoint, float]]:
-        """Yield places on the ridge in one direction, with the density across from them."""
-        stride, place, density = _STRIDE * ray, top, 1.0
-        aside = before = np.zeros_like(ray)
+        """Yield points along the ridge, with their relative density after marginalising across it."""
+        stride, point, density = _STRIDE * ray, top, 1.0
+        deviation = before = np.zeros_like(ray)
         for count in range(1, math.ceil(_FARTHEST / _STRIDE)):
-            there = self._above(hill, count * stride + 2 * aside - before)
+            there = self._ridge_point(posterior, count * stride + 2 * deviation - before)
             if there is None:
-                # Beyond what can be, as limits are not in a Gaussian: it goes on as straight and as one.
+                # Beyond the limits, which the Gaussian ignores: continue straight, with its density.
                 density *= math.exp(-(count - 0.5) * _STRIDE**2)
-                place = replace(place, step=place.step + stride)
+                point = replace(point, step=point.step + stride)
             else:
-                place, density = there, there.density(top)
-                before, aside = aside, there.step - count * stride
-            if density < _LEAST:
+                point, density = there, there.density(top)
+                before, deviation = deviation, there.step - count * stride
+            if density < _LEAST_DENSITY:
                 return
-            yield place, density
+            yield point, density
 
-    def _above(self, hill: _LocalPosterior, step: Array) -> _ManifoldPoint | None:
-        """Return the most probable place across from the end of a step; None if nobody can be there."""
-        best, share = self._place(hill, step), 1.0
+    def _ridge_point(self, posterior: _LocalPosterior, step: Array) -> _ManifoldPoint | None:
+        """Return the most probable point across the ridge at the end of a step; None if it is infeasible."""
+        best, share = self._evaluate(posterior, step), 1.0
         for _ in range(_MOST_CORRECTIONS):
             if best is None:
                 return None
-            aside = np.linalg.solve(best.across, -best.gradient)
-            if float(np.linalg.norm(aside)) < _SETTLED:
+            deviation = np.linalg.solve(best.across, -best.gradient)
+            if float(np.linalg.norm(deviation)) < _SETTLED:
                 break
-            tried = self._place(hill, best.step + share * aside @ hill.across)
-            if tried is None or tried.cost > best.cost:
+            trial = self._evaluate(posterior, best.step + share * deviation @ posterior.across)
+            if trial is None or trial.cost > best.cost:
                 share /= 4
             else:
-                best, share = tried, 1.0
+                best, share = trial, 1.0
         return best
 
-    def _place(self, hill: _LocalPosterior, step: Array) -> _ManifoldPoint | None:
-        group, known = self._layout.groups[hill.number], hill.standing.known
-        here, there = hill.belief.x[group.x], hill.belief.x.copy()
+    def _evaluate(self, posterior: _LocalPosterior, step: Array) -> _ManifoldPoint | None:
+        """Return the posterior at the end of a step; None if it is infeasible."""
+        group, inputs = self._layout.groups[posterior.number], posterior.record.inputs
+        here, there = posterior.belief.x[group.x], posterior.belief.x.copy()
         try:
-            x, turn = self._charted.step(hill.number, here, step, known)
-            there[group.x] = self._boxes[hill.number].clipped(x.copy())
+            x, transport = self._process_model.retract(posterior.number, here, step, inputs)
+            there[group.x] = self._group_bounds[posterior.number].clip(x.copy())
             if not np.array_equal(there[group.x], x):
                 return None
-            said = self._residuals.evaluate(there, known)
+            predicted = self._residuals.evaluate(there, inputs)
         except KineverseError:
             return None
-        prior = hill.standing.prior
+        prior = posterior.record.prior
         cost = float(step @ prior.matrix @ step) / 2 - float(prior.vector @ step)
         gradient, information = prior.matrix @ step - prior.vector, prior.matrix.copy()
-        for error, slope in self._residuals.errors(said, hill.reading, group.seen).values():
-            along = slope if turn is None else slope @ turn
+        for error, slope in self._residuals.errors(
+            predicted, posterior.reading, group.observation_indices
+        ).values():
+            along = slope if transport is None else slope @ transport
             cost += float(error @ error) / 2
             gradient -= along.T @ error
             information += along.T @ along
         if not (math.isfinite(cost) and np.isfinite(information).all()):
             return None
-        return _ManifoldPoint(step, cost, hill.across @ gradient, hill.across @ information @ hill.across.T)
+        return _ManifoldPoint(
+            step, cost, posterior.across @ gradient, posterior.across @ information @ posterior.across.T
+        )
 
 
-def _no_narrower(covariance: Array, steps: Array) -> Array:
-    """Return a covariance that is as wide as half of each step: what is narrower would not have been seen."""
-    back = np.linalg.inv(steps)
-    values, vectors = np.linalg.eigh(symmetric(back.T @ covariance @ back))
+def _floor_covariance(covariance: Array, steps: Array) -> Array:
+    """Return the covariance with a standard deviation of at least half of each step."""
+    inverse = np.linalg.inv(steps)
+    values, vectors = np.linalg.eigh(symmetric(inverse.T @ covariance @ inverse))
     wide = steps.T @ vectors * np.sqrt(np.maximum(values, 0.25))
     return symmetric(wide @ wide.T)
 
 
 @dataclass(frozen=True, eq=False)
 class _LocalPosterior:
-    """The probability of a group about its state, and steps of one deviation across the ridge (c, t)."""
+    """Posterior of a group about its estimate, with steps of one deviation across the ridge (c, t)."""
 
     number: int
     belief: InformationState
-    standing: StaticRecord
+    record: StaticRecord
     across: Array
     reading: Measurements
 
-    def spread(self, place: _ManifoldPoint) -> Array:
-        """Return the mean of the squares of steps to near a place."""
-        found: Array = (
-            np.outer(place.step, place.step) + self.across.T @ np.linalg.inv(place.across) @ self.across
+    def spread(self, point: _ManifoldPoint) -> Array:
+        """Return the second moment of steps to the neighbourhood of a point."""
+        result: Array = (
+            np.outer(point.step, point.step) + self.across.T @ np.linalg.inv(point.across) @ self.across
         )
-        return found
+        return result
 
 
 @dataclass(frozen=True, eq=False)
 class _ManifoldPoint:
-    """A step from the state, the cost there, and across the ridge its gradient (c,) and curvature (c, c)."""
+    """Step from the estimate, with its cost, and gradient (c,) and curvature (c, c) across the ridge."""
 
     step: Array
     cost: float
@@ -217,107 +225,113 @@ class _ManifoldPoint:
     across: Array
 
     @cached_property
-    def narrowness(self) -> float:
+    def log_curvature(self) -> float:
+        """Log determinant of the curvature across the ridge."""
         return float(np.linalg.slogdet(self.across)[1])
 
     def density(self, top: _ManifoldPoint) -> float:
-        """Return how probable it is to be across from here, compared with the top."""
-        log = top.cost - self.cost + (top.narrowness - self.narrowness) / 2
-        return math.exp(min(log, math.log(_MOST)))
+        """Return the density marginalised across the ridge, relative to the top."""
+        log = top.cost - self.cost + (top.log_curvature - self.log_curvature) / 2
+        return math.exp(min(log, math.log(_MOST_DENSITY)))
 
 
 _RANK = 1e-6
-# What is off by fewer deviations of all that was seen is straight.
-_STRAIGHT = 0.02
+# Measurements that deviate from linearity by less, in deviations of the noise, are linear.
+_LINEAR = 0.02
 
 
 class CovarianceInflation:
-    """Makes beliefs so wide that what was seen before still fits in.
+    """Inflation of beliefs by the curvature of the posterior.
 
     Parameters
     ----------
-    layout, residuals, charted, reader, boxes, openness
-        The parts of a tracker.
+    layout, residuals, process_model, reader, group_bounds, unobservable
+        Components of the tracker.
     """
 
     def __init__(
         self,
         layout: Layout,
         residuals: Residuals,
-        charted: ProcessModel,
+        process_model: ProcessModel,
         reader: MeasurementReader,
-        boxes: Sequence[GroupBounds],
-        openness: UnobservableDirections,
+        group_bounds: Sequence[GroupBounds],
+        unobservable: UnobservableDirections,
     ) -> None:
-        self._layout, self._residuals, self._charted = layout, residuals, charted
-        self._reader, self._boxes, self._openness = reader, boxes, openness
+        self._layout, self._residuals, self._process_model = layout, residuals, process_model
+        self._reader, self._group_bounds, self._unobservable = reader, group_bounds, unobservable
 
-    def widen(self, number: int, belief: InformationState) -> None:
-        """Believe in a Gaussian that is wide enough, and forget what was seen."""
-        standing = belief.standing[number]
-        if standing is None:
+    def inflate(self, number: int, belief: InformationState) -> None:
+        """Inflate the covariance of a group by the curvature of its posterior, and drop its static record."""
+        record = belief.records[number]
+        if record is None:
             return
         t = self._layout.groups[number].t
         block = np.ix_(t, t)
         information = belief.information[block].copy()
-        ways, _ = self._openness.directions(number, information)
-        if len(ways):
+        directions, _ = self._unobservable.directions(number, information)
+        if len(directions):
             covariance = inverse_spd(information)
-            most, slopes = self._bends(number, belief, ways, standing, self._reader.nothing())
-            missing = self._missing(number, covariance, most, slopes)
+            most, slopes = self._curvature(number, belief, directions, record, self._reader.empty())
+            missing = self._missing_covariance(number, covariance, most, slopes)
             belief.information[block] = inverse_spd(covariance + missing)
             belief.vector[t] = belief.information[block] @ (covariance @ belief.vector[t])
-        belief.standing[number] = None
+        belief.records[number] = None
 
     def is_straight(self, number: int, belief: InformationState) -> bool:
-        """Whether all that was seen of a group is straight as far as the belief reaches."""
-        standing = belief.standing[number]
-        assert standing is not None
+        """Return True if the measurements of a group are linear within its belief."""
+        record = belief.records[number]
+        assert record is not None
         t = self._layout.groups[number].t
-        ways, _ = self._openness.directions(number, belief.information[np.ix_(t, t)])
-        reading = standing.reading(self._layout, self._reader)
-        most, _ = self._bends(number, belief, ways, standing, reading)
-        return max(most.values()) < _STRAIGHT**2
+        directions, _ = self._unobservable.directions(number, belief.information[np.ix_(t, t)])
+        reading = record.as_measurements(self._layout, self._reader)
+        most, _ = self._curvature(number, belief, directions, record, reading)
+        return max(most.values()) < _LINEAR**2
 
-    def _bends(
-        self, number: int, belief: InformationState, ways: Array, standing: StaticRecord, noise: Measurements
+    def _curvature(
+        self,
+        number: int,
+        belief: InformationState,
+        directions: Array,
+        record: StaticRecord,
+        noise: Measurements,
     ) -> tuple[dict[int, float], dict[int, Array]]:
-        """Return how far what was seen is off from straight, squared and by number, and slopes.
+        """Return the largest squared nonlinearity of each measurement, and its Jacobian, by number.
 
-        Both are in deviations of the noise of a reading.
+        Both are in deviations of the measurement noise.
         """
-        group, known = self._layout.groups[number], standing.known
-        seen = list(standing.seen)
-        here = self._residuals.evaluate(belief.x, known)
-        as_said = noise._replace(values=self._reader.values_of(here))
-        as_said.seen[seen] = True
-        slopes = {i: s for i, (_, s) in self._residuals.errors(here, as_said, seen).items()}
-        most = dict.fromkeys(seen, 0.0)
-        for step in (*ways, *-ways):
+        group, inputs = self._layout.groups[number], record.inputs
+        measured = list(record.means)
+        here = self._residuals.evaluate(belief.x, inputs)
+        as_predicted = noise._replace(values=self._reader.as_values(here))
+        as_predicted.mask[measured] = True
+        slopes = {i: s for i, (_, s) in self._residuals.errors(here, as_predicted, measured).items()}
+        most = dict.fromkeys(measured, 0.0)
+        for step in (*directions, *-directions):
             try:
-                x, _ = self._charted.step(number, belief.x[group.x], step, known)
+                x, _ = self._process_model.retract(number, belief.x[group.x], step, inputs)
                 there = belief.x.copy()
-                there[group.x] = self._boxes[number].clipped(x)
-                said = self._residuals.evaluate(there, known)
-            except KineverseError:  # nobody can be there
+                there[group.x] = self._group_bounds[number].clip(x)
+                predicted = self._residuals.evaluate(there, inputs)
+            except KineverseError:  # infeasible
                 continue
-            taken = self._boxes[number].taken(belief.x[group.x], there[group.x], step)
-            for i, (error, _) in self._residuals.errors(said, as_said, seen).items():
-                bend = error + slopes[i] @ taken
-                if np.isfinite(bend).all():
-                    most[i] = max(most[i], float(bend @ bend) / len(bend))
+            remaining = self._group_bounds[number].remaining(belief.x[group.x], there[group.x], step)
+            for i, (error, _) in self._residuals.errors(predicted, as_predicted, measured).items():
+                curvature = error + slopes[i] @ remaining
+                if np.isfinite(curvature).all():
+                    most[i] = max(most[i], float(curvature @ curvature) / len(curvature))
         return most, slopes
 
-    def _missing(
+    def _missing_covariance(
         self, number: int, covariance: Array, most: Mapping[int, float], slopes: Mapping[int, Array]
     ) -> Array:
-        """Return what the covariance lacks (t, t), so that what was seen is as uncertain as it is bent."""
+        """Return the covariance to add (t, t), which makes predictions as uncertain as they are curved."""
         lacking = []
         for i, slope in slopes.items():
             variance = float(np.einsum("ij,jk,ik->", slope, covariance, slope)) / len(slope)
             lacking.append(np.full(len(slope), max(most[i] - variance, 0.0)))
-        scale = self._openness.deviations[self._layout.groups[number].t]
-        back = np.linalg.pinv(np.concatenate(list(slopes.values())) * scale, rcond=_RANK)
-        back *= scale[:, None]
-        missing: Array = (back * np.concatenate(lacking)) @ back.T
+        scale = self._unobservable.deviations[self._layout.groups[number].t]
+        inverse = np.linalg.pinv(np.concatenate(list(slopes.values())) * scale, rcond=_RANK)
+        inverse *= scale[:, None]
+        missing: Array = (inverse * np.concatenate(lacking)) @ inverse.T
         return missing

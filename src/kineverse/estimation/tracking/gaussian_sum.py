@@ -1,9 +1,10 @@
 """Gaussian-sum components, their pruning and merging.
 
-Each group has its own, kept apart until one of them explains all that came since much better (a Gaussian sum;
-Alspach and Sorenson, Nonlinear Bayesian estimation using Gaussian sum approximations, 1972).
+Each group has its own components. They are kept until the evidence of one exceeds that of the others by far
+(Alspach and Sorenson, Nonlinear Bayesian estimation using Gaussian sum approximations, 1972).
 
-Mirror images say the same from different states. Places on a ridge do so as well, but what they cover is one.
+Mirror images predict the same measurements from different states and stay apart. Points along an unobservable
+ridge also predict the same; the ridge covariance covers them, so they are merged.
 """
 
 from __future__ import annotations
@@ -15,44 +16,45 @@ from dataclasses import dataclass, field
 import numpy as np
 import numpy.typing as npt
 
+from kineverse.estimation.linear_algebra import inverse_spd
 from kineverse.lie import Array
 from kineverse.symbols import Symbol
 
 from .covariance import RidgeCovariance
-from .gaussian import InformationState, inverse_spd
+from .gaussian import InformationState
 from .layout import CoordinateGroup, Layout
 from .process_model import ProcessModel
 from .residuals import MeasurementReader, Residuals
 
 MOST_COMPONENTS = 8
-"""So many explanations are kept of each group."""
+"""Largest number of components of a group."""
 
 PRUNING_LOG_RATIO = 15.0
-"""An explanation whose log evidence is so far below the best is given up: one in three million."""
+"""Components whose log evidence is lower than the best by more are pruned: one in three million."""
 
 
 @dataclass(slots=True, eq=False)
 class Candidate:
-    """An explanation of some groups.
+    """Candidate component for some groups.
 
     Attributes
     ----------
     belief
-        What is believed then.
-    said
-        What the model says there.
+        Belief after the update.
+    predicted
+        Predicted measurements there.
     weights
-        How far each observation is believed; None if all are.
+        Inlier weight of each observation; None if all are 1.
     nis, dof
-        Of each group.
+        Normalised innovation squared of each group, and its degrees of freedom.
     groups
-        Which groups it is about.
+        Numbers of the groups.
     covariances
-        Of groups, as far as they were asked for.
+        Ridge covariances of groups, computed on demand.
     """
 
     belief: InformationState
-    said: Array
+    predicted: Array
     weights: Array | None
     nis: Array
     dof: Array
@@ -61,21 +63,21 @@ class Candidate:
 
 
 class GaussianSum:
-    """Beliefs, the best of each group first.
+    """Gaussian sum with independent components for each group, the best first.
 
     Parameters
     ----------
     layout
-        Where groups are.
+        Layout of the groups.
     beliefs
-        At first.
+        Components.
     alive
-        For each belief, which groups have it (modes, groups); all have the first.
+        True where a group has a component (components, groups); all have the first.
 
     Attributes
     ----------
     beliefs, alive
-        As they are now.
+        As given.
     """
 
     def __init__(
@@ -89,49 +91,49 @@ class GaussianSum:
 
     @property
     def best(self) -> InformationState:
-        """The best belief of every group."""
+        """Best component of every group."""
         return self.beliefs[0]
 
     @property
     def is_single(self) -> bool:
-        """Whether all is explained in one way."""
+        """True if there is one component only."""
         return len(self.beliefs) == 1
 
-    def groups(self, mode: int, among: Iterable[int]) -> list[int]:
-        """Return those of some groups that have a mode."""
-        return [number for number in among if self.alive[mode, number]]
+    def groups(self, component: int, among: Iterable[int]) -> list[int]:
+        """Return those of some groups that have a component."""
+        return [number for number in among if self.alive[component, number]]
 
-    def each(self, change: Callable[[InformationState], InformationState]) -> GaussianSum:
-        """Return what becomes of them when each belief changes."""
+    def map(self, change: Callable[[InformationState], InformationState]) -> GaussianSum:
+        """Apply a function to each component."""
         return GaussianSum(self._layout, [change(b) for b in self.beliefs], self.alive)
 
     def evidence(self, number: int) -> Array:
-        """Return the log evidence of the modes of a group, its best one first."""
+        """Return the log evidence of the components of a group, the best first."""
         return np.array(
             [b.evidence[number] for b, alive in zip(self.beliefs, self.alive, strict=True) if alive[number]]
         )
 
     @property
     def log_evidence(self) -> float:
-        """The log evidence of all groups, whichever mode is right."""
+        """Log evidence of all groups, summed over components."""
         count = len(self._layout.groups)
         return float(sum(np.logaddexp.reduce(self.evidence(number)) for number in range(count)))
 
-    def ranked(
+    def select(
         self,
         candidates: Sequence[Candidate],
-        is_same: Callable[[CoordinateGroup, Candidate, Candidate], bool],
+        should_merge: Callable[[CoordinateGroup, Candidate, Candidate], bool],
     ) -> tuple[GaussianSum, list[Candidate | None]]:
-        """Return the best candidates of each group as modes, and for each group which one is best.
+        """Prune and merge candidates to new components; also return the best candidate of each group.
 
-        Groups without candidates keep what they have.
+        Groups without candidates keep their components.
 
         Parameters
         ----------
         candidates
-            All explanations after a reading.
-        is_same
-            Whether two say the same about a group.
+            All candidates after an update.
+        should_merge
+            Predicate for two candidates that are the same component of a group.
         """
         kept: list[list[tuple[InformationState, Candidate | None]]] = []
         for number, group in enumerate(self._layout.groups):
@@ -139,49 +141,51 @@ class GaussianSum:
             own.sort(key=lambda c: -float(c.belief.evidence[number]))
             chosen: list[Candidate] = []
             for one in own:
-                behind = own[0].belief.evidence[number] - one.belief.evidence[number]
-                if behind > PRUNING_LOG_RATIO or len(chosen) == MOST_COMPONENTS:
+                deficit = own[0].belief.evidence[number] - one.belief.evidence[number]
+                if deficit > PRUNING_LOG_RATIO or len(chosen) == MOST_COMPONENTS:
                     break
-                if not any(is_same(group, one, other) for other in chosen):
+                if not any(should_merge(group, one, other) for other in chosen):
                     chosen.append(one)
             before: list[tuple[InformationState, Candidate | None]] = [
-                (self.beliefs[mode], None) for mode in range(len(self.beliefs)) if self.alive[mode, number]
+                (self.beliefs[component], None)
+                for component in range(len(self.beliefs))
+                if self.alive[component, number]
             ]
             kept.append([(c.belief, c) for c in chosen] or before)
         beliefs, alive = [], []
-        for mode in range(max(map(len, kept))):
+        for component in range(max(map(len, kept))):
             belief = self.best.copy()
-            for number, (group, own_modes) in enumerate(zip(self._layout.groups, kept, strict=True)):
-                source, _ = own_modes[min(mode, len(own_modes) - 1)]
+            for number, (group, own_components) in enumerate(zip(self._layout.groups, kept, strict=True)):
+                source, _ = own_components[min(component, len(own_components) - 1)]
                 copy_group(source, belief, number, group)
             beliefs.append(belief)
-            alive.append([mode < len(own_modes) for own_modes in kept])
+            alive.append([component < len(own_components) for own_components in kept])
         after = GaussianSum(self._layout, beliefs, np.array(alive))
-        return after, [own_modes[0][1] for own_modes in kept]
+        return after, [own_components[0][1] for own_components in kept]
 
 
 def copy_group(
     source: InformationState, target: InformationState, number: int, group: CoordinateGroup
 ) -> None:
-    """Take over what is believed of a group."""
+    """Copy the belief about one group."""
     block = np.ix_(group.t, group.t)
     target.x[group.x], target.vector[group.t] = source.x[group.x], source.vector[group.t]
     target.information[block], target.evidence[number] = source.information[block], source.evidence[number]
-    target.standing[number] = source.standing[number]
+    target.records[number] = source.records[number]
 
 
-# Explanations are one if predictions are fewer deviations of the noise apart, and each coordinate
-# of the state fewer of its own.
-_SAME, _NEAR = 0.3, 3.0
+# Candidates merge if their predictions differ by fewer deviations of the noise, and each coordinate of the
+# state by fewer of its own.
+_SAME_PREDICTION, _NEAR = 0.3, 3.0
 
 
 class MergeCriterion:
-    """Compares explanations.
+    """Criterion for two candidates that are one component.
 
     Parameters
     ----------
-    layout, residuals, reader, charted, ridge
-        The parts of a tracker.
+    layout, residuals, reader, process_model, ridge_covariance
+        Components of the tracker.
     """
 
     def __init__(
@@ -189,62 +193,67 @@ class MergeCriterion:
         layout: Layout,
         residuals: Residuals,
         reader: MeasurementReader,
-        charted: ProcessModel,
-        ridge: RidgeCovariance,
+        process_model: ProcessModel,
+        ridge_covariance: RidgeCovariance,
     ) -> None:
         self._layout, self._residuals, self._reader = layout, residuals, reader
-        self._charted, self._ridge = charted, ridge
+        self._process_model, self._ridge_covariance = process_model, ridge_covariance
 
-    def is_same(
-        self, known: Array, turns: frozenset[Symbol], group: CoordinateGroup, one: Candidate, other: Candidate
+    def should_merge(
+        self,
+        inputs: Array,
+        periodic: frozenset[Symbol],
+        group: CoordinateGroup,
+        one: Candidate,
+        other: Candidate,
     ) -> bool:
-        """Whether two explanations predict the same of a group, and are near each other.
+        """Return True if two candidates predict the same measurements of a group from nearby states.
 
         Parameters
         ----------
-        known
-            Values of what is known.
-        turns
-            The coordinates that come back after a turn.
+        inputs
+            Values of the inputs.
+        periodic
+            Periodic coordinates.
         group
-            What they explain.
+            The group.
         one, other
-            The explanations.
+            The candidates.
         """
-        values = self._reader.values_of(other.said)
-        nothing = self._reader.nothing()
-        as_seen = nothing._replace(values=values, seen=~nothing.seen)
-        errors = self._residuals.errors(one.said, as_seen, group.seen)
-        if any(float(e @ e) >= _SAME**2 for e, _ in errors.values()):
+        values = self._reader.as_values(other.predicted)
+        nothing = self._reader.empty()
+        as_seen = nothing._replace(values=values, mask=~nothing.mask)
+        errors = self._residuals.errors(one.predicted, as_seen, group.observation_indices)
+        if any(float(e @ e) >= _SAME_PREDICTION**2 for e, _ in errors.values()):
             return False
         number = self._layout.groups.index(group)
-        apart = self._apart(group, other.belief, one.belief, known, turns)
+        apart = self._difference(group, other.belief, one.belief, inputs, periodic)
         most = _NEAR**2 * len(apart)
         if float(apart @ other.belief.information[np.ix_(group.t, group.t)] @ apart) < most:
             return True
-        mine, theirs = one.belief.standing[number], other.belief.standing[number]
+        mine, theirs = one.belief.records[number], other.belief.records[number]
         if (
             mine is None
             or theirs is None
-            or (min(mine.looks, theirs.looks) > 1 and mine.branch is not theirs.branch)
+            or (min(mine.count, theirs.count) > 1 and mine.branch is not theirs.branch)
         ):
-            return False  # they were told apart before
+            return False  # separate components of earlier updates
         if number not in other.covariances:
-            other.covariances[number] = self._ridge.covariance(number, other.belief)
+            other.covariances[number] = self._ridge_covariance.compute(number, other.belief)
         return float(apart @ inverse_spd(other.covariances[number]) @ apart) < most
 
-    def _apart(
+    def _difference(
         self,
         group: CoordinateGroup,
         here: InformationState,
         there: InformationState,
-        known: Array,
-        turns: frozenset[Symbol],
+        inputs: Array,
+        periodic: frozenset[Symbol],
     ) -> Array:
-        """Return about which step in the tangent leads from one place of a group to another."""
+        """Return the tangent step between the states of two beliefs, to first order."""
         change = there.x[group.x] - here.x[group.x]
         for k, x in enumerate(group.coordinates):
-            if x in turns:
+            if x in periodic:
                 change[k] = math.remainder(change[k], 2 * math.pi)
-        basis = self._charted.basis(self._layout.groups.index(group), here.x[group.x], known)
+        basis = self._process_model.basis(self._layout.groups.index(group), here.x[group.x], inputs)
         return np.linalg.pinv(basis) @ change

@@ -22,112 +22,112 @@ from .tangent import TangentSpace, connected_components
 
 @dataclass(frozen=True, eq=False)
 class CoordinateGroup:
-    """Coordinates that share observations or limits, and nothing with others.
+    """Coordinates that share observations or limits; groups are independent of each other.
 
     Attributes
     ----------
     coordinates, tangent
-        Its symbols.
+        Symbols of the group.
     x, t
-        Where they are among all coordinates and in the whole tangent.
-    seen
-        The numbers of its observations.
+        Indices into all coordinates and into the whole tangent space.
+    observation_indices
+        Numbers of its observations.
     limits
-        The numbers of its curved limits.
-    driven
-        Where in its tangent are speeds of which no coordinate is the position, such as angular velocities.
+        Numbers of its curved limits.
+    rate_directions
+        Indices in its tangent of speeds that are no coordinate's derivative, such as angular velocities.
     """
 
     coordinates: tuple[Symbol, ...]
     tangent: tuple[Symbol, ...]
     x: TangentIndices
     t: TangentIndices
-    seen: tuple[int, ...]
+    observation_indices: tuple[int, ...]
     limits: tuple[int, ...]
-    driven: TangentIndices
+    rate_directions: TangentIndices
 
     @property
-    def own(self) -> TangentIndices:
-        """Which of its coordinates each direction of its tangent is; -1 if none."""
+    def coordinate_indices(self) -> TangentIndices:
+        """Coordinate of each tangent direction, as an index into the group; -1 for a rate direction."""
         speeds = [x.derivative() for x in self.coordinates]
-        driven = set(self.driven.tolist())
-        return np.array([-1 if k in driven else speeds.index(v) for k, v in enumerate(self.tangent)])
+        rate_directions = set(self.rate_directions.tolist())
+        return np.array([-1 if k in rate_directions else speeds.index(v) for k, v in enumerate(self.tangent)])
 
-    def own_place(self, k: int) -> int:
-        """Return which direction of its tangent is its coordinate of a number; -1 if none."""
+    def tangent_index(self, k: int) -> int:
+        """Return the tangent direction of the k-th coordinate; -1 if it has none."""
         speed = self.coordinates[k].derivative()
         return self.tangent.index(speed) if speed in self.tangent else -1
 
     @property
     def by_speeds(self) -> bool:
-        """Whether some of its coordinates move by such speeds."""
-        return len(self.driven) > 0
+        """True if some of its coordinates move by rate directions."""
+        return len(self.rate_directions) > 0
 
 
 @dataclass(frozen=True, eq=False)
 class Layout:
-    """How the state of a tracker is arranged.
+    """Arrangement of state, observations and inputs in vectors.
 
     Attributes
     ----------
-    chart
-        Coordinates and tangent.
+    tangent_space
+        Coordinates and tangent directions.
     observations
-        What is observed.
+        Measurement models.
     limits
-        The curved limits: those that are not bounds of one free coordinate alone.
-    known
-        What is handed in: coordinates that are measured elsewhere, and parameters.
+        Curved limits: all but bounds on a single free coordinate.
+    inputs
+        Symbols with given values: coordinates that are measured elsewhere, and parameters.
     groups
-        In the order of their first observation.
+        Independent groups, in the order of their first observation.
     """
 
-    chart: TangentSpace
+    tangent_space: TangentSpace
     observations: tuple[MeasurementModel, ...]
     limits: tuple[Constraint, ...]
-    known: tuple[Symbol, ...]
+    inputs: tuple[Symbol, ...]
     groups: tuple[CoordinateGroup, ...]
 
     @cached_property
     def group_of(self) -> tuple[int, ...]:
-        """The number of each observation's group."""
-        found = {i: number for number, group in enumerate(self.groups) for i in group.seen}
-        return tuple(found[i] for i in range(len(self.observations)))
+        """Number of each observation's group."""
+        result = {i: number for number, group in enumerate(self.groups) for i in group.observation_indices}
+        return tuple(result[i] for i in range(len(self.observations)))
 
     @cached_property
-    def inputs(self) -> tuple[Symbol, ...]:
-        """What is evaluated at."""
-        return (*self.chart.coordinates, *self.known)
+    def arguments(self) -> tuple[Symbol, ...]:
+        """Arguments of the compiled function: coordinates, then inputs."""
+        return (*self.tangent_space.coordinates, *self.inputs)
 
     @cached_property
     def value_slices(self) -> tuple[slice, ...]:
-        """Where each observation's value is: rotation row by row, then position, or a vector."""
+        """Position of each predicted value in the output: rotation row by row, then position, or a vector."""
         return self._slices[0]
 
     @cached_property
-    def slope_slices(self) -> tuple[slice, ...]:
-        """Where each observation's derivatives are, rows by columns of its group's tangent."""
+    def jacobian_slices(self) -> tuple[slice, ...]:
+        """Position of each observation's Jacobian in the output, rows by columns of its group's tangent."""
         return self._slices[1]
 
     @cached_property
     def limit_slices(self) -> tuple[slice, ...]:
-        """Where each curved limit's value, bounds and derivatives are."""
+        """Position of each curved limit's value, bounds and gradient in the output."""
         return self._slices[2]
 
     @cached_property
-    def seen_slices(self) -> tuple[slice, ...]:
-        """Where each observation is in a reading: 4×4 row by row, or a vector."""
+    def measurement_slices(self) -> tuple[slice, ...]:
+        """Position of each observation in a reading: 4×4 row by row, or a vector."""
         return _consecutive_slices(16 if one.is_pose else one.size for one in self.observations)
 
     @cached_property
-    def white_slices(self) -> tuple[slice, ...]:
-        """Where what whitens each observation is in a reading."""
+    def whitening_slices(self) -> tuple[slice, ...]:
+        """Position of each observation's whitening matrix in a reading."""
         return _consecutive_slices(one.size**2 for one in self.observations)
 
     @cached_property
     def _slices(self) -> tuple[tuple[slice, ...], tuple[slice, ...], tuple[slice, ...]]:
         at = 0
-        found: tuple[list[slice], list[slice], list[slice]] = [], [], []
+        result: tuple[list[slice], list[slice], list[slice]] = [], [], []
         sizes = []
         for one, number in zip(self.observations, self.group_of, strict=True):
             width = len(self.groups[number].tangent)
@@ -136,32 +136,32 @@ class Layout:
             group = next(g for g in self.groups if number in g.limits)
             sizes.append((2, 3 + len(group.tangent)))
         for kind, size in sizes:
-            found[kind].append(slice(at, at + size))
+            result[kind].append(slice(at, at + size))
             at += size
-        return tuple(found[0]), tuple(found[1]), tuple(found[2])
+        return tuple(result[0]), tuple(result[1]), tuple(result[2])
 
-    def compiled(self) -> CompiledFunction:
-        """Return values and derivatives of all observations, and of limits, as one function."""
+    def compile_function(self) -> CompiledFunction:
+        """Compile the values and derivatives of all observations and limits as one function."""
         parts: list[Expression] = []
         for one, number in zip(self.observations, self.group_of, strict=True):
-            value = self.chart.plain(one.value)
+            value = self.tangent_space.resolve(one.value)
             parts += [
                 _flatten_pose(value) if one.is_pose else value,
-                self._slope(one, value, self.groups[number]),
+                self._jacobian(one, value, self.groups[number]),
             ]
         for number, limit in enumerate(self.limits):
             group = next(g for g in self.groups if number in g.limits)
-            slopes = self.chart.gradient(limit.expression)
+            slopes = self.tangent_space.gradient(limit.expression)
             columns = [slopes.get(v, as_expression(0.0)) for v in group.tangent]
             parts.append(array([limit.expression, limit.lower, limit.upper, *columns]))
-        return compile(np.concatenate(parts), self.inputs)
+        return compile(np.concatenate(parts), self.arguments)
 
-    def _slope(self, one: MeasurementModel, value: Expression, group: CoordinateGroup) -> Expression:
-        """Return the derivatives of a value, one column after the other in each row, flat.
+    def _jacobian(self, one: MeasurementModel, value: Expression, group: CoordinateGroup) -> Expression:
+        """Return the Jacobian of a value in the group's tangent directions, flattened row by row.
 
-        Those of a pose are the geometric Jacobian: velocity of the origin and angular velocity.
+        For a pose this is the geometric Jacobian: linear velocity of the origin, then angular velocity.
         """
-        gradient = self.chart.gradient(value)
+        gradient = self.tangent_space.gradient(value)
         columns = []
         for speed in group.tangent:
             entry = gradient.get(speed)
@@ -185,51 +185,51 @@ def _flatten_pose(pose: Expression) -> Expression:
 
 
 def build_layout(
-    chart: TangentSpace,
+    tangent_space: TangentSpace,
     observations: tuple[MeasurementModel, ...],
     limits: tuple[Constraint, ...],
-    known: Sequence[Symbol],
+    inputs: Sequence[Symbol],
 ) -> Layout:
-    """Return the arrangement of observations and limits, in groups.
+    """Arrange observations and limits in independent groups.
 
     Raises
     ------
     InvalidValueError
-        If an observation depends on nothing that could be estimated.
+        If an observation depends on no estimated coordinate.
     """
-    speeds = {x: frozenset(chart.row(x)) for x in chart.coordinates}
-    watched: list[frozenset[Symbol]] = []
+    speeds = {x: frozenset(tangent_space.rate_row(x)) for x in tangent_space.coordinates}
+    observed: list[frozenset[Symbol]] = []
     for one in observations:
-        symbols = [s for s in chart.plain(one.value).symbols if s in speeds]
+        symbols = [s for s in tangent_space.resolve(one.value).symbols if s in speeds]
         if not symbols:
             raise InvalidValueError(
                 f"'{one.label}' does not move with any coordinate that is estimated: nothing can be learnt "
                 "from observing it."
             )
-        watched.append(frozenset().union(*(speeds[s] for s in symbols)))
+        observed.append(frozenset().union(*(speeds[s] for s in symbols)))
     limited = [frozenset[Symbol]().union(*(speeds[s] for s in c.symbols if s in speeds)) for c in limits]
-    # What a rate looks at is carried along with what it moves.
+    # A rate couples the coordinates it depends on with those it moves.
     rated = [
         frozenset().union(
-            speeds[x], *(speeds[s] for e in chart.rates[x].values() for s in e.symbols if s in speeds)
+            speeds[x], *(speeds[s] for e in tangent_space.rates[x].values() for s in e.symbols if s in speeds)
         )
-        for x in chart.coordinates
-        if x in chart.rates
+        for x in tangent_space.coordinates
+        if x in tangent_space.rates
     ]
     groups = []
-    for union in connected_components([*watched, *limited, *rated]):
-        tangent = tuple(v for v in chart.tangent if v in union)
-        coordinates = tuple(x for x in chart.coordinates if speeds[x] & union)
-        own = {x.derivative() for x in coordinates if x not in chart.by_speeds}
+    for union in connected_components([*observed, *limited, *rated]):
+        tangent = tuple(v for v in tangent_space.tangent if v in union)
+        coordinates = tuple(x for x in tangent_space.coordinates if speeds[x] & union)
+        own = {x.derivative() for x in coordinates if x not in tangent_space.by_speeds}
         groups.append(
             CoordinateGroup(
                 coordinates,
                 tangent,
-                np.array([chart.coordinates.index(x) for x in coordinates]),
-                np.array([chart.tangent.index(v) for v in tangent]),
-                tuple(i for i, w in enumerate(watched) if w & union),
+                np.array([tangent_space.coordinates.index(x) for x in coordinates]),
+                np.array([tangent_space.tangent.index(v) for v in tangent]),
+                tuple(i for i, w in enumerate(observed) if w & union),
                 tuple(i for i, w in enumerate(limited) if w & union),
                 np.array([k for k, v in enumerate(tangent) if v not in own], dtype=np.int64),
             )
         )
-    return Layout(chart, observations, limits, tuple(known), tuple(groups))
+    return Layout(tangent_space, observations, limits, tuple(inputs), tuple(groups))

@@ -20,12 +20,12 @@ if TYPE_CHECKING:
     from kineverse.model.model_view import ModelView
 
 USUAL_POSITION, USUAL_ORIENTATION = 0.01, math.radians(1.0)
-"""The standard deviations of a pose or position about which nothing was said [m], [rad]."""
+"""Default standard deviations of poses and positions [m], [rad]."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _Observed:
-    """What all observations have in common."""
+    """Common attributes of observed poses and positions."""
 
     relative_to: str = WORLD
     covariance: npt.ArrayLike | None = None
@@ -34,19 +34,19 @@ class _Observed:
 
 @dataclass(frozen=True, eq=False)
 class ObservedPose(_Observed):
-    """The pose of a frame, seen from another one.
+    """Observed pose of a frame relative to another one.
 
     Attributes
     ----------
     frame
-        What is seen.
+        Name of the observed frame.
     relative_to
-        From where: the world, or a camera, which may move.
+        Observing frame: the world, or a camera, which may move.
     covariance
-        6×6, of the errors in the axes of ``relative_to``, linear first [m²], [rad²]; by default 1 cm and 1°.
-        See :mod:`kineverse.estimation.noise`.
+        6×6, of the errors in the axes of ``relative_to``, linear part first [m²], [rad²]; by default 1 cm and
+        1°. See :mod:`kineverse.estimation.noise`.
     name
-        By which it is handed in; that of the frame if empty.
+        Key of its measurements; the name of the frame if empty.
     """
 
     frame: str
@@ -54,18 +54,18 @@ class ObservedPose(_Observed):
 
 @dataclass(frozen=True, eq=False)
 class ObservedPosition(_Observed):
-    """Where a point of a frame is, seen from another frame.
+    """Observed position of a point of a frame relative to another frame.
 
     Attributes
     ----------
     frame, point
         The point (3,) [m] in coordinates of the frame; its origin if not given.
     relative_to
-        From where: the world, or a camera, which may move.
+        Observing frame: the world, or a camera, which may move.
     covariance
         3×3, in the axes of ``relative_to`` [m²]; by default 1 cm.
     name
-        By which it is handed in; that of the frame if empty.
+        Key of its measurements; the name of the frame if empty.
     """
 
     frame: str
@@ -74,19 +74,18 @@ class ObservedPosition(_Observed):
 
 @dataclass(frozen=True, eq=False)
 class ObservedExpression:
-    """Any expression of coordinates, a scalar or a vector.
+    """Observed expression of coordinates, a scalar or a vector.
 
     Attributes
     ----------
     name
-        By which it is handed in.
+        Key of its measurements.
     expression
         Of shape () or (d,).
     covariance
         d×d, or the variance of a scalar.
     period
-        After which its numbers begin again, as those of an angle that is read off a dial do after 2π; None if
-        they never do.
+        Period of its values, such as 2π for an angle on a dial; None if they are not periodic.
     """
 
     name: str
@@ -100,22 +99,22 @@ ObservedLike: TypeAlias = str | ObservedPose | ObservedPosition | ObservedExpres
 
 @dataclass(frozen=True, eq=False)
 class MeasurementModel:
-    """An observation of a model, checked.
+    """Checked measurement model of one observation.
 
     Attributes
     ----------
     name
-        By which it is handed in.
+        Key of its measurements.
     label
-        What errors call it.
+        Name in error messages.
     is_pose
-        Whether it is on SE(3); everything else is a vector.
+        True if the value is on SE(3); otherwise it is a vector.
     value
-        4×4, or (d,).
+        Predicted measurement, 4×4 or (d,).
     covariance
-        Of one observation.
+        Default covariance of one measurement.
     period
-        After which numbers begin again; inf if they never do.
+        Period of the values; inf if they are not periodic.
     """
 
     name: str
@@ -127,14 +126,14 @@ class MeasurementModel:
 
     @property
     def size(self) -> int:
-        """How many numbers an error has."""
+        """Number of components of a residual."""
         return 6 if self.is_pose else self.value.shape[0]
 
 
 def build_measurement_models(
     model: ModelView, observed: Iterable[ObservedLike]
 ) -> tuple[MeasurementModel, ...]:
-    """Return what is observed of a model.
+    """Check observations and build their measurement models.
 
     Raises
     ------
@@ -143,21 +142,21 @@ def build_measurement_models(
     DuplicateNameError
         If two have one name.
     InvalidValueError
-        If there is nothing, something else, or a covariance that is not positive.
+        If there is none, one is of another type, or a covariance is not positive.
     """
     if isinstance(observed, (str, ObservedPose, ObservedPosition, ObservedExpression)):
         observed = [observed]
-    found: dict[str, MeasurementModel] = {}
+    result: dict[str, MeasurementModel] = {}
     for item in observed:
         one = _observation(model, item)
-        if one.name in found:
+        if one.name in result:
             raise DuplicateNameError(
                 f"Two observations have the name '{one.name}'; give one of them a name=."
             )
-        found[one.name] = one
-    if not found:
+        result[one.name] = one
+    if not result:
         raise InvalidValueError("A tracker needs at least one frame that is observed.")
-    return tuple(found.values())
+    return tuple(result.values())
 
 
 def _observation(model: ModelView, item: ObservedLike) -> MeasurementModel:
@@ -194,11 +193,11 @@ def _observation(model: ModelView, item: ObservedLike) -> MeasurementModel:
 
 
 def wrap_difference(difference: Array, period: float) -> Array:
-    """Return differences of numbers that begin again after a period, none longer than half of it."""
+    """Wrap differences of periodic numbers to at most half a period."""
     if math.isinf(period):
         return difference
-    found: Array = difference - period * np.round(difference / period)
-    return found
+    result: Array = difference - period * np.round(difference / period)
+    return result
 
 
 def _vector(item: ObservedExpression) -> Expression:
@@ -211,7 +210,7 @@ def _vector(item: ObservedExpression) -> Expression:
 
 
 def require_covariance(given: npt.ArrayLike, size: int, label: str) -> Array:
-    """Return a covariance, size × size.
+    """Check a covariance, size × size.
 
     Raises
     ------
@@ -236,18 +235,18 @@ def require_covariance(given: npt.ArrayLike, size: int, label: str) -> Array:
     if least <= 0:
         raise InvalidValueError(
             f"The covariance of '{label}' is not positive: its least eigenvalue is {least:.3g}. What is "
-            "known exactly is handed in as known=, and what is not measured is left out."
+            "known exactly is given as inputs=, and what is not measured is left out."
         )
     return matrix
 
 
 def require_number(given: Any, what: str) -> float:
-    """Return a number.
+    """Convert to float.
 
     Raises
     ------
     InvalidValueError
-        If it is none.
+        If that fails; ``what`` names the value.
     """
     try:
         return float(given)
@@ -256,7 +255,7 @@ def require_number(given: Any, what: str) -> float:
 
 
 def require_positive(key: object, given: Any) -> float:
-    """Return a deviation or variance of something.
+    """Check the standard deviation or variance of ``key``.
 
     Raises
     ------

@@ -16,25 +16,25 @@ from .tracker import Tracker
 
 
 class HypothesisBank:
-    """Trackers of the same observations that assume different things, weighed by evidence.
+    """Bank of trackers with competing models of the same observations, weighed by evidence.
 
-    The probability of each is that before times the density of all it has seen. Densities compare only if all
-    have seen the same, so every update goes to all of them.
+    The probability of each is its prior times the density of all its measurements, normalised. Densities
+    compare only for equal measurements, so every update goes to all trackers.
 
     Parameters
     ----------
     trackers
-        By name. What they observe has the same names and covariances.
+        By name. Their observations have the same names and covariances.
     prior
-        The probabilities before; equal ones if None.
+        Prior probabilities; equal ones if None.
     forgetting
-        [s⁻¹] How fast what was seen loses its weight, which lets a hypothesis come back that was wrong once,
-        such as a lock that opens. 0 for never.
+        Rate [s⁻¹] at which evidence decays. A hypothesis that was wrong can then become probable again, such
+        as a lock that opens. 0 for no decay.
 
     Raises
     ------
     InvalidValueError
-        If there is none, they observe different things, or the probabilities are none.
+        If there is no tracker, the observations differ, or the probabilities are not positive.
     """
 
     def __init__(
@@ -66,39 +66,39 @@ class HypothesisBank:
 
     @property
     def trackers(self) -> Mapping[str, Tracker]:
-        """The trackers by name."""
+        """Trackers by name."""
         return MappingProxyType(self._trackers)
 
     @property
     def estimates(self) -> Mapping[str, Estimate]:
-        """What each of them says."""
+        """Estimate of each tracker, by name."""
         return MappingProxyType(self._estimates)
 
     @property
     def probabilities(self) -> dict[str, float]:
-        """How probable each is."""
+        """Probability of each tracker, by name."""
         logs = np.array(list(self._logs.values()))
         weights = np.exp(logs - np.logaddexp.reduce(logs))
         return dict(zip(self._logs, weights.tolist(), strict=True))
 
     @property
     def best(self) -> str:
-        """The most probable one."""
+        """Name of the most probable tracker."""
         return max(self._logs, key=self._logs.__getitem__)
 
     def predict(self, dt: float, **options: Any) -> None:
-        """Move all of them on in time, see :meth:`.Tracker.predict`; commands go to those they move."""
+        """Predict all trackers, see :meth:`.Tracker.predict`; commands go to those they move."""
         moved = {name: tracker.copy() for name, tracker in self._trackers.items()}
         estimates = {name: tracker.predict(dt, **options) for name, tracker in moved.items()}
         self._trackers, self._estimates = moved, estimates
         self._forget(dt)
 
     def update(self, seen: Mapping[str, Any], **options: Any) -> dict[str, float]:
-        """Let all of them see the same, see :meth:`.Tracker.update`; return the probabilities.
+        """Update all trackers with the same measurements and return the probabilities.
 
-        If one of them refuses what was seen, all stay as they were.
+        See :meth:`.Tracker.update`. If one of them refuses the measurements, none changes.
         """
-        # Copies share all that is compiled; whoever fails has spoilt nothing.
+        # Copies share compiled code. After an error the originals are unchanged.
         after = {name: tracker.copy() for name, tracker in self._trackers.items()}
         stamps = {name: tracker.estimate.stamp for name, tracker in after.items()}
         estimates = {name: tracker.update(seen, **options) for name, tracker in after.items()}

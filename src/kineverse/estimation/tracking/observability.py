@@ -1,8 +1,8 @@
 """Unobservable directions, and states where the measurement Jacobian vanishes.
 
-The cosine of an angle has none at 0: whatever is seen of it, the angle stays where it is. The elbow of an arm
-that is stretched out has none either. So where an observation remains unexplained and some direction is open,
-the search begins anew to both sides.
+The cosine of an angle has zero slope at 0: a Gauss-Newton step does not move the angle, whatever is measured.
+An arm that is stretched out has the same property at its elbow. Where a residual remains unexplained and some
+direction is unobservable, the update therefore restarts on both sides.
 """
 
 from __future__ import annotations
@@ -21,126 +21,137 @@ from .layout import Layout
 from .map_update import MapResult
 from .process_model import ProcessModel
 
-# A direction is open as long as it is known no better than to this part of what was assumed at the start.
-_OPEN = 0.05
-# Rounding may leave nothing of what was known; no step is longer than a hundred deviations at the start.
+# A direction is unobservable while its deviation exceeds this part of the initial one.
+_UNOBSERVABLE = 0.05
+# Rounding may cancel information; no step is longer than a hundred initial deviations.
 _LEAST = 1e-4
 
 
 class UnobservableDirections:
-    """Tells open directions from others.
+    """Classification of tangent directions by their information.
 
     Parameters
     ----------
     layout
-        What is estimated.
+        Layout of the state.
 
     Attributes
     ----------
     deviations
-        How uncertain the tangent was at the start (t,).
+        Initial standard deviation of each tangent direction (t,).
     """
 
     def __init__(self, layout: Layout) -> None:
         self._groups = layout.groups
-        self.deviations: Array = np.ones(len(layout.chart.tangent))
+        self.deviations: Array = np.ones(len(layout.tangent_space.tangent))
 
     def directions(self, number: int, information: Array) -> tuple[Array, Array]:
-        """Return steps of one deviation in the tangent of a group: open ones (k, t), and others (t - k, t).
+        """Return steps of one deviation in the tangent of a group: unobservable (k, t), others (t - k, t).
 
         They are orthogonal in the metric of the information (t, t).
         """
         scale = self.deviations[self._groups[number].t]
         values, vectors = np.linalg.eigh(information * np.outer(scale, scale))
         steps = (vectors * np.maximum(values, _LEAST) ** -0.5).T * scale
-        is_open = values < _OPEN**-2
-        return steps[is_open], steps[~is_open]
+        is_unobservable = values < _UNOBSERVABLE**-2
+        return steps[is_unobservable], steps[~is_unobservable]
 
-    def is_open(self, number: int, information: Array) -> bool:
-        """Whether a group has such directions."""
+    def is_unobservable(self, number: int, information: Array) -> bool:
+        """Return True if a group has unobservable directions."""
         scale = self.deviations[self._groups[number].t]
         if len(scale) == 1:
-            return float(information[0, 0]) * float(scale[0]) ** 2 < _OPEN**-2
-        return bool(np.linalg.eigvalsh(information * np.outer(scale, scale))[0] < _OPEN**-2)
+            return float(information[0, 0]) * float(scale[0]) ** 2 < _UNOBSERVABLE**-2
+        return bool(np.linalg.eigvalsh(information * np.outer(scale, scale))[0] < _UNOBSERVABLE**-2)
 
 
-# What is seen is explained if its squares are fewer deviations than these above their mean.
+# Residuals are explained if their χ² is fewer deviations than this above its mean.
 _EXPLAINED = 3.0
-# Of all directions, those of which least is known are tried.
-_MOST_WAYS = 2
+# Restarts are limited to the directions of least information.
+_MOST_DIRECTIONS = 2
 
 
 class StationaryPoints:
-    """Finds such places, and others to begin at.
+    """Detection of states where the measurement Jacobian vanishes, and restarts beside them.
 
     Parameters
     ----------
-    layout, charted, openness, boxes
-        The parts of a tracker.
+    layout, process_model, unobservable, group_bounds
+        Components of the tracker.
     """
 
     def __init__(
         self,
         layout: Layout,
-        charted: ProcessModel,
-        openness: UnobservableDirections,
-        boxes: Sequence[GroupBounds],
+        process_model: ProcessModel,
+        unobservable: UnobservableDirections,
+        group_bounds: Sequence[GroupBounds],
     ) -> None:
-        self._layout, self._charted, self._openness, self._boxes = layout, charted, openness, boxes
+        self._layout, self._process_model, self._unobservable, self._group_bounds = (
+            layout,
+            process_model,
+            unobservable,
+            group_bounds,
+        )
 
-    def unexplained(self, before: InformationState, found: MapResult) -> list[int]:
-        """Return the numbers of the groups that are further off than noise is, and may be elsewhere."""
-        beyond = found.nis > found.dof + _EXPLAINED * np.sqrt(2 * found.dof)
+    def unexplained(self, before: InformationState, result: MapResult) -> list[int]:
+        """Return the groups whose residuals exceed the noise and that have unobservable directions."""
+        beyond = result.nis > result.dof + _EXPLAINED * np.sqrt(2 * result.dof)
         if not beyond.any():
             return []
-        return [n for n in np.flatnonzero(beyond).tolist() if self._may_be_elsewhere(n, before, found.belief)]
+        return [n for n in np.flatnonzero(beyond).tolist() if self._may_have_moved(n, before, result.belief)]
 
-    def _may_be_elsewhere(self, number: int, before: InformationState, after: InformationState) -> bool:
+    def _may_have_moved(self, number: int, before: InformationState, after: InformationState) -> bool:
         t = self._layout.groups[number].t
-        is_kept = before.standing[number] is not None
-        return is_kept or self._openness.is_open(number, after.information[np.ix_(t, t)])
+        is_kept = before.records[number] is not None
+        return is_kept or self._unobservable.is_unobservable(number, after.information[np.ix_(t, t)])
 
-    def aside(
-        self, before: InformationState, after: InformationState, groups: Sequence[int], known: Array
+    def restart_states(
+        self, before: InformationState, after: InformationState, groups: Sequence[int], inputs: Array
     ) -> list[InformationState]:
-        """Return what was believed before, about places to both sides in directions that are still open.
+        """Return the prior belief about points on both sides of the estimate, along unobservable directions.
 
         Parameters
         ----------
         before, after
-            What was believed before and after something was seen.
+            Beliefs before and after the update.
         groups
-            The numbers of those that are moved; all of them at once, each in its next direction.
-        known
-            Values of what is known.
+            Numbers of the groups to move; all at once, each in its next direction.
+        inputs
+            Values of the inputs.
         """
         beliefs: list[InformationState] = []
         for number in groups:
             group, x = self._layout.groups[number], before.x[self._layout.groups[number].x]
-            ways, turn = self._ways(number, before, after), 0
-            for way in (*ways, *-ways):
+            directions, index = self._unobservable_directions(number, before, after), 0
+            for direction in (*directions, *-directions):
                 try:
-                    there, _ = self._charted.step(number, x, way, known)
-                    step = self._boxes[number].taken(x, self._boxes[number].clipped(there), way)
-                    there, turned = self._charted.step(number, x, step, known)
-                except KineverseError:  # nobody can be there
+                    there, _ = self._process_model.retract(number, x, direction, inputs)
+                    step = self._group_bounds[number].remaining(
+                        x, self._group_bounds[number].clip(there), direction
+                    )
+                    there, transport = self._process_model.retract(number, x, step, inputs)
+                except KineverseError:  # infeasible
                     continue
-                if turn == len(beliefs):
+                if index == len(beliefs):
                     beliefs.append(before.copy())
-                beliefs[turn].x[group.x] = there
-                beliefs[turn].put(group.t, before.part(group.t).carried(step, turned))
-                standing = before.standing[number]
-                if standing is not None:
-                    prior = standing.prior.carried(step, turned)
-                    beliefs[turn].standing[number] = replace(standing, prior=prior)
-                turn += 1
+                beliefs[index].x[group.x] = there
+                beliefs[index].set_group_cost(
+                    group.t, before.group_cost(group.t).transported(step, transport)
+                )
+                record = before.records[number]
+                if record is not None:
+                    prior = record.prior.transported(step, transport)
+                    beliefs[index].records[number] = replace(record, prior=prior)
+                index += 1
         return beliefs
 
-    def _ways(self, number: int, before: InformationState, after: InformationState) -> Array:
-        """Return directions that are open, or were before all of what is remembered was seen."""
+    def _unobservable_directions(
+        self, number: int, before: InformationState, after: InformationState
+    ) -> Array:
+        """Return the directions that are unobservable now, or were before the stored measurements."""
         t = self._layout.groups[number].t
-        ways, _ = self._openness.directions(number, after.information[np.ix_(t, t)])
-        standing = before.standing[number]
-        if not len(ways) and standing is not None:
-            ways, _ = self._openness.directions(number, standing.prior.matrix)
-        return ways[:_MOST_WAYS]
+        directions, _ = self._unobservable.directions(number, after.information[np.ix_(t, t)])
+        record = before.records[number]
+        if not len(directions) and record is not None:
+            directions, _ = self._unobservable.directions(number, record.prior.matrix)
+        return directions[:_MOST_DIRECTIONS]

@@ -1,7 +1,7 @@
 """Goldfarb-Idnani dual method for small bounded QPs.
 
-It starts at the free minimum and takes in violated bounds one by one, so most calls end at once (Goldfarb and
-Idnani, A numerically stable dual method for solving strictly convex quadratic programs, 1983).
+It starts at the unconstrained minimum and adds violated bounds one by one, so most calls end at once
+(Goldfarb and Idnani, A numerically stable dual method for solving strictly convex quadratic programs, 1983).
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ _LEAST = 1e-12
 def solve_bounded_qp(
     inverse: Array, gradient: Array, rows: Array, lower: Array, upper: Array
 ) -> Array | None:
-    """Return the x that makes ½xᵀAx + gᵀx smallest with lower <= rows x <= upper; None if there is none.
+    """Minimise ½xᵀAx + gᵀx subject to lower <= rows x <= upper; return None if it is infeasible.
 
     Parameters
     ----------
@@ -42,13 +42,13 @@ def solve_bounded_qp(
         normal, added = normals[worst], 0.0
         while True:
             held = normals[active]
-            way = inverse @ normal
+            direction = inverse @ normal
             if active:
-                relation = np.linalg.lstsq(held @ inverse @ held.T, held @ way, rcond=None)[0]
-                way = way - inverse @ held.T @ relation
+                relation = np.linalg.lstsq(held @ inverse @ held.T, held @ direction, rcond=None)[0]
+                direction = direction - inverse @ held.T @ relation
             else:
                 relation = np.empty(0)
-            along = float(way @ normal)
+            along = float(direction @ normal)
             blocking = [
                 (m / r, k) for k, (m, r) in enumerate(zip(multipliers, relation, strict=True)) if r > _LEAST
             ]
@@ -59,7 +59,7 @@ def solve_bounded_qp(
             if not np.isfinite(step):
                 return None
             if is_free:
-                x = x + step * way
+                x = x + step * direction
             multipliers = multipliers - step * relation
             added += step
             if full <= partial:

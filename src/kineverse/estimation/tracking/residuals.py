@@ -16,37 +16,37 @@ from .layout import Layout
 from .measurements import MeasurementModel, require_covariance, wrap_difference
 
 RIGID = 1e-4
-"""How far RᵀR may be from the identity; a pose in single precision is off by 1e-6."""
+"""Largest accepted deviation of RᵀR from the identity; a pose in single precision has 1e-6."""
 
 
 class Measurements(NamedTuple):
-    """What was seen, as arrays; where each observation is in them, the layout knows.
+    """One reading of all observations, as arrays laid out by :class:`.layout.Layout`.
 
     Attributes
     ----------
     values
-        Poses 4×4 row by row, and vectors; anything for what is missing.
-    seen
-        A mask of what was seen (m,).
+        Poses 4×4 row by row, and vectors; arbitrary where missing.
+    mask
+        True for each observation that was measured (m,).
     whitening
-        For each a lower triangle W with Wᵀ W = R⁻¹, row by row.
+        Lower triangular W of each observation with Wᵀ W = R⁻¹, row by row.
     log_scale
-        For each ½ log |2πR|.
+        ½ log |2πR| of each observation.
     """
 
     values: Array
-    seen: npt.NDArray[np.bool_]
+    mask: npt.NDArray[np.bool_]
     whitening: Array
     log_scale: Array
 
 
 class MeasurementReader:
-    """Turns what users hand in into readings.
+    """Checked conversion of user input into :class:`Measurements`.
 
     Parameters
     ----------
     layout
-        What may be seen, and where it is put.
+        Layout of the observations.
     """
 
     def __init__(self, layout: Layout) -> None:
@@ -55,37 +55,38 @@ class MeasurementReader:
         self._index = {one.name: i for i, one in enumerate(observations)}
         self._whitening = np.concatenate([whitening(one.covariance).reshape(-1) for one in observations])
         self._log_scale = np.array([log_scale(one.covariance) for one in observations])
-        self._size = layout.seen_slices[-1].stop
+        self._size = layout.measurement_slices[-1].stop
         self._vectors = [one.label for one in observations if not one.is_pose]
         self._all = np.ones(len(observations), dtype=bool)
 
-    def nothing(self) -> Measurements:
-        """Return a reading of which all is missing."""
+    def empty(self) -> Measurements:
+        """Return a reading in which every observation is missing."""
         return Measurements(np.zeros(self._size), ~self._all, self._whitening, self._log_scale)
 
-    def values_of(self, said: Array) -> Array:
-        """Return what a model says, as if it had been seen."""
+    def as_values(self, predicted: Array) -> Array:
+        """Return predicted values in the layout of a reading."""
         values = np.zeros(self._size)
         for i, one in enumerate(self._layout.observations):
-            value = said[self._layout.value_slices[i]]
+            value = predicted[self._layout.value_slices[i]]
             if one.is_pose:
                 value = transform(value[:9].reshape(3, 3), value[9:]).reshape(-1)
-            values[self._layout.seen_slices[i]] = value
+            values[self._layout.measurement_slices[i]] = value
         return values
 
     def read(self, given: Mapping[str, Any]) -> Measurements:
-        """Return what was seen, from a mapping by name; what is absent is missing.
+        """Convert a mapping from names to measurements; absent names are missing.
 
-        Whether poses are rigid is not looked at yet, see :meth:`check_poses`.
+        Rigidity of poses is checked separately, see :meth:`check_poses`.
 
         Raises
         ------
         UnknownNameError, ShapeError, InvalidValueError
-            For other names, shapes, vectors that are not finite and covariances that are not positive.
+            For unknown names, wrong shapes, vectors that are not finite and covariances that are not
+            positive.
         """
         if not isinstance(given, Mapping):
             raise InvalidValueError(f"What was seen is a mapping {{frame: pose}}, not {given!r:.80}.")
-        values, seen, whitenings, scales = self.nothing()
+        values, observed, whitenings, scales = self.empty()
         for name, value in given.items():
             i = self._index.get(name)
             if i is None:
@@ -97,23 +98,23 @@ class MeasurementReader:
                 checked = require_covariance(covariance, one.size, one.label)
                 if whitenings is self._whitening:
                     whitenings, scales = whitenings.copy(), scales.copy()
-                whitenings[self._layout.white_slices[i]] = whitening(checked).reshape(-1)
+                whitenings[self._layout.whitening_slices[i]] = whitening(checked).reshape(-1)
                 scales[i] = log_scale(checked)
-            values[self._layout.seen_slices[i]] = (
+            values[self._layout.measurement_slices[i]] = (
                 _pose_like(value, one.label).reshape(-1) if one.is_pose else _checked_vector(value, one)
             )
-            seen[i] = True
-        return Measurements(values, seen, whitenings, scales)
+            observed[i] = True
+        return Measurements(values, observed, whitenings, scales)
 
     def read_poses(self, poses: npt.ArrayLike, mask: npt.ArrayLike | None) -> Measurements:
-        """Return what was seen, from an array of poses in the order of the observations.
+        """Convert an array of poses in the order of the observations.
 
-        They are not looked at yet, see :meth:`check_poses`.
+        Rigidity is checked separately, see :meth:`check_poses`.
 
         Raises
         ------
         ShapeError, InvalidValueError
-            If there are others than poses, or for other shapes.
+            For wrong shapes, or if some observations are not poses.
         """
         if self._vectors:
             raise InvalidValueError(
@@ -123,32 +124,32 @@ class MeasurementReader:
         count = len(self._all)
         if given.shape != (count, 4, 4):
             raise ShapeError(f"The poses are an array of shape {(count, 4, 4)}, not {given.shape}.")
-        seen = self._all if mask is None else np.ascontiguousarray(mask)
-        if seen.dtype != bool or seen.shape != (count,):
+        observed = self._all if mask is None else np.ascontiguousarray(mask)
+        if observed.dtype != bool or observed.shape != (count,):
             raise ShapeError(f"seen= is a mask of {count} booleans, not {mask!r:.80}.")
         values = np.ascontiguousarray(given).reshape(-1)
-        return Measurements(values, seen, self._whitening, self._log_scale)
+        return Measurements(values, observed, self._whitening, self._log_scale)
 
     def check_poses(self, reading: Measurements) -> None:
-        """Check the poses that were seen.
+        """Check that all measured poses are rigid.
 
         Raises
         ------
         InvalidValueError
-            Naming the first that is not rigid.
+            Naming the first pose that is not rigid.
         """
         for i, one in enumerate(self._layout.observations):
-            if one.is_pose and reading.seen[i]:
-                check_pose(reading.values[self._layout.seen_slices[i]].reshape(4, 4), one.label)
+            if one.is_pose and reading.mask[i]:
+                check_pose(reading.values[self._layout.measurement_slices[i]].reshape(4, 4), one.label)
 
 
 def check_pose(pose: Array, label: str) -> None:
-    """Check a 4×4 matrix.
+    """Check that a 4×4 matrix is a rigid transform.
 
     Raises
     ------
     InvalidValueError
-        If it is no rigid transform, saying by how much it is off.
+        Otherwise, with the deviation.
     """
     if not np.isfinite(pose).all():
         raise InvalidValueError(f"The pose of '{label}' is not finite.")
@@ -168,7 +169,7 @@ def check_pose(pose: Array, label: str) -> None:
 
 
 def _is_pair(value: Any, one: MeasurementModel) -> bool:
-    """Whether something is a value and its covariance, and not the two numbers of a vector."""
+    """Return True for a pair of value and covariance, False for a vector of two numbers."""
     if not (isinstance(value, tuple) and len(value) == 2):
         return False
     return one.size != 2 or np.ndim(value[0]) > 0
@@ -182,9 +183,9 @@ def _pose_like(given: npt.ArrayLike, label: str) -> Array:
 
 
 def whitening(covariance: Array) -> Array:
-    """Return the lower triangle W with Wᵀ W = R⁻¹."""
-    found: Array = np.linalg.inv(np.linalg.cholesky(covariance))
-    return np.tril(found)
+    """Return the lower triangular W with Wᵀ W = R⁻¹."""
+    result: Array = np.linalg.inv(np.linalg.cholesky(covariance))
+    return np.tril(result)
 
 
 def log_scale(covariance: Array) -> float:
@@ -214,12 +215,12 @@ def _numbers(given: npt.ArrayLike, what: str) -> Array:
 
 
 class Residuals:
-    """Whitened errors of observations: of a pose (p_seen - p, log(R_seen Rᵀ)), in the axes of the observer.
+    """Whitened residuals; for a pose (p_measured - p, log(R_measured Rᵀ)) in the axes of the observer.
 
     Parameters
     ----------
     layout, function
-        Where numbers are, and what computes them.
+        Layout of the numbers, and the compiled function that computes them.
     """
 
     def __init__(self, layout: Layout, function: CompiledFunction) -> None:
@@ -227,64 +228,68 @@ class Residuals:
         self._function = function
         self._widths = [len(layout.groups[number].tangent) for number in layout.group_of]
 
-    def evaluate(self, x: Array, known: Array) -> Array:
-        """Return values and derivatives of everything at a state, not whitened."""
-        found: Array = self._function(np.concatenate([x, known]))
-        return found
+    def evaluate(self, x: Array, inputs: Array) -> Array:
+        """Evaluate predicted values and Jacobians of all observations and limits at a state, not whitened."""
+        result: Array = self._function(np.concatenate([x, inputs]))
+        return result
 
     def errors(
-        self, out: Array, reading: Measurements, which: Sequence[int]
+        self, out: Array, reading: Measurements, indices: Sequence[int]
     ) -> dict[int, tuple[Array, Array]]:
-        """Return for each observation seen its whitened error (d,), and derivative of the model (d, t).
+        """Return whitened residuals (d,) and Jacobians of the prediction (d, t), by observation.
 
         Parameters
         ----------
         out
-            What :meth:`evaluate` gave.
-        which
-            The observations that are wanted.
+            Output of :meth:`evaluate`.
+        reading
+            The measurements.
+        indices
+            Numbers of the requested observations.
         """
         layout = self._layout
-        seen = [i for i in which if reading.seen[i]]
-        values = {i: reading.values[layout.seen_slices[i]] for i in seen}
+        measured = [i for i in indices if reading.mask[i]]
+        values = {i: reading.values[layout.measurement_slices[i]] for i in measured}
         errors: dict[int, Array] = {}
         slopes: dict[int, Array] = {}
-        for i in seen:
+        for i in measured:
             size = layout.observations[i].size
-            slopes[i] = out[layout.slope_slices[i]].reshape(size, self._widths[i])
-        poses = [i for i in seen if layout.observations[i].is_pose]
+            slopes[i] = out[layout.jacobian_slices[i]].reshape(size, self._widths[i])
+        poses = [i for i in measured if layout.observations[i].is_pose]
         if poses:
-            said = np.stack([out[layout.value_slices[i]] for i in poses])
-            found = np.stack([values[i] for i in poses]).reshape(-1, 4, 4)
-            differences = pose_difference(found, transform(said[:, :9].reshape(-1, 3, 3), said[:, 9:]))
+            predicted = np.stack([out[layout.value_slices[i]] for i in poses])
+            observed = np.stack([values[i] for i in poses]).reshape(-1, 4, 4)
+            differences = pose_difference(
+                observed, transform(predicted[:, :9].reshape(-1, 3, 3), predicted[:, 9:])
+            )
             back = inverse_right_jacobian(differences[:, 3:])
             errors.update(zip(poses, differences, strict=True))
             for i, turn in zip(poses, back, strict=True):
                 slope = slopes[i]
                 slopes[i] = np.concatenate([slope[:3], turn @ slope[3:]])
-        for i in seen:
+        for i in measured:
             if i not in errors:
                 errors[i] = wrap_difference(
                     values[i] - out[layout.value_slices[i]], layout.observations[i].period
                 )
         pairs = {}
-        for i in seen:
+        for i in measured:
             size = layout.observations[i].size
-            white = reading.whitening[layout.white_slices[i]].reshape(size, size)
+            white = reading.whitening[layout.whitening_slices[i]].reshape(size, size)
             pairs[i] = white @ errors[i], white @ slopes[i]
         return pairs
 
-    def check(self, out: Array, which: Sequence[int]) -> None:
-        """Raise an error that names an observation whose value or derivative is not finite.
+    def check(self, out: Array, indices: Sequence[int]) -> None:
+        """Check that values and Jacobians of observations are finite.
 
         Raises
         ------
         InvalidValueError
-            Naming it.
+            Naming the observation.
         """
-        for i in which:
+        for i in indices:
             one = self._layout.observations[i]
-            for where in (self._layout.value_slices[i], self._layout.slope_slices[i]):
+            for where in (self._layout.value_slices[i], self._layout.jacobian_slices[i]):
                 if not np.isfinite(out[where]).all():
                     raise InvalidValueError(
                         f"The model says nothing finite about '{one.label}' or its derivative at the present "

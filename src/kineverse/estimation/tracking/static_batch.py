@@ -1,10 +1,10 @@
 """Batch relinearisation of measurements while the state is static.
 
-A filter adds up what observations say where they are linear, each at another estimate. An arm with seven
-joints moves in itself while its tip stays; the direction of this differs a bit from estimate to estimate, so
-the sum knows of a motion of which nobody has seen anything. As long as nothing moves, all can be linearised
-anew at one place: what was seen is summed up on SE(3) instead, and the belief follows from what was believed
-before and from that. This needs to be done only as long as there are open directions.
+A filter sums information that was linearised at different estimates. An arm with seven joints can move while
+its end effector rests. The direction of this null motion differs a little between estimates, so the sum holds
+false information about an unobservable direction. While the state is static, measurements are instead
+averaged on SE(3), and the posterior follows from the prior and these means, linearised at one point. This is
+needed only while the group has unobservable directions.
 """
 
 from __future__ import annotations
@@ -15,9 +15,10 @@ from typing import TypeAlias
 
 import numpy as np
 
+from kineverse.estimation.linear_algebra import inverse_spd
 from kineverse.lie import Array, pose_difference, retract
 
-from .gaussian import InformationState, QuadraticCost, inverse_spd
+from .gaussian import InformationState, QuadraticCost
 from .layout import Layout
 from .map_update import MapResult, MapSolver
 from .measurements import MeasurementModel, wrap_difference
@@ -26,32 +27,32 @@ from .residuals import MeasurementReader, Measurements, Residuals, whitening
 
 UpdateFunction: TypeAlias = Callable[[InformationState, Measurements, Array, list[int]], MapResult]
 
-# Who counts less than this has said nothing.
-_NOTHING = 1e-3
+# Measurements with a smaller weight are ignored.
+_LEAST_WEIGHT = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
 class MeanMeasurement:
-    """The mean of observations, weighted with their information.
+    """Information-weighted mean of measurements of one observation.
 
     Attributes
     ----------
     value
         Pose 4×4 row by row, or vector.
     information
-        Of it (d, d), in the axes of the observer.
+        Inverse covariance of the mean (d, d), in the axes of the observing frame.
     peak
-        The log density of all of them if the mean is the truth.
+        Log density of all averaged measurements at their mean.
     """
 
     value: Array
     information: Array
     peak: float
 
-    def joined(self, other: MeanMeasurement, one: MeasurementModel) -> MeanMeasurement:
-        """Return the mean of both."""
+    def combine(self, other: MeanMeasurement, one: MeasurementModel) -> MeanMeasurement:
+        """Return the mean of both, weighted by information."""
         information = self.information + other.information
-        apart = self._apart(other, one)
+        apart = self._difference(other, one)
         share = np.linalg.solve(information, other.information)
         step = share @ apart
         peak = self.peak + other.peak - float(apart @ self.information @ step) / 2
@@ -60,7 +61,7 @@ class MeanMeasurement:
         pose = retract(self.value.reshape(4, 4), step)
         return MeanMeasurement(pose.reshape(-1), information, peak)
 
-    def _apart(self, other: MeanMeasurement, one: MeasurementModel) -> Array:
+    def _difference(self, other: MeanMeasurement, one: MeasurementModel) -> Array:
         if not one.is_pose:
             return wrap_difference(other.value - self.value, one.period)
         return pose_difference(other.value.reshape(4, 4), self.value.reshape(4, 4))
@@ -68,60 +69,60 @@ class MeanMeasurement:
 
 @dataclass(frozen=True, eq=False)
 class StaticRecord:
-    """What is known of a group since it moved last.
+    """Prior and averaged measurements of a group since it last moved.
 
     Attributes
     ----------
     prior
-        What was believed before anything was seen, in the tangent at the present place.
-    seen
-        What was seen since, by the number of the observation.
-    known
-        The values of what is known, at which it was seen.
+        Prior before the measurements, in the tangent space at the present estimate.
+    means
+        Averaged measurements, by number of the observation.
+    inputs
+        Values of the inputs during these measurements.
     evidence
-        The log evidence of the group before.
-    looks
-        How often something was seen.
+        Log evidence of the group before these measurements.
+    count
+        Number of updates.
     branch
-        The same for all that follows from the same first look.
+        Identity of the first update; records that descend from it share this object.
     """
 
     prior: QuadraticCost
-    seen: Mapping[int, MeanMeasurement]
-    known: Array
+    means: Mapping[int, MeanMeasurement]
+    inputs: Array
     evidence: float
-    looks: int = 0
+    count: int = 0
     branch: object = field(default_factory=object)
 
-    def with_seen(
+    def with_measurements(
         self, new: Mapping[int, MeanMeasurement], observations: Sequence[MeasurementModel]
     ) -> StaticRecord:
-        """Return it with more that was seen."""
-        seen = dict(self.seen)
+        """Return the record with further measurements averaged in."""
+        means = dict(self.means)
         for i, one in new.items():
-            seen[i] = seen[i].joined(one, observations[i]) if i in seen else one
-        return replace(self, seen=seen, looks=self.looks + 1)
+            means[i] = means[i].combine(one, observations[i]) if i in means else one
+        return replace(self, means=means, count=self.count + 1)
 
-    def reading(self, layout: Layout, reader: MeasurementReader) -> Measurements:
-        """Return all of it as one reading."""
-        nothing = reader.nothing()
-        white, scale = nothing.whitening.copy(), nothing.log_scale.copy()
-        for i, seen in self.seen.items():
-            nothing.values[layout.seen_slices[i]] = seen.value
-            nothing.seen[i], scale[i] = True, -seen.peak
-            white[layout.white_slices[i]] = whitening(inverse_spd(seen.information)).reshape(-1)
-        return nothing._replace(whitening=white, log_scale=scale)
+    def as_measurements(self, layout: Layout, reader: MeasurementReader) -> Measurements:
+        """Return the averaged measurements as one reading."""
+        empty = reader.empty()
+        white, scale = empty.whitening.copy(), empty.log_scale.copy()
+        for i, mean in self.means.items():
+            empty.values[layout.measurement_slices[i]] = mean.value
+            empty.mask[i], scale[i] = True, -mean.peak
+            white[layout.whitening_slices[i]] = whitening(inverse_spd(mean.information)).reshape(-1)
+        return empty._replace(whitening=white, log_scale=scale)
 
 
 class StaticBatch:
-    """Keeps what was seen of what stands still.
+    """Batch relinearisation for the groups of a tracker.
 
     Parameters
     ----------
-    layout, residuals, reader, solver, openness
-        The parts of a tracker.
+    layout, residuals, reader, solver, unobservable
+        Components of the tracker.
     update
-        What does the same as the solver, and faster where it can.
+        MAP update that runs compiled code where it can.
     """
 
     def __init__(
@@ -130,104 +131,108 @@ class StaticBatch:
         residuals: Residuals,
         reader: MeasurementReader,
         solver: MapSolver,
-        openness: UnobservableDirections,
+        unobservable: UnobservableDirections,
         update: UpdateFunction,
     ) -> None:
         self._layout, self._residuals, self._reader = layout, residuals, reader
-        self._solver, self._openness, self._update = solver, openness, update
-        # A single coordinate has no other that it could move with.
+        self._solver, self._unobservable, self._update = solver, unobservable, update
+        # In a group with one direction, linearisation at several estimates adds no false information.
         self._groups = {number for number, group in enumerate(layout.groups) if len(group.t) > 1}
 
-    def remember(
+    def relinearise(
         self,
         before: InformationState,
-        found: MapResult,
+        result: MapResult,
         reading: Measurements,
-        known: Array,
+        inputs: Array,
         groups: Sequence[int] | None = None,
     ) -> None:
-        """Have what was found follow from all that was seen, where it has open directions.
+        """Recompute an update from all stored measurements where a group has unobservable directions.
 
         Parameters
         ----------
         before
-            What was believed before a reading.
-        found
-            What is believed after it, which is changed.
+            Belief before the reading.
+        result
+            Result of the update; its belief is changed in place.
         reading
-            What was seen.
-        known
-            Values of what is known.
+            The measurements.
+        inputs
+            Values of the inputs.
         groups
-            The numbers of those that are changed; all if None.
+            Numbers of the groups to recompute; all if None.
         """
-        after, weights = found.belief, found.weights
+        after, weights = result.belief, result.weights
         for number in self._groups if groups is None else self._groups.intersection(groups):
-            group, old = self._layout.groups[number], before.standing[number]
+            group, old = self._layout.groups[number], before.records[number]
             new = {
-                i: self._seen(i, reading, 1.0 if weights is None else float(weights[i]))
-                for i in group.seen
-                if reading.seen[i] and (weights is None or weights[i] > _NOTHING)
+                i: self._mean_measurement(i, reading, 1.0 if weights is None else float(weights[i]))
+                for i in group.observation_indices
+                if reading.mask[i] and (weights is None or weights[i] > _LEAST_WEIGHT)
             }
-            if not new or (old is None and not self._is_open(number, after)):
+            if not new or (old is None and not self._is_unobservable(number, after)):
                 continue
             if old is None:
                 evidence = float(before.evidence[number])
-                first = StaticRecord(before.part(group.t), {}, known, evidence)
-                standing = first.with_seen(new, self._layout.observations)
-                if found.priors is not None or not group.by_speeds:
-                    after.standing[number] = replace(
-                        standing, prior=self._prior(number, before, first.prior, found)
+                first = StaticRecord(before.group_cost(group.t), {}, inputs, evidence)
+                record = first.with_measurements(new, self._layout.observations)
+                if result.priors is not None or not group.by_speeds:
+                    after.records[number] = replace(
+                        record, prior=self._transport_prior(number, before, first.prior, result)
                     )
                     continue
                 old = first
-            standing = old.with_seen(new, self._layout.observations)
-            self._solve(number, before, after, standing, are_all_right=weights is None)
-            # What was never seen yet may still say that all was taken for its mirror image.
-            if len(standing.seen) == len(group.seen) and not self._is_open(number, after):
-                after.standing[number] = None
+            record = old.with_measurements(new, self._layout.observations)
+            self._solve(number, before, after, record, all_inliers=weights is None)
+            # Observations still to come may show that the estimate is a mirror image: keep the record.
+            if len(record.means) == len(group.observation_indices) and not self._is_unobservable(
+                number, after
+            ):
+                after.records[number] = None
 
-    def add_noise(self, number: int, before: InformationState, after: InformationState, grown: Array) -> None:
-        """Let go of what noise takes away: of a group that moves by that alone, the rest is remembered.
+    def add_noise(
+        self, number: int, before: InformationState, after: InformationState, added_variance: Array
+    ) -> None:
+        """Add process noise to the record of a group that moves by noise alone.
 
         Parameters
         ----------
         number
-            Of the group.
+            Number of the group.
         before, after
-            What was believed before and after, of which the latter is changed.
-        grown
-            The variances that have come to its tangent (t,).
+            Beliefs before and after the prediction; ``after`` is changed in place.
+        added_variance
+            Variances added to its tangent directions (t,).
         """
-        standing, group = before.standing[number], self._layout.groups[number]
-        assert standing is not None
-        out = self._residuals.evaluate(after.x, standing.known)
-        seen = {}
-        for i, one in standing.seen.items():
+        record, group = before.records[number], self._layout.groups[number]
+        assert record is not None
+        out = self._residuals.evaluate(after.x, record.inputs)
+        means = {}
+        for i, one in record.means.items():
             size = self._layout.observations[i].size
-            slope = out[self._layout.slope_slices[i]].reshape(size, len(group.t))
-            # All that was seen moves alike. Taken to be independent, each is told of the motion of all.
-            noise = len(standing.seen) * (slope * grown) @ slope.T
+            slope = out[self._layout.jacobian_slices[i]].reshape(size, len(group.t))
+            # Errors from motion are fully correlated; scaled by their number they may count as independent.
+            noise = len(record.means) * (slope * added_variance) @ slope.T
             information = inverse_spd(inverse_spd(one.information) + noise)
             lost = np.linalg.slogdet(one.information)[1] - np.linalg.slogdet(information)[1]
-            seen[i] = replace(one, information=information, peak=one.peak - float(lost) / 2)
-        covariance = inverse_spd(standing.prior.matrix)
-        matrix = inverse_spd(covariance + np.diag(grown))
-        prior = QuadraticCost.of_density(matrix, matrix @ (covariance @ standing.prior.vector))
+            means[i] = replace(one, information=information, peak=one.peak - float(lost) / 2)
+        covariance = inverse_spd(record.prior.matrix)
+        matrix = inverse_spd(covariance + np.diag(added_variance))
+        prior = QuadraticCost.from_density(matrix, matrix @ (covariance @ record.prior.vector))
         step = after.x[group.x] - before.x[group.x]
-        loose = replace(standing, prior=prior.carried(step, None), seen=seen, evidence=0.0)
-        # What was seen is as probable as it was; only what comes is judged by what is left.
-        as_told = self._from_all(number, after, loose).belief.evidence[number]
-        after.standing[number] = replace(loose, evidence=float(before.evidence[number] - as_told))
+        reduced = replace(record, prior=prior.transported(step, None), means=means, evidence=0.0)
+        # The evidence of past measurements stays; the reduced information applies to future ones only.
+        from_record = self._solve_batch(number, after, reduced).belief.evidence[number]
+        after.records[number] = replace(reduced, evidence=float(before.evidence[number] - from_record))
 
-    def _is_open(self, number: int, belief: InformationState) -> bool:
+    def _is_unobservable(self, number: int, belief: InformationState) -> bool:
         t = self._layout.groups[number].t
-        return self._openness.is_open(number, belief.information[np.ix_(t, t)])
+        return self._unobservable.is_unobservable(number, belief.information[np.ix_(t, t)])
 
-    def _seen(self, i: int, reading: Measurements, weight: float) -> MeanMeasurement:
+    def _mean_measurement(self, i: int, reading: Measurements, weight: float) -> MeanMeasurement:
         size = self._layout.observations[i].size
-        white = reading.whitening[self._layout.white_slices[i]].reshape(size, size)
-        value = reading.values[self._layout.seen_slices[i]].copy()
+        white = reading.whitening[self._layout.whitening_slices[i]].reshape(size, size)
+        value = reading.values[self._layout.measurement_slices[i]].copy()
         return MeanMeasurement(value, weight * (white.T @ white), -float(reading.log_scale[i]))
 
     def _solve(
@@ -235,35 +240,37 @@ class StaticBatch:
         number: int,
         before: InformationState,
         after: InformationState,
-        standing: StaticRecord,
-        are_all_right: bool,
+        record: StaticRecord,
+        all_inliers: bool,
     ) -> None:
-        """Find the most probable state from where it was, and what is believed there."""
+        """Find the MAP estimate of the record, starting at the previous estimate, and store it."""
         group = self._layout.groups[number]
-        found = self._from_all(number, before, standing)
-        after.x[group.x] = found.belief.x[group.x]
-        after.put(group.t, found.belief.part(group.t))
-        if are_all_right:
-            after.evidence[number] = found.belief.evidence[number]
-        after.standing[number] = replace(standing, prior=self._prior(number, before, standing.prior, found))
+        result = self._solve_batch(number, before, record)
+        after.x[group.x] = result.belief.x[group.x]
+        after.set_group_cost(group.t, result.belief.group_cost(group.t))
+        if all_inliers:
+            after.evidence[number] = result.belief.evidence[number]
+        after.records[number] = replace(
+            record, prior=self._transport_prior(number, before, record.prior, result)
+        )
 
-    def _from_all(self, number: int, before: InformationState, standing: StaticRecord) -> MapResult:
-        """Return what follows from all that is remembered, beginning at a place."""
+    def _solve_batch(self, number: int, before: InformationState, record: StaticRecord) -> MapResult:
+        """Return the MAP estimate from all stored measurements of a group."""
         group = self._layout.groups[number]
         first = before.copy()
-        first.put(group.t, standing.prior)
-        first.evidence[number] = standing.evidence
-        reading = standing.reading(self._layout, self._reader)
-        # How a tangent turns on the way, C does not tell.
+        first.set_group_cost(group.t, record.prior)
+        first.evidence[number] = record.evidence
+        reading = record.as_measurements(self._layout, self._reader)
+        # The C code does not return the transport of the tangent space.
         update = self._solver.update if group.by_speeds else self._update
-        return update(first, reading, standing.known, [number])
+        return update(first, reading, record.inputs, [number])
 
-    def _prior(
-        self, number: int, before: InformationState, prior: QuadraticCost, found: MapResult
+    def _transport_prior(
+        self, number: int, before: InformationState, prior: QuadraticCost, result: MapResult
     ) -> QuadraticCost:
-        """Return what was believed before, in the tangent at the place that was found."""
-        if found.priors is not None:
-            return found.priors[number]
+        """Return the prior in the tangent space at the new estimate."""
+        if result.priors is not None:
+            return result.priors[number]
         group = self._layout.groups[number]
-        step = found.belief.x[group.x] - before.x[group.x]
-        return prior.carried(step, None)
+        step = result.belief.x[group.x] - before.x[group.x]
+        return prior.transported(step, None)

@@ -29,21 +29,21 @@ from .static_batch import StaticBatch
 
 @dataclass(slots=True, eq=False)
 class StepResult:
-    """What an update found.
+    """Result of an update of all components.
 
     Attributes
     ----------
-    modes
-        After it.
+    mixture
+        Gaussian sum after the update.
     nis, dof
-        The normalised innovation squared, and of how many numbers it is the sum.
+        Normalised innovation squared, and its degrees of freedom.
     outliers
-        The numbers of the observations that were not believed.
+        Numbers of the observations with an inlier probability below one half.
     rounds
-        How many times the model was evaluated, at most for one explanation.
+        Number of model evaluations, the largest of all candidates.
     """
 
-    modes: GaussianSum
+    mixture: GaussianSum
     nis: float
     dof: int
     outliers: tuple[int, ...]
@@ -51,318 +51,345 @@ class StepResult:
 
 
 _OUTSIDE = 1e-9
-# So few deviations from its mean a belief is about that, as after an update.
+# A belief closer to its mean, in deviations, is about its mean, as after an update.
 _SETTLED = 1e-5
 
 
 class UpdateStep:
-    """What is fixed about a tracker.
+    """Prediction and update of all components of a tracker.
 
     Parameters
     ----------
     layout, limits
-        What is estimated.
+        Layout of the state, and its limits.
     outliers
-        How observations may be wrong; None if they never are.
+        Outlier model; None without outliers.
 
     Attributes
     ----------
-    turns
-        The coordinates that come back after a turn.
+    periodic
+        Periodic coordinates.
     """
 
     def __init__(self, layout: Layout, limits: StateBounds, outliers: Outliers | None) -> None:
         self.layout, self.limits, self.outliers = layout, limits, outliers
-        self.function = layout.compiled()
-        self.charted = ProcessModel(layout)
+        self.function = layout.compile_function()
+        self.process_model = ProcessModel(layout)
         self.residuals = Residuals(layout, self.function)
         self.reader = MeasurementReader(layout)
-        self.solver = MapSolver(layout, self.residuals, self.charted, limits)
-        self.openness = UnobservableDirections(layout)
-        self.memory = StaticBatch(
-            layout, self.residuals, self.reader, self.solver, self.openness, self._found
+        self.solver = MapSolver(layout, self.residuals, self.process_model, limits)
+        self.unobservable = UnobservableDirections(layout)
+        self.static_batch = StaticBatch(
+            layout, self.residuals, self.reader, self.solver, self.unobservable, self._map_update
         )
-        boxes = self.solver.boxes
-        parts = (layout, self.residuals, self.charted, self.reader, boxes, self.openness)
-        self.ridge, self.widening = RidgeCovariance(*parts), CovarianceInflation(*parts)
-        self.likeness = MergeCriterion(layout, self.residuals, self.reader, self.charted, self.ridge)
-        self.saddles = StationaryPoints(layout, self.charted, self.openness, boxes)
+        group_bounds = self.solver.group_bounds
+        parts = (layout, self.residuals, self.process_model, self.reader, group_bounds, self.unobservable)
+        self.ridge_covariance, self.inflation = RidgeCovariance(*parts), CovarianceInflation(*parts)
+        self.merge_criterion = MergeCriterion(
+            layout, self.residuals, self.reader, self.process_model, self.ridge_covariance
+        )
+        self.stationary_points = StationaryPoints(layout, self.process_model, self.unobservable, group_bounds)
         self.native = (
-            NativeMapSolver(layout, limits, self.function, self.charted)
+            NativeMapSolver(layout, limits, self.function, self.process_model)
             if NativeMapSolver.suits(layout)
             else None
         )
-        self.undoubted = (
+        self.inlier_solver = (
             NativeInlierSolver(layout, self.native, outliers) if self.native and outliers else None
         )
-        self.turns: frozenset[Symbol] = frozenset()
+        self.periodic: frozenset[Symbol] = frozenset()
         if self.native:
             native_library.prepare()
 
     @property
     def is_native(self) -> bool:
-        """Whether C does the work where nothing is ambiguous."""
+        """True if unambiguous updates run in compiled C."""
         return self.native is not None and self.native.is_ready
 
-    def update(self, modes: GaussianSum, reading: Measurements, known: Array) -> StepResult:
-        """Return what is believed after a reading; see :meth:`.solving.Solver.update`."""
-        modes = self._at_other_values(modes, known)
-        if not modes.is_single or self.outliers is not None:
-            return self._weighed(modes, reading, known)
-        before = modes.best
-        found = self._found(before, reading, known)
-        self.memory.remember(before, found, reading, known)
-        self._settle(found.belief)
-        after = GaussianSum(self.layout, [found.belief], modes.alive)
-        stuck = self.saddles.unexplained(before, found)
-        explained = self._freed(before, found, reading, known, stuck) if stuck else []
-        if not explained:
-            return StepResult(after, float(found.nis.sum()), int(found.dof.sum()), (), found.rounds)
-        first = self._candidate(found.belief, None, found.nis, found.dof, stuck, known)
-        after, best = after.ranked([first, *explained], partial(self.likeness.is_same, known, self.turns))
+    def update(self, mixture: GaussianSum, reading: Measurements, inputs: Array) -> StepResult:
+        """Update all components with a reading; see :meth:`.map_update.MapSolver.update`."""
+        mixture = self._forget_other_inputs(mixture, inputs)
+        if not mixture.is_single or self.outliers is not None:
+            return self._update_mixture(mixture, reading, inputs)
+        before = mixture.best
+        result = self._map_update(before, reading, inputs)
+        self.static_batch.relinearise(before, result, reading, inputs)
+        self._wrap_angles(result.belief)
+        after = GaussianSum(self.layout, [result.belief], mixture.alive)
+        unexplained = self.stationary_points.unexplained(before, result)
+        candidates = self._restart(before, result, reading, inputs, unexplained) if unexplained else []
+        if not candidates:
+            return StepResult(after, float(result.nis.sum()), int(result.dof.sum()), (), result.rounds)
+        first = self._candidate(result.belief, None, result.nis, result.dof, unexplained, inputs)
+        after, best = after.select(
+            [first, *candidates], partial(self.merge_criterion.should_merge, inputs, self.periodic)
+        )
         for number, candidate in enumerate(best):
             if candidate:
-                found.nis[number] = candidate.nis[number]
-        return StepResult(after, float(found.nis.sum()), int(found.dof.sum()), (), found.rounds)
+                result.nis[number] = candidate.nis[number]
+        return StepResult(after, float(result.nis.sum()), int(result.dof.sum()), (), result.rounds)
 
-    def _found(
-        self, belief: InformationState, reading: Measurements, known: Array, groups: list[int] | None = None
+    def _map_update(
+        self, belief: InformationState, reading: Measurements, inputs: Array, groups: list[int] | None = None
     ) -> MapResult:
-        """Return what follows if everything is right; for all groups that are seen, if none are given."""
-        found = None
+        """Return the least-squares update of some groups; of all measured groups if None."""
+        result = None
         if self.native is not None and self.native.is_ready:
-            found = self.native.update(belief, reading, known)
-        if found is None:
-            groups = self._seen(reading) if groups is None else groups
-            found = self.solver.update(belief, reading, known, groups)
-        return found
+            result = self.native.update(belief, reading, inputs)
+        if result is None:
+            groups = self._measured_groups(reading) if groups is None else groups
+            result = self.solver.update(belief, reading, inputs, groups)
+        return result
 
-    def _freed(
+    def _restart(
         self,
         before: InformationState,
-        found: MapResult,
+        result: MapResult,
         reading: Measurements,
-        known: Array,
+        inputs: Array,
         groups: list[int],
     ) -> list[Candidate]:
-        """Return other explanations of groups that are where nothing that was seen has a slope."""
+        """Return candidates from restarts beside states where the measurement Jacobian vanishes."""
         candidates = []
-        for start in self.saddles.aside(before, found.belief, groups, known):
+        for start in self.stationary_points.restart_states(before, result.belief, groups, inputs):
             try:
-                candidates.append(self._from_aside(start, reading, known, groups))
-            except KineverseError:  # it leads nowhere
+                candidates.append(self._update_from(start, reading, inputs, groups))
+            except KineverseError:  # the restart fails
                 continue
         return candidates
 
-    def _from_aside(
-        self, start: InformationState, reading: Measurements, known: Array, groups: list[int]
+    def _update_from(
+        self, start: InformationState, reading: Measurements, inputs: Array, groups: list[int]
     ) -> Candidate:
         if self.outliers is not None:
-            start = self.solver.where_most_agree(start, reading, known, groups)
-        found = self.solver.update(start, reading, known, groups, self.outliers or "all")
-        candidate = self._explained(start, found, reading, known, groups)
+            start = self.solver.find_robust_start(start, reading, inputs, groups)
+        result = self.solver.update(start, reading, inputs, groups, self.outliers or "gaussian")
+        candidate = self._relinearised(start, result, reading, inputs, groups)
         if self.outliers is None:
-            # Where all that is remembered was another's, what remains unexplained is what counts.
-            errors = self.residuals.errors(candidate.said, reading, np.flatnonzero(reading.seen).tolist())
+            # The stored measurements belong to another branch: the present residuals decide.
+            errors = self.residuals.errors(
+                candidate.predicted, reading, np.flatnonzero(reading.mask).tolist()
+            )
             for number in groups:
-                if start.standing[number] is not None:
+                if start.records[number] is not None:
                     squares = (
                         float(e @ e) for i, (e, _) in errors.items() if self.layout.group_of[i] == number
                     )
                     candidate.nis[number] = sum(squares)
         return candidate
 
-    def _explained(
+    def _relinearised(
         self,
         before: InformationState,
-        found: MapResult,
+        result: MapResult,
         reading: Measurements,
-        known: Array,
+        inputs: Array,
         groups: list[int],
     ) -> Candidate:
-        self.memory.remember(before, found, reading, known, groups)
-        self._settle(found.belief)
-        return self._candidate(found.belief, found.weights, found.nis, found.dof, groups, known)
+        self.static_batch.relinearise(before, result, reading, inputs, groups)
+        self._wrap_angles(result.belief)
+        return self._candidate(result.belief, result.weights, result.nis, result.dof, groups, inputs)
 
-    def _at_other_values(self, modes: GaussianSum, known: Array) -> GaussianSum:
-        """Return the same beliefs, which remember nothing that was seen at other values of what is known."""
+    def _forget_other_inputs(self, mixture: GaussianSum, inputs: Array) -> GaussianSum:
+        """Drop static records that were taken at other values of the inputs."""
 
         def changed(belief: InformationState) -> InformationState:
             groups = [
                 number
-                for number, standing in enumerate(belief.standing)
-                if standing is not None and not np.array_equal(standing.known, known)
+                for number, record in enumerate(belief.records)
+                if record is not None and not np.array_equal(record.inputs, inputs)
             ]
-            return self._widened(belief, groups)
+            return self._inflated(belief, groups)
 
-        return modes.each(changed) if len(known) else modes
+        return mixture.map(changed) if len(inputs) else mixture
 
-    def _widened(self, belief: InformationState, groups: Iterable[int]) -> InformationState:
+    def _inflated(self, belief: InformationState, groups: Iterable[int]) -> InformationState:
         wide = belief
         for number in groups:
-            if belief.standing[number] is not None:
+            if belief.records[number] is not None:
                 wide = belief.copy() if wide is belief else wide
-                self.widening.widen(number, wide)
+                self.inflation.inflate(number, wide)
         return wide
 
     def predict(
         self,
         belief: InformationState,
-        known: Array,
+        inputs: Array,
         dt: float,
         speeds: Mapping[Symbol, float],
         noise: Mapping[Symbol, float],
     ) -> InformationState:
-        """Return a belief ``dt`` seconds later, about the most probable point inside the limits.
+        """Predict a belief by ``dt`` seconds; it stays about the most probable point inside the limits.
 
-        Speeds are commanded; noise is variances by second that add to that.
+        Parameters
+        ----------
+        belief
+            Belief before; not changed.
+        inputs
+            Values of the inputs.
+        dt
+            Time step [s].
+        speeds, noise
+            Commanded speeds, and variances per second added to them.
         """
-        moving = self.charted.moving(speeds, noise)
-        shaken = [n for n in moving if belief.standing[n] is not None and self.charted.only_shakes(n, speeds)]
-        belief = self._widened(belief, set(moving).difference(shaken))
-        found = None
-        if self.native is not None and self.native.is_ready and not self.charted.is_driven:
-            tangent = self.layout.chart.tangent
-            moved, grown = (np.array([by.get(v, 0.0) for v in tangent]) * dt for by in (speeds, noise))
-            found = self.native.predict(belief, moved, grown)
-        if found is None:
-            found = belief.copy()
-            self.charted.predict(found, known, dt, speeds, noise)
-            if not self._is_at_top(found):
-                found = self.solver.inside(found, self.reader.nothing(), known)
-        for number in shaken:
-            # What is straight is a Gaussian, which has gone on as it should.
-            if self.widening.is_straight(number, belief):
-                found.standing[number] = None
+        moving = self.process_model.find_moving_groups(speeds, noise)
+        noise_only = [
+            n for n in moving if belief.records[n] is not None and self.process_model.is_noise_only(n, speeds)
+        ]
+        belief = self._inflated(belief, set(moving).difference(noise_only))
+        result = None
+        if self.native is not None and self.native.is_ready and not self.process_model.has_rates:
+            tangent = self.layout.tangent_space.tangent
+            displacement, added_variance = (
+                np.array([by.get(v, 0.0) for v in tangent]) * dt for by in (speeds, noise)
+            )
+            result = self.native.predict(belief, displacement, added_variance)
+        if result is None:
+            result = belief.copy()
+            self.process_model.predict(result, inputs, dt, speeds, noise)
+            if not self._is_at_mean(result):
+                result = self.solver.constrain(result, self.reader.empty(), inputs)
+        for number in noise_only:
+            # A straight posterior is Gaussian; its prediction is exact.
+            if self.inflation.is_straight(number, belief):
+                result.records[number] = None
                 continue
             group = self.layout.groups[number]
-            grown = np.array([noise.get(v, 0.0) for v in group.tangent]) * dt
-            self.memory.add_noise(number, belief, found, grown)
-        self._settle(found)
-        return found
+            added_variance = np.array([noise.get(v, 0.0) for v in group.tangent]) * dt
+            self.static_batch.add_noise(number, belief, result, added_variance)
+        self._wrap_angles(result)
+        return result
 
-    def _is_at_top(self, belief: InformationState) -> bool:
-        """Whether a belief is about its own mean, inside limits that are easily looked at."""
+    def _is_at_mean(self, belief: InformationState) -> bool:
+        """Return True if a belief is about its own mean and inside bounds of single coordinates."""
         limits = self.limits
         if self.layout.limits or (belief.x < limits.lower).any() or (belief.x > limits.upper).any():
             return False
         return float(belief.vector @ np.linalg.solve(belief.information, belief.vector)) < _SETTLED**2
 
-    def is_possible(self, number: int, belief: InformationState, known: Array) -> bool:
-        """Whether a group can be at a place: inside its limits, and where the model says something."""
+    def is_possible(self, number: int, belief: InformationState, inputs: Array) -> bool:
+        """Return True if a group is inside its limits at a state and its model is finite there."""
         try:
-            out = self.residuals.evaluate(belief.x, known)
+            out = self.residuals.evaluate(belief.x, inputs)
         except KineverseError:
             return False
         group = self.layout.groups[number]
-        spoken = [
+        parts = [
             out[where]
-            for i in group.seen
-            for where in (self.layout.value_slices[i], self.layout.slope_slices[i])
+            for i in group.observation_indices
+            for where in (self.layout.value_slices[i], self.layout.jacobian_slices[i])
         ]
-        if not all(np.isfinite(each).all() for each in spoken):
+        if not all(np.isfinite(each).all() for each in parts):
             return False
-        return self.solver.room(number, belief.x[group.x], out).violation < _OUTSIDE
+        return self.solver.rows(number, belief.x[group.x], out).violation < _OUTSIDE
 
-    def _seen(self, reading: Measurements) -> list[int]:
-        return [n for n, group in enumerate(self.layout.groups) if reading.seen[list(group.seen)].any()]
+    def _measured_groups(self, reading: Measurements) -> list[int]:
+        return [
+            n
+            for n, group in enumerate(self.layout.groups)
+            if reading.mask[list(group.observation_indices)].any()
+        ]
 
-    def _settle(self, belief: InformationState) -> None:
-        """Bring back what has gone more than half a turn.
+    def _wrap_angles(self, belief: InformationState) -> None:
+        """Wrap periodic coordinates to half a turn.
 
         Raises
         ------
         InvalidValueError
-            If there are numbers that are not finite: nobody is ever told such.
+            If the belief is not finite. Non-finite results are never returned.
         """
         if not np.isfinite(belief.numbers).all():
             raise InvalidValueError(
                 "The step leads to numbers that are not finite, as what was seen or the covariances are too "
                 "large or too small for floating point. The belief stays as it was."
             )
-        for x in self.turns:
-            i = self.layout.chart.coordinates.index(x)
+        for x in self.periodic:
+            i = self.layout.tangent_space.coordinates.index(x)
             belief.x[i] = math.remainder(belief.x[i], 2 * math.pi)
 
-    def _weighed(self, modes: GaussianSum, reading: Measurements, known: Array) -> StepResult:
-        """Explain a reading in all ways, and keep the best."""
-        seen = self._seen(reading)
-        candidates, rounds = self._undoubted(modes, reading, known, seen)
-        sure = {number for candidate in candidates for number in candidate.groups}
-        left = [number for number in seen if number not in sure]
-        for mode, belief in enumerate(modes.beliefs):
-            groups = modes.groups(mode, left)
+    def _update_mixture(self, mixture: GaussianSum, reading: Measurements, inputs: Array) -> StepResult:
+        """Update all components and keep the best candidates."""
+        measured = self._measured_groups(reading)
+        candidates, rounds = self._solve_inliers(mixture, reading, inputs, measured)
+        solved = {number for candidate in candidates for number in candidate.groups}
+        remaining = [number for number in measured if number not in solved]
+        for component, belief in enumerate(mixture.beliefs):
+            groups = mixture.groups(component, remaining)
             if not groups:
                 continue
             try:
-                new, took = self._explanations(belief, reading, known, groups, mode == 0)
+                new, count = self._explain(belief, reading, inputs, groups, component == 0)
             except KineverseError:
-                # The best one has to be explained; another that leads nowhere is given up.
-                if mode == 0:
+                # The best component must succeed; others that fail are dropped.
+                if component == 0:
                     raise
                 continue
             candidates += new
-            rounds = max(rounds, took)
-        after, best = modes.ranked(candidates, partial(self.likeness.is_same, known, self.turns))
+            rounds = max(rounds, count)
+        after, best = mixture.select(
+            candidates, partial(self.merge_criterion.should_merge, inputs, self.periodic)
+        )
         nis = sum(float(c.nis[n]) for n, c in enumerate(best) if c)
         dof = sum(int(c.dof[n]) for n, c in enumerate(best) if c)
-        doubted = [
+        rejected = [
             i
             for i, number in enumerate(self.layout.group_of)
-            if reading.seen[i] and (c := best[number]) and c.weights is not None and c.weights[i] < 0.5
+            if reading.mask[i] and (c := best[number]) and c.weights is not None and c.weights[i] < 0.5
         ]
-        return StepResult(after, nis, dof, tuple(doubted), rounds)
+        return StepResult(after, nis, dof, tuple(rejected), rounds)
 
-    def _undoubted(
-        self, modes: GaussianSum, reading: Measurements, known: Array, groups: list[int]
+    def _solve_inliers(
+        self, mixture: GaussianSum, reading: Measurements, inputs: Array, groups: list[int]
     ) -> tuple[list[Candidate], int]:
-        """Return what C finds of groups that can be explained in one way only."""
-        if self.undoubted is None or not self.is_native:
+        """Return the candidates that C finds for unambiguous groups."""
+        if self.inlier_solver is None or not self.is_native:
             return [], 0
-        found, rounds = self.undoubted.explained(modes, reading, known, groups)
-        for candidate in found:
+        result, rounds = self.inlier_solver.solve(mixture, reading, inputs, groups)
+        for candidate in result:
             as_found = MapResult(candidate.belief, candidate.nis, candidate.dof, rounds, candidate.weights)
-            self.memory.remember(modes.best, as_found, reading, known, candidate.groups)
-            self._settle(candidate.belief)
-        return found, rounds
+            self.static_batch.relinearise(mixture.best, as_found, reading, inputs, candidate.groups)
+            self._wrap_angles(candidate.belief)
+        return result, rounds
 
-    def _explanations(
-        self, belief: InformationState, reading: Measurements, known: Array, groups: list[int], is_best: bool
+    def _explain(
+        self, belief: InformationState, reading: Measurements, inputs: Array, groups: list[int], is_best: bool
     ) -> tuple[list[Candidate], int]:
-        """Return a belief after a reading: if all is right, and in ways in which some of it is wrong."""
+        """Return candidates for one component: without outliers, with outliers, and all outliers."""
         if self.outliers is None:
-            found = self._found(belief, reading, known, groups)
-            explained = [self._explained(belief, found, reading, known, groups)]
-            if is_best and (stuck := self._stuck(belief, found, reading, groups)):
-                explained += self._freed(belief, found, reading, known, stuck)
-            return explained, found.rounds
-        nearby = self.solver.where_most_agree(belief, reading, known, groups)
-        explained, rounds = [], 0
-        for start in (belief, nearby):
-            found = self.solver.update(start, reading, known, groups, self.outliers)
-            explained.append(self._explained(start, found, reading, known, groups))
-            rounds = max(rounds, found.rounds)
-        if is_best and (stuck := self._stuck(belief, found, reading, groups)):
-            explained += self._freed(belief, found, reading, known, stuck)
-        nothing = belief.copy()
+            result = self._map_update(belief, reading, inputs, groups)
+            candidates = [self._relinearised(belief, result, reading, inputs, groups)]
+            if is_best and (unexplained := self._unexplained(belief, result, reading, groups)):
+                candidates += self._restart(belief, result, reading, inputs, unexplained)
+            return candidates, result.rounds
+        robust_start = self.solver.find_robust_start(belief, reading, inputs, groups)
+        candidates, rounds = [], 0
+        for start in (belief, robust_start):
+            result = self.solver.update(start, reading, inputs, groups, self.outliers)
+            candidates.append(self._relinearised(start, result, reading, inputs, groups))
+            rounds = max(rounds, result.rounds)
+        if is_best and (unexplained := self._unexplained(belief, result, reading, groups)):
+            candidates += self._restart(belief, result, reading, inputs, unexplained)
+        all_outliers = belief.copy()
         none = np.zeros(len(self.layout.groups))
         for number in groups:
-            seen = [i for i in self.layout.groups[number].seen if reading.seen[i]]
-            wrong = sum(self.outliers.log_density(self.layout.observations[i]) for i in seen)
-            nothing.evidence[number] += wrong
+            measured = [i for i in self.layout.groups[number].observation_indices if reading.mask[i]]
+            log_outliers = sum(self.outliers.log_density(self.layout.observations[i]) for i in measured)
+            all_outliers.evidence[number] += log_outliers
         weights = np.zeros(len(self.layout.observations))
-        explained.append(self._candidate(nothing, weights, none, none, groups, known))
-        return explained, rounds
+        candidates.append(self._candidate(all_outliers, weights, none, none, groups, inputs))
+        return candidates, rounds
 
-    def _stuck(
-        self, belief: InformationState, found: MapResult, reading: Measurements, groups: list[int]
+    def _unexplained(
+        self, belief: InformationState, result: MapResult, reading: Measurements, groups: list[int]
     ) -> list[int]:
-        """Return the groups of which something is not explained, or taken for wrong."""
-        stuck = set(self.saddles.unexplained(belief, found))
-        if found.weights is not None:
-            doubted = reading.seen & (found.weights < 0.5)
-            stuck |= {n for n in groups if doubted[list(self.layout.groups[n].seen)].any()}
-        return [n for n in groups if n in stuck]
+        """Return the groups with unexplained residuals or outliers."""
+        unexplained = set(self.stationary_points.unexplained(belief, result))
+        if result.weights is not None:
+            rejected = reading.mask & (result.weights < 0.5)
+            unexplained |= {
+                n for n in groups if rejected[list(self.layout.groups[n].observation_indices)].any()
+            }
+        return [n for n in groups if n in unexplained]
 
     def _candidate(
         self,
@@ -371,6 +398,6 @@ class UpdateStep:
         nis: Array,
         dof: Array,
         groups: list[int],
-        known: Array,
+        inputs: Array,
     ) -> Candidate:
-        return Candidate(belief, self.residuals.evaluate(belief.x, known), weights, nis, dof, groups)
+        return Candidate(belief, self.residuals.evaluate(belief.x, inputs), weights, nis, dof, groups)

@@ -40,59 +40,62 @@ if TYPE_CHECKING:
 
 
 def arrange_state(
-    model: ModelView, seen: tuple[MeasurementModel, ...], handed: frozenset[Symbol]
+    model: ModelView, observations: tuple[MeasurementModel, ...], given: frozenset[Symbol]
 ) -> tuple[Layout, StateBounds]:
-    """Return what is estimated, and the limits of that.
+    """Choose the estimated coordinates, and collect their limits.
 
     Parameters
     ----------
-    model, seen
-        What is tracked, and what is observed of it.
-    handed
-        The coordinates that are measured elsewhere.
+    model, observations
+        The model, and its measurement models.
+    given
+        Coordinates that are measured elsewhere.
 
     Raises
     ------
     InvalidValueError
-        If an observation depends on nothing that could be estimated.
+        If an observation depends on no estimated coordinate.
     """
     rates = model.rates
-    values = [rates.resolve(to_plain(one.value)) for one in seen]
-    chart = build_tangent_space(rates, values, handed, model.default_state())
-    limits = collect_bounds(model, chart, handed)
-    looked_at = {s for value in values for s in value.symbols}
-    looked_at |= {s for c in limits.curved for s in c.symbols}
-    looked_at |= {s for x in chart.coordinates if x in rates for e in rates[x].values() for s in e.symbols}
-    inputs = sorted(looked_at - set(chart.coordinates), key=lambda s: s.sort_key)
-    return build_layout(chart, seen, limits.curved, inputs), limits
+    values = [rates.resolve(to_plain(one.value)) for one in observations]
+    tangent_space = build_tangent_space(rates, values, given, model.default_state())
+    limits = collect_bounds(model, tangent_space, given)
+    dependencies = {s for value in values for s in value.symbols}
+    dependencies |= {s for c in limits.curved for s in c.symbols}
+    dependencies |= {
+        s for x in tangent_space.coordinates if x in rates for e in rates[x].values() for s in e.symbols
+    }
+    inputs = sorted(dependencies - set(tangent_space.coordinates), key=lambda s: s.sort_key)
+    return build_layout(tangent_space, observations, limits.curved, inputs), limits
 
 
 class Tracker:
-    """Estimates the coordinates behind what is observed of a model.
+    """Recursive MAP estimator of the coordinates of a model from observed frames.
 
-    It finds the symbols, splits them into groups that share observations, and reads limits off constraints.
+    It finds the coordinates, splits them into independent groups, and takes limits from the model's
+    constraints.
 
     Parameters
     ----------
     model
-        What is tracked. The tracker stays with the version it was given.
+        The model. Later edits of it have no effect.
     observed
-        Names of frames whose poses are seen, or :class:`ObservedPose`, :class:`ObservedPosition`,
+        Names of frames whose poses are measured, or :class:`ObservedPose`, :class:`ObservedPosition`,
         :class:`ObservedExpression`.
     start
-        Where to begin, as far as that is known; else the middle of the limits, or the default state.
+        Initial values of some coordinates; others start in the middle of the limits, or at the default state.
     uncertainty
-        Standard deviations at the start [m], [rad], by coordinate, or by speed for directions that are no
+        Initial standard deviations [m], [rad], by coordinate, or by speed for directions that are no
         coordinate's; by default half the width of the limits, π for angles, 10 m.
     process_noise
-        Variances by speed and second, of what moves without being told.
+        Process noise as variance per second, by speed.
     outliers
-        How observations may be wrong: :class:`Outliers`, or True for the usual ones. None if they never are.
+        Outlier model: :class:`Outliers`, or True for the default one. None without outliers.
     locks
-        Whether what a lock of the model holds at the estimate stays, whatever noise and commands say.
-    known
-        Coordinates that are measured elsewhere, such as a robot's joints, and handed in as ``given`` at each
-        step.
+        True if coordinates held by a lock of the model ignore commands and process noise.
+    inputs
+        Coordinates that are measured elsewhere, such as a robot's joints. Each step takes their values as
+        ``inputs``.
     """
 
     def __init__(
@@ -105,120 +108,116 @@ class Tracker:
         process_noise: StateLike | None = None,
         outliers: Outliers | bool | None = None,
         locks: bool = False,
-        known: Symbol | str | Iterable[Symbol | str] = (),
+        inputs: Symbol | str | Iterable[Symbol | str] = (),
     ) -> None:
-        known = (known,) if isinstance(known, str | Symbol) else known
-        handed = frozenset(k if isinstance(k, Symbol) else model.symbol(k) for k in known)
-        layout, limits = arrange_state(model, build_measurement_models(model, observed), handed)
+        keys = (inputs,) if isinstance(inputs, str | Symbol) else inputs
+        given = frozenset(k if isinstance(k, Symbol) else model.symbol(k) for k in keys)
+        layout, limits = arrange_state(model, build_measurement_models(model, observed), given)
         self._layout = layout
-        self._filter = UpdateStep(layout, limits, as_outliers(outliers))
-        charted = self._filter.charted
-        self._noise = {charted.speed(k): require_positive(k, v) for k, v in (process_noise or {}).items()}
-        self._known = np.array([np.nan if s.value is None else s.value for s in layout.known])
-        self._locks = SpeedLocks(model, layout, charted) if locks else None
+        self._update_step = UpdateStep(layout, limits, as_outliers(outliers))
+        process_model = self._update_step.process_model
+        self._noise = {
+            process_model.speed(k): require_positive(k, v) for k, v in (process_noise or {}).items()
+        }
+        self._inputs = np.array([np.nan if s.value is None else s.value for s in layout.inputs])
+        self._locks = SpeedLocks(model, layout, process_model) if locks else None
         self._stamp: float | None = getattr(start, "stamp", None)
-        self._modes = self._first(model, start or {}, uncertainty or {})
-        self._outcome = StepResult(self._modes, 0.0, 0, (), 0)
+        self._mixture = self._initial_mixture(model, start or {}, uncertainty or {})
+        self._result = StepResult(self._mixture, 0.0, 0, (), 0)
 
-    def _first(self, model: ModelView, start: StateLike, uncertainty: StateLike) -> GaussianSum:
-        layout, chart = self._layout, self._layout.chart
-        filter_ = self._filter
+    def _initial_mixture(self, model: ModelView, start: StateLike, uncertainty: StateLike) -> GaussianSum:
+        layout, tangent_space = self._layout, self._layout.tangent_space
+        update_step = self._update_step
         state = start if isinstance(start, State) else State(start)
-        given = {x: state[x] for x in chart.coordinates if x in state}
-        strange = [] if isinstance(start, State) else [str(s) for s in state if s not in given]
-        if strange:
-            hint = suggest(strange[0], map(str, chart.coordinates), "coordinate")
-            raise UnknownNameError(f"'{strange[0]}' is not estimated. {hint}")
-        for key, value in given.items():
+        given = {x: state[x] for x in tangent_space.coordinates if x in state}
+        unknown = [] if isinstance(start, State) else [str(s) for s in state if s not in given]
+        if unknown:
+            hint = suggest(unknown[0], map(str, tangent_space.coordinates), "coordinate")
+            raise UnknownNameError(f"'{unknown[0]}' is not estimated. {hint}")
+        for symbol, value in given.items():
             if not math.isfinite(value):
-                raise InvalidValueError(f"start= of '{key}' is {value!r}; it must be finite.")
-        x = initial_point(model, chart, filter_.limits, given)
-        known = np.nan_to_num(self._known)
-        filter_.turns = find_periodic_coordinates(filter_, x, known)
-        deviations = initial_deviations(chart, filter_.limits, filter_.turns)
-        names = {str(v): i for i, v in enumerate(chart.tangent)}
-        own = [v for v in chart.tangent if v.position in chart.coordinates]
-        names.update({str(v.position): chart.tangent.index(v) for v in own})
-        for symbol, value in uncertainty.items():
-            if str(symbol) not in names:
-                raise UnknownNameError(
-                    f"'{symbol}' is not estimated. {suggest(str(symbol), names, 'coordinate')}"
-                )
-            deviations[names[str(symbol)]] = require_positive(symbol, value)
-        filter_.openness.deviations = deviations
+                raise InvalidValueError(f"start= of '{symbol}' is {value!r}; it must be finite.")
+        x = initial_point(model, tangent_space, update_step.limits, given)
+        inputs = np.nan_to_num(self._inputs)
+        update_step.periodic = find_periodic_coordinates(update_step, x, inputs)
+        deviations = initial_deviations(tangent_space, update_step.limits, update_step.periodic)
+        names = {str(v): i for i, v in enumerate(tangent_space.tangent)}
+        own = [v for v in tangent_space.tangent if v.position in tangent_space.coordinates]
+        names.update({str(v.position): tangent_space.tangent.index(v) for v in own})
+        for key, value in uncertainty.items():
+            if str(key) not in names:
+                raise UnknownNameError(f"'{key}' is not estimated. {suggest(str(key), names, 'coordinate')}")
+            deviations[names[str(key)]] = require_positive(key, value)
+        update_step.unobservable.deviations = deviations
         belief = InformationState((len(x), len(deviations), len(layout.groups)))
         belief.x[:] = x
         belief.information[:] = np.diag(deviations**-2.0)
-        return spread_starts(filter_, belief, known)
-
-    # -- what it is about ----------------------------------------------------------------------------------
+        return spread_starts(update_step, belief, inputs)
 
     @property
     def symbols(self) -> tuple[Symbol, ...]:
-        """The coordinates that are estimated, sorted."""
-        return self._layout.chart.coordinates
+        """Estimated coordinates, sorted."""
+        return self._layout.tangent_space.coordinates
 
     @property
     def groups(self) -> tuple[tuple[Symbol, ...], ...]:
-        """The coordinates that share observations or limits; groups are independent of each other."""
+        """Independent groups of coordinates that share observations or limits."""
         return tuple(group.coordinates for group in self._layout.groups)
 
     @property
     def limits(self) -> dict[Symbol, tuple[float, float]]:
-        """The bounds of single coordinates; ±inf where there are none, or only others that move."""
-        return self._filter.limits.by_symbol(self._layout.chart)
+        """Bounds of single coordinates; ±inf without constant bounds."""
+        return self._update_step.limits.by_symbol(self._layout.tangent_space)
 
     @property
-    def turning(self) -> frozenset[Symbol]:
-        """The coordinates that come back after a turn; they stay within half a turn."""
-        return self._filter.turns
+    def periodic(self) -> frozenset[Symbol]:
+        """Periodic coordinates; their values stay within half a turn."""
+        return self._update_step.periodic
 
     @property
     def constraints(self) -> tuple[str, ...]:
-        """The names of the constraints that limit the state."""
-        return self._filter.limits.names
+        """Names of the constraints that limit the state."""
+        return self._update_step.limits.names
 
     @property
     def observed(self) -> tuple[str, ...]:
-        """The names of what is observed, in order."""
+        """Names of the observations, in order."""
         return tuple(one.name for one in self._layout.observations)
 
     @property
     def estimate(self) -> Estimate:
-        """What is believed now; innovations and outliers are those of the last update."""
-        return Estimate(self._outcome, self._modes, self._filter, self._known, self._stamp)
+        """Present estimate; innovations and outliers are those of the last update."""
+        return Estimate(self._result, self._mixture, self._update_step, self._inputs, self._stamp)
 
     @property
     def log_evidence(self) -> float:
-        """The log density of all that was seen so far, given what this tracker assumes."""
-        return self._modes.log_evidence
+        """Log density of all measurements so far, given the model."""
+        return self._mixture.log_evidence
 
     def copy(self) -> Tracker:
-        """Return another one that goes on from here; all that is compiled is shared, with any threads."""
+        """Return an independent tracker in the same state; compiled code is shared, also between threads."""
         return copy.copy(self)
 
-    # -- steps ---------------------------------------------------------------------------------------------
-
     def predict(
-        self, dt: float, commands: StateLike | None = None, given: StateLike | None = None
+        self, dt: float, commands: StateLike | None = None, inputs: StateLike | None = None
     ) -> Estimate:
-        """Move on in time, at commanded speeds and with the process noise.
+        """Predict the state with commanded speeds and process noise.
 
         Parameters
         ----------
         dt
-            [s], not negative.
+            Time step [s], not negative.
         commands
-            Speeds by symbol or name [m/s], [rad/s]; those not given are 0.
-        given
-            Values of what is known.
+            Commanded speeds by symbol or name [m/s], [rad/s]; others are 0.
+        inputs
+            Values of the inputs.
 
         Raises
         ------
         InvalidValueError
             If time goes backwards or a number is not finite.
         UnknownNameError
-            For a speed that moves nothing here.
+            For a speed with which no estimated coordinate moves.
         """
         dt = require_number(dt, "The length of a step")
         if not (math.isfinite(dt) and dt >= 0):
@@ -230,24 +229,24 @@ class Tracker:
             speed = require_number(value, f"The commanded speed '{key}'")
             if not math.isfinite(speed):
                 raise InvalidValueError(f"The commanded speed '{key}' is {value!r}; it must be finite.")
-            speeds[self._filter.charted.speed(key)] = speed
-        self._known, self._modes = self._predicted(dt, speeds, self._values_of_known(given))
+            speeds[self._update_step.process_model.speed(key)] = speed
+        self._inputs, self._mixture = self._predicted(dt, speeds, self._read_inputs(inputs))
         if self._stamp is not None:
             self._stamp += dt
         return self.estimate
 
     def _predicted(
-        self, dt: float, speeds: Mapping[Symbol, float], known: Array
+        self, dt: float, speeds: Mapping[Symbol, float], inputs: Array
     ) -> tuple[Array, GaussianSum]:
         if not speeds and not self._noise:
-            return known, self._modes
+            return inputs, self._mixture
 
         def moved(belief: InformationState) -> InformationState:
-            free = self._locks.free(belief, known) if self._locks else None
+            free = self._locks.free(belief, inputs) if self._locks else None
             moving, noise = (_only(values, free) for values in (speeds, self._noise))
-            return self._filter.predict(belief, known, dt, moving, noise)
+            return self._update_step.predict(belief, inputs, dt, moving, noise)
 
-        return known, self._modes.each(moved)
+        return inputs, self._mixture.map(moved)
 
     def update(
         self,
@@ -255,28 +254,28 @@ class Tracker:
         *,
         at: float | None = None,
         commands: StateLike | None = None,
-        given: StateLike | None = None,
+        inputs: StateLike | None = None,
     ) -> Estimate:
-        """Take in what was seen.
+        """Update the state with measurements.
 
         Parameters
         ----------
         seen
-            From names of observations to poses 4×4, vectors or numbers, or to pairs of these and a covariance
-            of their own. What is absent was not seen.
+            Measurements by name of the observation: poses 4×4, vectors or numbers, or pairs of these and a
+            covariance of their own. Absent names are missing.
         at
-            When [s]; the state is predicted up to then.
+            Time of the measurements [s]; the state is predicted to it first.
         commands
-            Speeds on the way there.
-        given
-            Values of what is known.
+            Speeds during this prediction.
+        inputs
+            Values of the inputs.
 
         Raises
         ------
         UnknownNameError, ShapeError, InvalidValueError
-            For what was not seen right, naming it, or if time goes backwards. The belief stays as it was.
+            For an invalid measurement, naming it, or if time goes backwards. The belief does not change then.
         """
-        return self._take(self._filter.reader.read(seen), at, commands, given)
+        return self._update(self._update_step.reader.read(seen), at, commands, inputs)
 
     def update_poses(
         self,
@@ -285,59 +284,59 @@ class Tracker:
         *,
         at: float | None = None,
         commands: StateLike | None = None,
-        given: StateLike | None = None,
+        inputs: StateLike | None = None,
     ) -> Estimate:
-        """Take in poses as an array (m, 4, 4), in the order of what is observed; see :meth:`update`.
+        """Update with poses in an array (m, 4, 4), in the order of the observations; see :meth:`update`.
 
         Parameters
         ----------
         poses
-            Of all frames; what stands for those that were not seen is not looked at.
+            Poses of all frames; entries of missing ones are ignored.
         seen
-            A mask (m,) of those that were; all if None.
-        at, commands, given
+            True for each measured pose (m,); all if None.
+        at, commands, inputs
             As in :meth:`update`.
         """
-        return self._take(self._filter.reader.read_poses(poses, seen), at, commands, given)
+        return self._update(self._update_step.reader.read_poses(poses, seen), at, commands, inputs)
 
     def wait(self, timeout: float | None = None) -> bool:
-        """Wait until updates run in compiled code, as far as they can; return whether they do.
+        """Wait for compiled code; return whether updates use it.
 
         Parameters
         ----------
         timeout
-            For the compiler, in seconds; as long as it takes if None.
+            In seconds; no limit if None.
         """
-        if self._filter.native is None:
+        if self._update_step.native is None:
             return False
-        self._filter.function.wait(timeout)
-        self._filter.charted.wait(timeout)
+        self._update_step.function.wait(timeout)
+        self._update_step.process_model.wait(timeout)
         native_library.prepare(wait=True)
-        return self._filter.is_native
+        return self._update_step.is_native
 
-    def _take(
+    def _update(
         self,
         reading: Measurements,
         at: float | None,
         commands: StateLike | None,
-        given: StateLike | None,
+        inputs: StateLike | None,
     ) -> Estimate:
-        native = self._filter.native
+        native = self._update_step.native
         if native is None or not native.are_rigid(reading):
-            self._filter.reader.check_poses(reading)
-        before = self._modes, self._known, self._stamp
+            self._update_step.reader.check_poses(reading)
+        before = self._mixture, self._inputs, self._stamp
         try:
-            known = self._values_of_known(given)
-            # On the way there, what is known was what it was before, if anybody has said so.
-            if not np.isfinite(self._known).all():
-                self._known = known
+            values = self._read_inputs(inputs)
+            # The prediction uses the previous values of the inputs, if there are any.
+            if not np.isfinite(self._inputs).all():
+                self._inputs = values
             self._advance(at, commands)
-            self._known = known
-            outcome = self._filter.update(self._modes, reading, self._known)
+            self._inputs = values
+            result = self._update_step.update(self._mixture, reading, self._inputs)
         except BaseException:
-            self._modes, self._known, self._stamp = before
+            self._mixture, self._inputs, self._stamp = before
             raise
-        self._modes, self._outcome = outcome.modes, outcome
+        self._mixture, self._result = result.mixture, result
         return self.estimate
 
     def _advance(self, at: float | None, commands: StateLike | None) -> None:
@@ -356,20 +355,20 @@ class Tracker:
             self.predict(at - self._stamp, commands, None)
         self._stamp = at
 
-    def _values_of_known(self, given: StateLike | None) -> Array:
-        known = self._layout.known
-        values = self._known.copy()
+    def _read_inputs(self, given: StateLike | None) -> Array:
+        symbols = self._layout.inputs
+        values = self._inputs.copy()
         if given is not None:
             state = given if isinstance(given, State) else State(given)
-            names = {str(s): i for i, s in enumerate(known)}
+            names = {str(s): i for i, s in enumerate(symbols)}
             for key in state:
                 if str(key) in names:
                     values[names[str(key)]] = state[key]
                 elif not isinstance(given, State):
-                    raise UnknownNameError(f"'{key}' is not known=. {suggest(str(key), names, 'symbol')}")
-        missing = [str(s) for s, v in zip(known, values.tolist(), strict=True) if not math.isfinite(v)]
-        if missing and (given is not None or known):
-            raise InvalidValueError(f"There is no finite value of '{missing[0]}'; hand it in as given=.")
+                    raise UnknownNameError(f"'{key}' is not in inputs=. {suggest(str(key), names, 'symbol')}")
+        missing = [str(s) for s, v in zip(symbols, values.tolist(), strict=True) if not math.isfinite(v)]
+        if missing and (given is not None or symbols):
+            raise InvalidValueError(f"There is no finite value of '{missing[0]}'; give it in inputs=.")
         return values
 
     def __repr__(self) -> str:

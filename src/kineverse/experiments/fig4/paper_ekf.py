@@ -1,8 +1,8 @@
 """The papers' extended Kalman filter over entries of poses (2020 paper, IV-A; 2022, IV-B).
 
-It stands here as it was published, to reproduce the papers and to compare with. What it does not do, by
-design of its authors: it takes entries of rotation matrices for numbers that vary independently, knows their
-noise at one configuration only, and knows of limits only where to start.
+It is implemented as published, for reproduction and comparison. By design it treats the entries of rotation
+matrices as independent numbers, knows their noise at one configuration only, and uses limits only for the
+start.
 """
 
 from __future__ import annotations
@@ -28,46 +28,46 @@ SPREAD = 0.5
 
 
 class PaperEkf:
-    """Estimates coordinates q from poses of frames in the world, as the papers do.
+    """Extended Kalman filter of coordinates q over entries of poses, as published.
 
-    An observation is z = h(q), those entries of the frames' 4×4 matrices that depend on a coordinate. Frames
+    An observation is z = h(q): those entries of the frames' 4×4 matrices that depend on a coordinate. Frames
     that share coordinates form a group, and each group has a filter of its own:
 
     - start: the middle of the limits, ±π without, and Σ = diag((½ width)²);
-    - first observation: ten steps q += 0.1 Hᵀ (z - h(q)), with H = ∂h/∂q, and Σ stays;
+    - first observation: ten steps q += 0.1 Hᵀ (z - h(q)), with H = ∂h/∂q; Σ stays;
     - prediction: q += Δt q̇, with Q = 0;
     - later observations: S = H Σ Hᵀ + R, K = Σ Hᵀ S⁻¹, q += K (z - h(q)), Σ = (I - K H) Σ.
 
-    R is the covariance of entries in noisy poses seen at one configuration, see :meth:`learn_noise`.
+    R is the covariance of entries in noisy poses at one configuration, see :meth:`learn_noise`.
 
     Parameters
     ----------
     model
-        The model, which knows the limits of its coordinates.
+        The model, with the limits of its coordinates.
     frames
-        The frames that are observed.
+        Observed frames.
     steps
-        How many gradient steps the first observation makes. The authors' code makes one.
+        Number of gradient steps at the first observation. The authors' code makes one.
     spread
-        The standard deviation at the start, as a share of the width of the limits. The authors' code has 1.
+        Initial standard deviation, relative to the width of the limits. The authors' code has 1.
     copies
-        How many beliefs run side by side on the same R, each on poses of its own; None for one, whose arrays
-        have no leading axis.
+        Number of beliefs that run side by side on the same R, each on its own poses; None for one, without a
+        leading axis in its arrays.
 
     Attributes
     ----------
     frames
-        The frames, in the order in which poses are expected.
+        Frames, in the order of their poses.
     symbols
         The n coordinates, by group.
     groups
-        The coordinates of each group.
+        Coordinates of each group.
     limits
         Lower and upper limits of the coordinates, (n, 2).
     function
-        What evaluates h and H of each group.
+        Compiled h and H of each group.
     q
-        The estimate, (n,) or (copies, n).
+        Estimate, (n,) or (copies, n).
 
     Raises
     ------
@@ -99,7 +99,7 @@ class PaperEkf:
         self.reset()
 
     def reset(self) -> None:
-        """Forget what was observed; R stays."""
+        """Reset the estimate to the start; R stays."""
         lower, upper = self.limits.T
         self.q = np.broadcast_to((lower + upper) / 2, (*self._lead, len(self.symbols))).copy()
         for group in self._groups:
@@ -109,26 +109,26 @@ class PaperEkf:
         self._started = False
 
     def learn_noise(self, poses: npt.ArrayLike) -> None:
-        """Take the covariance of noisy poses, seen at one configuration, for R.
+        """Estimate R as the covariance of noisy poses at one configuration.
 
         Parameters
         ----------
         poses
             N observations of all frames, (N, m, 4, 4).
         """
-        seen = self._taken(poses, np.shape(poses)[:1])
+        seen = self._observed_entries(poses, np.shape(poses)[:1])
         if len(seen) < 2:
             raise InvalidValueError("One observation has no covariance; the papers take 400.")
         for group in self._groups:
             group.noise = np.cov(seen[:, group.rows], rowvar=False).reshape([len(group.entries)] * 2)
 
     def predict(self, dt: float, speeds: Mapping[Symbol | str, float] | None = None) -> None:
-        """Move the estimate by q += Δt q̇.
+        """Predict the estimate by q += Δt q̇.
 
         Parameters
         ----------
         dt
-            The time that has passed [s].
+            Time step [s].
         speeds
             Commanded velocities by symbol or name; others are zero.
         """
@@ -143,23 +143,23 @@ class PaperEkf:
             self.q[..., by_name[str(symbol)]] += dt * speed
 
     def update(self, poses: npt.ArrayLike) -> Array:
-        """Take in an observation and return the estimate.
+        """Update with an observation and return the estimate.
 
         Parameters
         ----------
         poses
-            The frames' poses in the world, (m, 4, 4) or (copies, m, 4, 4).
+            Poses of the frames in the world, (m, 4, 4) or (copies, m, 4, 4).
 
         Raises
         ------
         ShapeError
             If the poses have another shape.
         InvalidValueError
-            If they contain NaN, if there is no R yet, if S is singular (the authors' code passes over an
-            observation then), or if the model has no value at q. The belief is what it was before.
+            If they contain NaN, R is missing, S is singular (the authors' code skips such an observation), or
+            the model has no value at q. The belief does not change then.
         """
-        z = self._taken(poses, self._lead)
-        q, covariances = self._updated(z) if self._started else self._begun(z)
+        z = self._observed_entries(poses, self._lead)
+        q, covariances = self._kalman_update(z) if self._started else self._gradient_steps(z)
         if not np.isfinite(q).all():
             raise InvalidValueError(
                 f"The step from {', '.join(map(str, self.symbols))} = {self.q} leads nowhere: this filter is "
@@ -172,31 +172,31 @@ class PaperEkf:
 
     @property
     def covariance(self) -> Array:
-        """Σ of all coordinates, block diagonal, (n, n) or (copies, n, n)."""
+        """Covariance Σ of all coordinates, block diagonal, (n, n) or (copies, n, n)."""
         n = len(self.symbols)
         found = np.zeros((*self._lead, n, n))
         for group in self._groups:
             found[..., group.columns[:, None], group.columns] = group.covariance
         return found
 
-    def _begun(self, z: Array) -> tuple[Array, list[Array]]:
+    def _gradient_steps(self, z: Array) -> tuple[Array, list[Array]]:
         q = self.q.copy()
         for _ in range(self._steps):
-            for group, h, H in self._measured(q):
+            for group, h, H in self._evaluate_groups(q):
                 y = z[..., group.rows] - h
                 q[..., group.columns] += STEP_SIZE * (np.swapaxes(H, -1, -2) @ y[..., None])[..., 0]
         return q, [group.covariance for group in self._groups]
 
-    def _updated(self, z: Array) -> tuple[Array, list[Array]]:
+    def _kalman_update(self, z: Array) -> tuple[Array, list[Array]]:
         q, covariances = self.q.copy(), []
-        for group, h, H in self._measured(q):
+        for group, h, H in self._evaluate_groups(q):
             gain = group.gain(H)
             y = z[..., group.rows] - h
             q[..., group.columns] += (gain @ y[..., None])[..., 0]
             covariances.append(group.covariance - gain @ H @ group.covariance)
         return q, covariances
 
-    def _measured(self, q: Array) -> list[tuple[_CoordinateGroup, Array, Array]]:
+    def _evaluate_groups(self, q: Array) -> list[tuple[_CoordinateGroup, Array, Array]]:
         """Return each group with h and H at q."""
         if self._lead:
             values = self.function.batch(q)
@@ -205,8 +205,8 @@ class PaperEkf:
             values = self._bound.outputs
         return list(zip(self._groups, values[::2], values[1::2], strict=True))
 
-    def _taken(self, poses: npt.ArrayLike, lead: tuple[int, ...]) -> Array:
-        """Return the entries of poses that are observed, by group."""
+    def _observed_entries(self, poses: npt.ArrayLike, lead: tuple[int, ...]) -> Array:
+        """Return the observed entries of poses, by group."""
         seen = np.asarray(poses, dtype=np.float64)
         wanted = (*lead, len(self.frames), 4, 4)
         if seen.shape != wanted:
@@ -221,8 +221,8 @@ class PaperEkf:
 class _CoordinateGroup:
     """Coordinates that share observations.
 
-    ``columns`` are their places in the filter's vector; ``entries`` are places in all poses written one after
-    the other, row by row, and ``rows`` their places among those of all groups.
+    ``columns`` are indices into the filter's vector. ``entries`` are indices into all poses written row by
+    row, and ``rows`` their indices among those of all groups.
     """
 
     symbols: tuple[Symbol, ...]
@@ -240,7 +240,7 @@ class _CoordinateGroup:
             raise InvalidValueError(f"The noise of what shows {names} is not known: call learn_noise first.")
         across = self.covariance @ np.swapaxes(H, -1, -2)
         try:
-            # The inverse, as published: what this costs is part of what is compared.
+            # The explicit inverse, as published: its cost is part of the comparison.
             gain: Array = across @ np.linalg.inv(H @ across + self.noise)
         except np.linalg.LinAlgError:
             raise InvalidValueError(
@@ -280,7 +280,7 @@ def _groups(model: ModelView, frames: Sequence[str]) -> list[_CoordinateGroup]:
 
 
 def _moving_entries(model: ModelView, frame: str) -> list[tuple[int, Expression]]:
-    """Return the entries of a pose that depend on a coordinate, with their places row by row."""
+    """Return the entries of a pose that depend on a coordinate, with their indices row by row."""
     pose = model.fk(frame)
     parameters = {s: s.value for s in pose.symbols if s.value is not None}
     if parameters:

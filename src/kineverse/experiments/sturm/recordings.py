@@ -113,5 +113,5 @@ def read_labelled_recordings(folder: Path | None) -> Iterator[LabelledRecording]
 
 def _read_labelled(file: Path, name: Path, label: Label) -> LabelledRecording:
     recording = read_recording(file, COLUMNS.get(name.as_posix()))
-    poses = recording.pair().thinned(THINNED).child_poses
+    poses = recording.pair().thin(THINNED).child_poses
     return LabelledRecording(name.with_suffix("").as_posix(), label, poses)
