@@ -37,7 +37,7 @@ def found() -> IdentificationResult:
 def test_a_garage_door_is_told_from_a_hinge(found: IdentificationResult) -> None:
     assert found.best.family == "garage"
     assert not found.is_ambiguous
-    assert found.best.told
+    assert found.best.is_determined
 
 
 def test_its_length_is_found(found: IdentificationResult) -> None:
@@ -57,7 +57,7 @@ def test_it_is_an_operation(found: IdentificationResult) -> None:
     with model.edit() as edit:
         edit.apply(found.best.operation("door", "world", "panel"), tag="learned")
     pose = model.fk("panel")({"door": 0.5})
-    expected = found.best.motion.at(np.array([[0.5]])).pose[0]
+    expected = found.best.motion.linearise(np.array([[0.5]])).pose[0]
     np.testing.assert_allclose(pose, expected, atol=1e-12)
     assert model.violations({"door": 3.0})
     copy = kv.formats.from_bytes(kv.formats.to_bytes(model))

@@ -67,7 +67,7 @@ def test_identical_poses_do_not_say_how_something_moves(count: int) -> None:
         np.tile(SEEN.parent[0], (count, 1, 1)), np.tile(SEEN.child[0], (count, 1, 1)), noise=NOISE
     )
     assert found.best.family == "rigid"
-    assert not found["revolute"].told
+    assert not found["revolute"].is_determined
     assert all(np.isfinite(fit.log_evidence) for fit in found)
 
 
@@ -96,7 +96,7 @@ def test_a_parent_that_is_the_world() -> None:
 def test_an_identifier_keeps_what_it_has_when_a_pose_is_refused() -> None:
     identifier = Identifier(noise=NOISE)
     with pytest.raises(kv.errors.InvalidValueError, match="0 poses so far"):
-        _ = identifier.found
+        _ = identifier.result
     identifier.add(SEEN.parent[0], SEEN.child[0])
     with pytest.raises(kv.errors.InvalidValueError, match="not finite"):
         identifier.add(SEEN.parent[1], np.nan * SEEN.child[1])
@@ -104,7 +104,7 @@ def test_an_identifier_keeps_what_it_has_when_a_pose_is_refused() -> None:
         identifier.add(SEEN.parent[1], SEEN.child[1, :3, 3])
     identifier.add(SEEN.parent[1], SEEN.child[1])
     assert len(identifier) == 2
-    assert identifier.found.fits
+    assert identifier.result.fits
 
 
 @pytest.mark.parametrize("count", [2, 3])
@@ -113,4 +113,4 @@ def test_what_always_fits_is_not_told(count: int) -> None:
     seen = recording("free", count=count, position=0.003, orientation=0.003, seed=2)
     found = identify(None, seen.true_relative[:, :3, 3], noise=seen.covariance)
     assert found.is_ambiguous
-    assert not found["prismatic" if count == 2 else "revolute"].told
+    assert not found["prismatic" if count == 2 else "revolute"].is_determined

@@ -143,9 +143,9 @@ def test_one_by_one_is_as_all_at_once(family: str) -> None:
     for a, b in zip(seen.parent, seen.child, strict=True):
         identifier.add(a, b)
         if len(identifier) > 4:
-            assert identifier.found.best.probability > 0.0
+            assert identifier.result.best.probability > 0.0
     whole = found_in(seen)
-    one, other = identifier.found[family], whole[family]
+    one, other = identifier.result[family], whole[family]
     assert one.log_evidence == pytest.approx(other.log_evidence, abs=0.02)
     assert angle_between(one.parameters["axis"], other.parameters["axis"]) < 0.05 * other.deviation("axis.x")
 
@@ -156,9 +156,9 @@ def test_going_on_for_long_does_not_drift() -> None:
     for a, b in zip(seen.parent, seen.child, strict=True):
         identifier.add(a, b)
         if len(identifier) >= 64:
-            assert identifier.found
+            assert identifier.result
     one, other = (
-        identifier.found["revolute"],
+        identifier.result["revolute"],
         identify(seen.parent, seen.child, noise=seen.covariance)["revolute"],
     )
     assert angle_between(one.parameters["axis"], other.parameters["axis"]) < 0.05 * other.deviation("axis.x")

@@ -87,7 +87,7 @@ def test_a_motion_within_the_noise_is_no_motion() -> None:
         short = recording("prismatic", count=80, position=0.03, orientation=0.02, seed=seed, extent=0.004)
         found = identify(short.parent, short.child, noise=short.covariance)
         assert found.is_ambiguous or found.best.family in ("rigid", "prismatic")
-        assert not found["prismatic"].told
+        assert not found["prismatic"].is_determined
 
 
 def test_types_are_told_apart() -> None:

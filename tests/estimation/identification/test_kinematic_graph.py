@@ -152,8 +152,8 @@ def test_a_telescope_hangs_by_its_smaller_motions_and_few_poses_leave_doubt(seed
         assert list(graph.connections.values()) == sorted(graph.connections.values(), reverse=True)
     for edge in unsure.edges:
         assert graph.connections[edge.parent, edge.child] == edge.probability
-        assert edge.probability + sum(edge.others.values()) > 0.9
-        assert all(f"or {a} -> {b}" in str(edge) for a, b in edge.others)
+        assert edge.probability + sum(edge.alternatives.values()) > 0.9
+        assert all(f"or {a} -> {b}" in str(edge) for a, b in edge.alternatives)
 
 
 def test_drawers_and_doors_beside_each_other_are_no_loop() -> None:

@@ -153,7 +153,7 @@ def test_a_four_bar_is_closed_and_documents_have_it(tmp_path: Path) -> None:
     graph = identify_graph(poses, noise=NOISE, families=SOME)
     assert connected(graph) == ring("world", "crank", "coupler", "rocker")
     # What closes the loop stands beside the tree, and leaves no doubt about it.
-    assert all(edge.probability > 0.99 and not edge.others for edge in graph.edges)
+    assert all(edge.probability > 0.99 and not edge.alternatives for edge in graph.edges)
     model = kv.Model()
     with model.edit() as edit:
         for operation in graph.operations("seen"):
@@ -194,7 +194,7 @@ def test_it_does_not_matter_which_joint_closes_a_loop() -> None:
     model = kv.Model()
     with model.edit() as edit:
         for joint in tree.values():
-            edit.apply(joint.found.best.operation(joint.child, joint.parent))
+            edit.apply(joint.result.best.operation(joint.child, joint.parent))
         for operation in plan.operations(str):
             edit.apply(operation)
     assert len(model.degrees_of_freedom) == 1
@@ -218,7 +218,7 @@ def test_loops_that_share_a_crank_are_closed_one_after_the_other() -> None:
 def test_what_a_joint_holds_is_what_its_motion_leaves(family: str) -> None:
     random = np.random.default_rng(0)
     motion = GroupMotion(JOINT_FAMILIES[family], 6, np.eye(4), np.eye(4))
-    poses = motion.at(random.normal(0.0, 0.5, (50, motion.joints))).pose
+    poses = motion.linearise(random.normal(0.0, 0.5, (50, motion.joints))).pose
     turned = 0.5 * (poses - np.swapaxes(poses, 1, 2))
     components = [*poses[:, :3, 3].T, turned[:, 2, 1], turned[:, 0, 2], turned[:, 1, 0]]
     still = tuple(k for k, component in enumerate(components) if np.allclose(component, 0.0))
@@ -259,7 +259,7 @@ def test_what_follows_a_follower_follows_its_leaders() -> None:
     some = times[2:]
     motion = Twists(("d", "c", "a"), some, np.zeros((5, 6, 3)))
     followers.add(motion, [1], np.stack([c_by_d, c_by_a], axis=1)[2:, None])
-    found = followers.resolved(twists)
+    found = followers.resolve(twists)
     assert np.array_equal(found.times, some)
     a, b, c, d = np.moveaxis(twists.twists, 2, 0)
     by_a = a + b * (b_by_a + b_by_c * c_by_a)[:, None] + c * c_by_a[:, None]

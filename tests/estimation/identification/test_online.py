@@ -22,7 +22,7 @@ def test_found_is_that_of_all_poses_at_every_step(family: str) -> None:
         identifier.add(a, b)
         if k < 12:
             continue
-        found = identifier.found
+        found = identifier.result
         if k % 6:
             continue
         whole = identify(seen.parent[:k], seen.child[:k], noise=seen.covariance)
@@ -42,13 +42,13 @@ def test_a_surprise_has_all_families_looked_at() -> None:
     for a, b in zip(seen.parent[:40], seen.child[:40], strict=True):
         identifier.add(a, b)
         if len(identifier) > 20:
-            assert identifier.found.best.family == "revolute"
-    assert 1e-6 < identifier.found.probabilities["cylindrical"] < 0.01
+            assert identifier.result.best.family == "revolute"
+    assert 1e-6 < identifier.result.probabilities["cylindrical"] < 0.01
     along = np.eye(4)
     along[2, 3] = 0.1
     there = seen.left @ along @ np.linalg.inv(seen.left) @ seen.true_relative[40]
     identifier.add(seen.true_parent[40], seen.true_parent[40] @ there)
-    assert identifier.found.best.family == "cylindrical"
+    assert identifier.result.best.family == "cylindrical"
 
 
 def test_what_was_handed_out_stays_as_it_was() -> None:

@@ -81,25 +81,25 @@ def test_what_is_wrong_is_said_and_does_not_count(hinge) -> None:
     seen, child, wrong, found = hinge
     fit = found.best
     assert fit.outliers == tuple(wrong)
-    np.testing.assert_array_equal(fit.right, np.setdiff1d(np.arange(20), wrong))
-    without = identify(seen.parent[fit.right], child[fit.right], noise=seen.covariance).best
+    np.testing.assert_array_equal(fit.inliers, np.setdiff1d(np.arange(20), wrong))
+    without = identify(seen.parent[fit.inliers], child[fit.inliers], noise=seen.covariance).best
     np.testing.assert_allclose(fit.range, without.range, atol=1e-3)
     np.testing.assert_allclose(fit.rms, without.rms, rtol=1e-3)
     np.testing.assert_allclose(fit.covariance, without.covariance, rtol=0.02, atol=1e-9)
     # What is wrong has the nearest place on the joint.
     assert fit.joint_values.shape == fit.deviations.shape == (20, 1)
     assert np.linalg.norm(fit.residuals[wrong], axis=1).min() > 0.2
-    assert np.linalg.norm(fit.residuals[fit.right], axis=1).max() < 0.2
+    assert np.linalg.norm(fit.residuals[fit.inliers], axis=1).max() < 0.2
     assert (fit.deviations > 0.0).all()
 
 
 def test_families_are_weighed_by_the_same_observations(hinge) -> None:
     seen, child, _, found = hinge
     fit = found.best
-    without = identify(seen.parent[fit.right], child[fit.right], noise=seen.covariance)
+    without = identify(seen.parent[fit.inliers], child[fit.inliers], noise=seen.covariance)
     usual = Outliers()
-    belief = 16 * math.log(1 - usual.fraction) + 4 * (math.log(usual.fraction) + usual.log_anywhere)
-    assert fit.log_evidence == pytest.approx(without["revolute"].log_evidence + belief, abs=0.01)
+    joint_prior = 16 * math.log(1 - usual.fraction) + 4 * (math.log(usual.fraction) + usual.log_anywhere)
+    assert fit.log_evidence == pytest.approx(without["revolute"].log_evidence + joint_prior, abs=0.01)
     # What moves freely explains everything, and what does not move cannot call almost everything wrong.
     assert found["free"].outliers == found["rigid"].outliers == ()
     assert found["free"].log_evidence < fit.log_evidence - 100
@@ -156,7 +156,7 @@ def test_one_by_one() -> None:
     for a, b in zip(seen.parent, child, strict=True):
         identifier.add(a, b)
         if len(identifier) >= 16 and len(identifier) % 3 == 0:
-            found = identifier.found
+            found = identifier.result
             assert found.best.family == "revolute"
     whole = identify(seen.parent, child, noise=seen.covariance, outliers=True).best
     assert found.best.outliers == whole.outliers == tuple(wrong)

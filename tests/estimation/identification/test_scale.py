@@ -75,8 +75,8 @@ def test_a_crane_is_a_hinge() -> None:
     for pose in seen:
         one_by_one.add(None, pose)
         if len(one_by_one) % 6 == 0:
-            assert len(one_by_one.found)
-    fit = one_by_one.found.best
+            assert len(one_by_one.result)
+    fit = one_by_one.result.best
     assert fit.family == "revolute"
     assert np.linalg.norm(fit.parameters["point"][:2] - [3, 1]) < 4 * fit.deviation("point.x")
 

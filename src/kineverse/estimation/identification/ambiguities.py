@@ -25,7 +25,7 @@ from typing import NamedTuple
 import numpy as np
 
 from kineverse.estimation.linear_algebra import invert_matrices, multiply_vectors
-from kineverse.lie import Stack, exp_so3, log_so3, skew
+from kineverse.lie import Array, exp_so3, log_so3, skew
 
 from .families import REACH, WX, WZ, GroupMotion
 from .motion_model import FamilyMember
@@ -66,7 +66,7 @@ def optimise_sliding_point(solution: Solution[FamilyMember]) -> Solution[FamilyM
     return solution
 
 
-def sliding_point_twists(motion: FamilyMember, values: Stack) -> Stack:
+def sliding_point_twists(motion: FamilyMember, values: Array) -> Array:
     """Return twists of the child per unit of each component of c, (N, m, 2 or 3), or (N, m, 0)."""
     if not isinstance(motion, GroupMotion) or not motion.slides:
         return np.zeros((len(values), motion.rows, 0))
@@ -89,19 +89,19 @@ class ChildOriginMotion(NamedTuple):
     """
 
     motion: FamilyMember
-    covariance: Stack
-    values: Stack
-    covariances: Stack
+    covariance: Array
+    values: Array
+    covariances: Array
 
 
 def slide_child_origin(
-    motion: FamilyMember, covariance: Stack, values: Stack, covariances: Stack
+    motion: FamilyMember, covariance: Array, values: Array, covariances: Array
 ) -> ChildOriginMotion:
     """Return a motion by the slides of the child's origin, around 0."""
     if not isinstance(motion, GroupMotion) or not motion.slides:
         return ChildOriginMotion(motion, covariance, values, covariances)
-    slides, freedom = motion.slides, motion.freedom
-    turned = motion.left[:3, :3].T @ motion.at(values).by_joints[:, :3]
+    slides, freedom = motion.slides, motion.parametrisation
+    turned = motion.left[:3, :3].T @ motion.linearise(values).by_joints[:, :3]
     by = np.tile(np.eye(motion.joints), (len(values), 1, 1))
     by[:, :slides, slides:] = turned[:, :slides, slides:]
     place = np.where(np.arange(3) < slides, motion.right[:3, 3], 0.0)
@@ -129,20 +129,20 @@ def slide_child_origin(
     )
 
 
-def _changed(solution: Solution[FamilyMember], motion: GroupMotion, change: Stack) -> Solution[FamilyMember]:
+def _changed(solution: Solution[FamilyMember], motion: GroupMotion, change: Array) -> Solution[FamilyMember]:
     way = np.zeros(3)
     way[: len(change)] = change
     values, right = solution.values.copy(), motion.right.copy()
     values[:, : len(change)] -= (_turns(motion, values) @ way)[:, : len(change)]
     right[:3, 3] += way
     motion = replace(motion, right=right)
-    return replace(solution, motion=motion, values=values, linear=motion.at(values))
+    return replace(solution, motion=motion, values=values, linear=motion.linearise(values))
 
 
-def _turns(motion: GroupMotion, values: Stack) -> Stack:
+def _turns(motion: GroupMotion, values: Array) -> Array:
     """Return Exp(w), (N, 3, 3)."""
     twist = np.zeros((len(values), 6))
-    twist[:, list(motion.freedom.joints)] = values
+    twist[:, list(motion.parametrisation.joints)] = values
     return exp_so3(twist[:, WX:])
 
 
@@ -164,9 +164,9 @@ class SingleObservation(NamedTuple):
         Of each observation, with both integrated out, (N,); without a constant.
     """
 
-    values: Stack
-    orientation: Stack
-    log_density: Stack
+    values: Array
+    orientation: Array
+    log_density: Array
 
 
 def choose_mirrored_values(seen: Observations, solution: Solution[FamilyMember]) -> Solution[FamilyMember]:
@@ -179,7 +179,7 @@ def choose_mirrored_values(seen: Observations, solution: Solution[FamilyMember])
         if start is None:
             break
         values, parent = start
-        better = levenberg_marquardt(seen, motion, values, parent, solution.belief)
+        better = levenberg_marquardt(seen, motion, values, parent, solution.joint_prior)
         if not (better.cost < solution.cost and isinstance(better.motion, GroupMotion)):
             break
         solution, motion = better, better.motion
@@ -188,12 +188,12 @@ def choose_mirrored_values(seen: Observations, solution: Solution[FamilyMember])
 
 def _exchanged(
     seen: Observations, solution: Solution[FamilyMember], motion: GroupMotion
-) -> tuple[Stack, Stack] | None:
+) -> tuple[Array, Array] | None:
     """Return joint values and the parent's poses with the other ones where they are more probable."""
-    belief, parent = solution.belief, solution.parent
-    here = evaluate_each_observation(seen, motion, solution.values, parent, belief)
+    joint_prior, parent = solution.joint_prior, solution.parent
+    here = evaluate_each_observation(seen, motion, solution.values, parent, joint_prior)
     there = evaluate_each_observation(
-        seen, motion, mirrored_values(motion, solution.values, belief), parent, belief
+        seen, motion, mirrored_values(motion, solution.values, joint_prior), parent, joint_prior
     )
     better = there.log_density > here.log_density + BETTER
     if not better.any():
@@ -205,7 +205,7 @@ def _exchanged(
 
 
 def evaluate_each_observation(
-    seen: Observations, motion: GroupMotion, values: Stack, parent: Stack, belief: JointValuePrior
+    seen: Observations, motion: GroupMotion, values: Array, parent: Array, joint_prior: JointValuePrior
 ) -> SingleObservation:
     """Return what each observation says near joint values (N, 1), whatever the others say.
 
@@ -214,10 +214,10 @@ def evaluate_each_observation(
     """
     whitening, log_volume = _whitening(seen)
     way, rows = seen.child[:, :3, 3] - seen.parent[:, :3, 3], seen.rows
-    turned = _aligned(parent[:, :3, :3], motion.at(values).pose[:, :3, 3], way)
+    turned = _aligned(parent[:, :3, :3], motion.linearise(values).pose[:, :3, 3], way)
     best = SingleObservation(values, turned, np.full(len(seen), -math.inf))
     for _ in range(MIRROR_STEPS):
-        linear = motion.at(values)
+        linear = motion.linearise(values)
         lever = multiply_vectors(turned, linear.pose[:, :3, 3])
         back = np.swapaxes(turned, 1, 2)
         of_parent = log_so3(seen.parent[:, :3, :3] @ back)
@@ -235,13 +235,13 @@ def evaluate_each_observation(
         by = whitening @ np.concatenate(
             [np.concatenate(by_turn, axis=1), np.concatenate(by_joint, axis=1)[:, :, None]], axis=2
         )
-        off = values[:, 0] - belief.mean[0]
+        off = values[:, 0] - joint_prior.mean[0]
         information = np.swapaxes(by, 1, 2) @ by
-        information[:, 3, 3] += belief.precision[0]
+        information[:, 3, 3] += joint_prior.precision[0]
         slope = -np.einsum("nri,nr->ni", by, error)
-        slope[:, 3] -= belief.precision[0] * off
-        log = -0.5 * (np.sum(error**2, axis=1) + belief.precision[0] * off**2) - log_volume
-        log -= 0.5 * np.linalg.slogdet(information)[1] - 0.5 * math.log(belief.precision[0])
+        slope[:, 3] -= joint_prior.precision[0] * off
+        log = -0.5 * (np.sum(error**2, axis=1) + joint_prior.precision[0] * off**2) - log_volume
+        log -= 0.5 * np.linalg.slogdet(information)[1] - 0.5 * math.log(joint_prior.precision[0])
         more = log > best.log_density
         best = SingleObservation(
             np.where(more[:, None], values, best.values),
@@ -250,23 +250,23 @@ def evaluate_each_observation(
         )
         step = multiply_vectors(invert_matrices(information), slope)
         turned = exp_so3(step[:, :3]) @ turned
-        values = motion.bounded(values, step[:, 3:])
+        values = motion.retract_joints(values, step[:, 3:])
     return best
 
 
-def mirrored_values(motion: GroupMotion, values: Stack, belief: JointValuePrior) -> Stack:
+def mirrored_values(motion: GroupMotion, values: Array, joint_prior: JointValuePrior) -> Array:
     """Return the other joint values (N, 1) at which the child is as far from the parent."""
     l_p_parent = -motion.left[:3, :3].T @ motion.left[:3, 3]
-    if motion.freedom.joints[0] < WZ:
+    if motion.parametrisation.joints[0] < WZ:
         # Of the line through the child along z, the place nearest to the parent.
         return np.asarray(2.0 * (l_p_parent[2] - motion.right[2, 3]) - values)
     x, y, _ = motion.right[:3, 3]
     towards = math.atan2(l_p_parent[1], l_p_parent[0]) - math.atan2(y, x)
     other = 2.0 * towards - values
-    return np.asarray(other - math.tau * np.round((other - belief.mean) / math.tau))
+    return np.asarray(other - math.tau * np.round((other - joint_prior.mean) / math.tau))
 
 
-def _whitening(seen: Observations) -> tuple[Stack, Stack]:
+def _whitening(seen: Observations) -> tuple[Array, Array]:
     """Return what makes errors of the way and of both orientations white, and the logarithm of its volume."""
     rows, of_parent = seen.rows, seen.parent_covariance
     assert of_parent is not None  # else positions are not told by orientations
@@ -284,7 +284,7 @@ def _whitening(seen: Observations) -> tuple[Stack, Stack]:
     return np.linalg.inv(lower), np.log(np.einsum("nii->ni", lower)).sum(axis=1)
 
 
-def _aligned(rotations: Stack, lever: Stack, way: Stack) -> Stack:
+def _aligned(rotations: Array, lever: Array, way: Array) -> Array:
     """Return rotations with the least turn before them that makes levers point along the way."""
     pointing = multiply_vectors(rotations, lever)
     normal = np.cross(pointing, way)
@@ -293,6 +293,6 @@ def _aligned(rotations: Stack, lever: Stack, way: Stack) -> Stack:
     return np.asarray(exp_so3(normal * (angle / np.where(sine > 0.0, sine, 1.0))[:, None]) @ rotations)
 
 
-def _inverse_left_jacobian(turns: Stack) -> Stack:
+def _inverse_left_jacobian(turns: Array) -> Array:
     """Return how logarithms of rotations change with turns behind them, to first order."""
     return np.eye(3) + 0.5 * skew(turns)

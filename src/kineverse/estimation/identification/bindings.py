@@ -16,7 +16,7 @@ from kineverse.compile.c_library import SourceLibrary
 from kineverse.compile.toolchain import NO_UNDEFINED_FLAGS
 from kineverse.errors import ShapeError
 from kineverse.estimation.c_source.identification_stages import IDENTIFICATION_SOURCE
-from kineverse.lie import Stack, transform
+from kineverse.lie import Array, transform
 
 from .motion_model import LinearisedPoses
 
@@ -91,7 +91,7 @@ library = SourceLibrary(IDENTIFICATION_SOURCE, _declare, _FLAGS)
 @functools.cache
 def fits_kernel(group: JointFamily, rows: int) -> bool:
     """Return whether C has room for a family."""
-    freedom = group.freedom(rows)
+    freedom = group.parametrisation(rows)
     left, right, joints = (len(part) for part in (freedom.left, freedom.right, freedom.joints))
     return (
         {*freedom.left, *freedom.right, *freedom.joints} <= {*range(6)}
@@ -105,7 +105,7 @@ def fits_kernel(group: JointFamily, rows: int) -> bool:
 @functools.cache
 def problem_of(group: JointFamily, rows: int) -> Problem:
     """Return the problem with what a family says, and nothing else. It is shared: copy it."""
-    freedom, problem = group.freedom(rows), Problem()
+    freedom, problem = group.parametrisation(rows), Problem()
     problem.rows, problem.joints = rows, len(freedom.joints)
     problem.lefts, problem.rights = len(freedom.left), len(freedom.right)
     problem.pitches = problem.pitched = group.pitch
@@ -117,7 +117,7 @@ def problem_of(group: JointFamily, rows: int) -> Problem:
     return problem
 
 
-def pack_motion(motion: GroupMotion) -> Stack:
+def pack_motion(motion: GroupMotion) -> Array:
     """Return what C knows of a member: rotation and place of both sides, and the pitch."""
     result = np.empty(MOTION_SIZE)
     for at, side in ((0, motion.left), (12, motion.right)):
@@ -127,13 +127,13 @@ def pack_motion(motion: GroupMotion) -> Stack:
     return result
 
 
-def unpack_motion(motion: GroupMotion, packed: Stack) -> GroupMotion:
+def unpack_motion(motion: GroupMotion, packed: Array) -> GroupMotion:
     """Return the member that C calls so."""
     left, right = (transform(packed[at : at + 9].reshape(3, 3), packed[at + 9 : at + 12]) for at in (0, 12))
     return replace(motion, left=left, right=right, pitch=float(packed[24]))
 
 
-def evaluate_poses(motion: GroupMotion, values: Stack) -> LinearisedPoses:
+def evaluate_poses(motion: GroupMotion, values: Array) -> LinearisedPoses:
     """Return the poses at joint values (N, k), as :meth:`.groups.GroupMotion.at` does.
 
     Raises

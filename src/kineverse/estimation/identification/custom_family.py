@@ -15,7 +15,7 @@ from kineverse.compile import CompiledFunction
 from kineverse.compile import compile as compiled
 from kineverse.errors import InvalidValueError, ShapeError, UnknownNameError
 from kineverse.expressions.expression import Expression
-from kineverse.lie import Stack, log_so3
+from kineverse.lie import Array, log_so3
 from kineverse.symbols import Symbol
 
 from .families import REACH
@@ -121,7 +121,7 @@ class FamilyMotion:
 
     family: Family
     rows: int
-    parameters: Stack
+    parameters: Array
     unit: float = 1.0
 
     @property
@@ -144,7 +144,7 @@ class FamilyMotion:
         """Each joint value has a width of its own."""
         return tuple(range(self.joints))
 
-    def at(self, values: Stack) -> LinearisedPoses:
+    def linearise(self, values: Array) -> LinearisedPoses:
         """Return the poses at joint values (N, k)."""
         count, rows = len(values), self.rows
         inputs = np.concatenate([values, np.tile(self.parameters, (count, 1))], axis=1)
@@ -156,12 +156,12 @@ class FamilyMotion:
         by_joints = _twists(poses, next(blocks))[:, :rows] if self.joints else np.zeros((count, rows, 0))
         return LinearisedPoses(poses, by_parameters, by_joints)
 
-    def moved(self, step: Stack) -> Self:
+    def retract(self, step: Array) -> Self:
         """Return the member that a step leads to, kept within the bounds of the parameters."""
         bounds = np.array([(u.lower, u.upper) for u in self.family.unknowns.values()]).reshape(-1, 2)
         return replace(self, parameters=np.clip(self.parameters + step, bounds[:, 0], bounds[:, 1]))
 
-    def bounded(self, values: Stack, step: Stack) -> Stack:
+    def retract_joints(self, values: Array, step: Array) -> Array:
         """Return joint values after a step, within the range in which they are looked for."""
         ranges = np.array([*self.family.joints.values()]).reshape(-1, 2)
         most = 0.25 * (ranges[:, 1] - ranges[:, 0])
@@ -172,7 +172,7 @@ class FamilyMotion:
         start, deviation = self._beliefs()
         return ParameterPrior((self.parameters - start) / deviation, np.diag(1.0 / deviation))
 
-    def beforehand(self, mean: Stack) -> tuple[float, Stack]:
+    def log_prior(self, mean: Array) -> tuple[float, Array]:
         """Return the density of parameters and of the mean joint values, and what keeps them finite.
 
         The joints of :mod:`.groups` have a mean pose besides, with the density 1. Here it is part of the
@@ -185,7 +185,7 @@ class FamilyMotion:
         log -= self.joints * math.log(math.sqrt(math.tau) * _MEAN_SPREAD)
         return log, np.concatenate([np.zeros(self.size), np.full(self.joints, _MEAN_SPREAD**-2)])
 
-    def named(self) -> dict[str, Stack | float]:
+    def named_parameters(self) -> dict[str, Array | float]:
         """Return the parameters by name."""
         return dict(zip(self.coordinates(), self.parameters.tolist(), strict=True))
 
@@ -200,37 +200,41 @@ class FamilyMotion:
             {**dict(zip(self.family.joints, joints, strict=True)), **values}
         )
 
-    def _beliefs(self) -> tuple[Stack, Stack]:
+    def _beliefs(self) -> tuple[Array, Array]:
         unknowns = self.family.unknowns.values()
         return np.array([u.start for u in unknowns]), np.array([u.deviation for u in unknowns])
 
 
-def family_starts(family: Family, seen: Observations, unit: float) -> Iterator[tuple[FamilyMotion, Stack]]:
+def family_starts(
+    family: Family, observations: Observations, unit: float
+) -> Iterator[tuple[FamilyMotion, Array]]:
     """Yield members of a family, at its start and around, with the joint values that come nearest."""
-    motion = FamilyMotion(family, seen.rows, np.array([u.start for u in family.unknowns.values()]), unit)
+    motion = FamilyMotion(
+        family, observations.rows, np.array([u.start for u in family.unknowns.values()]), unit
+    )
     # Always the same ones, so that the same poses give the same answer.
     random = np.random.default_rng(0)
     _, deviation = motion._beliefs()
     for k in range(_MEMBERS if motion.size else 1):
-        member = motion.moved(random.normal(0.0, deviation)) if k else motion
-        yield member, _nearest(member, seen)
+        member = motion.retract(random.normal(0.0, deviation)) if k else motion
+        yield member, _nearest(member, observations)
 
 
-def _nearest(motion: FamilyMotion, seen: Observations) -> Stack:
+def _nearest(motion: FamilyMotion, observations: Observations) -> Array:
     each = max(3, round(_TRIED ** (1.0 / max(1, motion.joints)) * (1 if motion.joints < 2 else 3)))
     ranges = motion.family.joints.values()
     tried = np.array([*product(*(np.linspace(low, high, each) for low, high in ranges))])
-    poses = motion.at(tried.reshape(-1, motion.joints)).pose
-    apart = np.sum((seen.relative[:, None, :3, 3] - poses[None, :, :3, 3]) ** 2, axis=-1)
-    if seen.rows == 6:
-        turns = np.swapaxes(seen.relative[:, None, :3, :3], -1, -2) @ poses[None, :, :3, :3]
-        lever = float(np.mean(np.einsum("nii->ni", seen.child_covariance)[:, :3]))
-        angle = float(np.mean(np.einsum("nii->ni", seen.child_covariance)[:, 3:]))
+    poses = motion.linearise(tried.reshape(-1, motion.joints)).pose
+    apart = np.sum((observations.relative[:, None, :3, 3] - poses[None, :, :3, 3]) ** 2, axis=-1)
+    if observations.rows == 6:
+        turns = np.swapaxes(observations.relative[:, None, :3, :3], -1, -2) @ poses[None, :, :3, :3]
+        lever = float(np.mean(np.einsum("nii->ni", observations.child_covariance)[:, :3]))
+        angle = float(np.mean(np.einsum("nii->ni", observations.child_covariance)[:, 3:]))
         apart = apart + lever / angle * np.sum(log_so3(turns) ** 2, axis=-1)
     return np.asarray(tried.reshape(-1, motion.joints)[np.argmin(apart, axis=1)])
 
 
-def _twists(poses: Stack, derivatives: Stack) -> Stack:
+def _twists(poses: Array, derivatives: Array) -> Array:
     """Return twists of the child in the parent's axes, (N, 6, n), from derivatives (N, 4, 4, n)."""
     turning = np.einsum("nijk,nlj->nilk", derivatives[:, :3, :3], poses[:, :3, :3])
     omega = np.stack([turning[:, 2, 1], turning[:, 0, 2], turning[:, 1, 0]], axis=1)

@@ -20,7 +20,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from kineverse.estimation.linear_algebra import invert_matrices, multiply_vectors, sum_log_determinants
-from kineverse.lie import Stack
+from kineverse.lie import Array
 
 from .ambiguities import sliding_point_twists
 from .motion_model import FamilyMember
@@ -43,12 +43,14 @@ class Evidence:
     """
 
     log_evidence: float
-    covariance: Stack
-    joint_values: Stack
-    joint_covariances: Stack
+    covariance: Array
+    joint_values: Array
+    joint_covariances: Array
 
     @staticmethod
-    def of(log: float, information: Stack, size: int, values: Stack, covariances: Stack) -> Evidence:
+    def from_information(
+        log: float, information: Array, size: int, values: Array, covariances: Array
+    ) -> Evidence:
         """Return it with the covariance of the first unknowns, which are the parameters."""
         return Evidence(log, invert_matrices(information)[:size, :size], values, covariances)
 
@@ -56,17 +58,21 @@ class Evidence:
 def laplace_evidence(solution: Solution[FamilyMember]) -> Evidence:
     """Return the evidence of a family of joints around its most likely member."""
     motion, size = solution.motion, solution.motion.size
-    seen = solve_per_observation(solution)
-    width = fit_joint_ranges(motion, seen) if motion.joints else JointRanges(np.zeros(0), np.zeros(0), 0.0)
-    values, covariances = _together(seen, width)
+    per_observation = solve_per_observation(solution)
+    width = (
+        fit_joint_ranges(motion, per_observation)
+        if motion.joints
+        else JointRanges(np.zeros(0), np.zeros(0), 0.0)
+    )
+    values, covariances = _posterior_joint_values(per_observation, width)
     information = _information(solution, width, values)
     prior = motion.prior().by_parameters
     information[:size, :size] += prior.T @ prior
-    beforehand, precision = motion.beforehand(width.mean)
+    beforehand, precision = motion.log_prior(width.mean)
     information[np.diag_indices_from(information)] += precision
-    log = seen.log_likelihood + width.log_density + beforehand
+    log = per_observation.log_likelihood + width.log_density + beforehand
     log += 0.5 * len(information) * math.log(math.tau) - 0.5 * float(np.linalg.slogdet(information)[1])
-    return Evidence.of(log, information, size, values, covariances)
+    return Evidence.from_information(log, information, size, values, covariances)
 
 
 def evidence_excess(solution: Solution[FamilyMember]) -> float:
@@ -75,12 +81,12 @@ def evidence_excess(solution: Solution[FamilyMember]) -> float:
     Evidence takes the quadratic at its word. Where it has not been followed to its end, what was reached is
     what counts.
     """
-    belief = solution.belief
-    if solution.converged or not belief.marginal:
+    joint_prior = solution.joint_prior
+    if solution.converged or not joint_prior.marginal:
         return 0.0
-    seen = solve_per_observation(solution)
-    total = seen.covariances + np.diag(1.0 / belief.precision)
-    off = seen.values - belief.mean
+    per_observation = solve_per_observation(solution)
+    total = per_observation.covariances + np.diag(1.0 / joint_prior.precision)
+    off = per_observation.values - joint_prior.mean
     promised = -0.5 * float(
         np.sum(off * multiply_vectors(invert_matrices(total), off))
     ) - 0.5 * sum_log_determinants(math.tau * total)
@@ -88,27 +94,27 @@ def evidence_excess(solution: Solution[FamilyMember]) -> float:
     reached = -0.5 * (solution.cost - float(prior @ prior)) - 0.5 * solution.residuals.size * math.log(
         math.tau
     )
-    return max(0.0, promised + seen.log_likelihood - reached)
+    return max(0.0, promised + per_observation.log_likelihood - reached)
 
 
-def _together(seen: PerObservation, width: JointRanges) -> tuple[Stack, Stack]:
+def _posterior_joint_values(per_observation: PerObservation, width: JointRanges) -> tuple[Array, Array]:
     """Return joint values and their covariances if they are also believed within the width."""
     if not len(width.mean):
-        return seen.values, seen.covariances
+        return per_observation.values, per_observation.covariances
     variance = np.diag(width.deviations**2)
-    shrink = variance @ invert_matrices(seen.covariances + variance)
-    values: Stack = width.mean + (shrink @ (seen.values - width.mean)[:, :, None])[:, :, 0]
-    return values, shrink @ seen.covariances
+    shrink = variance @ invert_matrices(per_observation.covariances + variance)
+    values: Array = width.mean + (shrink @ (per_observation.values - width.mean)[:, :, None])[:, :, 0]
+    return values, shrink @ per_observation.covariances
 
 
-def _information(solution: Solution[FamilyMember], width: JointRanges, values: Stack) -> Stack:
+def _information(solution: Solution[FamilyMember], width: JointRanges, values: Array) -> Array:
     """Return the information about parameters, μ and the point that slides."""
-    linear = solution.motion.at(values)
+    linear = solution.motion.linearise(values)
     by_joints = linear.by_joints
     moved = (by_joints * width.deviations**2) @ np.swapaxes(by_joints, 1, 2)
     weights = invert_matrices(solution.covariance + moved)
     both = np.concatenate(
         [linear.by_parameters, by_joints, sliding_point_twists(solution.motion, values)], axis=2
     )
-    result: Stack = (np.swapaxes(both, 1, 2) @ weights @ both).sum(axis=0)
+    result: Array = (np.swapaxes(both, 1, 2) @ weights @ both).sum(axis=0)
     return result

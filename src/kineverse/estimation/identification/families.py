@@ -18,7 +18,7 @@ from typing import Self
 
 import numpy as np
 
-from kineverse.lie import Stack, exp_so3, orthonormalize, right_jacobian, skew, transform
+from kineverse.lie import Array, exp_so3, orthonormalize, right_jacobian, skew, transform
 
 from .bindings import evaluate_poses, fits_kernel, library
 from .motion_model import LinearisedPoses, ParameterPrior
@@ -74,7 +74,7 @@ class JointFamily:
     reach: int = 0
     slides: int = 0
 
-    def freedom(self, rows: int) -> Parametrisation:
+    def parametrisation(self, rows: int) -> Parametrisation:
         """Return the freedom for poses (6) or positions (3)."""
         return self.poses if rows == 6 else self.positions
 
@@ -161,25 +161,25 @@ class GroupMotion:
 
     group: JointFamily
     rows: int
-    left: Stack
-    right: Stack
+    left: Array
+    right: Array
     pitch: float = 0.0
 
     @property
-    def freedom(self) -> Parametrisation:
+    def parametrisation(self) -> Parametrisation:
         """Which components are joint values and parameters."""
-        return self.group.freedom(self.rows)
+        return self.group.parametrisation(self.rows)
 
     @property
     def size(self) -> int:
         """Number of parameters."""
-        freedom = self.freedom
+        freedom = self.parametrisation
         return len(freedom.left) + len(freedom.right) + self.group.pitch
 
     @property
     def joints(self) -> int:
         """Number of joint values."""
-        return len(self.freedom.joints)
+        return len(self.parametrisation.joints)
 
     @property
     def slides(self) -> int:
@@ -191,11 +191,11 @@ class GroupMotion:
         """Whether it is what its group says and nothing else, so that C knows all of it."""
         return type(self) is GroupMotion and fits_kernel(self.group, self.rows)
 
-    def at(self, values: Stack, native: bool = True) -> LinearisedPoses:
+    def linearise(self, values: Array, native: bool = True) -> LinearisedPoses:
         """Return the poses at joint values (N, k); it is done in C where it can be and ``native`` is true."""
         if native and library.is_native and self.is_plain:
             return evaluate_poses(self, values)
-        freedom = self.freedom
+        freedom = self.parametrisation
         twist = np.zeros((len(values), 6))
         twist[:, freedom.joints] = values
         if self.group.pitch:
@@ -217,12 +217,12 @@ class GroupMotion:
         rows = self.rows
         return LinearisedPoses(parent_T_child, np.concatenate(blocks, axis=2)[:, :rows], by_joints[:, :rows])
 
-    def _by_joints(self, moved: Stack, twist: Stack) -> Stack:
+    def _by_joints(self, moved: Array, twist: Array) -> Array:
         result = np.empty_like(moved)
         # Slides come before the turn, so they are along the axes of L.
         result[:, :3, :3] = self.left[:3, :3]
         result[:, 3:, :3] = 0.0
-        joints = self.freedom.joints
+        joints = self.parametrisation.joints
         if WX in joints or WY in joints:
             result[:, :, 3:] = moved[:, :, 3:] @ right_jacobian(twist[:, 3:])
         else:
@@ -231,9 +231,9 @@ class GroupMotion:
             result[:, :3, WZ] += self.pitch * self.left[:3, 2]
         return result
 
-    def moved(self, step: Stack) -> Self:
+    def retract(self, step: Array) -> Self:
         """Return the member that a step in the parameters leads to."""
-        freedom = self.freedom
+        freedom = self.parametrisation
         left, right = np.zeros(6), np.zeros(6)
         ends = len(freedom.left), len(freedom.left) + len(freedom.right)
         left[list(freedom.left)] = step[: ends[0]]
@@ -245,12 +245,12 @@ class GroupMotion:
         left_moved, right_moved = orthonormalize(self.left @ l_T_l), orthonormalize(r_T_r @ self.right)
         return replace(self, left=left_moved, right=right_moved, pitch=pitch)
 
-    def bounded(self, values: Stack, step: Stack) -> Stack:
+    def retract_joints(self, values: Array, step: Array) -> Array:
         """Return joint values after a step: at most half a radian at once."""
-        turning = [j >= WX for j in self.freedom.joints]
+        turning = [j >= WX for j in self.parametrisation.joints]
         step = step.copy()
         step[:, turning] = np.clip(step[:, turning], -0.5, 0.5)
-        result: Stack = values + step
+        result: Array = values + step
         return result
 
     @property
@@ -261,15 +261,15 @@ class GroupMotion:
     @property
     def kinds(self) -> tuple[int, ...]:
         """Slides share a width, and so do turns."""
-        return tuple(int(j >= WX) for j in self.freedom.joints)
+        return tuple(int(j >= WX) for j in self.parametrisation.joints)
 
-    def beforehand(self, mean: Stack) -> tuple[float, Stack]:
+    def log_prior(self, mean: Array) -> tuple[float, Array]:
         """Return the density of what the family has beyond a mean pose, and what keeps it finite.
 
         A lever is within reach, and a direction anywhere on half the sphere, as an axis has no sign. The mean
         pose has the density 1 / (m³ rad³) everywhere, which is no density but is the same for all.
         """
-        freedom, reach = self.freedom, self.group.reach
+        freedom, reach = self.parametrisation, self.group.reach
         log = 0.0
         if WX in freedom.left:
             log -= math.log(math.tau)
@@ -282,7 +282,7 @@ class GroupMotion:
         if self.group.pitch:
             log -= 0.5 * (self.pitch / PITCHES) ** 2 + 0.5 * math.log(math.tau * PITCHES**2)
         # The volume of mean poses per unit of the parameters that move it.
-        linear = self.at(mean[None, :])
+        linear = self.linearise(mean[None, :])
         right = slice(len(freedom.left), len(freedom.left) + len(freedom.right))
         matrix = np.concatenate([linear.by_parameters[0, :, right], linear.by_joints[0]], axis=1)
         # A lever of nothing has no volume at all; the size of an atom is as good.
@@ -295,10 +295,10 @@ class GroupMotion:
         precision[self.size + self.joints :] = REACH**-2
         return log, precision
 
-    def named(self) -> dict[str, Stack | float]:
+    def named_parameters(self) -> dict[str, Array | float]:
         """Return what a member of a family is, by name."""
         name = self.name
-        result: dict[str, Stack | float] = {}
+        result: dict[str, Array | float] = {}
         axis, point = self.left[:3, 2].copy(), self.left[:3, 3].copy()
         if name == "planar":
             result["normal"] = axis
@@ -316,13 +316,18 @@ class GroupMotion:
     def coordinates(self) -> tuple[str, ...]:
         """Return the names of the parameters, in their order."""
         letters = "xyz"
-        left = [f"point.{letters[j]}" if j < WX else f"axis.{letters[j - WX]}" for j in self.freedom.left]
-        right = [f"child.{letters[j]}" if j < WX else f"child.r{letters[j - WX]}" for j in self.freedom.right]
+        left = [
+            f"point.{letters[j]}" if j < WX else f"axis.{letters[j - WX]}" for j in self.parametrisation.left
+        ]
+        right = [
+            f"child.{letters[j]}" if j < WX else f"child.r{letters[j - WX]}"
+            for j in self.parametrisation.right
+        ]
         return (*left, *right, *(["pitch"] if self.group.pitch else []))
 
     def prior(self) -> ParameterPrior:
         """Return that levers are within reach, and pitches ordinary."""
-        reach, freedom = self.group.reach, self.freedom
+        reach, freedom = self.group.reach, self.parametrisation
         r_p = self.right[:3, 3]
         moves = np.concatenate([np.eye(3), -skew(r_p)], axis=1)[:reach, freedom.right]
         derivatives = np.zeros((reach, self.size))
@@ -336,7 +341,7 @@ class GroupMotion:
         return ParameterPrior(residuals, np.concatenate([derivatives / REACH, steep]))
 
 
-def _columns(parent_R_frame: Stack, lever: Stack) -> Stack:
+def _columns(parent_R_frame: Array, lever: Array) -> Array:
     """Return twists of the child, about its origin, per unit twist of a frame that carries it by a lever."""
     result = np.zeros((len(lever), 6, 6))
     result[:, :3, :3] = result[:, 3:, 3:] = parent_R_frame

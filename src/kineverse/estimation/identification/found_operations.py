@@ -25,7 +25,7 @@ from kineverse.articulations import (
     Revolute,
     Screw,
 )
-from kineverse.lie import Stack, mean_rotation
+from kineverse.lie import Array, mean_rotation
 from kineverse.model.body import Pose
 from kineverse.model.constraint import Constraint
 from kineverse.model.operation import Operation, Writes
@@ -197,7 +197,7 @@ def joint_operation(
     return Floating(**names, origin=whole)
 
 
-def rigid_pose(matrix: Stack) -> Pose:
+def rigid_pose(matrix: Array) -> Pose:
     """Return a pose whose rotation is one to the last digits, after all steps that made it."""
     exact = matrix.copy()
     exact[:3, :3] = mean_rotation(matrix[None, :3, :3])

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from kineverse.lie import Stack, exp_so3, orthonormalize, rotation_along_z, transform, translation
+from kineverse.lie import Array, exp_so3, orthonormalize, rotation_along_z, transform, translation
 
 from .families import VZ, WZ, GroupMotion
 from .motion_model import FamilyMember
@@ -25,12 +25,12 @@ def fix_gauge(solution: Solution[FamilyMember]) -> Solution[FamilyMember]:
     name = motion.group.name
     if name in ("rigid", "free", "spherical"):
         return solution
-    values = np.concatenate([solution.values, solution.belief.mean[None]])
+    values = np.concatenate([solution.values, solution.joint_prior.mean[None]])
     shift = solution.values.mean(axis=0)
     if name == "planar":
         shift[2:] = 0.0  # turns and slides do not commute
     middle = np.zeros(6)
-    middle[list(motion.freedom.joints)] = shift
+    middle[list(motion.parametrisation.joints)] = shift
     middle[VZ] += motion.pitch * middle[WZ]
     # What goes on from an earlier solution multiplies rotations without end, and they drift.
     left, right = orthonormalize(motion.left), orthonormalize(motion.right)
@@ -43,9 +43,11 @@ def fix_gauge(solution: Solution[FamilyMember]) -> Solution[FamilyMember]:
         motion, values = _axes(motion, values, flip)
     elif flip:
         motion, values = _gauged(motion, values, np.diag([1.0, -1.0, -1.0]))
-    belief = replace(solution.belief, mean=values[-1])
+    joint_prior = replace(solution.joint_prior, mean=values[-1])
     values = values[:-1]
-    return replace(solution, motion=motion, values=values, belief=belief, linear=motion.at(values))
+    return replace(
+        solution, motion=motion, values=values, joint_prior=joint_prior, linear=motion.linearise(values)
+    )
 
 
 def _origin(motion: GroupMotion) -> GroupMotion:
@@ -56,15 +58,15 @@ def _origin(motion: GroupMotion) -> GroupMotion:
     return replace(motion, left=motion.left @ translation(way), right=translation(-way) @ motion.right)
 
 
-def _axes(motion: GroupMotion, values: Stack, flip: bool) -> tuple[GroupMotion, Stack]:
+def _axes(motion: GroupMotion, values: Array, flip: bool) -> tuple[GroupMotion, Array]:
     """Turn the joint's frame about its axis to the one that only depends on the axis."""
     wanted = rotation_along_z(-motion.left[:3, 2] if flip else motion.left[:3, 2])
     return _gauged(motion, values, motion.left[:3, :3].T @ wanted)
 
 
-def _gauged(motion: GroupMotion, values: Stack, turn: Stack) -> tuple[GroupMotion, Stack]:
+def _gauged(motion: GroupMotion, values: Array, turn: Array) -> tuple[GroupMotion, Array]:
     change = transform(turn, np.zeros(3))
-    joints = list(motion.freedom.joints)
+    joints = list(motion.parametrisation.joints)
     twist = np.zeros((len(values), 6))
     twist[:, joints] = values
     twist[:, :3], twist[:, 3:] = twist[:, :3] @ turn, twist[:, 3:] @ turn

@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from kineverse.lie import Stack, inverse, log_so3, mean_rotation, rotation_along_z, transform
+from kineverse.lie import Array, inverse, log_so3, mean_rotation, rotation_along_z, transform
 
 from .families import JOINT_FAMILIES, GroupMotion, JointFamily
 from .observations import Observations
@@ -20,29 +20,29 @@ from .optimise import InitialGuess
 class MotionStatistics:
     """What relative poses look like as a whole."""
 
-    def __init__(self, seen: Observations) -> None:
-        self.rows = seen.rows
-        self.poses = seen.relative
+    def __init__(self, observations: Observations) -> None:
+        self.rows = observations.rows
+        self.poses = observations.relative
         self.positions = self.poses[:, :3, 3]
 
     @cached_property
-    def mean(self) -> Stack:
+    def mean(self) -> Array:
         """A pose in the middle."""
         rotation = mean_rotation(self.poses[:, :3, :3]) if self.rows == 6 else np.eye(3)
         return transform(rotation, self.positions.mean(axis=0))
 
     @cached_property
-    def spread(self) -> Stack:
+    def spread(self) -> Array:
         """Directions in which positions differ, as rows, the most first."""
         return _directions(self.positions - self.mean[:3, 3])
 
     @cached_property
-    def turns(self) -> Stack:
+    def turns(self) -> Array:
         """Rotation vectors from the middle, in the parent's axes, (N, 3)."""
         return log_so3(self.poses[:, :3, :3] @ self.mean[:3, :3].T)
 
     @cached_property
-    def axes(self) -> list[Stack]:
+    def axes(self) -> list[Array]:
         """Directions about which the child may turn."""
         normal = self.spread[2]
         return [_directions(self.turns)[0], normal] if self.rows == 6 else [normal]
@@ -53,7 +53,7 @@ class MotionStatistics:
         return [turning for plane in self.planes for turning in _turnings(self, *plane)]
 
     @cached_property
-    def planes(self) -> list[tuple[Stack, Stack]]:
+    def planes(self) -> list[tuple[Array, Array]]:
         """Frames whose last column any of them is, and positions in them from the middle."""
         frames = [rotation_along_z(axis) for axis in self.axes]
         return [(frame, (self.positions - self.mean[:3, 3]) @ frame) for frame in frames]
@@ -65,7 +65,7 @@ def initial_guesses(name: str, overview: MotionStatistics) -> Iterator[InitialGu
     group = JOINT_FAMILIES[name]
     count = len(overview.poses)
 
-    def start(rotation: Stack, centre: Stack, values: Stack) -> InitialGuess:
+    def start(rotation: Array, centre: Array, values: Array) -> InitialGuess:
         left = transform(rotation, centre)
         return InitialGuess(GroupMotion(group, rows, left, inverse(left) @ mean), values)
 
@@ -85,9 +85,9 @@ def initial_guesses(name: str, overview: MotionStatistics) -> Iterator[InitialGu
             values = places.copy()
             if rows == 6:
                 values[:, 2] = overview.turns @ frame[:, 2]
-            yield start(frame, mean[:3, 3], values[:, : len(group.freedom(rows).joints)])
+            yield start(frame, mean[:3, 3], values[:, : len(group.parametrisation(rows).joints)])
     elif name == "spherical":
-        yield from _about_a_point(overview, group.freedom(rows).joints, start)
+        yield from _about_a_point(overview, group.parametrisation(rows).joints, start)
     else:
         yield from _about_an_axis(group, overview)
 
@@ -105,14 +105,14 @@ class _Turning(NamedTuple):
         Slides by turns.
     """
 
-    left: Stack
-    right: Stack
-    angles: Stack
-    along: Stack
+    left: Array
+    right: Array
+    angles: Array
+    along: Array
     slope: float
 
 
-def _turnings(overview: MotionStatistics, frame: Stack, places: Stack) -> Iterator[_Turning]:
+def _turnings(overview: MotionStatistics, frame: Array, places: Array) -> Iterator[_Turning]:
     flat, along, centre = places[:, :2], places[:, 2], overview.mean[:3, 3]
     if overview.rows == 6:
         angles = overview.turns @ frame[:, 2]
@@ -132,7 +132,7 @@ def _turnings(overview: MotionStatistics, frame: Stack, places: Stack) -> Iterat
     yield _Turning(left, right, angles, along, _slope(angles, along))
 
 
-def _slope(angles: Stack, along: Stack) -> float:
+def _slope(angles: Array, along: Array) -> float:
     off = angles - angles.mean()
     variance = float(off @ off)
     return float(off @ along) / variance if variance > 0.0 else 0.0
@@ -189,19 +189,19 @@ def _about_a_point(overview, joints, start) -> Iterator[InitialGuess]:  # type: 
     yield InitialGuess(replace(result.motion, right=right), result.values)
 
 
-def _directions(centred: Stack) -> Stack:
+def _directions(centred: Array) -> Array:
     """Return principal directions (3, 3) by rows, that of the largest spread first."""
-    result: Stack = np.linalg.eigh(centred.T @ centred)[1][:, ::-1].T
+    result: Array = np.linalg.eigh(centred.T @ centred)[1][:, ::-1].T
     return result
 
 
-def _mean_direction(lever: Stack) -> Stack:
+def _mean_direction(lever: Array) -> Array:
     middle = lever.mean(axis=0)
     length = np.linalg.norm(middle)
     return middle / length if length > 0 else np.array([1.0, 0.0])
 
 
-def _sphere(points: Stack) -> Stack:
+def _sphere(points: Array) -> Array:
     """Return the centre of the circle or sphere through points: |p|² = 2 c·p + const, kept within reach."""
     size = math.sqrt(float(np.mean(np.sum(points**2, axis=1)))) or 1.0
     scaled = points / size
@@ -210,7 +210,7 @@ def _sphere(points: Stack) -> Stack:
     return _nearest(matrix, np.sum(scaled**2, axis=1))[:-1] * size
 
 
-def _pivot(flat: Stack, angles: Stack) -> Stack:
+def _pivot(flat: Array, angles: Array) -> Array:
     """Return the fixed point of turns by known angles: p = c + rotation(angle) q, linear in c and q."""
     matrix = np.zeros((len(flat), 2, 4))
     matrix[:, 0, 0] = matrix[:, 1, 1] = 1.0
@@ -220,7 +220,7 @@ def _pivot(flat: Stack, angles: Stack) -> Stack:
     return _nearest(matrix.reshape(-1, 4), flat.ravel())[:2]
 
 
-def _nearest(matrix: Stack, target: Stack) -> Stack:
+def _nearest(matrix: Array, target: Array) -> Array:
     """Return x with A x nearest to b, and a touch nearer to nothing: what A does not tell stays small."""
     normal = matrix.T @ matrix
     normal.flat[:: len(normal) + 1] += 1e-6

@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from kineverse.errors import InvalidValueError, ShapeError
-from kineverse.lie import Stack, inverse
+from kineverse.lie import Array, inverse
 
 _RIGID = 1e-4
 # Beyond these a double has not enough digits for what is computed.
@@ -38,10 +38,10 @@ class Observations:
         (N, m, m) with m = 6, or m = 3 if only positions were seen.
     """
 
-    parent: Stack
-    child: Stack
-    parent_covariance: Stack | None
-    child_covariance: Stack
+    parent: Array
+    child: Array
+    parent_covariance: Array | None
+    child_covariance: Array
 
     def __len__(self) -> int:
         return len(self.child)
@@ -52,11 +52,11 @@ class Observations:
         return int(self.child_covariance.shape[-1])
 
     @cached_property
-    def relative(self) -> Stack:
+    def relative(self) -> Array:
         """parent_T_child as observed, (N, 4, 4)."""
         return inverse(self.parent) @ self.child
 
-    def at(self, rows: slice | npt.NDArray[np.int_]) -> Observations:
+    def select(self, rows: slice | npt.NDArray[np.int_]) -> Observations:
         """Return some of them."""
         of_parent = None if self.parent_covariance is None else self.parent_covariance[rows]
         return Observations(self.parent[rows], self.child[rows], of_parent, self.child_covariance[rows])
@@ -156,7 +156,7 @@ def check_observations(
     return Observations(a, b, of_parent, covariances(given, len(b), rows, "child"))
 
 
-def check_rigid(poses: Stack, part: str) -> None:
+def check_rigid(poses: Array, part: str) -> None:
     """Look whether matrices (N, 4, 4) are rigid transforms.
 
     Raises
@@ -179,7 +179,7 @@ def check_rigid(poses: Stack, part: str) -> None:
         )
 
 
-def covariances(given: npt.ArrayLike, count: int, rows: int, part: str) -> Stack:
+def covariances(given: npt.ArrayLike, count: int, rows: int, part: str) -> Array:
     """Return covariances (N, m, m) of one for all, or of one for each pose.
 
     Raises
@@ -206,7 +206,7 @@ def _check_one_covariance(numbers: bytes, rows: int, part: str) -> None:
     _check_covariances(np.frombuffer(numbers).reshape(1, rows, rows), part)
 
 
-def _check_covariances(each: Stack, part: str) -> None:
+def _check_covariances(each: Array, part: str) -> None:
     _check_finite(each.reshape(len(each), -1), part, "Covariance")
     scale = np.sqrt(np.abs(np.einsum("nii->ni", each)))
     scale[scale == 0.0] = 1.0
@@ -229,7 +229,7 @@ def _check_covariances(each: Stack, part: str) -> None:
         )
 
 
-def _numbers(given: npt.ArrayLike, what: str) -> Stack:
+def _numbers(given: npt.ArrayLike, what: str) -> Array:
     try:
         if np.iscomplexobj(given):
             raise TypeError
@@ -238,7 +238,7 @@ def _numbers(given: npt.ArrayLike, what: str) -> Stack:
         raise ShapeError(f"{what} are no array of numbers.") from None
 
 
-def _check_finite(rows: Stack, part: str, what: str = "Pose") -> None:
+def _check_finite(rows: Array, part: str, what: str = "Pose") -> None:
     wrong = np.flatnonzero(~np.isfinite(rows).all(axis=1))
     if len(wrong):
         raise InvalidValueError(
@@ -272,8 +272,8 @@ class PoseTrack:
         When it was seen, (N,).
     """
 
-    poses: Stack
-    covariances: Stack | None
+    poses: Array
+    covariances: Array | None
     seen: npt.NDArray[np.bool_]
 
     @property
@@ -365,7 +365,7 @@ def pair_tracks(parent: PoseTrack, child: PoseTrack, rows: npt.NDArray[Any]) -> 
     )
 
 
-def _given(track: PoseTrack) -> Stack:
+def _given(track: PoseTrack) -> Array:
     assert track.covariances is not None  # only the observer is exact, and it is no child
     return track.covariances
 

@@ -20,7 +20,7 @@ from typing import Generic, NamedTuple, Self, TypeVar
 import numpy as np
 
 from kineverse.estimation.linear_algebra import invert_matrices, multiply_vectors, sum_log_determinants
-from kineverse.lie import Stack, exp_so3, log_so3, skew, transform
+from kineverse.lie import Array, exp_so3, log_so3, skew, transform
 
 from .motion_model import FamilyMember, LinearisedPoses, MotionModel, ParameterPrior
 from .observations import Observations
@@ -51,8 +51,8 @@ class JointValuePrior:
         the motion.
     """
 
-    mean: Stack
-    precision: Stack
+    mean: Array
+    precision: Array
     marginal: bool = False
 
     @staticmethod
@@ -65,7 +65,7 @@ class InitialGuess(NamedTuple):
     """A member of a family and joint values (N, k)."""
 
     motion: FamilyMember
-    values: Stack
+    values: Array
 
 
 @dataclass(frozen=True)
@@ -89,20 +89,20 @@ class Solution(Generic[M_co]):
         Derivatives at the solution.
     parent
         The most likely true poses of the parent, (N, 4, 4).
-    belief
+    joint_prior
         What was believed of joint values.
     converged
         Whether steps became small; else the best that was found.
     """
 
     motion: M_co
-    values: Stack
+    values: Array
     cost: float
-    residuals: Stack
-    covariance: Stack
+    residuals: Array
+    covariance: Array
     linear: LinearisedPoses
-    parent: Stack
-    belief: JointValuePrior
+    parent: Array
+    joint_prior: JointValuePrior
     converged: bool
 
     def scaled(self, factor: float) -> Self:
@@ -115,47 +115,49 @@ class _Point(Generic[M_co]):
     """A place in the space of all unknowns, linearised."""
 
     motion: M_co
-    values: Stack
-    parent: Stack
+    values: Array
+    parent: Array
     linear: LinearisedPoses
     prior: ParameterPrior
-    own: Stack
-    residuals: Stack
-    lever: Stack
-    parent_covariance: Stack | None
-    weights: Stack
-    covariance: Stack
+    own: Array
+    residuals: Array
+    lever: Array
+    parent_covariance: Array | None
+    weights: Array
+    covariance: Array
     cost: float
 
 
 def levenberg_marquardt(
-    seen: Observations,
+    observations: Observations,
     motion: M,
-    values: Stack,
-    parent: Stack | None = None,
-    belief: JointValuePrior | None = None,
+    values: Array,
+    parent: Array | None = None,
+    joint_prior: JointValuePrior | None = None,
     steps: int = STEPS,
 ) -> Solution[M]:
     """Return the most likely member of a family, from a start.
 
     Parameters
     ----------
-    seen
+    observations
         What was observed.
     motion, values
         Where to start: a member, and joint values (N, k).
     parent
         True poses of the parent to start from, (N, 4, 4); those observed if None.
-    belief
+    joint_prior
         What is believed of joint values; next to nothing if None.
     steps
         After so many the best so far is returned.
     """
-    belief = belief or JointValuePrior.vague(motion.joints)
-    point = _point(seen, motion, values, seen.parent if parent is None else parent, belief)
+    joint_prior = joint_prior or JointValuePrior.vague(motion.joints)
+    point = _linearise(
+        observations, motion, values, observations.parent if parent is None else parent, joint_prior
+    )
     damping, converged, before = 0.0, False, 0.0
     for _ in range(steps):
-        reduced = _step(seen, point, damping, belief)
+        reduced = _step(observations, point, damping, joint_prior)
         if reduced is None:
             damping = max(10.0 * damping, 1e-6)
             if damping > 1e8:
@@ -182,66 +184,72 @@ def levenberg_marquardt(
         point.covariance,
         point.linear,
         point.parent,
-        belief,
+        joint_prior,
         converged,
     )
 
 
-def solve_from_best_start(seen: Observations, starts: Sequence[InitialGuess]) -> Solution[FamilyMember]:
+def solve_from_best_start(
+    observations: Observations, starts: Sequence[InitialGuess]
+) -> Solution[FamilyMember]:
     """Return the most likely member of a family, from the best of several starts after few steps."""
     if len(starts) == 1:
-        return levenberg_marquardt(seen, *starts[0])
-    begun = [levenberg_marquardt(seen, *start, steps=FIRST_STEPS) for start in starts]
+        return levenberg_marquardt(observations, *starts[0])
+    begun = [levenberg_marquardt(observations, *start, steps=FIRST_STEPS) for start in starts]
     best = min(begun, key=lambda solution: solution.cost)
-    return best if best.converged else levenberg_marquardt(seen, best.motion, best.values, best.parent)
+    return (
+        best if best.converged else levenberg_marquardt(observations, best.motion, best.values, best.parent)
+    )
 
 
-def _point(seen: Observations, motion: M, values: Stack, parent: Stack, belief: JointValuePrior) -> _Point[M]:
-    linear = motion.at(values)
+def _linearise(
+    observations: Observations, motion: M, values: Array, parent: Array, joint_prior: JointValuePrior
+) -> _Point[M]:
+    linear = motion.linearise(values)
     prior = motion.prior()
-    rows = seen.rows
+    rows = observations.rows
     p_R_w = np.swapaxes(parent[:, :3, :3], 1, 2)
     by_child = linear.pose[:, :3, :3]
-    offset = (p_R_w @ (seen.child[:, :3, 3] - parent[:, :3, 3])[:, :, None])[:, :, 0]
+    offset = (p_R_w @ (observations.child[:, :3, 3] - parent[:, :3, 3])[:, :, None])[:, :, 0]
     error = offset - linear.pose[:, :3, 3]
     if rows == 6:
-        turned = log_so3(p_R_w @ seen.child[:, :3, :3] @ np.swapaxes(by_child, 1, 2))
+        turned = log_so3(p_R_w @ observations.child[:, :3, :3] @ np.swapaxes(by_child, 1, 2))
         error = np.concatenate([error, turned], axis=1)
-    covariance = _turned(seen.child_covariance, p_R_w)
-    cost = _squared(error, covariance)
-    own, of_parent = np.zeros((len(seen), 6)), None
+    covariance = _rotate_covariances(observations.child_covariance, p_R_w)
+    cost = _sum_of_squares(error, covariance)
+    own, of_parent = np.zeros((len(observations), 6)), None
     lever = _lever(linear.pose[:, :3, 3], rows)
     residuals = error
-    if seen.parent_covariance is not None:
-        moved = (p_R_w @ (seen.parent[:, :3, 3] - parent[:, :3, 3])[:, :, None])[:, :, 0]
-        own = np.concatenate([moved, log_so3(p_R_w @ seen.parent[:, :3, :3])], axis=1)
-        of_parent = _turned(seen.parent_covariance, p_R_w)
-        cost += _squared(own, of_parent)
+    if observations.parent_covariance is not None:
+        moved = (p_R_w @ (observations.parent[:, :3, 3] - parent[:, :3, 3])[:, :, None])[:, :, 0]
+        own = np.concatenate([moved, log_so3(p_R_w @ observations.parent[:, :3, :3])], axis=1)
+        of_parent = _rotate_covariances(observations.parent_covariance, p_R_w)
+        cost += _sum_of_squares(own, of_parent)
         residuals = error - multiply_vectors(lever, own)
         covariance = covariance + lever @ of_parent @ np.swapaxes(lever, 1, 2)
     weights = invert_matrices(covariance)
     cost += float(prior.residuals @ prior.residuals)
-    cost += float(np.sum(belief.precision * (values - belief.mean) ** 2))
-    if belief.marginal:
-        cost += _spread(covariance, linear, belief)
+    cost += float(np.sum(joint_prior.precision * (values - joint_prior.mean) ** 2))
+    if joint_prior.marginal:
+        cost += _log_determinants(covariance, linear, joint_prior)
     return _Point(
         motion, values, parent, linear, prior, own, residuals, lever, of_parent, weights, covariance, cost
     )
 
 
 def _step(
-    seen: Observations, point: _Point[M], damping: float, belief: JointValuePrior
+    observations: Observations, point: _Point[M], damping: float, joint_prior: JointValuePrior
 ) -> tuple[_Point[M], float] | None:
     """Return where a step leads, and by how much it promises to reduce the cost; None if there is no step."""
     by_parameters, by_joints = point.linear.by_parameters, point.linear.by_joints
     projected = point.weights
     moving = by_joints.shape[2] > 0
     if moving:
-        pulled = belief.precision * (belief.mean - point.values)
+        pulled = joint_prior.precision * (joint_prior.mean - point.values)
         weighted = np.swapaxes(by_joints, 1, 2) @ point.weights
         curvature = weighted @ by_joints
         diagonal = np.einsum("nii->ni", curvature)
-        diagonal += belief.precision + damping * diagonal
+        diagonal += joint_prior.precision + damping * diagonal
         slope = multiply_vectors(weighted, point.residuals) + pulled
         inverse = invert_matrices(curvature)
         projected = point.weights - np.swapaxes(weighted, 1, 2) @ inverse @ weighted
@@ -253,8 +261,8 @@ def _step(
         # What the prior of joint values adds, carried to the parameters.
         pull = multiply_vectors(inverse, pulled)
         right -= np.einsum("nrj,nrk,nk->j", by_parameters, np.swapaxes(weighted, 1, 2), pull)
-        if belief.marginal:
-            right -= 0.5 * _widening(point, inverse @ weighted, belief)
+        if joint_prior.marginal:
+            right -= 0.5 * _log_determinant_gradient(point, inverse @ weighted, joint_prior)
     normal[np.diag_indices_from(normal)] *= 1.0 + damping
     try:
         step = np.linalg.solve(normal, right) if len(right) else right
@@ -268,7 +276,7 @@ def _step(
         change = multiply_vectors(inverse, back)
         gain += float(np.sum(slope * multiply_vectors(inverse, slope)))
         left = left + multiply_vectors(by_joints, change)
-        values = point.motion.bounded(values, change)
+        values = point.motion.retract_joints(values, change)
     parent = point.parent
     if point.parent_covariance is not None:
         rest = point.weights @ (point.residuals - left)[:, :, None]
@@ -279,41 +287,43 @@ def _step(
     if not (np.isfinite(step).all() and np.isfinite(values).all() and np.isfinite(parent).all()):
         return None
     try:
-        trial = _point(seen, point.motion.moved(step), values, parent, belief)
+        trial = _linearise(observations, point.motion.retract(step), values, parent, joint_prior)
     except np.linalg.LinAlgError:  # so far away that the lever is all there is
         return None
     return (trial, gain) if np.isfinite(trial.cost) else None
 
 
-def _spread(covariance: Stack, linear: LinearisedPoses, belief: JointValuePrior) -> float:
+def _log_determinants(covariance: Array, linear: LinearisedPoses, joint_prior: JointValuePrior) -> float:
     """Return the sum of log |S + J_a P⁻¹ J_aᵀ|."""
     by_joints = linear.by_joints
-    return sum_log_determinants(covariance + (by_joints / belief.precision) @ np.swapaxes(by_joints, 1, 2))
+    return sum_log_determinants(
+        covariance + (by_joints / joint_prior.precision) @ np.swapaxes(by_joints, 1, 2)
+    )
 
 
-def _widening(point: _Point[M], gains: Stack, belief: JointValuePrior) -> Stack:
+def _log_determinant_gradient(point: _Point[M], gains: Array, joint_prior: JointValuePrior) -> Array:
     """Return the derivatives of the spread by each parameter, with joint values following."""
     size = point.motion.size
     result = np.zeros(size)
-    before = _spread(point.covariance, point.linear, belief)
-    own = point.covariance - _carried(point.lever, point.parent_covariance)
+    before = _log_determinants(point.covariance, point.linear, joint_prior)
+    own = point.covariance - _lever_covariance(point.lever, point.parent_covariance)
     for i in range(size):
         step = np.zeros(size)
         step[i] = _DIFFERENCE
         values = point.values - _DIFFERENCE * multiply_vectors(gains, point.linear.by_parameters[:, :, i])
-        linear = point.motion.moved(step).at(values)
+        linear = point.motion.retract(step).linearise(values)
         lever = _lever(linear.pose[:, :3, 3], point.residuals.shape[1])
-        covariance = own + _carried(lever, point.parent_covariance)
-        result[i] = (_spread(covariance, linear, belief) - before) / _DIFFERENCE
+        covariance = own + _lever_covariance(lever, point.parent_covariance)
+        result[i] = (_log_determinants(covariance, linear, joint_prior) - before) / _DIFFERENCE
     return result
 
 
-def _carried(lever: Stack, covariance: Stack | None) -> Stack | float:
+def _lever_covariance(lever: Array, covariance: Array | None) -> Array | float:
     """Return M Σ_A Mᵀ."""
     return 0.0 if covariance is None else lever @ covariance @ np.swapaxes(lever, 1, 2)
 
 
-def _lever(offset: Stack, rows: int) -> Stack:
+def _lever(offset: Array, rows: int) -> Array:
     """Return M: how the child moves with an error of the parent."""
     result = np.zeros((len(offset), rows, 6))
     result[:, :, :rows] = np.eye(rows)
@@ -321,7 +331,7 @@ def _lever(offset: Stack, rows: int) -> Stack:
     return result
 
 
-def _turned(covariance: Stack, rotation: Stack) -> Stack:
+def _rotate_covariances(covariance: Array, rotation: Array) -> Array:
     """Return covariances in other axes."""
     turned = np.empty_like(covariance) if covariance.flags.writeable else np.empty(covariance.shape)
     back = np.swapaxes(rotation, 1, 2)
@@ -331,6 +341,6 @@ def _turned(covariance: Stack, rotation: Stack) -> Stack:
     return turned
 
 
-def _squared(errors: Stack, covariance: Stack) -> float:
+def _sum_of_squares(errors: Array, covariance: Array) -> float:
     solved = np.linalg.solve(covariance, errors[:, :, None])
     return float(np.sum(errors * solved[:, :, 0]))

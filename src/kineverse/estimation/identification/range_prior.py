@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from kineverse.estimation.linear_algebra import invert_matrices, multiply_vectors, sum_log_determinants
-from kineverse.lie import Stack
+from kineverse.lie import Array
 
 from .motion_model import FamilyMember
 from .optimise import Solution
@@ -36,8 +36,8 @@ class PerObservation:
         Of all observations, with the joint values integrated over all there is.
     """
 
-    values: Stack
-    covariances: Stack
+    values: Array
+    covariances: Array
     log_likelihood: float
 
 
@@ -73,31 +73,33 @@ class JointRanges:
         turns, all orders of magnitude alike.
     """
 
-    deviations: Stack
-    mean: Stack
+    deviations: Array
+    mean: Array
     log_density: float
 
 
-def fit_joint_ranges(motion: FamilyMember, seen: PerObservation) -> JointRanges:
+def fit_joint_ranges(motion: FamilyMember, per_observation: PerObservation) -> JointRanges:
     """Return the most likely widths of the motion."""
     kinds = np.array(motion.kinds)
     deviations, occam = np.zeros(len(kinds)), 0.0
-    variances = np.einsum("nii->ni", seen.covariances)
+    variances = np.einsum("nii->ni", per_observation.covariances)
     for kind in sorted(set(motion.kinds)):
         block = kinds == kind
-        deviations[block], part = _width(seen.values[:, block], variances[:, block])
+        deviations[block], part = _width(per_observation.values[:, block], variances[:, block])
         occam += part
-    total = seen.covariances + np.diag(deviations**2)
+    total = per_observation.covariances + np.diag(deviations**2)
     weights = invert_matrices(total)
-    mean: Stack = np.linalg.solve(weights.sum(axis=0), multiply_vectors(weights, seen.values).sum(axis=0))
-    off = seen.values - mean
+    mean: Array = np.linalg.solve(
+        weights.sum(axis=0), multiply_vectors(weights, per_observation.values).sum(axis=0)
+    )
+    off = per_observation.values - mean
     log = -0.5 * float(np.sum(off * multiply_vectors(weights, off))) - 0.5 * sum_log_determinants(
         math.tau * total
     )
     return JointRanges(deviations, mean, log + occam)
 
 
-def _width(values: Stack, variances: Stack) -> tuple[float, float]:
+def _width(values: Array, variances: Array) -> tuple[float, float]:
     """Return the best s, and the logarithm of the mean over all s relative to the best."""
     total = variances + GRID[:, None, None] ** 2
     weights = 1.0 / total

@@ -13,7 +13,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from kineverse.lie import Stack
+from kineverse.lie import Array
 
 from .custom_family import FamilyMotion
 from .families import WX, GroupMotion
@@ -24,23 +24,23 @@ from .result import Fit
 _TIMES = 4.0
 
 
-def length_scale(seen: Observations) -> float:
+def length_scale(observations: Observations) -> float:
     """Return the unit: four times how far relative positions are from their middle, by the median; or 1."""
-    positions = seen.relative[:, :3, 3]
+    positions = observations.relative[:, :3, 3]
     off = np.linalg.norm(positions - np.median(positions, axis=0), axis=1)
     return max(1.0, _TIMES * float(np.median(off)))
 
 
-def in_units(seen: Observations, unit: float) -> Observations:
+def in_units(observations: Observations, unit: float) -> Observations:
     """Return observations with lengths in a unit."""
     if unit == 1.0:
-        return seen
+        return observations
     scale = np.array([1.0 / unit] * 3 + [1.0] * 3)
     by = np.outer(scale, scale)
-    of_parent = None if seen.parent_covariance is None else seen.parent_covariance * by
-    of_child = seen.child_covariance * by[: seen.rows, : seen.rows]
+    of_parent = None if observations.parent_covariance is None else observations.parent_covariance * by
+    of_child = observations.child_covariance * by[: observations.rows, : observations.rows]
     return Observations(
-        _placed(seen.parent, 1.0 / unit), _placed(seen.child, 1.0 / unit), of_parent, of_child
+        _placed(observations.parent, 1.0 / unit), _placed(observations.child, 1.0 / unit), of_parent, of_child
     )
 
 
@@ -61,7 +61,7 @@ def in_metres(fit: Fit, unit: float) -> Fit:
     if not isinstance(motion, GroupMotion):
         return replace(fit, residuals=residuals)
     scale = np.array([unit if _is_length(name) else 1.0 for name in fit.coordinates])
-    slides = np.array([unit if j < WX else 1.0 for j in motion.freedom.joints])
+    slides = np.array([unit if j < WX else 1.0 for j in motion.parametrisation.joints])
     motion = replace(
         motion,
         left=_placed(motion.left, unit),
@@ -70,7 +70,7 @@ def in_metres(fit: Fit, unit: float) -> Fit:
     )
     return replace(
         fit,
-        parameters=motion.named(),
+        parameters=motion.named_parameters(),
         covariance=fit.covariance * np.outer(scale, scale),
         frame=motion.left,
         joint_values=fit.joint_values * slides,
@@ -80,7 +80,7 @@ def in_metres(fit: Fit, unit: float) -> Fit:
     )
 
 
-def _placed(poses: Stack, factor: float) -> Stack:
+def _placed(poses: Array, factor: float) -> Array:
     result = poses.copy()
     result[..., :3, 3] *= factor
     return result

@@ -12,7 +12,7 @@ from weakref import WeakKeyDictionary
 
 import numpy as np
 
-from kineverse.lie import Stack
+from kineverse.lie import Array
 
 from . import ambiguities, maximum_likelihood, optimise, range_prior
 from . import evidence as integrated
@@ -36,7 +36,7 @@ class SolutionBuffer:
     ----------
     motion
         A member of the family.
-    belief
+    joint_prior
         What is believed of joint values.
     values, parents
         Joint values (N, k) and true poses of the parent (N, 4, 4) to begin with.
@@ -44,7 +44,9 @@ class SolutionBuffer:
 
     __slots__ = ("_covariances", "_linear", "_motion", "_parents", "_residuals", "_values", "numbers")
 
-    def __init__(self, motion: GroupMotion, belief: JointValuePrior, values: Stack, parents: Stack) -> None:
+    def __init__(
+        self, motion: GroupMotion, joint_prior: JointValuePrior, values: Array, parents: Array
+    ) -> None:
         count, rows, joints, size = len(parents), motion.rows, motion.joints, motion.size
         shapes = ((joints,), (4, 4), (rows,), (rows, rows), (4, 4), (rows, size), (rows, joints))
         lengths = [count * math.prod(shape) for shape in shapes]
@@ -60,14 +62,14 @@ class SolutionBuffer:
         self._parents[:] = parents
         head = self.numbers
         head[:MOTION_SIZE] = pack_motion(motion)
-        head[_MARGINAL] = belief.marginal
-        head[_MEAN : _MEAN + joints] = belief.mean
-        head[_PRECISION : _PRECISION + joints] = belief.precision
+        head[_MARGINAL] = joint_prior.marginal
+        head[_MEAN : _MEAN + joints] = joint_prior.mean
+        head[_PRECISION : _PRECISION + joints] = joint_prior.precision
 
     @staticmethod
-    def of(solution: Solution[GroupMotion]) -> SolutionBuffer:
+    def from_solution(solution: Solution[GroupMotion]) -> SolutionBuffer:
         """Return a solution in memory of its own."""
-        answer = SolutionBuffer(solution.motion, solution.belief, solution.values, solution.parent)
+        answer = SolutionBuffer(solution.motion, solution.joint_prior, solution.values, solution.parent)
         answer.numbers[_COST], answer.numbers[_CONVERGED] = solution.cost, solution.converged
         answer._residuals[:] = solution.residuals
         answer._covariances[:] = solution.covariance
@@ -92,7 +94,7 @@ class SolutionBuffer:
             covariance=self._covariances,
             linear=self._linear,
             parent=self._parents,
-            belief=JointValuePrior(
+            joint_prior=JointValuePrior(
                 head[_MEAN : _MEAN + joints],
                 head[_PRECISION : _PRECISION + joints],
                 bool(head[_MARGINAL]),
@@ -137,53 +139,70 @@ class IdentificationSolver:
 
     def solve(
         self,
-        seen: Observations,
+        observations: Observations,
         start: InitialGuess,
-        parent: Stack,
-        belief: JointValuePrior,
+        parent: Array,
+        joint_prior: JointValuePrior,
         steps: int = optimise.STEPS,
     ) -> Solution[FamilyMember]:
         """Do what :func:`.optimise.levenberg_marquardt` does."""
         motion = start.motion
         if not _is_for_c(motion):
-            return optimise.levenberg_marquardt(seen, motion, start.values, parent, belief, steps)
-        problem, answer = _problem(seen, motion), SolutionBuffer(motion, belief, start.values, parent)
+            return optimise.levenberg_marquardt(
+                observations, motion, start.values, parent, joint_prior, steps
+            )
+        problem, answer = (
+            _problem(observations, motion),
+            SolutionBuffer(motion, joint_prior, start.values, parent),
+        )
         problem.steps = steps
         _run(library.code.solve, problem, answer)
         return answer.solution
 
-    def likeliest(self, seen: Observations, starts: Sequence[InitialGuess]) -> Scored:
+    def maximum_likelihood(self, observations: Observations, starts: Sequence[InitialGuess]) -> Scored:
         """Do what :func:`.maximum_likelihood.maximum_likelihood` does."""
         motions = [start.motion for start in starts if _is_for_c(start.motion)]
         if len(motions) < len(starts):
-            return maximum_likelihood.maximum_likelihood(seen, starts)
+            return maximum_likelihood.maximum_likelihood(observations, starts)
         motion = motions[0]
-        answer = SolutionBuffer(motion, JointValuePrior.vague(motion.joints), starts[0].values, seen.parent)
+        answer = SolutionBuffer(
+            motion, JointValuePrior.vague(motion.joints), starts[0].values, observations.parent
+        )
         begin, values = (
             np.array([pack_motion(m) for m in motions]),
             np.array([start.values for start in starts]),
         )
         given = len(starts), begin.ctypes.data, values.ctypes.data
-        _run(library.code.likeliest, _problem(seen, motion), answer, given)
+        _run(library.code.likeliest, _problem(observations, motion), answer, given)
         return Scored(answer.solution, answer.log_evidence)
 
-    def refined(self, seen: Observations, solution: Solution[FamilyMember]) -> Scored:
+    def maximise_marginal_likelihood(
+        self, observations: Observations, solution: Solution[FamilyMember]
+    ) -> Scored:
         """Do what :func:`.maximum_likelihood.maximise_marginal_likelihood` does."""
         if not _is_of_c(solution):
-            return maximum_likelihood.maximise_marginal_likelihood(seen, solution)
-        answer = SolutionBuffer.of(solution)
-        _run(library.code.refine, _problem(seen, solution.motion), answer)
+            return maximum_likelihood.maximise_marginal_likelihood(observations, solution)
+        answer = SolutionBuffer.from_solution(solution)
+        _run(library.code.refine, _problem(observations, solution.motion), answer)
         return Scored(answer.solution, answer.log_evidence)
 
-    def continued(
-        self, seen: Observations, start: InitialGuess, parent: Stack, belief: JointValuePrior, known: int
+    def continue_from(
+        self,
+        observations: Observations,
+        start: InitialGuess,
+        parent: Array,
+        joint_prior: JointValuePrior,
+        known: int,
     ) -> Scored:
         """Do what :func:`.maximum_likelihood.continue_from` does."""
         motion = start.motion
         if not _is_for_c(motion):
-            return maximum_likelihood.continue_from(seen, start, parent, belief, known)
-        problem, answer = _problem(seen, motion), SolutionBuffer(motion, belief, start.values, parent)
-        problem.given.fresh = len(seen) - known
+            return maximum_likelihood.continue_from(observations, start, parent, joint_prior, known)
+        problem, answer = (
+            _problem(observations, motion),
+            SolutionBuffer(motion, joint_prior, start.values, parent),
+        )
+        problem.given.fresh = len(observations) - known
         _run(library.code.carry_on, problem, answer)
         return Scored(answer.solution, answer.log_evidence)
 
@@ -193,9 +212,11 @@ class IdentificationSolver:
             return integrated.laplace_evidence(solution.scaled(scale))
         logs, *rest = _rated(solution, np.array([scale]))
         values, covariances, information = rest
-        return Evidence.of(float(logs[0]), information, solution.motion.size, values, covariances)
+        return Evidence.from_information(
+            float(logs[0]), information, solution.motion.size, values, covariances
+        )
 
-    def log_evidences(self, solution: Solution[FamilyMember], scales: Stack) -> Stack:
+    def log_evidences(self, solution: Solution[FamilyMember], scales: Array) -> Array:
         """Return the logarithm of the evidence for noise that is larger by several factors."""
         if not _is_of_c(solution):
             return np.array([integrated.laplace_evidence(solution.scaled(c)).log_evidence for c in scales])
@@ -218,16 +239,16 @@ def _run(
     problem: Problem,
     answer: SolutionBuffer,
     given: Sequence[int] = (),
-    results: Sequence[Stack] = (),
+    results: Sequence[Array] = (),
 ) -> None:
     """Run a stage: what it is given comes before its memory, and its results after the answer."""
     where = ctypes.addressof(problem)
-    memory = _memory.of(library.code.memory_of(where))
+    memory = _memory.reserve(library.code.memory_of(where))
     addresses = (array.ctypes.data for array in (memory, answer.numbers, *results))
     stage(where, *given, *addresses)
 
 
-def _rated(solution: Solution[GroupMotion], scales: Stack) -> tuple[Stack, ...]:
+def _rated(solution: Solution[GroupMotion], scales: Array) -> tuple[Array, ...]:
     """Return the logarithms of the evidence; of the last also joint values, covariances and information."""
     motion, (count, joints) = solution.motion, solution.values.shape
     problem = Problem.from_buffer_copy(_family(motion.group, motion.rows))
@@ -235,13 +256,19 @@ def _rated(solution: Solution[GroupMotion], scales: Stack) -> tuple[Stack, ...]:
     unknowns = motion.size + joints + motion.slides
     shapes = (len(scales),), (count, joints), (count, joints, joints), (unknowns, unknowns)
     results = tuple(np.empty(shape) for shape in shapes)
-    _run(library.code.rate, problem, SolutionBuffer.of(solution), (len(scales), scales.ctypes.data), results)
+    _run(
+        library.code.rate,
+        problem,
+        SolutionBuffer.from_solution(solution),
+        (len(scales), scales.ctypes.data),
+        results,
+    )
     return results
 
 
-def _problem(seen: Observations, motion: GroupMotion) -> Problem:
+def _problem(observations: Observations, motion: GroupMotion) -> Problem:
     problem = Problem.from_buffer_copy(_family(motion.group, motion.rows))
-    problem.given = _given(seen)
+    problem.given = _given(observations)
     return problem
 
 
@@ -256,24 +283,28 @@ def _family(group: JointFamily, rows: int) -> Problem:
 _known: WeakKeyDictionary[Observations, Given] = WeakKeyDictionary()
 
 
-def _given(seen: Observations) -> Given:
+def _given(observations: Observations) -> Given:
     """Return observations as C has them; they are the same for all families."""
-    given = _known.get(seen)
+    given = _known.get(observations)
     if given is None:
-        given = Given(count=len(seen), known=seen.parent_covariance is None, softer=len(seen.softness))
+        given = Given(
+            count=len(observations),
+            known=observations.parent_covariance is None,
+            softer=len(observations.softness),
+        )
         arrays = {
-            "parent": seen.parent,
-            "child": seen.child,
-            "parent_covariance": seen.parent_covariance,
-            "child_covariance": seen.child_covariance,
-            "softness": np.array(seen.softness),
+            "parent": observations.parent,
+            "child": observations.child,
+            "parent_covariance": observations.parent_covariance,
+            "child_covariance": observations.child_covariance,
+            "softness": np.array(observations.softness),
         }
         # Kept with it, as C only knows where they are.
         given.arrays = [np.ascontiguousarray(a) for a in arrays.values() if a is not None]
         there = iter(given.arrays)
         for name, array in arrays.items():
             setattr(given, name, None if array is None else next(there).ctypes.data)
-        _known[seen] = given
+        _known[observations] = given
     return given
 
 
@@ -283,7 +314,7 @@ class _Memory(threading.local):
     def __init__(self) -> None:
         self._numbers = np.empty(0)
 
-    def of(self, size: int) -> Stack:
+    def reserve(self, size: int) -> Array:
         """Return so many numbers at least."""
         if len(self._numbers) >= size:
             return self._numbers

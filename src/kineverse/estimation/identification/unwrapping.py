@@ -13,7 +13,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from kineverse.lie import Stack, inverse
+from kineverse.lie import Array, inverse
 
 from .families import WX, WY, WZ, GroupMotion
 from .motion_model import FamilyMember, MotionModel
@@ -26,7 +26,7 @@ def find_revolving_joint(motion: MotionModel) -> int | None:
     """Return the number of the joint value that counts turns about an axis, None if there is none."""
     if not isinstance(motion, GroupMotion):
         return None
-    joints = motion.freedom.joints
+    joints = motion.parametrisation.joints
     return None if WX in joints or WY in joints or WZ not in joints else joints.index(WZ)
 
 
@@ -37,12 +37,12 @@ def unwrap_solution(solution: Solution[FamilyMember]) -> Solution[FamilyMember]:
         return solution
     values = solution.values.copy()
     values[:, joint] = np.unwrap(values[:, joint])
-    mean = solution.belief.mean.copy()
+    mean = solution.joint_prior.mean.copy()
     mean[joint] = values[:, joint].mean()
-    return replace(solution, values=values, belief=replace(solution.belief, mean=mean))
+    return replace(solution, values=values, joint_prior=replace(solution.joint_prior, mean=mean))
 
 
-def unwrap_screw(seen: Observations, solution: Solution[FamilyMember]) -> InitialGuess | None:
+def unwrap_screw(observations: Observations, solution: Solution[FamilyMember]) -> InitialGuess | None:
     """Return a screw that goes round as often as the observations do; None if this one does."""
     motion = solution.motion
     if not isinstance(motion, GroupMotion) or not is_screw(motion):
@@ -50,7 +50,7 @@ def unwrap_screw(seen: Observations, solution: Solution[FamilyMember]) -> Initia
     angles = np.unwrap(solution.values[:, 0])
     if np.array_equal(angles, solution.values[:, 0]):
         return None
-    along = (inverse(motion.left) @ seen.relative)[:, 2, 3]
+    along = (inverse(motion.left) @ observations.relative)[:, 2, 3]
     pitch, offset = np.polyfit(angles, along, 1)
     right = motion.right.copy()
     right[2, 3] = offset
@@ -77,7 +77,7 @@ def log_unwrapping_gain(solution: Solution[FamilyMember]) -> float:
     return max(0.0, gain)
 
 
-def _spread(deviations: Stack, covariances: Stack) -> float:
+def _spread(deviations: Array, covariances: Array) -> float:
     """Return the logarithm of the standard deviation of the mean of joint values."""
     return -0.5 * math.log(float(np.sum(1.0 / (deviations[0] ** 2 + covariances[:, 0, 0]))))
 

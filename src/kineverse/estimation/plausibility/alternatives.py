@@ -198,7 +198,7 @@ class JointObservations:
     def at(self, rows: slice | npt.NDArray[np.int_]) -> JointObservations:
         """Return some of the times at which it was seen."""
         return JointObservations(
-            self.link, self.served, self.observations.at(rows), self.misfit.at(rows), self.times[rows]
+            self.link, self.served, self.observations.select(rows), self.misfit.at(rows), self.times[rows]
         )
 
 
@@ -217,7 +217,7 @@ def judge_joint(
         since = seen.at(slice(int(np.searchsorted(seen.times, stopped)), None))
         right = np.arange(len(since.times))
         if outliers is not None and len(right) >= 2:
-            right = identify_observations(since.observations, families, outliers).best.right
+            right = identify_observations(since.observations, families, outliers).best.inliers
     good = since.at(right)
     instead = identify_observations(good.observations, families) if len(right) >= 2 else None
     probabilities = _probabilities(good, instead)
@@ -271,7 +271,7 @@ def _propose_replacement(
 ) -> tuple[Operation | None, str]:
     if instead is None or len(since.times) < _ENOUGH:
         return None, "it was seen too seldom since to say what it is instead"
-    if not instead.best.told:
+    if not instead.best.is_determined:
         return None, f"what it is instead is not known yet, {instead}"
     if not follows_another(model, seen.link) and _stands_alone(model, since, instead):
         # Another joint in its place would not help.

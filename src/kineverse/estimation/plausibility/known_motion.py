@@ -229,15 +229,15 @@ class KnownMotion:
         """The number of joint values."""
         return self.served.joints
 
-    def at(self, values: Stack) -> LinearisedPoses:
+    def linearise(self, values: Stack) -> LinearisedPoses:
         """Return the poses at joint values (N, k)."""
         return self.served.at(self.served.moved(self.reference, values))
 
-    def moved(self, step: Stack) -> Self:
+    def retract(self, step: Stack) -> Self:
         """Return itself: there are no parameters."""
         return self
 
-    def bounded(self, values: Stack, step: Stack) -> Stack:
+    def retract_joints(self, values: Stack, step: Stack) -> Stack:
         """Return joint values after a step: at most half a radian at once, and inside the limits."""
         turning = self.served.turning
         step = np.where(turning, np.clip(step, -0.5, 0.5), step)

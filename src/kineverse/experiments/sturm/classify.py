@@ -192,7 +192,7 @@ def axis_distance(fit: Fit) -> float:
     if fit.family not in ("revolute", "screw", "cylindrical"):
         return math.nan
     axis, point = np.asarray(fit.parameters["axis"]), np.asarray(fit.parameters["point"])
-    offsets = fit.motion.at(fit.joint_values).pose[:, :3, 3] - point
+    offsets = fit.motion.linearise(fit.joint_values).pose[:, :3, 3] - point
     return float(np.linalg.norm(np.cross(offsets, axis), axis=1).mean())
 
 

@@ -21,7 +21,7 @@ from kineverse.errors import DuplicateNameError, InvalidValueError, ModelError
 from kineverse.estimation.identification.found_operations import rigid_pose
 from kineverse.estimation.identification.observations import PosesLike, PoseTrack, check_tracks, exact_track
 from kineverse.estimation.identification.result import SURE, Fit, IdentificationResult
-from kineverse.lie import Stack, inverse
+from kineverse.lie import Array, inverse
 from kineverse.model.frame import WORLD
 from kineverse.model.model import Model
 from kineverse.model.operation import Operation
@@ -53,7 +53,7 @@ class RigidBody:
     """
 
     parts: tuple[str, ...]
-    places: Mapping[str, Stack]
+    poses: Mapping[str, Array]
     probability: float = 1.0
 
     def __str__(self) -> str:
@@ -62,42 +62,44 @@ class RigidBody:
 
 
 def find_rigid_bodies(
-    seen: Mapping[str, PoseTrack], pairs: Mapping[frozenset[str], PartPair]
+    tracks: Mapping[str, PoseTrack], pairs: Mapping[frozenset[str], PartPair]
 ) -> tuple[RigidBody, ...]:
     """Return rigid bodies: parts join while more speaks for it than against it over all pairs."""
-    group: dict[str, tuple[str, ...]] = {name: (name,) for name in seen}
-    surest = dict.fromkeys(seen, 1.0)
-    for joined in sorted(pairs.values(), key=lambda p: -p.rigid):
+    group: dict[str, tuple[str, ...]] = {name: (name,) for name in tracks}
+    surest = dict.fromkeys(tracks, 1.0)
+    for joined in sorted(pairs.values(), key=lambda p: -p.log_odds_rigid):
         a, b = group[joined.parent], group[joined.child]
-        if a == b or joined.rigid <= 0.0:
+        if a == b or joined.log_odds_rigid <= 0.0:
             continue
         across = [pairs[frozenset((x, y))] for x in a for y in b if frozenset((x, y)) in pairs]
-        odds = sum(p.rigid for p in across)
+        odds = sum(p.log_odds_rigid for p in across)
         if odds <= 0.0:
             continue
-        least = min(joined.found["rigid"].probability, surest[a[0]], surest[b[0]])
+        least = min(joined.result["rigid"].probability, surest[a[0]], surest[b[0]])
         for name in (*a, *b):
             group[name], surest[name] = (*a, *b), least
     result = []
     for parts in dict.fromkeys(group.values()):
         # What was seen most often stands for all, unless it is a point, and the world before everything.
-        often = {p: (p == WORLD, not seen[p].is_point, int(seen[p].seen.sum())) for p in parts}
-        ordered = sorted(parts, key=lambda p: (*(-n for n in often[p]), list(seen).index(p)))
-        places = _places(ordered, pairs, {p for p in parts if seen[p].is_point})
+        often = {p: (p == WORLD, not tracks[p].is_point, int(tracks[p].seen.sum())) for p in parts}
+        ordered = sorted(parts, key=lambda p: (*(-n for n in often[p]), list(tracks).index(p)))
+        places = _poses_in_first(ordered, pairs, {p for p in parts if tracks[p].is_point})
         result.append(RigidBody(tuple(ordered), places, surest[parts[0]]))
     return tuple(result)
 
 
-def _places(parts: list[str], pairs: Mapping[frozenset[str], PartPair], points: set[str]) -> dict[str, Stack]:
+def _poses_in_first(
+    parts: list[str], pairs: Mapping[frozenset[str], PartPair], points: set[str]
+) -> dict[str, Array]:
     """Return the poses of parts in the first, along the pairs that are surest to be rigid."""
     places = {parts[0]: np.eye(4)}
-    rigid = {c: p.rigid for c, p in pairs.items() if c <= set(parts)}
+    rigid = {c: p.log_odds_rigid for c, p in pairs.items() if c <= set(parts)}
     tree = spanning_tree(parts, rigid, points)
     for part in parts[1:]:
         place = np.eye(4)
         for a, b in pairwise(tree_path(tree, parts[0], part)):
             known = pairs[frozenset((a, b))]
-            reference = np.asarray(known.found["rigid"].parameters["reference"])
+            reference = np.asarray(known.result["rigid"].parameters["reference"])
             place = place @ (reference if known.parent == a else inverse(reference))
         places[part] = place
     return places
@@ -127,20 +129,20 @@ class KinematicEdge:
 
     parent: str
     child: str
-    found: IdentificationResult
+    result: IdentificationResult
     times: npt.NDArray[np.int_]
     probability: float = 1.0
-    others: Mapping[tuple[str, str], float] = field(default_factory=dict)
-    closing: LoopClosure | None = None
+    alternatives: Mapping[tuple[str, str], float] = field(default_factory=dict)
+    closure: LoopClosure | None = None
 
     @property
     def fit(self) -> Fit:
         """The most probable joint, with its covariance and the range that was seen."""
-        return self.found.best
+        return self.result.best
 
     def __str__(self) -> str:
-        words = f"{self.parent} -> {self.child}: {self.found}"
-        for (a, b), probability in self.others.items():
+        words = f"{self.parent} -> {self.child}: {self.result}"
+        for (a, b), probability in self.alternatives.items():
             words += f"; or {a} -> {b} ({probability:.0%})"
         return words
 
@@ -205,16 +207,16 @@ class KinematicGraph:
                 yield edge.fit.operation(name(first), name(edge.parent), as_point=first in self.points)
             body = next(b for b in self.bodies if b.parts[0] == first)
             for part in body.parts[1:]:
-                origin = rigid_pose(body.places[part])
+                origin = rigid_pose(body.poses[part])
                 yield Fixed(name=name(part), parent=name(first), child=name(part), origin=origin)
         for loop in self.loops if close else ():
-            if loop.closing is None:
+            if loop.closure is None:
                 raise ModelError(
                     f"The loop of '{loop.parent}' and '{loop.child}' cannot be closed: it has coordinates "
                     "that cannot follow others, as those of a ball, or it is a screw that would close it. "
                     "Say close=False for a model in which it is open."
                 )
-            yield from loop.closing.operations(name)
+            yield from loop.closure.operations(name)
 
     def model(self, prefix: str | None = None, close: bool = True) -> Model:
         """Return a model with a frame for each part.
@@ -284,31 +286,31 @@ def identify_graph(
     UnknownNameError
         For a family that does not exist.
     """
-    seen = check_tracks(poses, noise, points=True)
+    tracks = check_tracks(poses, noise, points=True)
     if world:
-        if WORLD in seen:
+        if WORLD in tracks:
             raise DuplicateNameError(
                 "The world is a part already; call the part otherwise, or say world=False."
             )
-        seen = {WORLD: exact_track(max((len(t.poses) for t in seen.values()), default=0)), **seen}
-    if len(seen) < 2:
+        tracks = {WORLD: exact_track(max((len(t.poses) for t in tracks.values()), default=0)), **tracks}
+    if len(tracks) < 2:
         raise InvalidValueError("How parts are connected takes at least two of them, or one and the world.")
-    if all(track.is_point for track in seen.values()):
+    if all(track.is_point for track in tracks.values()):
         raise InvalidValueError(
             "Only positions were seen, of all parts. What a part hangs on has to be seen as a pose, "
             "(N, 4, 4); the world is one, unless world=False."
         )
-    pairs = identify_pairs(seen, families, progress)
-    bodies = find_rigid_bodies(seen, pairs)
+    pairs = identify_pairs(tracks, families, progress)
+    bodies = find_rigid_bodies(tracks, pairs)
     firsts = [body.parts[0] for body in bodies]
     between = {c: p for c, p in pairs.items() if c <= set(firsts)}
-    points = {name for name, track in seen.items() if track.is_point}
+    points = {name for name, track in tracks.items() if track.is_point}
     tree = spanning_tree(firsts, {c: p.gain for c, p in between.items()}, points)
     # From the world, or from what most parts hang on, but never from a point.
     first = sorted(firsts, key=lambda n: (n != WORLD, n in points, -sum(n in c for c in tree)))
     roots, directed = orient_tree(first, firsts, tree)
-    joints = [_towards(between[frozenset(ends)], ends[0], seen, families) for ends in directed]
-    loops = _loops({c: p for c, p in between.items() if not c & points}, joints)
+    joints = [_orient_pair(between[frozenset(ends)], ends[0], tracks, families) for ends in directed]
+    loops = _find_loops({c: p for c, p in between.items() if not c & points}, joints)
     # What closes a loop is there beside the tree, not in place of a part of it.
     gains = {c: p.gain for c, p in between.items() if c not in loops}
     likely = edge_probabilities(firsts, gains, points)
@@ -320,23 +322,25 @@ def identify_graph(
             found = replacement_probabilities(connection, tree, gains, points)
             others = {(between[c].parent, between[c].child): p for c, p in found.items() if p > 1.0 - SURE}
         edges.append(
-            KinematicEdge(joint.parent, joint.child, joint.found, joint.times, likely[connection], others)
+            KinematicEdge(joint.parent, joint.child, joint.result, joint.times, likely[connection], others)
         )
     ordered = sorted(likely.items(), key=lambda pair: -pair[1])
     connections = {(between[c].parent, between[c].child): p for c, p in ordered}
-    of_points = tuple(name for name in seen if name in points)
+    of_points = tuple(name for name in tracks if name in points)
     return KinematicGraph(bodies, tuple(edges), tuple(loops.values()), roots, connections, of_points)
 
 
-def _towards(known: PartPair, parent: str, seen: Mapping[str, PoseTrack], families: FamilyChoice) -> PartPair:
+def _orient_pair(
+    known: PartPair, parent: str, tracks: Mapping[str, PoseTrack], families: FamilyChoice
+) -> PartPair:
     """Return a pair seen from its other end, if need be."""
     if known.parent == parent:
         return known
-    turned = identify_pair(seen, known.child, known.parent, families)
+    turned = identify_pair(tracks, known.child, known.parent, families)
     return known if turned is None else turned
 
 
-def _loops(
+def _find_loops(
     between: Mapping[frozenset[str], PartPair], joints: Sequence[PartPair]
 ) -> dict[frozenset[str], KinematicEdge]:
     """Return what closes loops of a tree, by its ends."""
@@ -347,7 +351,7 @@ def _loops(
         if connection not in tree and way and closes_loop(known, way):
             candidates.append(ObservedLoop(known, way))
     found = {}
-    for (joint, _), closing in close_loops(candidates, joints):
-        edge = KinematicEdge(joint.parent, joint.child, joint.found, joint.times, closing=closing)
+    for (joint, _), closure in close_loops(candidates, joints):
+        edge = KinematicEdge(joint.parent, joint.child, joint.result, joint.times, closure=closure)
         found[frozenset((joint.parent, joint.child))] = edge
     return found

@@ -23,7 +23,7 @@ from kineverse.estimation.identification.families import GroupMotion
 from kineverse.estimation.identification.found_operations import family_coordinates, rigid_pose
 from kineverse.estimation.identification.result import Fit
 from kineverse.estimation.linear_algebra import invert_matrices
-from kineverse.lie import Stack, inverse, skew, transform
+from kineverse.lie import Array, inverse, skew, transform
 from kineverse.loops import CloseLoop
 from kineverse.loops.equations import AXES
 from kineverse.model.frame import Frame
@@ -61,7 +61,7 @@ class ObservedLoop(NamedTuple):
     """A joint, and the joints of a tree from its parent to its child."""
 
     joint: ObservedJoint
-    others: Sequence[ObservedJoint]
+    chain: Sequence[ObservedJoint]
 
     @property
     def strength(self) -> float:
@@ -69,7 +69,7 @@ class ObservedLoop(NamedTuple):
 
         Any short motion is like that of a hinge somewhere.
         """
-        fit = self.joint.found.best
+        fit = self.joint.result.best
         moved = np.ptp(fit.joint_values, axis=0)
         known = np.maximum(fit.deviations.mean(axis=0), 1e-12)
         bent = np.where(find_angles(fit), np.minimum(moved, 1.0), 1.0)
@@ -94,9 +94,9 @@ class LoopClosure:
 
     name: str
     seat_in: str
-    seat: Stack
+    seat: Array
     pin_in: str
-    pin: Stack
+    pin: Array
     mask: tuple[str, ...]
     dependent: tuple[str, ...]
     home: tuple[tuple[str, float], ...]
@@ -128,10 +128,10 @@ class _Ends:
         The components that coincide.
     """
 
-    seat: Stack
-    pin: Stack
+    seat: Array
+    pin: Array
     motion: Twists
-    held: tuple[int, ...]
+    constrained: tuple[int, ...]
 
 
 def close_loops(
@@ -159,13 +159,13 @@ def close_loops(
         elif _can_move(loop) and (plan := _plan(loop, ends, followers)) is not None:
             followers.add(plan.motion, plan.columns, plan.slopes)
             kept.append((loop, ends))
-    seen = {
-        x: (joint.times, joint.found.best.joint_values[:, k])
+    observed = {
+        x: (joint.times, joint.result.best.joint_values[:, k])
         for joint in joints
-        for k, x in enumerate(_coordinates(joint.found.best, joint.child) or ())
+        for k, x in enumerate(_coordinates(joint.result.best, joint.child) or ())
     }
     followers = DependentCoordinates()
-    for loop, ends in sorted(kept, key=lambda pair: len(pair[0].others)):
+    for loop, ends in sorted(kept, key=lambda pair: len(pair[0].chain)):
         plan = _plan(loop, ends, followers, followers.leading)
         if plan is None:
             yield loop, None
@@ -181,9 +181,9 @@ def close_loops(
                 ends.seat @ turn,
                 joint.child,
                 ends.pin @ turn,
-                mask=tuple(AXES[ends.held[k]] for k in plan.rows),
+                mask=tuple(AXES[ends.constrained[k]] for k in plan.rows),
                 dependent=tuple(names[k] for k in plan.columns),
-                home=_home(seen, names, plan.columns, plan.motion.times),
+                home=_home(observed, names, plan.columns, plan.motion.times),
             ),
         )
 
@@ -192,21 +192,21 @@ class _Plan(NamedTuple):
     """Which rows are zero, in which axes of the seat, and which columns follow, by which slopes."""
 
     motion: Twists
-    axes: Stack
+    axes: Array
     rows: list[int]
     columns: list[int]
-    slopes: Stack
+    slopes: Array
 
 
 def _plan(
     loop: ObservedLoop, ends: _Ends, followers: DependentCoordinates, leading: Iterable[str] = ()
 ) -> _Plan | None:
     """Return how a loop is closed; None if nothing is left of it to close, or nothing that could follow."""
-    fit = loop.joint.found.best
-    motion = followers.resolved(ends.motion)
+    fit = loop.joint.result.best
+    motion = followers.resolve(ends.motion)
     axes = _axes(motion.twists, fit.family in _ABOUT_Z)
-    equations = _equations(motion.twists, axes)[:, ends.held]
-    whole = _equations(ends.motion.twists, axes)[:, ends.held]
+    equations = _equations(motion.twists, axes)[:, ends.constrained]
+    whole = _equations(ends.motion.twists, axes)[:, ends.constrained]
     able = [k for k, x in enumerate(motion.names) if x not in leading]
     # Something moves, or no loop would have been seen.
     count = min(_rank(equations, _tolerance(loop), whole), len(motion.names) - 1)
@@ -222,7 +222,7 @@ def _can_move(loop: ObservedLoop) -> bool:
     """Whether a loop can move for more than a moment, unlike three hinges in a line."""
     elsewhere = _ends(loop, np.random.default_rng(0))
     assert elsewhere is not None  # as where it was seen
-    equations = _equations(elsewhere.motion.twists, np.eye(3))[:, elsewhere.held]
+    equations = _equations(elsewhere.motion.twists, np.eye(3))[:, elsewhere.constrained]
     return _rank(equations, _tolerance(loop)) < len(elsewhere.motion.names)
 
 
@@ -246,31 +246,31 @@ def _ends(loop: ObservedLoop, random: np.random.Generator | None = None) -> _End
 
     None if it cannot be closed.
     """
-    joint, fit = loop.joint, loop.joint.found.best
+    joint, fit = loop.joint, loop.joint.result.best
     names: list[str] = []
-    for other in loop.others:
-        between = _coordinates(other.found.best, other.child)
+    for other in loop.chain:
+        between = _coordinates(other.result.best, other.child)
         if between is None:
             return None
         names += between
     if not isinstance(fit.motion, GroupMotion) or fit.family not in CONSTRAINED_COMPONENTS:
         return None
-    ring = build_chain(loop.others, joint.parent, random)
+    ring = build_chain(loop.chain, joint.parent, random)
     seat, pin = fit.motion.left, inverse(fit.motion.right)
     axes = np.broadcast_to(seat[:3, :3], (len(ring.times), 3, 3))
     twists = _moved(ring.twists, ring.poses[:, :3, :3] @ pin[:3, 3], axes)
     return _Ends(seat, pin, Twists(tuple(names), ring.times, twists), CONSTRAINED_COMPONENTS[fit.family])
 
 
-def _moved(twists: Stack, offset: Stack, parent_R_axes: Stack) -> Stack:
+def _moved(twists: Array, offset: Array, parent_R_axes: Array) -> Array:
     """Return twists (N, 6, n) of a point at some offset, in other axes."""
     linear = twists[:, :3] - skew(offset) @ twists[:, 3:]
     axes_R_parent = np.swapaxes(parent_R_axes, 1, 2)
-    moved: Stack = np.concatenate([axes_R_parent @ linear, axes_R_parent @ twists[:, 3:]], axis=1)
+    moved: Array = np.concatenate([axes_R_parent @ linear, axes_R_parent @ twists[:, 3:]], axis=1)
     return moved
 
 
-def _axes(twists: Stack, about_z: bool) -> Stack:
+def _axes(twists: Array, about_z: bool) -> Array:
     """Return axes along which linkages in a plane move or do not: their plane contains or leaves out one."""
     v, w = (np.concatenate([*part.transpose(0, 2, 1)]) for part in (twists[:, :3], twists[:, 3:]))
     if about_z:
@@ -278,18 +278,18 @@ def _axes(twists: Stack, about_z: bool) -> Stack:
         normal = np.concatenate([_lever(twists) * w[:, :2], v[:, 1::-1] * (-1.0, 1.0)])
         x = np.linalg.eigh(normal.T @ normal)[1][:, 1]
         return np.array([[x[0], -x[1], 0.0], [x[1], x[0], 0.0], [0.0, 0.0, 1.0]])
-    axes: Stack = np.linalg.eigh(v.T @ v)[1]
+    axes: Array = np.linalg.eigh(v.T @ v)[1]
     axes[:, 2] *= np.linalg.det(axes)
     return axes
 
 
-def _lever(twists: Stack) -> float:
+def _lever(twists: Array) -> float:
     """Return how many metres make a radian."""
     v, w = (float(np.sum(part**2)) for part in (twists[:, :3], twists[:, 3:]))
     return math.sqrt(v / w) if v and w else 1.0
 
 
-def _equations(twists: Stack, seat_R_new: Stack) -> Stack:
+def _equations(twists: Array, seat_R_new: Array) -> Array:
     """Return twists in new axes, with radians and metres alike, (N, 6, n)."""
     lever = _lever(twists)
     parts = [seat_R_new.T @ twists[:, :3] / lever, seat_R_new.T @ twists[:, 3:]]
@@ -298,22 +298,22 @@ def _equations(twists: Stack, seat_R_new: Stack) -> Stack:
 
 def _tolerance(loop: ObservedLoop) -> float:
     """Return up to which part of the largest a way to part may be due to axes that are not well known."""
-    fits = [joint.found.best for joint in (loop.joint, *loop.others)]
+    fits = [joint.result.best for joint in (loop.joint, *loop.chain)]
     axes = [fit.deviation(c) for fit in fits for c in fit.coordinates if c.startswith("axis.")]
     return min(max(RANK_TOLERANCE, _WELL_KNOWN * max(axes, default=0.0)), _SMALL)
 
 
-def _rank(equations: Stack, tolerance: float, whole: Stack | None = None) -> int:
+def _rank(equations: Array, tolerance: float, whole: Array | None = None) -> int:
     """Return in how many ways the ends can part; they are small beside those if nothing else held them."""
     values = np.linalg.svd(equations, compute_uv=False)
     most = values if whole is None else np.linalg.svd(whole, compute_uv=False)
     return int(np.median(np.sum(values > tolerance * np.median(most[:, 0]), axis=1)))
 
 
-def _chosen(equations: Stack, count: int, able: Sequence[int]) -> tuple[list[int], list[int]]:
+def _chosen(equations: Array, count: int, able: Sequence[int]) -> tuple[list[int], list[int]]:
     """Return the rows, and the columns that follow, by which a loop is told best where it is told worst."""
 
-    def told(square: Stack) -> float:
+    def told(square: Array) -> float:
         return float(np.linalg.svd(square, compute_uv=False)[:, -1].min())
 
     rows = max(combinations(range(equations.shape[1]), count), key=lambda some: told(equations[:, some]))
@@ -323,18 +323,18 @@ def _chosen(equations: Stack, count: int, able: Sequence[int]) -> tuple[list[int
 
 
 def _home(
-    seen: Mapping[str, tuple[Times, Stack]], names: Sequence[str], columns: Sequence[int], times: Times
+    observed: Mapping[str, tuple[Times, Array]], names: Sequence[str], columns: Sequence[int], times: Times
 ) -> tuple[tuple[str, float], ...]:
     """Return the coordinates when those that do not follow were in the middle of what was seen of them."""
 
-    def at(x: str, time: Times | np.int_) -> Stack:
-        when, values = seen[x]
-        there: Stack = values[np.searchsorted(when, time)]
+    def at(x: str, time: Times | np.int_) -> Array:
+        when, values = observed[x]
+        there: Array = values[np.searchsorted(when, time)]
         return there
 
     off = np.zeros(len(times))
     for k in set(range(len(names))) - {*columns}:
-        values = seen[names[k]][1]
+        values = observed[names[k]][1]
         middle, range_ = 0.5 * (values.min() + values.max()), np.ptp(values) or 1.0
         off += ((at(names[k], times) - middle) / range_) ** 2
     best = times[np.argmin(off)]

@@ -17,7 +17,7 @@ import numpy.typing as npt
 
 from kineverse.estimation.identification.families import GroupMotion
 from kineverse.estimation.identification.result import Fit, IdentificationResult
-from kineverse.lie import Stack, inverse, skew
+from kineverse.lie import Array, inverse, skew
 
 from .pairwise import PartPair
 
@@ -29,14 +29,14 @@ class Twists(NamedTuple):
 
     names: tuple[str, ...]
     times: Times
-    twists: Stack
+    twists: Array
 
 
 class _Slopes(NamedTuple):
     """By how much a coordinate changes with each of those it follows, (N,), at N times."""
 
     times: Times
-    slopes: Mapping[str, Stack]
+    slopes: Mapping[str, Array]
 
 
 class DependentCoordinates:
@@ -50,20 +50,20 @@ class DependentCoordinates:
         """The coordinates that are followed."""
         return {u for known in self._known.values() for u in known.slopes}
 
-    def resolved(self, motion: Twists) -> Twists:
+    def resolve(self, motion: Twists) -> Twists:
         """Return twists per unit of coordinates that follow no others."""
         times = motion.times
         for x in motion.names:
             if x in self._known:
                 times = np.intersect1d(times, self._known[x].times)
         rows = np.searchsorted(motion.times, times)
-        columns: dict[str, Stack] = {}
+        columns: dict[str, Array] = {}
         for k, x in enumerate(motion.names):
             for u, slope in self._slopes(x, times).items():
                 columns[u] = columns.get(u, 0.0) + motion.twists[rows, :, k] * slope[:, None]
         return Twists(tuple(columns), times, np.stack([*columns.values()], axis=2))
 
-    def add(self, motion: Twists, columns: Sequence[int], slopes: Stack) -> None:
+    def add(self, motion: Twists, columns: Sequence[int], slopes: Array) -> None:
         """Have some columns follow the others, by slopes (N, followers, leaders)."""
         leads = [x for k, x in enumerate(motion.names) if k not in columns]
         new = {
@@ -77,13 +77,13 @@ class DependentCoordinates:
                 if u in new:
                     common = np.intersect1d(common, new[u].times)
             rows = np.searchsorted(times, common)
-            total: dict[str, Stack] = {}
+            total: dict[str, Array] = {}
             for u, own in by_others.items():
                 for v, slope in self._slopes(u, common).items():
                     total[v] = total.get(v, 0.0) + own[rows] * slope
             self._known[x] = _Slopes(common, total)
 
-    def _slopes(self, name: str, times: Times) -> Mapping[str, Stack]:
+    def _slopes(self, name: str, times: Times) -> Mapping[str, Array]:
         """Return what a coordinate follows: itself, if no other."""
         if name not in self._known:
             return {name: np.ones(len(times))}
@@ -98,11 +98,11 @@ RANK_TOLERANCE = 0.05
 # The degree of polynomials, or of Fourier series, of one and of two joint values; 2 for more.
 _DEGREES = {1: 5, 2: 3}
 # Which part of a joint value's variance may be left open where it is determined by others.
-_OPEN = 0.1
+_UNEXPLAINED = 0.1
 # From which range on an angle may go round, so that its values jump somewhere [rad].
-_WIDE = math.pi
+_WRAPPING = math.pi
 # How far joint values elsewhere are from those that were seen [m] or [rad].
-_ELSEWHERE = 0.3
+_PERTURBATION = 0.3
 
 
 class ObservedJoint(Protocol):
@@ -119,7 +119,7 @@ class ObservedJoint(Protocol):
         ...
 
     @property
-    def found(self) -> IdentificationResult:
+    def result(self) -> IdentificationResult:
         """What was identified between them."""
         ...
 
@@ -147,15 +147,15 @@ class Chain:
         The numbers of the observations.
     """
 
-    poses: Stack
-    twists: Stack
-    values: Stack
-    deviations: Stack
-    turning: tuple[bool, ...]
+    poses: Array
+    twists: Array
+    values: Array
+    deviations: Array
+    is_angle: tuple[bool, ...]
     times: npt.NDArray[np.int_]
 
     @property
-    def ways(self) -> int:
+    def mobility(self) -> int:
         """In how many ways the end can move at once."""
         if not self.twists.shape[2]:
             return 0
@@ -178,18 +178,18 @@ def build_chain(
         times = np.intersect1d(times, one.times)
     poses = np.tile(np.eye(4), (len(times), 1, 1))
     # Twists about the origin of the beginning, until all are known.
-    twists: list[Stack] = []
-    values: list[Stack] = []
-    deviations: list[Stack] = []
+    twists: list[Array] = []
+    values: list[Array] = []
+    deviations: list[Array] = []
     for one in joints:
-        fit = one.found.best
+        fit = one.result.best
         rows = np.searchsorted(one.times, times)
         taken = fit.joint_values[rows]
         if random is not None:
             taken = random.permuted(taken, axis=0)
             if isinstance(fit.motion, GroupMotion):
-                taken = taken + random.uniform(-_ELSEWHERE, _ELSEWHERE, taken.shape)
-        linear = fit.motion.at(taken)
+                taken = taken + random.uniform(-_PERTURBATION, _PERTURBATION, taken.shape)
+        linear = fit.motion.linearise(taken)
         forward = one.parent == start
         step = linear.pose if forward else inverse(linear.pose)
         # A joint that is passed backwards moves by the opposite twist, said in its other part.
@@ -204,39 +204,39 @@ def build_chain(
         start = one.child if forward else one.parent
     columns = np.concatenate(twists, axis=2)
     columns[:, :3] -= skew(poses[:, :3, 3]) @ columns[:, 3:]
-    angles = tuple(angle for one in joints for angle in find_angles(one.found.best))
+    angles = tuple(angle for one in joints for angle in find_angles(one.result.best))
     joined, known = np.concatenate(values, axis=1), np.concatenate(deviations, axis=1)
     return Chain(poses, columns, joined, known, angles, times)
 
 
 def closes_loop(known: PartPair, joints: Sequence[ObservedJoint]) -> bool:
     """Whether a pair is held by more than the joints between both, from its parent to its child."""
-    if known.found.is_ambiguous or not known.explained:
+    if known.result.is_ambiguous or not known.is_consistent:
         return False
     between_both = build_chain(joints, known.parent)
-    fit = known.found.best
+    fit = known.result.best
     count = fit.motion.joints
-    if len(between_both.times) < 2 or between_both.ways <= count:
+    if len(between_both.times) < 2 or between_both.mobility <= count:
         return False
     own = np.searchsorted(known.times, between_both.times)
     values = np.concatenate([between_both.values, fit.joint_values[own]], axis=1)
     deviations = np.concatenate([between_both.deviations, fit.deviations[own]], axis=1)
-    angles = [*between_both.turning, *find_angles(fit)]
-    seen = [
-        _Seen(values[:, k], deviations[:, k], angle and bool(np.ptp(values[:, k]) > _WIDE))
+    angles = [*between_both.is_angle, *find_angles(fit)]
+    samples = [
+        _JointSamples(values[:, k], deviations[:, k], angle and bool(np.ptp(values[:, k]) > _WRAPPING))
         for k, angle in enumerate(angles)
     ]
-    return any(_determine(seen, chosen) for chosen in combinations(range(len(seen)), count))
+    return any(_determine(samples, chosen) for chosen in combinations(range(len(samples)), count))
 
 
-class _Seen(NamedTuple):
+class _JointSamples(NamedTuple):
     """The values of a joint, how well they are known, and whether they go round."""
 
-    values: Stack
-    deviations: Stack
+    values: Array
+    deviations: Array
     round: bool
 
-    def terms(self, degree: int) -> list[Stack]:
+    def terms(self, degree: int) -> list[Array]:
         """Return what is of a degree in a polynomial of the values, or in a Fourier series."""
         if not degree:
             return [np.ones(len(self.values))]
@@ -252,19 +252,21 @@ def find_angles(fit: Fit) -> list[bool]:
     return [own and bool(kind) for kind in fit.motion.kinds]
 
 
-def _determine(seen: Sequence[_Seen], chosen: Sequence[int]) -> bool:
+def _determine(samples: Sequence[_JointSamples], chosen: Sequence[int]) -> bool:
     """Whether some joint values determine all others, as polynomials or Fourier series of them."""
     most = _DEGREES.get(len(chosen), 2)
     degrees = [d for d in product(range(most + 1), repeat=len(chosen)) if sum(d) <= most]
-    each = [[seen[k].terms(d) for k, d in zip(chosen, some, strict=True)] for some in degrees]
+    each = [[samples[k].terms(d) for k, d in zip(chosen, some, strict=True)] for some in degrees]
     features = np.column_stack([np.prod(factors, axis=0) for some in each for factors in product(*some)])
     if len(features) < 2 * features.shape[1]:
         return False
-    for k in set(range(len(seen))) - {*chosen}:
-        for term in seen[k].terms(1):
+    for k in set(range(len(samples))) - {*chosen}:
+        for term in samples[k].terms(1):
             moved = term - term.mean()
             left = moved - features @ np.linalg.lstsq(features, moved, rcond=None)[0]
-            noise = np.mean(seen[k].deviations ** 2) / (1.0 if seen[k].round else seen[k].values.var() or 1.0)
-            if np.mean(left**2) >= _OPEN * np.mean(moved**2) + 4.0 * noise:
+            noise = np.mean(samples[k].deviations ** 2) / (
+                1.0 if samples[k].round else samples[k].values.var() or 1.0
+            )
+            if np.mean(left**2) >= _UNEXPLAINED * np.mean(moved**2) + 4.0 * noise:
                 return False
     return True

@@ -14,7 +14,7 @@ from kineverse.estimation.identification.identify import family_weights, identif
 from kineverse.estimation.identification.observations import Observations, PoseTrack, pair_tracks
 from kineverse.estimation.identification.result import Fit, IdentificationResult
 from kineverse.estimation.robust import Outliers
-from kineverse.lie import Stack, skew
+from kineverse.lie import Array, skew
 
 FamilyChoice = Iterable[str] | Mapping[str, float] | None
 
@@ -52,16 +52,16 @@ class PartPair:
 
     parent: str
     child: str
-    found: IdentificationResult
+    result: IdentificationResult
     times: npt.NDArray[np.int_]
     gain: float
-    explained: bool
+    is_consistent: bool
 
     @property
-    def rigid(self) -> float:
+    def log_odds_rigid(self) -> float:
         """The logarithm of the odds of being one rigid body against the likeliest other family."""
-        rigid = sum(fit.probability for fit in self.found if fit.family == "rigid")
-        other = max((fit.probability for fit in self.found if fit.family != "rigid"), default=0.0)
+        rigid = sum(fit.probability for fit in self.result if fit.family == "rigid")
+        other = max((fit.probability for fit in self.result if fit.family != "rigid"), default=0.0)
         return math.log(max(rigid, _TINY)) - math.log(max(other, _TINY))
 
 
@@ -80,12 +80,12 @@ def identify_pair(
     times = np.flatnonzero(a.seen & b.seen)
     if len(times) < 2:
         return None
-    seen = pair_tracks(a, b, times)
-    found = identify_observations(seen, families)
+    observations = pair_tracks(a, b, times)
+    found = identify_observations(observations, families)
     weights = {str(getattr(f, "name", f)): w for f, w in family_weights(families).items()}
     best = found.best
     log = best.log_evidence + math.log(weights[best.family] / best.probability / sum(weights.values()))
-    squares = squared_error(seen, best)
+    squares = squared_error(observations, best)
     expected = max(best.residuals.size - best.joint_values.size - len(best.covariance), 1)
     explained = abs(squares - expected) < SURPRISE_DEVIATIONS * math.sqrt(2.0 * expected)
     if explained:
@@ -93,61 +93,63 @@ def identify_pair(
         log += 0.5 * (squares - expected)
     if a.covariances is not None:
         # A part on a joint is better known than it is seen: its noise is no reason to hang on the world.
-        log += _log_volume(relative_covariance(seen, best), best) - _log_volume(child_covariance(seen), best)
+        log += _log_volume(relative_covariance(observations, best), best) - _log_volume(
+            child_covariance(observations), best
+        )
     turned = 0.0 if b.is_point else _LOG_TURNED
     log += LOG_ANYWHERE - _LOG_TURNED + turned - len(times) * (_LOG_ROOM + turned)
     return PartPair(parent, child, found, times, log, explained)
 
 
-def squared_error(seen: Observations, fit: Fit) -> float:
+def squared_error(observations: Observations, fit: Fit) -> float:
     """Return χ²: the squares of what a fit leaves, in units of its covariance."""
-    weighted = np.linalg.solve(relative_covariance(seen, fit), fit.residuals[:, :, None])[:, :, 0]
+    weighted = np.linalg.solve(relative_covariance(observations, fit), fit.residuals[:, :, None])[:, :, 0]
     return float(np.sum(fit.residuals * weighted))
 
 
-def relative_covariance(seen: Observations, fit: Fit) -> Stack:
+def relative_covariance(observations: Observations, fit: Fit) -> Array:
     """Return the covariances of observed relative poses, or positions, in the parent's axes, (N, m, m)."""
-    covariance = child_covariance(seen)
-    if seen.parent_covariance is not None:
-        lever = np.tile(np.eye(6), (len(seen), 1, 1))
+    covariance = child_covariance(observations)
+    if observations.parent_covariance is not None:
+        lever = np.tile(np.eye(6), (len(observations), 1, 1))
         lever[:, :3, 3:] = -skew(fit.poses[:, :3, 3])
-        carried = lever[:, : seen.rows] @ _turned(seen, 6)
-        covariance = covariance + carried @ seen.parent_covariance @ np.swapaxes(carried, 1, 2)
+        carried = lever[:, : observations.rows] @ _turned(observations, 6)
+        covariance = covariance + carried @ observations.parent_covariance @ np.swapaxes(carried, 1, 2)
     return covariance
 
 
-def child_covariance(seen: Observations) -> Stack:
+def child_covariance(observations: Observations) -> Array:
     """Return the covariances of the child's pose or position in the parent's axes, (N, m, m)."""
-    turned = _turned(seen, seen.rows)
-    covariance: Stack = turned @ seen.child_covariance @ np.swapaxes(turned, 1, 2)
+    turned = _turned(observations, observations.rows)
+    covariance: Array = turned @ observations.child_covariance @ np.swapaxes(turned, 1, 2)
     return covariance
 
 
-def _turned(seen: Observations, rows: int) -> Stack:
-    p_R_w = np.swapaxes(seen.parent[:, :3, :3], 1, 2)
+def _turned(observations: Observations, rows: int) -> Array:
+    p_R_w = np.swapaxes(observations.parent[:, :3, :3], 1, 2)
     turned = np.zeros((len(p_R_w), 6, 6))
     turned[:, :3, :3] = turned[:, 3:, 3:] = p_R_w
     return turned[:, :rows, :rows]
 
 
-def _log_volume(covariance: Stack, fit: Fit) -> float:
+def _log_volume(covariance: Array, fit: Fit) -> float:
     """Return the logarithm of the volume of noise across a motion, up to a constant: ½ log |S| |Jᵀ S⁻¹ J|."""
-    by_joints = fit.motion.at(fit.joint_values).by_joints
+    by_joints = fit.motion.linearise(fit.joint_values).by_joints
     along = np.swapaxes(by_joints, 1, 2) @ np.linalg.solve(covariance, by_joints)
     return 0.5 * float(np.sum(np.linalg.slogdet(covariance)[1] + np.linalg.slogdet(along)[1]))
 
 
 def identify_observations(
-    seen: Observations, families: FamilyChoice, outliers: Outliers | None = None
+    observations: Observations, families: FamilyChoice, outliers: Outliers | None = None
 ) -> IdentificationResult:
     """Return what is between two parts that were seen."""
-    exact = seen.parent_covariance is None
-    child = seen.relative if exact else seen.child
+    exact = observations.parent_covariance is None
+    child = observations.relative if exact else observations.child
     return identify(
-        None if exact else seen.parent,
-        child if seen.rows == 6 else child[:, :3, 3],
-        parent_covariance=seen.parent_covariance,
-        child_covariance=seen.child_covariance,
+        None if exact else observations.parent,
+        child if observations.rows == 6 else child[:, :3, 3],
+        parent_covariance=observations.parent_covariance,
+        child_covariance=observations.child_covariance,
         families=families,
         outliers=outliers,
     )

@@ -8,7 +8,7 @@ from typing import TypeVar
 
 import numpy as np
 
-from kineverse.lie import Stack
+from kineverse.lie import Array
 
 NodeT = TypeVar("NodeT", bound=Hashable)
 
@@ -104,7 +104,7 @@ def replacement_probabilities(
     return dict(sorted(across.items(), key=lambda pair: -pair[1]))
 
 
-def _log_conductance(logs: Stack, start: int, end: int) -> float:
+def _log_conductance(logs: Array, start: int, end: int) -> float:
     """Return the logarithm of the conductance between two nodes, from those of all connections."""
     order = [*(k for k in range(len(logs)) if k not in (start, end)), start, end]
     left = logs[np.ix_(order, order)]
