@@ -51,8 +51,8 @@ special cases and is rarer; a free one is rarer still."""
 UNKNOWN_NOISE = (0.005, math.radians(1.0))
 """Standard deviations of positions [m] and orientations [rad] that are scaled where no noise is stated."""
 
-# A family is not refined if its log evidence is below that of the best by more than this, a constant and a term
-# for each observation. With noise that is large beside the motion, the unrefined evidence is this inaccurate.
+# A family is not refined if its log evidence is below that of the best by more than a constant and a term for
+# each observation. With noise that is large beside the motion, the unrefined evidence is this inaccurate.
 _NEGLIGIBLE, _NEGLIGIBLE_EACH = 15.0, 0.5
 # Candidate scales of the unknown noise, and the standard deviation of their log-normal prior: a factor of 5.
 _SCALES = np.geomspace(0.01, 100.0, 33)

@@ -54,8 +54,8 @@ def maximise_marginal_likelihood(observations: Observations, solution: Solution[
     softened = observations.softened()
     if solution.joint_prior.marginal or not softened:
         return _score(result)
-    # With positions this precise the maximum of the likelihood is a poor start: its motion is bent to fit each
-    # joint value. A prior on the ranges during the continuation prevents that.
+    # With positions this precise the maximum of the likelihood is a poor start: its motion is distorted to
+    # fit each joint value. A prior on the ranges during the continuation prevents that.
     for softer in (*softened, observations):
         solution = levenberg_marquardt(
             softer, solution.motion, solution.values, solution.parent, solution.joint_prior

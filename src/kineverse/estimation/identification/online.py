@@ -160,7 +160,7 @@ def _nearest_observations(observations: Observations, known: int) -> RowIndices:
 
 
 def _predict_inliers(data: IdentificationData, one: FamilySolution, scale: float) -> RowIndices:
-    """Return the indices of the inliers: those so far, and new observations that agree with the prediction."""
+    """Return the indices of the inliers so far and of the new observations that match the prediction."""
     new, solution = np.arange(one.count, len(data.observations)), one.scored.solution
     if data.outliers is None or solution.motion.joints == data.observations.rows:
         return np.concatenate([one.inliers, new])

@@ -1,7 +1,8 @@
 """Mobility of loops, loop-closure tests and dependent coordinates.
 
-In a loop joint values are no longer independent: as many of them as the pair has ways to move determine all
-others. A pair that only happens to move nearly like a simple joint, as a door and a drawer far away, is none.
+In a loop the joint values are not independent. As many of them as the mobility of the loop determine all
+others. A pair whose relative motion is only similar to a simple joint, such as a door and a distant drawer,
+is no loop.
 """
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ Times = npt.NDArray[np.int_]
 
 
 class Twists(NamedTuple):
-    """Twists of a frame per unit of each of n coordinates, (N, 6, n), at the times of N observations."""
+    """Twists of a frame per unit of each of n coordinates, (N, 6, n), at N times."""
 
     names: tuple[str, ...]
     times: Times
@@ -33,25 +34,25 @@ class Twists(NamedTuple):
 
 
 class _Slopes(NamedTuple):
-    """By how much a coordinate changes with each of those it follows, (N,), at N times."""
+    """Derivatives of a dependent coordinate by each of its independent ones, (N,), at N times."""
 
     times: Times
     slopes: Mapping[str, Array]
 
 
 class DependentCoordinates:
-    """Which coordinates follow which others."""
+    """Dependent coordinates of closed loops, with their derivatives by the independent ones."""
 
     def __init__(self) -> None:
         self._known: dict[str, _Slopes] = {}
 
     @property
     def leading(self) -> set[str]:
-        """The coordinates that are followed."""
+        """Independent coordinates on which others depend."""
         return {u for known in self._known.values() for u in known.slopes}
 
     def resolve(self, motion: Twists) -> Twists:
-        """Return twists per unit of coordinates that follow no others."""
+        """Return twists per unit of the independent coordinates."""
         times = motion.times
         for x in motion.names:
             if x in self._known:
@@ -64,7 +65,7 @@ class DependentCoordinates:
         return Twists(tuple(columns), times, np.stack([*columns.values()], axis=2))
 
     def add(self, motion: Twists, columns: Sequence[int], slopes: Array) -> None:
-        """Have some columns follow the others, by slopes (N, followers, leaders)."""
+        """Make some columns dependent on the others, with slopes (N, dependent, independent)."""
         leads = [x for k, x in enumerate(motion.names) if k not in columns]
         new = {
             motion.names[k]: _Slopes(motion.times, {x: slopes[:, i, j] for j, x in enumerate(leads)})
@@ -84,7 +85,7 @@ class DependentCoordinates:
             self._known[x] = _Slopes(common, total)
 
     def _slopes(self, name: str, times: Times) -> Mapping[str, Array]:
-        """Return what a coordinate follows: itself, if no other."""
+        """Return the derivatives of a coordinate by independent ones; an independent one has slope 1."""
         if name not in self._known:
             return {name: np.ones(len(times))}
         known = self._known[name]
@@ -93,58 +94,59 @@ class DependentCoordinates:
 
 
 RANK_TOLERANCE = 0.05
-"""How small a way to move may be beside the largest, to be one."""
+"""Smallest singular value that counts as a degree of freedom, relative to the largest."""
 
-# The degree of polynomials, or of Fourier series, of one and of two joint values; 2 for more.
+# Degree of polynomials or Fourier series of one and of two joint values; 2 for more.
 _DEGREES = {1: 5, 2: 3}
-# Which part of a joint value's variance may be left open where it is determined by others.
+# Largest unexplained share of the variance of a dependent joint value.
 _UNEXPLAINED = 0.1
-# From which range on an angle may go round, so that its values jump somewhere [rad].
+# Range from which on an angle is treated as periodic [rad].
 _WRAPPING = math.pi
-# How far joint values elsewhere are from those that were seen [m] or [rad].
+# Largest random change of joint values for configurations that were not observed [m] or [rad].
 _PERTURBATION = 0.3
 
 
 class ObservedJoint(Protocol):
-    """A joint between two parts, with the numbers of the observations in which both were seen."""
+    """Joint between two parts, with the indices of the observations of both."""
 
     @property
     def parent(self) -> str:
-        """Where it begins."""
+        """Name of the parent part."""
         ...
 
     @property
     def child(self) -> str:
-        """Where it ends."""
+        """Name of the child part."""
         ...
 
     @property
     def result(self) -> IdentificationResult:
-        """What was identified between them."""
+        """Identification result of the pair."""
         ...
 
     @property
     def times(self) -> npt.NDArray[np.int_]:
-        """The numbers of the observations."""
+        """Indices of the observations of both parts."""
         ...
 
 
 @dataclass(frozen=True)
 class Chain:
-    """Where the end of a chain of joints is in its beginning, at the times at which all parts were seen.
+    """Chain of joints, at the times at which all of its parts were observed.
 
     Attributes
     ----------
     poses
-        (N, 4, 4).
+        Poses of the last part in the first, (N, 4, 4).
     twists
-        Of the end about its origin, in the axes of the beginning, per unit of each joint value, (N, 6, m).
+        Twists of the last part about its origin, in the axes of the first, per unit of each joint value,
+        (N, 6, m).
     values, deviations
-        The joint values and how well they are known, (N, m).
-    turning
-        Which of them are angles, (m,).
+        Joint values and their standard deviations, (N, m).
+    is_angle
+        Mask of the joint values that are angles, (m,).
     times
-        The numbers of the observations.
+        Indices of the observations.
     """
 
     poses: Array
@@ -156,7 +158,7 @@ class Chain:
 
     @property
     def mobility(self) -> int:
-        """In how many ways the end can move at once."""
+        """Number of degrees of freedom of the last part relative to the first."""
         if not self.twists.shape[2]:
             return 0
         scaled = self.twists.copy()
@@ -168,37 +170,39 @@ class Chain:
 def build_chain(
     joints: Sequence[ObservedJoint], start: str, random: np.random.Generator | None = None
 ) -> Chain:
-    """Return the chain of some joints, each beginning where the one before ended.
+    """Return the chain of successive joints from the part ``start`` on.
 
-    With ``random`` it is not where it was seen, but somewhere else, with joint values that know nothing of
-    each other.
+    With ``random``, the joint values are permuted and perturbed independently, for configurations that were
+    not observed.
     """
     times = joints[0].times
     for one in joints[1:]:
         times = np.intersect1d(times, one.times)
     poses = np.tile(np.eye(4), (len(times), 1, 1))
-    # Twists about the origin of the beginning, until all are known.
+    # Twists about the origin of the first part, until all joints are passed.
     twists: list[Array] = []
     values: list[Array] = []
     deviations: list[Array] = []
     for one in joints:
         fit = one.result.best
         rows = np.searchsorted(one.times, times)
-        taken = fit.joint_values[rows]
+        values_taken = fit.joint_values[rows]
         if random is not None:
-            taken = random.permuted(taken, axis=0)
+            values_taken = random.permuted(values_taken, axis=0)
             if isinstance(fit.motion, GroupMotion):
-                taken = taken + random.uniform(-_PERTURBATION, _PERTURBATION, taken.shape)
-        linear = fit.motion.linearise(taken)
+                values_taken = values_taken + random.uniform(
+                    -_PERTURBATION, _PERTURBATION, values_taken.shape
+                )
+        linear = fit.motion.linearise(values_taken)
         forward = one.parent == start
         step = linear.pose if forward else inverse(linear.pose)
-        # A joint that is passed backwards moves by the opposite twist, said in its other part.
+        # A joint that is traversed backwards has the opposite twist, in the axes of its child.
         parent = poses if forward else poses @ step
         turned = parent[:, :3, :3]
         v, w = turned @ linear.by_joints[:, :3], turned @ linear.by_joints[:, 3:]
         place = (parent @ linear.pose)[:, :3, 3]
         twists.append(np.concatenate([v + skew(place) @ w, w], axis=1))
-        values.append(taken)
+        values.append(values_taken)
         deviations.append(fit.deviations[rows])
         poses = poses @ step
         start = one.child if forward else one.parent
@@ -210,18 +214,18 @@ def build_chain(
 
 
 def closes_loop(known: PartPair, joints: Sequence[ObservedJoint]) -> bool:
-    """Whether a pair is held by more than the joints between both, from its parent to its child."""
+    """Return True if a pair is constrained beyond the chain of joints from its parent to its child."""
     if known.result.is_ambiguous or not known.is_consistent:
         return False
-    between_both = build_chain(joints, known.parent)
+    chain = build_chain(joints, known.parent)
     fit = known.result.best
     count = fit.motion.joints
-    if len(between_both.times) < 2 or between_both.mobility <= count:
+    if len(chain.times) < 2 or chain.mobility <= count:
         return False
-    own = np.searchsorted(known.times, between_both.times)
-    values = np.concatenate([between_both.values, fit.joint_values[own]], axis=1)
-    deviations = np.concatenate([between_both.deviations, fit.deviations[own]], axis=1)
-    angles = [*between_both.is_angle, *find_angles(fit)]
+    own = np.searchsorted(known.times, chain.times)
+    values = np.concatenate([chain.values, fit.joint_values[own]], axis=1)
+    deviations = np.concatenate([chain.deviations, fit.deviations[own]], axis=1)
+    angles = [*chain.is_angle, *find_angles(fit)]
     samples = [
         _JointSamples(values[:, k], deviations[:, k], angle and bool(np.ptp(values[:, k]) > _WRAPPING))
         for k, angle in enumerate(angles)
@@ -234,26 +238,26 @@ class _JointSamples(NamedTuple):
 
     values: Array
     deviations: Array
-    round: bool
+    is_periodic: bool
 
     def terms(self, degree: int) -> list[Array]:
         """Return what is of a degree in a polynomial of the values, or in a Fourier series."""
         if not degree:
             return [np.ones(len(self.values))]
-        if self.round:
+        if self.is_periodic:
             return [np.cos(degree * self.values), np.sin(degree * self.values)]
         moved = self.values - self.values.mean()
         return [(moved / (moved.std() or 1.0)) ** degree]
 
 
 def find_angles(fit: Fit) -> list[bool]:
-    """Return which joint values are angles."""
+    """Return the mask of the joint values that are angles."""
     own = isinstance(fit.motion, GroupMotion)
     return [own and bool(kind) for kind in fit.motion.kinds]
 
 
 def _determine(samples: Sequence[_JointSamples], chosen: Sequence[int]) -> bool:
-    """Whether some joint values determine all others, as polynomials or Fourier series of them."""
+    """Return True if chosen joint values determine all others, by polynomials or Fourier series."""
     most = _DEGREES.get(len(chosen), 2)
     degrees = [d for d in product(range(most + 1), repeat=len(chosen)) if sum(d) <= most]
     each = [[samples[k].terms(d) for k, d in zip(chosen, some, strict=True)] for some in degrees]
@@ -265,7 +269,7 @@ def _determine(samples: Sequence[_JointSamples], chosen: Sequence[int]) -> bool:
             moved = term - term.mean()
             left = moved - features @ np.linalg.lstsq(features, moved, rcond=None)[0]
             noise = np.mean(samples[k].deviations ** 2) / (
-                1.0 if samples[k].round else samples[k].values.var() or 1.0
+                1.0 if samples[k].is_periodic else samples[k].values.var() or 1.0
             )
             if np.mean(left**2) >= _UNEXPLAINED * np.mean(moved**2) + 4.0 * noise:
                 return False
