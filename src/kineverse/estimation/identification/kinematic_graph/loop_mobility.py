@@ -234,14 +234,14 @@ def closes_loop(known: PartPair, joints: Sequence[ObservedJoint]) -> bool:
 
 
 class _JointSamples(NamedTuple):
-    """The values of a joint, how well they are known, and whether they go round."""
+    """Values of a joint and their standard deviations; periodic for an angle of a wide range."""
 
     values: Array
     deviations: Array
     is_periodic: bool
 
     def terms(self, degree: int) -> list[Array]:
-        """Return what is of a degree in a polynomial of the values, or in a Fourier series."""
+        """Return the terms of a degree in a polynomial, or in a Fourier series if periodic."""
         if not degree:
             return [np.ones(len(self.values))]
         if self.is_periodic:
