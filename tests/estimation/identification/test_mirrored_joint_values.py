@@ -1,4 +1,4 @@
-"""Positions that are known much better than orientations: what an observation means is not where steps lead."""
+"""Mirrored joint values for positions that are much more precise than orientations."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from kineverse.estimation.identification.optimise import JointValuePrior, levenb
 
 
 @pytest.mark.parametrize("family", ["prismatic", "revolute"])
-def test_observations_on_the_wrong_side_are_put_right(family: str) -> None:
+def test_mirrored_joint_values_are_corrected(family: str) -> None:
     seen = recording(
         family, count=40, position=1e-3, orientation=math.radians(5.0), seed=3, extent=0.4, radius=0.5
     )
@@ -44,7 +44,7 @@ def test_observations_on_the_wrong_side_are_put_right(family: str) -> None:
     assert choose_mirrored_values(problem, bad).cost < good.cost + 0.1 * (bad.cost - good.cost)
 
 
-def test_what_steps_have_not_reached_does_not_count() -> None:
+def test_evidence_of_an_unconverged_solution_is_reduced() -> None:
     seen = recording("planar", count=20, position=1e-3, orientation=0.05, seed=3)
     problem = check_observations(seen.parent, seen.child, seen.covariance, seen.covariance)
     motion = GroupMotion(JOINT_FAMILIES["planar"], 6, seen.left, seen.right)
@@ -59,7 +59,7 @@ def test_what_steps_have_not_reached_does_not_count() -> None:
 
 
 @pytest.mark.parametrize("family", ["prismatic", "revolute"])
-def test_an_observation_by_itself_is_as_least_squares_have_it(family: str) -> None:
+def test_single_observation_agrees_with_scipys_least_squares(family: str) -> None:
     seen = recording(family, count=5, position=0.01, orientation=0.05, seed=2)
     problem = check_observations(seen.parent, seen.child, seen.covariance, seen.covariance)
     motion = GroupMotion(JOINT_FAMILIES[family], 6, seen.left, seen.right)

@@ -1,4 +1,4 @@
-"""Loops that were seen, closed in the model of what was seen: linkages that are known, through noise."""
+"""Loop closures of known linkages from noisy poses."""
 
 from __future__ import annotations
 
@@ -146,7 +146,7 @@ def two_cylinders() -> kv.Model:
     return model
 
 
-def test_a_four_bar_is_closed_and_documents_have_it(tmp_path: Path) -> None:
+def test_a_four_bar_is_closed_and_saved(tmp_path: Path) -> None:
     truth = four_bar()
     values = np.random.default_rng(0).uniform(0.0, 2.5, (40, 1))
     poses = seen(truth, ["crank", "coupler", "rocker"], values, 1)
@@ -167,7 +167,7 @@ def test_a_four_bar_is_closed_and_documents_have_it(tmp_path: Path) -> None:
     assert np.array_equal(again.fk("seen/coupler")(q), model.fk("seen/coupler")(q))
 
 
-def test_a_crank_that_goes_round_and_what_it_pushes_are_closed() -> None:
+def test_a_slider_crank_is_closed() -> None:
     values = np.random.default_rng(1).uniform(-3.1, 3.1, (40, 1))
     poses = seen(slider_crank(), ["crank", "rod", "slider"], values, 2)
     graph = identify_graph(poses, noise=NOISE, families=SOME)
@@ -177,7 +177,7 @@ def test_a_crank_that_goes_round_and_what_it_pushes_are_closed() -> None:
     assert 0.7 < left(model, poses) < 1.3
 
 
-def test_it_does_not_matter_which_joint_closes_a_loop() -> None:
+def test_a_loop_can_be_closed_at_each_of_its_joints() -> None:
     """Here it is a slider, which holds other components than a hinge, in axes that are turned to suit."""
     values = np.random.default_rng(1).uniform(-1.2, 1.2, (40, 1))
     poses = seen(slider_crank(), ["crank", "rod", "slider"], values, 2)
@@ -201,7 +201,7 @@ def test_it_does_not_matter_which_joint_closes_a_loop() -> None:
     assert 0.7 < left(model, poses) < 1.3
 
 
-def test_loops_that_share_a_crank_are_closed_one_after_the_other() -> None:
+def test_loops_with_a_common_crank_are_both_closed() -> None:
     truth = two_cylinders()
     values = np.random.default_rng(2).uniform(0.7, 2.6, (50, 1))
     poses = seen(truth, ["crank", "left_rod", "left", "right_rod", "right"], values, 3)
@@ -215,7 +215,7 @@ def test_loops_that_share_a_crank_are_closed_one_after_the_other() -> None:
 
 
 @pytest.mark.parametrize("family", sorted(CONSTRAINED_COMPONENTS))
-def test_what_a_joint_holds_is_what_its_motion_leaves(family: str) -> None:
+def test_constrained_components_are_those_without_motion(family: str) -> None:
     random = np.random.default_rng(0)
     motion = GroupMotion(JOINT_FAMILIES[family], 6, np.eye(4), np.eye(4))
     poses = motion.linearise(random.normal(0.0, 0.5, (50, motion.joints))).pose
@@ -225,7 +225,7 @@ def test_what_a_joint_holds_is_what_its_motion_leaves(family: str) -> None:
     assert still == CONSTRAINED_COMPONENTS[family]
 
 
-def test_a_loop_of_balls_is_stated_and_left_open() -> None:
+def test_a_loop_of_balls_is_reported_and_left_open() -> None:
     truth = kv.Model()
     with truth.edit() as edit:
         bar(edit, "crank", "world", 0.0, 0.2)
@@ -246,7 +246,7 @@ def test_a_loop_of_balls_is_stated_and_left_open() -> None:
     assert {"crank", "rod", "rocker"} == set(graph.model(close=False).frames)
 
 
-def test_what_follows_a_follower_follows_its_leaders() -> None:
+def test_dependent_coordinates_are_resolved_transitively() -> None:
     random = np.random.default_rng(0)
     times = np.arange(7)
     twists = Twists(("a", "b", "c", "d"), times, random.normal(size=(7, 6, 4)))

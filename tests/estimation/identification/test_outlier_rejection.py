@@ -1,4 +1,4 @@
-"""Some of what was seen is wrong altogether, and what moves is found all the same."""
+"""Outlier rejection in identification."""
 
 from __future__ import annotations
 
@@ -35,7 +35,9 @@ CASES = [(0.05, 2, 8), (0.2, 7, 28), (0.4, 3, 11)]
 
 
 @pytest.mark.parametrize(("fraction", "repeats", "least"), CASES)
-def test_what_moves_is_told_as_if_nothing_were_wrong(fraction: float, repeats: int, least: int) -> None:
+def test_identify_with_outliers_agrees_with_the_inliers_alone(
+    fraction: float, repeats: int, least: int
+) -> None:
     right, off, off_without = 0, [], []
     for family in TOLD:
         for seed in range(repeats):
@@ -56,7 +58,7 @@ def test_what_moves_is_told_as_if_nothing_were_wrong(fraction: float, repeats: i
 
 
 @pytest.mark.parametrize("family", [*JOINTS])
-def test_nothing_changes_where_nothing_is_wrong(family: str) -> None:
+def test_outliers_option_changes_nothing_without_outliers(family: str) -> None:
     seen = seen_as(family, 3)
     before = identify(seen.parent, seen.child, noise=seen.covariance)
     after = identify(seen.parent, seen.child, noise=seen.covariance, outliers=True)
@@ -77,7 +79,7 @@ def hinge() -> tuple[Recording, Array, Array, IdentificationResult]:
     return seen, child, wrong, identify(seen.parent, child, noise=seen.covariance, outliers=True)
 
 
-def test_what_is_wrong_is_said_and_does_not_count(hinge) -> None:
+def test_outliers_are_listed_and_ignored(hinge) -> None:
     seen, child, wrong, found = hinge
     fit = found.best
     assert fit.outliers == tuple(wrong)
@@ -93,7 +95,7 @@ def test_what_is_wrong_is_said_and_does_not_count(hinge) -> None:
     assert (fit.deviations > 0.0).all()
 
 
-def test_families_are_weighed_by_the_same_observations(hinge) -> None:
+def test_evidence_includes_the_density_of_the_outliers(hinge) -> None:
     seen, child, _, found = hinge
     fit = found.best
     without = identify(seen.parent[fit.inliers], child[fit.inliers], noise=seen.covariance)
@@ -107,7 +109,7 @@ def test_families_are_weighed_by_the_same_observations(hinge) -> None:
 
 
 @pytest.mark.parametrize("family", ["revolute", "prismatic", "rigid"])
-def test_positions_alone(family: str) -> None:
+def test_outliers_among_positions_are_found(family: str) -> None:
     for seed in range(3):
         seen = seen_as(family, seed, noise=(0.005, 0.03))
         child, wrong = with_wrong(seen, 0.2, seed)
@@ -120,7 +122,7 @@ def test_positions_alone(family: str) -> None:
 
 
 @pytest.mark.parametrize("family", TOLD)
-def test_noise_that_nobody_knows(family: str) -> None:
+def test_outliers_are_found_with_unknown_noise(family: str) -> None:
     seen = seen_as(family, 2)
     child, wrong = with_wrong(seen, 0.2, 2)
     found = identify(seen.parent, child, outliers=True)
@@ -129,7 +131,7 @@ def test_noise_that_nobody_knows(family: str) -> None:
     assert found.noise_scale == pytest.approx(2.0, rel=0.5)
 
 
-def test_millimetres() -> None:
+def test_outliers_are_found_in_millimetres() -> None:
     seen = seen_as("revolute", 4)
     child, wrong = with_wrong(seen, 0.2, 4)
     parent = seen.parent.copy()
@@ -140,7 +142,7 @@ def test_millimetres() -> None:
         assert (found.best.family, found.best.outliers) == ("revolute", tuple(wrong))
 
 
-def test_half_of_it_wrong_is_no_explanation() -> None:
+def test_half_of_the_observations_as_outliers_is_no_explanation() -> None:
     """What goes round four axes in turn is no hinge of which most was seen wrong."""
     several = [seen_as("revolute", seed, count=5) for seed in range(4)]
     parent, child = (np.concatenate([getattr(s, part) for s in several]) for part in ("parent", "child"))
@@ -149,7 +151,7 @@ def test_half_of_it_wrong_is_no_explanation() -> None:
     assert found.best.family == "free"
 
 
-def test_one_by_one() -> None:
+def test_identifier_finds_outliers() -> None:
     seen = seen_as("revolute", 5, count=30)
     child, wrong = with_wrong(seen, 0.2, 5)
     identifier = Identifier(noise=seen.covariance, outliers=True)
@@ -165,7 +167,7 @@ def test_one_by_one() -> None:
     )
 
 
-def test_what_outliers_are_is_checked() -> None:
+def test_invalid_outlier_models_are_refused() -> None:
     seen = seen_as("rigid", 0)
     with pytest.raises(InvalidValueError, match="Outliers are True, False or Outliers"):
         identify(seen.parent, seen.child, noise=seen.covariance, outliers=0.2)  # type: ignore[arg-type]

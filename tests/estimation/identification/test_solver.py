@@ -1,4 +1,4 @@
-"""Stages in C are those in numpy."""
+"""C stages of identification compared with numpy."""
 
 from __future__ import annotations
 
@@ -75,7 +75,7 @@ def compiled() -> None:
 @pytest.mark.compiler
 @pytest.mark.parametrize("family", [*JOINTS])
 @pytest.mark.parametrize("how", HOW)
-def test_c_and_numpy_agree(family: str, how: str) -> None:
+def test_levenberg_marquardt_in_c_agrees_with_numpy(family: str, how: str) -> None:
     seen = seen_as(how, family)
     start = next(initial_guesses(family, MotionStatistics(seen)))
     slow = levenberg_marquardt(seen, *start)
@@ -90,7 +90,7 @@ def test_c_and_numpy_agree(family: str, how: str) -> None:
 @pytest.mark.compiler
 @pytest.mark.parametrize("family", MOVING)
 @pytest.mark.parametrize("how", HOW)
-def test_steps_with_joint_values_integrated_out_agree(family: str, how: str) -> None:
+def test_marginal_steps_in_c_agree_with_numpy(family: str, how: str) -> None:
     seen = seen_as(how, family)
     start = next(initial_guesses(family, MotionStatistics(seen)))
     near = levenberg_marquardt(seen, start.motion, start.values)
@@ -107,7 +107,7 @@ def test_steps_with_joint_values_integrated_out_agree(family: str, how: str) -> 
 @pytest.mark.compiler
 @pytest.mark.parametrize("family", [*JOINTS])
 @pytest.mark.parametrize("how", HOW)
-def test_poses_agree(family: str, how: str) -> None:
+def test_linearised_poses_in_c_agree_with_numpy(family: str, how: str) -> None:
     start = next(initial_guesses(family, MotionStatistics(seen_as(how, family))))
     assert isinstance(start.motion, GroupMotion)
     for slow, fast in zip(
@@ -119,7 +119,7 @@ def test_poses_agree(family: str, how: str) -> None:
 @pytest.mark.compiler
 @pytest.mark.parametrize("family", [*JOINTS])
 @pytest.mark.parametrize("how", HOW)
-def test_the_likeliest_member_is_the_same(family: str, how: str) -> None:
+def test_maximum_likelihood_in_c_agrees_with_numpy(family: str, how: str) -> None:
     seen = seen_as(how, family)
     begin = [*initial_guesses(family, MotionStatistics(seen))]
     same(maximum_likelihood.maximum_likelihood(seen, begin), solver.maximum_likelihood(seen, begin))
@@ -128,7 +128,7 @@ def test_the_likeliest_member_is_the_same(family: str, how: str) -> None:
 @pytest.mark.compiler
 @pytest.mark.parametrize("family", MOVING)
 @pytest.mark.parametrize("how", ["both noisy", "parent known"])
-def test_integrating_joint_values_out_is_the_same(family: str, how: str) -> None:
+def test_marginal_likelihood_in_c_agrees_with_numpy(family: str, how: str) -> None:
     seen = seen_as(how, family)
     near = solve_from_best_start(seen, [*initial_guesses(family, MotionStatistics(seen))])
     slow, fast = (
@@ -152,7 +152,7 @@ def test_integrating_joint_values_out_is_the_same(family: str, how: str) -> None
 @pytest.mark.parametrize(
     ("family", "whole"), [("prismatic", True), ("revolute", True), ("spherical", True), ("revolute", False)]
 )
-def test_precise_positions_are_the_same(family: str, whole: bool) -> None:
+def test_precise_positions_in_c_agree_with_numpy(family: str, whole: bool) -> None:
     seen = precise(family, whole)
     begin = [*initial_guesses(family, MotionStatistics(seen))]
     slow, fast = maximum_likelihood.maximum_likelihood(seen, begin), solver.maximum_likelihood(seen, begin)
@@ -169,9 +169,7 @@ def test_precise_positions_are_the_same(family: str, whole: bool) -> None:
 @pytest.mark.compiler
 @pytest.mark.parametrize("family", [*JOINTS])
 @pytest.mark.parametrize("how", [*HOW, "precise"])
-def test_c_stays_within_the_memory_it_asks_for(
-    family: str, how: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_c_stays_within_its_work_memory(family: str, how: str, monkeypatch: pytest.MonkeyPatch) -> None:
     lent = []
 
     def lend(size: int) -> np.ndarray:
@@ -191,7 +189,7 @@ def test_c_stays_within_the_memory_it_asks_for(
 @pytest.mark.compiler
 @pytest.mark.parametrize("family", [*JOINTS])
 @pytest.mark.parametrize("how", HOW)
-def test_evidence_agrees(family: str, how: str) -> None:
+def test_evidence_in_c_agrees_with_numpy(family: str, how: str) -> None:
     seen = seen_as(how, family)
     solution = solver.maximum_likelihood(seen, [*initial_guesses(family, MotionStatistics(seen))]).solution
     for scale in (1.0, 3.0):
@@ -205,7 +203,7 @@ def test_evidence_agrees(family: str, how: str) -> None:
 
 @pytest.mark.compiler
 @pytest.mark.parametrize("family", ["revolute", "planar"])
-def test_what_steps_have_not_reached_does_not_count_in_c_either(family: str) -> None:
+def test_evidence_of_an_unconverged_solution_is_reduced_in_c(family: str) -> None:
     seen = seen_as("both noisy", family)
     near = solver.maximum_likelihood(seen, [*initial_guesses(family, MotionStatistics(seen))])
     reached = solver.maximise_marginal_likelihood(seen, near.solution)
@@ -230,7 +228,7 @@ class Pinned(GroupMotion):
 
 
 @pytest.mark.compiler
-def test_c_has_nothing_to_do_with_motions_that_are_not_what_their_group_says() -> None:
+def test_a_subclass_of_a_motion_is_solved_in_numpy() -> None:
     seen = seen_as("both noisy", "revolute")
     start = next(initial_guesses("revolute", MotionStatistics(seen)))
     pinned = Pinned(JOINT_FAMILIES["revolute"], 6, start.motion.left, start.motion.right)
@@ -252,14 +250,14 @@ def test_c_has_nothing_to_do_with_motions_that_are_not_what_their_group_says() -
     ],
     ids=["too many", "more than there are", "no such component"],
 )
-def test_c_refuses_groups_it_has_no_room_for(freedom: Parametrisation) -> None:
+def test_a_family_too_large_for_the_kernel_is_not_accepted(freedom: Parametrisation) -> None:
     group = replace(JOINT_FAMILIES["revolute"], poses=freedom, positions=freedom)
     assert not GroupMotion(group, 6, np.eye(4), np.eye(4)).is_plain
     assert GroupMotion(JOINT_FAMILIES["revolute"], 6, np.eye(4), np.eye(4)).is_plain
 
 
 @pytest.mark.compiler
-def test_joint_values_of_another_shape_are_refused() -> None:
+def test_linearise_refuses_joint_values_of_another_shape() -> None:
     motion = GroupMotion(JOINT_FAMILIES["revolute"], 6, np.eye(4), np.eye(4))
     with pytest.raises(ShapeError, match=r"\(N, 1\), not \(4, 2\)"):
         motion.linearise(np.zeros((4, 2)))
@@ -267,7 +265,7 @@ def test_joint_values_of_another_shape_are_refused() -> None:
 
 @pytest.mark.compiler
 @pytest.mark.parametrize("family", ["prismatic", "revolute", "planar"])
-def test_without_a_compiler_the_same_is_found(family: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_identify_without_a_compiler_agrees(family: str, monkeypatch: pytest.MonkeyPatch) -> None:
     seen = recording(family, count=12, position=0.02, orientation=0.05, seed=1)
     fast = identify(seen.parent, seen.child, noise=seen.covariance)
     with monkeypatch.context() as patched:

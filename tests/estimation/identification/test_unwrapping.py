@@ -1,4 +1,4 @@
-"""Cranks, valves and wheels: turns are counted where it is said that observations are in order."""
+"""Counting of revolutions in sequential observations."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def found_of(seen: Array, **options: object) -> IdentificationResult:
 
 
 @pytest.mark.parametrize("turns", [2.3, 5.0, 20.0])
-def test_a_crank_goes_round_and_round(turns: float) -> None:
+def test_revolutions_of_a_crank_are_counted(turns: float) -> None:
     seen = seen_turning(turns, 0.0, int(10 * turns))
     fit = found_of(seen, sequential=True).best
     assert fit.family == "revolute"
@@ -47,7 +47,7 @@ def test_a_crank_goes_round_and_round(turns: float) -> None:
 
 
 @pytest.mark.parametrize("lead", [0.002, 0.005, -0.01])
-def test_the_lead_of_a_screw_is_millimetres(lead: float) -> None:
+def test_the_lead_of_a_screw_is_found_by_counted_revolutions(lead: float) -> None:
     for seed in range(3):
         found = found_of(seen_turning(5.0, lead, 60, seed), sequential=True)
         assert found.best.family == "screw"
@@ -59,7 +59,7 @@ def test_the_lead_of_a_screw_is_millimetres(lead: float) -> None:
         assert angle_between(axis, LEFT[:3, 2]) < 0.03
 
 
-def test_less_than_a_turn_is_as_without_order() -> None:
+def test_less_than_a_revolution_agrees_with_unordered_poses() -> None:
     for start in (0.0, 2.0, 4.0):
         seen = seen_turning(0.9, 0.0, 30, start=start)
         one, other = found_of(seen), found_of(seen, sequential=True)
@@ -72,7 +72,7 @@ def test_less_than_a_turn_is_as_without_order() -> None:
         np.testing.assert_allclose(one.best.range, other.best.range, atol=1e-6)
 
 
-def test_turns_are_counted_past_what_is_wrong() -> None:
+def test_revolutions_are_counted_across_outliers() -> None:
     random = np.random.default_rng(3)
     seen = seen_turning(5.0, 0.004, 80)
     wrong = np.sort(random.choice(80, 12, replace=False))
@@ -84,7 +84,7 @@ def test_turns_are_counted_past_what_is_wrong() -> None:
     assert fit.parameters["pitch"] == pytest.approx(0.004, abs=5e-4)
 
 
-def test_positions_alone() -> None:
+def test_revolutions_are_counted_from_positions() -> None:
     seen = seen_turning(4.0, 0.02, 60)[:, :3, 3]
     found = identify(None, seen, noise=COVARIANCE[:3, :3], sequential=True)
     assert found.best.family == "screw"
@@ -95,7 +95,7 @@ def test_positions_alone() -> None:
 
 
 @pytest.mark.parametrize(("lead", "family"), [(0.0, "revolute"), (0.005, "screw")])
-def test_one_by_one(lead: float, family: str) -> None:
+def test_identifier_counts_revolutions(lead: float, family: str) -> None:
     identifier = Identifier(noise=COVARIANCE)
     for k, pose in enumerate(seen_turning(4.0, lead, 45)):
         identifier.add(None, pose)
